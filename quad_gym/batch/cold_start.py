@@ -63,7 +63,7 @@ def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
             f"{field} is {value:.3g} {unit}, more than {bound:.3g} {unit}: after a cold start the "
             "filter is overconfident, as its linearized model does not hold for errors so large",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

@@ -1,8 +1,7 @@
 """`FlightBatch`: many flights of one configuration, flown together."""
 
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,51 +9,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.cold_start import check_cold_start
-from quad_gym.batch.effects import require_effect, require_no_filter
 from quad_gym.batch.following import check_trajectories, followed
 from quad_gym.batch.innovations import innovations_of
 from quad_gym.batch.memory import FlightMemory, configuration_digest
 from quad_gym.batch.standing import check_standing
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
-from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
-from quad_gym.faults.presets import FaultsGiven, faults_of
+from quad_gym.batch.warm_start import pack_warm_start
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages, used_parts
-from quad_gym.packing.faults import pack_faults
-from quad_gym.packing.flight import (
-    pack_imperfections,
-    pack_latency,
-    params_block,
-    params_record,
-    settings_record,
-)
+from quad_gym.packing.configuration import FlightConfiguration, configured
+from quad_gym.packing.flight import params_block, params_record
 from quad_gym.packing.paths import pack_paths
-from quad_gym.packing.world import pack_options, pack_places
+from quad_gym.packing.settings import settings_record
 from quad_gym.params import checks as check
-from quad_gym.params.clocks import Clocks
-from quad_gym.params.control import ActionParams, PDGains, pd_gains
-from quad_gym.params.draw_limits import check_draws
-from quad_gym.params.randomization import DrawingTable, Given, Randomization
-from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import sensor_suite
-from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.params.trajectories import Trajectory
-from quad_gym.params.vehicle import VehicleParams, vehicle_params
-from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import (
-    COLUMNS,
     FLIGHT_BLOCK,
-    MAX_ACTION_DELAY,
     RESULTS,
     WIDTH,
     WORK_BLOCK,
-    Autoreset,
     Call,
     Command,
-    Control,
-    Layout,
-    Source,
     aligned_zeros,
     room_of,
     words_of_update,
@@ -79,203 +55,58 @@ class FlightBatch(FlightMemory):
 
     Args:
         count: Number of flights.
-        vehicle: Vehicle, or the name of a preset.
-        sensors: Sensor suite, or the name of a preset.
-        gains: Gains of `Control.PD`, or the name of a preset; None: "lab".
-        action_params: Scales of the actions, and bandwidths of the inner loops.
-        task: Reference, start and termination.
-        source: Source of the state that the controller observes.
-        control: Meaning of an action; `Control.PD` flies without actions.
-        control_rate: Actions per second; must divide the IMU rate [Hz].
-        substeps: Runge-Kutta steps per tick.
-        action_delay: Delay from the command of an action to its execution, rounded to whole ticks,
-            at most MAX_ACTION_DELAY [control steps]. Before the first action arrives, the vehicle
-            hovers.
-        layout: Layout of the observations.
-        include_std: True: append the filter's standard deviations to the observations.
-        privileged: True: append the truth to the observations.
-        bounds: (low, high) of the observations, each (n,); None: no observations.
-        autoreset: Start of the next episode after one has ended.
-        run_filter: True: sensors and filter run; None: they run if another argument needs them.
-        filter_start: "cold": the filter starts from its first fix; "warm": it has converged in
-            `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn
-            from the covariance that it has reached. See `quad_gym.batch.cold_start` for the bounds.
-        innovations: True: keep innovations and NIS block by block, for `record`: "innovation",
-            "innovation_sigma", "block_nis". Filters with an innovation gate, with `faults`, or with
-            `truncate_when_diverged` in their task always keep them.
-        threads: Number of threads; None: one per core.
-        true_vehicle: True parameters of the vehicle, if they differ from `vehicle`, which the
-            controller assumes.
-        true_sensors: True parameters of the sensors, if they differ from `sensors`, which the
-            filter assumes.
-        world: Wind, gusts, drag, ground, battery, obstacles and geofence, or the name of a preset.
-        randomization: Parameters drawn in every episode, relative to `true_vehicle`, `true_sensors`
-            and `world`: a `Randomization`, or distributions by name.
-        faults: Faults of sensors and rotors, or names of presets, see `quad_gym.faults`.
+        keywords: See `quad_gym.packing.configuration.FlightConfiguration`.
 
     Raises:
         ValueError: If an argument is invalid; nothing is allocated then.
     """
 
-    def __init__(
-        self,
-        count: int,
-        *,
-        vehicle: VehicleParams | str = "lab",
-        sensors: SensorSuite | str = "standard",
-        gains: PDGains | str | None = None,
-        action_params: ActionParams | None = None,
-        task: TaskParams | None = None,
-        source: Source = Source.ESTIMATE,
-        control: Control = Control.PD,
-        control_rate: float | None = None,
-        substeps: int = 1,
-        action_delay: float = 0.0,
-        layout: Layout = Layout.RELATIVE,
-        include_std: bool = False,
-        privileged: bool = False,
-        bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
-        autoreset: Autoreset = Autoreset.DISABLED,
-        run_filter: bool | None = None,
-        filter_start: str = "cold",
-        innovations: bool = False,
-        threads: int | None = None,
-        true_vehicle: VehicleParams | None = None,
-        true_sensors: SensorSuite | None = None,
-        world: WorldParams | str = "calm",
-        randomization: Randomization | Mapping[str, Given] | None = None,
-        faults: FaultsGiven = None,
-    ) -> None:
+    @configured(FlightConfiguration)
+    def __init__(self, count: int, c: FlightConfiguration) -> None:
         self.count = check.whole("count", count, most=MOST_FLIGHTS)
-        self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
-        self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
-        self.gains = pd_gains(gains or "lab") if isinstance(gains, str | None) else gains
-        self.action_params = ActionParams() if action_params is None else action_params
-        self.task = TaskParams() if task is None else task
-        self.world = world_params(world) if isinstance(world, str) else world
-        self.randomization = Randomization.of(randomization)
-        for name, value, kind in (
-            ("vehicle", self.vehicle, VehicleParams),
-            ("sensors", self.sensors, SensorSuite),
-            ("gains", self.gains, PDGains),
-            ("action_params", self.action_params, ActionParams),
-            ("task", self.task, TaskParams),
-            ("true_vehicle", self.vehicle if true_vehicle is None else true_vehicle, VehicleParams),
-            ("true_sensors", self.sensors if true_sensors is None else true_sensors, SensorSuite),
-            ("world", self.world, WorldParams),
-        ):
-            check.instance(name, value, kind)
-        self.source, self.control = Source(source), Control(control)
-        rate = self.sensors.imu.rate if control_rate is None else control_rate
-        self.clocks = Clocks.of(self.sensors, rate, substeps)
-        check_limit(self.task, self.clocks.imu_rate, "IMU rate")
-        self.threads = resolve_threads(threads)
-        true_vehicle = self.vehicle if true_vehicle is None else true_vehicle
-        true_sensors = self.sensors if true_sensors is None else true_sensors
-        self.sensors.require_like(true_sensors)
-        self.faults = faults_of(faults, true_sensors)
-        self.innovations = check.flag("innovations", innovations)
-        self._begins_after_step = self.innovations and autoreset == Autoreset.SAME_STEP
-        self.final_innovations: dict[str, NDArray[Any]] = {}
-        check.flag("include_std", include_std)
-        check.flag("privileged", privileged)
-        check.choice("filter_start", filter_start, FILTER_STARTS)
-        if run_filter is None:
-            needed = include_std or innovations
-            run_filter = needed or self.source in (Source.ESTIMATE, Source.MEASUREMENTS)
-        self.run_filter = check.flag("run_filter", run_filter)
-        given = {"gains": gains, "action_params": action_params}
-        require_effect(self.control, {name for name in given if given[name] is not None})
-        if not run_filter:
-            require_no_filter(
-                include_std=include_std,
-                innovations=innovations,
-                truncate_when_diverged=self.task.truncate_when_diverged,
-                filter_start=filter_start,
-            )
-        watches = self.innovations or bool(self.faults) or self.task.truncate_when_diverged
-        if run_filter:
-            self.sensors.require_filter()
-
-        self.action_delay = check.number(
-            "action_delay", action_delay, least=0.0, most=float(MAX_ACTION_DELAY)
-        )
-        draws = DrawingTable(
-            self.randomization, true_vehicle, true_sensors, self.world, self.action_delay
-        )
-        longest_delay = math.ceil(draws.high[COLUMNS["action_delay"]][0])
-        if longest_delay > 0 and self.control is Control.PD:
-            raise ValueError("action_delay needs actions: Control.PD flies without any")
-        check_draws(draws, true_vehicle, self.world, self.clocks)
-        if run_filter and filter_start == "cold":
-            check_cold_start(self.sensors, draws)
-        check_trajectories(self.task, self.vehicle, self.action_params, self.control)
-        check_standing(self.task, true_vehicle, self.world, draws)
-        model = params_record(self.vehicle, self.sensors, self.gains, self.action_params)
-        true = params_record(true_vehicle, true_sensors, self.gains, self.action_params, self.world)
-        true["action_delay"] = self.action_delay
+        self.configuration = c
+        self.vehicle, self.sensors, self.task, self.world = c.vehicle, c.sensors, c.task, c.world
+        self.gains, self.action_params, self.action_delay = c.pd_gains, c.actions, c.action_delay
+        self.source, self.control, self.clocks = c.source, c.control, c.clocks
+        self.randomization, self.faults = c.randomization, c.possible_faults
+        self.run_filter, self.innovations = c.filters, c.innovations
+        self.threads = resolve_threads(c.threads)
+        if c.filters and c.filter_start == "cold":
+            check_cold_start(c.sensors, c.draws)
+        check_trajectories(c.task, c.vehicle, c.actions, c.control)
+        check_standing(c.task, c.flown_vehicle, c.world, c.draws)
+        model = params_record(c.vehicle, c.sensors, c.pd_gains, c.actions)
+        true = params_record(c.flown_vehicle, c.flown_sensors, c.pd_gains, c.actions, c.world)
+        true["action_delay"] = c.action_delay
         self._model, self._world = params_block(model), params_block(true)
-        self._own = [self._world.copy() for _ in range(self.threads)]
-        self._believed = [self._model.copy() for _ in range(self.threads)]
-        self._settings = settings_record(
-            self.task,
-            self.clocks,
-            self.sensors,
-            source=self.source,
-            control=self.control,
-            layout=Layout(layout),
-            include_std=include_std,
-            privileged=privileged,
-            # the kernels would begin an episode before anybody reads the last one's innovations
-            autoreset=Autoreset.DISABLED if self._begins_after_step else Autoreset(autoreset),
-            run_filter=run_filter,
-            innovations=run_filter and watches,
-            lever_drawn=self.randomization.known
-            and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
-            gnss_drifts=true_sensors.drifts,
-        )
-        pack_options(
-            self._settings[0],
-            self.world,
-            draws,
-            known=self.randomization.known,
-            limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
-        )
-        self._settings["action_delays"] = longest_delay
-        self._paths = pack_paths(self.task.trajectories)
-        self._settings["path_count"] = len(self._paths[0])
-        pack_places(self._settings[0], draws, true_sensors, self.sensors)
-        pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
-        pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors)
-        pack_imperfections(self._settings[0], true_sensors)
-        if run_filter and filter_start == "warm":
-            pack_warm_start(
-                self._settings[0],
-                FlightBatch,
-                true_sensors,
-                vehicle=self.vehicle,
-                sensors=self.sensors,
-                task=self.task,
-                substeps=substeps,
-            )
+        self._settings, self._paths = settings_record(c), pack_paths(c.task.trajectories)
+        if c.filters and c.filter_start == "warm":
+            pack_warm_start(self._settings[0], FlightBatch, c)
         self._stages = needed_stages(self._settings[0])
-        self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
-        configuration = configuration_digest(self._settings, model, true, *self._paths)
+        digest = configuration_digest(self._settings, model, true, *self._paths)
         used = used_parts(self._settings[0])
-        self._allocate(room_of(used), draws.low, configuration)
-        self._group = self._group_of_blocks()
+        self._allocate(room_of(used), c.draws.low, digest)
         self._words, self._written = words_of_update(self._settings[0], used)
-        self._gathered = [aligned_zeros(1, FLIGHT_BLOCK) for _ in range(self.threads)]
-        for block in self._gathered:
-            block["stamps"] = np.nan  # nothing arrives in the other slots
-        self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
+        self._allocate_for_threads()
+        self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if c.bounds is None else c.bounds
         padded = len(self._blocks) * WIDTH
         self._actions = np.zeros((padded, 4))
         self._resets = np.zeros(self.count, np.uint8)
         self._observations = np.zeros((self.count, self._low.size), np.float32)
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
+        self.final_innovations: dict[str, NDArray[Any]] = {}
         self._results = np.zeros((len(RESULTS), padded + WIDTH))  # no rows 4 KiB apart
         self._crew: Crew | None = None
+
+    def _allocate_for_threads(self) -> None:
+        """Allocate the memory that each thread has for itself."""
+        self._group = self._group_of_blocks()
+        self._own = [self._world.copy() for _ in range(self.threads)]
+        self._believed = [self._model.copy() for _ in range(self.threads)]
+        self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
+        self._gathered = [aligned_zeros(1, FLIGHT_BLOCK) for _ in range(self.threads)]
+        for block in self._gathered:
+            block["stamps"] = np.nan  # nothing arrives in the other slots
 
     def reset(
         self,
@@ -340,7 +171,7 @@ class FlightBatch(FlightMemory):
             self._require_begun()
         self._actions[: self.count] = self.record("action") if actions is None else actions
         observations = self._run(Command.STEP)
-        if self._begins_after_step:
+        if self.configuration.begins_after_step:
             over = self._flights_over()
             if over.any():
                 self.final_observations[over] = observations[over]

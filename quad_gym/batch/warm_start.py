@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.packing.aids import slow_states
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import portable
 from quad_gym.params.gnss import LEAST_DRIFT, GnssParams
 from quad_gym.params.sensors import SensorSuite
@@ -23,9 +24,6 @@ from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import MAX_STATES, WARM_DRAWS, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
-
-FILTER_STARTS = ("cold", "warm")
-"""Values of the keyword `filter_start`."""
 
 WARM_UP = 10.0
 """Time for which a filter has been running at a warm start [s]: several correlation times of its
@@ -41,25 +39,24 @@ is wrong by half its square. Overconfidence alone is no reason to refuse a warm 
 Floats = NDArray[np.float64]
 
 
-def pack_warm_start(
-    settings: Any, make: Callable[..., Any], true_sensors: SensorSuite, **configuration: Any
-) -> None:
+def pack_warm_start(settings: Any, make: Callable[..., Any], c: FlightConfiguration) -> None:
     """Fill the settings' fields of a warm start.
 
     Args:
         settings: One SETTINGS record.
         make: Makes a batch of flights, called as `FlightBatch`.
-        true_sensors: The true sensors.
-        configuration: Arguments of `converged_covariance`.
+        c: Configuration of the flights that start warm.
     """
-    P, sensors = converged_covariance(make, **configuration), configuration["sensors"]
-    W = root_with_truth(P, sensors)
+    P = converged_covariance(
+        make, vehicle=c.vehicle, sensors=c.sensors, task=c.task, substeps=c.substeps
+    )
+    W = root_with_truth(P, c.sensors)
     settings["warm"] = True
     states, draws = W.shape
     settings["warm_root"][:states, :draws] = W
     settings["warm_covariance"][:states, :states] = portable.product(W, W.T)
-    if true_sensors.gnss is not None:
-        settings["warm_drift_sigma"] = drift_sigma(true_sensors.gnss)
+    if c.flown_sensors.gnss is not None:
+        settings["warm_drift_sigma"] = drift_sigma(c.flown_sensors.gnss)
 
 
 @functools.lru_cache(maxsize=64)

@@ -1,6 +1,6 @@
 """From the keywords of an environment to its flights: the same for all three interfaces."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,14 +24,13 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
-from quad_gym.faults.presets import FaultsGiven, faults_of, needs_sensors
+from quad_gym.faults import Fault
+from quad_gym.faults.presets import faults_of, needs_sensors
 from quad_gym.params import checks as check
-from quad_gym.params.control import ActionParams
-from quad_gym.params.randomization import Given, Randomization
+from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
-from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import RESULTS, Autoreset, Layout
 
@@ -137,7 +136,7 @@ class Flights:
         if own_task is not None:
             keywords["task"] = own_task
         if "faults" in own and keywords["faults"] is own["faults"] and runs_no_sensor(keywords):
-            keywords["faults"] = None  # the task's own, which nobody would notice
+            keywords["faults"] = None  # the task's own, which would have no effect
         steps = keywords.pop("max_episode_steps", None)
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
@@ -145,121 +144,68 @@ class Flights:
             rate = check.positive("control_rate", keywords["control_rate"])
             self.task = self.task.replace(duration=steps / rate)
         require_effect(asked, keywords)
-        self._build(count, autoreset, camera_is_wanted="camera" in asked, **keywords)
+        self._build(count, autoreset, asked, keywords)
         if steps is not None:
             self.batch.limit(min(steps, self.batch.max_steps or steps))
 
     def _build(
-        self,
-        count: int,
-        autoreset: Autoreset,
-        *,
-        camera_is_wanted: bool,
-        observation: str,
-        action: str,
-        layout: str,
-        include_std: bool,
-        privileged: bool,
-        sensors: SensorSuite | str,
-        vehicle: VehicleParams | str,
-        action_params: ActionParams | None,
-        camera: bool,
-        estimator: str | None,
-        filter_start: str,
-        control_rate: float,
-        action_delay: float,
-        substeps: int,
-        innovations: bool,
-        reward_terms: bool,
-        true_vehicle: VehicleParams | None,
-        true_sensors: SensorSuite | None,
-        world: WorldParams | str,
-        randomization: Randomization | Mapping[str, Given] | None,
-        faults: FaultsGiven,
-        threads: int | None = None,
-        task: "Task | type[Task] | str | None" = None,
+        self, count: int, autoreset: Autoreset, asked: Collection[str], keywords: dict[str, Any]
     ) -> None:
-        check.choice("observation", observation, tuple(OBSERVATIONS))
-        check.choice("action", action, tuple(ACTIONS))
-        check.choice("layout", layout, tuple(LAYOUTS))
-        check.flag("camera", camera)
-        check.flag("include_std", include_std)
-        check.flag("privileged", privileged)
-        self.reward_terms = check.flag("reward_terms", reward_terms)
-        suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
-        if not isinstance(suite, SensorSuite):
-            raise ValueError(f"sensors must be a SensorSuite or its name, got {sensors!r}")
-        if not camera:
-            suite = suite.replace(camera=None)
-        elif camera_is_wanted and suite.camera is None:
-            raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
-        if estimator is not None:
-            check.choice("estimator", estimator, ("ukf", "ekf"))
-            suite = suite.replace(estimator=suite.estimator.replace(kind=estimator))
-        if true_sensors is not None:
-            check.instance("true_sensors", true_sensors, SensorSuite)
-        befall = faults_of(faults, suite if true_sensors is None else true_sensors)
-        idle = runs_no_sensor(
-            {
-                "observation": observation,
-                "include_std": include_std,
-                "innovations": innovations,
-            }
-        )
-        felt = [fault for fault in befall if needs_sensors(fault)]
-        if idle and felt:
-            raise ValueError(
-                f"faults must concern simulated parts: {type(felt[0]).__name__} concerns "
-                f'sensors, and none runs with observation="{observation}" (unless '
-                "include_std or innovations ask for the filter)"
-            )
-        drawn = Randomization.of(randomization)
-        place = world_params(world) if isinstance(world, str) else world
+        """Make the flights and the table of their observation.
+
+        Args:
+            count: Number of flights.
+            autoreset: When a flight whose episode is over begins the next one.
+            asked: Names of the keywords that the user gave.
+            keywords: All keywords; those of `FlightBatch` are passed on.
+        """
+        for name, known in (
+            ("observation", OBSERVATIONS),
+            ("action", ACTIONS),
+            ("layout", LAYOUTS),
+        ):
+            check.choice(name, keywords[name], tuple(known))
+        for name in ("camera", "include_std", "privileged", "reward_terms"):
+            check.flag(name, keywords[name])
+        flown = {name: value for name, value in keywords.items() if name not in _NOT_OF_BATCH}
+        self.observation, self.action = keywords["observation"], keywords["action"]
+        self.layout, self.reward_terms = keywords["layout"], keywords["reward_terms"]
+        flown["sensors"] = suite = _suite(keywords, "camera" in asked)
+        flown["faults"] = _faults(keywords, suite)
+        drawn = flown["randomization"] = Randomization.of(keywords["randomization"])
+        place = world_params(flown["world"]) if isinstance(flown["world"], str) else flown["world"]
         check.instance("world", place, WorldParams)
-        if place.ground is None and task is None and "start_position_I" not in drawn.names:
-            check_pad(self.task)  # a task of one's own may say where vehicles start
+        flown["world"], own_task = place, keywords.get("task")
+        if place.ground is None and own_task is None and "start_position_I" not in drawn.names:
+            check_pad(self.task)  # a user-defined task may set where vehicles start
+        privileged = flown["privileged"]
         self.table: tuple[ObservationField, ...] = layout_of_suite(
-            observation,
-            layout,
+            self.observation,
+            self.layout,
             suite,
-            include_std=include_std,
+            include_std=flown["include_std"],
             privileged=privileged,
             drawn=drawn.names if drawn.names or place != WorldParams() else None,
         )
-        bounds = layout_bounds(self.table)
-        self.observation, self.action, self.layout = observation, action, layout
-        self.control_rate = check.positive("control_rate", control_rate)
+        self.control_rate = check.positive("control_rate", flown["control_rate"])
         check_limit(self.task, self.control_rate, "control_rate")
+        raw = self.observation == "measurements"
         make = partial(
             FlightBatch,
-            vehicle=vehicle,
-            sensors=suite,
-            action_params=action_params,
             task=self.task,
-            source=OBSERVATIONS[observation],
-            control=ACTIONS[action],
-            control_rate=control_rate,
-            substeps=substeps,
-            action_delay=action_delay,
-            layout=Layout.MEASUREMENTS if observation == "measurements" else LAYOUTS[layout],
-            include_std=include_std,
-            privileged=privileged,
-            bounds=bounds,
-            filter_start=filter_start,
-            innovations=innovations,
-            true_vehicle=true_vehicle,
-            true_sensors=true_sensors,
-            world=place,
-            randomization=drawn,
-            faults=befall,
+            source=OBSERVATIONS[self.observation],
+            control=ACTIONS[self.action],
+            layout=Layout.MEASUREMENTS if raw else LAYOUTS[self.layout],
+            bounds=layout_bounds(self.table),
+            **flown,
         )
-        if task is not None:
+        if own_task is not None:
             from quad_gym.envs.own_task import with_task
 
-            make, self.table = with_task(task, make, self.table)
+            make, self.table = with_task(own_task, make, self.table)
         self.space = observation_space(self.table)
         self._split = policy_size(self.table) if privileged else None
-        self.batch = make(count, autoreset=autoreset, threads=threads)
+        self.batch = make(count, autoreset=autoreset)
 
     def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
         """The start values in the options of a reset, checked before anything changes.
@@ -285,6 +231,55 @@ class Flights:
             "policy": observations[..., : self._split].copy(),
             "privileged": observations[..., self._split :].copy(),
         }
+
+
+_NOT_OF_BATCH = (
+    *("observation", "action", "layout", "task"),
+    *("camera", "estimator", "reward_terms"),
+)
+"""Keywords of environments from which those of `FlightBatch` follow."""
+
+
+def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:
+    """Return the sensor suite that the keywords `sensors`, `camera` and `estimator` select.
+
+    Raises:
+        ValueError: If one is invalid.
+    """
+    sensors, estimator = keywords["sensors"], keywords["estimator"]
+    suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
+    if not isinstance(suite, SensorSuite):
+        raise ValueError(f"sensors must be a SensorSuite or its name, got {sensors!r}")
+    if not keywords["camera"]:
+        suite = suite.replace(camera=None)
+    elif camera_is_wanted and suite.camera is None:
+        raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
+    if estimator is None:
+        return suite
+    check.choice("estimator", estimator, ("ukf", "ekf"))
+    return suite.replace(  # type: ignore[no-any-return]
+        estimator=suite.estimator.replace(kind=estimator)
+    )
+
+
+def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...]:
+    """Return the faults that can occur.
+
+    Raises:
+        ValueError: If one concerns sensors, and none runs.
+    """
+    true = keywords["true_sensors"]
+    if true is not None:
+        check.instance("true_sensors", true, SensorSuite)
+    faults = faults_of(keywords["faults"], suite if true is None else true)
+    of_sensors = [fault for fault in faults if needs_sensors(fault)]
+    if of_sensors and runs_no_sensor(keywords):
+        raise ValueError(
+            f"faults must concern simulated parts: {type(of_sensors[0]).__name__} concerns "
+            f'sensors, and none runs with observation="{keywords["observation"]}" (unless '
+            "include_std or innovations ask for the filter)"
+        )
+    return faults
 
 
 COLUMN = {name: column for column, name in enumerate(RESULTS)}

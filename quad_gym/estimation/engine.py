@@ -13,7 +13,7 @@ from quad_gym.estimation.samples import Measurement, Sample
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import Stage, needed_stages
-from quad_gym.packing.aids import pack_aid_settings
+from quad_gym.packing.aids import pack_sensors
 from quad_gym.packing.flight import form_of, pack_tick, params_block, params_record
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
@@ -59,7 +59,7 @@ class Engine:
         self.settings = np.zeros(1, SETTINGS)
         self.settings["run_filter"] = True
         self.settings["form"] = int(self.form)
-        pack_aid_settings(self.settings[0], sensors, sensors)
+        pack_sensors(self.settings[0], sensors)
         needed = needed_stages(self.settings[0])
         self._stages = {stage: needed[stage] for stage in single.FILTER_STAGES if stage in needed}
         self.slow = bool(self.settings["slow_states"] > 0)

@@ -168,7 +168,7 @@ def magnetic_heading(
     iron, declination = states.vectors[Aid.MAGNETOMETER], states.scalars[Aid.MAGNETOMETER]
     of_slow = {iron + i: float(by / f_h) for i, by in enumerate(tilt.T @ t)}
     of_slow[declination] = float(t @ g / f_h)
-    white = magnetometer.white_sigma if sigma is None else sigma
+    white = magnetometer.noise_sigma if sigma is None else sigma
     of_tilt = (float(f[2] * u[0] / f_h), float(f[2] * u[1] / f_h))
     return Heading(angle, white / f_h, of_tilt, of_slow)
 

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.packing.gates import gate_limit
-from quad_gym.params import checks as check
 from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import LEAST_DRIFT
-from quad_gym.params.sensors import SensorSuite, delay_ticks
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
     AID_BLOCKS,
     AID_FREEDOMS,
@@ -83,7 +82,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
     p["slow_sigma"][: len(states.errors)] = states.first_sigmas
     for aid, params in sensors.aids.items():
         p["aid_scale"][aid] = params.scale
-        p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.white_sigma, params.matrix_sigma
+        p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.noise_sigma, params.matrix_sigma
         p["aid_gate"][aid] = gate_limit(
             AID_FREEDOMS[aid], sensors.estimator.false_alarm_probability
         )
@@ -96,37 +95,22 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
         p["aid_numbers"][aid] = params.numbers
 
 
-def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuite) -> None:
-    """Write the available sensors and slow errors, and the clocks of the aiding sensors.
+def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
+    """Write the sensors of a suite and the slow errors that its filter estimates.
 
     Args:
         settings: One SETTINGS record.
-        measures: The true sensors.
-        believes: The sensors that the filter assumes.
-
-    Raises:
-        ValueError: If the latency of a sensor is too long for its rate.
+        sensors: The sensors that the filter assumes; the true ones measure the same quantities.
     """
-    states = slow_states(believes)
+    states = slow_states(sensors)
     assert len(states.errors) <= MAX_SLOW
     settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated
     settings["estimates_drift"] = states.drifts
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
-    heading = believes.heading_aid
+    heading = sensors.heading_aid
     settings["heading_sensor"] = -1 if heading is None else FIRST_AID + heading
-    features = 0 if measures.camera is None else len(measures.camera.features_I)
+    features = 0 if sensors.camera is None else len(sensors.camera.features_I)
     settings["sensor_blocks"][: Sensor.CAMERA + 1] = FEATURE_BLOCKS, features
     settings["feature_count"] = features
-    for aid, params in measures.aids.items():
-        sensor = FIRST_AID + aid
-        ticks = check.ticks(f"{type(params).__name__}.rate", params.rate, measures.imu.rate)
-        label = f"{type(params).__name__}.latency"
-        settings["sensor_blocks"][sensor], settings["sensor_ticks"][sensor] = 1, ticks
-        settings["sensor_phase"][sensor] = phase_ticks(params.phase, ticks)
-        delay = delay_ticks(label, params.latency, params.rate, measures.imu.rate)
-        settings["sensor_delay"][sensor] = delay
-
-
-def phase_ticks(phase: float | None, period: int) -> int:
-    """Return the ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
-    return -1 if phase is None else min(round(phase * period), period - 1)
+    for aid in sensors.aids:
+        settings["sensor_blocks"][FIRST_AID + aid] = 1

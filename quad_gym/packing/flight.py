@@ -1,4 +1,4 @@
-"""Parameters and settings as records: conversion of the dataclasses to numbers for kernels."""
+"""Parameters as records: conversion of the dataclasses to numbers for kernels."""
 
 import math
 from dataclasses import fields
@@ -10,44 +10,29 @@ from numpy.typing import NDArray
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import (
     decay_and_drive,
-    pack_aid_settings,
     pack_aids,
-    phase_ticks,
     slow_states,
 )
 from quad_gym.packing.gates import gate_limit
 from quad_gym.params import portable
 from quad_gym.params.aids import SlowError
-from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.randomization import nominal_values
-from quad_gym.params.sensors import SensorSuite, delay_ticks
-from quad_gym.params.task import TaskParams
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import (
     BASELINE_BLOCK,
-    FOLLOWED,
     FREEDOMS,
-    MAX_HARMONICS,
     PARAMETERS_DRAWN,
     PARAMS,
     PARAMS_BLOCK,
     PARAMS_FIELDS,
     POSITION_BLOCK,
-    SETTINGS,
-    Autoreset,
-    Control,
     FilterForm,
-    Layout,
-    RewardTerm,
-    Sensor,
-    Source,
-    Start,
-    Task,
     aligned_zeros,
 )
 
@@ -225,114 +210,9 @@ def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
     return FilterForm.LEVER_AVERAGES if averages else FilterForm.LEVER_SAMPLES
 
 
-_HARMONICS = {
-    Task.HOVER: 0,
-    Task.CIRCLE: 1,
-    Task.LEMNISCATE: 2,
-    Task.WAYPOINTS: 0,
-    Task.TRAJECTORY: FOLLOWED,
-}
-"""Terms in the series of a task's reference, for tasks that do not use all of them."""
-
-
-def pack_latency(
-    settings: Any, measures: SensorSuite, clocks: Clocks, believes: SensorSuite
-) -> None:
-    """Fill the settings' fields of available sensors and of delayed measurements.
-
-    Args:
-        settings: One SETTINGS record.
-        measures: The true sensors.
-        clocks: Rates of the IMU, GNSS and camera.
-        believes: The sensors that the filter assumes.
-
-    Raises:
-        ValueError: If the latency of a sensor is too long for its rate.
-    """
-    pack_aid_settings(settings, measures, believes)
-    for name in ("gnss", "camera"):
-        sensor = getattr(measures, name)
-        if sensor is not None:
-            label = f"{type(sensor).__name__}.latency"
-            rate = getattr(clocks, f"{name}_rate")
-            delay = delay_ticks(label, sensor.latency, rate, clocks.imu_rate)
-            settings["sensor_delay"][Sensor[name.upper()]] = delay
-    settings["late"] = settings["sensor_delay"].max() > 0
-    settings["rewinds"] = believes.estimator.delay_compensation == "retrodict"
-
-
-def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
-    """Fill the settings' fields of the errors of the true sensors, `measures`."""
-    imu, gnss, camera = measures.imu, measures.gnss, measures.camera
-    settings["imu_errs"], settings["imu_vibrates"] = imu.errs, imu.vibrates
-    settings["heading_errs"] = gnss is not None and gnss.heading_errs
-    if camera is not None:
-        settings["camera_limited"] = camera.limited
-        settings["camera_blurs"] = camera.exposure > 0.0
-        settings["ground_hides"] = camera.ground_hides
-
-
 def params_block(record: NDArray[Any]) -> NDArray[Any]:
     """Return a scalar parameter record repeated for the flights of a block, shape (1,)."""
     block = aligned_zeros(1, PARAMS_BLOCK)
     for name in PARAMS.names or ():
         block[name][...] = record[name][..., np.newaxis]
     return block
-
-
-def settings_record(
-    task: TaskParams,
-    clocks: Clocks,
-    sensors: SensorSuite,
-    *,
-    source: Source,
-    control: Control,
-    layout: Layout,
-    include_std: bool,
-    privileged: bool,
-    autoreset: Autoreset,
-    run_filter: bool,
-    innovations: bool = False,
-    gnss_drifts: bool = False,
-    lever_drawn: bool = False,
-) -> NDArray[Any]:
-    """Return the settings of a batch as one scalar record, shape (1,)."""
-    record = np.zeros(1, SETTINGS)
-    s = record[0]
-    s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")
-    s["form"] = form_of(sensors.estimator, innovations, lever_form(sensors.imu, lever_drawn))
-    s["imu_averages"] = sensors.imu.samples == "average"
-    if sensors.gnss is not None:
-        ticks = clocks.ticks_between("gnss")
-        s["sensor_ticks"][Sensor.GNSS] = ticks
-        s["sensor_phase"][Sensor.GNSS] = phase_ticks(sensors.gnss.phase, ticks)
-        s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
-    s["gnss_baseline"] = sensors.gnss is None or sensors.gnss.has_baseline
-    s["gnss_drifts"] = gnss_drifts
-    s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
-    if sensors.camera is not None:
-        ticks = clocks.ticks_between("camera")
-        s["sensor_ticks"][Sensor.CAMERA] = ticks
-        s["sensor_phase"][Sensor.CAMERA] = phase_ticks(sensors.camera.phase, ticks)
-    s["source"], s["control"], s["layout"] = source, control, layout
-    s["include_std"], s["privileged"] = include_std, privileged
-    s["autoreset"], s["run_filter"] = autoreset, run_filter
-    s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
-    s["pad"], s["randomize_reference"] = (
-        task.pad and task.may_start_on_ground,
-        task.randomize_reference,
-    )
-    s["reward_scale"] = clocks.control_rate if task.reward_per == "step" else 1.0
-    weights = task.reward_params
-    s["reward_weight"] = [getattr(weights, term.name.lower()) for term in RewardTerm]
-    s["near_decay"], s["fine_decay"] = weights.near_decay, weights.fine_decay
-    s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], MAX_HARMONICS)
-    s["max_steps"] = round(task.duration * clocks.control_rate)
-    s["out_of_bounds"], s["min_height"] = task.out_of_bounds, task.min_height
-    s["truncate_when_diverged"] = task.truncate_when_diverged
-    s["least_up"] = math.cos(task.max_tilt)
-    s["radius"], s["period"], s["height"] = task.radius, task.period, task.height
-    s["max_speed"], s["max_acceleration"] = task.max_speed, task.max_acceleration
-    s["gate_count"], s["gate_radius"] = task.gate_count, task.gate_radius
-    s["preview"] = task.preview
-    return record

@@ -30,6 +30,8 @@ class AidParams(Checked):
     latency: float = 0.0
     """delay from a measurement to its arrival at the filter, which receives it with its time stamp
     [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods"""
+    noise_sigma: float
+    """standard deviation of the white noise, per component"""
 
     aid: ClassVar[Aid]
     raw: ClassVar[tuple[str, str, float]]
@@ -39,11 +41,6 @@ class AidParams(Checked):
         self._check(check.positive, "rate")
         self._check(check.phase, "phase")
         self._check(check.number, "latency", least=0.0)
-
-    @property
-    def white_sigma(self) -> float:
-        """Standard deviation of the white noise of each component."""
-        raise NotImplementedError
 
     @property
     def slow_vector(self) -> SlowError | None:
@@ -81,4 +78,4 @@ class AidParams(Checked):
 
     def scaled_noise(self, factor: float) -> "AidParams":
         """Return a copy with the white noise multiplied by `factor`."""
-        raise NotImplementedError
+        return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

@@ -29,15 +29,6 @@ class BarometerParams(AidParams):
         self._check(check.positive, "noise_sigma", "bias_sigma", "bias_tau")
 
     @property
-    def white_sigma(self) -> float:
-        """Standard deviation of the white noise [m]."""
-        return self.noise_sigma
-
-    @property
     def slow_scalar(self) -> SlowError:
         """Bias of the altitude [m]."""
         return SlowError(self.bias_sigma, self.bias_tau)
-
-    def scaled_noise(self, factor: float) -> "BarometerParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

@@ -71,6 +71,16 @@ class CameraParams(Checked):
                 f"got {len(self.features_I)}"
             )
 
+    def simplified(self) -> "CameraParams":
+        """Return a copy without latency, motion blur, and limits of range and ground."""
+        return self.replace(  # type: ignore[no-any-return]
+            latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False
+        )
+
+    def scaled_noise(self, factor: float) -> "CameraParams":
+        """Return a copy with the white noise multiplied by `factor`."""
+        return self.replace(pixel_sigma=factor * self.pixel_sigma)  # type: ignore[no-any-return]
+
     @property
     def limited(self) -> bool:
         """True if range, motion blur or the ground limit the features that are visible."""

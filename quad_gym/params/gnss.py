@@ -105,6 +105,18 @@ class GnssParams(Checked):
                 f"got {self.reference_antenna_G}"
             )
 
+    def simplified(self) -> "GnssParams":
+        """Return a copy without latency and constant heading error."""
+        return self.replace(latency=0.0, heading_error_sigma=0.0)  # type: ignore[no-any-return]
+
+    def scaled_noise(self, factor: float) -> "GnssParams":
+        """Return a copy with the white noise multiplied by `factor`."""
+        return self.replace(  # type: ignore[no-any-return]
+            position_sigma_I=tuple(factor * sigma for sigma in self.position_sigma_I),
+            baseline_sigma=factor * self.baseline_sigma,
+            velocity_sigma=self.velocity_sigma and factor * self.velocity_sigma,
+        )
+
     def require_filter(self) -> None:
         """Refuse positions with hardly any noise, by the square of which a filter divides.
 

@@ -78,6 +78,24 @@ class ImuParams(Checked):
         self._check(check.place, "lever_arm_B")
         self._check(check.choice, "samples", choices=("instant", "average"))
 
+    def simplified(self) -> "ImuParams":
+        """Return a copy without errors of scale and alignment, and without vibration."""
+        return self.replace(  # type: ignore[no-any-return]
+            accel_scale_sigma=0.0,
+            gyro_scale_sigma=0.0,
+            accel_misalignment_sigma=0.0,
+            gyro_misalignment_sigma=0.0,
+            accel_vibration=0.0,
+            gyro_vibration=0.0,
+        )
+
+    def scaled_noise(self, factor: float) -> "ImuParams":
+        """Return a copy with the white noise multiplied by `factor`."""
+        return self.replace(  # type: ignore[no-any-return]
+            accel_noise_density=factor * self.accel_noise_density,
+            gyro_noise_density=factor * self.gyro_noise_density,
+        )
+
     @property
     def dt(self) -> float:
         """Duration of a tick, the time between two samples [s]."""

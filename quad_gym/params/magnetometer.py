@@ -74,11 +74,6 @@ class MagnetometerParams(AidParams):
         )
 
     @property
-    def white_sigma(self) -> float:
-        """Standard deviation of the white noise, per axis [T]."""
-        return self.noise_sigma
-
-    @property
     def slow_vector(self) -> SlowError:
         """Hard iron, per axis [T]."""
         return SlowError(self.hard_iron_sigma)
@@ -111,7 +106,3 @@ class MagnetometerParams(AidParams):
     def simplified(self) -> "MagnetometerParams":
         """Return a copy without latency and soft iron."""
         return self.replace(latency=0.0, soft_iron_sigma=0.0)  # type: ignore[no-any-return]
-
-    def scaled_noise(self, factor: float) -> "MagnetometerParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

@@ -34,15 +34,6 @@ class OpticalFlowParams(AidParams):
         self._check(check.positive, "noise_sigma", "min_height", "max_rate")
 
     @property
-    def white_sigma(self) -> float:
-        """Standard deviation of the white noise, per axis [rad/s]."""
-        return self.noise_sigma
-
-    @property
     def numbers(self) -> tuple[float, float, float]:
         """Least height [m], largest rate [rad/s], 0."""
         return (self.min_height, self.max_rate, 0.0)
-
-    def scaled_noise(self, factor: float) -> "OpticalFlowParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

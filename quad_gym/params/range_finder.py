@@ -39,15 +39,6 @@ class RangeFinderParams(AidParams):
             )
 
     @property
-    def white_sigma(self) -> float:
-        """Standard deviation of the white noise [m]."""
-        return self.noise_sigma
-
-    @property
     def numbers(self) -> tuple[float, float, float]:
         """Shortest and longest distance [m], 0."""
         return (self.min_range, self.max_range, 0.0)
-
-    def scaled_noise(self, factor: float) -> "RangeFinderParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

@@ -4,7 +4,6 @@ As everywhere in `params`: SI units, body frame B with x forward and z up along 
 laboratory's numbers from the Aerial Robotics course (ASE 479W, The University of Texas at Austin).
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +22,9 @@ from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suite_files import SUFFIX, text_of
 from quad_gym.records import MAX_UNDER_WAY, Aid
 
+SensorParams = GnssParams | CameraParams | AidParams
+"""Parameters of a sensor other than the IMU."""
+
 AID_PARAMS: dict[str, type[AidParams]] = {
     "barometer": BarometerParams,
     "magnetometer": MagnetometerParams,
@@ -30,6 +32,16 @@ AID_PARAMS: dict[str, type[AidParams]] = {
     "range_finder": RangeFinderParams,
 }
 """Parameters of other sensors by their fields in `SensorSuite`."""
+
+SENSOR_PARAMS: dict[str, type[SensorParams]] = {
+    "gnss": GnssParams,
+    "camera": CameraParams,
+    **AID_PARAMS,
+}
+"""Parameters of all sensors but the IMU by their fields in `SensorSuite`."""
+
+_WORDS = {"gnss": "GNSS"}
+"""Sensors in messages, where the name of the field is none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,17 +133,7 @@ class SensorSuite(Checked):
             ("noisy", NoisyObservationParams),
         ):
             check.instance(f"SensorSuite.{name}", getattr(self, name), kind)
-        if self.gnss is not None:
-            check.instance("SensorSuite.gnss", self.gnss, GnssParams)
-            check.ticks("GnssParams.rate", self.gnss.rate, self.imu.rate)
-            delay_ticks("GnssParams.latency", self.gnss.latency, self.gnss.rate, self.imu.rate)
-        if self.camera is not None:
-            check.instance("SensorSuite.camera", self.camera, CameraParams)
-            check.ticks("CameraParams.rate", self.camera.rate, self.imu.rate)
-            delay_ticks(
-                "CameraParams.latency", self.camera.latency, self.camera.rate, self.imu.rate
-            )
-        for name, params in AID_PARAMS.items():
+        for name, params in SENSOR_PARAMS.items():
             sensor = getattr(self, name)
             if sensor is not None:
                 check.instance(f"SensorSuite.{name}", sensor, params)
@@ -157,6 +159,12 @@ class SensorSuite(Checked):
             raise ValueError(f"file must end with {SUFFIX}, got {str(file)!r}")
         path.write_text(text_of(self), encoding="utf-8")
         return path
+
+    @property
+    def sensors(self) -> dict[str, SensorParams]:
+        """Parameters of the sensors in the suite, other than the IMU, by field."""
+        found = {name: getattr(self, name) for name in SENSOR_PARAMS}
+        return {name: params for name, params in found.items() if params is not None}
 
     @property
     def aids(self) -> dict[Aid, AidParams]:
@@ -207,7 +215,7 @@ class SensorSuite(Checked):
                 "true_sensors must have the IMU samples of sensors, which order a tick: "
                 f"{true_sensors.imu.samples!r} is not {self.imu.samples!r}"
             )
-        for name in ("gnss", "camera", *AID_PARAMS):
+        for name in SENSOR_PARAMS:
             if (getattr(true_sensors, name) is None) != (getattr(self, name) is None):
                 raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
         for what, true, believed in self._schedule(true_sensors):
@@ -218,24 +226,19 @@ class SensorSuite(Checked):
 
     def _schedule(self, true: "SensorSuite") -> Iterator[tuple[str, object, object]]:
         """Yield the rates, phases and measured quantities of sensors: name, in `true`, here."""
+        for name, sensor in self.sensors.items():
+            word = _WORDS.get(name, name)
+            yield f"{word} rate [Hz]", true.sensors[name].rate, sensor.rate
+            yield f"{word} phase", true.sensors[name].phase, sensor.phase
         if self.gnss is not None and true.gnss is not None:
-            here, there = self.gnss, true.gnss
-            yield "GNSS rate [Hz]", there.rate, here.rate
-            yield "GNSS phase", there.phase, here.phase
-            paired = [p.has_baseline for p in (there, here)]
-            yield "presence of a GNSS baseline (secondary_antenna_B)", paired[0], paired[1]
-            measured = [p.velocity_sigma is not None for p in (there, here)]
-            yield "presence of GNSS velocities (velocity_sigma)", measured[0], measured[1]
+            gnss = (true.gnss, self.gnss)
+            paired, other_paired = (p.has_baseline for p in gnss)
+            yield "presence of a GNSS baseline (secondary_antenna_B)", paired, other_paired
+            gives, other_gives = (p.velocity_sigma is not None for p in gnss)
+            yield "presence of GNSS velocities (velocity_sigma)", gives, other_gives
         if self.camera is not None and true.camera is not None:
-            image, expected = true.camera, self.camera
-            yield "camera rate [Hz]", image.rate, expected.rate
-            yield "camera phase", image.phase, expected.phase
-            counts = [len(p.features_I) for p in (image, expected)]
+            counts = [len(p.features_I) for p in (true.camera, self.camera)]
             yield "number of camera features", counts[0], counts[1]
-        for aid in self.aids:
-            name = aid.name.lower()
-            yield f"{name} rate [Hz]", true.aids[aid].rate, self.aids[aid].rate
-            yield f"{name} phase", true.aids[aid].phase, self.aids[aid].phase
 
     def with_rates(
         self,
@@ -264,29 +267,17 @@ class SensorSuite(Checked):
             check.ticks(name, rate, imu_rate)
             return rate
 
-        gnss_params = self.gnss
-        if gnss_params is not None:
-            gnss_params = gnss_params.replace(rate=rate_of("gnss_rate", gnss, gnss_params.rate))
-        elif gnss is not None:
-            raise ValueError(f"gnss_rate must not be given without GNSS, got {gnss} Hz")
-        camera_params = self.camera
-        if camera_params is not None:
-            camera_params = camera_params.replace(
-                rate=rate_of("camera_rate", camera, camera_params.rate)
-            )
-        elif camera is not None:
-            raise ValueError(f"camera_rate must not be given without a camera, got {camera} Hz")
         changed = {}
-        for name in AID_PARAMS:
-            sensor, wanted = getattr(self, name), aids.get(name)
-            if sensor is not None:
-                rate = rate_of(f"{name}_rate", wanted, sensor.rate)
-                changed[name] = sensor.replace(rate=rate)
-            elif wanted is not None:
-                raise ValueError(f"{name}_rate must not be given without a {name}, got {wanted} Hz")
-        return self.replace(  # type: ignore[no-any-return]
-            imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params, **changed
-        )
+        for name, wanted in {"gnss": gnss, "camera": camera, **aids}.items():
+            if wanted is not None and getattr(self, name) is None:
+                lacking = _WORDS.get(name, f"a {name}")
+                raise ValueError(
+                    f"{name}_rate must not be given without {lacking}, got {wanted} Hz"
+                )
+        for name, sensor in self.sensors.items():
+            wanted = {"gnss": gnss, "camera": camera, **aids}.get(name)
+            changed[name] = sensor.replace(rate=rate_of(f"{name}_rate", wanted, sensor.rate))
+        return self.replace(imu=self.imu.replace(rate=imu_rate), **changed)  # type: ignore[no-any-return]
 
     def simplified(self) -> "SensorSuite":
         """Return a copy with white noise, bias and drift only, and without delays.
@@ -294,44 +285,13 @@ class SensorSuite(Checked):
         The difference shows the effect of latency, vibration, misalignment, constant heading
         errors, motion blur, range and ground on a flight. White noise stays as it is.
         """
-        gnss, camera = self.gnss, self.camera
-        if gnss is not None:
-            gnss = gnss.replace(latency=0.0, heading_error_sigma=0.0)
-        if camera is not None:
-            camera = camera.replace(
-                latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False
-            )
-        imu = self.imu.replace(
-            accel_scale_sigma=0.0,
-            gyro_scale_sigma=0.0,
-            accel_misalignment_sigma=0.0,
-            gyro_misalignment_sigma=0.0,
-            accel_vibration=0.0,
-            gyro_vibration=0.0,
-        )
-        aids = {aid.name.lower(): params.simplified() for aid, params in self.aids.items()}
-        return self.replace(  # type: ignore[no-any-return]
-            imu=imu, gnss=gnss, camera=camera, **aids
-        )
+        changed = {name: sensor.simplified() for name, sensor in self.sensors.items()}
+        return self.replace(imu=self.imu.simplified(), **changed)  # type: ignore[no-any-return]
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
         """Return a copy with all white noise multiplied by `factor`, for sensors and filter."""
         check.positive("factor", factor)
-        gnss, camera = self.gnss, self.camera
-        if camera is not None:
-            camera = camera.replace(pixel_sigma=factor * camera.pixel_sigma)
-        if gnss is not None:
-            gnss = gnss.replace(
-                position_sigma_I=tuple(factor * s for s in gnss.position_sigma_I),
-                baseline_sigma=factor * gnss.baseline_sigma,
-                velocity_sigma=gnss.velocity_sigma and factor * gnss.velocity_sigma,
-            )
+        changed = {name: sensor.scaled_noise(factor) for name, sensor in self.sensors.items()}
         return self.replace(  # type: ignore[no-any-return]
-            imu=self.imu.replace(
-                accel_noise_density=factor * self.imu.accel_noise_density,
-                gyro_noise_density=factor * self.imu.gyro_noise_density,
-            ),
-            gnss=gnss,
-            camera=camera,
-            **{aid.name.lower(): params.scaled_noise(factor) for aid, params in self.aids.items()},
+            imu=self.imu.scaled_noise(factor), **changed
         )

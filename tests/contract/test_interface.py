@@ -92,9 +92,10 @@ def test_a_vector_of_stable_baselines_shows_its_own_keywords_too():
 def test_keywords_are_what_environments_are_built_with():
     fields = {field.name for field in dataclasses.fields(quad_gym.TaskParams)} - {"kind"}
     assert set(inspect.get_annotations(TaskKeywords)) == fields == set(TASK_KEYWORDS)
-    built = inspect.signature(Flights._build).parameters
-    required = {name for name, p in built.items() if p.kind is p.KEYWORD_ONLY}
-    assert set(DEFAULTS) == required - {"camera_is_wanted", "threads", "task"}
+    of_flights = set(inspect.signature(FlightBatch).parameters)
+    assert set(DEFAULTS) - of_flights == {
+        *("observation", "action", "camera", "estimator", "reward_terms")
+    }
     others = {"max_episode_steps", *RENDERING_KEYWORDS, *TASK_KEYWORDS}
     assert set(inspect.get_annotations(EnvKeywords)) == set(DEFAULTS) | others
 

@@ -10,16 +10,13 @@ from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.task.episode import draw_reference
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
-from quad_gym.packing.flight import settings_record
-from quad_gym.params.clocks import Clocks
+from quad_gym.packing.configuration import FlightConfiguration
+from quad_gym.packing.settings import settings_record
 from quad_gym.records import (
     FLIGHT,
     FLIGHT_BLOCK,
     MAX_HARMONICS,
     WIDTH,
-    Autoreset,
-    Control,
-    Layout,
     Source,
     aligned_zeros,
     field_of_flights,
@@ -56,19 +53,9 @@ def evaluated(flights, times):
 
 def drawn(count, seed=1, **task):
     """Flights, as scalar records, whose references were drawn for a task."""
-    sensors = quad_gym.SensorSuite()
-    settings = settings_record(
-        quad_gym.TaskParams(**task),
-        Clocks(),
-        sensors,
-        source=Source.TRUTH,
-        control=Control.PD,
-        layout=Layout.RELATIVE,
-        include_std=False,
-        privileged=False,
-        autoreset=Autoreset.DISABLED,
-        run_filter=False,
-    )
+    task_params = quad_gym.TaskParams(**task)
+    configuration = FlightConfiguration(task=task_params, sensors="lab", source=Source.TRUTH)
+    settings = settings_record(configuration)
     blocks = aligned_zeros(-(-count // WIDTH), FLIGHT_BLOCK)
     rng = np.random.default_rng(seed)
     blocks["key"] = rng.integers(0, 2**64, blocks["key"].shape, np.uint64)

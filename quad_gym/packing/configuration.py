@@ -1,0 +1,258 @@
+"""`FlightConfiguration`: the keywords of `FlightBatch`, checked; packing reads them."""
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar, get_args, get_origin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.faults import Fault
+from quad_gym.faults.presets import FaultsGiven, faults_of
+from quad_gym.params import checks as check
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.control import ActionParams, PDGains, pd_gains
+from quad_gym.params.draw_limits import check_draws
+from quad_gym.params.randomization import DrawingTable, Randomization
+from quad_gym.params.randomization import Given as Drawn
+from quad_gym.params.resolved import Resolved, default_of, preset_of
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import sensor_suite
+from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.vehicle import VehicleParams, vehicle_params
+from quad_gym.params.world import WorldParams, world_params
+from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
+
+FILTER_STARTS = ("cold", "warm")
+"""Values of the keyword `filter_start`."""
+
+_WITHOUT = {
+    "gains": tuple(control for control in Control if control is not Control.PD),
+    "action_params": (Control.PD, Control.MOTOR, Control.WRENCH),
+}
+"""Arguments of controllers, and the meanings of an action with which they have no effect."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlightConfiguration:
+    """Keywords of `FlightBatch`: everything that its flights have in common.
+
+    Raises:
+        ValueError: If a value is invalid, or has no effect with the others.
+    """
+
+    vehicle: Resolved[VehicleParams | str, VehicleParams] = Resolved(
+        preset_of(VehicleParams, vehicle_params), "lab"
+    )
+    """vehicle, or the name of a preset"""
+    sensors: Resolved[SensorSuite | str, SensorSuite] = Resolved(
+        preset_of(SensorSuite, sensor_suite), "standard"
+    )
+    """sensor suite, or the name of a preset"""
+    gains: PDGains | str | None = None
+    """gains of `Control.PD`, or the name of a preset; None: "lab\""""
+    action_params: ActionParams | None = None
+    """scales of the actions, and bandwidths of the inner loops"""
+    task: Resolved[TaskParams | None, TaskParams] = Resolved(default_of(TaskParams), None)
+    """reference, start and termination"""
+    source: Source = Source.ESTIMATE
+    """source of the state that the controller observes"""
+    control: Control = Control.PD
+    """meaning of an action; `Control.PD` flies without actions"""
+    control_rate: float | None = None
+    """actions per second, which must divide the IMU rate; None: the IMU rate [Hz]"""
+    substeps: int = 1
+    """Runge-Kutta steps per tick"""
+    action_delay: float = 0.0
+    """delay from the command of an action to its execution, rounded to whole ticks, at most
+    MAX_ACTION_DELAY [control steps]. Before the first action arrives, the vehicle hovers"""
+    layout: Layout = Layout.RELATIVE
+    """layout of the observations"""
+    include_std: bool = False
+    """True: append the filter's standard deviations to the observations"""
+    privileged: bool = False
+    """True: append the truth to the observations"""
+    bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    """(low, high) of the observations, each (n,); None: no observations"""
+    autoreset: Autoreset = Autoreset.DISABLED
+    """start of the next episode after one has ended"""
+    run_filter: bool | None = None
+    """True: sensors and filter run; None: they run if another argument needs them"""
+    filter_start: str = "cold"
+    """"cold": the filter starts from its first fix; "warm": it has converged in
+    `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn from
+    the covariance that it has reached. See `quad_gym.batch.cold_start` for the bounds"""
+    innovations: bool = False
+    """True: keep innovations and NIS block by block, for `record`: "innovation",
+    "innovation_sigma", "block_nis". Filters with an innovation gate, with `faults`, or with
+    `truncate_when_diverged` in their task always keep them"""
+    threads: int | None = None
+    """number of threads; None: one per core"""
+    true_vehicle: VehicleParams | None = None
+    """true parameters of the vehicle, if they differ from `vehicle`, which the controller
+    assumes"""
+    true_sensors: SensorSuite | None = None
+    """true parameters of the sensors, if they differ from `sensors`, which the filter assumes"""
+    world: Resolved[WorldParams | str, WorldParams] = Resolved(
+        preset_of(WorldParams, world_params), "calm"
+    )
+    """wind, gusts, drag, ground, battery, obstacles and geofence, or the name of a preset"""
+    randomization: Resolved[Randomization | Mapping[str, Drawn] | None, Randomization] = Resolved(
+        lambda _, given: Randomization.of(given), None
+    )
+    """parameters drawn in every episode, relative to `true_vehicle`, `true_sensors` and `world`: a
+    `Randomization`, or distributions by name"""
+    faults: FaultsGiven = None
+    """faults of sensors and rotors, or names of presets, see `quad_gym.faults`"""
+
+    def __post_init__(self) -> None:
+        for name, kind in (
+            ("source", Source),
+            ("control", Control),
+            ("layout", Layout),
+            ("autoreset", Autoreset),
+        ):
+            object.__setattr__(self, name, kind(getattr(self, name)))
+        check.instance("gains", self.pd_gains, PDGains)
+        check.instance("action_params", self.actions, ActionParams)
+        check.instance("true_vehicle", self.flown_vehicle, VehicleParams)
+        check.instance("true_sensors", self.flown_sensors, SensorSuite)
+        for name in ("innovations", "include_std", "privileged"):
+            check.flag(name, getattr(self, name))
+        check.choice("filter_start", self.filter_start, FILTER_STARTS)
+        check_limit(self.task, self.clocks.imu_rate, "IMU rate")
+        self.sensors.require_like(self.flown_sensors)
+        self._require_effect()
+        if self.filters:
+            self.sensors.require_filter()
+        check.number("action_delay", self.action_delay, least=0.0, most=float(MAX_ACTION_DELAY))
+        if self.longest_delay > 0 and self.control is Control.PD:
+            raise ValueError("action_delay needs actions: Control.PD flies without any")
+        check_draws(self.draws, self.flown_vehicle, self.world, self.clocks)
+
+    def _require_effect(self) -> None:
+        """Refuse arguments of another controller, and of a filter that does not run."""
+        for name, without in _WITHOUT.items():
+            if getattr(self, name) is not None and self.control in without:
+                raise ValueError(
+                    f"{name} must not be given with Control.{self.control.name}: it uses none"
+                )
+        if self.filters:
+            return
+        for name, value, idle in (
+            ("include_std", self.include_std, False),
+            ("innovations", self.innovations, False),
+            ("truncate_when_diverged", self.task.truncate_when_diverged, False),
+            ("filter_start", self.filter_start, "cold"),
+        ):
+            if value != idle:
+                raise ValueError(f"{name} needs a filter, and none runs here, got {value!r}")
+
+    @property
+    def pd_gains(self) -> PDGains:
+        """Gains of `Control.PD`."""
+        return pd_gains(self.gains or "lab") if isinstance(self.gains, str | None) else self.gains
+
+    @property
+    def actions(self) -> ActionParams:
+        """Scales of the actions."""
+        return ActionParams() if self.action_params is None else self.action_params
+
+    @property
+    def flown_vehicle(self) -> VehicleParams:
+        """The true vehicle."""
+        return self.vehicle if self.true_vehicle is None else self.true_vehicle
+
+    @property
+    def flown_sensors(self) -> SensorSuite:
+        """The true sensors."""
+        return self.sensors if self.true_sensors is None else self.true_sensors
+
+    @cached_property
+    def clocks(self) -> Clocks:
+        """Rates of simulation, sensors and control."""
+        rate = self.sensors.imu.rate if self.control_rate is None else self.control_rate
+        return Clocks.of(self.sensors, rate, self.substeps)
+
+    @cached_property
+    def possible_faults(self) -> tuple[Fault, ...]:
+        """Faults that can occur, at most one of each kind."""
+        return faults_of(self.faults, self.flown_sensors)
+
+    @property
+    def filters(self) -> bool:
+        """True if sensors and filter run."""
+        if self.run_filter is not None:
+            return check.flag("run_filter", self.run_filter)
+        needed = self.include_std or self.innovations
+        return needed or self.source in (Source.ESTIMATE, Source.MEASUREMENTS)
+
+    @property
+    def keeps_innovations(self) -> bool:
+        """True if innovations are kept block by block."""
+        diverges = self.task.truncate_when_diverged
+        return self.filters and (self.innovations or bool(self.possible_faults) or diverges)
+
+    @property
+    def begins_after_step(self) -> bool:
+        """True if the batch itself begins episodes after a step.
+
+        The kernels would begin them before the last innovations can be read.
+        """
+        return self.innovations and self.autoreset is Autoreset.SAME_STEP
+
+    @cached_property
+    def draws(self) -> DrawingTable:
+        """Distributions of the parameters that episodes draw."""
+        true = (self.flown_vehicle, self.flown_sensors, self.world)
+        return DrawingTable(self.randomization, *true, self.action_delay)
+
+    @property
+    def longest_delay(self) -> int:
+        """Longest delay of an action, drawn or not [control steps]."""
+        return math.ceil(self.draws.high[COLUMNS["action_delay"]][0])
+
+
+P = ParamSpec("P")
+Batch = TypeVar("Batch")
+
+
+def configured(
+    configuration: Callable[P, FlightConfiguration],
+) -> Callable[
+    [Callable[[Batch, int, FlightConfiguration], None]],
+    Callable[Concatenate[Batch, int, P], None],
+]:
+    """Return a decorator for the constructor of a batch, which then takes keywords.
+
+    Args:
+        configuration: `FlightConfiguration`, whose keywords the signature shows.
+    """
+    make: Callable[..., FlightConfiguration] = configuration
+
+    def decorate(init: Callable[[Batch, int, FlightConfiguration], None]) -> Any:
+        keywords = {
+            name: parameter.replace(annotation=_given_type(parameter.annotation))
+            for name, parameter in inspect.signature(configuration).parameters.items()
+        }
+        own = list(inspect.signature(init).parameters.values())[:2]
+
+        @wraps(init)
+        def construct(self: Batch, count: int, **given: Any) -> None:
+            check.keywords(given, tuple(keywords), "FlightBatch")
+            init(self, count, make(**given))
+
+        construct.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            [*own, *keywords.values()]
+        )
+        return construct
+
+    return decorate
+
+
+def _given_type(annotation: Any) -> Any:
+    """Return the type in which a field is given."""
+    return get_args(annotation)[0] if get_origin(annotation) is Resolved else annotation

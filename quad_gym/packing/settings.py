@@ -1,0 +1,127 @@
+"""Settings as a record: the options of a batch of flights for kernels."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.packing.aids import pack_sensors
+from quad_gym.packing.configuration import FlightConfiguration
+from quad_gym.packing.faults import pack_faults
+from quad_gym.packing.flight import form_of, lever_form
+from quad_gym.packing.world import pack_options, pack_places
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite, delay_ticks
+from quad_gym.params.task import TaskParams
+from quad_gym.records import (
+    FOLLOWED,
+    MAX_HARMONICS,
+    SETTINGS,
+    Autoreset,
+    RewardTerm,
+    Sensor,
+    Start,
+    Task,
+)
+
+_HARMONICS = {
+    Task.HOVER: 0,
+    Task.CIRCLE: 1,
+    Task.LEMNISCATE: 2,
+    Task.WAYPOINTS: 0,
+    Task.TRAJECTORY: FOLLOWED,
+}
+"""Terms in the series of a task's reference, for tasks that do not use all of them."""
+
+
+def settings_record(c: FlightConfiguration) -> NDArray[Any]:
+    """Return the settings of a batch as one scalar record, shape (1,).
+
+    Raises:
+        ValueError: If the latency of a sensor is too long for its rate.
+    """
+    record = np.zeros(1, SETTINGS)
+    s, task, assumed = record[0], c.task, c.sensors
+    s["substeps"], s["ticks_per_step"] = c.clocks.substeps, c.clocks.ticks_between("control")
+    s["source"], s["control"], s["layout"] = c.source, c.control, c.layout
+    s["include_std"], s["privileged"] = c.include_std, c.privileged
+    s["autoreset"] = Autoreset.DISABLED if c.begins_after_step else c.autoreset
+    s["run_filter"], s["reuse_first_fix"] = c.filters, assumed.estimator.reuse_first_fix
+    draws_lever = {"lever_arm_B", "center_of_mass_B"} & set(c.randomization.names)
+    lever_arm = lever_form(assumed.imu, c.randomization.known and bool(draws_lever))
+    s["form"] = form_of(assumed.estimator, c.keeps_innovations, lever_arm)
+    _pack_task(s, task)
+    s["reward_scale"] = c.clocks.control_rate if task.reward_per == "step" else 1.0
+    s["max_steps"] = round(task.duration * c.clocks.control_rate)
+    pack_options(
+        s,
+        c.world,
+        c.draws,
+        known=c.randomization.known,
+        limited=c.flown_vehicle.max_voltage < c.vehicle.max_voltage,
+    )
+    s["action_delays"] = c.longest_delay
+    pack_places(s, c.draws, c.flown_sensors, assumed)
+    pack_faults(s, c.possible_faults, assumed.imu.dt)
+    _pack_sensors(s, c)
+    _pack_imperfections(s, c.flown_sensors)
+    return record
+
+
+def _pack_task(s: Any, task: TaskParams) -> None:
+    """Write reference, start, reward and endings of a task."""
+    kind = Task[task.kind.upper()]
+    s["task"], s["start"] = kind, Start[task.start.upper()]
+    s["pad"] = task.pad and task.may_start_on_ground
+    weights = task.reward_params
+    s["reward_weight"] = [getattr(weights, term.name.lower()) for term in RewardTerm]
+    s["near_decay"], s["fine_decay"] = weights.near_decay, weights.fine_decay
+    s["harmonics"] = _HARMONICS.get(kind, MAX_HARMONICS)
+    s["path_count"] = len(task.trajectories)
+    s["least_up"] = math.cos(task.max_tilt)
+    for name in (
+        *("randomize_reference", "radius", "period", "height", "preview"),
+        *("max_speed", "max_acceleration", "gate_count", "gate_radius"),
+        *("out_of_bounds", "min_height", "truncate_when_diverged"),
+    ):
+        s[name] = getattr(task, name)
+
+
+def _pack_sensors(s: Any, c: FlightConfiguration) -> None:
+    """Write clocks, delays and quantities of the sensors, and the errors that the filter estimates.
+
+    Rates, phases and measured quantities of the true and the assumed sensors are the same.
+    """
+    assumed, true = c.sensors, c.flown_sensors
+    s["imu_averages"] = assumed.imu.samples == "average"
+    if assumed.gnss is not None:
+        s["gnss_velocity"] = assumed.gnss.velocity_sigma is not None
+    s["gnss_baseline"] = assumed.gnss is None or assumed.gnss.has_baseline
+    s["gnss_drifts"] = true.drifts
+    pack_sensors(s, assumed)
+    for name, sensor in true.sensors.items():
+        place, label = Sensor[name.upper()], type(sensor).__name__
+        ticks = check.ticks(f"{label}.rate", sensor.rate, true.imu.rate)
+        s["sensor_ticks"][place] = ticks
+        s["sensor_phase"][place] = _phase_ticks(sensor.phase, ticks)
+        delay = delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, true.imu.rate)
+        s["sensor_delay"][place] = delay
+    s["late"] = s["sensor_delay"].max() > 0
+    s["rewinds"] = assumed.estimator.delay_compensation == "retrodict"
+
+
+def _phase_ticks(phase: float | None, period: int) -> int:
+    """Return the ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
+    return -1 if phase is None else min(round(phase * period), period - 1)
+
+
+def _pack_imperfections(s: Any, true: SensorSuite) -> None:
+    """Write which errors the true sensors have."""
+    imu, gnss, camera = true.imu, true.gnss, true.camera
+    s["imu_errs"], s["imu_vibrates"] = imu.errs, imu.vibrates
+    s["heading_errs"] = gnss is not None and gnss.heading_errs
+    if camera is not None:
+        s["camera_limited"] = camera.limited
+        s["camera_blurs"] = camera.exposure > 0.0
+        s["ground_hides"] = camera.ground_hides

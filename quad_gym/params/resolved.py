@@ -1,0 +1,61 @@
+"""Fields of dataclasses that accept several forms of a value, such as the name of a preset."""
+
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar, overload
+
+from quad_gym.params import checks as check
+
+Given = TypeVar("Given")
+Value = TypeVar("Value")
+
+
+class Resolved(Generic[Given, Value]):
+    """Field of a dataclass that is given in one of several forms and read in one.
+
+    Args:
+        resolve: Returns the value from the field's name and from what is given.
+        default: Default of what is given.
+    """
+
+    def __init__(self, resolve: Callable[[str, Given], Value], default: Given) -> None:
+        self._resolve, self._default = resolve, default
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Store the name of the field."""
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Given: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> Value: ...
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        """Return the value, or from the class the default."""
+        return self._default if instance is None else vars(instance)[self._name]
+
+    def __set__(self, instance: Any, given: Given) -> None:
+        """Store the value, checked."""
+        vars(instance)[self._name] = self._resolve(self._name, given)
+
+
+def preset_of(kind: type[Value], named: Callable[[str], Value]) -> Callable[[str, Any], Value]:
+    """Return a function that resolves the name of a preset and checks the type of the value."""
+
+    def resolve(name: str, given: Any) -> Value:
+        value = named(given) if isinstance(given, str) else given
+        check.instance(name, value, kind)
+        return value
+
+    return resolve
+
+
+def default_of(kind: type[Value]) -> Callable[[str, Any], Value]:
+    """Return a function that resolves None to the defaults of parameters."""
+
+    def resolve(name: str, given: Any) -> Value:
+        value = kind() if given is None else given
+        check.instance(name, value, kind)
+        return value
+
+    return resolve
