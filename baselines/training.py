@@ -29,7 +29,7 @@ from quad_gym.batch.threads import resolve_threads
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingResult:
     """Results of a training."""
 
     folder: Path
@@ -47,7 +47,7 @@ class Training:
 
 def train(
     plan: Plan, folder: Path, *, resume: bool = False, tensorboard: bool = True, quiet: bool = False
-) -> Training:
+) -> TrainingResult:
     """Train a policy, or resume a training that was stopped.
 
     Ctrl-C or SIGTERM stops the run at the next step, from which it can be resumed. The folder is
@@ -122,11 +122,13 @@ def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
     return before
 
 
-def _train(plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: bool) -> Training:
+def _train(
+    plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: bool
+) -> TrainingResult:
     described = description(plan)
     before = run_in(folder, plan, resume=resume)
     if before is not None and before["finished"]:
-        return Training(
+        return TrainingResult(
             folder,
             before["steps"],
             before["training_seconds"],
@@ -161,7 +163,7 @@ def _train(plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: 
     }
     _write_record(folder, record)
     judge.close()
-    return Training(
+    return TrainingResult(
         folder, keeper.steps, keeper.seconds, keeper.finished, keeper.best, best_file(plan, folder)
     )
 
@@ -171,7 +173,7 @@ def _write_record(folder: Path, record: Any) -> None:
     write_json(folder / "training.json.part", record).replace(folder / "training.json")
 
 
-def export(training: Training, file: Path) -> None:
+def export(training: TrainingResult, file: Path) -> None:
     """Write the best policy of a training, with its record, to a file that requires only NumPy.
 
     Raises:

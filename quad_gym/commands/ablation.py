@@ -26,7 +26,7 @@ from quad_gym.experiments.consistency.ablation import (
     run_ablation,
     table_of,
 )
-from quad_gym.experiments.consistency.cases import Flights
+from quad_gym.experiments.consistency.cases import CaseFlights
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def main(args: Args) -> None:
         for case in cases:
             case.batch(8, 1)  # rejects invalid cases before any flight
         require_writable("--output", args.output)
-    flights = Flights(args.episodes, args.seed, args.duration, args.threads)
+    flights = CaseFlights(args.episodes, args.seed, args.duration, args.threads)
     rows = run_ablation(args.table, cases, flights)
     print(
         f"{args.episodes:,} flights of {args.duration:g} s on random trajectories, suite "

@@ -35,7 +35,13 @@ from quad_gym.commands.options import (
     usage_errors,
     with_full_id,
 )
-from quad_gym.experiments.compare import Comparison, Matrix, conclusions, matrix_text, write_report
+from quad_gym.experiments.compare import (
+    Comparison,
+    ComparisonResults,
+    conclusions,
+    matrix_text,
+    write_report,
+)
 from quad_gym.experiments.driver import train_all
 from quad_gym.experiments.executors import make_executor
 from quad_gym.params import checks as check
@@ -135,7 +141,7 @@ def main(args: Args) -> int:
     driver = train_all(comparison.trainings, executor, args.jobs or resolve_threads(None))
     if code := driver.exit_code():
         return code
-    matrix = Matrix(comparison, comparison.fly())
+    matrix = ComparisonResults(comparison, comparison.fly())
     for suite in comparison.suites:
         print(f"\nSensors {suite}\n\n{matrix_text(matrix, suite)}")
     print("\n" + "\n".join(conclusions(matrix)))

@@ -79,11 +79,11 @@ class Args:
     """replace earlier results in the folder"""
 
 
-Case = tuple[str, str]
+Pairing = tuple[str, str]
 """A policy and an observation."""
 
 
-def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
+def configure(args: Args) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:
     """Check all options, and make every policy with its environment.
 
     Raises:
@@ -109,7 +109,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
         folder = free_folder(folder, "summary.json")
     refuse_overwriting(folder / "summary.json", args.overwrite)
     policies = args.policy or default_policies(args)
-    cases: dict[Case, tuple[Policy, Any]] = {}
+    cases: dict[Pairing, tuple[Policy, Any]] = {}
     for observation in args.observation:
         for name in policies:
             env = make_flights(args, observation, args.episodes, name)
@@ -150,7 +150,7 @@ def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
     )
 
 
-def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
+def write_videos(cases: dict[Pairing, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
     """Write a video of the first episode of each case."""
     from tqdm import tqdm
 
@@ -165,7 +165,7 @@ def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path
     return files
 
 
-def table(results: dict[Case, Episodes], env: Any) -> str:
+def table(results: dict[Pairing, Episodes], env: Any) -> str:
     """Format a table of errors and endings of each case."""
     gates = env.unwrapped.flights.task.gate_count
     course = task_of(env) == "QuadGym/Waypoints-v0"
@@ -215,7 +215,7 @@ def _rate(happened: Any) -> str:
 
 
 def write(
-    results: dict[Case, Episodes], tracers: dict[Case, Tracer], args: Args, folder: Path
+    results: dict[Pairing, Episodes], tracers: dict[Pairing, Tracer], args: Args, folder: Path
 ) -> list[Path]:
     """Write numbers and figures; return the files."""
     tables = (

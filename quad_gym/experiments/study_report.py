@@ -18,12 +18,12 @@ from quad_gym.analysis.study_plots import (
 )
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.experiments.pages import Report
-from quad_gym.experiments.study import Results
+from quad_gym.experiments.study import StudyResults
 from quad_gym.experiments.study_films import CHOICES, label_of, pair_of
 from quad_gym.experiments.study_words import conclusions, number, share
 
 
-def _table(results: Results) -> tuple[tuple[str, ...], list[list[str]]]:
+def _table(results: StudyResults) -> tuple[tuple[str, ...], list[list[str]]]:
     """Headings and rows of the table."""
     columns = results.study.about.table()
 
@@ -38,14 +38,14 @@ def _table(results: Results) -> tuple[tuple[str, ...], list[list[str]]]:
     return ("arm", *(column.heading for column in columns.values())), rows
 
 
-def table_text(results: Results) -> str:
+def table_text(results: StudyResults) -> str:
     """Table for the screen."""
     heads, rows = _table(results)
     flown = "flown on the estimate unless the arm says otherwise"
     return text_table({"": heads[:1], flown: heads[1:]}, rows)
 
 
-def page_text(results: Results) -> str:
+def page_text(results: StudyResults) -> str:
     """Setting, table and conclusions, in Markdown."""
     study, (heads, rows) = results.study, _table(results)
     lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *rows]
@@ -62,7 +62,7 @@ def page_text(results: Results) -> str:
     )
 
 
-def _trainings(results: Results) -> str:
+def _trainings(results: StudyResults) -> str:
     """Number of trainings, if there are any."""
     study = results.study
     if not results.trained():
@@ -70,7 +70,7 @@ def _trainings(results: Results) -> str:
     return f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
 
 
-def write_report(results: Results, film: Path | None = None) -> list[Path]:
+def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
     """Write figures, numbers and pages; the last file is the page, which also shows the film."""
     study, folder = results.study, results.study.folder
     table = folder / "table.md"
@@ -106,7 +106,7 @@ def write_report(results: Results, film: Path | None = None) -> list[Path]:
     return report.write()
 
 
-def _episodes(results: Results) -> Iterator[dict[str, Any]]:
+def _episodes(results: StudyResults) -> Iterator[dict[str, Any]]:
     """Numbers of all episodes, policy by policy."""
     study = results.study
     for arm in study.arms:
@@ -128,7 +128,7 @@ def _episodes(results: Results) -> Iterator[dict[str, Any]]:
             }
 
 
-def _add_figures(report: Report, results: Results) -> None:
+def _add_figures(report: Report, results: StudyResults) -> None:
     """Draw the learning curves, and one episode of two policies."""
     study = results.study
     curves = {results.arm(name).label: results.curves[name] for name in results.trained()}

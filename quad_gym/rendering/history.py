@@ -25,7 +25,7 @@ def position_sigma(flight: Flight) -> Floats:
     return np.asarray(np.sqrt(variances.max(axis=1)))
 
 
-class History:
+class ErrorHistory:
     """Plot of errors over a whole episode, up to the last row of a flight.
 
     Args:

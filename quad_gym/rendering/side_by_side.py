@@ -22,7 +22,7 @@ from quad_gym.rendering.canvas import (
     Color,
 )
 from quad_gym.rendering.geometry import View, course_view, fixed_view
-from quad_gym.rendering.history import History
+from quad_gym.rendering.history import ErrorHistory
 from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.renderer import active_faults
 from quad_gym.rendering.scene import Scene
@@ -127,7 +127,7 @@ class _Half:
         self._canvas = Canvas(width, height)
         self._scene = Box(0.0, _BAND, width, height - _BAND - _PLOT)
         plot = Box(0.0, height - _PLOT, width, _PLOT)
-        self._history = History(self._canvas, plot, side.flight, end, _SMALL, side.course)
+        self._history = ErrorHistory(self._canvas, plot, side.flight, end, _SMALL, side.course)
         self._fixed: View | None = None
 
     def draw(self, time: float) -> NDArray[np.uint8]:

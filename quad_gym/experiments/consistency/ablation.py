@@ -12,7 +12,7 @@ from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.reports import text_table
 from quad_gym.experiments.benchmark.timing import by_turns, lasting
-from quad_gym.experiments.consistency.cases import Case, Flights, Results, fly
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, CaseResults, fly
 from quad_gym.params.checks import Vector
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -121,9 +121,9 @@ def _filters(suite: SensorSuite) -> Iterator[Fields]:
     yield "UKF, all of the report's form", suite.replace(imu=sampled, estimator=report), {}
 
 
-def run_ablation(table: str, cases: list[Case], flights: Flights) -> Results:
+def run_ablation(table: str, cases: list[Case], flights: CaseFlights) -> CaseResults:
     """Fly all cases; with "filters", also time a tick of each."""
-    rows: Results = {}
+    rows: CaseResults = {}
     for number, case in enumerate(cases, 1):
         print(f"  {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
         rows[case.name] = row_of(fly(case.batch(flights.count, flights.threads), flights))
@@ -160,7 +160,7 @@ def row_of(findings: Findings) -> dict[str, float]:
     return {**nees, **inside, **rms, **{f"tracking_{k}": v for k, v in tracking.items()}, **counts}
 
 
-def table_of(table: str, rows: Results) -> str:
+def table_of(table: str, rows: CaseResults) -> str:
     """Format the table for the screen."""
     errors = {
         "position [mm]": ("rms_position", 1e3, 1),

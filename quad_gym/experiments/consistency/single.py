@@ -15,12 +15,12 @@ from quad_gym.analysis.consistency_plots import (
 )
 from quad_gym.analysis.plots import house_style, save_figure
 from quad_gym.analysis.reports import text_table, versions, write_json
-from quad_gym.experiments.consistency.cases import Case, Flights, fly
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, fly
 
 
 def run_single(
     case: Case,
-    flights: Flights,
+    flights: CaseFlights,
     output: Path,
     *,
     every: float,
@@ -126,7 +126,7 @@ def report_of(findings: Findings) -> str:
         if findings.consistent
         else "The filter is not consistent in everything:",
         *(f"  {text}" for text in findings.sentences().values()),
-        f"  Filters with a numerical failure: {findings.failed}. Flights lost: "
+        f"  Filters with a numerical failure: {findings.failed}. CaseFlights lost: "
         f"{findings.astray.sum()}.",
         f"Criterion: means within the tolerance, the 95 % band of a mean over at most "
         f"{BAND_FLIGHTS:,} values, at {100 * CONSISTENT_SHARE:.0f} % of the instants or more; "
