@@ -7,7 +7,7 @@ The folder contains
   generators and counters (and `replay_*.pickle` in addition, for algorithms with a replay buffer);
 - or, from the compiled engine, `last.npz` and `best.npz`, in the format of `MlpPolicy`;
 - `training.json`: plan, versions, seeds, wall time; `evaluations.csv`: errors during training;
-- `training.lock`: the process that trains in the folder, or did last;
+- `training.lock`, and `training.process`: the process that trains in the folder, or did last;
 - files for TensorBoard.
 
 A resumed run continues exactly from its last checkpoint.

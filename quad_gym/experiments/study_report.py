@@ -1,7 +1,7 @@
 """Report of a study: tables, figures, numbers, and a page."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,7 @@ import numpy as np
 from quad_gym import IDS, sensor_suite
 from quad_gym.analysis.comparison_plots import learning_figure
 from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
-from quad_gym.analysis.study_plots import (
-    Glance,
-    Pace,
-    glance_figure,
-    pace_figure,
-)
+from quad_gym.analysis.study_plots import glance_figure, pace_figure
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.experiments.pages import Report
 from quad_gym.experiments.study import StudyResults
@@ -149,21 +144,20 @@ def _add_figures(report: Report, results: StudyResults) -> None:
         traces = {trace: recorded[trace][:, pair.episode] for trace in study.about.traced}
         label = label_of(results, name).replace(", ", ",\n")
         episodes[label] = {"time": recorded["time"], **traces}
-    above = "where the vehicle looks" if kind == "glance" else "the speed of the vehicle"
+    if kind == "glance":
+        figure, above = glance_figure(episodes, _half_view(study.env_id)), "where the vehicle looks"
+    else:
+        figure, above = pace_figure(episodes), "the speed of the vehicle"
     report.add_figure(
         kind,
-        _glances(study.env_id, episodes) if kind == "glance" else _paces(episodes),
+        figure,
         f"The same episode, flown on the estimate. Above, {above}; below, "
         f"standard deviation of the filter, and errors. {CHOICES[kind]}",
     )
 
 
-def _glances(env_id: str, episodes: Mapping[str, Mapping[str, Any]]) -> Any:
+def _half_view(env_id: str) -> float:
+    """Half of the horizontal field of view of a task's camera [rad]."""
     camera = sensor_suite(BENCHMARKS[IDS[env_id]].keywords["sensors"]).camera
     assert camera is not None
-    half_view = math.atan(0.5 * camera.image_size[0] / camera.focal_length)
-    return glance_figure({label: Glance(**each) for label, each in episodes.items()}, half_view)
-
-
-def _paces(episodes: Mapping[str, Mapping[str, Any]]) -> Any:
-    return pace_figure({label: Pace(**each) for label, each in episodes.items()})
+    return math.atan(0.5 * camera.image_size[0] / camera.focal_length)
