@@ -9,8 +9,7 @@ from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSq
 from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.consistency_plots import (
     errors_figure,
-    nees_figure,
-    nis_figure,
+    mean_square_figure,
     whiteness_figure,
 )
 from quad_gym.analysis.plots import house_style, save_figure
@@ -88,11 +87,11 @@ def _draw(
     files: list[Path] = []
     with house_style():
         figures = {
-            "nees": nees_figure(whole.nees, title, settle),
+            "nees": mean_square_figure("NEES", whole.nees, title, settle),
             "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
         }
         if whole.nis:
-            figures["nis"] = nis_figure(whole.nis, title, settle)
+            figures["nis"] = mean_square_figure("NIS", whole.nis, title, settle)
         if findings.whiteness:
             figures["whiteness"] = whiteness_figure(findings.whiteness, title)
         for name, figure in figures.items():
