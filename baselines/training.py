@@ -15,6 +15,7 @@ A resumed run continues exactly from its last checkpoint.
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,14 +129,7 @@ def _train(
     described = description(plan)
     before = run_in(folder, plan, resume=resume)
     if before is not None and before["finished"]:
-        return TrainingResult(
-            folder,
-            before["steps"],
-            before["training_seconds"],
-            True,
-            before["best"],
-            best_file(plan, folder),
-        )
+        return _result(plan, folder, before)
     judge = plan.make_judge()
     if before is None:
         begun = {"plan": described, "interface": interface_of(judge), "finished": False}
@@ -163,8 +157,17 @@ def _train(
     }
     _write_record(folder, record)
     judge.close()
+    return _result(plan, folder, record)
+
+
+def _result(plan: Plan, folder: Path, record: Mapping[str, Any]) -> TrainingResult:
     return TrainingResult(
-        folder, keeper.steps, keeper.seconds, keeper.finished, keeper.best, best_file(plan, folder)
+        folder=folder,
+        steps=record["steps"],
+        seconds=record["training_seconds"],
+        finished=record["finished"],
+        best=record["best"],
+        best_policy=best_file(plan, folder),
     )
 
 

@@ -18,7 +18,7 @@ from tyro.conf import Positional
 from quad_gym import sensor_suite
 from quad_gym.analysis.consistency_flights import ASTRAY
 from quad_gym.analysis.reports import require_writable, versions, write_json
-from quad_gym.commands.options import SuiteName, require_at_least, usage_errors
+from quad_gym.commands.options import SuiteName, Threads, require_at_least, usage_errors
 from quad_gym.experiments.consistency.ablation import (
     SETTLED,
     as_fields,
@@ -46,8 +46,7 @@ class Args:
     """start of the filter"""
     output: Path = Path("results/ablation")
     """folder for the numbers"""
-    threads: int | None = None
-    """number of threads; if not given, one per core"""
+    threads: Threads = None
 
     def __post_init__(self) -> None:
         """Check the numbers."""

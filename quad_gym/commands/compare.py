@@ -27,6 +27,7 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.threads import resolve_threads
 from quad_gym.commands.options import (
     TRACKING,
+    Engine,
     Keywords,
     SuiteNames,
     TrackingId,
@@ -69,9 +70,7 @@ class Args:
 
     algorithm: Literal["ppo", "sac", "td3", "tqc"] = "ppo"
     """reinforcement learning algorithm"""
-    engine: Literal["sb3", "compiled"] = "sb3"
-    """training engine: Stable-Baselines3, or the compiled PPO, which is several times faster
-    and needs no torch"""
+    engine: Engine = "sb3"
     steps: int | None = None
     """number of environment steps of each training; if not given, the recipe's"""
     env: Keywords = field(default_factory=dict)

@@ -37,6 +37,7 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import (
     TRACKING,
     SuiteName,
+    Threads,
     TrackingId,
     known_id,
     option_name,
@@ -83,8 +84,7 @@ class Args:
     threads"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """with --matrix: the suites on all tasks, other conditions on one task, or both"""
-    threads: int | None = None
-    """number of threads; if not given, one per core; it does not affect results"""
+    threads: Threads = None
 
     sensors: SuiteName = "standard"
     form: Literal["suite", "report", "corrected"] = "suite"

@@ -20,7 +20,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
-from quad_gym.analysis.intervals import mean_interval, rate_interval
+from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_interval
 from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import (
     require_writable,
@@ -35,6 +35,7 @@ from quad_gym.commands.options import (
     EnvId,
     Keywords,
     OwnSuite,
+    Threads,
     free_folder,
     leave,
     refuse_overwriting,
@@ -68,8 +69,7 @@ class Args:
     """number of episodes of each policy on each observation"""
     seed: int = 0
     """seed of the first episode; the others have consecutive seeds; trainings use different ones"""
-    threads: int | None = None
-    """number of threads; if not given, one per core"""
+    threads: Threads = None
     video: Literal["none", "mp4", "gif", "webp"] = "none"
     """format of a video of the first episode of each case; none: no video"""
     output: Path | None = None
@@ -183,7 +183,10 @@ def table(results: dict[Pairing, Episodes], env: Any) -> str:
             ]
         else:
             late = f"{1e3 * found['late_error']:.1f}"
-            row += [_with_interval(episodes.mean_error), "-" if late == "nan" else late]
+            errors = episodes.mean_error
+            interval = mean_interval(errors) if len(errors) > 1 else None
+            row.append(in_brackets(errors.mean(), interval, ".1f", 1e3))
+            row.append("-" if late == "nan" else late)
         rows.append(
             [
                 *row,
@@ -200,13 +203,6 @@ def table(results: dict[Pairing, Episodes], env: Any) -> str:
     return text_table(
         {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
     )
-
-
-def _with_interval(values: Any) -> str:
-    if len(values) < 2:
-        return f"{1e3 * values.mean():.1f}"
-    low, high = mean_interval(values)
-    return f"{1e3 * values.mean():.1f} [{1e3 * low:.1f}, {1e3 * high:.1f}]"
 
 
 def _rate(happened: Any) -> str:

@@ -16,7 +16,7 @@ from quad_gym.analysis.comparison_plots import (
     matrix_figure,
     paths_figure,
 )
-from quad_gym.analysis.intervals import mean_interval, paired_difference
+from quad_gym.analysis.intervals import in_brackets, mean_interval, paired_difference
 from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import columns_of, text_table, versions, write_csv, write_json
 from quad_gym.envs.effects import with_effect
@@ -124,9 +124,7 @@ class MatrixCell:
 
     def texts(self) -> tuple[str, str, str]:
         """Error and its interval, late error [mm], and crash rate."""
-        error = f"{1e3 * float(np.mean(self.errors)):.1f}"
-        if self.interval is not None:
-            error += f" [{1e3 * self.interval.low:.1f}, {1e3 * self.interval.high:.1f}]"
+        error = in_brackets(float(np.mean(self.errors)), self.interval, ".1f", 1e3)
         late, crashed = float(np.mean(self.late_errors)), float(np.mean(self.crash_rates))
         return error, f"{1e3 * late:.1f}", f"{crashed:.1%}"
 

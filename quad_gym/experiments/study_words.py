@@ -7,7 +7,7 @@ it is larger for an arm that was selected as the best of several by the same num
 
 from collections.abc import Mapping
 
-from quad_gym.analysis.intervals import Estimated, difference
+from quad_gym.analysis.intervals import Estimated, difference, in_brackets
 from quad_gym.experiments.study import StudyResults
 
 FEW = 5
@@ -16,8 +16,7 @@ FEW = 5
 
 def number(found: Estimated, digits: int) -> str:
     """Number with its interval."""
-    low, high = f"{found.low:.{digits}f}", f"{found.high:.{digits}f}"
-    return f"{found.value:.{digits}f} [{low}, {high}]"
+    return in_brackets(found.value, (found.low, found.high), f".{digits}f")
 
 
 def share(found: Estimated) -> str:

@@ -2,11 +2,12 @@
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import Findings
@@ -77,23 +78,20 @@ def _sensors(suite: SensorSuite) -> dict[str, SensorSuite]:
 
 def _scaled(params: Any, factor: float, *names: str) -> Any:
     """Parameters of a sensor with some multiplied by a factor, as far as they are given."""
-    values = {name: getattr(params, name) for name in names}
-    return params.replace(
-        **{
-            name: tuple(factor * np.array(value)) if isinstance(value, tuple) else factor * value
-            for name, value in values.items()
-            if value is not None
-        }
-    )
+    return _changed(params, lambda value: factor * np.array(value), names)
 
 
 def _moved(params: Any, by: Vector, *names: str) -> Any:
     """Parameters of a sensor with a vector added to some, as far as they are given."""
-    values = {name: getattr(params, name) for name in names}
-    sums = {
-        k: tuple(np.add(value, by).tolist()) for k, value in values.items() if value is not None
-    }
-    return params.replace(**sums)
+    return _changed(params, lambda value: np.add(value, by), names)
+
+
+def _changed(params: Any, change: Callable[[Any], NDArray[Any]], names: Sequence[str]) -> Any:
+    given = {name: getattr(params, name) for name in names}
+    changed = {k: change(value).tolist() for k, value in given.items() if value is not None}
+    return params.replace(
+        **{k: tuple(value) if isinstance(value, list) else value for k, value in changed.items()}
+    )
 
 
 def _filters(suite: SensorSuite) -> Iterator[Fields]:
