@@ -23,21 +23,8 @@ if TYPE_CHECKING:
 TYPICAL = 0.03
 """Typical standard deviation of the position while markers are in view [m]."""
 
-EVERY = 10
-"""Steps between the instants of a history: 0.2 s at 50 Hz."""
-
 REMEMBERED = 4
 """Number of instants in a history."""
-
-_SEEN = 18
-"""Number of values per instant: errors of position and velocity, vertical, heading, body rates and
-direction of the features."""
-
-RECALLED_EVERY = 5
-"""Steps between the instants of a history in a race: 0.1 s."""
-
-_RECALLED = 12
-"""Number of values per instant in a race: errors of position and velocity, vertical, body rates."""
 
 _SCALES = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "next_gap": 12.0}
 """Divisors of parts of the observation of `OutageDash`, in their units."""
@@ -102,27 +89,30 @@ REPORTED_STD_X1_4, REPORTED_STD_X1_2, REPORTED_STD_X2, REPORTED_STD_X4 = map(
 """Tasks in which the controller observes a wrong multiple of the standard deviation."""
 
 
+def _remember(view: "View", every: int, *now: NDArray[np.float64]) -> None:
+    """Append present values (n, ...) to `past` every few steps, and drop the oldest ones."""
+    due = (view.step % every == 0)[:, np.newaxis, np.newaxis]
+    latest, past = np.concatenate(now, axis=1)[:, np.newaxis], view.state.past
+    view.state.past = np.where(due, np.concatenate([latest, past[:, :-1]], axis=1), past)
+
+
 class WithStdHistory(WithStd):
     """`WithStd` whose observation also contains the observations 0.2, 0.4, 0.6 and 0.8 s ago.
 
     At the start of an episode, the history is zero.
     """
 
-    state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _SEEN))}
+    state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, 18))}
     observes: Mapping[str, ObservationSpec] = {
         **WithStd.observes,
         "past": ObservationSpec("mixed", "B"),
     }
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
-        """Append the present observation to the history at intervals, and drop the oldest one."""
-        due = (view.step % EVERY == 0)[:, np.newaxis, np.newaxis]
-        seen = view.observed
-        direction = LookAround.observe(self, view)["features_direction"]
-        now = [seen.position_error, seen.velocity_error, seen.up, seen.heading, seen.body_rates]
-        latest = np.concatenate([*now, direction], axis=1)[:, np.newaxis]
-        past = view.state.past
-        view.state.past = np.where(due, np.concatenate([latest, past[:, :-1]], axis=1), past)
+        """Append the present observation to the history every 0.2 s."""
+        seen, direction = view.observed, LookAround.observe(self, view)["features_direction"]
+        errors = (seen.position_error, seen.velocity_error)
+        _remember(view, 10, *errors, seen.up, seen.heading, seen.body_rates, direction)
 
     def observe(self, view: "View") -> Parts:
         """Return the observation of `WithStd`, and `past` (n, 72)."""
@@ -155,17 +145,13 @@ class RaceWithHistory(StaleRace):
     At the start of an episode, the history is zero.
     """
 
-    state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _RECALLED))}
+    state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, 12))}
     observes: Mapping[str, ObservationSpec] = {"past": ObservationSpec("mixed", "B")}
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
-        """Append the present observation to the history at intervals, and drop the oldest one."""
-        due = (view.step % RECALLED_EVERY == 0)[:, np.newaxis, np.newaxis]
+        """Append the present observation to the history every 0.1 s."""
         seen = view.observed
-        now = [seen.position_error, seen.velocity_error, seen.up, seen.body_rates]
-        latest = np.concatenate(now, axis=1)[:, np.newaxis]
-        past = view.state.past
-        view.state.past = np.where(due, np.concatenate([latest, past[:, :-1]], axis=1), past)
+        _remember(view, 5, seen.position_error, seen.velocity_error, seen.up, seen.body_rates)
 
     def observe(self, view: "View") -> Parts:
         """Return `past` (n, 48)."""

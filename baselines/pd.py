@@ -36,6 +36,13 @@ exceeds half the width of the next gap minus this margin, slightly more than the
 FACES = ("reference", "features", "features_when_uncertain")
 """Directions in which PD control can point body x."""
 
+_REQUIRED = {
+    'faces="features"': ("features_direction",),
+    'faces="features_when_uncertain"': ("features_direction", "position_sigma"),
+    'pace="waiting"': ("gap_width", "position_sigma"),
+}
+"""Fields of the observation that modes require."""
+
 UNSURE = 0.1
 """Standard deviation of the position above which "features_when_uncertain" faces features [m]."""
 
@@ -140,26 +147,13 @@ class PDPolicy:
             raise ValueError('env must observe a state: observation="measurements" contains none')
         needed = _ABSOLUTE_FIELDS if flights.layout == "absolute" else _RELATIVE_FIELDS
         self._faces = check.choice("faces", faces, FACES)
-        wanted = {
-            "reference": (),
-            "features": ("features_direction",),
-            "features_when_uncertain": ("features_direction", "position_sigma"),
-        }[faces]
-        shown = {field.name for field in flights.table}
-        lacking = [name for name in wanted if name not in shown]
-        if lacking:
-            raise ValueError(
-                f'env must observe {lacking[0]} for faces="{faces}"'
-                + (": make it with include_std=True" if "sigma" in lacking[0] else "")
-            )
         self._waits = check.choice("pace", pace, PACES) == "waiting"
-        if self._waits:
-            for name in ("gap_width", "position_sigma"):
-                if name not in shown:
-                    raise ValueError(
-                        f'env must observe {name} for pace="waiting", as OutageDash does with '
-                        "include_std=True"
-                    )
+        shown = {field.name for field in flights.table}
+        for mode, names in _REQUIRED.items():
+            for name in names:
+                if mode in (f'faces="{faces}"', f'pace="{pace}"') and name not in shown:
+                    how = ": make it with include_std=True" if "sigma" in name else ""
+                    raise ValueError(f"env must observe {name} for {mode}{how}")
         # observations of tasks with a reference at rest may lack its acceleration
         self._gaps = "gap_width" in shown
         spared = {"reference_acceleration"} if self._gaps else set()

@@ -19,16 +19,18 @@ from quad_gym.params import checks as check
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 """Folder of the included policies."""
 
-NAMES = (
-    "pd",
-    "pd:tuned",
-    "pd:lab",
-    "pd:features",
-    "pd:features_when_uncertain",
-    "pd:slow",
-    "pd:waiting",
-    "pretrained",
-)
+_PD: dict[str, dict[str, Any]] = {
+    "pd": {},
+    "pd:tuned": {},
+    "pd:lab": {"gains": "lab"},
+    "pd:features": {"faces": "features"},
+    "pd:features_when_uncertain": {"faces": "features_when_uncertain"},
+    "pd:slow": {"max_position_error": 0.5 * REACH_OF_GAPS},
+    "pd:waiting": {"pace": "waiting"},
+}
+"""Arguments of `PDPolicy` by name, see `load_policy`."""
+
+NAMES = (*_PD, "pretrained")
 """Names of policies, see `load_policy`."""
 
 _ALGORITHM_OF_MODULE = {
@@ -73,14 +75,8 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     Warns:
         UserWarning: If a `.npz` was trained on another task.
     """
-    if name in ("pd", "pd:tuned", "pd:lab"):
-        return PDPolicy(env, gains="lab" if name == "pd:lab" else "tuned")
-    if name in ("pd:features", "pd:features_when_uncertain"):
-        return PDPolicy(env, faces=name.removeprefix("pd:"))
-    if name in ("pd:slow", "pd:waiting"):
-        slow = 0.5 * REACH_OF_GAPS if name == "pd:slow" else None
-        pace = "steady" if name == "pd:slow" else "waiting"
-        return PDPolicy(env, max_position_error=slow, pace=pace)
+    if name in _PD:
+        return PDPolicy(env, **_PD[name])
     if name.startswith("pd:"):
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)

@@ -7,7 +7,7 @@ The folder contains
   generators and counters (and `replay_*.pickle` in addition, for algorithms with a replay buffer);
 - or, from the compiled engine, `last.npz` and `best.npz`, in the format of `MlpPolicy`;
 - `training.json`: plan, versions, seeds, wall time; `evaluations.csv`: errors during training;
-- `training.lock`: the process that trains in the folder, or did last;
+- `training.lock`, and `training.process`: the process that trains in the folder, or did last;
 - files for TensorBoard.
 
 A resumed run continues exactly from its last checkpoint.
@@ -15,6 +15,7 @@ A resumed run continues exactly from its last checkpoint.
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from quad_gym.batch.threads import resolve_threads
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingResult:
     """Results of a training."""
 
     folder: Path
@@ -47,7 +48,7 @@ class Training:
 
 def train(
     plan: Plan, folder: Path, *, resume: bool = False, tensorboard: bool = True, quiet: bool = False
-) -> Training:
+) -> TrainingResult:
     """Train a policy, or resume a training that was stopped.
 
     Ctrl-C or SIGTERM stops the run at the next step, from which it can be resumed. The folder is
@@ -122,18 +123,13 @@ def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
     return before
 
 
-def _train(plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: bool) -> Training:
+def _train(
+    plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: bool
+) -> TrainingResult:
     described = description(plan)
     before = run_in(folder, plan, resume=resume)
     if before is not None and before["finished"]:
-        return Training(
-            folder,
-            before["steps"],
-            before["training_seconds"],
-            True,
-            before["best"],
-            best_file(plan, folder),
-        )
+        return _result(plan, folder, before)
     judge = plan.make_judge()
     if before is None:
         begun = {"plan": described, "interface": interface_of(judge), "finished": False}
@@ -161,8 +157,17 @@ def _train(plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: 
     }
     _write_record(folder, record)
     judge.close()
-    return Training(
-        folder, keeper.steps, keeper.seconds, keeper.finished, keeper.best, best_file(plan, folder)
+    return _result(plan, folder, record)
+
+
+def _result(plan: Plan, folder: Path, record: Mapping[str, Any]) -> TrainingResult:
+    return TrainingResult(
+        folder=folder,
+        steps=record["steps"],
+        seconds=record["training_seconds"],
+        finished=record["finished"],
+        best=record["best"],
+        best_policy=best_file(plan, folder),
     )
 
 
@@ -171,7 +176,7 @@ def _write_record(folder: Path, record: Any) -> None:
     write_json(folder / "training.json.part", record).replace(folder / "training.json")
 
 
-def export(training: Training, file: Path) -> None:
+def export(training: TrainingResult, file: Path) -> None:
     """Write the best policy of a training, with its record, to a file that requires only NumPy.
 
     Raises:

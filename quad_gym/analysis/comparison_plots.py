@@ -20,7 +20,9 @@ from quad_gym.analysis.plots import (
     Trace,
     draw_path,
     house_style,
+    one_picture,
     path_handles,
+    plain_numbers,
 )
 
 Floats = NDArray[np.float64]
@@ -49,14 +51,14 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
         matplotlib Figure.
     """
     with house_style():
-        figure, axes = _figure((7.0, 3.8), title)
+        figure, axes = one_picture((7.0, 3.8), title)
         for (label, (time, (low, middle, high))), (color, dashes) in zip(
             curves.items(), line_styles(len(curves)), strict=True
         ):
             axes.fill_between(time, low, high, color=color, alpha=0.15, linewidth=0)
             axes.plot(time, middle, color=color, linestyle=dashes, label=label)
         axes.set_yscale("log")
-        _plain_numbers(axes.yaxis)
+        plain_numbers(axes.yaxis)
         axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))
         axes.set_xlabel("time [s]")
         axes.set_ylabel("position error [m]\nmedian, 5 to 95 % of episodes")
@@ -100,7 +102,7 @@ def learning_figure(
         matplotlib Figure.
     """
     with house_style():
-        figure, axes = _figure((7.0, 4.0), title)
+        figure, axes = one_picture((7.0, 4.0), title)
         for (label, seeds), (color, dashes) in zip(
             curves.items(), line_styles(len(curves), skip=1), strict=True
         ):
@@ -111,7 +113,7 @@ def learning_figure(
             axes.axhline(level, color=INK, linewidth=1.0, linestyle=dashes, label=label)
         if logarithmic:
             axes.set_yscale("log")
-            _plain_numbers(axes.yaxis)
+            plain_numbers(axes.yaxis)
         axes.set_xlim(left=0.0)
         axes.set_xlabel("training [million steps]")
         axes.set_ylabel(score)
@@ -139,7 +141,7 @@ def matrix_figure(
         matplotlib Figure.
     """
     with house_style():
-        figure, axes = _figure((2.6 + 2.1 * len(columns), 1.2 + 0.55 * len(rows)), title)
+        figure, axes = one_picture((2.6 + 2.1 * len(columns), 1.2 + 0.55 * len(rows)), title)
         shades = np.log10(values)
         axes.imshow(shades, cmap="cividis_r", aspect="auto", alpha=0.75)
         middle = 0.5 * (np.nanmin(shades) + np.nanmax(shades))
@@ -187,15 +189,6 @@ def paths_figure(traces: Mapping[str, Trace], title: str = "") -> Any:
     return figure
 
 
-def _figure(size: tuple[float, float], title: str) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_title(title)
-    return figure, axes
-
-
 def legend_below(figure: Any, axes: Any) -> None:
     """Add a legend below the axes, with as many columns as fit."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -212,10 +205,3 @@ def legend_below(figure: Any, axes: Any) -> None:
 def line_styles(count: int, *, skip: int = 0) -> list[tuple[str, Any]]:
     """Distinct colors and dash patterns for curves, without the first `skip` of them."""
     return [_STYLES[(k + skip) % len(_STYLES)] for k in range(count)]
-
-
-def _plain_numbers(axis: Any) -> None:
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())

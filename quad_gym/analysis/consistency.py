@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.analysis.metrics import STATE_DIMENSION, nees, state_error
+from quad_gym.analysis.metrics import STATE_DIMENSION, mean_band, nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import (
     AID_BLOCKS,
@@ -106,33 +106,6 @@ def start_matched(batch: FlightBatch, seed: int) -> None:
     for name, values in estimates.items():
         blocks[name][flight // WIDTH, ..., flight % WIDTH] = values
     batch.restore(blocks)
-
-
-def mean_band(
-    dimension: int, counts: ArrayLike, probability: float = 0.95
-) -> tuple[Floats, Floats]:
-    """Probability bands of means of independent chi-square values, one band for each instant.
-
-    Args:
-        dimension: Degrees of freedom of one value.
-        counts: Number of values in the mean at each instant, at least 1, (t,).
-        probability: Probability that a mean is inside its band; the tails are equal.
-
-    Returns:
-        Lower and upper ends, (t,) each.
-
-    Raises:
-        ValueError: If a number is out of range.
-    """
-    n = np.asarray(counts, np.float64)
-    if not 0.0 < probability < 1.0:
-        raise ValueError(f"probability must be between 0 and 1, got {probability}")
-    if dimension < 1 or n.size == 0 or n.min() < 1:
-        raise ValueError(f"dimension and counts must be at least 1, got {dimension} and {n}")
-    from scipy.stats import chi2
-
-    tail = (1.0 - probability) / 2
-    return chi2.ppf(tail, dimension * n) / n, chi2.ppf(1.0 - tail, dimension * n) / n
 
 
 @dataclass(frozen=True)

@@ -73,9 +73,11 @@ def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     axes.set_xlim(0.0, part.time[-1])
 
 
-def nees_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
-    """Figure of the mean NEES of the state and its blocks over time, with their tolerances."""
-    text = f"{title}\nMean NEES over flights (blue), and {_TOLERANCE}"
+def mean_square_figure(
+    quantity: str, parts: dict[str, MeanSquare], title: str, settle: float = 0.0
+) -> Any:
+    """Figure of the means of "NEES" of the state's parts, or "NIS" of the sensors, over time."""
+    text = f"{title}\nMean {quantity} over flights (blue), and {_TOLERANCE}"
     figure, axes = _grid(len(parts), text)
     for axis, part in zip(axes, parts.values(), strict=True):
         draw_mean_square(axis, part, settle)
@@ -106,15 +108,6 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(axis="y", which="minor", labelsize=7.0)
         axis.set_xlim(0.0, time[-1])
-    return figure
-
-
-def nis_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
-    """Figure of the mean NIS of the sensors over time, with their tolerances."""
-    text = f"{title}\nMean NIS over flights (blue), and {_TOLERANCE}"
-    figure, axes = _grid(len(parts), text)
-    for axis, part in zip(axes, parts.values(), strict=True):
-        draw_mean_square(axis, part, settle)
     return figure
 
 

@@ -51,6 +51,17 @@ class Estimated(NamedTuple):
         return self.low <= value <= self.high
 
 
+def in_brackets(
+    value: float, interval: tuple[float, float] | None, form: str, scale: float = 1.0
+) -> str:
+    """Format a number and, in brackets, its interval; None: the number alone."""
+    text = f"{scale * value:{form}}"
+    if interval is None:
+        return text
+    low, high = (scale * limit for limit in interval)
+    return f"{text} [{low:{form}}, {high:{form}}]"
+
+
 def mean(values: Floats) -> Floats:
     """Mean over the last axis."""
     return np.asarray(np.mean(values, axis=-1))

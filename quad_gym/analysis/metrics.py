@@ -52,25 +52,6 @@ class TrackingSummary:
         return {name: spread(values[np.asarray(chosen)]) for name, values in parts.items()}
 
 
-def tracking_summary(errors: ArrayLike) -> TrackingSummary:
-    """Mean error of each flight, over the whole flight and over its last half.
-
-    Args:
-        errors: Errors at n equally spaced instants, (..., n), in any unit.
-
-    Returns:
-        Means, (...,) each. If n is odd, the last half includes the middle instant.
-
-    Raises:
-        ValueError: If there are no instants.
-    """
-    values = np.asarray(errors, np.float64)
-    if values.ndim == 0 or values.shape[-1] == 0:
-        raise ValueError(f"errors must have shape (..., n) with n >= 1, got {values.shape}")
-    half = values[..., values.shape[-1] // 2 :]
-    return TrackingSummary(mean=values.mean(axis=-1), last_half=half.mean(axis=-1))
-
-
 class RunningSummary:
     """Recorder for a `TrackingSummary`, which stores only sums.
 
@@ -192,24 +173,35 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
     return np.asarray((e * weighted).sum(axis=-1))
 
 
-def chi_square_band(dimension: int, count: int = 1, probability: float = 0.95) -> Interval:
-    """Probability band of the mean of `count` independent NEES values of a consistent filter.
+def mean_band(
+    dimension: int, counts: ArrayLike, probability: float = 0.95
+) -> tuple[Floats, Floats]:
+    """Probability bands of means of independent NEES or NIS values of a consistent filter.
 
     Args:
         dimension: Degrees of freedom of one value, 15 for the whole state.
-        count: Number of independent values in the mean.
-        probability: Probability that the mean is inside the band; the tails are equal.
+        counts: Number of independent values in each mean, at least 1, (...,).
+        probability: Probability that a mean is inside its band; the tails are equal.
+
+    Returns:
+        Lower and upper ends, (...,) each.
 
     Raises:
         ValueError: If a number is out of range.
     """
+    n = np.asarray(counts, np.float64)
     _require_probability(probability)
-    if dimension < 1 or count < 1:
-        raise ValueError(f"dimension and count must be at least 1, got {dimension} and {count}")
+    if dimension < 1 or n.size == 0 or n.min() < 1:
+        raise ValueError(f"dimension and counts must be at least 1, got {dimension} and {n}")
     from scipy.stats import chi2
 
     tail = (1.0 - probability) / 2
-    low, high = chi2.ppf((tail, 1.0 - tail), dimension * count) / count
+    return chi2.ppf(tail, dimension * n) / n, chi2.ppf(1.0 - tail, dimension * n) / n
+
+
+def chi_square_band(dimension: int, count: int = 1, probability: float = 0.95) -> Interval:
+    """Probability band of the mean of `count` values; see `mean_band`."""
+    low, high = mean_band(dimension, count, probability)
     return Interval(float(low), float(high))
 
 

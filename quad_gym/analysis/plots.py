@@ -6,7 +6,7 @@ closed, and no display is required. The palette is by Okabe and Ito, which peopl
 vision deficiency can distinguish.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -238,8 +238,6 @@ def draw_error(
         label: Name of the flight in the legend.
         limits: Lowest and highest error shown [m], to compare figures; None: chosen by matplotlib.
     """
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
     handles = [_line(label, BLUE, width=1.1)]
     if band is not None:
         axes.fill_between(trace.time, band.low, band.high, color=ORANGE, alpha=0.45, linewidth=0)
@@ -251,8 +249,7 @@ def draw_error(
     axes.set_yscale("log")
     axes.set_xlim(trace.time[0], trace.time[-1])
     axes.set_ylim(limits or error_limits([trace], [band] if band else []))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    plain_numbers(axes.yaxis)
     axes.grid(True, which="minor", axis="y", linewidth=0.3)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("position error [m]")
@@ -273,12 +270,18 @@ def error_limits(traces: list[Trace], bands: list[Band]) -> tuple[float, float]:
 
 def path_figure(trace: Trace, title: str = "") -> Any:
     """Make a matplotlib Figure with `draw_path`."""
-    return _one_picture((5.0, 5.0), title, lambda axes: draw_path(axes, trace))
+    with house_style():
+        figure, axes = one_picture((5.0, 5.0), title)
+        draw_path(axes, trace)
+    return figure
 
 
 def height_figure(trace: Trace, title: str = "") -> Any:
     """Make a matplotlib Figure with `draw_height`."""
-    return _one_picture((6.0, 3.4), title, lambda axes: draw_height(axes, trace))
+    with house_style():
+        figure, axes = one_picture((6.0, 3.4), title)
+        draw_height(axes, trace)
+    return figure
 
 
 def error_figure(
@@ -290,9 +293,10 @@ def error_figure(
     limits: tuple[float, float] | None = None,
 ) -> Any:
     """Make a matplotlib Figure with `draw_error`."""
-    return _one_picture(
-        (6.0, 3.4), title, lambda axes: draw_error(axes, trace, band, label=label, limits=limits)
-    )
+    with house_style():
+        figure, axes = one_picture((6.0, 3.4), title)
+        draw_error(axes, trace, band, label=label, limits=limits)
+    return figure
 
 
 def overview_figure(
@@ -354,21 +358,26 @@ def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     return files
 
 
-def _one_picture(size: tuple[float, float], title: str, draw: Callable[[Any], None]) -> Any:
-    with house_style():
-        from matplotlib.figure import Figure
+def plain_numbers(axis: Any) -> None:
+    """Label a logarithmic axis with numbers such as 0.1 instead of powers of ten."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
 
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.add_subplot()
-        draw(axes)
-        axes.set_title(title)
-    return figure
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def one_picture(size: tuple[float, float], title: str) -> tuple[Any, Any]:
+    """Make a matplotlib Figure with one Axes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_title(title)
+    return figure, axes
 
 
 def _line(label: str, color: str, *, width: float) -> Any:
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], color=color, linewidth=width, label=label)
+    return _sample(label, {"color": color, "linewidth": width})
 
 
 def _sample(label: str, style: dict[str, Any]) -> Any:

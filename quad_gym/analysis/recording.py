@@ -6,12 +6,12 @@ flights fit into memory.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.metrics import RunningSummary, TrackingSummary, nees, state_error
+from quad_gym.analysis.consistency import flight_errors
+from quad_gym.analysis.metrics import RunningSummary, TrackingSummary, nees
 from quad_gym.analysis.plots import Band, Trace
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Ending, Source
@@ -114,7 +114,8 @@ def record_flights(
         error[step] = errors[0]
         row = int(np.searchsorted(samples, step))
         if estimating and samples[row] == step and flying.any():
-            nees_values[row, flying] = nees_of_flights(batch, flying)
+            errors_hat, P = flight_errors(batch), batch.covariance()
+            nees_values[row, flying] = nees(errors_hat[flying], P[flying])
 
     alike = bool(np.allclose(percentiles[0], percentiles[1], equal_nan=True))
     share = "all" if alike else "5 to 95 % of"
@@ -213,16 +214,6 @@ class Tracer:
             reference=reference[: len(shown)][shown] if len(reference) >= len(shown) else reference,
             error=self.errors[shown, flight],
         )
-
-
-def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
-    """Normalized estimation error squared of chosen flights at the present instant, (m,)."""
-    names = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
-    truth: dict[str, Any] = {word: batch.record(name)[chosen] for word, name in names.items()}
-    estimate = {word: batch.record(f"{name}_hat")[chosen] for word, name in names.items()}
-    truth["R_BI"] = quaternion_to_dcm(batch.record("q")[chosen])
-    estimate["R_BI"] = batch.record("R_hat")[chosen]
-    return nees(state_error(truth, estimate), batch.covariance()[chosen])
 
 
 def reference_of_flight(batch: FlightBatch, flight: int, times: Floats) -> Floats:

@@ -18,7 +18,7 @@ from tyro.conf import Positional
 from quad_gym import sensor_suite
 from quad_gym.analysis.consistency_flights import ASTRAY
 from quad_gym.analysis.reports import require_writable, versions, write_json
-from quad_gym.commands.options import SuiteName, require_at_least, usage_errors
+from quad_gym.commands.options import SuiteName, Threads, require_at_least, usage_errors
 from quad_gym.experiments.consistency.ablation import (
     SETTLED,
     as_fields,
@@ -26,7 +26,7 @@ from quad_gym.experiments.consistency.ablation import (
     run_ablation,
     table_of,
 )
-from quad_gym.experiments.consistency.cases import Flights
+from quad_gym.experiments.consistency.cases import CaseFlights
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,7 @@ class Args:
     """start of the filter"""
     output: Path = Path("results/ablation")
     """folder for the numbers"""
-    threads: int | None = None
-    """number of threads; if not given, one per core"""
+    threads: Threads = None
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -64,7 +63,7 @@ def main(args: Args) -> None:
         for case in cases:
             case.batch(8, 1)  # rejects invalid cases before any flight
         require_writable("--output", args.output)
-    flights = Flights(args.episodes, args.seed, args.duration, args.threads)
+    flights = CaseFlights(args.episodes, args.seed, args.duration, args.threads)
     rows = run_ablation(args.table, cases, flights)
     print(
         f"{args.episodes:,} flights of {args.duration:g} s on random trajectories, suite "

@@ -42,7 +42,7 @@ from quad_gym.analysis.reports import (
     write_json,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import require_at_least, usage_errors
+from quad_gym.commands.options import Threads, require_at_least, usage_errors
 from quad_gym.records import Source
 
 TRUTH, ESTIMATE, NO_CAMERA = "truth", "estimate", "estimate_without_camera"
@@ -62,8 +62,7 @@ class Args:
     """length of a flight [s]"""
     output: Path = Path("results/circle")
     """folder for figures and numbers, created if it is missing"""
-    threads: int | None = None
-    """number of threads; if not given, one per core; it does not affect results"""
+    threads: Threads = None
 
     radius: float = 4.0
     """radius of the circle [m]"""

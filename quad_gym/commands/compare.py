@@ -27,6 +27,7 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.threads import resolve_threads
 from quad_gym.commands.options import (
     TRACKING,
+    Engine,
     Keywords,
     SuiteNames,
     TrackingId,
@@ -35,7 +36,13 @@ from quad_gym.commands.options import (
     usage_errors,
     with_full_id,
 )
-from quad_gym.experiments.compare import Comparison, Matrix, conclusions, matrix_text, write_report
+from quad_gym.experiments.compare import (
+    Comparison,
+    ComparisonResults,
+    conclusions,
+    matrix_text,
+    write_report,
+)
 from quad_gym.experiments.driver import train_all
 from quad_gym.experiments.executors import make_executor
 from quad_gym.params import checks as check
@@ -63,9 +70,7 @@ class Args:
 
     algorithm: Literal["ppo", "sac", "td3", "tqc"] = "ppo"
     """reinforcement learning algorithm"""
-    engine: Literal["sb3", "compiled"] = "sb3"
-    """training engine: Stable-Baselines3, or the compiled PPO, which is several times faster
-    and needs no torch"""
+    engine: Engine = "sb3"
     steps: int | None = None
     """number of environment steps of each training; if not given, the recipe's"""
     env: Keywords = field(default_factory=dict)
@@ -135,7 +140,7 @@ def main(args: Args) -> int:
     driver = train_all(comparison.trainings, executor, args.jobs or resolve_threads(None))
     if code := driver.exit_code():
         return code
-    matrix = Matrix(comparison, comparison.fly())
+    matrix = ComparisonResults(comparison, comparison.fly())
     for suite in comparison.suites:
         print(f"\nSensors {suite}\n\n{matrix_text(matrix, suite)}")
     print("\n" + "\n".join(conclusions(matrix)))

@@ -37,6 +37,7 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import (
     TRACKING,
     SuiteName,
+    Threads,
     TrackingId,
     known_id,
     option_name,
@@ -45,7 +46,7 @@ from quad_gym.commands.options import (
 )
 from quad_gym.envs import IDS
 from quad_gym.experiments.consistency import matrix, recovery
-from quad_gym.experiments.consistency.cases import Case, Flights, run_cases
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, run_cases
 from quad_gym.experiments.consistency.single import run_single
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
@@ -83,8 +84,7 @@ class Args:
     threads"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """with --matrix: the suites on all tasks, other conditions on one task, or both"""
-    threads: int | None = None
-    """number of threads; if not given, one per core; it does not affect results"""
+    threads: Threads = None
 
     sensors: SuiteName = "standard"
     form: Literal["suite", "report", "corrected"] = "suite"
@@ -142,10 +142,10 @@ class Args:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
 
     @property
-    def flights(self) -> Flights:
+    def flights(self) -> CaseFlights:
         """Number, seeds and length of the flights."""
         assert self.episodes is not None
-        return Flights(self.episodes, self.seed, self.duration, self.threads)
+        return CaseFlights(self.episodes, self.seed, self.duration, self.threads)
 
     @property
     def folder(self) -> Path:

@@ -20,7 +20,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
-from quad_gym.analysis.intervals import mean_interval, rate_interval
+from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_interval
 from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import (
     require_writable,
@@ -35,6 +35,7 @@ from quad_gym.commands.options import (
     EnvId,
     Keywords,
     OwnSuite,
+    Threads,
     free_folder,
     leave,
     refuse_overwriting,
@@ -68,8 +69,7 @@ class Args:
     """number of episodes of each policy on each observation"""
     seed: int = 0
     """seed of the first episode; the others have consecutive seeds; trainings use different ones"""
-    threads: int | None = None
-    """number of threads; if not given, one per core"""
+    threads: Threads = None
     video: Literal["none", "mp4", "gif", "webp"] = "none"
     """format of a video of the first episode of each case; none: no video"""
     output: Path | None = None
@@ -79,11 +79,11 @@ class Args:
     """replace earlier results in the folder"""
 
 
-Case = tuple[str, str]
+Pairing = tuple[str, str]
 """A policy and an observation."""
 
 
-def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
+def configure(args: Args) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:
     """Check all options, and make every policy with its environment.
 
     Raises:
@@ -109,7 +109,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
         folder = free_folder(folder, "summary.json")
     refuse_overwriting(folder / "summary.json", args.overwrite)
     policies = args.policy or default_policies(args)
-    cases: dict[Case, tuple[Policy, Any]] = {}
+    cases: dict[Pairing, tuple[Policy, Any]] = {}
     for observation in args.observation:
         for name in policies:
             env = make_flights(args, observation, args.episodes, name)
@@ -150,7 +150,7 @@ def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
     )
 
 
-def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
+def write_videos(cases: dict[Pairing, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
     """Write a video of the first episode of each case."""
     from tqdm import tqdm
 
@@ -165,7 +165,7 @@ def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path
     return files
 
 
-def table(results: dict[Case, Episodes], env: Any) -> str:
+def table(results: dict[Pairing, Episodes], env: Any) -> str:
     """Format a table of errors and endings of each case."""
     gates = env.unwrapped.flights.task.gate_count
     course = task_of(env) == "QuadGym/Waypoints-v0"
@@ -183,7 +183,10 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
             ]
         else:
             late = f"{1e3 * found['late_error']:.1f}"
-            row += [_with_interval(episodes.mean_error), "-" if late == "nan" else late]
+            errors = episodes.mean_error
+            interval = mean_interval(errors) if len(errors) > 1 else None
+            row.append(in_brackets(errors.mean(), interval, ".1f", 1e3))
+            row.append("-" if late == "nan" else late)
         rows.append(
             [
                 *row,
@@ -202,20 +205,13 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
     )
 
 
-def _with_interval(values: Any) -> str:
-    if len(values) < 2:
-        return f"{1e3 * values.mean():.1f}"
-    low, high = mean_interval(values)
-    return f"{1e3 * values.mean():.1f} [{1e3 * low:.1f}, {1e3 * high:.1f}]"
-
-
 def _rate(happened: Any) -> str:
     low, high = (100.0 * limit for limit in rate_interval(happened.sum(), len(happened)))
     return f"{happened.mean():.1%} [{low:.1f}, {high:.1f}]"
 
 
 def write(
-    results: dict[Case, Episodes], tracers: dict[Case, Tracer], args: Args, folder: Path
+    results: dict[Pairing, Episodes], tracers: dict[Pairing, Tracer], args: Args, folder: Path
 ) -> list[Path]:
     """Write numbers and figures; return the files."""
     tables = (

@@ -21,11 +21,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import gymnasium
-import numpy as np
 from tyro.conf import arg
 
 from baselines.policies import keywords_of_policy, load_policy
-from quad_gym import IDS, Flight, FlightRecorder, SensorSuite, sensor_suite
+from quad_gym import IDS, Flight, SensorSuite, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import (
@@ -44,7 +43,7 @@ from quad_gym.faults.presets import PRESETS, faults_of
 from quad_gym.flights.rerun import load_rerun
 from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
-from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
+from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path, fly_steps
 
 FAULTS = tuple(name for name in PRESETS if name != "none")
 OTHER_ENDINGS = (".npz", ".csv", ".rrd")
@@ -211,23 +210,10 @@ def make_env(args: Args) -> Any:
 
 def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> Iterator[Flight]:
     """Run an episode, and yield the flight so far after each step."""
-    batch = env.unwrapped.flights.batch
-    recorder = FlightRecorder(batch, about=about | {"seed": seed})
-    observation, _ = env.reset(seed=seed)
-    recorder.keep()
-    yield recorder.flight
-    state, starts, over = None, np.ones(1, bool), False
-    while not over:
-        switches.apply(batch)
-        action, state = policy.predict(
-            observation, state=state, episode_start=starts, deterministic=True
-        )
-        observation, _, terminated, truncated, info = env.step(action)
-        starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
-        recorder.keep()
-        yield recorder.flight
-    ending = str(info["ending"][0]).replace("_", " ")
-    print(f"seed {seed}: {ending} after {in_words(recorder.flight)}")
+    steps = fly_steps(policy, env, seed, about | {"seed": seed}, switches.apply)
+    for flight, ending in steps:  # noqa: B007 - the last one is printed
+        yield flight
+    print(f"seed {seed}: {ending.replace('_', ' ')} after {in_words(flight)}")
 
 
 def replayed(flight: Flight) -> Iterator[Flight]:

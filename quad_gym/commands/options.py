@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -189,6 +189,29 @@ Keywords = Annotated[
     ),
 ]
 """Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
+
+Parameters = Annotated[
+    Keywords,
+    tyro.conf.arg(
+        help="parameters of the algorithm that override the recipe's, such as gamma=0.98"
+    ),
+]
+"""Parameters of the algorithm of a training."""
+
+Engine = Annotated[
+    Literal["sb3", "compiled"],
+    tyro.conf.arg(
+        help="training engine: Stable-Baselines3, or the compiled PPO, which is several times "
+        "faster and needs no torch"
+    ),
+]
+"""Training engine."""
+
+Threads = Annotated[
+    int | None,
+    tyro.conf.arg(help="number of threads; if not given, one per core; it does not affect results"),
+]
+"""Number of threads of the flights."""
 
 TRACKING = tuple(
     env_id for env_id, task in IDS.items() if task in TASK_DEFAULTS and task != "waypoints"

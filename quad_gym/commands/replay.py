@@ -150,20 +150,21 @@ def problems_in_words(result: "Replay") -> str:
 
 def innovations_of(result: "Replay") -> dict[str, list[Any]]:
     """Columns of all innovations, ordered by sensor."""
-    names = ("time", "received", "innovation", "sigma", "nis", "gate")
-    table: dict[str, list[Any]] = {"sensor": []}
+    from quad_gym.analysis.reports import stacked
+
+    tables = []
     for sensor, measured in result.measured.items():
-        table["sensor"] += [sensor] * len(measured.time)
-        for name in names:
+        table: dict[str, list[Any]] = {"sensor": [sensor] * len(measured.time)}
+        for name in ("time", "received", "innovation", "sigma", "nis", "gate"):
             values = getattr(measured, name)
             if values.ndim == 1:
-                table.setdefault(name, []).extend(values.tolist())
+                table[name] = values.tolist()
                 continue
             wide = np.full((len(values), 3), np.nan)
             wide[:, : values.shape[1]] = values
-            for i in range(3):
-                table.setdefault(f"{name}_{i}", []).extend(wide[:, i].tolist())
-    return table
+            table |= {f"{name}_{i}": wide[:, i].tolist() for i in range(3)}
+        tables.append(table)
+    return stacked(tables)
 
 
 def _lists(columns: "dict[str, Floats]") -> dict[str, list[float]]:

@@ -31,6 +31,8 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import (
     EnvId,
     Keywords,
+    Parameters,
+    Threads,
     leave,
     one_of,
     require_at_least,
@@ -63,8 +65,7 @@ class Args:
     """number of training seeds"""
     steps: int | None = None
     """number of environment steps of each training; if not given, the recipe's"""
-    set: Keywords = field(default_factory=dict)
-    """parameters of the algorithm that override the recipe's, such as gamma=0.99"""
+    set: Parameters = field(default_factory=dict)
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as duration=30.0"""
     quick: bool = False
@@ -80,8 +81,7 @@ class Args:
     success_within: float | None = None
     """for LookAround: largest mean position error in the second half of a successful episode [m];
     if not given, 0.5"""
-    threads: int | None = None
-    """number of threads; if not given, one per core; it does not affect results"""
+    threads: Threads = None
     video: Literal["none", "webp", "gif", "mp4"] = "none"
     """also write a film of this kind: policies trained on truth and on the estimate, side by side
     in the same episode"""

@@ -21,8 +21,11 @@ from typing import Any, Literal
 
 from quad_gym import IDS
 from quad_gym.commands.options import (
+    Engine,
     EnvId,
     Keywords,
+    Parameters,
+    Threads,
     flying_options,
     require_at_least,
     usage_errors,
@@ -37,17 +40,14 @@ class Args:
     env_id: EnvId = "QuadGym/Circle-v0"
     algorithm: Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"] = "ppo"
     """reinforcement learning algorithm"""
-    engine: Literal["sb3", "compiled"] = "sb3"
-    """training engine: Stable-Baselines3, or the compiled PPO, which is several times faster
-    and needs no torch"""
+    engine: Engine = "sb3"
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=rtk camera=false"""
     steps: int | None = None
     """number of environment steps; if not given, the recipe's"""
     n_envs: int | None = None
     """number of parallel flights; if not given, the recipe's"""
-    set: Keywords = field(default_factory=dict)
-    """parameters of the algorithm that override the recipe's, such as gamma=0.98"""
+    set: Parameters = field(default_factory=dict)
     seed: int = 0
     """seed of the networks, and of the flights in training and its evaluations; other seeds use
     different flights, and so does quad-gym evaluate"""
@@ -61,8 +61,7 @@ class Args:
     """number of evaluations and checkpoints during the run"""
     episodes: int = 100
     """number of episodes in each evaluation"""
-    threads: int | None = None
-    """number of threads of the flights; if not given, one per core; it does not affect results"""
+    threads: Threads = None
     tensorboard: bool = True
     """write files for TensorBoard, if it is installed"""
     progress: bool = True

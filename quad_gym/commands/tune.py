@@ -26,7 +26,7 @@ from tyro.conf import arg
 from baselines.pd import PDPolicy
 from baselines.seeds import first_seed
 from quad_gym import PDGains, pd_gains
-from quad_gym.analysis.intervals import paired_difference
+from quad_gym.analysis.intervals import in_brackets, paired_difference
 from quad_gym.analysis.reports import (
     columns_of,
     require_writable,
@@ -39,6 +39,7 @@ from quad_gym.commands.options import (
     TRACKING,
     Keywords,
     SuiteName,
+    Threads,
     flying_options,
     full_id,
     known_id,
@@ -83,8 +84,7 @@ class Args:
     """flown at the end, with seeds that the search never saw"""
     seed: int = 0
     """of the search, whose episodes follow from it, and of the first fresh episode"""
-    threads: int | None = None
-    """threads; if not given, one per core"""
+    threads: Threads = None
     output: Path = Path("results/tune")
     """folder for gains and numbers"""
     overwrite: bool = False
@@ -263,10 +263,7 @@ def judge(args: Args, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
         row = [env_id]
         for episodes in (start, tuned):
             row += [f"{1e3 * episodes.mean_error.mean():.1f}", f"{episodes.crashed.mean():.1%}"]
-        text = f"{1e3 * change.spread.mean:+.1f}"
-        if change.interval is not None:
-            text += f" [{1e3 * change.interval.low:+.1f}, {1e3 * change.interval.high:+.1f}]"
-        row.append(text)
+        row.append(in_brackets(change.spread.mean, change.interval, "+.1f", 1e3))
         rows.append(row)
         numbers[env_id] = {name: episodes.summary() for name, episodes in flown.items()}
     cells = ["error [mm]", "crashed"]

@@ -16,7 +16,7 @@ from quad_gym.analysis.comparison_plots import (
     matrix_figure,
     paths_figure,
 )
-from quad_gym.analysis.intervals import mean_interval, paired_difference
+from quad_gym.analysis.intervals import in_brackets, mean_interval, paired_difference
 from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import columns_of, text_table, versions, write_csv, write_json
 from quad_gym.envs.effects import with_effect
@@ -110,7 +110,7 @@ def case_of(suite: str, source: str, *flown_on: str) -> str:
 
 
 @dataclass(frozen=True)
-class Cell:
+class MatrixCell:
     """Cell of the matrix: one number per training seed, (s,)."""
 
     errors: Floats
@@ -124,9 +124,7 @@ class Cell:
 
     def texts(self) -> tuple[str, str, str]:
         """Error and its interval, late error [mm], and crash rate."""
-        error = f"{1e3 * float(np.mean(self.errors)):.1f}"
-        if self.interval is not None:
-            error += f" [{1e3 * self.interval.low:.1f}, {1e3 * self.interval.high:.1f}]"
+        error = in_brackets(float(np.mean(self.errors)), self.interval, ".1f", 1e3)
         late, crashed = float(np.mean(self.late_errors)), float(np.mean(self.crash_rates))
         return error, f"{1e3 * late:.1f}", f"{crashed:.1%}"
 
@@ -142,26 +140,26 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class Matrix:
+class ComparisonResults:
     """Results of a comparison."""
 
     comparison: Comparison
     flown: Mapping[str, Sequence[Flown]]
     """Flights of each training seed, by `case_of`"""
 
-    def cell(self, suite: str, source: str, observation: str) -> Cell:
+    def cell(self, suite: str, source: str, observation: str) -> MatrixCell:
         """Cell of the matrix."""
         episodes = [flown.episodes for flown in self.flown[case_of(suite, source, observation)]]
         errors = np.array([float(each.mean_error.mean()) for each in episodes])
         sample = episodes[0].mean_error if source == "PD" else errors
-        return Cell(
+        return MatrixCell(
             errors,
             np.array([each.summary()["late_error"] for each in episodes]),
             np.array([float(each.crashed.mean()) for each in episodes]),
             mean_interval(sample) if len(sample) > 1 else None,
         )
 
-    def cells(self, suite: str) -> dict[str, list[Cell]]:
+    def cells(self, suite: str) -> dict[str, list[MatrixCell]]:
         """Rows of the matrix of a suite."""
         rows = self.comparison.rows
         return {source: [self.cell(suite, source, on) for on in FLOWN_ON] for source in rows}
@@ -174,14 +172,14 @@ class Matrix:
         ]
 
 
-def matrix_text(matrix: Matrix, suite: str) -> str:
+def matrix_text(matrix: ComparisonResults, suite: str) -> str:
     """Matrix of a sensor suite, for the screen."""
     flown = ["on truth", "on estimate"]
     groups = {"": ["policy"], "mean error [mm]": flown, "second half [mm]": flown, "crashed": flown}
     return text_table(groups, matrix.texts(suite))
 
 
-def conclusions(matrix: Matrix) -> list[str]:
+def conclusions(matrix: ComparisonResults) -> list[str]:
     """Conclusions that the intervals allow."""
     comparison, sentences = matrix.comparison, []
     for suite in comparison.suites:
@@ -236,7 +234,7 @@ def _sentence(first: str, second: str, errors: Floats, others: Floats) -> str:
 # ---- files ---------------------------------------------------------------------------------------
 
 
-def write_report(matrix: Matrix) -> list[Path]:
+def write_report(matrix: ComparisonResults) -> list[Path]:
     """Write numbers, figures and the page; the last file is the page."""
     comparison, trainings = matrix.comparison, matrix.comparison.trainings
     recipe, seconds = comparison.recipe, sum(t.record()["training_seconds"] for t in trainings)
@@ -259,7 +257,7 @@ def write_report(matrix: Matrix) -> list[Path]:
     return report.write()
 
 
-def _write_numbers(matrix: Matrix) -> list[Path]:
+def _write_numbers(matrix: ComparisonResults) -> list[Path]:
     """Write all numbers as CSV, and the summary as JSON."""
     comparison, rows, cells = matrix.comparison, [], []
     for suite, source, observation in product(comparison.suites, comparison.rows, FLOWN_ON):
@@ -290,7 +288,7 @@ def _write_numbers(matrix: Matrix) -> list[Path]:
     ]
 
 
-def _add_figures(report: Report, matrix: Matrix, suite: str) -> None:
+def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
     """Draw learning curves, matrix, errors over time, and paths of a suite."""
     comparison, cells, label = matrix.comparison, matrix.cells(suite), suite_label(suite)
     curves = {}

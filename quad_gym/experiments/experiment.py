@@ -72,7 +72,7 @@ def read_evaluations(folder: Path) -> list[dict[str, float]]:
         return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(stream)]
 
 
-def trainings_of(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path) -> list[Training]:
+def make_trainings(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path) -> list[Training]:
     """Trainings of all cases with all seeds; the first seed of every case is first."""
     return [
         Training(case, plan.replace(seed=seed), folder / "runs" / case / f"seed_{seed}")
@@ -134,7 +134,7 @@ class Experiment(ABC):
     @cached_property
     def trainings(self) -> list[Training]:
         """Trainings, the first seed of every case first."""
-        return trainings_of(self.cases(), self.seeds, self.folder)
+        return make_trainings(self.cases(), self.seeds, self.folder)
 
     def trainings_of(self, case: str) -> list[Training]:
         """Trainings of a case, in the order of the seeds."""

@@ -61,7 +61,7 @@ class Study(Experiment):
             for arm in self.arms
         }
 
-    def results(self) -> "Results":
+    def results(self) -> "StudyResults":
         """Fly all policies, and compute the table."""
         curves = {
             case: [t.curve("return") for t in self.trainings_of(case)] for case in self.cases()
@@ -84,7 +84,7 @@ class Study(Experiment):
 
 
 @dataclass(frozen=True, eq=False)
-class Results:
+class StudyResults:
     """Numbers of a study."""
 
     study: Study
@@ -144,7 +144,7 @@ class Results:
 
 def results_of(
     study: Study, flown: Mapping[str, Sequence[Flown]], curves: Mapping[Any, Any]
-) -> Results:
+) -> StudyResults:
     """Compute the table of a study from its flights and the evaluations of its trainings."""
     rows = {
         arm.name: {
@@ -153,7 +153,7 @@ def results_of(
         }
         for arm in study.arms
     }
-    return Results(study, flown, curves, rows)
+    return StudyResults(study, flown, curves, rows)
 
 
 def _estimated(values: list[NDArray[Any]], score: Score) -> Estimated:

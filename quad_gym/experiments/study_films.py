@@ -24,7 +24,7 @@ from baselines.policies import load_policy
 from quad_gym import FlightRecorder
 from quad_gym.evaluation import roll_out
 from quad_gym.experiments.flown import Flown
-from quad_gym.experiments.study import Results, Study
+from quad_gym.experiments.study import Study, StudyResults
 from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
 from quad_gym.rendering.video import checked_video_path
@@ -52,7 +52,7 @@ class Pair(NamedTuple):
     """Index of the test episode"""
 
 
-def pair_of(results: Results) -> Pair | None:
+def pair_of(results: StudyResults) -> Pair | None:
     """Policies and episode to show; None without `truth` and another trained arm."""
     others = [name for name in results.trained() if name != "truth"]
     if "truth" not in results.trained() or not others:
@@ -63,7 +63,7 @@ def pair_of(results: Results) -> Pair | None:
     return Pair(trainings, _first_away(other) if looks else _first_crash(truth))
 
 
-def label_of(results: Results, name: str) -> str:
+def label_of(results: StudyResults, name: str) -> str:
     """Label of a policy above a figure or a film."""
     return f"trained on {results.arm(name).label}"
 
@@ -93,7 +93,7 @@ def require_film(study: Study, kind: str) -> None:
     checked_video_path(study.folder / f"film.{kind}")
 
 
-def write_film(results: Results, kind: str) -> Path:
+def write_film(results: StudyResults, kind: str) -> Path:
     """Fly the two policies once more, and write the film; returns its path."""
     pair = pair_of(results)
     assert pair is not None
@@ -106,7 +106,7 @@ def write_film(results: Results, kind: str) -> Path:
     )
 
 
-def side_of(results: Results, name: str, k: int, episode: int) -> Side:
+def side_of(results: StudyResults, name: str, k: int, episode: int) -> Side:
     """One test episode of the training with the k-th seed of an arm.
 
     It is flown in a batch of all test episodes, as in the test: in a smaller batch, the matrix

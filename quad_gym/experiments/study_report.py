@@ -1,7 +1,7 @@
 """Report of a study: tables, figures, numbers, and a page."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +10,15 @@ import numpy as np
 from quad_gym import IDS, sensor_suite
 from quad_gym.analysis.comparison_plots import learning_figure
 from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
-from quad_gym.analysis.study_plots import (
-    Glance,
-    Pace,
-    glance_figure,
-    pace_figure,
-)
+from quad_gym.analysis.study_plots import glance_figure, pace_figure
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.experiments.pages import Report
-from quad_gym.experiments.study import Results
+from quad_gym.experiments.study import StudyResults
 from quad_gym.experiments.study_films import CHOICES, label_of, pair_of
 from quad_gym.experiments.study_words import conclusions, number, share
 
 
-def _table(results: Results) -> tuple[tuple[str, ...], list[list[str]]]:
+def _table(results: StudyResults) -> tuple[tuple[str, ...], list[list[str]]]:
     """Headings and rows of the table."""
     columns = results.study.about.table()
 
@@ -38,14 +33,14 @@ def _table(results: Results) -> tuple[tuple[str, ...], list[list[str]]]:
     return ("arm", *(column.heading for column in columns.values())), rows
 
 
-def table_text(results: Results) -> str:
+def table_text(results: StudyResults) -> str:
     """Table for the screen."""
     heads, rows = _table(results)
     flown = "flown on the estimate unless the arm says otherwise"
     return text_table({"": heads[:1], flown: heads[1:]}, rows)
 
 
-def page_text(results: Results) -> str:
+def page_text(results: StudyResults) -> str:
     """Setting, table and conclusions, in Markdown."""
     study, (heads, rows) = results.study, _table(results)
     lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *rows]
@@ -62,7 +57,7 @@ def page_text(results: Results) -> str:
     )
 
 
-def _trainings(results: Results) -> str:
+def _trainings(results: StudyResults) -> str:
     """Number of trainings, if there are any."""
     study = results.study
     if not results.trained():
@@ -70,7 +65,7 @@ def _trainings(results: Results) -> str:
     return f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
 
 
-def write_report(results: Results, film: Path | None = None) -> list[Path]:
+def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
     """Write figures, numbers and pages; the last file is the page, which also shows the film."""
     study, folder = results.study, results.study.folder
     table = folder / "table.md"
@@ -106,7 +101,7 @@ def write_report(results: Results, film: Path | None = None) -> list[Path]:
     return report.write()
 
 
-def _episodes(results: Results) -> Iterator[dict[str, Any]]:
+def _episodes(results: StudyResults) -> Iterator[dict[str, Any]]:
     """Numbers of all episodes, policy by policy."""
     study = results.study
     for arm in study.arms:
@@ -128,7 +123,7 @@ def _episodes(results: Results) -> Iterator[dict[str, Any]]:
             }
 
 
-def _add_figures(report: Report, results: Results) -> None:
+def _add_figures(report: Report, results: StudyResults) -> None:
     """Draw the learning curves, and one episode of two policies."""
     study = results.study
     curves = {results.arm(name).label: results.curves[name] for name in results.trained()}
@@ -149,21 +144,20 @@ def _add_figures(report: Report, results: Results) -> None:
         traces = {trace: recorded[trace][:, pair.episode] for trace in study.about.traced}
         label = label_of(results, name).replace(", ", ",\n")
         episodes[label] = {"time": recorded["time"], **traces}
-    above = "where the vehicle looks" if kind == "glance" else "the speed of the vehicle"
+    if kind == "glance":
+        figure, above = glance_figure(episodes, _half_view(study.env_id)), "where the vehicle looks"
+    else:
+        figure, above = pace_figure(episodes), "the speed of the vehicle"
     report.add_figure(
         kind,
-        _glances(study.env_id, episodes) if kind == "glance" else _paces(episodes),
+        figure,
         f"The same episode, flown on the estimate. Above, {above}; below, "
         f"standard deviation of the filter, and errors. {CHOICES[kind]}",
     )
 
 
-def _glances(env_id: str, episodes: Mapping[str, Mapping[str, Any]]) -> Any:
+def _half_view(env_id: str) -> float:
+    """Half of the horizontal field of view of a task's camera [rad]."""
     camera = sensor_suite(BENCHMARKS[IDS[env_id]].keywords["sensors"]).camera
     assert camera is not None
-    half_view = math.atan(0.5 * camera.image_size[0] / camera.focal_length)
-    return glance_figure({label: Glance(**each) for label, each in episodes.items()}, half_view)
-
-
-def _paces(episodes: Mapping[str, Mapping[str, Any]]) -> Any:
-    return pace_figure({label: Pace(**each) for label, each in episodes.items()})
+    return math.atan(0.5 * camera.image_size[0] / camera.focal_length)

@@ -13,7 +13,7 @@ from quad_gym.experiments.flown import Flown
 
 
 @dataclass(frozen=True, kw_only=True)
-class Column:
+class StudyColumn:
     """Column of the table: one number per episode, and their score."""
 
     heading: str
@@ -38,7 +38,7 @@ class StudiedTask:
     """Function that returns True for successful episodes, (e,)"""
     meaning: str
     """Definition of success in words"""
-    columns: Mapping[str, Column]
+    columns: Mapping[str, StudyColumn]
     """Further columns of the table, by name"""
     telling: str
     """Column that the conclusions quote, in addition to successes and crashes"""
@@ -53,14 +53,14 @@ class StudiedTask:
     film_speed: float = 1.0
     """Seconds of flight per second of a film"""
 
-    def table(self) -> dict[str, Column]:
+    def table(self) -> dict[str, StudyColumn]:
         """Columns of the table by name, in their order."""
-        returns = Column(heading="return", of=lambda run: run.episodes.returns, digits=1)
+        returns = StudyColumn(heading="return", of=lambda run: run.episodes.returns, digits=1)
         return {
             "return": returns,
             "worst": replace(returns, heading="worst tenth", score=worst_tenth),
-            "success": Column(heading="success", of=self.success),
-            "crashed": Column(heading="crashed", of=lambda run: run.episodes.crashed),
+            "success": StudyColumn(heading="success", of=self.success),
+            "crashed": StudyColumn(heading="crashed", of=lambda run: run.episodes.crashed),
             **self.columns,
         }
 
@@ -79,7 +79,9 @@ def passes(run: Flown, gates: int) -> NDArray[np.bool_]:
     return ~run.episodes.crashed & (run.episodes.gates_passed >= gates)
 
 
-_SPEED = Column(heading="mean speed [m/s]", of=lambda run: run.recorded["mean_speed"], digits=2)
+_SPEED = StudyColumn(
+    heading="mean speed [m/s]", of=lambda run: run.recorded["mean_speed"], digits=2
+)
 
 STUDIED: Mapping[str, StudiedTask] = {
     "look_around": StudiedTask(
@@ -95,10 +97,12 @@ STUDIED: Mapping[str, StudiedTask] = {
         meaning="flown to the end, with a mean position error below "
         f"{WITHIN:g} m in the second half",
         columns={
-            "error": Column(
+            "error": StudyColumn(
                 heading="position error [m]", of=lambda run: run.episodes.mean_error, digits=3
             ),
-            "in_view": Column(heading="features in view", of=lambda run: run.recorded["in_view"]),
+            "in_view": StudyColumn(
+                heading="features in view", of=lambda run: run.recorded["in_view"]
+            ),
         },
         telling="error",
         traced=("off_wall", "off_reward", "sigma", "estimation_error", "position_error"),
@@ -114,7 +118,7 @@ STUDIED: Mapping[str, StudiedTask] = {
         success=lambda run: passes(run, 8),
         meaning="all eight gates passed",
         columns={
-            "gates": Column(
+            "gates": StudyColumn(
                 heading="gates passed, of 8", of=lambda run: run.episodes.gates_passed, digits=2
             ),
             "speed": _SPEED,
@@ -131,7 +135,7 @@ STUDIED: Mapping[str, StudiedTask] = {
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",
         columns={
-            "gates": Column(
+            "gates": StudyColumn(
                 heading="gaps passed, of 10", of=lambda run: run.episodes.gates_passed, digits=2
             ),
             "speed": _SPEED,

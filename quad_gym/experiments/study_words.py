@@ -7,8 +7,8 @@ it is larger for an arm that was selected as the best of several by the same num
 
 from collections.abc import Mapping
 
-from quad_gym.analysis.intervals import Estimated, difference
-from quad_gym.experiments.study import Results
+from quad_gym.analysis.intervals import Estimated, difference, in_brackets
+from quad_gym.experiments.study import StudyResults
 
 FEW = 5
 """Number of seeds below which intervals over trainings are wide."""
@@ -16,8 +16,7 @@ FEW = 5
 
 def number(found: Estimated, digits: int) -> str:
     """Number with its interval."""
-    low, high = f"{found.low:.{digits}f}", f"{found.high:.{digits}f}"
-    return f"{found.value:.{digits}f} [{low}, {high}]"
+    return in_brackets(found.value, (found.low, found.high), f".{digits}f")
 
 
 def share(found: Estimated) -> str:
@@ -26,7 +25,7 @@ def share(found: Estimated) -> str:
     return number(scaled, 1 if scaled.value < 10.0 else 0) + " %"
 
 
-def conclusions(results: Results) -> list[str]:
+def conclusions(results: StudyResults) -> list[str]:
     """Conclusions that the intervals allow."""
     found = []
     learned = [name for name in results.trained() if name != "truth"]
@@ -49,12 +48,12 @@ def conclusions(results: Results) -> list[str]:
     return found
 
 
-def _label(results: Results, name: str) -> str:
+def _label(results: StudyResults, name: str) -> str:
     arm = results.arm(name)
     return f'the arm "{arm.label}"' if arm.trained else arm.label
 
 
-def _against_truth(results: Results, best: str) -> list[str]:
+def _against_truth(results: StudyResults, best: str) -> list[str]:
     label = _label(results, best)
     ours, truth = results.rows[best], results.rows["truth"]
     change = difference(ours["success"], truth["success"])
@@ -69,7 +68,9 @@ def _against_truth(results: Results, best: str) -> list[str]:
     ]
 
 
-def _how(results: Results, ours: Mapping[str, Estimated], truth: Mapping[str, Estimated]) -> str:
+def _how(
+    results: StudyResults, ours: Mapping[str, Estimated], truth: Mapping[str, Estimated]
+) -> str:
     """Difference in crashes and in the column of the task that conclusions quote."""
     telling = results.study.about.telling
     crashes = f"It crashes in {share(ours['crashed'])}, compared with {share(truth['crashed'])}"
@@ -89,7 +90,7 @@ def _how(results: Results, ours: Mapping[str, Estimated], truth: Mapping[str, Es
     )
 
 
-def _against_rules(results: Results, best: str) -> str:
+def _against_rules(results: StudyResults, best: str) -> str:
     rule = results.best(results.fixed())
     a, b = results.rows[best]["return"], results.rows[rule]["return"]
     change = difference(a, b)
@@ -103,7 +104,7 @@ def _against_rules(results: Results, best: str) -> str:
     )
 
 
-def _of_pair(results: Results, first: str, second: str) -> str:
+def _of_pair(results: StudyResults, first: str, second: str) -> str:
     chance = results.improvement(first, second)
     a, b = _label(results, first), _label(results, second)
     return (

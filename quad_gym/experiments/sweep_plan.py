@@ -11,7 +11,7 @@ from baselines.plans import Plan
 from baselines.recipes import Recipe, recipe
 from quad_gym import IDS
 from quad_gym.experiments.arms import Arm
-from quad_gym.experiments.experiment import Training, trainings_of
+from quad_gym.experiments.experiment import Training, make_trainings
 from quad_gym.params import checks as check
 
 DEFAULTS: Mapping[str, Any] = {
@@ -93,7 +93,7 @@ def expand(
         if name in cases:
             raise ValueError(f"every value of a sweep must be given once, got {name} twice")
         cases[name] = _plan(spec, env_id, arms.get(arm), chosen, threads)
-    return trainings_of(cases, _seeds(spec["seeds"]), folder)
+    return make_trainings(cases, _seeds(spec["seeds"]), folder)
 
 
 def _seeds(given: Any) -> Sequence[int]:

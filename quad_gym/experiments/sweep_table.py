@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.analysis.intervals import mean_interval, rate_over_trainings
+from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_over_trainings
 from quad_gym.analysis.reports import columns_of, text_table, write_csv
 from quad_gym.experiments.experiment import Training
 
@@ -68,9 +68,9 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
     def cell(row: dict[str, Any], name: str, form: str) -> str:
         if row[name] is None:
             return "-"
-        if row.get(f"{name}_low") is None:
-            return format(row[name], form)
-        return f"{row[name]:{form}} [{row[f'{name}_low']:{form}}, {row[f'{name}_high']:{form}}]"
+        low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+        interval = None if low is None or high is None else (low, high)
+        return in_brackets(row[name], interval, form)
 
     def cells(row: dict[str, Any]) -> list[str]:
         shown = (("mean_error", ".4f"), ("crash_rate", ".1%"), ("return", ".1f"))

@@ -13,26 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.rendering import colors
+from quad_gym.rendering.colors import Color
 from quad_gym.rendering.shrink import halve
 
 Floats = NDArray[np.float64]
-Color = tuple[int, int, int]
-
-WHITE: Color = (255, 255, 255)
-SKY: Color = (250, 251, 253)
-GROUND: Color = (236, 239, 243)
-GRID: Color = (206, 211, 218)
-PALE: Color = (221, 221, 221)
-GREY: Color = (118, 118, 118)
-INK: Color = (34, 34, 34)
-BLUE: Color = (0, 95, 165)
-LIGHT_BLUE: Color = (86, 180, 233)
-VERMILLION: Color = (198, 81, 0)
-GREEN: Color = (0, 145, 80)
-PURPLE: Color = (190, 90, 150)
-PALE_PURPLE: Color = (218, 176, 204)
-"""Colors based on the palette of Okabe and Ito, which people with a color vision deficiency can
-distinguish; they are darker, for contrast on a pale ground, and shifted to remain distinct."""
+Label = tuple[str, Floats, Color]
+"""Text, its place (2,) [pixels], and its color."""
 
 OVERSAMPLING = 2
 _RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
@@ -192,11 +179,17 @@ class Canvas:
         """Brighten a rectangle of the finished picture, for text to stand out."""
         box = (0, 0, round(width), round(height))
         self._layer.set_clip(None)
-        self._layer.fill((*WHITE, 190), box)
+        self._layer.fill((*colors.WHITE, 190), box)
         self.surface.blit(self._layer, (round(left), round(top)), box)
 
     def text(
-        self, words: str, x: float, y: float, size: int, color: Color = INK, anchor: float = 0.0
+        self,
+        words: str,
+        x: float,
+        y: float,
+        size: int,
+        color: Color = colors.INK,
+        anchor: float = 0.0,
     ) -> int:
         """Write a text with its upper left corner at x and y, shifted left by `anchor` widths.
 
@@ -209,9 +202,31 @@ class Canvas:
             self.surface.blit(image, (round(left), round(min(max(y, -_FAR), _FAR))))
         return int(image.get_width())
 
+    def write_labels(
+        self, labels: Sequence[Label], size: int, bottom: float, top: float = -np.inf
+    ) -> None:
+        """Write labels centered at their places, between two heights [pixels]."""
+        for words, at, color in labels:
+            if np.isfinite(at).all() and top < at[1] < bottom - self.line_height(size):
+                self.text(words, at[0], at[1], size, color, 0.5)
+
+    def write_legend(
+        self, entries: Sequence[tuple[str, Color]], x: float, y: float, size: int
+    ) -> float:
+        """Write a legend of lines, and of crosses (purple); returns the height below it."""
+        step = self.line_height(size) + 2
+        for words, color in entries:
+            if color == colors.PURPLE:
+                self.text("x", x + 1, y - 1, size, color)
+            else:
+                self.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
+            self.text(words, x + 15, y, size)
+            y += step
+        return y
+
     def width_of(self, words: str, size: int) -> int:
         """Width of a text [pixels]."""
-        return int(self._word(words, size, INK).get_width())
+        return int(self._word(words, size, colors.INK).get_width())
 
     def fitting(self, wordings: Sequence[str], size: int, width: float) -> str:
         """First of the wordings that is no wider than `width` [pixels], or the last one."""

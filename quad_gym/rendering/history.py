@@ -4,8 +4,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.flights.record import Flight
-from quad_gym.rendering.canvas import BLUE, GREY, INK, PALE, VERMILLION, WHITE, Canvas, Color
-from quad_gym.rendering.strip import Box, Plot, format_length, height_on
+from quad_gym.rendering import colors
+from quad_gym.rendering.canvas import Canvas
+from quad_gym.rendering.colors import Color
+from quad_gym.rendering.strip import (
+    Box,
+    Plot,
+    draw_axes,
+    format_length,
+    height_on,
+    write_axes,
+)
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +34,7 @@ def position_sigma(flight: Flight) -> Floats:
     return np.asarray(np.sqrt(variances.max(axis=1)))
 
 
-class History:
+class ErrorHistory:
     """Plot of errors over a whole episode, up to the last row of a flight.
 
     Args:
@@ -53,10 +62,10 @@ class History:
         self._faulty = flight["faults"] > 0
         self._curves: list[tuple[str, Floats, Color]] = []
         if course is None:
-            self._curves.append(("position error", flight["position_error"], BLUE))
+            self._curves.append(("position error", flight["position_error"], colors.BLUE))
         self._curves += [
-            ("filter sigma", position_sigma(flight), INK),
-            ("estimation error", flight["estimation_error"], VERMILLION),
+            ("filter sigma", position_sigma(flight), colors.INK),
+            ("estimation error", flight["estimation_error"], colors.VERMILLION),
         ]
         label = 10.0 + max(canvas.width_of(words, size - 2) for words in ERRORS.ticks.values())
         top = box.top + canvas.line_height(size) + 12.0
@@ -66,18 +75,11 @@ class History:
     def draw(self, flight: Flight) -> None:
         """Draw axes, faults and curves."""
         canvas, box, place, count = self._canvas, self._box, self._place, len(flight)
-        canvas.box(box.left, box.top, box.width, box.height, WHITE)
+        canvas.box(box.left, box.top, box.width, box.height, colors.WHITE)
         x = place.left + place.width * self._time[:count] / self._end
         for begin, stop in _runs(self._faulty[:count]):
             canvas.box(x[begin], place.top, x[stop - 1] - x[begin], place.height, _FAULT)
-        across = np.array([place.left, place.left + place.width])
-        for tick in ERRORS.ticks:
-            y = np.full(2, height_on(ERRORS, tick, place))
-            canvas.line(np.stack([across, y], axis=1), PALE, 0.6)
-        bottom = place.top + place.height
-        canvas.line(
-            np.array([[across[0], place.top], [across[0], bottom], [across[1], bottom]]), GREY, 0.8
-        )
+        draw_axes(canvas, ERRORS, place)
         stride = -(-count // 480)
         chosen = np.append(np.arange(0, count - 1, stride), count - 1)
         for _, values, color in self._curves:
@@ -88,23 +90,18 @@ class History:
 
     def write(self, flight: Flight) -> None:
         """Write names, present values and ticks, after the canvas is finished."""
-        canvas, box, place, small = self._canvas, self._box, self._place, self._size - 2
+        canvas, box = self._canvas, self._box
         last = len(flight) - 1
         words = [(f"{name} {format_length(values[last])}", c) for name, values, c in self._curves]
         if self._course is not None:
             what, total = self._course
             speed = np.linalg.norm(flight["velocity"][last])
             passed = int(flight["gates_passed"][last])
-            words.insert(0, (f"{passed} of {total} {what}, {speed:.1f} m/s", BLUE))
+            words.insert(0, (f"{passed} of {total} {what}, {speed:.1f} m/s", colors.BLUE))
         for k, (text, color) in enumerate(words):
             x = box.left + 10.0 + k / len(words) * (box.width - 10.0)
             canvas.text(text, x, box.top + 5.0, self._size, color)
-        for tick, text in ERRORS.ticks.items():
-            y = float(height_on(ERRORS, tick, place)) - 0.45 * canvas.line_height(small)
-            canvas.text(text, place.left - 4.0, y, small, GREY, 1.0)
-        y = place.top + place.height + 2.0
-        canvas.text("0 s", place.left, y, small, GREY)
-        canvas.text(f"{self._end:.0f} s", place.left + place.width, y, small, GREY, 1.0)
+        write_axes(canvas, ERRORS, self._place, (0.0, self._end), self._size - 2)
 
 
 def _runs(active: NDArray[np.bool_]) -> list[tuple[int, int]]:

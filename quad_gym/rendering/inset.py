@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.flights.record import Flight
 from quad_gym.records import GateDecision
-from quad_gym.rendering.canvas import GREY, INK, PALE, VERMILLION, WHITE, Canvas
+from quad_gym.rendering import colors
+from quad_gym.rendering.canvas import Canvas
 from quad_gym.rendering.strip import Box
 from quad_gym.rotations import quaternion_to_dcm
 
@@ -67,21 +68,21 @@ class Inset:
     def draw(self, flight: Flight) -> None:
         """Draw measured features as crosses, and features predicted from the estimate as rings."""
         canvas, box, scene, image = self._canvas, self._box, flight.scene, last_image(flight)
-        canvas.box(box.left, box.top, box.width, box.height, WHITE)
+        canvas.box(box.left, box.top, box.width, box.height, colors.WHITE)
         x, y = box.left + box.width / 2, box.top + box.height / 2
-        canvas.line(np.array([[box.left, y], [box.left + box.width, y]]), PALE)
-        canvas.line(np.array([[x, box.top], [x, box.top + box.height]]), PALE)
+        canvas.line(np.array([[box.left, y], [box.left + box.width, y]]), colors.PALE)
+        canvas.line(np.array([[x, box.top], [x, box.top + box.height]]), colors.PALE)
         canvas.inside((box.left, box.top, box.width, box.height))
         q = image["estimated_quaternion"]
         if np.isfinite(q).all():
             predicted = scene.project_features(image["estimated_position"], quaternion_to_dcm(q))
             for at in place_in_inset(predicted, scene, box):
-                canvas.disc(at, 6.0, VERMILLION, 1.5)
+                canvas.disc(at, 6.0, colors.VERMILLION, 1.5)
         places, refused = place_in_inset(image["pixels"], scene, box), rejected_features(image)
-        canvas.crosses(places[~refused], 3.2, INK, 1.6)
-        canvas.crosses(places[refused], 3.2, GREY, 1.6)
+        canvas.crosses(places[~refused], 3.2, colors.INK, 1.6)
+        canvas.crosses(places[refused], 3.2, colors.GREY, 1.6)
         canvas.inside(None)
-        canvas.box(box.left, box.top, box.width, box.height, GREY, 1.0)
+        canvas.box(box.left, box.top, box.width, box.height, colors.GREY, 1.0)
 
     def write(self, flight: Flight) -> None:
         """Write a title and the numbers of the features."""
@@ -94,7 +95,9 @@ class Inset:
         words = canvas.fitting(wordings, size, box.width - 4.0)
         width = canvas.width_of(words, size)
         canvas.veil(box.left, top, width + 8, canvas.line_height(size))
-        canvas.text(words, box.left + 4.0, top + 1.0, size, INK if seen.any() else GREY)
+        canvas.text(
+            words, box.left + 4.0, top + 1.0, size, colors.INK if seen.any() else colors.GREY
+        )
         if len(seen) <= 4:
             for k in np.flatnonzero(seen):
                 x, y = place_in_inset(image["pixels"][k], flight.scene, box)

@@ -10,15 +10,9 @@ from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.flights.record import Flight
 from quad_gym.params import checks as check
 from quad_gym.records import FaultKind, FilterStatus, GateDecision
-from quad_gym.rendering.canvas import (
-    BLUE,
-    GREEN,
-    INK,
-    PURPLE,
-    VERMILLION,
-    Canvas,
-    Color,
-)
+from quad_gym.rendering import colors
+from quad_gym.rendering.canvas import Canvas
+from quad_gym.rendering.colors import Color
 from quad_gym.rendering.geometry import View, chase_view, fixed_view
 from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.scene import Scene, ellipsoid_scale
@@ -80,9 +74,7 @@ class Renderer:
         self._strip.draw(flight)
         canvas.finish()
 
-        for words, at, color in labels:
-            if np.isfinite(at).all() and at[1] < self._scene_height - canvas.line_height(small):
-                canvas.text(words, at[0], at[1], small, color, 0.5)
+        canvas.write_labels(labels, small, self._scene_height)
         if inset is not None:
             inset.write(flight)
         self._strip.write(flight)
@@ -122,18 +114,18 @@ class Renderer:
         title = f"{name} on {_SEEN[scene.observation]}"
         aim = "reference, next second" if scene.reference_period else "reference"
         aim = "next gate" if len(scene.gates_I) else aim
-        entries: list[tuple[str, Color]] = [(aim, GREEN), ("truth", BLUE)]
+        entries: list[tuple[str, Color]] = [(aim, colors.GREEN), ("truth", colors.BLUE)]
         if flight.estimated:
             scale = ellipsoid_scale(flight)
             size = "3-sigma ellipsoid, true size"
             size = size if scale == 1.0 else f"3-sigma ellipsoid, error, drawn x {scale:g}"
-            entries += [("estimate", VERMILLION), (size, VERMILLION)]
+            entries += [("estimate", colors.VERMILLION), (size, colors.VERMILLION)]
             if scene.has_gnss:
                 refused = (flight.rows["gnss_decision"][:, 0] == GateDecision.REJECTED).any()
                 words = "GNSS fix (gray: rejected)" if refused else "GNSS fix"
-                entries.append((words, PURPLE))
+                entries.append((words, colors.PURPLE))
         elif scene.observation == "noisy":
-            entries.append(("observed position", VERMILLION))
+            entries.append(("observed position", colors.VERMILLION))
         policy, warnings = flight.about.get("policy"), self._warnings(flight)
         flown_by = [f"flown by {short_name(str(policy))}"] if policy else []
         lines = [title, *flown_by, *[words for words, _ in entries], *warnings]
@@ -146,18 +138,12 @@ class Renderer:
         canvas.veil(6, 6, width, 8 + canvas.line_height(large) + step * (len(lines) - 1))
         x, y = 12.0, 9.0
         canvas.text(title, x, y, large)
-        canvas.text(clock, 6 + width - 6, y, large, INK, 1.0)
+        canvas.text(clock, 6 + width - 6, y, large, colors.INK, 1.0)
         y += canvas.line_height(large) + 2
         for words in flown_by:
             canvas.text(words, x, y, small)
             y += step
-        for words, color in entries:
-            if color == PURPLE:
-                canvas.text("x", x + 1, y - 1, small, color)
-            else:
-                canvas.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
-            canvas.text(words, x + 15, y, small, INK)
-            y += step
+        y = canvas.write_legend(entries, x, y, small)
         for words in warnings:
             canvas.text(words, x, y, small)
             y += step

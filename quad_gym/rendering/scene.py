@@ -5,27 +5,9 @@ from numpy.typing import NDArray
 
 from quad_gym.flights.record import Flight
 from quad_gym.records import GateDecision
-from quad_gym.rendering.canvas import (
-    BLUE,
-    GREEN,
-    GREY,
-    GRID,
-    GROUND,
-    INK,
-    LIGHT_BLUE,
-    PALE,
-    PALE_PURPLE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    WHITE,
-    Canvas,
-)
-from quad_gym.rendering.geometry import (
-    View,
-    ellipsoid_axes,
-    ellipsoid_outline,
-)
+from quad_gym.rendering import colors
+from quad_gym.rendering.canvas import Canvas, Label
+from quad_gym.rendering.geometry import View, ellipsoid_axes, ellipsoid_outline
 from quad_gym.rendering.inset import last_image
 from quad_gym.rendering.solids import faces_of
 from quad_gym.rotations import quaternion_to_dcm
@@ -63,9 +45,6 @@ EDGES = (
     *((2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7)),
 )
 """Edges of a box whose corners are numbered in binary: x, y, z."""
-
-Label = tuple[str, Floats, tuple[int, int, int]]
-"""Text, its position (2,) and its color."""
 
 
 def ellipsoid_scale(flight: Flight) -> float:
@@ -118,7 +97,7 @@ class Scene:
     def draw(self) -> list[Label]:
         """Draw the rest from back to front; return the labels to write when all is drawn."""
         for tip, name in ((1.15, 0.0, 0.0), "E"), ((0.0, 1.15, 0.0), "N"):
-            self.labels.append((name, self._view.project(np.array(tip))[0], GREY))
+            self.labels.append((name, self._view.project(np.array(tip))[0], colors.GREY))
         self._reference()
         self._gates()
         self._fence()
@@ -142,18 +121,18 @@ class Scene:
         wide = bool((np.abs(self._scene.obstacles[:, 1:3]) > n).any())
         if self._moving or wide:  # an infinite plane, with the grid around the vehicle
             shift[:2] = self._spacing * np.round(self._now["position"][:2] / self._spacing)
-            canvas.clear(SKY, bottom=view.horizon)
-            canvas.clear(GROUND, top=view.horizon)
+            canvas.clear(colors.SKY, bottom=view.horizon)
+            canvas.clear(colors.GROUND, top=view.horizon)
         else:
-            canvas.clear(SKY)
+            canvas.clear(colors.SKY)
             corners = n * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
             border = view.segments(corners, np.roll(corners, -1, axis=0))
-            canvas.polygon(border.reshape(-1, 2), GROUND)
+            canvas.polygon(border.reshape(-1, 2), colors.GROUND)
         starts, ends = self._spacing * _GRID + shift
-        canvas.segments(view.segments(starts, ends), GRID)
+        canvas.segments(view.segments(starts, ends), colors.GRID)
         origin = np.zeros((2, 3))
         tips = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        canvas.segments(view.segments(origin, tips), GREY, 1.6)
+        canvas.segments(view.segments(origin, tips), colors.GREY, 1.6)
 
     def _reference(self) -> None:
         scene, view, canvas = self._scene, self._view, self._canvas
@@ -164,19 +143,19 @@ class Scene:
             return
         if scene.reference_period:
             ahead = np.linspace(now, now + AHEAD_SECONDS, 24)
-            canvas.line(view.project(scene.reference(ahead))[0], GREEN, 3.0)
+            canvas.line(view.project(scene.reference(ahead))[0], colors.GREEN, 3.0)
         at, _ = view.project(self._now["reference_position"])
-        canvas.disc(at, 5.0, WHITE)
-        canvas.disc(at, 5.0, GREEN, 2.0)
+        canvas.disc(at, 5.0, colors.WHITE)
+        canvas.disc(at, 5.0, colors.GREEN, 2.0)
 
     def _path(self, points: Floats) -> None:
-        self._canvas.dashes(self._view.project(points)[0], GREY, 1.2)
+        self._canvas.dashes(self._view.project(points)[0], colors.GREY, 1.2)
 
     def _gates(self) -> None:
         view, canvas = self._view, self._canvas
         passed = int(self._now["gates_passed"])
         for k, gate in enumerate(self._scene.gates_I):
-            color = PALE if k < passed else GREEN if k == passed else GREY
+            color = colors.PALE if k < passed else colors.GREEN if k == passed else colors.GREY
             sphere = self._scene.gate_radius * np.eye(3)
             outline = ellipsoid_outline(gate, sphere, view)
             foot = np.array([[gate[0], gate[1], 0.0]])
@@ -185,7 +164,7 @@ class Scene:
             if k == passed:
                 canvas.polygon(outline, color, 0.15)
             canvas.line(outline, color, 2.5 if k == passed else 1.5, closed=True)
-            ink = GREY if k < passed else INK
+            ink = colors.GREY if k < passed else colors.INK
             self.labels.append((str(k + 1), view.project(gate)[0] - (0.0, 6.0), ink))
 
     def _obstacles(self, before_vehicle: bool) -> None:
@@ -206,9 +185,9 @@ class Scene:
             is_round = any(len(face) > 4 for face in faces)
             for face in faces:
                 outline = view.outline(face)
-                canvas.polygon(outline, GREY, GLASS if before_vehicle else SOLID)
+                canvas.polygon(outline, colors.GREY, GLASS if before_vehicle else SOLID)
                 if len(face) > 4 or not is_round:
-                    canvas.line(outline, GREY, 1.2, closed=True)
+                    canvas.line(outline, colors.GREY, 1.2, closed=True)
 
     def _fence(self) -> None:
         """Draw the edges of the geofence."""
@@ -217,14 +196,16 @@ class Scene:
             corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
             places = np.where(corners == 0, fence[0], fence[1])
             a, b = np.array(EDGES).T
-            self._canvas.segments(self._view.segments(places[a], places[b]), PALE, 1.0)
+            self._canvas.segments(self._view.segments(places[a], places[b]), colors.PALE, 1.0)
 
     def _shadow(self) -> None:
         r_I = np.array(self._now["position"])
         foot = r_I * (1.0, 1.0, 0.0)
         if r_I[2] > 0.0:
-            self._canvas.polygon(self._view.project(foot + 0.22 * _RING)[0], GREY, 0.35)
-            self._canvas.segments(self._view.segments(foot[np.newaxis], r_I[np.newaxis]), GREY, 0.7)
+            self._canvas.polygon(self._view.project(foot + 0.22 * _RING)[0], colors.GREY, 0.35)
+            self._canvas.segments(
+                self._view.segments(foot[np.newaxis], r_I[np.newaxis]), colors.GREY, 0.7
+            )
 
     def _trail(self, column: str) -> Floats:
         """Pixels of a position over the last seconds, evenly subsampled."""
@@ -237,8 +218,8 @@ class Scene:
 
     def _trails(self) -> None:
         if self._flight.estimated:
-            self._canvas.line(self._trail("estimated_position"), VERMILLION, 2.6)
-        self._canvas.line(self._trail("position"), BLUE, 1.5)
+            self._canvas.line(self._trail("estimated_position"), colors.VERMILLION, 2.6)
+        self._canvas.line(self._trail("position"), colors.BLUE, 1.5)
 
     # ---- sensors ------------------------------------------------------------------------------
 
@@ -254,14 +235,14 @@ class Scene:
         apex = np.repeat(corners[:1], 4, axis=0)
         image = view.segments(corners[1:], np.roll(corners[1:], -1, axis=0))
         if len(image) == 4 and not self._moving:  # from near it would hide too much
-            canvas.polygon(image[:, 0], LIGHT_BLUE, 0.14)
-        canvas.segments(view.segments(apex, corners[1:]), LIGHT_BLUE)
-        canvas.segments(image, LIGHT_BLUE, 1.3)
+            canvas.polygon(image[:, 0], colors.LIGHT_BLUE, 0.14)
+        canvas.segments(view.segments(apex, corners[1:]), colors.LIGHT_BLUE)
+        canvas.segments(image, colors.LIGHT_BLUE, 1.3)
         seen = np.isfinite(last_image(self._flight)["pixels"]).all(axis=1)
         features = scene.features_I
         if seen.any():
             eye = np.repeat(corners[:1], seen.sum(), axis=0)
-            canvas.segments(view.segments(eye, features[seen]), LIGHT_BLUE, 1.4)
+            canvas.segments(view.segments(eye, features[seen]), colors.LIGHT_BLUE, 1.4)
         self._features(seen)
 
     def _features(self, seen: NDArray[np.bool_]) -> None:
@@ -270,8 +251,8 @@ class Scene:
         for at, visible in zip(places, seen, strict=True):
             if np.isfinite(at).all():
                 x, y = at
-                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, INK if visible else WHITE)
-                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, INK, 1.2)
+                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, colors.INK if visible else colors.WHITE)
+                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, colors.INK, 1.2)
 
     def _fixes(self) -> None:
         rows = self._flight.rows[-max(1, round(FIX_SECONDS * self._scene.control_rate)) :]
@@ -284,10 +265,14 @@ class Scene:
         refused = rows["gnss_decision"][measured, 0] == GateDecision.REJECTED
         stride = -(-len(places) // 40)
         old = ages > 0.5 * FIX_SECONDS
-        for color, which in ((PALE_PURPLE, old), (PURPLE, ~old), (GREY, refused)):
-            chosen = which if color == GREY else which & ~refused
+        for color, which in (
+            (colors.PALE_PURPLE, old),
+            (colors.PURPLE, ~old),
+            (colors.GREY, refused),
+        ):
+            chosen = which if color == colors.GREY else which & ~refused
             self._canvas.crosses(places[chosen][::stride], 2.6, color, 1.3)
-        color = GREY if refused[-1] else PURPLE
+        color = colors.GREY if refused[-1] else colors.PURPLE
         self._canvas.crosses(places[-1:], 4.0, color, 2.0)
         if ages[-1] < 0.3 and len(places) < 0.5 * FIX_SECONDS * self._scene.control_rate:
             radius = 6.0 + 40.0 * float(ages[-1])
@@ -313,17 +298,17 @@ class Scene:
             scale = ellipsoid_scale(self._flight) if self._magnified else 1.0
             axes = scale * ellipsoid_axes(self._now["covariance"][:3, :3], SIGMAS)
             outline = ellipsoid_outline(believed, axes, view)
-            canvas.polygon(outline, VERMILLION, 0.16)
-            canvas.line(outline, VERMILLION, 1.2, closed=True)
-            canvas.segments(view.segments(believed - axes, believed + axes), VERMILLION, 0.8)
+            canvas.polygon(outline, colors.VERMILLION, 0.16)
+            canvas.line(outline, colors.VERMILLION, 1.2, closed=True)
+            canvas.segments(view.segments(believed - axes, believed + axes), colors.VERMILLION, 0.8)
         self._body(np.array(believed), self._attitude(attitude), ghost=True)
         if self._flight.estimated and scale > 1.0:
             # the error has the scale of the ellipsoid, which shows if the truth is inside
             error = believed + scale * (self._now["position"] - believed)
-            canvas.segments(view.segments(believed[np.newaxis], error[np.newaxis]), INK, 1.4)
+            canvas.segments(view.segments(believed[np.newaxis], error[np.newaxis]), colors.INK, 1.4)
             at = view.project(error)[0]
-            canvas.disc(at, 4.0, WHITE)
-            canvas.disc(at, 2.8, INK)
+            canvas.disc(at, 4.0, colors.WHITE)
+            canvas.disc(at, 2.8, colors.INK)
 
     def _vehicle(self) -> None:
         self._body(np.array(self._now["position"]), self._R_BI, ghost=False)
@@ -334,28 +319,28 @@ class Scene:
         hubs_B = scene.rotor_positions_B
         hubs = r_I + hubs_B @ R_BI
         thickness = float(np.clip(0.035 * view.scale_at(r_I), 1.6, 6.0))
-        color = VERMILLION if ghost else BLUE
+        color = colors.VERMILLION if ghost else colors.BLUE
         middle = np.repeat(r_I[np.newaxis], len(hubs), axis=0)
         arms = view.segments(middle, hubs)
         if ghost:
             canvas.segments(arms, color, 1.2)
         else:
-            canvas.segments(arms, INK, thickness)
+            canvas.segments(arms, colors.INK, thickness)
         speeds = np.nan_to_num(self._now["rotor_speeds"]) / scene.max_rotor_speed
         discs = view.project(hubs[:, np.newaxis] + (ROTOR_RADIUS * _RING) @ R_BI)[0]
         for disc, hub_B, speed in zip(discs, hubs_B, speeds, strict=True):
             front = hub_B[0] > 1e-9
             if not ghost:
-                canvas.polygon(disc, BLUE, float(np.clip(0.1 + 0.9 * speed, 0.1, 0.7)))
-            canvas.line(disc, color if ghost or front else INK, 1.2 if ghost else 1.4)
+                canvas.polygon(disc, colors.BLUE, float(np.clip(0.1 + 0.9 * speed, 0.1, 0.7)))
+            canvas.line(disc, color if ghost or front else colors.INK, 1.2 if ghost else 1.4)
 
     def _axes(self) -> None:
         r_I, view = self._now["position"], self._view
         near = view.scale_at(np.array(r_I)) > 120.0
         tips = r_I + 0.42 * self._R_BI
         origin = np.repeat(r_I[np.newaxis], 3, axis=0)
-        self._canvas.segments(view.segments(origin, tips), INK, 1.5)
+        self._canvas.segments(view.segments(origin, tips), colors.INK, 1.5)
         places = view.project(r_I + 0.5 * self._R_BI)[0] - (0.0, 5.0)
         for name, at in zip("xyz", places, strict=True):
             if near or name == "x":
-                self.labels.append((name, at, INK))
+                self.labels.append((name, at, colors.INK))

@@ -3,13 +3,14 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from quad_gym.kernels.compiling import entry
 
 _EVEN, _HALF = np.uint32(0x00FF00FF), np.uint32(0x00020002)
 _TWO, _EIGHT = np.uint32(2), np.uint32(8)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@entry
 def halve(large: Any, small: Any) -> None:
     """Write the rounded means of two by two pixels.
 

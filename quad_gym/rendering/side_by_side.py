@@ -9,20 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.flights.record import Flight
-from quad_gym.rendering.canvas import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    LIGHT_BLUE,
-    PURPLE,
-    VERMILLION,
-    WHITE,
-    Canvas,
-    Color,
-)
+from quad_gym.rendering import colors
+from quad_gym.rendering.canvas import Canvas
+from quad_gym.rendering.colors import Color
 from quad_gym.rendering.geometry import View, course_view, fixed_view
-from quad_gym.rendering.history import History
+from quad_gym.rendering.history import ErrorHistory
 from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.renderer import active_faults
 from quad_gym.rendering.scene import Scene
@@ -114,7 +105,7 @@ class SideBySide:
         """Draw a picture (height, width, 3) of red, green, blue at a time [s]."""
         parts = [half.draw(time) for half in self._halves]
         for part in parts[1:]:
-            part[:, :2] = GREY
+            part[:, :2] = colors.GREY
         return np.concatenate(parts, axis=1)
 
 
@@ -127,7 +118,7 @@ class _Half:
         self._canvas = Canvas(width, height)
         self._scene = Box(0.0, _BAND, width, height - _BAND - _PLOT)
         plot = Box(0.0, height - _PLOT, width, _PLOT)
-        self._history = History(self._canvas, plot, side.flight, end, _SMALL, side.course)
+        self._history = ErrorHistory(self._canvas, plot, side.flight, end, _SMALL, side.course)
         self._fixed: View | None = None
 
     def draw(self, time: float) -> NDArray[np.uint8]:
@@ -135,7 +126,7 @@ class _Half:
         canvas, box, width = self._canvas, self._scene, SIDE[0]
         flight = self._side.flight.until(time)
         view = self._view(flight)
-        canvas.clear(WHITE)
+        canvas.clear(colors.WHITE)
         canvas.inside((box.left, box.top, box.width, box.height))
         scene = Scene(
             *(canvas, flight, view, self._moves),
@@ -154,10 +145,7 @@ class _Half:
         canvas.box(0.0, 0.0, width, _BAND, self._tint)
         self._history.draw(flight)
         canvas.finish()
-        for words, at, color in labels:
-            inside = box.top < at[1] < box.top + box.height - canvas.line_height(15)
-            if np.isfinite(at).all() and inside:
-                canvas.text(words, at[0], at[1], 15, color, 0.5)
+        canvas.write_labels(labels, 15, box.top + box.height, box.top)
         if inset is not None:
             inset.write(flight)
         self._write_label(flight)
@@ -187,8 +175,10 @@ class _Half:
         """Mark truth and estimate where they are hardly visible."""
         now = flight.rows[-1]
         if view.scale_at(np.array(now["position"])) < _FAR:
-            self._canvas.disc(view.project(now["estimated_position"])[0], 6.0, VERMILLION, 2.0)
-            self._canvas.disc(view.project(now["position"])[0], 4.0, BLUE)
+            self._canvas.disc(
+                view.project(now["estimated_position"])[0], 6.0, colors.VERMILLION, 2.0
+            )
+            self._canvas.disc(view.project(now["position"])[0], 4.0, colors.BLUE)
 
     def _wedge(self, flight: Flight, view: View) -> None:
         """Draw a horizontal slice of the camera's field of view, up to `WEDGE`."""
@@ -196,8 +186,8 @@ class _Half:
         R_BI = quaternion_to_dcm(now["quaternion"])
         apex, a, b, c, d = flight.scene.frustum_corners(now["position"], R_BI, WEDGE)
         outline = view.outline(np.stack([apex, (a + d) / 2, (b + c) / 2]))
-        self._canvas.polygon(outline, LIGHT_BLUE, 0.25)
-        self._canvas.line(outline, LIGHT_BLUE, 1.0, closed=True)
+        self._canvas.polygon(outline, colors.LIGHT_BLUE, 0.25)
+        self._canvas.line(outline, colors.LIGHT_BLUE, 1.0, closed=True)
 
     def _write_label(self, flight: Flight) -> None:
         canvas, width = self._canvas, SIDE[0]
@@ -209,31 +199,27 @@ class _Half:
         for line in lines:
             canvas.text(line, 10.0, y, _TEXT)
             y += step
-        canvas.text(clock, width - 10.0, 0.5 * (_BAND - step) + 2.0, _TEXT, INK, 1.0)
+        canvas.text(clock, width - 10.0, 0.5 * (_BAND - step) + 2.0, _TEXT, colors.INK, 1.0)
 
     def _write_legend(self, flight: Flight) -> None:
         """Write legend and warnings in the upper left corner of the scene."""
         canvas, scene = self._canvas, flight.scene
-        entries: list[tuple[str, Color]] = [("truth", BLUE), ("estimate, 3 sigma", VERMILLION)]
+        entries: list[tuple[str, Color]] = [
+            ("truth", colors.BLUE),
+            ("estimate, 3 sigma", colors.VERMILLION),
+        ]
         if not self._moves:
-            entries.append(("next gate" if len(scene.gates_I) else "reference", GREEN))
+            entries.append(("next gate" if len(scene.gates_I) else "reference", colors.GREEN))
         if scene.has_gnss:
-            entries.append(("GNSS fix", PURPLE))
+            entries.append(("GNSS fix", colors.PURPLE))
         step = canvas.line_height(_SMALL) + 2
         top = _BAND + 6.0
         faults = [f"fault: {name}" for name in active_faults(flight)]
         widths = [canvas.width_of(words, _SMALL) for words in [w for w, _ in entries] + faults]
         canvas.veil(6, top, max(widths) + 28, step * (len(entries) + len(faults)) + 4)
-        y = top + 3.0
-        for words, color in entries:
-            if color == PURPLE:
-                canvas.text("x", 14.0, y - 1.0, _SMALL, color)
-            else:
-                canvas.surface.fill(color, (12, round(y + 0.3 * step), 11, 5))
-            canvas.text(words, 28.0, y, _SMALL)
-            y += step
+        y = canvas.write_legend(entries, 12.0, top + 3.0, _SMALL)
         for words in faults:
-            canvas.text(words, 12.0, y, _SMALL, VERMILLION)
+            canvas.text(words, 12.0, y, _SMALL, colors.VERMILLION)
             y += step
 
     def _write_end(self) -> None:
@@ -242,9 +228,9 @@ class _Half:
         words, height = self._side.last_words(), canvas.line_height(_TEXT) + 8
         width = canvas.width_of(words, _TEXT) + 24
         left, top = 0.5 * (box.width - width), box.top + box.height - height - 8.0
-        color = VERMILLION if self._side.crashed else GREEN
+        color = colors.VERMILLION if self._side.crashed else colors.GREEN
         canvas.surface.fill(color, (round(left), round(top), width, height))
-        canvas.text(words, 0.5 * box.width, top + 4.0, _TEXT, WHITE, 0.5)
+        canvas.text(words, 0.5 * box.width, top + 4.0, _TEXT, colors.WHITE, 0.5)
 
 
 def _wrapped(canvas: Canvas, words: str, size: int, width: float) -> list[str]:

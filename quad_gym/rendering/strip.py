@@ -8,17 +8,9 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import STATE_DIMENSION, Interval, chi_square_band
 from quad_gym.flights.record import Flight
-from quad_gym.rendering.canvas import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    PALE,
-    VERMILLION,
-    WHITE,
-    Canvas,
-    Color,
-)
+from quad_gym.rendering import colors
+from quad_gym.rendering.canvas import Canvas
+from quad_gym.rendering.colors import Color
 
 Floats = NDArray[np.float64]
 
@@ -50,14 +42,17 @@ class Plot:
 
 
 ERRORS = Plot(
-    (("position_error", "tracking", BLUE), ("estimation_error", "estimation", VERMILLION)),
+    (
+        ("position_error", "tracking", colors.BLUE),
+        ("estimation_error", "estimation", colors.VERMILLION),
+    ),
     low=3e-4,
     high=6.0,
     ticks={1e-3: "1 mm", 1e-2: "1 cm", 1e-1: "10 cm", 1.0: "1 m"},
     share=0.47,
 )
 CONSISTENCY = Plot(
-    (("nees", "NEES", INK),),
+    (("nees", "NEES", colors.INK),),
     low=1.0,
     high=2000.0,
     ticks={1.0: "1", 10.0: "10", 100.0: "100", 1e3: "1000"},
@@ -97,6 +92,28 @@ def shows(flight: Flight, column: str) -> bool:
     return column != "estimation_error" or flight.scene.observation != "truth"
 
 
+def draw_axes(canvas: Canvas, plot: Plot, place: Box) -> None:
+    """Draw the lines of the ticks, and the axes to the left and below."""
+    right, bottom = place.left + place.width, place.top + place.height
+    for tick in plot.ticks:
+        y = height_on(plot, tick, place)
+        canvas.line(np.array([[place.left, y], [right, y]]), colors.PALE, 0.6)
+    corners = [[place.left, place.top], [place.left, bottom], [right, bottom]]
+    canvas.line(np.array(corners), colors.GREY, 0.8)
+
+
+def write_axes(
+    canvas: Canvas, plot: Plot, place: Box, span: tuple[float, float], size: int
+) -> None:
+    """Write the ticks, and the first and last time [s] below."""
+    for tick, words in plot.ticks.items():
+        y = float(height_on(plot, tick, place)) - 0.45 * canvas.line_height(size)
+        canvas.text(words, place.left - 4.0, y, size, colors.GREY, 1.0)
+    y = place.top + place.height + 1.0
+    canvas.text(f"{span[0]:.0f} s", place.left, y, size, colors.GREY)
+    canvas.text(f"{span[1]:.0f} s", place.left + place.width, y, size, colors.GREY, 1.0)
+
+
 class Strip:
     """Strip for the last row of a flight.
 
@@ -123,9 +140,9 @@ class Strip:
     def draw_background(self, hover_share: float) -> None:
         """Draw boxes, axes and bands; `hover_share` is the hover speed over the largest speed."""
         box, canvas = self._box, self._canvas
-        canvas.box(box.left, box.top, box.width, box.height, WHITE)
+        canvas.box(box.left, box.top, box.width, box.height, colors.WHITE)
         edge = np.array([[box.left, box.top], [box.left + box.width, box.top]])
-        canvas.line(edge, GREY)
+        canvas.line(edge, colors.GREY)
         for plot, place in zip(PLOTS, self._boxes, strict=True):
             self._draw_axes(plot, place)
         place = self._rotors
@@ -134,7 +151,7 @@ class Strip:
             canvas.box(left, place.top, 0.15 * place.width, place.height, (238, 241, 245))
         y = place.top + place.height * (1.0 - hover_share)
         hover = np.array([[place.left, y], [place.left + place.width, y]])
-        canvas.dashes(hover, INK, 1.0, 4.0, 3.0)
+        canvas.dashes(hover, colors.INK, 1.0, 4.0, 3.0)
 
     def draw(self, flight: Flight) -> None:
         """Draw the curves and the rotors."""
@@ -145,7 +162,9 @@ class Strip:
         speeds = flight.rows["rotor_speeds"][-1] / flight.scene.max_rotor_speed
         for k, speed in enumerate(np.clip(np.nan_to_num(speeds), 0.0, 1.0)):
             left, height = place.left + (k + 0.25) * place.width / 4, speed * place.height
-            canvas.box(left, place.top + place.height - height, 0.125 * place.width, height, BLUE)
+            canvas.box(
+                left, place.top + place.height - height, 0.125 * place.width, height, colors.BLUE
+            )
 
     def write(self, flight: Flight) -> None:
         """Write titles, numbers and ticks, after the canvas is finished."""
@@ -161,17 +180,15 @@ class Strip:
             if plot is CONSISTENCY and flight.estimated:
                 words = f"({STATE_DIMENSION} if consistent)"
                 if x + canvas.width_of(words, small) < place.left + place.width:
-                    canvas.text(words, x, self._title_y + 1, small, GREY)
-            for tick, words in plot.ticks.items():
-                y = float(height_on(plot, tick, place)) - 0.45 * canvas.line_height(small)
-                canvas.text(words, place.left - 4.0, y, small, GREY, 1.0)
-            self._write_times(place, now["time"], small)
+                    canvas.text(words, x, self._title_y + 1, small, colors.GREY)
+            begin = max(0.0, now["time"] - WINDOW_SECONDS)
+            write_axes(canvas, plot, place, (begin, begin + WINDOW_SECONDS), small)
         place = self._rotors
         words = canvas.fitting(("rotor speeds", "rotors"), self._size, place.width)
         canvas.text(words, place.left, self._title_y, self._size)
         for k in range(4):
             x = place.left + (k + 0.5) * place.width / 4
-            canvas.text(str(k + 1), x, place.top + place.height + 1.0, small, GREY, 0.5)
+            canvas.text(str(k + 1), x, place.top + place.height + 1.0, small, colors.GREY, 0.5)
 
     def _titles(self, flight: Flight, plot: Plot, *, named: bool = True) -> list[tuple[str, Color]]:
         """Names of a plot's curves with their last values, or the values alone."""
@@ -179,7 +196,7 @@ class Strip:
         roomy = self._canvas.width_of("0" * 45, self._size - 2) < self._boxes[0].width
         for column, name, color in plot.curves:
             if not shows(flight, column):
-                found.append(("no filter runs" if plot is CONSISTENCY else "", GREY))
+                found.append(("no filter runs" if plot is CONSISTENCY else "", colors.GREY))
                 continue
             value = float(flight.rows[-1][column])
             number = f"{value:.0f}" if plot is CONSISTENCY else format_length(value)
@@ -191,27 +208,15 @@ class Strip:
             found.append((words if named or plot is CONSISTENCY else number, color))
         return found
 
-    def _write_times(self, place: Box, now: float, size: int) -> None:
-        y = place.top + place.height + 1.0
-        begin = max(0.0, now - WINDOW_SECONDS)
-        self._canvas.text(f"{begin:.0f} s", place.left, y, size, GREY)
-        right = place.left + place.width
-        self._canvas.text(f"{begin + WINDOW_SECONDS:.0f} s", right, y, size, GREY, 1.0)
-
     def _draw_axes(self, plot: Plot, place: Box) -> None:
         canvas = self._canvas
-        across = np.array([place.left, place.left + place.width])
         if plot is CONSISTENCY:
+            across = np.array([place.left, place.left + place.width])
             low, high = (float(height_on(plot, x, place)) for x in nees_band())
             canvas.box(place.left, high, place.width, low - high, (214, 236, 229))
             middle = height_on(plot, float(STATE_DIMENSION), place)
-            canvas.dashes(np.stack([across, np.full(2, middle)], axis=1), GREEN, 0.8)
-        for tick in plot.ticks:
-            y = np.full(2, height_on(plot, tick, place))
-            canvas.line(np.stack([across, y], axis=1), PALE, 0.6)
-        axes = [[across[0], place.top], [across[0], place.top + place.height]]
-        axes.append([across[1], place.top + place.height])
-        canvas.line(np.array(axes), GREY, 0.8)
+            canvas.dashes(np.stack([across, np.full(2, middle)], axis=1), colors.GREEN, 0.8)
+        draw_axes(canvas, plot, place)
 
     def _draw_curves(self, plot: Plot, place: Box, flight: Flight, rows: NDArray[np.void]) -> None:
         begin = max(0.0, float(rows["time"][-1]) - WINDOW_SECONDS)

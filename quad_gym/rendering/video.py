@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.flights.record import Flight, FlightRecorder
 from quad_gym.params import checks as check
 from quad_gym.rendering.renderer import Renderer, checked_size
@@ -62,18 +63,41 @@ def flight_of(
         raise ValueError("env must be a QuadGym vector environment of one flight")
     if flights.batch.max_steps == 0:
         raise ValueError("env must have a time limit: a duration or max_episode_steps above 0")
-    recorder = FlightRecorder(flights.batch, about={"seed": seed, **(about or {})})
+    *_, (flight, _) = fly_steps(policy, env, seed, {"seed": seed, **(about or {})})
+    return flight
+
+
+def fly_steps(
+    policy: Any,
+    env: Any,
+    seed: int,
+    about: dict[str, Any],
+    before_step: Callable[[FlightBatch], None] = lambda batch: None,
+) -> Iterator[tuple[Flight, str]]:
+    """Run an episode; yield the flight so far, at the start and after each step, and its ending.
+
+    Args:
+        policy: Policy, as in `record_flight`.
+        env: Vector environment of one flight.
+        seed: Seed of the episode.
+        about: Information to be stored with the flight.
+        before_step: Function called with the batch before each step.
+    """
+    batch = env.unwrapped.flights.batch
+    recorder = FlightRecorder(batch, about=about)
     observation, _ = env.reset(seed=seed)
     recorder.keep()
+    yield recorder.flight, "none"
     state, starts, over = None, np.ones(1, bool), False
     while not over:
+        before_step(batch)
         action, state = policy.predict(
             observation, state=state, episode_start=starts, deterministic=True
         )
-        observation, _, terminated, truncated, _ = env.step(action)
+        observation, _, terminated, truncated, info = env.step(action)
         starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
         recorder.keep()
-    return recorder.flight
+        yield recorder.flight, str(info["ending"][0])
 
 
 def times_of(

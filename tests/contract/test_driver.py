@@ -141,7 +141,8 @@ def test_locked_folder_is_busy(tmp_path):
         with pytest.raises(BusyError, match="is in use by process"), locked(training.folder):
             pass
         assert work(training.plan, training.folder).kind == "busy"
-        assert [path.name for path in training.folder.iterdir()] == ["training.lock"]
+        files = sorted(path.name for path in training.folder.iterdir())
+        assert files == ["training.lock", "training.process"]
     assert not is_locked(training.folder)
 
 
@@ -160,7 +161,8 @@ def undisturbed(tmp_path_factory):
     end(start(folder))
     assert not list(folder.glob("out/**/*.part"))
     found = folder / "out/runs" / GROUP.format(0.9) / "seed_0"
-    names = ["best.npz", "evaluations.csv", "last.npz", "training.json", "training.lock"]
+    names = ["best.npz", "evaluations.csv", "last.npz"]
+    names += ["training.json", "training.lock", "training.process"]
     assert sorted(path.name for path in found.iterdir()) == names
     return tables(folder)
 

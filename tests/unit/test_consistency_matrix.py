@@ -9,10 +9,10 @@ from quad_gym.commands import consistency
 from quad_gym.commands.options import parse
 from quad_gym.experiments.consistency import cases as runs
 from quad_gym.experiments.consistency import matrix
-from quad_gym.experiments.consistency.cases import Flights, run_cases
+from quad_gym.experiments.consistency.cases import CaseFlights, run_cases
 from quad_gym.params.suites import SUITES
 
-SMALL = Flights(64, duration=1.0)
+SMALL = CaseFlights(64, duration=1.0)
 
 
 def run(cases, folder, flights=SMALL):
@@ -80,17 +80,17 @@ def test_a_run_goes_on_where_it_was_and_begins_anew_with_other_flights(tmp_path,
     run(cells[:2], tmp_path)
     run(cells[:4], tmp_path)
     assert flown == [cell.name for cell in cells[:4]]
-    run(cells[:1], tmp_path, Flights(65, duration=1.0))
+    run(cells[:1], tmp_path, CaseFlights(65, duration=1.0))
     assert flown[4:] == [cells[0].name]
     monkeypatch.setattr(runs, "flights_digest", lambda: "of other sources")
-    run(cells[:1], tmp_path, Flights(65, duration=1.0))
+    run(cells[:1], tmp_path, CaseFlights(65, duration=1.0))
     assert flown[5:] == [cells[0].name]
 
 
 def test_the_table_marks_misses_and_those_that_are_expected():
     cell = {"values": {"state": 20.0, "position": 4.0}, "misses": ["state", "position"]}
     cell |= {"expected": {"state": "wrong noise"}, "filters_failed": 2}
-    text = matrix.table_of({"one": cell}, Flights(400))
+    text = matrix.table_of({"one": cell}, CaseFlights(400))
     assert "| one | *20.00* | **4.00** |" in text
     assert "state: wrong noise; **2 filters failed**" in text
 
@@ -109,7 +109,7 @@ def test_wrong_options_are_refused():
 def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
     """Means over 400 flights of 10 s: 0.8 is 2.9 deviations even if a flight's errors stayed."""
     cell = matrix.case_of(suite, task, start)
-    found = matrix.measure(cell, Flights(400))
+    found = matrix.measure(cell, CaseFlights(400))
     assert found["filters_failed"] == 0
     assert 14.2 < found["values"]["state"] < 15.8
     assert cell.sensors == quad_gym.sensor_suite(suite)
@@ -121,5 +121,5 @@ def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
 def test_the_default_filter_stays_consistent_while_sensors_are_silent(fault, start):
     """Of 400 flights none may take a feature near a position that is uncertain for a fix."""
     cell = matrix.case_of("standard", "random_trajectory", start, faults=fault)
-    found = matrix.measure(cell, Flights(400))
+    found = matrix.measure(cell, CaseFlights(400))
     assert 14.2 < found["values"]["state"] < 15.8

@@ -11,7 +11,7 @@ from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery, lo
 from quad_gym.commands import consistency
 from quad_gym.commands.options import parse
 from quad_gym.experiments.consistency import recovery
-from quad_gym.experiments.consistency.cases import Flights, run_cases
+from quad_gym.experiments.consistency.cases import CaseFlights, run_cases
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.suites import SUITES
 from tests.field_flights import fly, nees
@@ -96,7 +96,7 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     chosen = [t for t in recovery.cases() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
     chosen = [t for t in chosen if t.keywords]  # hovering takes a minute
     cells = run_cases(
-        chosen, tmp_path / "recovery", Flights(32), recovery.measure, recovery.table_of
+        chosen, tmp_path / "recovery", CaseFlights(32), recovery.measure, recovery.table_of
     )
     values = cells["rtk, camera_occlusion"]["values"]
     assert values["consistent"] >= 90.0
@@ -106,7 +106,9 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     calm |= {"expected": "", "filters_failed": 0}
     lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "miss": True, "expected": ""}
     lost |= {"filters_failed": 1}
-    text = recovery.table_of({"a": lost, "b": lost | {"expected": "why"}, "c": calm}, Flights(32))
+    text = recovery.table_of(
+        {"a": lost, "b": lost | {"expected": "why"}, "c": calm}, CaseFlights(32)
+    )
     assert "| **5.0** |" in text.splitlines()[4]
     assert "**1 filters failed**" in text
     assert "| *5.0* |" in text

@@ -6,8 +6,7 @@ import pytest
 import quad_gym
 from quad_gym.faults import GnssOutliers
 from quad_gym.records import GateDecision
-from quad_gym.rendering import Renderer, record_flight, record_video, save_video, tile
-from quad_gym.rendering import canvas as colors
+from quad_gym.rendering import Renderer, colors, record_flight, record_video, save_video, tile
 from quad_gym.rendering.geometry import fixed_view
 from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
 from quad_gym.rendering.scene import ELLIPSOID_LIMIT, ELLIPSOID_SCALES, ellipsoid_scale

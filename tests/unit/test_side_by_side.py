@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from quad_gym.rendering import Side, SideBySide, record_flight, save_side_by_side
-from quad_gym.rendering import canvas as colors
+from quad_gym.rendering import Side, SideBySide, colors, record_flight, save_side_by_side
 from quad_gym.rendering.canvas import Canvas
 from quad_gym.rendering.side_by_side import SIDE, _wrapped
 

@@ -107,11 +107,11 @@ def report(name: str, timing: Timing, **more: Any) -> Row:
     return {"name": name, "seconds": timing.best, "spread": timing.spread, **more}
 
 
-Cell = Callable[[Row], str]
+CellText = Callable[[Row], str]
 """Function that formats the cell of a row in one column."""
 
 
-def column(key: str, form: str = "", scale: float = 1) -> Cell:
+def column(key: str, form: str = "", scale: float = 1) -> CellText:
     """Column of texts, or of numbers multiplied by a scale; a dash for None."""
 
     def cell(row: Row) -> str:
@@ -121,7 +121,7 @@ def column(key: str, form: str = "", scale: float = 1) -> Cell:
     return cell
 
 
-def percent(key: str) -> Cell:
+def percent(key: str) -> CellText:
     """Column of shares, in percent; a dash for None."""
     return lambda row: "-" if row[key] is None else f"{100.0 * row[key]:.1f} %"
 
@@ -139,7 +139,7 @@ class Section:
     """Section of the benchmark."""
 
     measure: Callable[[Scope], list[Row]]
-    groups: Mapping[str, Mapping[str, Cell]]
+    groups: Mapping[str, Mapping[str, CellText]]
     """Columns of the table by heading, in groups by heading"""
     summary: Callable[[list[Row]], str] = lambda rows: ""
     """Function that returns the text below the table"""

@@ -2,17 +2,18 @@
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.reports import text_table
 from quad_gym.experiments.benchmark.timing import by_turns, lasting
-from quad_gym.experiments.consistency.cases import Case, Flights, Results, fly
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, CaseResults, fly
 from quad_gym.params.checks import Vector
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -77,23 +78,20 @@ def _sensors(suite: SensorSuite) -> dict[str, SensorSuite]:
 
 def _scaled(params: Any, factor: float, *names: str) -> Any:
     """Parameters of a sensor with some multiplied by a factor, as far as they are given."""
-    values = {name: getattr(params, name) for name in names}
-    return params.replace(
-        **{
-            name: tuple(factor * np.array(value)) if isinstance(value, tuple) else factor * value
-            for name, value in values.items()
-            if value is not None
-        }
-    )
+    return _changed(params, lambda value: factor * np.array(value), names)
 
 
 def _moved(params: Any, by: Vector, *names: str) -> Any:
     """Parameters of a sensor with a vector added to some, as far as they are given."""
-    values = {name: getattr(params, name) for name in names}
-    sums = {
-        k: tuple(np.add(value, by).tolist()) for k, value in values.items() if value is not None
-    }
-    return params.replace(**sums)
+    return _changed(params, lambda value: np.add(value, by), names)
+
+
+def _changed(params: Any, change: Callable[[Any], NDArray[Any]], names: Sequence[str]) -> Any:
+    given = {name: getattr(params, name) for name in names}
+    changed = {k: change(value).tolist() for k, value in given.items() if value is not None}
+    return params.replace(
+        **{k: tuple(value) if isinstance(value, list) else value for k, value in changed.items()}
+    )
 
 
 def _filters(suite: SensorSuite) -> Iterator[Fields]:
@@ -121,9 +119,9 @@ def _filters(suite: SensorSuite) -> Iterator[Fields]:
     yield "UKF, all of the report's form", suite.replace(imu=sampled, estimator=report), {}
 
 
-def run_ablation(table: str, cases: list[Case], flights: Flights) -> Results:
+def run_ablation(table: str, cases: list[Case], flights: CaseFlights) -> CaseResults:
     """Fly all cases; with "filters", also time a tick of each."""
-    rows: Results = {}
+    rows: CaseResults = {}
     for number, case in enumerate(cases, 1):
         print(f"  {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
         rows[case.name] = row_of(fly(case.batch(flights.count, flights.threads), flights))
@@ -160,7 +158,7 @@ def row_of(findings: Findings) -> dict[str, float]:
     return {**nees, **inside, **rms, **{f"tracking_{k}": v for k, v in tracking.items()}, **counts}
 
 
-def table_of(table: str, rows: Results) -> str:
+def table_of(table: str, rows: CaseResults) -> str:
     """Format the table for the screen."""
     errors = {
         "position [mm]": ("rms_position", 1e3, 1),

@@ -15,12 +15,12 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.kernels.compiling.digest import flights_digest
 from quad_gym.params.sensors import SensorSuite
 
-Results = dict[str, dict[str, Any]]
+CaseResults = dict[str, dict[str, Any]]
 """Results of cases, by name."""
 
 
 @dataclass(frozen=True)
-class Flights:
+class CaseFlights:
     """Flights of each case."""
 
     count: int
@@ -68,7 +68,7 @@ class Case:
         )
 
 
-def fly(batch: FlightBatch, flights: Flights, **options: Any) -> Findings:
+def fly(batch: FlightBatch, flights: CaseFlights, **options: Any) -> Findings:
     """Fly, and compare errors with covariances; for options, see `measure_consistency`."""
     return measure_consistency(batch, seeds=flights.seeds, duration=flights.duration, **options)
 
@@ -76,31 +76,31 @@ def fly(batch: FlightBatch, flights: Flights, **options: Any) -> Findings:
 def run_cases(
     cases: Iterable[Case],
     files: Path,
-    flights: Flights,
-    measure: Callable[[Case, Flights], dict[str, Any]],
-    table: Callable[[Results, Flights], str],
+    flights: CaseFlights,
+    measure: Callable[[Case, CaseFlights], dict[str, Any]],
+    table: Callable[[CaseResults, CaseFlights], str],
     **head: Any,
-) -> Results:
+) -> CaseResults:
     """Compute the cases that an earlier run has not completed.
 
     Args:
         cases: Cases of the table.
         files: Output path without extension: numbers in .json and the table in .md. Both are
             written again after each case.
-        flights: Flights of each case.
+        flights: CaseFlights of each case.
         measure: Function that computes the results of a case, including "sensors".
         table: Function that formats the results of all cases.
         **head: Further parameters that an earlier run must have in common with this one.
 
     Returns:
-        Results of these cases.
+        CaseResults of these cases.
     """
     file, chosen = files.with_suffix(".json"), list(cases)
     before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     head = {"flights": flights.count, **head, "seeds": flights.seed_limits}
     head |= {"versions": versions("numpy", "numba"), "sources": flights_digest()}
     same = {key: before.get(key) for key in head} == as_json(head)
-    done: Results = before["cells"] if same else {}
+    done: CaseResults = before["cells"] if same else {}
     for case in tqdm(chosen, desc=files.name, unit=" cells"):
         if done.get(case.name, {}).get("sensors") != as_json(case.sensors):
             done[case.name] = as_json(measure(case, flights))

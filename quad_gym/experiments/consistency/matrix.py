@@ -11,12 +11,13 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-from quad_gym.analysis.consistency import PARTS, SENSOR_BLOCKS, mean_band
+from quad_gym.analysis.consistency import PARTS, SENSOR_BLOCKS
+from quad_gym.analysis.metrics import chi_square_band
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.experiments.consistency.cases import (
     Case,
-    Flights,
-    Results,
+    CaseFlights,
+    CaseResults,
     fly,
     markdown,
     remark,
@@ -156,14 +157,14 @@ def cases_of(kind: str) -> list[Case]:
     return {"suites": suites, "conditions": conditions, "all": suites + conditions}[kind]
 
 
-def measure(case: Case, flights: Flights) -> dict[str, Any]:
+def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:
     """Fly a case: values by column, misses, and the configuration."""
     batch = case.batch(flights.count, flights.threads)
     found = fly(batch, flights, every=0.1)
     values = {name: part.overall for name, part in found.nees.items()}
     values |= {f"nis_{name}": part.overall for name, part in found.nis.items()}
-    bands = {name: mean_band(FREEDOMS[name], [flights.count]) for name in values}
-    misses = [k for k, v in values.items() if not bands[k][0][0] <= v <= bands[k][1][0]]
+    bands = {name: chi_square_band(FREEDOMS[name], flights.count) for name in values}
+    misses = [name for name, value in values.items() if not bands[name].holds(value)]
     return {
         "values": values,
         "misses": misses,
@@ -178,17 +179,17 @@ def measure(case: Case, flights: Flights) -> dict[str, Any]:
     }
 
 
-def table_of(cells: Results, flights: Flights) -> str:
+def table_of(cells: CaseResults, flights: CaseFlights) -> str:
     """Format the matrix in Markdown: misses bold, or in italics if they are expected."""
     names = [*PARTS, *(f"nis_{name}" for name in SENSOR_BLOCKS)]
-    bands = [mean_band(FREEDOMS[name], [flights.count]) for name in names]
+    bands = [chi_square_band(FREEDOMS[name], flights.count) for name in names]
     rows = [
         [
             "suite, task, start, condition",
             *(name.removeprefix("nis_") for name in names),
             "expected misses",
         ],
-        ["95 % band", *(f"{low[0]:.2f} to {high[0]:.2f}" for low, high in bands), ""],
+        ["95 % band", *(f"{low:.2f} to {high:.2f}" for low, high in bands), ""],
     ]
     for label, cell in cells.items():
         expected = cell["expected"]
@@ -216,7 +217,7 @@ def _text(name: str, cell: Mapping[str, Any]) -> str:
     return f"*{text}*" if {"", name} & cell["expected"].keys() else f"**{text}**"
 
 
-def unexpected(cells: Results) -> int:
+def unexpected(cells: CaseResults) -> int:
     """Number of misses without a known reason."""
     return sum(
         not {"", name} & cell["expected"].keys()

@@ -13,8 +13,8 @@ from typing import Any
 from quad_gym.analysis.recovery import REQUIRED, Recovery, follow_recovery
 from quad_gym.experiments.consistency.cases import (
     Case,
-    Flights,
-    Results,
+    CaseFlights,
+    CaseResults,
     markdown,
     remark,
 )
@@ -99,7 +99,7 @@ def _possible(faults: tuple[Fault, ...], suite: SensorSuite) -> bool:
     return True
 
 
-def measure(case: Case, flights: Flights) -> dict[str, Any]:
+def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:
     """Fly a case: values by column, and the configuration."""
     faults = case.keywords.get("faults")
     batch = case.batch(flights.count, flights.threads)
@@ -140,7 +140,7 @@ def _without_faults(found: Recovery) -> dict[str, float]:
     }
 
 
-def table_of(cells: Results, flights: Flights) -> str:
+def table_of(cells: CaseResults, flights: CaseFlights) -> str:
     """Format two tables in Markdown: after faults, and without faults."""
     calm = f"Without a fault, {flights.count} flights of {CALM_DURATION:g} s each."
     parts = []
@@ -174,6 +174,6 @@ def _text(value: float | None) -> str:
     return "-" if value is None or math.isinf(value) else f"{value:.1f}"
 
 
-def unexpected(cells: Results) -> int:
+def unexpected(cells: CaseResults) -> int:
     """Number of cases with undetected failures without a known reason."""
     return sum(cell["miss"] and not cell["expected"] for cell in cells.values())

@@ -9,18 +9,17 @@ from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSq
 from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.consistency_plots import (
     errors_figure,
-    nees_figure,
-    nis_figure,
+    mean_square_figure,
     whiteness_figure,
 )
 from quad_gym.analysis.plots import house_style, save_figure
 from quad_gym.analysis.reports import text_table, versions, write_json
-from quad_gym.experiments.consistency.cases import Case, Flights, fly
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, fly
 
 
 def run_single(
     case: Case,
-    flights: Flights,
+    flights: CaseFlights,
     output: Path,
     *,
     every: float,
@@ -88,11 +87,11 @@ def _draw(
     files: list[Path] = []
     with house_style():
         figures = {
-            "nees": nees_figure(whole.nees, title, settle),
+            "nees": mean_square_figure("NEES", whole.nees, title, settle),
             "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
         }
         if whole.nis:
-            figures["nis"] = nis_figure(whole.nis, title, settle)
+            figures["nis"] = mean_square_figure("NIS", whole.nis, title, settle)
         if findings.whiteness:
             figures["whiteness"] = whiteness_figure(findings.whiteness, title)
         for name, figure in figures.items():
@@ -126,7 +125,7 @@ def report_of(findings: Findings) -> str:
         if findings.consistent
         else "The filter is not consistent in everything:",
         *(f"  {text}" for text in findings.sentences().values()),
-        f"  Filters with a numerical failure: {findings.failed}. Flights lost: "
+        f"  Filters with a numerical failure: {findings.failed}. CaseFlights lost: "
         f"{findings.astray.sum()}.",
         f"Criterion: means within the tolerance, the 95 % band of a mean over at most "
         f"{BAND_FLIGHTS:,} values, at {100 * CONSISTENT_SHARE:.0f} % of the instants or more; "
