@@ -7,19 +7,13 @@ between machines on a shared file system that supports locks (NFS, and Lustre if
 
 import os
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import ModuleType
+
+from filelock import FileLock, Timeout
 
 from baselines.keeping import RunError
-
-fcntl: ModuleType | None
-try:
-    import fcntl
-except ImportError:  # Windows, where runs are not locked
-    fcntl = None
 
 LOCK = "training.lock"
 """Name of the lock file in the folder; it contains the process that has or had the lock."""
@@ -42,30 +36,28 @@ def locked(folder: Path, patience: float = PATIENCE) -> Iterator[None]:
 
     Raises:
         ValueError: If another process has the lock (`BusyError`).
-        OSError: If the file system has no locks, or the folder is not writable.
+        OSError: If the folder is not writable.
     """
-    file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        if not _take(file, patience):
-            raise BusyError(f"folder {folder} is in use by {holder(folder)}")
+        lock = FileLock(folder / LOCK, timeout=patience).acquire()
+    except Timeout:
+        raise BusyError(f"folder {folder} is in use by {holder(folder)}") from None
+    with lock:
         with suppress(OSError):  # on a full disk the lock file stays empty
-            os.ftruncate(file, 0)
-            os.pwrite(file, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+            text = f"process {os.getpid()} on {socket.gethostname()}\n"
+            (folder / LOCK).write_text(text, encoding="utf-8")
         yield
-    finally:
-        os.close(file)  # releases the lock
 
 
 def is_locked(folder: Path) -> bool:
     """True if a process trains in the folder now."""
-    try:
-        file = os.open(folder / LOCK, os.O_RDWR)
-    except OSError:  # never begun
+    if not (folder / LOCK).exists():  # never begun
         return False
     try:
-        return not _take(file, 0.0)
-    finally:
-        os.close(file)
+        with FileLock(folder / LOCK, timeout=0):
+            return False
+    except Timeout:
+        return True
 
 
 def holder(folder: Path) -> str:
@@ -74,18 +66,3 @@ def holder(folder: Path) -> str:
         return (folder / LOCK).read_text(encoding="utf-8").strip() or "another process"
     except OSError:
         return "another process"
-
-
-def _take(file: int, patience: float) -> bool:
-    if fcntl is None:
-        return True
-    end = time.monotonic() + patience
-    while True:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() >= end:
-                return False
-            time.sleep(0.02)
-        else:
-            return True
