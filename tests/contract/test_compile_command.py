@@ -43,7 +43,7 @@ def fill(folder, names, monkeypatch):
         dispatcher.compile(dispatcher.signature)
     with monkeypatch.context() as patch:
         patch.setattr(caches.config, "CACHE_DIR", str(folder))
-        places = [caches.cache_of(dispatcher.py_func).folder for dispatcher in dispatchers]
+        places = [caches.CodeCache(dispatcher.py_func).folder for dispatcher in dispatchers]
     for dispatcher, place in zip(dispatchers, places, strict=True):
         place.mkdir(parents=True, exist_ok=True)
         cache = dispatcher._cache

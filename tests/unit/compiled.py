@@ -16,19 +16,19 @@ class Compiled:
     """
 
     def __init__(self, body, **fields):
-        body = kernel(body)
+        body, name = kernel(body), body.__qualname__
 
-        @entry
         def on_records(records, option):
             for i in range(len(records)):
                 body(records[i], option)
 
-        @entry
         def on_blocks(blocks, option):
             for i in range(len(blocks)):
                 body(lanes_of(blocks[i]), option)
 
-        self._on_records, self._on_blocks = on_records, on_blocks
+        for function in (on_records, on_blocks):  # a name of its own in the cache
+            function.__qualname__ = f"{function.__name__}_of_{name}"
+        self._on_records, self._on_blocks = entry(on_records), entry(on_blocks)
         kinds = [(n, "u8" if n.startswith("word_") else "f8", shape) for n, shape in fields.items()]
         self._record = np.dtype(kinds, align=True)
         self._block = np.dtype([(n, k, (*shape, WIDTH)) for n, k, shape in kinds], align=True)

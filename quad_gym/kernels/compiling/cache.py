@@ -12,8 +12,6 @@ import inspect
 import os
 import pickle
 import sys
-import time
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,11 +23,10 @@ from numba.core import caching, compiler, config
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
-from quad_gym.kernels.compiling.digest import closure_of, digest_of_function
-from quad_gym.kernels.compiling.locks import locked, say
+from quad_gym.kernels.compiling.digest import digest_of_function
 from quad_gym.records import WIDTH
 
-_FORM = 3
+_FORM = 4
 """Version of the files' contents and of the compilation; after a change, no older file is found."""
 KEPT = 8
 """Number of files kept for a function: the latest for other sources, processors or signatures."""
@@ -40,9 +37,42 @@ _LOCATORS = (
 )
 
 
-def cache_of(function: Callable[..., Any]) -> "CodeCache":
-    """The cache of the compiled code of a function."""
-    return CodeCache(function)
+def say(text: str, end: str = "\n") -> None:
+    """Write a line to standard error, if there is one."""
+    if sys.stderr is not None:
+        print(text, file=sys.stderr, end=end, flush=True)
+
+
+def where_cached(*folders: Path | None) -> str:
+    """Describe where code is cached, for messages."""
+    known = [str(folder) for folder in folders if folder is not None]
+    if not known:
+        return "not cached: no folder can be written; set NUMBA_CACHE_DIR to one that can"
+    return f"once; cached in {os.path.commonpath(known)}"
+
+
+@contextlib.contextmanager
+def locked(path: Path | None, waiting: str = "") -> Iterator[None]:
+    """Hold a lock between processes; a process that dies releases it.
+
+    Where the system or the folder supports no locks, two processes may do the same work.
+
+    Args:
+        path: The file that represents the lock; None: no lock.
+        waiting: Message on standard error if another process holds it.
+    """
+    from filelock import FileLock, Timeout  # here, as only compiling needs it
+
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError, NotImplementedError):
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    held.enter_context(FileLock(path, timeout=0 if waiting else -1))
+                except Timeout:
+                    say(waiting)
+                    held.enter_context(FileLock(path))
+        yield
 
 
 @functools.lru_cache(maxsize=64)  # the records of a stage's arguments take milliseconds to write
@@ -70,26 +100,16 @@ def _needed(module: Any) -> tuple[str, ...]:
     )
 
 
-def where_cached(*folders: Path | None) -> str:
-    """Describe where code is cached, for messages."""
-    known = [str(folder) for folder in folders if folder is not None]
-    if not known:
-        return "not cached: no folder can be written; set NUMBA_CACHE_DIR to one that can"
-    return f"once; cached in {os.path.commonpath(known)}"
-
-
-class CodeCache(caching._Cache):  # type: ignore[misc]
+class CodeCache:
     """The compiled code of one function, by signature: a dispatcher's cache, as Numba calls it."""
 
     announcing = True
-    """flag for announcing a compilation; off in a process that compiles for another one"""
+    """flag for announcing a compilation; off while a line of progress is shown"""
     complaining = True
     """flag for reporting that code cannot be cached; once is enough"""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
-        self._found: dict[str, bytes] = {}
-        """contents read but not yet loaded, by file name, so that each file is read once"""
 
     @functools.cached_property
     def folder(self) -> Path | None:
@@ -109,24 +129,12 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
             return [beside]
         return [self.folder] if config.CACHE_DIR else [self.folder, beside]
 
-    @property
-    def cache_path(self) -> str | None:
-        """The folder, in the form that Numba expects."""
-        return None if self.folder is None else str(self.folder)
-
     @functools.cached_property
     def _stem(self) -> str:
         """Common prefix of the names of all files of this function, independent of its sources."""
         module = Path(inspect.getfile(self._function)).stem
         name = self._function.__qualname__.replace("<", "").replace(">", "")
-        stem = f"{module}.{name}.py{sys.version_info[0]}{sys.version_info[1]}"
-        closed_over = [
-            f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
-            for value in closure_of(self._function)
-        ]
-        if closed_over:  # separate files for functions made from one piece of source
-            stem += f".{hashlib.sha256(' '.join(closed_over).encode()).hexdigest()[:8]}"
-        return stem
+        return f"{module}.{name}.py{sys.version_info[0]}{sys.version_info[1]}"
 
     @functools.cached_property
     def _sources(self) -> str:
@@ -141,24 +149,35 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     def _content(self, signature: Any, context: Any) -> bytes | None:
         """Content of the file of a signature; None if it is missing or damaged."""
-        if not self._folders:
-            return None
         name = self._name(signature, context)
         for folder in self._folders:
-            if name in self._found:
-                break
             with contextlib.suppress(OSError):
                 content = (folder / name).read_bytes()
                 if hashlib.sha256(content[32:]).digest() == content[:32]:
-                    self._found[name] = content[32:]
-        return self._found.get(name)
+                    return content[32:]
+        return None
+
+    def holds(self, signature: Any, context: Any) -> bool:
+        """True if there is an undamaged file for a signature."""
+        return self._content(signature, context) is not None
+
+    @contextlib.contextmanager
+    def compiling_alone(self, signature: Any, context: Any) -> Iterator[None]:
+        """Block other processes that would compile this function; they load the result then."""
+        if self.holds(signature, context):
+            yield
+            return
+        with locked(None if self.folder is None else self.folder / f"{self._stem}.lock"):
+            if self.announcing and not self.holds(signature, context):
+                where = where_cached(self.folder)
+                say(f"quad_gym: compiling {self._function.__name__} ({where})")
+            yield
 
     # ---- what Numba calls -------------------------------------------------------------------
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled code of a signature, or None."""
         content = self._content(sig, target_context)
-        self._found.clear()
         if content is None:
             return None
         try:
@@ -174,64 +193,19 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
         """Write the compiled code of a signature; if this fails, report it and continue."""
         if self.folder is None:
             return
-        path = self.folder / self._name(sig, data.target_context)
         content = dumps((_needed(data.library._final_module), data._reduce()))
-        temporary = path.with_suffix(f".{uuid.uuid4().hex[:12]}.tmp")
+        temporary = self.folder / f"{self._stem}.tmp"  # one process at a time writes it
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
             temporary.write_bytes(hashlib.sha256(content).digest() + content)
-            temporary.replace(path)
+            temporary.replace(self.folder / self._name(sig, data.target_context))
+            files = self.folder.glob(f"{self._stem}.*.code")
+            for old in sorted(files, key=lambda file: file.stat().st_mtime)[:-KEPT]:
+                old.unlink(missing_ok=True)
         except OSError as error:
             if CodeCache.complaining:
                 CodeCache.complaining = False
                 say(f"quad_gym: compiled code cannot be cached in {self.folder}: {error.strerror}")
-        else:
-            self._tidy()
         finally:  # also where Ctrl-C interrupts
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
-
-    def flush(self) -> None:
-        """Delete the files of this function."""
-        self._found.clear()
-        for path in self._files("code"):
-            path.unlink(missing_ok=True)
-
-    def enable(self) -> None:
-        """Do nothing: the cache is always on."""
-
-    def disable(self) -> None:
-        """Do nothing: the cache is always on."""
-
-    # ---- who compiles -----------------------------------------------------------------------
-
-    def holds(self, signature: Any, context: Any) -> bool:
-        """True if there is an undamaged file for a signature."""
-        return self._content(signature, context) is not None
-
-    @contextlib.contextmanager
-    def compiling_alone(self, signature: Any, context: Any) -> Iterator[None]:
-        """Block other processes that would compile the same code; they load the result then."""
-        if self.holds(signature, context):
-            yield
-            return
-        path = None if self.folder is None else self.folder / self._name(signature, context)
-        with locked(None if path is None else path.with_suffix(".lock")):
-            if self.announcing and not self.holds(signature, context):
-                where = where_cached(self.folder)
-                say(f"quad_gym: compiling {self._function.__name__} ({where})")
-            yield
-
-    def _files(self, kind: str) -> list[Path]:
-        return [] if self.folder is None else list(self.folder.glob(f"{self._stem}.*.{kind}"))
-
-    def _tidy(self) -> None:
-        """Delete the oldest files of this function, and the remains of killed processes."""
-        with contextlib.suppress(OSError):
-            files = self._files("code")
-            files.sort(key=lambda path: path.stat().st_mtime, reverse=True)
-            for path in files[KEPT:]:
-                path.unlink(missing_ok=True)
-            for path in (*self._files("tmp"), *self._files("lock")):
-                if time.time() - path.stat().st_mtime > 3600.0:
-                    path.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numba
 from numba.core.registry import CPUDispatcher
 
-from quad_gym.kernels.compiling.cache import cache_of
+from quad_gym.kernels.compiling.cache import CodeCache
 
 _OPTIONS: dict[str, Any] = {"nopython": True, "boundscheck": None, "error_model": "numpy"}
 
@@ -81,6 +81,6 @@ def entry(function: Callable[..., Any] | None = None, signature: Any = None) -> 
         return functools.partial(entry, signature=signature)
     lean = {"pipeline_class": EntryCompiler} if LEAN else {}
     dispatcher = EntryDispatcher(py_func=function, targetoptions=_OPTIONS | {"nogil": True}, **lean)
-    dispatcher._cache = cache_of(function)
+    dispatcher._cache = CodeCache(function)
     dispatcher.signature = signature
     return dispatcher

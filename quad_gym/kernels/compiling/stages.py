@@ -103,7 +103,7 @@ class Source(NamedTuple):
 
     stage: Stage
     function: str
-    """its module in `quad_gym.kernels`, and its name"""
+    """its module in `quad_gym.kernels`, and its name without `_stage`"""
     needed: Callable[[Any], bool]
     parts: tuple[str, ...] = ()
     """parts of a flight's record that it uses in addition to the core, see `records.PARTS`"""
@@ -111,58 +111,33 @@ class Source(NamedTuple):
     @property
     def name(self) -> str:
         """Name of the compiled function, such as "quad_gym.kernels.filter.update:update_stage"."""
-        return f"quad_gym.kernels.{self.function}"
+        return f"quad_gym.kernels.{self.function}_stage"
 
 
-def _always(s: Any) -> bool:
-    return True
+def _with(*names: str) -> Callable[[Any], bool]:
+    """Make a test of settings: all of these are set."""
+    return lambda settings: all(settings[name] > 0 for name in names)
 
 
-def _filter(s: Any) -> bool:
-    return bool(s["run_filter"])
+_always, _filter, _faults = _with(), _with("run_filter"), _with("faults")
+_corrupts, _air = _with("run_filter", "faults"), _with("air")
+_late, _slow = _with("run_filter", "late"), _with("run_filter", "slow_states")
+_grounded, _contacts, _drawn = _with("grounded"), _with("contacts"), _with("randomized")
 
 
-def _air(s: Any) -> bool:
-    return bool(s["air"])
+def _pad(s: Any) -> bool:
+    return bool(s["pad"]) and not _grounded(s)
 
 
-def _faults(s: Any) -> bool:
-    return bool(s["faults"])
-
-
-def _corrupts(s: Any) -> bool:
-    return _faults(s) and _filter(s)
-
-
-def _late(s: Any) -> bool:
-    return _filter(s) and bool(s["late"])
-
-
-def _rewinds(s: Any) -> bool:
-    return _late(s) and bool(s["rewinds"])
-
-
-def _slow(s: Any) -> bool:
-    return _filter(s) and bool(s["slow_states"])
-
-
-def _warm(s: Any) -> bool:
-    return _filter(s) and bool(s["warm"])
-
-
-def _imu_averages(s: Any) -> bool:
-    return _filter(s) and bool(s["imu_averages"])
+def _keeps_start(s: Any) -> bool:
+    return bool(_pad(s) or _grounded(s) or (_filter(s) and s["imu_averages"]))
 
 
 def _imu_disturbed(s: Any) -> bool:
     return _filter(s) and bool(s["imu_errs"] or s["imu_vibrates"])
 
 
-def _heading_errs(s: Any) -> bool:
-    return _filter(s) and bool(s["heading_errs"])
-
-
-def _lasting(s: Any) -> bool:
+def _has_constant_errors(s: Any) -> bool:
     return _filter(s) and bool(s["imu_errs"] or s["heading_errs"])
 
 
@@ -170,44 +145,12 @@ def _watches(s: Any) -> bool:
     return _filter(s) and bool(int(s["form"]) & (FilterForm.GATE | FilterForm.INNOVATIONS))
 
 
-def _raw(s: Any) -> bool:
+def _observes_measurements(s: Any) -> bool:
     return _filter(s) and bool(s["layout"] == Layout.MEASUREMENTS)
-
-
-def _grounded(s: Any) -> bool:
-    return bool(s["grounded"])
-
-
-def _pad(s: Any) -> bool:
-    return bool(s["pad"]) and not _grounded(s)
-
-
-def _contacts(s: Any) -> bool:
-    return bool(s["contacts"])
 
 
 def _hides(s: Any) -> bool:
     return _sensor(Sensor.CAMERA)(s) and bool(s["obstacle_count"])
-
-
-def _limits(s: Any) -> bool:
-    return _filter(s) and bool(s["camera_limited"])
-
-
-def _follows(s: Any) -> bool:
-    return bool(s["harmonics"] == FOLLOWED)
-
-
-def _places(s: Any) -> bool:
-    return bool(s["features_drawn"])
-
-
-def _drawn(s: Any) -> bool:
-    return bool(s["randomized"])
-
-
-def _delays(s: Any) -> bool:
-    return bool(s["action_delays"] > 0)
 
 
 def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
@@ -216,75 +159,85 @@ def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
 
 def _sensor_source(sensor: Sensor) -> Source:
     name, parts = sensor.name.lower(), () if sensor < FIRST_AID else ("aids",)
-    return Source(Stage[sensor.name], f"sensors.{name}:{name}_stage", _sensor(sensor), parts)
+    return Source(Stage[sensor.name], f"sensors.{name}:{name}", _sensor(sensor), parts)
 
 
 SOURCES = (
-    Source(Stage.UPDATE, "filter.update:update_with_slow_stage", _slow, ("filter", "slow")),
-    Source(Stage.UPDATE, "filter.update:update_stage", _filter, ("filter",)),
-    Source(Stage.PREDICT, "filter.predict:predict_with_slow_stage", _slow, ("filter", "slow")),
-    Source(Stage.PREDICT, "filter.predict:predict_stage", _filter, ("filter",)),
+    Source(Stage.UPDATE, "filter.update:update_with_slow", _slow, ("filter", "slow")),
+    Source(Stage.UPDATE, "filter.update:update", _filter, ("filter",)),
+    Source(Stage.PREDICT, "filter.predict:predict_with_slow", _slow, ("filter", "slow")),
+    Source(Stage.PREDICT, "filter.predict:predict", _filter, ("filter",)),
     Source(
         Stage.LATE_UPDATE,
-        "filter.delayed:late_update_with_slow_stage",
-        lambda s: _slow(s) and _rewinds(s),
+        "filter.delayed:late_update_with_slow",
+        _with("run_filter", "slow_states", "late", "rewinds"),
         ("late",),
     ),
-    Source(Stage.LATE_UPDATE, "filter.delayed:late_update_stage", _rewinds, ("late",)),
+    Source(
+        Stage.LATE_UPDATE,
+        "filter.delayed:late_update",
+        _with("run_filter", "late", "rewinds"),
+        ("late",),
+    ),
     *map(_sensor_source, Sensor),
-    Source(Stage.SAMPLE, "sensors.imu:sample_stage", _filter, ("filter",)),
-    Source(Stage.DRAW, "task.draws:draw_stage", _drawn, ("draws",)),
-    Source(Stage.IMPOSE, "task.draws:impose_stage", _drawn, ("draws",)),
-    Source(Stage.PLACE_FEATURES, "task.places:place_features_stage", _places, ("places",)),
-    Source(Stage.BEGIN, "task.episode:begin_stage", _always),
-    Source(Stage.MOVE, "vehicle.air:move_in_air_stage", _air),
-    Source(Stage.ALIGN, "filter.align:align_stage", _filter, ("filter",)),
-    Source(Stage.OBSERVE, "task.observation:observe_stage", _always),
-    Source(Stage.SHOW, "task.show:show_stage", lambda s: bool(s["shown"])),
-    Source(Stage.ADVANCE_FAULTS, "sensors.faults:advance_faults_stage", _faults, ("faults",)),
-    Source(Stage.BEGIN_FAULTS, "sensors.faults:begin_faults_stage", _faults, ("faults",)),
-    Source(Stage.CONTROL, "vehicle.control:control_stage", _always),
-    Source(Stage.MOVE, "vehicle.dynamics:move_stage", _always),
-    Source(Stage.BEGIN_IN_AIR, "vehicle.air:begin_in_air_stage", _air),
-    Source(Stage.WARM, "filter.warm:warm_with_slow_stage", lambda s: _slow(s) and _warm(s)),
-    Source(Stage.WARM, "filter.warm:warm_stage", _warm),
-    Source(Stage.AVERAGE_IMU, "sensors.imu:average_imu_stage", _imu_averages),
-    Source(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features_stage", _corrupts),
-    Source(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss_stage", _corrupts),
-    Source(Stage.INCREMENT, "filter.preintegration:increment_stage", _late, ("late",)),
-    Source(Stage.LOOK, "task.look:look_stage", _always),
-    Source(Stage.JUDGE, "task.reward_and_endings:judge_stage", _always),
-    Source(Stage.DRIFT_BIASES, "sensors.imu:drift_biases_stage", _filter),
-    Source(Stage.FOLLOW, "task.follow:follow_stage", _follows, ("path",)),
-    Source(Stage.REST_ON_PAD, "vehicle.pad:rest_on_pad_stage", _pad),
+    Source(Stage.SAMPLE, "sensors.imu:sample", _filter, ("filter",)),
+    Source(Stage.DRAW, "task.draws:draw", _drawn, ("draws",)),
+    Source(Stage.IMPOSE, "task.draws:impose", _drawn, ("draws",)),
     Source(
-        Stage.KEEP_START,
-        "vehicle.pad:keep_start_stage",
-        lambda s: _pad(s) or _grounded(s) or _imu_averages(s),
+        Stage.PLACE_FEATURES, "task.places:place_features", _with("features_drawn"), ("places",)
     ),
-    Source(Stage.SUPPLY, "vehicle.air:supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
-    Source(Stage.BEGIN_LATE, "filter.preintegration:begin_late_stage", _late, ("late",)),
-    Source(Stage.BEGIN_IMPERFECT, "sensors.imperfect:begin_imperfect_stage", _lasting, ("errors",)),
-    Source(Stage.DISTURB_IMU, "sensors.imperfect:disturb_imu_stage", _imu_disturbed),
-    Source(Stage.TURN_BASELINE, "sensors.imperfect:turn_baseline_stage", _heading_errs),
-    Source(Stage.LIMIT_CAMERA, "sensors.imperfect:limit_camera_stage", _limits),
-    Source(Stage.DELAY_ACTION, "vehicle.delay:delay_action_stage", _delays, ("actions",)),
-    Source(Stage.HIDE_FEATURES, "obstacles.sight:hide_features_stage", _hides),
-    Source(Stage.BEGIN_CONTACTS, "obstacles.contact:begin_contacts_stage", _contacts),
-    Source(Stage.TOUCH, "obstacles.contact:touch_stage", _contacts, ("contacts",)),
-    Source(Stage.JUDGE_CONTACTS, "obstacles.contact:judge_contacts_stage", _contacts),
-    Source(Stage.BEGIN_GROUND, "vehicle.ground:begin_ground_stage", _grounded),
-    Source(Stage.STAND, "vehicle.ground:stand_stage", _grounded, ("ground",)),
+    Source(Stage.BEGIN, "task.episode:begin", _always),
+    Source(Stage.MOVE, "vehicle.air:move_in_air", _air),
+    Source(Stage.ALIGN, "filter.align:align", _filter, ("filter",)),
+    Source(Stage.OBSERVE, "task.observation:observe", _always),
+    Source(Stage.SHOW, "task.show:show", _with("shown")),
+    Source(Stage.ADVANCE_FAULTS, "sensors.faults:advance_faults", _faults, ("faults",)),
+    Source(Stage.BEGIN_FAULTS, "sensors.faults:begin_faults", _faults, ("faults",)),
+    Source(Stage.CONTROL, "vehicle.control:control", _always),
+    Source(Stage.MOVE, "vehicle.dynamics:move", _always),
+    Source(Stage.BEGIN_IN_AIR, "vehicle.air:begin_in_air", _air),
+    Source(Stage.WARM, "filter.warm:warm_with_slow", _with("run_filter", "slow_states", "warm")),
+    Source(Stage.WARM, "filter.warm:warm", _with("run_filter", "warm")),
+    Source(Stage.AVERAGE_IMU, "sensors.imu:average_imu", _with("run_filter", "imu_averages")),
+    Source(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features", _corrupts),
+    Source(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss", _corrupts),
+    Source(Stage.INCREMENT, "filter.preintegration:increment", _late, ("late",)),
+    Source(Stage.LOOK, "task.look:look", _always),
+    Source(Stage.JUDGE, "task.reward_and_endings:judge", _always),
+    Source(Stage.DRIFT_BIASES, "sensors.imu:drift_biases", _filter),
     Source(
-        Stage.FEEL_GROUND,
-        "vehicle.ground:feel_ground_stage",
-        lambda s: _grounded(s) and _filter(s),
+        Stage.FOLLOW, "task.follow:follow", lambda s: bool(s["harmonics"] == FOLLOWED), ("path",)
     ),
-    Source(Stage.JUDGE_LANDING, "vehicle.ground:judge_landing_stage", _grounded),
-    Source(Stage.SATURATE_IMU, "sensors.faults:saturate_imu_stage", _corrupts),
-    Source(Stage.MEET_ROTORS, "sensors.faults:meet_rotors_stage", _faults),
-    Source(Stage.SUM_IMU, "sensors.imu:sum_imu_stage", _raw, ("raw",)),
-    Source(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations_stage", _watches, ("watch",)),
+    Source(Stage.REST_ON_PAD, "vehicle.pad:rest_on_pad", _pad),
+    Source(Stage.KEEP_START, "vehicle.pad:keep_start", _keeps_start),
+    Source(Stage.SUPPLY, "vehicle.air:supply", lambda s: s["supply"] != Supply.NOMINAL),
+    Source(Stage.BEGIN_LATE, "filter.preintegration:begin_late", _late, ("late",)),
+    Source(
+        Stage.BEGIN_IMPERFECT,
+        "sensors.imperfect:begin_imperfect",
+        _has_constant_errors,
+        ("errors",),
+    ),
+    Source(Stage.DISTURB_IMU, "sensors.imperfect:disturb_imu", _imu_disturbed),
+    Source(
+        Stage.TURN_BASELINE, "sensors.imperfect:turn_baseline", _with("run_filter", "heading_errs")
+    ),
+    Source(
+        Stage.LIMIT_CAMERA, "sensors.imperfect:limit_camera", _with("run_filter", "camera_limited")
+    ),
+    Source(Stage.DELAY_ACTION, "vehicle.delay:delay_action", _with("action_delays"), ("actions",)),
+    Source(Stage.HIDE_FEATURES, "obstacles.sight:hide_features", _hides),
+    Source(Stage.BEGIN_CONTACTS, "obstacles.contact:begin_contacts", _contacts),
+    Source(Stage.TOUCH, "obstacles.contact:touch", _contacts, ("contacts",)),
+    Source(Stage.JUDGE_CONTACTS, "obstacles.contact:judge_contacts", _contacts),
+    Source(Stage.BEGIN_GROUND, "vehicle.ground:begin_ground", _grounded),
+    Source(Stage.STAND, "vehicle.ground:stand", _grounded, ("ground",)),
+    Source(Stage.FEEL_GROUND, "vehicle.ground:feel_ground", _with("run_filter", "grounded")),
+    Source(Stage.JUDGE_LANDING, "vehicle.ground:judge_landing", _grounded),
+    Source(Stage.SATURATE_IMU, "sensors.faults:saturate_imu", _corrupts),
+    Source(Stage.MEET_ROTORS, "sensors.faults:meet_rotors", _faults),
+    Source(Stage.SUM_IMU, "sensors.imu:sum_imu", _observes_measurements, ("raw",)),
+    Source(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations", _watches, ("watch",)),
 )
 """Every function of a stage, the longest to compile first. A slot with several functions gets the
 first one that is needed."""

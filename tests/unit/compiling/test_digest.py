@@ -15,23 +15,23 @@ from quad_gym.kernels.compiling.digest import digest_of_function
 
 ROOT = Path(__file__).parents[3]
 SCRIPT = """
-import json, sys
+import importlib, json, sys
 from pathlib import Path
-import tests
+from quad_gym.kernels.compiling import digest
 from quad_gym.kernels.compiling.digest import digest_of
 
 root = Path.cwd()
-looked_at = [root / name for name in json.loads(sys.argv[1])]
-found = []
-for name, old, new in [("", "", ""), *json.loads(sys.argv[2])]:
-    if not name:
-        found.append([digest_of(path) for path in looked_at])
-        continue
+modules = [name.removesuffix(".py").replace("/", ".") for name in json.loads(sys.argv[1])]
+for name in modules:
+    importlib.import_module(name)
+found = [[digest_of(name) for name in modules]]
+for name, old, new in json.loads(sys.argv[2]):
     file = root / name
     text = file.read_text()
     assert old in text, (name, old)
     file.write_text(text.replace(old, new, 1) if old else text + new)
-    found.append([digest_of(path) for path in looked_at])
+    digest._read.cache_clear()
+    found.append([digest_of(name) for name in modules])
     file.write_text(text)
 print(json.dumps(found))
 """
@@ -152,15 +152,10 @@ def minus(x):
         (0.0, -0.0, float("nan"), np.float64(0.0), np.float32(0.0)),
         ((1, 2), (1, (2,)), (2, 1), ()),
         (plus, minus, calling(plus), calling(minus)),
-        (np.zeros(3), np.zeros(4), np.zeros((3, 1)), np.zeros(3, np.float32), np.ones(3)),
-        (np.dtype("f8"), np.dtype([("a", "f8")]), np.dtype([("a", "f8", (2,))])),
-        (np.sin, abs, min),
     ],
-    ids=["kinds", "floats", "tuples", "functions", "arrays", "dtypes", "builtins"],
+    ids=["kinds", "floats", "tuples", "functions"],
 )
 def test_functions_differ_in_what_they_close_over(values):
-    if values[0] is np.sin:
-        values = values[1:]
     digests = [digest_of_function(holding(value)) for value in values]
     assert len(set(digests)) == len(values)
     assert digests == [digest_of_function(holding(value)) for value in values]
@@ -178,6 +173,7 @@ def test_a_function_that_calls_itself_has_a_digest():
     assert digest_of_function(again) == digest_of_function(again)
 
 
-def test_what_has_no_lasting_identity_cannot_be_closed_over():
-    with pytest.raises(TypeError, match="closes over <object object"):
-        digest_of_function(holding(object()))
+@pytest.mark.parametrize("value", [object(), np.zeros(3), np])
+def test_only_functions_numbers_and_strings_can_be_closed_over(value):
+    with pytest.raises(TypeError, match="cannot be cached that closes over"):
+        digest_of_function(holding(value))
