@@ -9,14 +9,13 @@ import quad_gym
 from quad_gym.commands import benchmark as script
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.experiments.benchmark import interfaces, learning, stages
+from quad_gym.experiments.benchmark import learning, stages
 from quad_gym.experiments.benchmark.filter import repeated
 from quad_gym.experiments.benchmark.stages import Staged, hovering
-from quad_gym.experiments.benchmark.timing import Effort, Timing, by_turns
+from quad_gym.experiments.benchmark.timing import Timing, by_turns
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.records import POSITION_BLOCK, WIDTH
-from tests.console import plain
 
 
 def run(folder, *options):
@@ -101,24 +100,6 @@ def test_the_options_section_compares_each_with_everything_off(tmp_path):
         assert row["seconds"] > 0.0
 
 
-def test_the_interfaces_name_the_suite_they_time(monkeypatch):
-    effort = Effort(1, 0.001)
-    for options, suite in (({}, "standard"), ({"sensors": "lab"}, "lab")):
-        row = interfaces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
-        assert row["suite"] == suite
-        assert row["name"] == f"vector, estimate, 50 Hz, {suite}"
-
-
-@pytest.mark.slow
-def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(tmp_path):
-    found = run(tmp_path, "--only", "compile")
-    assert list(found["sections"]) == ["compile"]
-    rows = {row["cache"]: row for row in found["sections"]["compile"]}
-    assert list(rows) == ["empty", "full", "edit"]
-    assert rows["edit"]["name"].endswith("kernels/task/reward_and_endings.py")
-    assert rows["full"]["seconds"] < rows["empty"]["seconds"]
-
-
 def test_the_learning_section_says_when_the_policy_was_better_than_pd(tmp_path, capsys):
     rows = run(tmp_path, "--only", "learning", "--seeds", "2")["sections"]["learning"]
     assert [row["seed"] for row in rows] == [0]  # quick
@@ -132,35 +113,6 @@ def test_the_learning_section_says_when_the_policy_was_better_than_pd(tmp_path, 
     assert (found["steps_to_pd"], found["seconds_to_pd"], found["error"]) == (20, 2.0, 0.05)
     better = {**rows[0], **found}
     assert "1 of 2 below tuned PD, the last after 2.0 s" in learning.SECTION.table([*rows, better])
-
-
-def test_all_sections_are_those_that_take_no_minutes():
-    chosen = script.chosen_sections(parse(script.Args, []))
-    assert chosen == ["filter", "tick", "options", "interfaces", "tasks"]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--batch", "12"],
-        ["--batch", "0"],
-        ["--n-envs", "0"],
-        ["--repeats", "0"],
-        ["--seeds", "0"],
-        ["--seconds", "0"],
-        ["--seconds", "nan"],
-        ["--threads", "0"],
-        ["--only", "speed"],
-    ],
-    ids=" ".join,
-)
-def test_invalid_options_are_told_and_exit_code_2(options, capsys):
-    with pytest.raises(SystemExit) as caught:
-        parse(script.Args, options)
-    assert caught.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert options[0] in plain(printed.err)
 
 
 def test_update_of_repeated_flights_shrinks_each_covariance():

@@ -56,17 +56,6 @@ class TestSummary:
         assert truth["tracking_error"]["mean"]["sd"] == 0.0
         assert "estimation_error" not in truth
 
-    def test_holds_the_configuration(self, flown):
-        configuration = flown[1]["configuration"]
-        assert configuration["task"]["radius"] == 4.0
-        assert configuration["gains"]["position"] == 5.0
-        assert configuration["vehicle"]["mass"] == 0.78
-        assert configuration["sensors"]["estimate"]["camera"]["pixel_sigma"] == 20.0
-        assert configuration["sensors"]["estimate_without_camera"]["camera"] is None
-        assert configuration["arguments"]["episodes"] == 20
-        assert flown[1]["versions"]["numpy"] == np.__version__
-        assert flown[1]["seeds"] == {"first": 0, "count": 20}
-
     def test_compares_the_cases_seed_by_seed(self, flown):
         pairs = flown[1]["paired_differences_of_mean_tracking_error"]
         found = pairs["estimate_without_camera - truth"]
@@ -96,19 +85,6 @@ def test_figures_are_those_of_the_report(flown):
     assert written == {f"{name}.{ending}" for name in names for ending in ("png", "svg")}
 
 
-def test_prints_a_table_and_says_what_it_means(tmp_path, capsys, no_figures):
-    run(tmp_path, "--episodes 3 --duration 1")
-    printed = capsys.readouterr()
-    for part in ("tracking error [mm]", "crash", "truth", "estimate, no camera", "±", "NEES"):
-        assert part in printed.out
-    assert "Flying on the estimate" in printed.out
-    assert "Having the camera" in printed.out
-    assert "ticks" not in printed.out
-    assert "ticks" in printed.err
-    lines = [line for line in printed.out.splitlines() if str(tmp_path) not in line]
-    assert max(map(len, lines)) <= 100
-
-
 def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
     one = run(tmp_path / "one", "--seed 3 --episodes 1 --threads 1")
     with (flown[0] / "flights.csv").open() as stream:
@@ -118,17 +94,6 @@ def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
         found = one["cases"][case]["tracking_error"]["mean"]
         assert found["mean"] == pytest.approx(float(want["tracking_error_mean_m"]), rel=1e-12)
         assert found["sd"] is None
-
-
-def test_without_camera(tmp_path, capsys, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(script.plots, "save_figure", lambda figure, path: drawn.append(path) or [])
-    summary = run(tmp_path, "--episodes 2 --duration 1 --no-camera")
-    assert set(summary["cases"]) == {"truth", "estimate_without_camera"}
-    names = {path.name for path in drawn}
-    assert "path_estimate_without_camera" in names
-    assert "path_estimate" not in names
-    assert "Having the camera" not in capsys.readouterr().out
 
 
 def test_options_reach_the_flights(tmp_path, no_figures):
@@ -161,41 +126,3 @@ def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
     np.testing.assert_allclose(trace.error, distance, atol=1e-12)
     assert trace.time[-1] == pytest.approx(0.5)
     np.testing.assert_allclose(trace.heading[0], [-1.0, 0.0], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("line", "reason"),
-    [
-        ("--episodes 0", "--episodes must be at least 1"),
-        ("--seed -1", "--seed must be at least 0"),
-        ("--threads 0", "--threads must be at least 1"),
-        ("--gnss-rate 33", "gnss_rate must divide the IMU rate of 200 Hz"),
-        ("--camera-rate 400", "camera_rate must divide the IMU rate"),
-        ("--camera-rate 50 --no-camera", "has no effect with --no-camera"),
-        ("--imu-rate -1", "imu_rate must be greater than 0"),
-        ("--duration 0.001", "--duration must be at least 0.01 s"),
-        ("--duration nan", "--duration must be at least"),
-        ("--radius -4", "radius must be greater than 0"),
-        ("--period inf", "period must be finite"),
-        ("--position-gain -1", "position must be at least 0"),
-    ],
-)
-def test_refuses_nonsense_in_one_line(tmp_path, capsys, line, reason):
-    with pytest.raises(SystemExit) as end:
-        run(tmp_path / "new", line)
-    assert end.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert reason in printed.err
-    assert printed.err.count("\n") == 1
-    assert not (tmp_path / "new").exists()
-
-
-def test_refuses_a_folder_that_cannot_be(tmp_path, capsys):
-    file = tmp_path / "file"
-    file.write_text("mine")
-    with pytest.raises(SystemExit) as end:
-        run(file)
-    assert end.value.code == 2
-    assert "cannot write to --output" in capsys.readouterr().err
-    assert file.read_text() == "mine"

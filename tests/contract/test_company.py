@@ -181,41 +181,6 @@ def outcome(process):
     return "compiling" in errors
 
 
-@pytest.fixture(scope="module")
-def filled_cache(tmp_path_factory):
-    cache = tmp_path_factory.mktemp("cache")
-    assert outcome(start(cache)), "an empty cache means compiling"
-    return cache
-
-
-@pytest.mark.slow  # the same with smaller kernels: tests/unit/compiling/test_processes.py
-def test_a_kernel_is_compiled_once_and_loaded_ever_after(filled_cache):
-    assert not outcome(start(filled_cache))
-
-
-@pytest.mark.slow  # as many at once, with smaller kernels: tests/unit/compiling/test_processes.py
-def test_two_processes_may_fill_an_empty_cache_at_once(tmp_path):
-    both = [start(tmp_path) for _ in range(2)]
-    outcomes = [outcome(process) for process in both]
-    assert sorted(outcomes) == [False, True]  # one compiles, the other waits and loads
-    assert not outcome(start(tmp_path))
-
-
-@pytest.mark.slow  # in this process, and more kinds: tests/unit/compiling/test_cache.py
-@pytest.mark.parametrize("damage", ["emptied", "cut", "overwritten"])
-def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, damage):
-    cache = tmp_path / "cache"
-    shutil.copytree(filled_cache, cache)
-    files = list(cache.rglob("*.code"))
-    assert files
-    for file in files:
-        content = file.read_bytes()
-        corrupt = {"emptied": b"", "cut": content[: len(content) // 2], "overwritten": b"\x00" * 99}
-        file.write_bytes(corrupt[damage])
-    assert outcome(start(cache))
-    assert not outcome(start(cache))
-
-
 @pytest.mark.slow  # nine processes; which edits count is in tests/unit/compiling/test_digest.py
 def test_changed_kernel_is_compiled_again(tmp_path):
     copy = tmp_path / "quad_gym"
@@ -253,20 +218,6 @@ def run_in(folder, begin):
         return outcome(begin())
     finally:
         os.chdir(here)
-
-
-@pytest.mark.slow  # the same with smaller kernels: tests/unit/compiling/test_cache.py
-def test_kernels_without_a_writable_folder_compile_each_time(tmp_path):
-    source, blocked = Path(quad_gym.__file__).parent, tmp_path / "file"
-    copy = tmp_path / "quad_gym"
-    shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    blocked.write_text("no folder can be made below a file")
-    (copy / "kernels" / "__pycache__").write_text("nor here")
-    places = ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA")
-    environment = {name: str(blocked / "below") for name in places}
-    environment |= {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
-    for _ in range(2):
-        assert run_in(tmp_path, lambda: start(blocked / "cache", **environment))
 
 
 # ---- cores and imports ---------------------------------------------------------------------------

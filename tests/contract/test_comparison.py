@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from quad_gym.commands import evaluate
-from tests.console import plain
 from tests.console_commands import run
 
 pytest.importorskip("stable_baselines3")
@@ -69,51 +68,6 @@ def test_evaluate_without_included_policy_flies_pd(tmp_path, capsys):
         assert told in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("asked", [("pretrained",), ("pd", "pretrained")])
-def test_evaluate_rejects_missing_included_policy(tmp_path, asked):
-    done = run("evaluate", "trajectory", "--policy", *asked, where=tmp_path)
-    assert done.returncode == 2
-    assert "error: no policy is included for QuadGym/Trajectory-v0" in done.stderr
-    wrong = run("evaluate", "circle", "--env", "acton=motor", where=tmp_path)
-    assert wrong.returncode == 2
-    assert "did you mean action?" in wrong.stderr
-    assert "alone" not in wrong.stdout
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["QuadGym/Square-v0"], "ENV_ID must be one of"),
-        (["--policy", "nobody"], "policy must be pd"),
-        (["--policy"], "--policy must have at least one value"),
-        (["--observation", "measurements"], "select a --policy that was trained on measurements"),
-        (["--policy", "missing.zip"], "there is no policy"),
-        (["--observation", "guess"], "observation must be one of"),
-        (["--observation", "estimat"], "did you mean estimate?"),
-        (
-            ["--policy", "pretrained", "--env", "include_std=true"],
-            "trained with observations of 9 fields, but the environment returns 14 (it adds "
-            "position_sigma, velocity_sigma, attitude_sigma, accel_bias_sigma, gyro_bias_sigma):",
-        ),
-        (
-            ["--policy", "pretrained", "--env", "layout=absolute"],
-            "but the environment returns 13 (it lacks position_error, velocity_error, up, heading "
-            "and adds position, ",
-        ),
-        (["--observation"], "--observation must have at least one value"),
-        (["--episodes", "0"], "--episodes must be at least 1"),
-        (["--policy", "pretrained", "--env", "action=motor"], "trained with action ctbr"),
-        (["QuadGym/Hover-v0", "--policy", "pretrained", "--env", "wings=2"], "wings is not"),
-        (["--output", "/dev/null/x"], "cannot write to --output"),
-    ],
-)
-def test_evaluate_rejects_invalid_options(tmp_path, more, message):
-    done = run("evaluate", *more, where=tmp_path)
-    assert done.returncode == 2
-    assert message in plain(done.stderr)
-    assert "Traceback" not in done.stderr
-
-
 def compare(where, *more):
     line = ["--quick", "--steps", 8192, "--output", where / "out", "--env", "duration=0.4"]
     return run("compare", *line, *more, where=where)
@@ -140,29 +94,3 @@ def test_compare_writes_report_and_continues(tmp_path):
     other = compare(tmp_path, "--env", "duration=0.5")
     assert other.returncode == 2
     assert "contains a run of another plan (different: environment)" in other.stderr
-
-
-def test_compare_trains_with_the_compiled_engine(tmp_path):
-    done = compare(tmp_path, "--engine", "compiled", "--train-on", "estimate")
-    assert done.returncode == 0, done.stderr
-    assert "trained on the estimate" in done.stdout
-    folder = tmp_path / "out/runs/standard/estimate/seed_0"
-    assert {file.name for file in folder.glob("best.*")} == {"best.npz"}
-    assert json.loads((folder / "training.json").read_text())["plan"]["engine"] == "compiled"
-    assert "PPO (the compiled engine)" in (tmp_path / "out/report.html").read_text()
-    other = compare(tmp_path, "--train-on", "estimate")
-    assert other.returncode == 2
-    assert "contains a run of another plan (different: engine)" in other.stderr
-
-
-def test_compare_rejects_invalid_options(tmp_path):
-    for more, message in (
-        (["QuadGym/Waypoints-v0"], "ENV_ID must be one of QuadGym/Hover-v0"),
-        (["--sensors", "sonar"], "sensors must be one of"),
-        (["--seeds", "0"], "--seeds must be at least 1"),
-        (["--env", "observation=truth"], "must not contain observation: use --train-on"),
-        (["--engine", "compiled", "--algorithm", "sac"], "engine"),
-    ):
-        done = run("compare", *more, "--output", tmp_path / "x", where=tmp_path)
-        assert done.returncode == 2, more
-        assert message in plain(done.stderr)

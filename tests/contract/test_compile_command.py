@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-import quad_gym
 from quad_gym.commands.compile import names_of_kinds
 from quad_gym.commands.main import main
 from quad_gym.kernels.compiling import cache as caches
@@ -100,39 +99,3 @@ def test_code_that_cannot_be_kept_is_an_error(monkeypatch, capsys):
     assert main(["compile", "--stages", "truth"]) == 1
     count = len(names_of_kinds(["truth"]))
     assert f"error: {count} of them could not be written" in capsys.readouterr().err
-
-
-def test_version(capsys):
-    assert main(["version"]) == 0
-    assert capsys.readouterr().out == f"{quad_gym.__version__}\n"
-
-
-def test_help_of_a_command_has_examples(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["compile", "--help"])
-    assert end.value.code == 0
-    assert "quad-gym compile --stages truth" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        [],
-        ["flap"],
-        ["compile", "--stages", "most"],
-        ["compile", "--stages"],
-        ["compile", "--jobs", "0"],
-        ["version", "stray"],
-    ],
-    ids=" ".join,
-)
-def test_invalid_commands_are_told_and_exit_code_2(words, capsys):
-    try:
-        code = main(words)
-    except SystemExit as end:
-        code = end.code
-    printed = capsys.readouterr()
-    assert code == 2
-    assert printed.out == ""
-    assert "Traceback" not in printed.err
-    assert printed.err

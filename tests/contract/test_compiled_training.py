@@ -49,12 +49,6 @@ def assert_same_policy(first, second):
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_same_seed_gives_the_same_policy_with_any_number_of_threads(tmp_path):
-    for name, threads in (("a", 1), ("b", 2)):
-        assert run(small_plan(threads=threads), tmp_path / name).finished
-    assert_same_policy(tmp_path / "a", tmp_path / "b")
-
-
 def die_after(rollouts, plan, folder, monkeypatch):
     """Train until a rollout fails."""
     calls = iter(range(10_000))
@@ -132,14 +126,6 @@ def test_a_policy_whose_critic_saw_the_truth_flies_without_it(tmp_path):
     names = policy.record["interface"]["observation"]
     assert names[-1] == "log_sigma"
     assert not any("actual" in name for name in names)
-
-
-def test_a_training_with_such_a_critic_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch):
-    plan = asymmetric_plan()
-    run(plan, tmp_path / "whole")
-    die_after(5, plan, tmp_path / "cut", monkeypatch)
-    assert run(plan, tmp_path / "cut", resume=True).finished
-    assert_same_policy(tmp_path / "whole", tmp_path / "cut")
 
 
 @pytest.mark.parametrize(
@@ -252,20 +238,6 @@ def test_the_command_trains_and_exports(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "best.npz" in done.stdout
     assert MlpPolicy.load(tmp_path / "policy.npz").record["plan"]["engine"] == "compiled"
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--algorithm", "sac"], "must be one of ppo"),
-        (["--set", "target_kl=0.1"], "target_kl is not a keyword of the compiled PPO"),
-    ],
-)
-def test_what_the_engine_lacks_is_refused_before_anything_is_trained(tmp_path, more, message):
-    done = command(tmp_path, *more)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert not (tmp_path / "run" / "last.npz").exists()
 
 
 def test_nothing_of_it_needs_torch():

@@ -58,13 +58,6 @@ def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path, monk
     assert "too cautious" in found["verdicts"]["nees_state"]
 
 
-def test_wrong_options_are_refused_in_a_line(tmp_path):
-    for options in (("--episodes", "1"), ("--settle", "5"), ("--sensors", "none")):
-        done = run(tmp_path, *options)
-        assert done.returncode == 2
-        assert "Traceback" not in done.stderr
-
-
 def test_small_innovations_of_a_constant_error_that_counts_as_noise_are_expected(tmp_path):
     line = ["--episodes", "100", "--duration", "2", "--output", str(tmp_path)]
     assert console_commands.run("consistency", "--sensors", "rtk", *line).returncode == 0

@@ -146,48 +146,6 @@ def test_command_lines_parse(file, words, monkeypatch):
     assert exit_code(command, options) == 0, f"{file}: quad-gym {words}"
 
 
-def targets():
-    """(prerequisites, recipe) of the targets of the Makefile, by name."""
-    text = (ROOT / "Makefile").read_text(encoding="utf-8").replace("\\\n", " ")
-    rule = re.compile(r"^([\w$()/.-]+):(?!=)([^\n#]*)[^\n]*\n((?:\t[^\n]*\n)*)", re.MULTILINE)
-    return {
-        name: (needs.replace("|", " ").split(), recipe)
-        for name, needs, recipe in rule.findall(text)
-    }
-
-
-def needed(target, rules):
-    """The target and everything that it needs, directly or not."""
-    return {target}.union(*(needed(n, rules) for n in rules.get(target, ([], ""))[0]))
-
-
-def readme_commands():
-    """The commands of README's first shell block: the main job, and the tests."""
-    _, text, _ = next(blocks(ROOT / "README.md", "sh"))
-    return [line.split("#")[0].strip() for line in text.splitlines()]
-
-
-def test_the_two_commands_of_readme_do_their_set_up():
-    demo, test = readme_commands()
-    rules = targets()
-    for command in (demo, test):
-        make, target = command.split()
-        assert make == "make"
-        assert "$(PYTHON) -m venv" in "".join(
-            rules.get(n, ("", ""))[1] for n in needed(target, rules)
-        )
-        assert rules[target][1].lstrip().startswith("$(BIN)/")  # runs in that environment
-    assert "train]" not in "".join(
-        rules[n][1] for n in needed(demo.split()[1], rules) if n in rules
-    )
-
-
-def test_ci_runs_the_test_command_of_readme():
-    _, test = readme_commands()
-    lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    assert any(re.match(rf"{test}\b", line) for line in lines)
-
-
 def test_files_that_pages_name_exist():
     for page in PAGES:
         if page.name == "CHANGELOG.md":

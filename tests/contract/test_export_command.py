@@ -62,33 +62,3 @@ def test_a_filter_becomes_json_or_a_header(tmp_path, kind, suffix):
         assert json.loads(text)["choices"]["kind"] == "ukf"
     else:
         assert "static const double dt = 0.005;" in text
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("export policy", "POLICY"),
-        ("export policy pretrained", "needs an ENV_ID"),
-        ("export policy pd QuadGym/Hover-v0", "must be a trained network"),
-        ("export policy pretrained QuadGym/Hover-v1", "must be one of"),
-        ("export policy pretrained QuadGym/Hover-v0 --to json", "invalid choice 'json'"),
-        ("export policy pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
-        ("export policy pretrained QuadGym/Hover-v0 --sensors rtk", "Unrecognized options"),
-        (
-            "export policy pretrained QuadGym/Hover-v0 --env action=motor",
-            "trained with action ctbr",
-        ),
-        ("export filter --to c", "invalid choice 'c'"),
-        ("export filter QuadGym/Hover-v0 --to json", "QuadGym/Hover-v0"),
-        ("export filter --sensors gps --to json", "sensors must be one of"),
-        ("export policy nothing.npz", "there is no policy"),
-        ("export policy pretrained QuadGym/Hover-v0 --output /dev/null/it.c", "cannot write"),
-    ],
-)
-def test_nonsense_is_refused(line, message, capsys):
-    assert message in refused(line, capsys)
-
-
-@pytest.mark.parametrize("line", ["export", "export pretrained", "export filters"])
-def test_exports_are_listed_if_none_is_named(line, capsys):
-    assert "policy, filter" in refused(line, capsys)

@@ -10,7 +10,6 @@ import pytest
 from quad_gym import IDS, Flight
 from quad_gym.commands import fly as script
 from tests import console_commands
-from tests.console import plain
 
 ROOT = Path(__file__).resolve().parents[2]
 pytest.importorskip("pygame")
@@ -96,36 +95,6 @@ def test_faults_come_and_go_at_the_given_time(tmp_path):
     assert sigma[99] > 10.0 * sigma[50]  # the filter knows that it is lost
     assert sigma[110] < 0.1 * sigma[99]
     assert not flight.scene.has_camera
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--output", "a.avi"), "--output must end in"),
-        (("--speed", 0), "--speed"),
-        (("--faults", "gnss_outage", "--fault-time", 3, 2), "--fault-time"),
-        (("--fault-time", 2, 3), "--fault-time"),
-        (("--faults", "gremlins"), "gremlins"),
-        (("--faults", "camera_occlusion", "--no-camera"), "CameraOcclusion"),
-        (("--size", 10, 10, "--output", "a.gif"), "render_size"),
-        (("--replay", "nowhere.npz"), "nowhere.npz"),
-        (("--policy", "me"), "policy must be"),
-        (("--policy", "pretraind"), "did you mean pretrained?"),
-        (("--sensors", "standart"), "did you mean standard?"),
-        (("--faults", "gnss_outtage"), "did you mean gnss_outage?"),
-        (("circel",), "did you mean circle?"),
-        (("--env", "worl=calm"), "did you mean world?"),
-        (("--env", "world=clam"), "did you mean calm?"),
-        (("--gnss-rate", 77), "gnss_rate"),
-        (("--duration", 0), "--duration"),
-    ],
-)
-def test_wrong_options_are_one_line_and_write_nothing(tmp_path, options, message):
-    done = fly("--output", "a.npz", *options, cwd=tmp_path)
-    assert done.returncode == 2
-    assert message in plain(done.stderr)
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.iterdir())
 
 
 def test_without_a_display_the_window_is_a_clear_error(tmp_path):

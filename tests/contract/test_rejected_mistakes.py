@@ -11,7 +11,7 @@ from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
 from tests.builders import actions_of, single_env, vec_env
-from tests.contract.comparing import ACTIONS, IDS, OBSERVATIONS, assert_same
+from tests.contract.comparing import IDS, assert_same
 
 TASKS = tuple(quad_gym.IDS.values())
 
@@ -203,12 +203,6 @@ def test_unknown_ids_are_refused(env_id):
         gymnasium.make(env_id)
 
 
-@pytest.mark.parametrize("threads", [0, -2, 1.5, "all", True])
-def test_a_number_of_threads_that_is_invalid_is_refused(threads):
-    with pytest.raises(ValueError, match="threads"):
-        QuadVectorEnv(4, "hover", threads=threads)
-
-
 def test_unknown_keyword_raises_the_error_torchrl_expects():
     with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
         gymnasium.make("QuadGym/Hover-v0", frameskip=1)
@@ -219,10 +213,3 @@ def test_unknown_keyword_raises_the_error_torchrl_expects():
 def test_an_unknown_autoreset_mode_is_refused(env_id, mode):
     with pytest.raises(ValueError, match=r"autoreset_mode|AutoresetMode"):
         gymnasium.make_vec(env_id, num_envs=2, autoreset_mode=mode)
-
-
-def test_every_observation_and_action_says_so_in_its_attributes():
-    for observation in OBSERVATIONS:
-        for action in ACTIONS:
-            env = QuadEnv("hover", observation=observation, action=action)
-            assert (env.flights.observation, env.flights.action) == (observation, action)

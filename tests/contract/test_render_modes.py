@@ -46,20 +46,6 @@ def test_every_task_has_frames(env_id, view):
     assert (frame != env.render()).any()
 
 
-@pytest.mark.parametrize("observation", ["truth", "noisy", "measurements"])
-def test_every_observation_has_frames(observation):
-    env = flown(QuadEnv("circle", observation=observation, render_mode="rgb_array", **SMALL))
-    assert env.render().shape == (240, 320, 3)
-
-
-def test_what_stands_by_is_drawn_without_a_camera():
-    frames = [
-        flown(QuadEnv("hover", camera=camera, render_mode="rgb_array")).render()
-        for camera in (True, False)
-    ]
-    assert (frames[0] != frames[1]).any()
-
-
 @pytest.mark.parametrize("env_id", IDS)
 def test_gymnasiums_checker_is_content(env_id, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # it opens a window, too
@@ -181,14 +167,6 @@ def test_a_vector_environment_renders_what_single_ones_do():
         for one in ones:
             one.step(action)
     assert_same(list(env.render()), [one.render() for one in ones])
-
-
-def test_lists_of_a_vector_environment_are_tiled():
-    env = vec_env(count=3, seed=0, render_mode="rgb_array_list", **SMALL)
-    env.step(np.zeros((3, 4)))
-    frames = env.render()
-    assert [frame.shape for frame in frames] == [(480, 640, 3)] * 2
-    assert (frames[0][240:, 320:] == 255).all()  # the place of a fourth flight
 
 
 def test_a_new_episode_begins_a_new_trail():

@@ -95,44 +95,6 @@ def test_one_study_trains_arms_of_both_engines(tmp_path, capsys):
     assert set(summary["study"]["recipes"]) == {"ppo", "recurrent_ppo"}
 
 
-def test_steps_are_given_for_each_algorithm():
-    two = command.configure(command.Args(arms=("std_certainty_privileged", "recurrent")))
-    counts = [recipe("QuadGym/LookAround-v0", name).steps for name in ("ppo", "recurrent_ppo")]
-    assert two.steps() == f"{counts[0]:,} (ppo) or {counts[1]:,} (recurrent_ppo) steps"
-    same = command.configure(
-        command.Args(arms=("std_certainty_privileged", "recurrent"), steps=5000)
-    )
-    assert same.steps() == "5,000 steps"
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--arms", "nobody"], "--arms must be one of"),
-        (["--arms-file", "nowhere.py"], "--arms-file must be a Python file"),
-        (["--seeds", "0"], "--seeds must be at least 1"),
-        (["--episodes", "1"], "--episodes must be at least 2"),
-        (["--success-within", "-1"], "--success-within must be"),
-        (["stale_race", "--success-within", "1"], "--success-within belongs to LookAround"),
-        (
-            ["stale_race", "--arms", "truth_delay_compensated"],
-            "--arms must name truth, whose policies",
-        ),
-        (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
-        (["--env", "observation=truth"], "--env must not contain observation: use --arms instead"),
-        (["--set", "gammma=0.9"], "gammma"),
-        (["--arms", "recurrent", "--set", "clip=0.1"], "clip is not a keyword of RecurrentPPO"),
-        (["--arms", "truth", "--set", "critic_only=3"], "critic_only must be the number of values"),
-    ],
-)
-def test_invalid_options_are_rejected_before_training(words, message, tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["study", *words, "--output", str(tmp_path / "none")])
-    assert ended.value.code == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "none").exists()
-
-
 def test_invalid_arms_are_rejected():
     with pytest.raises(ValueError, match=r"Arm.name must be a word"):
         Arm(name="a b", label="x")
@@ -240,8 +202,3 @@ def test_conclusions_follow_from_the_numbers(tmp_path):
     assert "0.200 m, not smaller than 0.100 m" in words
     assert "significantly below the best fixed rule" in words
     assert "the intervals are wide" not in words
-
-
-def test_conclusions_contain_the_probability_of_improvement(tmp_path):
-    words = " ".join(conclusions(results(tmp_path, {"estimate": (9, 0, 1), "std": (99, 0, 1)})))
-    assert "with probability 1.00 [0.64, 1.00]." in words

@@ -1,7 +1,5 @@
 """Films of a study: choice of policies and episode, and agreement with the test."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -51,21 +49,6 @@ def test_film_lasts_as_long_as_the_episode_and_loops(filmed):
         assert seconds_of(film) == pytest.approx((pictures + round(HOLD * RATE)) / RATE)
 
 
-def test_report_shows_the_film(filmed):
-    folder, _ = filmed
-    report = (folder / "out/report.html").read_text()
-    assert report.count("data:image/webp;base64,") == 1
-    assert "training with the best validation" in report
-
-
-def test_film_is_repeatable(filmed):
-    folder, words = filmed
-    before = (folder / "out/film.webp").read_bytes()
-    (folder / "out/film.webp").unlink()
-    assert main(words) == 0
-    assert (folder / "out/film.webp").read_bytes() == before
-
-
 def test_film_shows_the_episode_of_the_test(filmed):
     folder, _ = filmed
     study = command.configure(
@@ -89,45 +72,6 @@ def test_film_shows_the_episode_of_the_test(filmed):
             np.testing.assert_array_equal(side.flight["time"][:count], time[:count])
             np.testing.assert_array_equal(side.flight["estimation_error"][:count], kept[:count])
             assert side.crashed == crashed
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--arms", "pd_features", "truth"], "--video needs the arm truth and another trained one"),
-        (["--arms", "std", "estimate"], "--video needs the arm truth and another trained one"),
-        (["--video", "avi"], "--video"),
-    ],
-)
-def test_impossible_film_is_rejected_before_training(words, message, tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["study", "--video", "webp", *words, "--output", str(tmp_path / "none")])
-    assert ended.value.code == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.parametrize(
-    ("module", "kind", "message"),
-    [
-        ("pygame", "webp", "Rendering needs pygame"),
-        ("PIL.Image", "webp", "videos need PIL.Image"),
-        ("imageio_ffmpeg", "mp4", "videos need imageio_ffmpeg"),
-    ],
-)
-def test_missing_library_of_a_film_is_named_before_training(
-    module, kind, message, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setitem(sys.modules, module, None)
-    words = ["study", "--video", kind, "--output", str(tmp_path / "none")]
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert 'pip install "quad-gym[render]"' in error
-    assert not (tmp_path / "none").exists()
-    assert command.configure(command.Args(output=tmp_path / "plain")).arms  # without a film
 
 
 def study_of(task, names, tmp_path):
@@ -170,8 +114,3 @@ def test_glance_shows_the_first_episode_with_a_far_heading(tmp_path):
     pair = pair_of(results_of(study, found, seen))
     assert pair.trainings == {"truth": 0, "std": 0}
     assert pair.episode == 2
-
-
-def test_study_without_truth_has_no_pair(tmp_path):
-    study = study_of("look_around", ("std",), tmp_path)
-    assert pair_of(results_of(study, {"std": 3 * [flown(1.0, [False] * 4, {})]}, {})) is None

@@ -90,19 +90,6 @@ def test_options_override_the_file(tmp_path):
     assert not (tmp_path / "results").exists()
 
 
-def test_steps_and_n_envs_override_the_file(tmp_path):
-    (tmp_path / "mine.toml").write_text("steps = 40960\nn_envs = 16")
-    options = ("mine.toml", "--dry-run", "--steps", "1000", "--n-envs", "8", "4")
-    done = console_commands.run("sweep", *options, where=tmp_path)
-    assert done.returncode == 0, done.stderr
-    *folders, last = done.stdout.splitlines()
-    runs = "results/sweep/mine/runs/circle,ppo"
-    assert folders == [f"{runs},n_envs=8/seed_0", f"{runs},n_envs=4/seed_0"]
-    assert last == "2 trainings, 2,000 steps."
-    plans = [t.plan.recipe for t in expand({"steps": 1000, "n_envs": [8, 4]}, {}, tmp_path)]
-    assert [(recipe.steps, recipe.n_envs) for recipe in plans] == [(1000, 8), (1000, 4)]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -137,22 +124,6 @@ def test_invalid_file_is_rejected_with_one_line(tmp_path, text, message):
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "results/sweep/bad/runs").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--jobs", "0"], "--jobs must be at least 1"),
-        (["--retries", "-1"], "--retries must be at least 0"),
-        (["--threads", "0"], "threads must be at least 1"),
-        (["--options", "mem_gb=4"], "--options are of slurm and ray"),
-        (["nowhere.toml"], "nowhere.toml does not exist"),
-    ],
-)
-def test_invalid_options_are_rejected(tmp_path, options, message):
-    done = console_commands.run("sweep", "--engine", "compiled", *options, where=tmp_path)
-    assert done.returncode == 2
-    assert message in done.stderr
 
 
 @pytest.mark.parametrize("executor", ["slurm", "ray"])

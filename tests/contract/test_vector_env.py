@@ -266,54 +266,6 @@ def test_closing_twice_is_fine():
 # ---- time limits ---------------------------------------------------------------------------------
 
 
-def length_of_an_episode(step, limit):
-    """Steps until `step()` says that the episode is over."""
-    return next(k for k in range(1, limit + 2) if step())
-
-
-@pytest.mark.parametrize(
-    ("limit", "given", "expected"),
-    [
-        (7, {}, 7),
-        (499, {}, 499),
-        (501, {}, 501),  # in place of the task's own ten seconds
-        (501, {"duration": 0.0}, 501),
-        (730, {"duration": 60.0}, 730),
-        (60, {"duration": 1.0}, 50),
-        (60, {"duration": 1.0, "control_rate": 100}, 60),
-    ],
-)
-def test_earlier_of_duration_and_max_episode_steps_truncates(limit, given, expected):
-    keywords = {"observation": "truth", "action": "velocity", "max_episode_steps": limit, **given}
-    single = gymnasium.make("QuadGym/Hover-v0", **keywords)
-    vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **keywords)
-    sync = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, vectorization_mode="sync", **keywords)
-    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=2, seed=1, **keywords)
-    for env in (single, vector, sync):
-        env.reset(seed=1)
-    sb3.reset()
-    still = np.zeros((2, 4), np.float32)
-    assert length_of_an_episode(lambda: single.step(still[0])[3], limit) == expected
-    assert length_of_an_episode(lambda: vector.step(still)[3].all(), limit) == expected
-    assert length_of_an_episode(lambda: sync.step(still)[3].all(), limit) == expected
-    assert length_of_an_episode(lambda: sb3.step(still)[2].all(), limit) == expected
-
-
-@pytest.mark.parametrize("duration", [0.1, 0.5])
-def test_duration_without_max_episode_steps_is_the_limit(duration):
-    keywords = {"observation": "truth", "action": "velocity", "duration": duration}
-    env = gymnasium.make("QuadGym/Hover-v0", **keywords)
-    env.reset(seed=1)
-    assert length_of_an_episode(lambda: env.step(np.zeros(4))[3], 50) == round(50 * duration)
-
-
-def test_without_a_duration_an_episode_has_no_limit():
-    env = vec_env(count=2, seed=1, duration=0.0, observation="truth", action="velocity")
-    for _ in range(1200):
-        _, _, terminated, truncated, _ = env.step(np.zeros((2, 4)))
-        assert not (terminated | truncated).any()
-
-
 @pytest.mark.parametrize("count", [0, -1, 1.5, "two", None, True, 10**8])
 def test_invalid_number_of_environments_is_refused(count):
     for make in (gymnasium.make_vec, quad_gym.make_sb3_vec_env):

@@ -149,19 +149,6 @@ def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
     assert not np.array_equal(observation[: last.slice.start], other[: last.slice.start])
 
 
-def test_a_vector_environment_flies_as_the_single_one():
-    keywords = {"action_delay": 1.5, "randomize_reference": True}
-    many = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, **keywords)
-    one = gymnasium.make("QuadGym/Circle-v0", **keywords)
-    rows, _ = many.reset(seed=7)
-    row, _ = one.reset(seed=9)
-    np.testing.assert_array_equal(rows[2], row)
-    for action in commands(2, 5).astype(np.float32):
-        rows, *_ = many.step(action)
-        row, *_ = one.step(action[2])
-        np.testing.assert_array_equal(rows[2], row)
-
-
 @pytest.mark.parametrize("delay", [-0.1, 10.5, np.nan, "1", None])
 def test_a_delay_that_cannot_be_is_refused(delay):
     with pytest.raises(ValueError, match="action_delay must be"):

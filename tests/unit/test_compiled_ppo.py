@@ -309,17 +309,6 @@ def test_it_learns_an_environment_that_is_not_ours():
     assert action[1, 0] > 0.3
 
 
-def test_learning_shows_its_progress_unless_it_is_quiet(capsys):
-    model = CompiledPPO(sliders(), small_recipe(), seed=0)
-    model.learn(1000)
-    shown = capsys.readouterr().err
-    assert "100%" in shown
-    assert "1.00k/1.00k" in shown
-    assert f"return {model.training_return:.1f}" in shown
-    model.learn(2000, quiet=True)
-    assert capsys.readouterr().err == ""
-
-
 def test_a_diverged_training_says_so():
     model = CompiledPPO(sliders(), small_recipe(), seed=0)
     model.prepare()

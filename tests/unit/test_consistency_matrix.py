@@ -5,8 +5,6 @@ import json
 import pytest
 
 import quad_gym
-from quad_gym.commands import consistency
-from quad_gym.commands.options import parse
 from quad_gym.experiments.consistency import cases as runs
 from quad_gym.experiments.consistency import matrix
 from quad_gym.experiments.consistency.cases import CaseFlights, run_cases
@@ -38,18 +36,6 @@ def test_it_has_every_suite_on_every_task_and_names_no_cell_twice():
     assert {"gnss_outage", "camera_occlusion", "two periods late", "lever arm"} <= conditions
     assert "gnss_ramp" not in conditions  # it does not end
     assert "gnss_outage" not in {condition_of(c) for c in cells if c.name.startswith("indoor")}
-
-
-def test_latencies_are_none_half_and_all_of_two_periods():
-    late = {
-        condition_of(c): c.sensors
-        for c in matrix.cases_of("conditions")
-        if c.name.startswith("rtk, ")
-    }
-    found = [late[f"{name} late"].gnss.latency for name in ("one period", "two periods")]
-    assert found == pytest.approx([0.1, 0.2])
-    assert late["no latency"].camera.latency == 0.0
-    assert late["two periods late"].camera.latency == pytest.approx(0.08)
 
 
 def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
@@ -85,21 +71,6 @@ def test_a_run_goes_on_where_it_was_and_begins_anew_with_other_flights(tmp_path,
     monkeypatch.setattr(runs, "flights_digest", lambda: "of other sources")
     run(cells[:1], tmp_path, CaseFlights(65, duration=1.0))
     assert flown[5:] == [cells[0].name]
-
-
-def test_the_table_marks_misses_and_those_that_are_expected():
-    cell = {"values": {"state": 20.0, "position": 4.0}, "misses": ["state", "position"]}
-    cell |= {"expected": {"state": "wrong noise"}, "filters_failed": 2}
-    text = matrix.table_of({"one": cell}, CaseFlights(400))
-    assert "| one | *20.00* | **4.00** |" in text
-    assert "state: wrong noise; **2 filters failed**" in text
-
-
-def test_wrong_options_are_refused():
-    with pytest.raises(SystemExit):
-        parse(consistency.Args, ["--cells", "suites"])
-    assert parse(consistency.Args, []).flights.count == 4000
-    assert parse(consistency.Args, ["--matrix"]).flights.count == 400
 
 
 @pytest.mark.slow

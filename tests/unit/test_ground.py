@@ -2,7 +2,6 @@
 
 import math
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -301,55 +300,6 @@ def test_it_stands_on_ground_of_its_own_center_of_mass():
     assert (flights.record("v") == 0.0).all()
 
 
-def test_a_flight_is_the_same_in_any_batch():
-    found = []
-    for count, threads in ((1, 1), (19, 2)):
-        flights = batch(count, threads=threads, run_filter=True, ground=TOUGH)
-        flights.reset(seeds=range(count), position=[0.0, 0.0, 0.3])
-        for _ in range(150):
-            flights.step(np.full((count, 4), -0.6))
-        found.append([flights.record(name)[0] for name in ("r", "v", "q", "w", "accel", "r_hat")])
-    for one, other in zip(*found, strict=True):
-        assert (one == other).all()
-
-
-def test_a_snapshot_brings_a_landing_back():
-    flights = batch(4, run_filter=True)
-    flights.reset(seeds=range(4), position=[0.0, 0.0, 0.05])
-    for _ in range(30):
-        flights.step(stopped(flights))
-    kept = flights.snapshot()
-    ends = []
-    for _ in range(2):
-        flights.restore(kept)
-        for _ in range(60):
-            flights.step(stopped(flights))
-        ends.append(flights.record("L"))
-    assert (ends[0] == ends[1]).all()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"friction": -0.1},
-        {"max_touchdown_speed": 0.1},
-        {"max_touchdown_tilt": 4.0},
-        {"feet_B": ((0.1, 0.1, -0.1),) * 3},
-        {"feet_B": ((0.1, 0.1, -0.1),) * 4},
-        {"feet_B": ((0.1, -0.1, 0.1), (0.1, 0.1, 0.1), (-0.1, 0.1, 0.1), (-0.1, -0.1, 0.1))},
-        {"feet_B": ((0.1, -0.1, -0.1), (0.1, 0.1, -0.2), (-0.1, 0.1, -0.1), (-0.1, -0.1, -0.1))},
-    ],
-)
-def test_what_is_no_ground_is_refused(wrong):
-    with pytest.raises(ValueError, match=f"GroundParams.{next(iter(wrong))}"):
-        GroundParams(**wrong)
-
-
-def test_a_world_refuses_what_is_no_ground():
-    with pytest.raises(ValueError, match=r"WorldParams\.ground"):
-        WorldParams(ground=True)
-
-
 @pytest.mark.parametrize("suite", ["standard", "indoor"])
 def test_the_filter_is_consistent_while_the_vehicle_stands(suite):
     """NEES of 15 degrees of freedom, mean over 256 flights: 15 +- 0.34, of which 5 deviations.
@@ -362,21 +312,3 @@ def test_the_filter_is_consistent_while_the_vehicle_stands(suite):
         flights.step(np.full((256, 4), -0.3))
     assert (flights.record("footing") == 4.0).all()
     assert 10.0 < nees(flights).mean() < 15.0 + 5.0 * 0.34
-
-
-def test_every_interface_lands_the_same():
-    world = WorldParams(ground=GroundParams())
-    made = {"world": world, "start": "ground", "action": "motor", "sensors": "indoor"}
-    together = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, **made)
-    alone = gymnasium.make("QuadGym/Hover-v0", **made)
-    together.reset(seed=[4, 5, 6])
-    alone.reset(seed=5)
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        action = np.float32(rng.uniform(-0.6, 0.7, 4))
-        many, rewards, *_ = together.step(np.tile(action, (3, 1)))
-        one, reward, terminated, _, _ = alone.step(action)
-        assert (many[1] == one).all()
-        assert rewards[1] == reward
-        if terminated:
-            break

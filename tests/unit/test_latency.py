@@ -5,7 +5,6 @@ import pytest
 
 import quad_gym
 from quad_gym.envs.single import QuadEnv
-from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import POSITION_BLOCK, WIDTH, FilterStatus, Source
 from tests.field_flights import fly, measured_now, nees, steps
 from tests.reference_late import Rewinding
@@ -316,36 +315,6 @@ def test_without_latency_it_does_not_matter_what_a_filter_does_about_it():
     one, other = (batch.snapshot() for batch in flown)
     for name in set(one.dtype.names) - {"configuration"}:
         assert one[name].tobytes() == other[name].tobytes(), name
-
-
-@pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
-def test_a_flight_in_a_batch_is_the_flight_alone(autoreset):
-    keywords = {
-        "sensors": late(RTK, gnss=0.13, camera=0.06, kind="ekf"),
-        "filter_start": "warm",
-        "duration": 0.3,
-        "include_std": True,
-    }
-    vector = QuadVectorEnv(11, "circle", autoreset_mode=autoreset, **keywords)
-    together = [vector.reset(seed=3)[0]] + [
-        vector.step(np.full((11, 4), 0.1 * (k % 3), np.float32))[0] for k in range(30)
-    ]
-    for i in (0, 7, 10):
-        alone = QuadEnv("circle", **keywords)
-        rows, over = [alone.reset(seed=3 + i)[0]], False
-        for k in range(30):
-            if over and autoreset == "NextStep":
-                rows.append(alone.reset()[0])
-                over = False
-                continue
-            observation, _, terminated, truncated, _ = alone.step(
-                np.full(4, 0.1 * (k % 3), np.float32)
-            )
-            over = terminated or truncated
-            if over and autoreset == "SameStep":
-                observation, over = alone.reset()[0], False
-            rows.append(observation)
-        np.testing.assert_array_equal(rows, np.array(together)[:, i])
 
 
 def test_an_episode_begins_with_nothing_under_way():

@@ -118,38 +118,12 @@ def test_ids_that_a_command_does_not_fly_are_not_suggested():
         known_id("ENV_ID", "waypoints", ["QuadGym/Circle-v0"])
 
 
-@pytest.mark.parametrize(
-    ("line", "told"),
-    [
-        ("--seeds x", "x"),
-        ("--seeds 0", "seeds must be at least 1"),
-        ("--kind c", "--kind"),
-        ("--gains 1", "--gains"),
-        ("--see 3", "--seeds"),
-        ("QuadGym/Hover-v0 stray", "stray"),
-        ("--env a", "KEY=VALUE"),
-        ("--env 1=2", "KEY=VALUE"),
-    ],
-)
-def test_wrong_options_end_with_a_message_that_names_them(line, told, capsys):
-    with pytest.raises(SystemExit) as end:
-        parse(Args, line.split(), prog="it")
-    assert end.value.code == 2
-    message = plain(capsys.readouterr().err)
-    assert told in message
-
-
 @pytest.mark.parametrize("error", [ValueError("why"), OSError("why"), ImportError("why")])
 def test_usage_errors_end_with_one_line(error, capsys):
     with pytest.raises(SystemExit) as end, usage_errors():
         raise error
     assert end.value.code == 2
     assert capsys.readouterr().err == "error: why\n"
-
-
-def test_bugs_are_raised():
-    with pytest.raises(KeyError), usage_errors():
-        raise KeyError("bug")
 
 
 def test_keywords_with_an_option_of_their_own_are_refused():

@@ -50,10 +50,6 @@ class TestHeadingTicks:
         ticks = plots.heading_ticks(time, position, position + 1.0, every=1.0, length=1.0)
         np.testing.assert_allclose(ticks[:, 0, 0], np.arange(11), atol=dt / 2 + 1e-9)
 
-    def test_flight_of_one_instant(self):
-        ticks = plots.heading_ticks([0.0], [[1.0, 2.0, 3.0]], [[0.0, 1.0]], every=0.5, length=1.0)
-        assert ticks.tolist() == [[[1.0, 2.0], [1.0, 3.0]]]
-
 
 class TestPath:
     def test_shows_path_reference_and_start_to_scale(self):
@@ -67,15 +63,6 @@ class TestPath:
         np.testing.assert_array_equal(flown.get_xydata(), trace.position[:, :2])
         np.testing.assert_array_equal(reference.get_xydata(), trace.reference[:, :2])
         np.testing.assert_array_equal(start.get_xydata(), trace.position[:1, :2])
-
-    def test_has_a_tick_every_half_second(self):
-        (ticks,) = axes_of(plots.path_figure(circle())).collections
-        assert len(ticks.get_segments()) == 21
-
-    def test_everything_lies_inside(self):
-        axes = axes_of(plots.path_figure(circle()))
-        for low, high in (axes.get_xlim(), axes.get_ylim()):
-            assert low < -4.0 < 4.0 < high
 
 
 class TestHeight:
@@ -100,34 +87,6 @@ class TestError:
         np.testing.assert_array_equal(axes.lines[-1].get_ydata(), trace.error)
         assert len(axes.collections) == 1
         assert axes.get_yscale() == "log"
-
-    def test_band_without_width_is_drawn_as_a_line(self):
-        trace = circle()
-        axes = axes_of(plots.error_figure(trace, band(trace, 1.0, 1.0)))
-        assert len(axes.lines) == 2
-
-    def test_needs_no_band(self):
-        assert self.labels(axes_of(plots.error_figure(circle()))) == ["one flight"]
-
-    def test_limits_can_be_shared(self):
-        near, far = circle(gap=0.01), circle(gap=1.0)
-        limits = plots.error_limits([near, far], [band(far)])
-        assert limits[0] < 0.01
-        assert limits[1] > 2.0
-        assert axes_of(plots.error_figure(near, limits=limits)).get_ylim() == limits
-
-    def test_limits_do_not_follow_a_zero(self):
-        trace = circle()
-        trace.error[50] = 0.0
-        assert plots.error_limits([trace], [])[0] > 0.01
-
-
-def test_overview_shows_all(tmp_path):
-    trace = circle()
-    errors = {"one": (trace, band(trace)), "two": (trace, None)}
-    figure = plots.overview_figure(trace, errors, title="Path")
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert titles == ["Path", "Height", "one", "two"]
 
 
 def test_saves_png_and_svg_with_the_same_bytes_each_time(tmp_path):

@@ -9,7 +9,6 @@ import quad_gym
 from quad_gym import FlightBatch, TaskParams, sensor_suite
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.flights.record import COLUMNS
-from quad_gym.params.randomization import DRAWABLES
 from quad_gym.records import FLIGHT_FIELDS, Source
 from quad_gym.tasks.view import VIEW_FIELDS
 
@@ -40,10 +39,6 @@ def test_flights_and_views_have_the_words_of_the_table():
             if group == prefix and rest not in ("gnss_drift", "quaternion"):
                 assert f"{shown}.{rest}" in views, name
     assert {"truth.position", "truth.quaternion", "truth.accel_bias", "reference_velocity"} <= views
-
-
-def test_no_quantity_has_the_name_of_a_drawn_parameter():
-    assert not set(QUANTITIES) & {drawable.name for drawable in DRAWABLES}
 
 
 def test_every_quantity_has_the_shape_of_the_table():
@@ -136,10 +131,6 @@ def test_estimates_without_a_filter_are_refused():
         else:
             batch.read(name)
     assert not batch.read("filter_diverged").any()
-
-
-def test_flights_that_were_never_reset_have_no_attitude():
-    assert np.isnan(FlightBatch(2).read("R_BI")).all()
 
 
 def test_a_drawn_parameter_is_read_by_its_name():

@@ -109,25 +109,6 @@ def test_corrections_of_a_right_filter_have_the_variance_that_they_are_given():
     assert np.abs(scaled).max() < 5.0
 
 
-def test_whether_a_flight_is_lost_does_not_depend_on_the_other_flights():
-    """Phases differ, so that flights of a block measure at different ticks."""
-    suite = quad_gym.sensor_suite("rtk").simplified()  # prompt ones, whose update is of all lanes
-    fault = GyroBiasStep(start=0.5, size=math.radians(3.0))
-
-    def lost(seed, count):
-        batch = fly(suite, count, seed=seed, task="hover", filter_start="warm", faults=fault)
-        found = []
-        for _ in range(600):
-            batch.step()
-            found.append(batch.record("diverged"))
-        return np.array(found)
-
-    together = lost(0, 8)
-    assert (np.diff(together, axis=0) < 0.0).any()  # some are found again
-    for k in range(8):
-        np.testing.assert_array_equal(lost(k, 1)[:, 0], together[:, k])
-
-
 @pytest.mark.slow  # what the fault does to another filter
 def test_without_inflated_biases_the_step_would_outlast_the_test():
     """The same fault with a gate that never reopens and never doubts: it takes everything."""
@@ -169,14 +150,6 @@ def test_info_tells_of_it_and_episodes_can_end_with_it():
         endings += info["ending"][truncated].tolist()
     assert lost.mean() > 0.9
     assert endings.count(Ending.FILTER_DIVERGED) > 16
-
-
-@pytest.mark.parametrize("sensors", ["standard", "rtk"])
-def test_an_end_that_no_filter_could_tell_is_refused(sensors):
-    with pytest.raises(
-        ValueError, match="truncate_when_diverged needs a filter, and none runs here"
-    ):
-        QuadVectorEnv(2, "hover", truncate_when_diverged=True, sensors=sensors, observation="truth")
 
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])

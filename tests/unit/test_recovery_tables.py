@@ -8,12 +8,9 @@ from scipy import stats
 
 import quad_gym
 from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery, longest
-from quad_gym.commands import consistency
-from quad_gym.commands.options import parse
 from quad_gym.experiments.consistency import recovery
 from quad_gym.experiments.consistency.cases import CaseFlights, run_cases
 from quad_gym.faults import GyroBiasStep
-from quad_gym.params.suites import SUITES
 from tests.field_flights import fly, nees
 
 
@@ -78,20 +75,6 @@ def test_consistent_flights_and_flags_equal_a_plain_computation():
         follow_recovery(batch, seeds=range(64), duration=0.1, every=0.1)
 
 
-def test_every_fault_of_the_catalogue_ends_and_meets_every_suite_that_can_have_it():
-    found = list(recovery.cases())
-    names = [case.name for case in found]
-    assert len(set(names)) == len(names)
-    for suite in SUITES:
-        assert {f"{suite}, {task}" for task in recovery.CALM_TASKS} <= set(names)
-    assert {"rtk, gnss_ramp", "indoor, camera_occlusion", "consumer, barometer_loss"} <= set(names)
-    assert "indoor, gnss_outage" not in names
-    over = {c.name: recovery.end_of(c.keywords["faults"]) for c in found if c.keywords}
-    assert set(over.values()) == {3.0, 8.0}
-    assert over["rtk, imu_bias_step"] == 3.0
-    assert over["rtk, gnss_outage with imu_bias_step"] == 8.0
-
-
 def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     chosen = [t for t in recovery.cases() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
     chosen = [t for t in chosen if t.keywords]  # hovering takes a minute
@@ -114,12 +97,3 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     assert "| *5.0* |" in text
     assert "| why" in text
     assert "| c | 0.2 | 0.0 | 6.0 |" in text
-
-
-def test_options_that_do_not_go_together_are_refused():
-    for line in (["--matrix", "--recovery"], ["--recovery", "--cells", "all"]):
-        if line[-1] == "all":
-            assert parse(consistency.Args, line).flights.count == 400
-            continue
-        with pytest.raises(SystemExit):
-            parse(consistency.Args, line)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_gym import CameraParams, sensor_suite
+from quad_gym import CameraParams
 from quad_gym.envs.configuration import Flights
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import Autoreset
@@ -18,7 +18,7 @@ from quad_gym.rendering.geometry import (
 )
 from quad_gym.rendering.inset import inset_box, place_in_inset
 from quad_gym.rendering.solids import faces_of
-from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
+from quad_gym.rotations import euler_to_dcm
 from quad_gym.sensors import Camera
 
 CENTER = np.array([320.0, 180.0])
@@ -75,12 +75,6 @@ def test_a_segment_that_passes_the_eye_keeps_its_visible_part_and_direction():
     assert far[1] == pytest.approx(near[1])  # the line lies level with the eye
     assert far[0] > near[0]  # and comes closer on the right
     assert not len(view.segments(end, end + 0.1))
-
-
-def test_looking_straight_down_is_no_special_case():
-    view = look_at(np.array([0.0, 0.0, 5.0]), np.zeros(3), 500.0, CENTER)
-    np.testing.assert_allclose(view.R_VI @ view.R_VI.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(view.R_VI) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -206,15 +200,6 @@ def test_the_inset_shows_the_image_upright_and_to_scale():
         first, second = place_in_inset(pixels, scene, box)
         step = np.where(abs(second - first) > 4.0, np.sign(second - first), 0.0)
         np.testing.assert_array_equal(step, expected)
-
-
-def test_the_rays_of_the_measured_pixels_point_at_the_features():
-    flight = a_flight("hover", seed=4, steps=80, sensors=sensor_suite("lab"))
-    row, scene = flight.rows[-1], flight.scene
-    predicted = scene.project_features(row["position"], quaternion_to_dcm(row["quaternion"]))
-    seen = np.isfinite(row["pixels"]).all(axis=1)
-    assert seen.any()
-    assert (abs(row["pixels"] - predicted)[seen] < 6 * 20.0).all()  # pixel noise of 20
 
 
 def test_views_are_rotations():

@@ -1,51 +1,12 @@
 """Words in pictures: the wording that fits, and none across another."""
 
-import dataclasses
 import itertools
 
-import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
-from baselines.pd import PDPolicy
-from quad_gym.rendering import Renderer, record_flight
 from quad_gym.rendering.canvas import Canvas
-
-
-def test_the_first_wording_that_fits_is_chosen():
-    canvas = Canvas(320, 240)
-    long, short = "camera: no feature in view", "no feature"
-    width = canvas.width_of(long, 16)
-    assert canvas.fitting((long, short), 16, width) == long
-    assert canvas.fitting((long, short), 16, width - 1) == short
-    assert canvas.fitting((long, short), 16, 1.0) == short
-
-
-@pytest.mark.parametrize(
-    ("policy", "words"),
-    [("pd", "flown by pd"), ("results/circle/ppo_seed_0/best.zip", "flown by ppo_seed_0/best")],
-)
-def test_the_legend_names_the_policy(monkeypatch, policy, words):
-    flight = record_flight(
-        PDPolicy(gymnasium.make_vec("QuadGym/Hover-v0", num_envs=1)),
-        "QuadGym/Hover-v0",
-        about={"policy": policy},
-        max_episode_steps=2,
-    )
-    written, write = [], Canvas.text
-
-    def text(self, words, x, y, *more):
-        written.append((words, y))
-        return write(self, words, x, y, *more)
-
-    monkeypatch.setattr(Canvas, "text", text)
-    named = Renderer().draw(flight)
-    places = dict(written)
-    assert places["hover on the estimate"] < places[words] < places["truth"]
-    plain = Renderer().draw(dataclasses.replace(flight, about={}))
-    assert named.shape == plain.shape
-    assert (named != plain).any()
 
 
 @pytest.mark.parametrize("size", [(320, 240), (480, 270), (640, 480), (1280, 720)])

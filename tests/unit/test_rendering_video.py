@@ -6,12 +6,10 @@ import pytest
 import quad_gym
 from quad_gym.faults import GnssOutliers
 from quad_gym.records import GateDecision
-from quad_gym.rendering import Renderer, colors, record_flight, record_video, save_video, tile
+from quad_gym.rendering import Renderer, colors, record_flight, save_video, tile
 from quad_gym.rendering.geometry import fixed_view
 from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
-from quad_gym.rendering.scene import ELLIPSOID_LIMIT, ELLIPSOID_SCALES, ellipsoid_scale
 from quad_gym.rendering.shrink import halve
-from quad_gym.rendering.strip import CONSISTENCY, Box, format_length, height_on
 
 pygame = pytest.importorskip("pygame")
 
@@ -104,38 +102,6 @@ def test_a_replay_shows_what_was_seen_live(flight):
             env.step(np.zeros((1, 4)))
 
 
-def test_the_order_of_pictures_does_not_matter(flight):
-    renderer = Renderer("fixed", (320, 240))
-    forward = [renderer.draw(flight.until(t)) for t in (0.0, 0.2, 0.4)]
-    backward = [renderer.draw(flight.until(t)) for t in (0.4, 0.2, 0.0)][::-1]
-    np.testing.assert_array_equal(forward, backward)
-
-
-def test_the_ellipsoid_is_drawn_as_large_as_fits(flight):
-    scale = ellipsoid_scale(flight)
-    assert scale in ELLIPSOID_SCALES
-    sigma = np.sqrt(np.diagonal(flight["covariance"][:, :3, :3], axis1=1, axis2=2).max())
-    assert 3.0 * sigma * scale <= ELLIPSOID_LIMIT
-    larger = [s for s in ELLIPSOID_SCALES if s > scale]
-    assert all(3.0 * sigma * s > ELLIPSOID_LIMIT for s in larger)
-
-
-def test_logarithmic_plots_place_values_between_their_ends():
-    box = Box(0.0, 10.0, 100.0, 60.0)
-    middle = np.sqrt(CONSISTENCY.low * CONSISTENCY.high)
-    found = height_on(CONSISTENCY, np.array([CONSISTENCY.low, middle, CONSISTENCY.high]), box)
-    np.testing.assert_allclose(found, [70.0, 40.0, 10.0])
-    assert height_on(CONSISTENCY, 1e9, box) == 10.0
-
-
-@pytest.mark.parametrize(
-    ("meters", "words"),
-    [(0.0032, "3.2 mm"), (0.874, "87.4 cm"), (0.999, "1.00 m"), (2.52, "2.52 m"), (np.nan, "-")],
-)
-def test_lengths_are_for_people(meters, words):
-    assert format_length(meters) == words
-
-
 def test_shrinking_takes_the_mean_of_two_by_two_pixels():
     rng = np.random.default_rng(0)
     large = rng.integers(0, 256, (6, 10, 4), dtype=np.uint8)
@@ -200,20 +166,6 @@ def test_an_interrupted_video_leaves_what_was_there_before(flight, tmp_path, end
         assert {f.name: f.read_bytes() for f in tmp_path.iterdir()} == (
             {} if before is None else {file.name: before}
         )
-
-
-def test_a_policy_is_flown_and_filmed_in_one_call(tmp_path):
-    flown = record_video(
-        Still(),
-        "QuadGym/Hover-v0",
-        tmp_path / "hover.gif",
-        seed=1,
-        size=(320, 240),
-        fps=10.0,
-        max_episode_steps=10,
-    )
-    assert len(flown) == 11
-    assert (tmp_path / "hover.gif").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quad_gym import __version__
-from quad_gym.analysis.reports import as_json, text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import as_json, text_table, write_csv, write_json
 
 
 @dataclasses.dataclass
@@ -50,10 +49,3 @@ def test_table():
         "one   |  1           2 |  3.25",
         "three | 10          20 |     -",
     ]
-
-
-def test_versions():
-    found = versions("numpy", "no-such-package")
-    assert found["quad_gym"] == __version__
-    assert found["numpy"] == np.__version__
-    assert found["no-such-package"] is None

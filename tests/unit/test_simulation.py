@@ -5,7 +5,6 @@ import tracemalloc
 import numpy as np
 import pytest
 
-import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults import AccelBiasStep, GnssOutage
 from quad_gym.params.task import TaskParams
@@ -50,35 +49,6 @@ def hundred():
     return fly(SEEDS)
 
 
-@pytest.mark.parametrize("size", [1, 7, 8, 9, 99])
-def test_a_flight_does_not_depend_on_the_size_of_its_batch(hundred, size):
-    assert_same_flights(fly(SEEDS[:size]), hundred, others=slice(0, size))
-
-
-def test_a_flight_does_not_depend_on_its_place_in_the_batch(hundred):
-    order = np.random.default_rng(6).permutation(100)
-    assert_same_flights(fly([SEEDS[i] for i in order]), hundred, others=order)
-
-
-@pytest.mark.parametrize("threads", [2, 3, 8])
-def test_a_flight_does_not_depend_on_the_number_of_threads(hundred, threads):
-    other = fly(SEEDS, threads=threads)
-    assert_same_flights(other, hundred)
-    np.testing.assert_array_equal(other.results, hundred.results)
-
-
-def test_flights_of_different_seeds_differ_and_a_seed_repeats_itself(hundred):
-    assert len(np.unique(hundred.record("gyro"), axis=0)) == 100
-    again = new_batch(100)
-    again.reset(seeds=[0] * 100)
-    for _ in range(3):
-        again.step()
-    again.reset(seeds=SEEDS)
-    for _ in range(60):
-        again.step()
-    np.testing.assert_array_equal(again.record("r_hat"), hundred.record("r_hat"))
-
-
 @pytest.mark.parametrize("source", list(Source))
 def test_a_snapshot_in_mid_flight_comes_back_bit_for_bit(source):
     batch = fly(SEEDS[:11], source=source)
@@ -114,28 +84,6 @@ def test_a_snapshot_is_a_copy():
     assert kept.tobytes() == bytes_then
 
 
-def test_a_masked_reset_begins_the_chosen_flights_alone(hundred):
-    batch, mask = fly(SEEDS), np.random.default_rng(7).random(100) < 0.3
-    batch.reset(seeds=[9] * 100, mask=mask)
-    assert_same_flights(batch, hundred, flights=~mask, others=~mask)
-    fresh = new_batch(100)
-    fresh.reset(seeds=[9] * 100)
-    for name in ("r", "q", "r_hat", "L", "key", "instant", "tick", "gyro", "b_a", "episode"):
-        np.testing.assert_array_equal(
-            batch.record(name)[mask], fresh.record(name)[mask], err_msg=name
-        )
-
-
-def test_a_reset_without_seeds_goes_on_with_the_stream():
-    batch = fly(SEEDS[:5], steps=0)
-    first = batch.record("b_a")
-    batch.reset()
-    assert (batch.record("b_a") != first).all()
-    np.testing.assert_array_equal(batch.record("episode"), 2.0)
-    batch.reset(seeds=SEEDS[:5])
-    np.testing.assert_array_equal(batch.record("b_a"), first)
-
-
 def test_a_batch_flies_on_the_motors_it_is_told():
     task = TaskParams(duration=0, pad=False)
     batch = new_batch(2, control=Control.MOTOR, source=Source.TRUTH, task=task)
@@ -148,35 +96,6 @@ def test_a_batch_flies_on_the_motors_it_is_told():
     assert batch.record("v")[0, 2] < -0.5 < 0.5 < batch.record("v")[1, 2]
     batch.step()  # keeps the present actions
     np.testing.assert_array_equal(batch.record("voltages"), voltages)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"count": 0},
-        {"count": -3},
-        {"count": 2.5},
-        {"count": "many"},
-        {"sensors": "laboratory"},
-        {"vehicle": "boat"},
-        {"gains": "best"},
-        {"threads": 0},
-        {"threads": 1.5},
-        {"substeps": 0},
-        {"control_rate": 70.0},
-        {"control_rate": -1.0},
-        {"control_rate": np.nan},
-        {"source": 9},
-        {"control": 77},
-        {"layout": 5},
-        {"autoreset": 4},
-        {"true_sensors": quad_gym.sensor_suite("lab").with_rates(imu=100.0)},
-    ],
-    ids=str,
-)
-def test_a_batch_that_is_invalid_raises(options):
-    with pytest.raises(ValueError, match=r".+"):
-        FlightBatch(**{"count": 4, **options})
 
 
 @pytest.mark.parametrize(
@@ -208,15 +127,6 @@ def test_actions_that_do_not_fit_raise_and_change_nothing():
     before = batch.snapshot()
     with pytest.raises(ValueError, match="shape"):
         batch.step(np.zeros((3, 4)))
-    assert batch.snapshot().tobytes() == before.tobytes()
-
-
-def test_a_snapshot_of_another_kind_is_refused():
-    batch = fly(SEEDS[:4], steps=3)
-    before = batch.snapshot()
-    for snapshot in (np.zeros(3), np.zeros(1), new_batch(9).snapshot()):
-        with pytest.raises(ValueError, match="snapshot"):
-            batch.restore(snapshot)
     assert batch.snapshot().tobytes() == before.tobytes()
 
 

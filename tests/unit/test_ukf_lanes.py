@@ -155,38 +155,6 @@ def started():
     return filters
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["gnss_position", "gnss_baseline", "pixels"])
-def test_a_measurement_that_is_not_finite_fails_the_update_of_its_lane_alone(name, value):
-    filters = started()
-    filters.put(4, **{name: value}, block_valid=ALL_VALID)
-    before = {field: filters.get(field) for field in (*STATE, "nis", "nis_dimension")}
-    filters.update()
-    for field, values in before.items():
-        np.testing.assert_array_equal(filters.get(field)[4], values[4])
-        if field in STATE:
-            assert all((filters.get(field)[lane] != values[lane]).any() for lane in (0, 3, 5, 7))
-    expected = np.zeros(EIGHT)
-    expected[4] = FilterStatus.UPDATE_FAILED
-    np.testing.assert_array_equal(filters.get("filter_status"), expected)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
-@pytest.mark.parametrize("name", ["gyro", "accel"])
-def test_a_prediction_that_fails_keeps_the_state_of_its_lane_alone(name, value):
-    filters = started()
-    filters.put(6, **{name: value})
-    before = {field: filters.get(field) for field in STATE}
-    filters.predict()
-    for field, values in before.items():
-        np.testing.assert_array_equal(filters.get(field)[6], values[6])
-        if field in ("r_hat", "v_hat", "R_hat", "L"):
-            assert all((filters.get(field)[lane] != values[lane]).any() for lane in (0, 5, 7))
-    expected = np.zeros(EIGHT)
-    expected[6] = FilterStatus.PREDICTION_FAILED
-    np.testing.assert_array_equal(filters.get("filter_status"), expected)
-
-
 def test_a_lost_covariance_fails_the_prediction_and_stays_for_the_record():
     filters = started()
     filters.put(1, L=np.nan)

@@ -193,28 +193,6 @@ def test_a_filter_that_cannot_know_its_heading_has_nothing_to_start_warm_with(ca
 # ---- the interfaces --------------------------------------------------------------------------
 
 
-def test_every_interface_starts_warm_alike():
-    keywords = {
-        "sensors": "rtk",
-        "filter_start": "warm",
-        "include_std": True,
-        "randomization": {"start_yaw": Uniform(-np.pi, np.pi)},
-    }
-    vector = QuadVectorEnv(3, "hover", **keywords)
-    together, infos = vector.reset(seed=5)
-    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=3, seed=5, **keywords)
-    np.testing.assert_array_equal(sb3.reset(), together)
-    action = np.full((3, 4), 0.1, np.float32)
-    stepped = vector.step(action)[0]
-    np.testing.assert_array_equal(sb3.step(action)[0], stepped)
-    for i in range(3):
-        alone = QuadEnv("hover", **keywords)
-        observation, info = alone.reset(seed=5 + i)
-        np.testing.assert_array_equal(observation, together[i])
-        assert info["estimation_error"] == infos["estimation_error"][i] > 0.0
-        np.testing.assert_array_equal(alone.step(action[i])[0], stepped[i])
-
-
 def test_every_episode_starts_warm_anew():
     env = QuadVectorEnv(
         2, "hover", sensors="indoor", filter_start="warm", duration=0.1, autoreset_mode="SameStep"
