@@ -18,11 +18,12 @@ from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import pack_warm_start
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages, used_parts
-from quad_gym.packing.configuration import FlightConfiguration, configured
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.packing.flight import params_block, params_record
 from quad_gym.packing.paths import pack_paths
 from quad_gym.packing.settings import settings_record
 from quad_gym.params import checks as check
+from quad_gym.params.resolved import taking
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import (
     FLIGHT_BLOCK,
@@ -36,8 +37,6 @@ from quad_gym.records import (
     words_of_update,
 )
 
-MOST_FLIGHTS = 10**7
-"""Largest number of flights in a batch."""
 _GROUP_MEMORY = 1 << 22
 """Memory of the blocks that a thread flies side by side [bytes]: less leaves gathered blocks half
 empty."""
@@ -53,18 +52,15 @@ class FlightBatch(FlightMemory):
     flight depends only on its seed and its actions, not on the size of the batch, its order or the
     number of threads.
 
-    Args:
-        count: Number of flights.
-        keywords: See `quad_gym.packing.configuration.FlightConfiguration`.
+    `quad_gym.packing.configuration.FlightConfiguration` explains the arguments.
 
     Raises:
         ValueError: If an argument is invalid; nothing is allocated then.
     """
 
-    @configured(FlightConfiguration)
-    def __init__(self, count: int, c: FlightConfiguration) -> None:
-        self.count = check.whole("count", count, most=MOST_FLIGHTS)
-        self.configuration = c
+    @taking(FlightConfiguration, "FlightBatch")
+    def __init__(self, c: FlightConfiguration) -> None:
+        self.configuration, self.count = c, int(c.count)
         self.vehicle, self.sensors, self.task, self.world = c.vehicle, c.sensors, c.task, c.world
         self.gains, self.action_params, self.action_delay = c.pd_gains, c.actions, c.action_delay
         self.source, self.control, self.clocks = c.source, c.control, c.clocks

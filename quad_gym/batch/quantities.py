@@ -46,7 +46,7 @@ class Quantity(NamedTuple):
     meaning: str
     kind: type = float
     filtered: bool = False
-    """whether only flights have it in which a filter, and so sensors, run"""
+    """True if only flights have it in which a filter, and so sensors, run"""
 
 
 def read(batch: "FlightBatch", name: str, flights: Flights) -> NDArray[Any]:
@@ -186,31 +186,31 @@ def _aid(aid: Aid) -> Computed:
 
 # fmt: off
 QUANTITIES = {
-    "time": Quantity(_time, (), "s", "-", "since the start of the episode"),
+    "time": Quantity(_time, (), "s", "-", "time since the start of the episode"),
     "step": Quantity("step", (), "-", "-", "control steps since the start of the episode", int),
     # the truth
-    "position": Quantity("r", (3,), "m", "I", "of the center of mass"),
-    "velocity": Quantity("v", (3,), "m/s", "I", "of the center of mass"),
-    "quaternion": Quantity("q", (4,), "-", "B to I", "attitude, unit quaternion (w, x, y, z)"),
-    "R_BI": Quantity(_true_R_BI, (3, 3), "-", "I to B", "attitude, v_B = R_BI v_I"),
-    "body_rates": Quantity("w", (3,), "rad/s", "B", "angular rate"),
-    "rotor_speeds": Quantity("rotor_speeds", (4,), "rad/s", "-", "of the four rotors"),
-    "accel_bias": Quantity("b_a", (3,), "m/s^2", "B", "of the accelerometer"),
-    "gyro_bias": Quantity("b_g", (3,), "rad/s", "B", "of the gyro"),
+    "position": Quantity("r", (3,), "m", "I", "true position of the center of mass"),
+    "velocity": Quantity("v", (3,), "m/s", "I", "true velocity of the center of mass"),
+    "quaternion": Quantity("q", (4,), "-", "B to I", "true attitude, unit quaternion (w, x, y, z)"),
+    "R_BI": Quantity(_true_R_BI, (3, 3), "-", "I to B", "true attitude, v_B = R_BI v_I"),
+    "body_rates": Quantity("w", (3,), "rad/s", "B", "true body rates"),
+    "rotor_speeds": Quantity("rotor_speeds", (4,), "rad/s", "-", "true speeds of the four rotors"),
+    "accel_bias": Quantity("b_a", (3,), "m/s^2", "B", "true bias of the accelerometer"),
+    "gyro_bias": Quantity("b_g", (3,), "rad/s", "B", "true bias of the gyro"),
     "gnss_drift": Quantity("gnss_drift", (3,), "m", "I", "time-correlated error of GNSS positions"),
     "disturbance": Quantity("disturbance", (3,), "N", "I", "external force on the body"),
     "wind": Quantity("wind", (3,), "m/s", "I", "velocity of the air"),
     "faults": Quantity("faults", (), "bits", "-", "active at the present instant: the sum of 2^`FaultKind`", int),
     # the filter's estimate
-    "estimated_position": Quantity("r_hat", (3,), "m", "I", "estimate of `position`", filtered=True),
-    "estimated_velocity": Quantity("v_hat", (3,), "m/s", "I", "estimate of `velocity`", filtered=True),
-    "estimated_quaternion": Quantity(_quaternions("R_hat"), (4,), "-", "B to I", "estimate of `quaternion`", filtered=True),
-    "estimated_R_BI": Quantity("R_hat", (3, 3), "-", "I to B", "estimate of `R_BI`", filtered=True),
+    "estimated_position": Quantity("r_hat", (3,), "m", "I", "the filter's estimate of `position`", filtered=True),
+    "estimated_velocity": Quantity("v_hat", (3,), "m/s", "I", "the filter's estimate of `velocity`", filtered=True),
+    "estimated_quaternion": Quantity(_quaternions("R_hat"), (4,), "-", "B to I", "the filter's estimate of `quaternion`", filtered=True),
+    "estimated_R_BI": Quantity("R_hat", (3, 3), "-", "I to B", "the filter's estimate of `R_BI`", filtered=True),
     "estimated_body_rates": Quantity(_estimated_rates, (3,), "rad/s", "B", "measured rates minus the estimated bias", filtered=True),
-    "estimated_accel_bias": Quantity("b_a_hat", (3,), "m/s^2", "B", "estimate of `accel_bias`", filtered=True),
-    "estimated_gyro_bias": Quantity("b_g_hat", (3,), "rad/s", "B", "estimate of `gyro_bias`", filtered=True),
-    "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "estimate of `gnss_drift`", filtered=True),
-    "filter_status": Quantity("filter_status", (), "bits", "-", "numerical failures so far, see `FilterStatus`", int),
+    "estimated_accel_bias": Quantity("b_a_hat", (3,), "m/s^2", "B", "the filter's estimate of `accel_bias`", filtered=True),
+    "estimated_gyro_bias": Quantity("b_g_hat", (3,), "rad/s", "B", "the filter's estimate of `gyro_bias`", filtered=True),
+    "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "the filter's estimate of `gnss_drift`", filtered=True),
+    "filter_status": Quantity("filter_status", (), "bits", "-", "numerical failures of the filter so far, see `FilterStatus`", int),
     "filter_diverged": Quantity("diverged", (), "-", "-", "the covariance does not explain the last innovations", bool),
     "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update", filtered=True),
     "nis_dimension": Quantity("nis_dimension", (), "-", "-", "measurements in the last update", int, filtered=True),
@@ -234,13 +234,13 @@ QUANTITIES = {
     # the task
     "action": Quantity("action", (4,), "-", "-", "the present action, in [-1, 1]"),
     "last_action": Quantity("last_action", (4,), "-", "-", "the action before it"),
-    "reference_position": Quantity(_reference(0), (3,), "m", "I", "of the reference; on a course, the next gate"),
-    "reference_velocity": Quantity(_reference(1), (3,), "m/s", "I", "of the reference"),
-    "reference_acceleration": Quantity(_reference(2), (3,), "m/s^2", "I", "of the reference"),
+    "reference_position": Quantity(_reference(0), (3,), "m", "I", "position of the reference; on a course, the next gate"),
+    "reference_velocity": Quantity(_reference(1), (3,), "m/s", "I", "velocity of the reference"),
+    "reference_acceleration": Quantity(_reference(2), (3,), "m/s^2", "I", "acceleration of the reference"),
     "reference_heading": Quantity(_reference(3), (3,), "-", "I", "horizontal direction in which body x is to point"),
     "gates": Quantity(_gates, ("gates", 3), "m", "I", "centers of the course's gates, in order"),
     "gates_passed": Quantity("gate_next", (), "-", "-", "gates passed in this episode", int),
-    "reward": Quantity("reward", (), "-", "-", "of the last step"),
+    "reward": Quantity("reward", (), "-", "-", "reward of the last step"),
     "terminated": Quantity("terminated", (), "-", "-", "the last step ended the episode by a crash or at the goal", bool),
     "truncated": Quantity("truncated", (), "-", "-", "the last step ended the episode by its time limit or a failed filter", bool),
     "ending": Quantity("ending", (), "-", "-", "why the episode ended, see `Ending`", int),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.beginnings import check_in_bounds
-from quad_gym.batch.flight_batch import MOST_FLIGHTS, FlightBatch
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.standing import check_pad
 from quad_gym.batch.starts import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
@@ -26,13 +26,14 @@ from quad_gym.envs.spaces import (
 )
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import faults_of, needs_sensors
+from quad_gym.packing.configuration import MOST_FLIGHTS
 from quad_gym.params import checks as check
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.params.world import WorldParams, world_params
-from quad_gym.records import RESULTS, Autoreset, Layout
+from quad_gym.records import Autoreset, Layout
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -205,7 +206,7 @@ class Flights:
             make, self.table = with_task(own_task, make, self.table)
         self.space = observation_space(self.table)
         self._split = policy_size(self.table) if privileged else None
-        self.batch = make(count, autoreset=autoreset)
+        self.batch = make(count=count, autoreset=autoreset)
 
     def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
         """The start values in the options of a reset, checked before anything changes.
@@ -257,9 +258,7 @@ def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:
     if estimator is None:
         return suite
     check.choice("estimator", estimator, ("ukf", "ekf"))
-    return suite.replace(  # type: ignore[no-any-return]
-        estimator=suite.estimator.replace(kind=estimator)
-    )
+    return suite.replace(estimator=suite.estimator.replace(kind=estimator))
 
 
 def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...]:
@@ -282,10 +281,6 @@ def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...
     return faults
 
 
-COLUMN = {name: column for column, name in enumerate(RESULTS)}
-"""Columns of a batch's `results`, by name."""
-
-
 def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     """Actions as floats, clipped to [-1, 1].
 
@@ -293,7 +288,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         ValueError: If the shape is another or a number is not finite.
     """
     if _in_order(actions, shape):
-        return actions  # type: ignore[no-any-return]
+        return actions
     try:
         given = np.asarray(actions)
     except ValueError:
@@ -340,10 +335,3 @@ def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"options may hold {', '.join(known)}, got {unknown[0]!r}")
     return chosen
-
-
-def drawn_info(drawn: dict[str, NDArray[np.float64]], flight: int) -> dict[str, Any]:
-    """Return the entry "drawn" of `info` for one flight: draws by name; empty without draws."""
-    values = {name: flights[flight] for name, flights in drawn.items()}
-    numbers = {name: float(v) if v.ndim == 0 else v for name, v in values.items()}
-    return {"drawn": numbers} if numbers else {}

@@ -1,5 +1,6 @@
 """Faults and innovations in `info`."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,8 +9,28 @@ from numpy.typing import NDArray
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.innovations import innovations_of
 from quad_gym.faults.presets import named_faults
+from quad_gym.records import Ending
 
 Parts = dict[str, dict[str, NDArray[Any]]]
+
+
+def start_info(batch: FlightBatch) -> dict[str, Any]:
+    """Return `info` of all flights at the start of episodes: arrays, and dictionaries of arrays."""
+    return {
+        "position_error": batch.record("position_error"),
+        "estimation_error": batch.record("estimation_error"),
+        "ending": np.full(batch.count, Ending.NONE, object),
+        "filter_status": batch.record("filter_status").astype(np.int64),
+        "filter_diverged": batch.record("diverged") > 0.0,
+        "gates_passed": np.zeros(batch.count, np.int64),
+        **drawn_info(batch.drawn()),
+        **flight_info(batch, batch.record("faults")),
+    }
+
+
+def drawn_info(drawn: dict[str, NDArray[np.float64]]) -> Parts:
+    """Return the entry "drawn" of `info` for all flights; empty without draws."""
+    return {"drawn": drawn} if drawn else {}
 
 
 def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
@@ -27,15 +48,17 @@ def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
     return found
 
 
-def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
+def info_of_flight(infos: Mapping[str, Any], flight: int) -> dict[str, Any]:
     """Return the entries of one flight, with Python's booleans and numbers for arrays of one."""
-    return {
-        name: {
-            key: values[flight] if values.ndim > 1 else values[flight].item()
-            for key, values in part.items()
-        }
-        for name, part in parts.items()
-    }
+    found: dict[str, Any] = {}
+    for name, values in infos.items():
+        if isinstance(values, dict):
+            found[name] = info_of_flight(values, flight)
+        elif values.ndim > 1 or values.dtype == object:
+            found[name] = values[flight]
+        else:
+            found[name] = values[flight].item()
+    return found
 
 
 def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[np.intp]) -> None:

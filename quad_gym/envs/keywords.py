@@ -5,12 +5,14 @@ interfaces, `inspect.signature` and `help` from the signatures that `shows` make
 explains each keyword.
 """
 
+import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
 
 from quad_gym.faults.presets import FaultsGiven
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import checks as check
 from quad_gym.params.control import ActionParams
 from quad_gym.params.randomization import Given, Randomization
@@ -86,28 +88,24 @@ class VectorKeywords(EnvKeywords, total=False):
     render_flights: Sequence[int] | None
 
 
-DEFAULTS: EnvKeywords = {
+_OWN_DEFAULTS: dict[str, Any] = {
     "observation": "estimate",
     "action": "ctbr",
     "layout": "relative",
-    "include_std": False,
-    "privileged": False,
-    "sensors": "standard",
-    "innovations": False,
     "reward_terms": False,
-    "vehicle": "lab",
-    "action_params": None,
     "camera": True,
     "estimator": None,
-    "filter_start": "cold",
     "control_rate": 50.0,
-    "action_delay": 0.0,
-    "substeps": 1,
-    "true_vehicle": None,
-    "true_sensors": None,
-    "world": "calm",
-    "randomization": None,
-    "faults": None,
+}
+"""Defaults that differ from those of `FlightBatch`, or that it lacks."""
+
+DEFAULTS: dict[str, Any] = {
+    **{
+        field.name: field.default
+        for field in dataclasses.fields(FlightConfiguration)
+        if field.name in inspect.get_annotations(EnvKeywords)
+    },
+    **_OWN_DEFAULTS,
 }
 """Defaults of keywords that the id's task does not set; None for all others."""
 
@@ -165,7 +163,7 @@ def shows(keywords: type) -> Callable[[F], F]:
             inspect.Parameter(
                 name,
                 inspect.Parameter.KEYWORD_ONLY,
-                default=dict(DEFAULTS).get(name),
+                default=DEFAULTS.get(name),
                 annotation=kind,
             )
             for name, kind in types_of(keywords).items()

@@ -1,7 +1,7 @@
 """`QuadSB3VecEnv`: many flights as a Stable-Baselines3 vector environment."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Unpack
 
 import gymnasium
@@ -10,19 +10,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from quad_gym.batch.starts import stream_keys
-from quad_gym.envs.configuration import (
-    COLUMN,
-    Flights,
-    checked_actions,
-    drawn_info,
-    start_options,
-)
-from quad_gym.envs.flight_info import flight_info, info_of_flight
+from quad_gym.envs.configuration import Flights, checked_actions, start_options
+from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset, Ending
+from quad_gym.records import Autoreset, Ending, Result
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -120,7 +114,7 @@ class QuadSB3VecEnv(VecEnv):
         if self.rendering is not None:
             self.rendering.observe()
         results = batch.results
-        done = (results[:, COLUMN["terminated"]] + results[:, COLUMN["truncated"]]) > 0.0
+        done = (results[:, Result.TERMINATED] + results[:, Result.TRUNCATED]) > 0.0
         infos: list[dict[str, Any]] = [
             {
                 "position_error": position,
@@ -129,40 +123,40 @@ class QuadSB3VecEnv(VecEnv):
             }
             # two lists of numbers are made faster than a list of pairs
             for position, estimation in zip(
-                results[:, COLUMN["position_error"]].tolist(),
-                results[:, COLUMN["estimation_error"]].tolist(),
+                results[:, Result.POSITION_ERROR].tolist(),
+                results[:, Result.ESTIMATION_ERROR].tolist(),
                 strict=True,
             )
         ]
-        more = flight_info(batch, results[:, COLUMN["faults"]])
+        more = flight_info(batch, results[:, Result.FAULTS])
         if self.flights.reward_terms:
             more["reward_terms"] = batch.reward_terms()
         if more:
             for i, info in enumerate(infos):
                 info |= info_of_flight(more, i)
         for i in np.flatnonzero(done).tolist():
-            infos[i] |= self._episode_end(i, results[i]) | drawn_info(flown_with, i)
+            infos[i] |= self._episode_end(i, results[i]) | info_of_flight(drawn_info(flown_with), i)
             if batch.innovations:
                 infos[i] |= info_of_flight({"innovations": batch.final_innovations}, i)
-        rewards = results[:, COLUMN["reward"]].astype(np.float32)
+        rewards = results[:, Result.REWARD].astype(np.float32)
         return self.flights.split(observations), rewards, done, infos
 
     def _episode_end(self, i: int, row: np.ndarray) -> dict[str, Any]:
         """Return the entries that only the last `info` of an episode has."""
         final = self.flights.batch.final_observations[i].copy()
-        steps = int(row[COLUMN["episode_steps"]])
+        steps = int(row[Result.EPISODE_STEPS])
         return {
             "terminal_observation": self.flights.split(final),
-            "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > row[COLUMN["terminated"]]),
-            "ending": Ending(int(row[COLUMN["ending"]])),
-            "filter_status": int(row[COLUMN["filter_status"]]),
-            "filter_diverged": bool(row[COLUMN["filter_diverged"]] > 0.0),
-            "gates_passed": int(row[COLUMN["gates_passed"]]),
+            "TimeLimit.truncated": bool(row[Result.TRUNCATED] > row[Result.TERMINATED]),
+            "ending": Ending(int(row[Result.ENDING])),
+            "filter_status": int(row[Result.FILTER_STATUS]),
+            "filter_diverged": bool(row[Result.FILTER_DIVERGED] > 0.0),
+            "gates_passed": int(row[Result.GATES_PASSED]),
             "episode": {
-                "r": float(row[COLUMN["episode_return"]]),
+                "r": float(row[Result.EPISODE_RETURN]),
                 "l": steps,
                 "t": round(time.monotonic() - self._began, 6),
-                "e": float(row[COLUMN["episode_error_sum"]]) / steps,
+                "e": float(row[Result.EPISODE_ERROR_SUM]) / steps,
             },
         }
 
@@ -245,19 +239,7 @@ class QuadSB3VecEnv(VecEnv):
         return self.flights.start(start)
 
     def _infos_of_start(self) -> list[dict[str, Any]]:
-        batch = self.flights.batch
-        errors: Iterable[tuple[float, float]] = zip(
-            batch.record("position_error").tolist(),
-            batch.record("estimation_error").tolist(),
-            strict=True,
-        )
-        drawn, more = batch.drawn(), flight_info(batch, batch.record("faults"))
-        return [
-            {
-                "position_error": p,
-                "estimation_error": e,
-                **drawn_info(drawn, i),
-                **info_of_flight(more, i),
-            }
-            for i, (p, e) in enumerate(errors)
-        ]
+        infos = start_info(self.flights.batch)
+        for name in ("ending", "filter_status", "filter_diverged", "gates_passed"):
+            del infos[name]
+        return [info_of_flight(infos, i) for i in range(self.num_envs)]

@@ -9,30 +9,16 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec, make
 
 from quad_gym.batch.starts import stream_key
-from quad_gym.envs.configuration import (
-    COLUMN,
-    Flights,
-    checked_actions,
-    drawn_info,
-)
-from quad_gym.envs.flight_info import flight_info, info_of_flight
+from quad_gym.envs.configuration import Flights, checked_actions
+from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset, Ending
+from quad_gym.records import Autoreset, Ending, Result
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
-
-_REWARD, _TERMINATED, _TRUNCATED = COLUMN["reward"], COLUMN["terminated"], COLUMN["truncated"]
-_POSITION_ERROR, _ESTIMATION_ERROR = COLUMN["position_error"], COLUMN["estimation_error"]
-_ENDING, _FILTER_STATUS = COLUMN["ending"], COLUMN["filter_status"]
-_FILTER_DIVERGED, _GATES_PASSED, _FAULTS = (
-    COLUMN["filter_diverged"],
-    COLUMN["gates_passed"],
-    COLUMN["faults"],
-)
 
 
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):
@@ -272,16 +258,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         self._over = False
         if self.rendering is not None:
             self.rendering.observe(reset=True)
-        return self.flights.split(observations[0]), {
-            "position_error": float(batch.record("position_error")[0]),
-            "estimation_error": float(batch.record("estimation_error")[0]),
-            "ending": Ending.NONE,
-            "filter_status": int(batch.record("filter_status")[0]),
-            "filter_diverged": bool(batch.record("diverged")[0] > 0.0),
-            "gates_passed": 0,
-            **drawn_info(batch.drawn(), 0),
-            **info_of_flight(flight_info(batch, batch.record("faults")), 0),
-        }
+        return self.flights.split(observations[0]), info_of_flight(start_info(batch), 0)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly one control period.
@@ -305,25 +282,25 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         batch = self.flights.batch
         observations = batch.step(numbers)
         row = batch.results[0].tolist()
-        terminated, truncated = row[_TERMINATED] > 0.0, row[_TRUNCATED] > 0.0
+        terminated, truncated = row[Result.TERMINATED] > 0.0, row[Result.TRUNCATED] > 0.0
         self._over = terminated or truncated
         if self.rendering is not None:
             self.rendering.observe()
         info = {
-            "position_error": row[_POSITION_ERROR],
-            "estimation_error": row[_ESTIMATION_ERROR],
-            "ending": Ending(int(row[_ENDING])),
-            "filter_status": int(row[_FILTER_STATUS]),
-            "filter_diverged": row[_FILTER_DIVERGED] > 0.0,
-            "gates_passed": int(row[_GATES_PASSED]),
+            "position_error": row[Result.POSITION_ERROR],
+            "estimation_error": row[Result.ESTIMATION_ERROR],
+            "ending": Ending(int(row[Result.ENDING])),
+            "filter_status": int(row[Result.FILTER_STATUS]),
+            "filter_diverged": row[Result.FILTER_DIVERGED] > 0.0,
+            "gates_passed": int(row[Result.GATES_PASSED]),
         }
         if batch.randomization.names:
-            info |= drawn_info(batch.drawn(), 0)
+            info |= info_of_flight(drawn_info(batch.drawn()), 0)
         if batch.faults or batch.innovations:
-            info |= info_of_flight(flight_info(batch, batch.results[:, _FAULTS]), 0)
+            info |= info_of_flight(flight_info(batch, batch.results[:, Result.FAULTS]), 0)
         if self.flights.reward_terms:
             info |= info_of_flight({"reward_terms": batch.reward_terms()}, 0)
-        return self.flights.split(observations[0]), row[_REWARD], terminated, truncated, info
+        return self.flights.split(observations[0]), row[Result.REWARD], terminated, truncated, info
 
     def render(self) -> Any:
         """Return the output that `render_mode` selects.

@@ -11,19 +11,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from quad_gym.batch.starts import stream_keys
-from quad_gym.envs.configuration import (
-    COLUMN,
-    Flights,
-    checked_actions,
-    named_options,
-)
-from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults
+from quad_gym.envs.configuration import Flights, checked_actions, named_options
+from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults, start_info
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.single import with_limit
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset, Ending
+from quad_gym.records import Autoreset, Ending, Result
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -35,7 +30,6 @@ _MODES = {
 }
 _OTHERS = ("num_envs", "autoreset_mode", "threads", "render_mode", "render_flights")
 _ENDINGS = np.array(list(Ending), object)
-_TERMINATED, _TRUNCATED = COLUMN["terminated"], COLUMN["truncated"]
 
 
 class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
@@ -149,17 +143,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         self._over[mask] = False
         if self.rendering is not None:
             self.rendering.observe(reset=True)
-        infos: dict[str, Any] = {
-            "position_error": batch.record("position_error"),
-            "estimation_error": batch.record("estimation_error"),
-            "ending": self._no_ending.copy(),
-            "filter_status": batch.record("filter_status").astype(np.int64),
-            "filter_diverged": batch.record("diverged") > 0.0,
-            "gates_passed": np.zeros(self.num_envs, np.int64),
-            **self._drawn(),
-            **flight_info(batch, batch.record("faults")),
-        }
-        return self.flights.split(observations), _masked(infos, mask)
+        return self.flights.split(observations), _masked(start_info(batch), mask)
 
     def step(
         self, actions: Any
@@ -192,7 +176,10 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         flown_with = batch.drawn() if same_step else {}
         observations = batch.step(numbers)
         results = batch.results
-        terminated, truncated = results[:, _TERMINATED] > 0.0, results[:, _TRUNCATED] > 0.0
+        terminated, truncated = (
+            results[:, Result.TERMINATED] > 0.0,
+            results[:, Result.TRUNCATED] > 0.0,
+        )
         self._over = terminated | truncated
         if self.rendering is not None:
             self.rendering.observe()
@@ -202,7 +189,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             infos = self._with_finals(infos, flown_with)
         return (
             self.flights.split(observations),
-            results[:, COLUMN["reward"]].copy(),
+            results[:, Result.REWARD].copy(),
             terminated,
             truncated,
             infos,
@@ -239,23 +226,23 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     def _step_infos(self, results: NDArray[np.float64]) -> dict[str, Any]:
         """Return errors, endings and counters of the step."""
         infos: dict[str, Any] = {
-            "position_error": results[:, COLUMN["position_error"]].copy(),
-            "estimation_error": results[:, COLUMN["estimation_error"]].copy(),
+            "position_error": results[:, Result.POSITION_ERROR].copy(),
+            "estimation_error": results[:, Result.ESTIMATION_ERROR].copy(),
             "ending": self._no_ending.copy(),
-            "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
-            "filter_diverged": results[:, COLUMN["filter_diverged"]] > 0.0,
-            "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
+            "filter_status": results[:, Result.FILTER_STATUS].astype(np.int64),
+            "filter_diverged": results[:, Result.FILTER_DIVERGED] > 0.0,
+            "gates_passed": results[:, Result.GATES_PASSED].astype(np.int64),
         }
         batch = self.flights.batch
         if batch.randomization.names:
             infos["drawn"] = batch.drawn()
         if batch.faults or batch.innovations:
-            infos |= flight_info(batch, results[:, COLUMN["faults"]])
+            infos |= flight_info(batch, results[:, Result.FAULTS])
         if self.flights.reward_terms:
             infos["reward_terms"] = batch.reward_terms()
         ended = np.flatnonzero(self._over)
         if ended.size:  # rare: members for every flight would cost more than the rest
-            infos["ending"][ended] = _ENDINGS[results[ended, COLUMN["ending"]].astype(np.int64)]
+            infos["ending"][ended] = _ENDINGS[results[ended, Result.ENDING].astype(np.int64)]
         return infos
 
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
@@ -266,11 +253,6 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         infos["ending"][began] = Ending.NONE
         infos["gates_passed"][began] = 0
         replace_faults(infos, self.flights.batch, began)
-
-    def _drawn(self) -> dict[str, Any]:
-        """Return the draws of all flights, as `info` holds them; empty without draws."""
-        drawn = self.flights.batch.drawn()
-        return {"drawn": drawn} if drawn else {}
 
     def _with_finals(
         self, infos: dict[str, Any], flown_with: dict[str, NDArray[np.float64]]

@@ -6,7 +6,7 @@ from quad_gym.estimation.filters import (
     ExtendedKalmanFilter,
     UnscentedKalmanFilter,
 )
-from quad_gym.estimation.first_fix import FARTHEST_FIX
+from quad_gym.estimation.first_fix import FARTHEST_FIX, FirstFix
 from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Stream
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Measured, Replay
@@ -18,6 +18,7 @@ __all__ = [
     "LOG_COLUMNS",
     "LONGEST_STEP",
     "ExtendedKalmanFilter",
+    "FirstFix",
     "Innovations",
     "Log",
     "LogColumn",

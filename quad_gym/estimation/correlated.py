@@ -27,7 +27,6 @@ def in_principal_axes(covariance: Floats) -> tuple[Floats, Floats]:
 
 def turn_state(engine: Engine, T: Floats) -> None:
     """Rotate all parts of the estimate that are in I, and the rotation of GNSS positions to I."""
-    n = int(engine.settings["slow_states"][0])
     drifts = bool(engine.settings["estimates_drift"][0])
     for name in ("r_hat", "v_hat"):
         engine.write(name, engine.read(name) @ T.T)
@@ -38,15 +37,10 @@ def turn_state(engine: Engine, T: Floats) -> None:
         slow = engine.read("slow_hat")
         slow[:, :3] = slow[:, :3] @ T.T
         engine.write("slow_hat", slow)
-    L, rows = engine.read("L"), engine.read("L_slow")
-    joint = np.zeros((engine.lanes, 15 + n, 15 + n))
-    joint[:, :15, :15], joint[:, 15:] = L, rows[:, :n, : 15 + n]
+    joint = engine.factors()
     for first in (0, 3, *((15,) if drifts else ())):
         joint[:, first : first + 3] = T @ joint[:, first : first + 3]
-    factors = np.array([lower_factor(root) for root in joint])
-    rows[:, :n, : 15 + n] = factors[:, 15:]
-    engine.write("L", factors[:, :15, :15])
-    engine.write("L_slow", rows)
+    engine.write_factors(np.array([lower_factor(root) for root in joint]))
 
 
 def update_with_correlated(
@@ -94,4 +88,4 @@ def _innovation_sigmas(engine: Engine, covariance: Floats) -> Floats:
         rows[:, :, :15] += root
         root = rows
     variances = (root**2).sum(axis=2) + np.diag(covariance)
-    return np.sqrt(variances)  # type: ignore[no-any-return]
+    return np.sqrt(variances)

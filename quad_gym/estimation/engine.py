@@ -62,7 +62,6 @@ class Engine:
         pack_sensors(self.settings[0], sensors)
         needed = needed_stages(self.settings[0])
         self._stages = {stage: needed[stage] for stage in single.FILTER_STAGES if stage in needed}
-        self.slow = bool(self.settings["slow_states"] > 0)
         self._room = room_of(_PARTS)
         self._work = aligned_zeros(1, WORK_BLOCK)
         self._work["mask"] = 1.0
@@ -92,6 +91,28 @@ class Engine:
     def fill(self, name: str, value: NDArray[Any]) -> None:
         """Write one value into a field of all lanes."""
         self.blocks[name] = value[..., np.newaxis]
+
+    @property
+    def slow_states(self) -> int:
+        """Number of time-correlated errors among the states."""
+        return int(self.settings["slow_states"][0])
+
+    def factors(self) -> Floats:
+        """Return the lower factors (lanes, 15 + n, 15 + n) of all states' covariances."""
+        n = self.slow_states
+        joint = np.zeros((self.lanes, 15 + n, 15 + n))
+        joint[:, :15, :15] = self.read("L")
+        joint[:, 15:] = self.read("L_slow")[:, :n, : 15 + n]
+        return joint
+
+    def write_factors(self, factors: Floats) -> None:
+        """Write the factors of all lanes."""
+        n = self.slow_states
+        self.write("L", factors[:, :15, :15])
+        if n:
+            rows = self.read("L_slow")
+            rows[:, :n, : 15 + n] = factors[:, 15:]
+            self.write("L_slow", rows)
 
     def copy(self) -> NDArray[Any]:
         """Return a copy of the filter's memory for `restore`: one lane if all are equal."""

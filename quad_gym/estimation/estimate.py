@@ -29,7 +29,7 @@ class Innovations(NamedTuple):
     """(n,) gate decisions, see `quad_gym.records.GateDecision`"""
 
 
-class Estimate:
+class FilterEstimate:
     """State estimate and covariance."""
 
     sensors: SensorSuite

@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.estimation.correlated import update_with_correlated
 from quad_gym.estimation.engine import Engine
-from quad_gym.estimation.estimate import Estimate
-from quad_gym.estimation.first_fix import checked_fix
+from quad_gym.estimation.estimate import FilterEstimate
+from quad_gym.estimation.first_fix import FirstFix, filter_start
 from quad_gym.estimation.headings import RESOLVED, collapse, moments, update_and_weigh
-from quad_gym.estimation.history import SAME_TIME, History
+from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.samples import Measurement, Sample, checked_measurement
 from quad_gym.params import checks as check
+from quad_gym.params.resolved import taking
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FilterForm, FilterStatus
 
@@ -26,7 +27,7 @@ LONGEST_STEP = 1.0
 _OF_GATES = int(FilterForm.GATE)
 
 
-class _KalmanFilter(Estimate):
+class _KalmanFilter(FilterEstimate):
     """Common base of the filters: everything but the kind of their kernels."""
 
     _kind: str
@@ -38,7 +39,7 @@ class _KalmanFilter(Estimate):
         length = check.number("window", window, least=0.0, most=60.0)
         self.sensors = sensors
         self._engine = Engine(sensors, self._kind)
-        self._history = History(length, self._apply, self._copy, self._restore)
+        self._history = InputHistory(length, self._apply, self._copy, self._restore)
         self._log_weights, self._moments = None, None
         self._gyro: NDArray[np.float64] | None = None
         self._awaited: Measurement | None = None
@@ -47,25 +48,9 @@ class _KalmanFilter(Estimate):
 
     # ---- the cycle ----------------------------------------------------------------------------
 
-    def initialize(
-        self,
-        gnss_position_G: ArrayLike,
-        gnss_baseline_G: ArrayLike | None = None,
-        heading: float | None = None,
-        *,
-        heading_sigma: float | None = None,
-        magnetometer: ArrayLike | None = None,
-        magnetometer_sigma: float | None = None,
-        gnss_velocity_G: ArrayLike | None = None,
-        course: bool = False,
-        gnss_sigma: ArrayLike | None = None,
-        velocity_sigma: float | None = None,
-        tilt_sigma: float | None = None,
-        accel: ArrayLike | None = None,
-        accel_sigma: float | None = None,
-        time: float = 0.0,
-    ) -> None:
-        """Start from a first fix.
+    @taking(FirstFix, "initialize")
+    def initialize(self, fix: FirstFix) -> None:
+        """Start from a first fix; `FirstFix` explains the arguments.
 
         With a baseline, the attitude solves Wahba's problem, with the body z axis assumed vertical.
         A baseline within 12 degrees of the vertical hardly observes the heading; `heading` then
@@ -84,55 +69,15 @@ class _KalmanFilter(Estimate):
         changes the magnetic heading, an accelerometer bias tilts the start, and the lever arm of
         the antenna couples position and attitude.
 
-        Args:
-            gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
-            gnss_baseline_G: (3,) primary to secondary antenna, in G [m]; None: not measured.
-            heading: Heading of the body x axis, from east toward north [rad]; None: unknown. With a
-                steep baseline and no heading, the initial heading is arbitrary, and the filter may
-                diverge.
-            heading_sigma: Standard deviation of `heading`, or, with `course`, of the angle between
-                the body x axis and the course [rad]; None: `initial_pose.heading_sigma`.
-            magnetometer: (3,) magnetic field in B [T], for suites with a magnetometer.
-            magnetometer_sigma: Standard deviation of its white noise, per axis [T]; None: the
-                suite's value.
-            gnss_velocity_G: (3,) velocity in G [m/s]; None: at rest.
-            course: True: the vehicle flies nose first.
-            gnss_sigma: Noise of the position, as in `update`; None: the suite's value.
-            velocity_sigma: Standard deviation of the velocity, per axis [m/s]; None: the suite's
-                value.
-            tilt_sigma: Standard deviation of roll and pitch of a level start [rad]; None:
-                `FilterParams.initial_tilt_sigma`, or else LEVEL_SIGMA.
-            accel: (3,) specific force at rest in B, preferably the mean of many samples [m/s^2];
-                None: the vehicle is assumed level.
-            accel_sigma: Standard deviation of the white noise of `accel`, per axis [m/s^2]; None:
-                the noise of one sample. The bias is accounted for separately.
-            time: Time stamp of the start [s]; all time stamps share its zero.
-
         Raises:
             ValueError: If an argument has another shape or is not finite, the position is farther
                 than FARTHEST_FIX from the reference antenna, the baseline is zero, arguments
                 contradict each other, or the suite lacks a sensor.
         """
-        fix = checked_fix(
-            self.sensors,
-            gnss_position_G,
-            gnss_baseline_G,
-            heading,
-            heading_sigma,
-            magnetometer,
-            magnetometer_sigma,
-            gnss_velocity_G,
-            course,
-            gnss_sigma,
-            velocity_sigma,
-            tilt_sigma,
-            accel,
-            accel_sigma,
-        )
-        begin, engine = check.number("time", time), self._engine
-        self._begin(begin, len(fix.starts))
-        fix.write(engine)
-        if len(fix.starts) > 1:
+        start, engine = filter_start(self.sensors, fix), self._engine
+        self._begin(check.number("time", fix.time), len(start.estimates))
+        start.write(engine)
+        if len(start.estimates) > 1:
             self._log_weights = np.full(engine.lanes, -math.log(engine.lanes))
             self._choose_form()
         self._running = True

@@ -1,8 +1,7 @@
 """The arguments of `initialize`, checked, and the first estimate that follows from them."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +14,7 @@ from quad_gym.estimation.starts import (
     LEVEL,
     LEVEL_SIGMA,
     FirstEstimate,
-    Heading,
+    FirstHeading,
     Tilt,
     baseline_heading,
     known_heading,
@@ -37,7 +36,62 @@ LEAST_COURSE = 5.0
 
 @dataclass(frozen=True)
 class FirstFix:
-    """Measurements at the start."""
+    """Arguments of `initialize`: a first fix, and measurements of the attitude."""
+
+    gnss_position_G: ArrayLike
+    """(3,) primary antenna relative to the reference antenna, in G [m]"""
+    gnss_baseline_G: ArrayLike | None = None
+    """(3,) primary to secondary antenna, in G [m]; None: not measured"""
+    heading: float | None = None
+    """heading of the body x axis, from east toward north [rad]; None: unknown. With a steep
+    baseline and no heading, the initial heading is arbitrary, and the filter may diverge"""
+    _: KW_ONLY
+    heading_sigma: float | None = None
+    """standard deviation of `heading`, or, with `course`, of the angle between the body x axis and
+    the course [rad]; None: `initial_pose.heading_sigma`"""
+    magnetometer: ArrayLike | None = None
+    """(3,) magnetic field in B [T], for suites with a magnetometer"""
+    magnetometer_sigma: float | None = None
+    """standard deviation of its white noise, per axis [T]; None: the suite's value"""
+    gnss_velocity_G: ArrayLike | None = None
+    """(3,) velocity in G [m/s]; None: at rest"""
+    course: bool = False
+    """True: the vehicle flies nose first"""
+    gnss_sigma: ArrayLike | None = None
+    """noise of the position, as in `update`; None: the suite's value"""
+    velocity_sigma: float | None = None
+    """standard deviation of the velocity, per axis [m/s]; None: the suite's value"""
+    tilt_sigma: float | None = None
+    """standard deviation of roll and pitch of a level start [rad]; None:
+    `FilterParams.initial_tilt_sigma`, or else LEVEL_SIGMA"""
+    accel: ArrayLike | None = None
+    """(3,) specific force at rest in B, preferably the mean of many samples [m/s^2]; None: the
+    vehicle is assumed level"""
+    accel_sigma: float | None = None
+    """standard deviation of the white noise of `accel`, per axis [m/s^2]; None: the noise of one
+    sample. The bias is accounted for separately"""
+    time: float = 0.0
+    """time stamp of the start [s]; all time stamps share its zero"""
+
+    def refuse(self, what: str, *names: str) -> None:
+        """Refuse arguments that have no effect with the others.
+
+        Args:
+            what: Reason, as the end of the message.
+            names: Names of the arguments.
+
+        Raises:
+            ValueError: If one is given.
+        """
+        for name in names:
+            value = getattr(self, name)
+            if not (value is None or (isinstance(value, bool | np.bool_) and not value)):
+                raise ValueError(f"{name} must {what}")
+
+
+@dataclass(frozen=True)
+class FilterStart:
+    """Start of a filter, from the checked arguments of `initialize`."""
 
     position_G: Floats
     sigmas: Floats
@@ -48,8 +102,8 @@ class FirstFix:
     baseline_G: Floats
     x_I: Floats
     """horizontal direction of the body x axis, for a steep baseline; zero: unknown"""
-    starts: list[FirstEstimate] = field(default_factory=list)
-    """starts with a known tilt, one or one for each heading; empty with Wahba's problem"""
+    estimates: list[FirstEstimate] = field(default_factory=list)
+    """estimates with a known tilt, one or one for each heading; empty with Wahba's problem"""
 
     def write(self, engine: Engine) -> None:
         """Start the filters in an engine's memory."""
@@ -58,8 +112,8 @@ class FirstFix:
         kept = engine.impose({"gnss_sigma": self.sigmas})
         engine.start(self.x_I)
         engine.restore_noise(kept)
-        if self.starts:
-            write_starts(engine, self.starts)
+        if self.estimates:
+            write_starts(engine, self.estimates)
         elif self.velocity_I is not None:
             engine.fill("v_hat", self.velocity_I)
             L = engine.read("L")
@@ -67,85 +121,40 @@ class FirstFix:
             engine.write("L", L)
 
 
-def checked_fix(
-    sensors: SensorSuite,
-    gnss_position_G: ArrayLike,
-    gnss_baseline_G: ArrayLike | None,
-    heading: float | None,
-    heading_sigma: float | None,
-    magnetometer: ArrayLike | None,
-    magnetometer_sigma: float | None,
-    gnss_velocity_G: ArrayLike | None,
-    course: bool,
-    gnss_sigma: ArrayLike | None,
-    velocity_sigma: float | None,
-    tilt_sigma: float | None,
-    accel: ArrayLike | None,
-    accel_sigma: float | None,
-) -> FirstFix:
-    """Check the arguments of `initialize`.
+def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
+    """Return the start that follows from a first fix.
 
     Raises:
         ValueError: As in `initialize`.
     """
     require_gnss(sensors, "initialize: start with set_state() instead")
-    position = check.array("gnss_position_G", gnss_position_G, (3,))
-    _require_relative(position)
-    sigmas, covariance = _position_noise(sensors, gnss_sigma)
-    velocity, speeds = _first_velocity(sensors, gnss_velocity_G, velocity_sigma)
-    baseline = None if gnss_baseline_G is None else checked_baseline(sensors, gnss_baseline_G)
-    if baseline is not None and accel is None:
-        _refuse_beside_baseline(
-            heading_sigma=heading_sigma,
-            magnetometer=magnetometer,
-            magnetometer_sigma=magnetometer_sigma,
-            tilt_sigma=tilt_sigma,
-            accel_sigma=accel_sigma,
-            course=course or None,
-            **{"a covariance as gnss_sigma": covariance},
-        )
-        x_I = np.zeros(3)
-        if heading is not None:
-            angle = check.number("heading", heading)
-            x_I[:2] = np.cos(angle), np.sin(angle)
-        return FirstFix(position, sigmas, velocity, speeds, baseline, x_I)
-
-    tilt = _first_tilt(sensors, tilt_sigma, accel, accel_sigma)
-    told = {
-        "heading": heading is not None,
-        "magnetometer": magnetometer is not None,
-        "course": check.flag("course", course),
-        "gnss_baseline_G": baseline is not None,
-    }
-    if sum(told.values()) > 1:
-        raise ValueError(
-            "only one of heading, magnetometer, course and a baseline must be given, got "
-            + " and ".join(name for name, given in told.items() if given)
-        )
-    if magnetometer is None and magnetometer_sigma is not None:
-        raise ValueError("magnetometer_sigma must come with magnetometer")
-    own = sensors.initial_pose.heading_sigma
-    if heading_sigma is not None:
-        if heading is None and not course:
-            raise ValueError("heading_sigma must come with heading or course")
-        own = check.positive("heading_sigma", heading_sigma, most=math.pi)
-
-    # with half the spacing as standard deviation they overlap to a uniform distribution
-    headings = [known_heading(k * SPACING, 0.5 * SPACING, tilt) for k in range(COUNT)]
-    if heading is not None:
-        headings = [known_heading(check.number("heading", heading), own, tilt)]
-    elif magnetometer is not None:
-        headings = [_by_magnetometer(sensors, magnetometer, magnetometer_sigma, tilt)]
-    elif course:
-        headings = [_by_course(velocity, float(speeds[0]), own, tilt)]
-    elif baseline is not None:
-        headings = [_by_baseline(sensors, baseline, tilt)]
     assert sensors.gnss is not None
+    position = check.array("gnss_position_G", fix.gnss_position_G, (3,))
+    _require_relative(position)
+    sigmas, covariance = np.array(sensors.gnss.position_sigma_I), None
+    if fix.gnss_sigma is not None:
+        sigmas, covariance = gnss_noise("gnss_sigma", fix.gnss_sigma)
+    velocity, speeds = _first_velocity(sensors, fix)
+    baseline = fix.gnss_baseline_G
+    if baseline is not None:
+        baseline = checked_baseline(sensors, baseline)
+    if baseline is not None and fix.accel is None:
+        others = ("heading_sigma", "magnetometer", "magnetometer_sigma", "tilt_sigma")
+        fix.refuse("not be given with gnss_baseline_G", *others, "accel_sigma", "course")
+        if covariance is not None:
+            raise ValueError("a covariance as gnss_sigma must not be given with gnss_baseline_G")
+        x_I = np.zeros(3)
+        if fix.heading is not None:
+            angle = check.number("heading", fix.heading)
+            x_I[:2] = np.cos(angle), np.sin(angle)
+        return FilterStart(position, sigmas, velocity, speeds, baseline, x_I)
+    tilt = _first_tilt(sensors, fix)
+    headings = _first_headings(sensors, fix, tilt, velocity, float(speeds[0]), baseline)
     antenna_I = ecef_to_enu(sensors.gnss.reference_antenna_G) @ position
     root = math.sqrt(sensors.estimator.initial_covariance_scale) * _root(sigmas, covariance)
     still = np.zeros(3) if velocity is None else velocity
-    starts = [still_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
-    return FirstFix(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), starts)
+    found = [still_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
+    return FilterStart(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), found)
 
 
 def _require_relative(position_G: Floats) -> None:
@@ -158,80 +167,96 @@ def _require_relative(position_G: Floats) -> None:
         )
 
 
-def _refuse_beside_baseline(**given: Any) -> None:
-    """Refuse arguments that a start with a baseline does not use."""
-    for name, value in given.items():
-        if value is not None:
-            raise ValueError(f"{name} must not be given with gnss_baseline_G")
-
-
 def _root(sigmas: Floats, covariance: Floats | None) -> Floats:
     """Return a root of the covariance of the position."""
     if covariance is None:
         return np.diag(sigmas)
     T, s = in_principal_axes(covariance)
-    return T.T * s  # type: ignore[no-any-return]
+    return T.T * s
 
 
-def _position_noise(sensors: SensorSuite, given: ArrayLike | None) -> tuple[Floats, Floats | None]:
-    assert sensors.gnss is not None
-    if given is None:
-        return np.array(sensors.gnss.position_sigma_I), None
-    return gnss_noise("gnss_sigma", given)
-
-
-def _first_velocity(
-    sensors: SensorSuite, given_G: ArrayLike | None, sigma: float | None
-) -> tuple[Floats | None, Floats]:
+def _first_velocity(sensors: SensorSuite, fix: FirstFix) -> tuple[Floats | None, Floats]:
     """Return the velocity in I at the start, or None, and its standard deviations."""
     gnss = sensors.gnss
     assert gnss is not None
-    if given_G is None:
-        if sigma is not None:
-            raise ValueError("velocity_sigma must come with gnss_velocity_G")
+    if fix.gnss_velocity_G is None:
+        fix.refuse("come with gnss_velocity_G", "velocity_sigma")
         return None, np.full(3, math.sqrt(sensors.estimator.initial_velocity_variance))
-    noise = gnss.velocity_sigma if sigma is None else check.positive("velocity_sigma", sigma)
+    noise = gnss.velocity_sigma
+    if fix.velocity_sigma is not None:
+        noise = check.positive("velocity_sigma", fix.velocity_sigma)
     if noise is None:
         raise ValueError("velocity_sigma must be given: the suite has no GNSS velocity")
-    v_G = check.array("gnss_velocity_G", given_G, (3,))
+    v_G = check.array("gnss_velocity_G", fix.gnss_velocity_G, (3,))
     return ecef_to_enu(gnss.reference_antenna_G) @ v_G, np.full(3, noise)
 
 
-def _first_tilt(
-    sensors: SensorSuite,
-    tilt_sigma: float | None,
-    accel: ArrayLike | None,
-    accel_sigma: float | None,
-) -> Tilt:
+def _first_tilt(sensors: SensorSuite, fix: FirstFix) -> Tilt:
     """Return a level tilt, or the tilt from an accelerometer at rest."""
-    if accel is None:
-        if accel_sigma is not None:
-            raise ValueError("accel_sigma must come with accel")
+    if fix.accel is None:
+        fix.refuse("come with accel", "accel_sigma")
         sigma = sensors.estimator.initial_tilt_sigma or LEVEL_SIGMA
-        if tilt_sigma is not None:
-            sigma = check.positive("tilt_sigma", tilt_sigma, most=1.0)
+        if fix.tilt_sigma is not None:
+            sigma = check.positive("tilt_sigma", fix.tilt_sigma, most=1.0)
         return LEVEL._replace(sigma=sigma)
-    if tilt_sigma is not None:
-        raise ValueError("tilt_sigma must not be given with accel, which measures the tilt")
+    fix.refuse("not be given with accel, which measures the tilt", "tilt_sigma")
     white = sensors.imu.accel_noise_density / math.sqrt(sensors.imu.dt)
-    if accel_sigma is not None:
-        white = check.positive("accel_sigma", accel_sigma)
-    force = check.array("accel", accel, (3,))
+    if fix.accel_sigma is not None:
+        white = check.positive("accel_sigma", fix.accel_sigma)
+    force = check.array("accel", fix.accel, (3,))
     return resting_tilt(force, white, sensors.estimator.gravity)
 
 
-def _by_magnetometer(
-    sensors: SensorSuite, magnetometer: ArrayLike, sigma: float | None, tilt: Tilt
-) -> Heading:
+def _first_headings(
+    sensors: SensorSuite,
+    fix: FirstFix,
+    tilt: Tilt,
+    velocity: Floats | None,
+    speed_sigma: float,
+    baseline_G: Floats | None,
+) -> list[FirstHeading]:
+    """Return the heading at the start, or all headings if it is unknown."""
+    given = {
+        "heading": fix.heading is not None,
+        "magnetometer": fix.magnetometer is not None,
+        "course": check.flag("course", fix.course),
+        "gnss_baseline_G": baseline_G is not None,
+    }
+    if sum(given.values()) > 1:
+        raise ValueError(
+            "only one of heading, magnetometer, course and a baseline must be given, got "
+            + " and ".join(name for name, is_given in given.items() if is_given)
+        )
+    if fix.magnetometer is None:
+        fix.refuse("come with magnetometer", "magnetometer_sigma")
+    sigma = sensors.initial_pose.heading_sigma
+    if fix.heading is None and not fix.course:
+        fix.refuse("come with heading or course", "heading_sigma")
+    if fix.heading_sigma is not None:
+        sigma = check.positive("heading_sigma", fix.heading_sigma, most=math.pi)
+    if fix.heading is not None:
+        return [known_heading(check.number("heading", fix.heading), sigma, tilt)]
+    if fix.magnetometer is not None:
+        return [_by_magnetometer(sensors, fix, tilt)]
+    if fix.course:
+        return [_by_course(velocity, speed_sigma, sigma, tilt)]
+    if baseline_G is not None:
+        return [_by_baseline(sensors, baseline_G, tilt)]
+    # with half the spacing as standard deviation they overlap to a uniform distribution
+    return [known_heading(k * SPACING, 0.5 * SPACING, tilt) for k in range(COUNT)]
+
+
+def _by_magnetometer(sensors: SensorSuite, fix: FirstFix, tilt: Tilt) -> FirstHeading:
     if Aid.MAGNETOMETER not in sensors.aids:
         raise ValueError("the sensor suite has no magnetometer to initialize with")
-    field_B = check.array("magnetometer", magnetometer, (3,))
+    assert fix.magnetometer is not None
+    field_B, sigma = check.array("magnetometer", fix.magnetometer, (3,)), fix.magnetometer_sigma
     if sigma is not None:
         sigma = check.positive("magnetometer_sigma", sigma)
     return magnetic_heading(sensors, field_B, sigma, tilt)
 
 
-def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> Heading:
+def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> FirstHeading:
     gnss = sensors.gnss
     assert gnss is not None
     sigma = math.sqrt(sensors.estimator.initial_covariance_scale) * gnss.first_baseline_sigma
@@ -245,7 +270,7 @@ def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> Headin
     return found
 
 
-def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) -> Heading:
+def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) -> FirstHeading:
     if velocity is None:
         raise ValueError("course must come with gnss_velocity_G")
     speed = math.hypot(velocity[0], velocity[1])

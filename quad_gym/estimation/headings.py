@@ -53,30 +53,11 @@ class Moments(NamedTuple):
 
 def write_starts(engine: Engine, starts: list[FirstEstimate]) -> None:
     """Write first estimates into the lanes of an engine that has just been started."""
-    n = len(starts[0].factor) - 15
     fill = [starts[k % len(starts)] for k in range(engine.lanes)]
     engine.write("r_hat", np.array([s.position for s in fill]))
     engine.write("v_hat", np.array([s.velocity for s in fill]))
     engine.write("R_hat", np.array([s.R_BI for s in fill]))
-    _write_factors(engine, np.array([s.factor for s in fill]), n)
-
-
-def _write_factors(engine: Engine, factors: Floats, n: int) -> None:
-    """Write joint factors (lanes, 15 + n, 15 + n)."""
-    engine.write("L", factors[:, :15, :15])
-    if n:
-        rows = engine.read("L_slow")
-        rows[:, :n, : 15 + n] = factors[:, 15:]
-        engine.write("L_slow", rows)
-
-
-def _factors(engine: Engine) -> Floats:
-    """Return the joint factors (lanes, 15 + n, 15 + n)."""
-    n = int(engine.settings["slow_states"][0])
-    joint = np.zeros((engine.lanes, 15 + n, 15 + n))
-    joint[:, :15, :15] = engine.read("L")
-    joint[:, 15:] = engine.read("L_slow")[:, :n, : 15 + n]
-    return joint
+    engine.write_factors(np.array([s.factor for s in fill]))
 
 
 def _log_determinant(factors: Floats) -> Floats:
@@ -87,9 +68,9 @@ def _log_determinant(factors: Floats) -> Floats:
 
 def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floats) -> Floats:
     """Update all lanes with a measurement; return their new weights, normalized."""
-    before, failures = _log_determinant(_factors(engine)), engine.read("update_failures")
+    before, failures = _log_determinant(engine.factors()), engine.read("update_failures")
     engine.update(measurement)
-    after = _log_determinant(_factors(engine))
+    after = _log_determinant(engine.factors())
     nis, dimension = engine.read("nis"), engine.read("nis_dimension")
     if not dimension.any() or not measurement.blocks:
         return log_weights
@@ -107,7 +88,7 @@ def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floa
 
 def moments(engine: Engine, log_weights: Floats) -> Moments:
     """Return mean and covariance of all lanes; for the attitude, about a mean on the circle."""
-    w, n = np.exp(log_weights), int(engine.settings["slow_states"][0])
+    w, n = np.exp(log_weights), engine.slow_states
     R = engine.read("R_hat")
     R_mean, turns = R[int(np.argmax(w))], np.zeros((len(w), 3))
     for _ in range(10):
@@ -119,7 +100,7 @@ def moments(engine: Engine, log_weights: Floats) -> Moments:
     means["slow_hat"] = w @ slow
     apart = [engine.read(name) - means[name] for name in _VECTORS]
     d = np.hstack([*apart[:2], turns, *apart[2:], slow - means["slow_hat"]])
-    factors = _factors(engine)
+    factors = engine.factors()
     covariance = np.einsum("k,kij,klj->il", w, factors, factors)
     covariance += np.einsum("k,ki,kj->ij", w, d, d)
     return Moments(means, R_mean, covariance)
@@ -131,7 +112,7 @@ def collapse(engine: Engine, log_weights: Floats, m: Moments) -> None:
     best = int(np.argmax(log_weights))
     width = words.shape[2]
     engine.restore(words[best // width, :, best % width][np.newaxis, :, np.newaxis])
-    n = len(m.covariance) - 15
+    n = engine.slow_states
     for name in _VECTORS:
         engine.fill(name, m.vectors[name])
     engine.fill("R_hat", m.R_hat)
@@ -141,4 +122,4 @@ def collapse(engine: Engine, log_weights: Floats, m: Moments) -> None:
         engine.write("slow_hat", slow)
     values, vectors = np.linalg.eigh(m.covariance)
     factor = lower_factor(vectors * np.sqrt(np.maximum(values, 0.0)))
-    _write_factors(engine, np.repeat(factor[np.newaxis], engine.lanes, axis=0), n)
+    engine.write_factors(np.repeat(factor[np.newaxis], engine.lanes, axis=0))

@@ -36,7 +36,7 @@ class _Event:
         return self.time - self.given.dt if isinstance(self.given, Sample) else self.time
 
 
-class History:
+class InputHistory:
     """The samples and measurements of a window of time, and states to filter them again from.
 
     Args:

@@ -135,4 +135,4 @@ class Log:
             return None
         if near_G is not None and np.linalg.norm(known[0] - near_G) < within:
             return near_G
-        return known[0].copy()  # type: ignore[no-any-return]
+        return known[0].copy()

@@ -220,8 +220,8 @@ class Player:
         fix = self._fix(stream, k)
         if "gnss_position_G" not in fix:
             return
-        told = "gnss_baseline_G" in fix or {"heading", "course", "magnetometer"} & set(self.start)
-        if not told and "magnetometer" in self.streams:
+        known = "gnss_baseline_G" in fix or {"heading", "course", "magnetometer"} & set(self.start)
+        if not known and "magnetometer" in self.streams:
             self.first_fix = min(self.first_fix, float(stream.received[k]))
             if self.field is None and stream.received[k] < self.first_fix + PATIENCE:
                 return

@@ -131,11 +131,11 @@ def _gnss(topic: dict[str, Any] | None, delay: float) -> Stream | None:
     for k in np.flatnonzero(fixed):
         position[k] = geodetic_to_ecef(np.radians(lat[k]), np.radians(lon[k]), height[k])
     velocity = np.column_stack([topic["vel_e_m_s"], topic["vel_n_m_s"], -topic["vel_d_m_s"]])
-    told = np.asarray(topic.get("vel_ned_valid", np.ones(len(time))), bool) & fixed
+    valid = np.asarray(topic.get("vel_ned_valid", np.ones(len(time))), bool) & fixed
     eph, epv = (np.asarray(topic[name], np.float64) for name in ("eph", "epv"))
     values = {
         "position_G": position,
-        "velocity_I": np.where(told[:, np.newaxis], velocity, np.nan).astype(np.float64),
+        "velocity_I": np.where(valid[:, np.newaxis], velocity, np.nan).astype(np.float64),
         "position_sigma_I": _positive(np.column_stack([eph, eph, epv])),
         "velocity_sigma": _positive(np.asarray(topic["s_variance_m_s"], np.float64)),
     }

@@ -52,7 +52,7 @@ the heading; as in `kernels/filter/align.py`."""
 _R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
 
 
-class Heading(NamedTuple):
+class FirstHeading(NamedTuple):
     """A heading, and the errors on which it depends."""
 
     angle: float
@@ -126,14 +126,14 @@ def resting_tilt(accel: Floats, sigma: float, gravity: float) -> Tilt:
     return Tilt(np.column_stack([x, np.cross(k, x), k]), sigma / gravity, 1.0 / gravity)
 
 
-def known_heading(angle: float, sigma: float, tilt: Tilt) -> Heading:
+def known_heading(angle: float, sigma: float, tilt: Tilt) -> FirstHeading:
     """Return a given heading of the body x axis, which roll changes if that axis is not level."""
-    return Heading(angle, sigma, (float(tilt.T[0, 2] / tilt.T[0, 0]), 0.0))
+    return FirstHeading(angle, sigma, (float(tilt.T[0, 2] / tilt.T[0, 0]), 0.0))
 
 
 def magnetic_heading(
     sensors: SensorSuite, field_B: Floats, sigma: float | None, tilt: Tilt = LEVEL
-) -> Heading:
+) -> FirstHeading:
     """Return the heading of a vehicle of known tilt from its magnetometer.
 
     To first order `m = f + f x e + delta g + T^T b + v` in the level frame with f = R m_I and g = R
@@ -170,12 +170,12 @@ def magnetic_heading(
     of_slow[declination] = float(t @ g / f_h)
     white = magnetometer.noise_sigma if sigma is None else sigma
     of_tilt = (float(f[2] * u[0] / f_h), float(f[2] * u[1] / f_h))
-    return Heading(angle, white / f_h, of_tilt, of_slow)
+    return FirstHeading(angle, white / f_h, of_tilt, of_slow)
 
 
 def baseline_heading(
     baseline_B: Floats, baseline_I: Floats, sigma: float, tilt: Tilt
-) -> Heading | None:
+) -> FirstHeading | None:
     """Return the heading of a vehicle of known tilt from two antennas; None if too steep.
 
     The baseline acts as a magnetic field whose direction is measured in I.
@@ -192,7 +192,7 @@ def baseline_heading(
         return None
     angle = math.atan2(baseline_I[1], baseline_I[0]) - math.atan2(f[1], f[0])
     slope = f[2] / f_h
-    return Heading(angle, sigma / f_h, (float(slope * f[0] / f_h), float(slope * f[1] / f_h)))
+    return FirstHeading(angle, sigma / f_h, (float(slope * f[0] / f_h), float(slope * f[1] / f_h)))
 
 
 def still_start(
@@ -202,7 +202,7 @@ def still_start(
     velocity: Floats,
     velocity_sigma: Floats,
     tilt: Tilt,
-    heading: Heading,
+    heading: FirstHeading,
 ) -> FirstEstimate:
     """Return the first estimate of a vehicle of known tilt, with the factor of its covariance.
 

@@ -38,14 +38,6 @@ def span(name: str, value: Any, *, least: float = 0.0, open_end: bool = False) -
     return check.number(name, value, least=least, open_end=open_end)
 
 
-def share_of_one(name: str, value: Any) -> float:
-    """Return `value` as a number above 0 and up to 1."""
-    share = check.positive(name, value)
-    if share > 1.0:
-        raise ValueError(f"{name} must be at most 1, got {value!r}")
-    return share
-
-
 @dataclass(frozen=True, kw_only=True)
 class Fault(Checked):
     """Schedule of a fault; its subclasses are the kinds of faults.
@@ -76,7 +68,7 @@ class Fault(Checked):
         if not (isinstance(self.duration, float) and self.duration == math.inf):
             self._check(span, "duration", open_end=True)
         self._check(check.number, "rate", least=0.0)
-        self._check(share_of_one, "probability")
+        self._check(check.positive, "probability", most=1.0)
         if self.rate > 0.0 and self.start != 0.0:
             raise ValueError(
                 f"{type(self).__name__} takes start or rate, not both, got start={self.start} and "

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from quad_gym.faults.base import Fault, share_of_one
+from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FaultKind
@@ -24,7 +24,7 @@ class CameraOcclusion(Fault):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(share_of_one, "share")
+        self._check(check.positive, "share", most=1.0)
 
     @property
     def numbers(self) -> dict[str, Any]:
@@ -51,7 +51,7 @@ class WrongAssociations(Fault):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(share_of_one, "share")
+        self._check(check.positive, "share", most=1.0)
         self._check(check.choice, "how", choices=("swap", "copy"))
 
     def check_suite(self, sensors: SensorSuite) -> None:

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from quad_gym.faults.base import DirectedFault, Fault, Span, share_of_one, span
+from quad_gym.faults.base import DirectedFault, Fault, Span, span
+from quad_gym.params import checks as check
 from quad_gym.records import FaultKind
 
 __all__ = ["BaselineLoss", "GnssJump", "GnssOutage", "GnssOutliers", "GnssRamp"]
@@ -42,7 +43,7 @@ class GnssOutliers(Fault):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(share_of_one, "share")
+        self._check(check.positive, "share", most=1.0)
         self._check(span, "size", open_end=True)
 
     @property

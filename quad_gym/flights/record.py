@@ -42,58 +42,46 @@ class Column(NamedTuple):
 FEATURES = -1
 
 # fmt: off
-COLUMNS = (
-    Column("time", (), "s", "-", "since the start of the episode"),
+_ROWS: tuple[str | Column, ...] = (
+    "time",
     # the truth
-    Column("position", (3,), "m", "I", "true position of the center of mass"),
-    Column("velocity", (3,), "m/s", "I", "true velocity"),
-    Column("quaternion", (4,), "-", "B to I", "true attitude, unit quaternion (w, x, y, z)"),
-    Column("body_rates", (3,), "rad/s", "B", "true body rates"),
-    Column("rotor_speeds", (4,), "rad/s", "-", "true rotor speeds"),
-    Column("accel_bias", (3,), "m/s^2", "B", "true accelerometer bias"),
-    Column("gyro_bias", (3,), "rad/s", "B", "true gyro bias"),
-    Column("disturbance", (3,), "N", "I", "external force on the body"),
-    Column("wind", (3,), "m/s", "I", "velocity of the air"),
-    Column("faults", (), "bits", "-", "active at the present instant: the sum of 2^`FaultKind`"),
+    *("position", "velocity", "quaternion", "body_rates", "rotor_speeds", "accel_bias", "gyro_bias"),
+    *("disturbance", "wind", "faults"),
     # the filter
-    Column("estimated_position", (3,), "m", "I", "the filter's estimate of `position`"),
-    Column("estimated_velocity", (3,), "m/s", "I", "the filter's estimate of `velocity`"),
-    Column("estimated_quaternion", (4,), "-", "B to I", "the filter's estimate of `quaternion`"),
-    Column("estimated_accel_bias", (3,), "m/s^2", "B", "the filter's estimate of `accel_bias`"),
-    Column("estimated_gyro_bias", (3,), "rad/s", "B", "the filter's estimate of `gyro_bias`"),
+    *("estimated_position", "estimated_velocity", "estimated_quaternion"),
+    *("estimated_accel_bias", "estimated_gyro_bias"),
     Column("covariance", (15, 15), "mixed", "mixed", "the filter's covariance of position, velocity, attitude error, accelerometer and gyro bias"),
-    Column("filter_status", (), "bits", "-", "numerical failures of the filter so far, see `FilterStatus`"),
-    Column("filter_diverged", (), "0 or 1", "-", "1: the covariance does not explain the last innovations"),
+    *("filter_status", "filter_diverged"),
     Column("nees", (), "-", "-", "normalized estimation error squared; 15 on average if the filter is consistent"),
-    Column("nis", (), "-", "-", "normalized innovation squared of the last update"),
-    Column("nis_dimension", (), "-", "-", "measurements in the last update"),
+    *("nis", "nis_dimension"),
     # the state that the controller observed
-    Column("observed_position", (3,), "m", "I", "position from the controller's source"),
-    Column("observed_quaternion", (4,), "-", "B to I", "attitude from the controller's source"),
+    *("observed_position", "observed_quaternion"),
     # the latest measurements since the previous row
-    Column("gyro", (3,), "rad/s", "B", "angular rate"),
-    Column("accel", (3,), "m/s^2", "B", "specific force"),
-    Column("gnss_position", (3,), "m", "I", "primary antenna"),
-    Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
-    Column("gnss_velocity", (3,), "m/s", "I", "of the primary antenna, where the receiver gives it"),
+    *("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity"),
     Column("gnss_decision", (3,), "-", "-", "gate decisions on position, baseline and velocity, see `GateDecision`; 0: no gate"),
-    Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's center"),
+    "pixels",
     Column("feature_decision", (FEATURES,), "-", "-", "gate decision on each feature, see `GateDecision`"),
-    # the task
-    Column("action", (4,), "-", "-", "action that led to this row, in [-1, 1]"),
-    Column("reference_position", (3,), "m", "I", "position of the reference; on a course, the next gate"),
-    Column("gates_passed", (), "-", "-", "gates passed so far"),
-    Column("reward", (), "-", "-", "reward of the step that led to this row"),
-    Column("position_error", (), "m", "-", "distance of the true position from the reference"),
-    Column("estimation_error", (), "m", "-", "distance of the observed from the true position"),
+    # the task: the action and the reward of the step that led to this row
+    *("action", "reference_position", "gates_passed", "reward"),
+    *("position_error", "estimation_error"),
 )
 # fmt: on
 
-_READ = tuple(
-    column.name
-    for column in COLUMNS
-    if column.name in QUANTITIES and column.name != "reference_position"
-)
+
+def _column(row: str | Column) -> Column:
+    """Return a column, which may be a quantity of flights."""
+    if isinstance(row, Column):
+        return row
+    quantity = QUANTITIES[row]
+    shape = tuple(FEATURES if isinstance(size, str) else size for size in quantity.shape)
+    unit = "0 or 1" if quantity.kind is bool else quantity.unit
+    return Column(row, shape, unit, quantity.frame, quantity.meaning)
+
+
+COLUMNS = tuple(map(_column, _ROWS))
+"""Columns of a flight, in order."""
+
+_READ = tuple(row for row in _ROWS if isinstance(row, str) and row != "reference_position")
 """Columns that are quantities of a batch, copied unchanged."""
 
 _WITH_FILTER = (

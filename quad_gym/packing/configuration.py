@@ -1,11 +1,9 @@
 """`FlightConfiguration`: the keywords of `FlightBatch`, checked; packing reads them."""
 
-import inspect
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property, wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar, get_args, get_origin
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +24,9 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
 
+MOST_FLIGHTS = 10**7
+"""Largest number of flights in a batch."""
+
 FILTER_STARTS = ("cold", "warm")
 """Values of the keyword `filter_start`."""
 
@@ -36,14 +37,17 @@ _WITHOUT = {
 """Arguments of controllers, and the meanings of an action with which they have no effect."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class FlightConfiguration:
-    """Keywords of `FlightBatch`: everything that its flights have in common.
+    """Arguments of `FlightBatch`: number of flights, and everything that they have in common.
 
     Raises:
         ValueError: If a value is invalid, or has no effect with the others.
     """
 
+    count: int
+    """number of flights"""
+    _: KW_ONLY
     vehicle: Resolved[VehicleParams | str, VehicleParams] = Resolved(
         preset_of(VehicleParams, vehicle_params), "lab"
     )
@@ -109,6 +113,7 @@ class FlightConfiguration:
     """faults of sensors and rotors, or names of presets, see `quad_gym.faults`"""
 
     def __post_init__(self) -> None:
+        check.whole("count", self.count, most=MOST_FLIGHTS)
         for name, kind in (
             ("source", Source),
             ("control", Control),
@@ -214,45 +219,3 @@ class FlightConfiguration:
     def longest_delay(self) -> int:
         """Longest delay of an action, drawn or not [control steps]."""
         return math.ceil(self.draws.high[COLUMNS["action_delay"]][0])
-
-
-P = ParamSpec("P")
-Batch = TypeVar("Batch")
-
-
-def configured(
-    configuration: Callable[P, FlightConfiguration],
-) -> Callable[
-    [Callable[[Batch, int, FlightConfiguration], None]],
-    Callable[Concatenate[Batch, int, P], None],
-]:
-    """Return a decorator for the constructor of a batch, which then takes keywords.
-
-    Args:
-        configuration: `FlightConfiguration`, whose keywords the signature shows.
-    """
-    make: Callable[..., FlightConfiguration] = configuration
-
-    def decorate(init: Callable[[Batch, int, FlightConfiguration], None]) -> Any:
-        keywords = {
-            name: parameter.replace(annotation=_given_type(parameter.annotation))
-            for name, parameter in inspect.signature(configuration).parameters.items()
-        }
-        own = list(inspect.signature(init).parameters.values())[:2]
-
-        @wraps(init)
-        def construct(self: Batch, count: int, **given: Any) -> None:
-            check.keywords(given, tuple(keywords), "FlightBatch")
-            init(self, count, make(**given))
-
-        construct.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-            [*own, *keywords.values()]
-        )
-        return construct
-
-    return decorate
-
-
-def _given_type(annotation: Any) -> Any:
-    """Return the type in which a field is given."""
-    return get_args(annotation)[0] if get_origin(annotation) is Resolved else annotation

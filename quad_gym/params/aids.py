@@ -74,8 +74,8 @@ class AidParams(Checked):
 
     def simplified(self) -> "AidParams":
         """Return a copy without latency and without errors that the filter does not model."""
-        return self.replace(latency=0.0)  # type: ignore[no-any-return]
+        return self.replace(latency=0.0)
 
     def scaled_noise(self, factor: float) -> "AidParams":
         """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]
+        return self.replace(noise_sigma=factor * self.noise_sigma)

@@ -50,18 +50,14 @@ class CameraParams(Checked):
     def __post_init__(self) -> None:
         self._check(check.number, "latency", least=0.0)
         self._check(check.number, "exposure", least=0.0, most=1.0)
-        check.flag("CameraParams.ground_hides", self.ground_hides)
+        self._check(check.flag, "ground_hides")
         if not (isinstance(self.max_range, float) and self.max_range == math.inf):
             self._check(check.positive, "max_range")
         self._check(check.phase, "phase")
         self._check(check.positive, "rate", "focal_length", "pixel_sigma")
         self._check(check.place, "position_B")
         self._check(check.vector, "attitude", length=3)
-        self._check(check.vector, "image_size", length=2)
-        if min(self.image_size) <= 0.0:
-            raise ValueError(
-                f"CameraParams.image_size must be greater than 0, got {self.image_size}"
-            )
+        self._check(check.vector, "image_size", length=2, least=0.0, open_end=True)
         if np.size(self.features_I) == 0:
             raise ValueError("CameraParams.features_I must hold at least one feature, got none")
         self._check(check.matrix, "features_I", rows=None, columns=3)
@@ -73,13 +69,11 @@ class CameraParams(Checked):
 
     def simplified(self) -> "CameraParams":
         """Return a copy without latency, motion blur, and limits of range and ground."""
-        return self.replace(  # type: ignore[no-any-return]
-            latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False
-        )
+        return self.replace(latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False)
 
     def scaled_noise(self, factor: float) -> "CameraParams":
         """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(pixel_sigma=factor * self.pixel_sigma)  # type: ignore[no-any-return]
+        return self.replace(pixel_sigma=factor * self.pixel_sigma)
 
     @property
     def limited(self) -> bool:

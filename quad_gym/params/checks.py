@@ -90,13 +90,13 @@ def number(
 ) -> float:
     """`value` as a finite float in [least, most] (above `least`, with `open_end`)."""
     try:
-        result = math.nan if _no_number(value) else float(value)
+        if _no_number(value):
+            raise TypeError
+        result = float(value)
     except OverflowError:
         result = math.inf
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number, got {value!r}") from None
-    if _no_number(value):
-        raise ValueError(f"{name} must be a number, got {value!r}")
     if not math.isfinite(result):
         raise ValueError(f"{name} must be finite, got {value!r}")
     if result < least or (open_end and result == least):
@@ -201,9 +201,15 @@ def _holds_no_numbers(value: Any) -> bool:
     return value is None or isinstance(value, (str, bytes, bytearray, bool, np.bool_))
 
 
-def vector(name: str, value: Any, length: int) -> tuple[float, ...]:
-    """`value` as a tuple of `length` finite floats."""
-    return tuple(_sized(name, array(name, value, (length,))).tolist())
+def vector(
+    name: str, value: Any, length: int, *, least: float = -math.inf, open_end: bool = False
+) -> tuple[float, ...]:
+    """`value` as a tuple of `length` finite floats, at least (above, with `open_end`) `least`."""
+    found = tuple(_sized(name, array(name, value, (length,))).tolist())
+    if min(found) < least or (open_end and min(found) == least):
+        relation = "greater than" if open_end else "at least"
+        raise ValueError(f"{name} must be {relation} {least:g}, got {found}")
+    return found
 
 
 def _sized(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -282,6 +288,6 @@ class Checked:
             label = f"{type(self).__name__}.{name}"
             self._set(name, rule(label, getattr(self, name), **options))
 
-    def replace(self, **changes: Any) -> Any:
+    def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; all values are checked again."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]

@@ -22,9 +22,7 @@ class PDGains(Checked):
 
     def __post_init__(self) -> None:
         self._check(check.number, "position", "velocity", least=0.0)
-        self._check(check.vector, "attitude", "body_rates", length=3)
-        if min(self.attitude + self.body_rates) < 0.0:
-            raise ValueError("PDGains.attitude and PDGains.body_rates must be at least 0")
+        self._check(check.vector, "attitude", "body_rates", length=3, least=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +51,7 @@ class ActionParams(Checked):
             "attitude_bandwidth",
             "velocity_bandwidth",
         )
-        self._check(check.vector, "rate_scale", length=3)
-        if min(self.rate_scale) <= 0.0:
-            raise ValueError(
-                f"ActionParams.rate_scale must be greater than 0, got {self.rate_scale}"
-            )
+        self._check(check.vector, "rate_scale", length=3, least=0.0, open_end=True)
         if self.tilt_scale >= math.pi / 2:
             raise ValueError(
                 f"ActionParams.tilt_scale must be less than pi/2, got {self.tilt_scale}"

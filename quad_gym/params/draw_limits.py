@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params.clocks import Clocks
-from quad_gym.params.gnss import check_baseline
+from quad_gym.params.gnss import GnssParams, check_baseline
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import (
     RK4_LIMIT,
@@ -60,7 +60,7 @@ def check_bounds(
                 elif owner is not None:
                     value: Any = float(ends[0]) if ends.size == 1 else tuple(ends.tolist())
                     drawn = owner.replace(**{field: value})
-                    if name == "position_sigma_I":
+                    if name == "position_sigma_I" and isinstance(drawn, GnssParams):
                         drawn.require_filter()
             except ValueError as error:
                 reached = ", ".join(f"{end:g}" for end in ends)

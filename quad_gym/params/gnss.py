@@ -86,17 +86,10 @@ class GnssParams(Checked):
         self._check(check.phase, "phase")
         if self.velocity_sigma is not None:
             self._check(check.positive, "velocity_sigma")
-        self._check(check.vector, "drift_sigma_I", length=3)
-        if min(self.drift_sigma_I) < 0.0:
-            raise ValueError(
-                f"GnssParams.drift_sigma_I must be at least 0, got {self.drift_sigma_I}"
-            )
+        self._check(check.vector, "drift_sigma_I", length=3, least=0.0)
         self._check(check.place, *self._antennas)
-        self._check(check.vector, "reference_antenna_G", "position_sigma_I", length=3)
-        if min(self.position_sigma_I) <= 0.0:
-            raise ValueError(
-                f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
-            )
+        self._check(check.vector, "reference_antenna_G", length=3)
+        self._check(check.vector, "position_sigma_I", length=3, least=0.0, open_end=True)
         if self.has_baseline:
             check_baseline("GnssParams.secondary_antenna_B and primary_antenna_B", self.baseline_B)
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
@@ -107,11 +100,11 @@ class GnssParams(Checked):
 
     def simplified(self) -> "GnssParams":
         """Return a copy without latency and constant heading error."""
-        return self.replace(latency=0.0, heading_error_sigma=0.0)  # type: ignore[no-any-return]
+        return self.replace(latency=0.0, heading_error_sigma=0.0)
 
     def scaled_noise(self, factor: float) -> "GnssParams":
         """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(  # type: ignore[no-any-return]
+        return self.replace(
             position_sigma_I=tuple(factor * sigma for sigma in self.position_sigma_I),
             baseline_sigma=factor * self.baseline_sigma,
             velocity_sigma=self.velocity_sigma and factor * self.velocity_sigma,

@@ -80,7 +80,7 @@ class ImuParams(Checked):
 
     def simplified(self) -> "ImuParams":
         """Return a copy without errors of scale and alignment, and without vibration."""
-        return self.replace(  # type: ignore[no-any-return]
+        return self.replace(
             accel_scale_sigma=0.0,
             gyro_scale_sigma=0.0,
             accel_misalignment_sigma=0.0,
@@ -91,7 +91,7 @@ class ImuParams(Checked):
 
     def scaled_noise(self, factor: float) -> "ImuParams":
         """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(  # type: ignore[no-any-return]
+        return self.replace(
             accel_noise_density=factor * self.accel_noise_density,
             gyro_noise_density=factor * self.gyro_noise_density,
         )

@@ -105,4 +105,4 @@ class MagnetometerParams(AidParams):
 
     def simplified(self) -> "MagnetometerParams":
         """Return a copy without latency and soft iron."""
-        return self.replace(latency=0.0, soft_iron_sigma=0.0)  # type: ignore[no-any-return]
+        return self.replace(latency=0.0, soft_iron_sigma=0.0)

@@ -32,9 +32,8 @@ class Obstacle(Checked):
 
     def __post_init__(self) -> None:
         name = type(self).__name__
-        self._check(check.vector, "center_I", "shift_I", length=3)
-        if min(self.shift_I) < 0.0:
-            raise ValueError(f"{name}.shift_I must be at least 0, got {self.shift_I}")
+        self._check(check.vector, "center_I", length=3)
+        self._check(check.vector, "shift_I", length=3, least=0.0)
         for field in ("center_I", "shift_I"):
             check.number(
                 f"{name}.{field}",

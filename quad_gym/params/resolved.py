@@ -1,12 +1,16 @@
-"""Fields of dataclasses that accept several forms of a value, such as the name of a preset."""
+"""Arguments as dataclasses: fields given in several forms, and methods that take the fields."""
 
+import inspect
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar, overload
+from functools import wraps
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, get_args, get_origin, overload
 
 from quad_gym.params import checks as check
 
 Given = TypeVar("Given")
 Value = TypeVar("Value")
+Arguments = ParamSpec("Arguments")
+Owner = TypeVar("Owner")
 
 
 class Resolved(Generic[Given, Value]):
@@ -59,3 +63,41 @@ def default_of(kind: type[Value]) -> Callable[[str, Any], Value]:
         return value
 
     return resolve
+
+
+def taking(
+    kind: Callable[Arguments, Value], name: str
+) -> Callable[
+    [Callable[[Owner, Value], None]],
+    Callable[Concatenate[Owner, Arguments], None],
+]:
+    """Return a decorator for a method of a dataclass, which then takes the fields as arguments.
+
+    Args:
+        kind: The dataclass, whose fields the signature shows.
+        name: Name of the method in messages.
+    """
+    make: Callable[..., Value] = kind
+    fields = {
+        name: parameter.replace(annotation=_given_type(parameter.annotation))
+        for name, parameter in inspect.signature(kind).parameters.items()
+    }
+
+    def decorate(method: Callable[[Owner, Value], None]) -> Any:
+        @wraps(method)
+        def take(self: Owner, *values: Any, **given: Any) -> None:
+            check.keywords(given, tuple(fields), name)
+            method(self, make(*values, **given))
+
+        itself = next(iter(inspect.signature(method).parameters.values()))
+        take.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            [itself, *fields.values()]
+        )
+        return take
+
+    return decorate
+
+
+def _given_type(annotation: Any) -> Any:
+    """Return the type in which a field is given."""
+    return get_args(annotation)[0] if get_origin(annotation) is Resolved else annotation

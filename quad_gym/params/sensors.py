@@ -277,7 +277,7 @@ class SensorSuite(Checked):
         for name, sensor in self.sensors.items():
             wanted = {"gnss": gnss, "camera": camera, **aids}.get(name)
             changed[name] = sensor.replace(rate=rate_of(f"{name}_rate", wanted, sensor.rate))
-        return self.replace(imu=self.imu.replace(rate=imu_rate), **changed)  # type: ignore[no-any-return]
+        return self.replace(imu=self.imu.replace(rate=imu_rate), **changed)
 
     def simplified(self) -> "SensorSuite":
         """Return a copy with white noise, bias and drift only, and without delays.
@@ -286,12 +286,10 @@ class SensorSuite(Checked):
         errors, motion blur, range and ground on a flight. White noise stays as it is.
         """
         changed = {name: sensor.simplified() for name, sensor in self.sensors.items()}
-        return self.replace(imu=self.imu.simplified(), **changed)  # type: ignore[no-any-return]
+        return self.replace(imu=self.imu.simplified(), **changed)
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
         """Return a copy with all white noise multiplied by `factor`, for sensors and filter."""
         check.positive("factor", factor)
         changed = {name: sensor.scaled_noise(factor) for name, sensor in self.sensors.items()}
-        return self.replace(  # type: ignore[no-any-return]
-            imu=self.imu.scaled_noise(factor), **changed
-        )
+        return self.replace(imu=self.imu.scaled_noise(factor), **changed)

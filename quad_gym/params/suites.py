@@ -317,7 +317,7 @@ def sensor_suite(name: str | Path) -> SensorSuite:
         OSError: If the file cannot be read.
     """
     if is_suite_file(name):
-        return read_suite(Path(name), SensorSuite, _base)  # type: ignore[no-any-return]
+        return read_suite(Path(name), SensorSuite, _base)
     if not isinstance(name, str) or name not in _ALL:
         raise ValueError(
             f"sensors must be one of {', '.join(ALL_SUITES)}, or a file of a suite (.toml), got "

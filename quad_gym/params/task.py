@@ -105,21 +105,14 @@ class TaskParams(Checked):
         self._check(check.number, "period", least=MIN_PERIOD)
         self._check(check.number, "duration", least=0.0, most=1e9)
         self._check(check.number, "min_height")
-        self._check(check.flag, "randomize_reference")
-        self._check(check.vector, "preview", length=2)
+        self._check(check.flag, "randomize_reference", "truncate_when_diverged")
+        self._check(check.vector, "preview", length=2, least=0.0)
         self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
-        self._check(check.whole, "gate_count")
-        if self.gate_count > MAX_GATES:
-            raise ValueError(
-                f"TaskParams.gate_count must be at most {MAX_GATES}, got {self.gate_count}"
-            )
+        self._check(check.whole, "gate_count", most=MAX_GATES)
         check.instance("TaskParams.reward_params", self.reward_params, RewardParams)
         self.reward_params.require_effect(self.kind)
-        check.flag("TaskParams.truncate_when_diverged", self.truncate_when_diverged)
         if not 0.0 < check.number("TaskParams.max_tilt", self.max_tilt) <= math.pi:
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
-        if min(self.preview) < 0.0:
-            raise ValueError(f"TaskParams.preview must be at least 0, got {self.preview}")
 
     @property
     def may_start_on_ground(self) -> bool:

@@ -106,7 +106,8 @@ class WorldParams(Checked):
     leaves the box; None: no geofence"""
 
     def __post_init__(self) -> None:
-        self._check(check.vector, "wind_I", "linear_drag_B", "rotor_drag_B", length=3)
+        self._check(check.vector, "wind_I", length=3)
+        self._check(check.vector, "linear_drag_B", "rotor_drag_B", length=3, least=0.0)
         self._check(check.number, "gust_wind_speed", least=0.0, most=MAX_WIND)
         if np.linalg.norm(self.wind_I) > MAX_WIND:
             raise ValueError(
@@ -115,11 +116,6 @@ class WorldParams(Checked):
         self._check(check.flag, "ground_effect")
         self._check(check.positive, "rotor_radius")
         self._check(check.number, "ground_height")
-        for name in ("linear_drag_B", "rotor_drag_B"):
-            if min(getattr(self, name)) < 0.0:
-                raise ValueError(
-                    f"WorldParams.{name} must be at least 0, got {getattr(self, name)}"
-                )
         if self.ground is not None:
             check.instance("WorldParams.ground", self.ground, GroundParams)
         if self.battery is not None:

@@ -12,7 +12,7 @@ from quad_gym.tasks.memory import ReadableBatch
 T = TypeVar("T")
 
 
-class Field(Generic[T]):
+class GroupField(Generic[T]):
     """Read-only value of a `Group`, stored until the next step.
 
     Args:
@@ -35,7 +35,7 @@ class Field(Generic[T]):
         self._name = name
 
     @overload
-    def __get__(self, group: None, owner: type) -> "Field[T]": ...
+    def __get__(self, group: None, owner: type) -> "GroupField[T]": ...
 
     @overload
     def __get__(self, group: "Group", owner: type) -> T: ...
@@ -50,20 +50,20 @@ class Field(Generic[T]):
 
 def field(
     shape: str, unit: str, frame: str, meaning: str
-) -> Callable[[Callable[[Any], T]], Field[T]]:
+) -> Callable[[Callable[[Any], T]], GroupField[T]]:
     """Make a field of the method that computes it."""
-    return lambda read: Field(read, shape, unit, frame, meaning)
+    return lambda read: GroupField(read, shape, unit, frame, meaning)
 
 
-def record(name: str, shape: str, unit: str, frame: str, meaning: str) -> Field[NDArray[Any]]:
+def record(name: str, shape: str, unit: str, frame: str, meaning: str) -> GroupField[NDArray[Any]]:
     """Make a field of the flights' records."""
     kind = {"int": np.int64, "bool": np.bool_}.get(shape.rpartition(" ")[2], np.float64)
-    return Field(lambda group: group._flights.rows(name, kind), shape, unit, frame, meaning)
+    return GroupField(lambda group: group._flights.rows(name, kind), shape, unit, frame, meaning)
 
 
-def shown(name: str, shape: str, unit: str, frame: str, meaning: str) -> Field[NDArray[Any]]:
+def shown(name: str, shape: str, unit: str, frame: str, meaning: str) -> GroupField[NDArray[Any]]:
     """Make a field of `quad_gym.records.SHOWN`."""
-    return Field(lambda group: group._flights.shown(name), shape, unit, frame, meaning)
+    return GroupField(lambda group: group._flights.shown(name), shape, unit, frame, meaning)
 
 
 def frozen(value: Any) -> Any:

@@ -9,7 +9,7 @@ from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
 from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK
 from quad_gym.rotations import dcm_to_quaternion
-from quad_gym.tasks.fields import Field, Group, field, record, shown
+from quad_gym.tasks.fields import Group, GroupField, field, record, shown
 from quad_gym.tasks.memory import ReadableBatch
 
 Floats = NDArray[np.float64]
@@ -17,23 +17,23 @@ Truths = NDArray[np.bool_]
 
 
 # fmt: off
-def _block(first: int, unit: str, frame: str, of: str) -> tuple[Field[Floats], Field[Floats]]:
+def _block(first: int, unit: str, frame: str, of: str) -> tuple[GroupField[Floats], GroupField[Floats]]:
     """Fields of a block of the covariance and the square roots of its diagonal."""
     squared = f"({unit})^2" if "/" in unit else f"{unit}^2"
 
     @field("(n, 3, 3)", squared, frame, f"covariance of the {of}")
-    def covariance(self: "Estimate") -> Floats:
+    def covariance(self: "EstimateView") -> Floats:
         rows = np.ascontiguousarray(self.factor[:, first : first + 3, : first + 3])
         return rows @ rows.transpose(0, 2, 1)
 
     @field("(n, 3)", unit, frame, f"standard deviations of the {of}")
-    def sigma(self: "Estimate") -> Floats:
+    def sigma(self: "EstimateView") -> Floats:
         return self.sigma[:, first : first + 3]
 
     return covariance, sigma
 
 
-class Estimate(Group):
+class EstimateView(Group):
     """Estimate of the filter and its covariance."""
 
     def _require(self) -> None:
@@ -79,12 +79,12 @@ class Estimate(Group):
     nis_dimension = record("nis_dimension", "(n,) int", "-", "-", "number of scalar measurements in the last update")
 
 
-class Truth(Group):
+class TruthView(Group):
     """True state."""
 
     __slots__ = ("_estimate",)
 
-    def __init__(self, flights: ReadableBatch, estimate: Estimate) -> None:
+    def __init__(self, flights: ReadableBatch, estimate: EstimateView) -> None:
         super().__init__(flights)
         self._estimate = estimate
 
@@ -161,7 +161,7 @@ class Truth(Group):
         return self._flights.drawn()
 
 
-class Observed(Group):
+class ObservedView(Group):
     """State observed by the controller: the estimate, the truth, or the truth with noise."""
 
     position = record("r_seen", "(n, 3)", "m", "I", "position from the source that `observation` names")
@@ -190,7 +190,7 @@ class Observed(Group):
         return nearest_obstacle(flights.world.obstacles, flights.read("obstacles"), self.position)
 
 
-class Measured(Group):
+class MeasuredView(Group):
     """Last measurement of each kind in the step; NaN if there was none."""
 
     def _require(self) -> None:
@@ -243,7 +243,7 @@ class Measured(Group):
         return self._flights.rows("block_fresh", np.bool_)[:, FEATURE_SLICE][:, :count]
 
 
-class Builtin(Group):
+class BuiltinView(Group):
     """Reward and endings of the built-in task; zero where an episode has begun since."""
 
     @field("(n,)", "-", "-", "reward of the built-in task, per step")

@@ -146,18 +146,18 @@ class Task:
 
     def reward(self, view: "View") -> "NDArray[np.float64] | dict[str, NDArray[np.float64]]":
         """Return the reward of the last step, (n,), or its terms by name, (n,) each."""
-        return view.builtin.reward  # type: ignore[no-any-return]
+        return view.builtin.reward
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """Return True for episodes that end by a crash or at the goal, (n,)."""
-        return view.builtin.terminated  # type: ignore[no-any-return]
+        return view.builtin.terminated
 
     def truncated(self, view: "View") -> NDArray[np.bool_]:
         """Return True for episodes that are cut short, such as by the time limit, (n,).
 
         Both `terminated` and `truncated` may be True in the same step.
         """
-        return view.builtin.truncated  # type: ignore[no-any-return]
+        return view.builtin.truncated
 
     def observe(self, view: "View") -> Any:
         """Return the task's observation: numbers (n,) or (n, k), or a dictionary of such arrays."""

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params.world import WorldParams
-from quad_gym.tasks.fields import Field, Group, field, record, shown
-from quad_gym.tasks.groups import Builtin, Estimate, Measured, Observed, Truth
+from quad_gym.tasks.fields import Group, GroupField, field, record, shown
+from quad_gym.tasks.groups import BuiltinView, EstimateView, MeasuredView, ObservedView, TruthView
 from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.state import State
 
@@ -52,18 +52,18 @@ class View(Group):
     """
 
     __slots__ = ("_builtin", "_hidden", "_truth", "estimate", "measured", "observed", "state")
-    estimate: Estimate
-    observed: Observed
-    measured: Measured
+    estimate: EstimateView
+    observed: ObservedView
+    measured: MeasuredView
     state: State
 
     def __init__(self, flights: ReadableBatch, state: State) -> None:
         super().__init__(flights)
-        estimate = Estimate(flights)
-        self._truth, self._builtin, self._hidden = Truth(flights, estimate), Builtin(flights), False
+        estimate = EstimateView(flights)
+        self._truth, self._builtin, self._hidden = TruthView(flights, estimate), BuiltinView(flights), False
         object.__setattr__(self, "estimate", estimate)
-        object.__setattr__(self, "observed", Observed(flights))
-        object.__setattr__(self, "measured", Measured(flights))
+        object.__setattr__(self, "observed", ObservedView(flights))
+        object.__setattr__(self, "measured", MeasuredView(flights))
         object.__setattr__(self, "state", state)
 
     def forget(self) -> None:
@@ -85,13 +85,13 @@ class View(Group):
             )
 
     @property
-    def truth(self) -> Truth:
+    def truth(self) -> TruthView:
         """True state; `observe` may read it only if the task is privileged."""
         self._require_open("truth")
         return self._truth
 
     @property
-    def builtin(self) -> Builtin:
+    def builtin(self) -> BuiltinView:
         """Built-in reward and endings of the step; `observe` may read them as it may the truth."""
         self._require_open("builtin")
         return self._builtin
@@ -169,17 +169,17 @@ class ViewField(NamedTuple):
 
 GROUPS: dict[str, type[Group]] = {
     "": View,
-    "truth.": Truth,
-    "estimate.": Estimate,
-    "observed.": Observed,
-    "measured.": Measured,
-    "builtin.": Builtin,
+    "truth.": TruthView,
+    "estimate.": EstimateView,
+    "observed.": ObservedView,
+    "measured.": MeasuredView,
+    "builtin.": BuiltinView,
 }
 """Groups of a view by their prefixes."""
 VIEW_FIELDS = tuple(
     ViewField(prefix + name, value.shape, value.unit, value.frame, value.meaning)
     for prefix, group in GROUPS.items()
     for name, value in vars(group).items()
-    if isinstance(value, Field)
+    if isinstance(value, GroupField)
 )
-"""All fields of a view; for `quad_gym.tasks.fields.Field`, see the meaning of shapes and frames."""
+"""All fields of a view; for `quad_gym.tasks.fields.GroupField`, see the meaning of shapes and frames."""

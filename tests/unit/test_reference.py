@@ -54,7 +54,7 @@ def evaluated(flights, times):
 def drawn(count, seed=1, **task):
     """Flights, as scalar records, whose references were drawn for a task."""
     task_params = quad_gym.TaskParams(**task)
-    configuration = FlightConfiguration(task=task_params, sensors="lab", source=Source.TRUTH)
+    configuration = FlightConfiguration(count, task=task_params, sensors="lab", source=Source.TRUTH)
     settings = settings_record(configuration)
     blocks = aligned_zeros(-(-count // WIDTH), FLIGHT_BLOCK)
     rng = np.random.default_rng(seed)

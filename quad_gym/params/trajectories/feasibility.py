@@ -2,13 +2,14 @@
 
 import functools
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.trajectories.flatness import motion_of
+from quad_gym.params.trajectories.timing import derivative
 from quad_gym.params.vehicle import VehicleParams
 
 if TYPE_CHECKING:
@@ -57,11 +58,33 @@ def check_trajectory(
     *,
     max_thrust: float | None = None,
     max_tilt: float = math.pi,
-    max_body_rates: Any = None,
+    max_body_rates: ArrayLike | None = None,
     max_speed: float | None = None,
     name: str = "trajectory",
 ) -> Demand:
-    """See `Trajectory.check`."""
+    """Check that a vehicle can fly the trajectory, and return the largest demands.
+
+    Thrust, attitude and body rates follow from acceleration, jerk and yaw (differential
+    flatness), torques from snap, and the forces of the four rotors from thrust and torques.
+    Drag and the lag of the rotors are neglected.
+
+    Args:
+        vehicle: The vehicle; its rotor forces must be between 0 and their values at full
+            voltage.
+        max_thrust: Bound of the total thrust, if below the rotors' own [N].
+        max_tilt: Bound of the angle between body z and the vertical [rad].
+        max_body_rates: (3,) bounds of the body rates about the body axes [rad/s]; None: no
+            bound.
+        max_speed: Bound of the speed [m/s]; None: no bound.
+        name: Name of the trajectory in messages.
+
+    Returns:
+        The largest demands.
+
+    Raises:
+        ValueError: If a demand exceeds its limit, or the trajectory jumps. The message names
+            the demand, the time, the segment and the excess.
+    """
     check.instance("vehicle", vehicle, VehicleParams)
     rates = None
     if max_body_rates is not None:
@@ -174,15 +197,10 @@ def _refuse_jumps(trajectory: "Trajectory", name: str) -> None:
     """Refuse segments that do not continue each other."""
     lengths = np.diff(trajectory.times)
     path = trajectory._polynomials(0, 3)
-    shared = np.concatenate([path.c, np.zeros((0, *path.c.shape[1:]))])
-    following = slice(1, None)
     for order, (what, unit) in enumerate(
         (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
     ):
-        terms = shared
-        for _ in range(order):
-            powers = np.arange(len(terms) - 1, 0, -1)[:, np.newaxis, np.newaxis]
-            terms = terms[:-1] * powers
+        terms = derivative(path.c, order)
         ends = np.zeros(terms.shape[1:])
         for row in terms:
             ends = ends * lengths[:, np.newaxis] + row
@@ -190,7 +208,7 @@ def _refuse_jumps(trajectory: "Trajectory", name: str) -> None:
         if trajectory.closed:
             gaps = np.abs(np.roll(begins, -1, axis=0) - ends).max(axis=1)
         else:
-            gaps = np.abs(begins[following] - ends[:-1]).max(axis=1)
+            gaps = np.abs(begins[1:] - ends[:-1]).max(axis=1)
         scale = 1.0 + float(np.abs(ends).max())
         if gaps.size and gaps.max() > JUMP * scale:
             k = int(gaps.argmax())

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.trajectories.headings import heading_choice
@@ -30,17 +30,42 @@ LOOSER = 1e3
 
 def fit(
     cls: "type[Trajectory]",
-    function: Function,
+    function: Callable[[float], ArrayLike],
     duration: float,
     *,
-    velocity: Function | None,
-    acceleration: Function | None,
-    closed: bool,
-    tolerance: float,
-    yaw: Any,
-    look_at: Any,
+    velocity: Callable[[float], ArrayLike] | None = None,
+    acceleration: Callable[[float], ArrayLike] | None = None,
+    closed: bool = False,
+    tolerance: float = 1e-6,
+    yaw: Callable[[float], float] | float | str | None = None,
+    look_at: ArrayLike | None = None,
 ) -> "Trajectory":
-    """See `Trajectory.of`."""
+    """Return a trajectory that approximates any smooth function of time.
+
+    The function is replaced by splines of degree 7, with as many segments as the tolerance
+    requires.
+
+    Args:
+        function: Position (3,) in I [m] as a function of time [s], from 0 to the duration.
+        duration: Duration of the trajectory [s].
+        velocity: First derivative of the position [m/s], if known: checked against differences,
+            and met to 1000 times the tolerance.
+        acceleration: Second derivative of the position [m/s^2], if known: checked and met in
+            the same way.
+        closed: True: the trajectory repeats.
+        tolerance: Largest distance from the function [m].
+        yaw: Heading of body x: None (east), an angle [rad], "along" the horizontal velocity, or
+            a function of time.
+        look_at: (2,) or (3,) a point in I that body x faces instead [m].
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        ValueError: If a function does not return finite numbers, a derivative contradicts the
+            function, a closed trajectory does not return to its start, or the function is not
+            smooth enough.
+    """
     span = check.positive("duration", duration, least=1e-3)
     check.flag("closed", closed)
     limit = check.positive("tolerance", tolerance, least=1e-9)

@@ -18,9 +18,28 @@ OPTIONS = ("closed", "minimize", "at_rest", "yaw", "look_at")
 """Keywords of `Trajectory.through` that do not contradict a table."""
 
 
-def from_csv(cls: "type[Trajectory]", path: Path, options: dict[str, Any]) -> "Trajectory":
-    """See `Trajectory.from_csv`."""
+def from_csv(cls: "type[Trajectory]", /, path: Path | str, **options: Any) -> "Trajectory":
+    """Return a trajectory through the rows of a table, at their times.
+
+    The first line names the columns: `time` [s], `x`, `y`, `z` in I [m], and optionally `yaw`
+    [rad]; others are ignored. Times must increase, and are counted from the first.
+
+    Args:
+        path: A text file of comma-separated values.
+        options: Keywords of `through` other than times and bounds, such as `minimize="jerk"`,
+            or `at_rest=False` for a table that begins and ends in flight. With `closed=True`,
+            the last row is the return to the first.
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If a column is missing or a value is not a number; the message names the
+            line.
+    """
     check.keywords(options, OPTIONS, "Trajectory.from_csv")
+    path = Path(path)
     with path.open(newline="", encoding="utf-8-sig") as stream:
         lines = csv.reader(stream)
         names = [name.strip().lower() for name in next(lines, [])]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.trajectories.headings import heading_choice
@@ -36,18 +36,46 @@ SHORTEST = 1e-6
 
 def through(
     cls: "type[Trajectory]",
-    points: Any,
-    times: Any,
+    points: ArrayLike,
+    times: ArrayLike | None = None,
     *,
-    max_speed: float | None,
-    max_acceleration: float | None,
-    closed: bool,
-    minimize: str,
-    at_rest: bool,
-    yaw: Any,
-    look_at: Any,
+    max_speed: float | None = None,
+    max_acceleration: float | None = None,
+    closed: bool = False,
+    minimize: str = "snap",
+    at_rest: bool = True,
+    yaw: ArrayLike | str | None = None,
+    look_at: ArrayLike | None = None,
 ) -> "Trajectory":
-    """See `Trajectory.through`."""
+    """Return the smoothest trajectory through points: least integral of squared snap or jerk.
+
+    It is a spline of degree 7 (5) whose derivatives up to the sixth (fourth) are continuous.
+
+    Args:
+        points: (n, 3) in I [m].
+        times: (n,) times at which the points are passed, counted from the first [s]; closed: (n
+            + 1,), with the return to the first point. None: chosen so that speed and
+            acceleration reach their bounds and stay below them.
+        max_speed: Bound of the speed for the choice of times [m/s]; default: 2.5.
+        max_acceleration: Bound of the acceleration for the choice of times [m/s^2]; default: 3.
+        closed: True: the trajectory returns to the first point, and repeats.
+        minimize: "snap" (fourth derivative) or "jerk" (third).
+        at_rest: True: the trajectory starts and ends at rest; False: the minimum sets the
+            velocities at its ends. A closed trajectory ignores this.
+        yaw: Heading of body x: None (east), an angle [rad], "along" the horizontal velocity, or
+            (n,) an angle at each point.
+        look_at: (2,) or (3,) a point in I that body x faces instead [m].
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        ValueError: If an argument is invalid, such as a single point, two equal points in a row
+            where times are to be chosen, or times that do not increase.
+
+    Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors,
+    ICRA 2011.
+    """
     order = ORDERS[check.choice("minimize", minimize, tuple(ORDERS))]
     check.flag("closed", closed)
     check.flag("at_rest", at_rest)

@@ -31,7 +31,7 @@ def choose_times(
     max_speed: float,
     max_acceleration: float,
 ) -> Floats:
-    """When each point is passed.
+    """Return the time at which each point is passed.
 
     The shares of the segments are powers of their lengths, then improved by a search for the
     shortest flight. Velocities scale with 1/s and accelerations with 1/s^2 when all times do with
@@ -77,7 +77,7 @@ def _times_of(logs: Floats) -> Floats:
 
 
 def _use(times: Floats, terms: Floats, max_speed: float, max_acceleration: float) -> Floats:
-    """By how much the whole would have to be stretched to meet its bounds at each sample."""
+    """Factors by which the whole would have to be stretched to meet its bounds, by sample."""
     speed, acceleration = (_sampled(times, terms, k).ravel() for k in (1, 2))
     return np.concatenate([speed / max_speed, np.sqrt(acceleration / max_acceleration)])
 

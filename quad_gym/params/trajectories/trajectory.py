@@ -3,9 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,12 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.params import checks as check
 from quad_gym.params import portable
 from quad_gym.params.checks import Checked, Vector
-from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.trajectories.feasibility import check_trajectory
+from quad_gym.params.trajectories.fitting import fit
+from quad_gym.params.trajectories.headings import yaw_angles
+from quad_gym.params.trajectories.reading import from_csv
+from quad_gym.params.trajectories.splines import through
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
-
-    from quad_gym.params.trajectories.feasibility import Demand
 
 Floats = NDArray[np.float64]
 
@@ -78,145 +78,10 @@ class Trajectory(Checked):
         for array in (self.times, self.coefficients):
             array.flags.writeable = False
 
-    # ---- how they are made -------------------------------------------------------------------
-
-    @classmethod
-    def through(
-        cls,
-        points: ArrayLike,
-        times: ArrayLike | None = None,
-        *,
-        max_speed: float | None = None,
-        max_acceleration: float | None = None,
-        closed: bool = False,
-        minimize: str = "snap",
-        at_rest: bool = True,
-        yaw: ArrayLike | str | None = None,
-        look_at: ArrayLike | None = None,
-    ) -> "Trajectory":
-        """Return the smoothest trajectory through points: least integral of squared snap or jerk.
-
-        It is a spline of degree 7 (5) whose derivatives up to the sixth (fourth) are continuous.
-
-        Args:
-            points: (n, 3) in I [m].
-            times: (n,) times at which the points are passed, counted from the first [s]; closed: (n
-                + 1,), with the return to the first point. None: chosen so that speed and
-                acceleration reach their bounds and stay below them.
-            max_speed: Bound of the speed for the choice of times [m/s]; default: 2.5.
-            max_acceleration: Bound of the acceleration for the choice of times [m/s^2]; default: 3.
-            closed: True: the trajectory returns to the first point, and repeats.
-            minimize: "snap" (fourth derivative) or "jerk" (third).
-            at_rest: True: the trajectory starts and ends at rest; False: the minimum sets the
-                velocities at its ends. A closed trajectory ignores this.
-            yaw: Heading of body x: None (east), an angle [rad], "along" the horizontal velocity, or
-                (n,) an angle at each point.
-            look_at: (2,) or (3,) a point in I that body x faces instead [m].
-
-        Returns:
-            The trajectory.
-
-        Raises:
-            ValueError: If an argument is invalid, such as a single point, two equal points in a row
-                where times are to be chosen, or times that do not increase.
-
-        Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors,
-        ICRA 2011.
-        """
-        from quad_gym.params.trajectories.splines import through
-
-        return through(
-            cls,
-            points,
-            times,
-            max_speed=max_speed,
-            max_acceleration=max_acceleration,
-            closed=closed,
-            minimize=minimize,
-            at_rest=at_rest,
-            yaw=yaw,
-            look_at=look_at,
-        )
-
-    @classmethod
-    def from_csv(cls, path: Path | str, **options: Any) -> "Trajectory":
-        """Return a trajectory through the rows of a table, at their times.
-
-        The first line names the columns: `time` [s], `x`, `y`, `z` in I [m], and optionally `yaw`
-        [rad]; others are ignored. Times must increase, and are counted from the first.
-
-        Args:
-            path: A text file of comma-separated values.
-            options: Keywords of `through` other than times and bounds, such as `minimize="jerk"`,
-                or `at_rest=False` for a table that begins and ends in flight. With `closed=True`,
-                the last row is the return to the first.
-
-        Returns:
-            The trajectory.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If a column is missing or a value is not a number; the message names the
-                line.
-        """
-        from quad_gym.params.trajectories.reading import from_csv
-
-        return from_csv(cls, Path(path), options)
-
-    @classmethod
-    def of(
-        cls,
-        function: Callable[[float], ArrayLike],
-        duration: float,
-        *,
-        velocity: Callable[[float], ArrayLike] | None = None,
-        acceleration: Callable[[float], ArrayLike] | None = None,
-        closed: bool = False,
-        tolerance: float = 1e-6,
-        yaw: Callable[[float], float] | float | str | None = None,
-        look_at: ArrayLike | None = None,
-    ) -> "Trajectory":
-        """Return a trajectory that approximates any smooth function of time.
-
-        The function is replaced by splines of degree 7, with as many segments as the tolerance
-        requires.
-
-        Args:
-            function: Position (3,) in I [m] as a function of time [s], from 0 to the duration.
-            duration: Duration of the trajectory [s].
-            velocity: First derivative of the position [m/s], if known: checked against differences,
-                and met to 1000 times the tolerance.
-            acceleration: Second derivative of the position [m/s^2], if known: checked and met in
-                the same way.
-            closed: True: the trajectory repeats.
-            tolerance: Largest distance from the function [m].
-            yaw: Heading of body x: None (east), an angle [rad], "along" the horizontal velocity, or
-                a function of time.
-            look_at: (2,) or (3,) a point in I that body x faces instead [m].
-
-        Returns:
-            The trajectory.
-
-        Raises:
-            ValueError: If a function does not return finite numbers, a derivative contradicts the
-                function, a closed trajectory does not return to its start, or the function is not
-                smooth enough.
-        """
-        from quad_gym.params.trajectories.fitting import fit
-
-        return fit(
-            cls,
-            function,
-            duration,
-            velocity=velocity,
-            acceleration=acceleration,
-            closed=closed,
-            tolerance=tolerance,
-            yaw=yaw,
-            look_at=look_at,
-        )
-
-    # ---- what they are -----------------------------------------------------------------------
+    through = classmethod(through)
+    from_csv = classmethod(from_csv)
+    of = classmethod(fit)
+    check = check_trajectory
 
     @property
     def duration(self) -> float:
@@ -251,55 +116,8 @@ class Trajectory(Checked):
         Returns:
             (...) [rad/s^derivative].
         """
-        from quad_gym.params.trajectories.headings import yaw_angles
-
         order = check.whole("derivative", derivative, least=0, most=2)
         return yaw_angles(self, np.asarray(t, np.float64))[order]
-
-    def check(
-        self,
-        vehicle: VehicleParams,
-        *,
-        max_thrust: float | None = None,
-        max_tilt: float = math.pi,
-        max_body_rates: ArrayLike | None = None,
-        max_speed: float | None = None,
-        name: str = "trajectory",
-    ) -> "Demand":
-        """Check that a vehicle can fly the trajectory, and return the largest demands.
-
-        Thrust, attitude and body rates follow from acceleration, jerk and yaw (differential
-        flatness), torques from snap, and the forces of the four rotors from thrust and torques.
-        Drag and the lag of the rotors are neglected.
-
-        Args:
-            vehicle: The vehicle; its rotor forces must be between 0 and their values at full
-                voltage.
-            max_thrust: Bound of the total thrust, if below the rotors' own [N].
-            max_tilt: Bound of the angle between body z and the vertical [rad].
-            max_body_rates: (3,) bounds of the body rates about the body axes [rad/s]; None: no
-                bound.
-            max_speed: Bound of the speed [m/s]; None: no bound.
-            name: Name of the trajectory in messages.
-
-        Returns:
-            The largest demands.
-
-        Raises:
-            ValueError: If a demand exceeds its limit, or the trajectory jumps. The message names
-                the demand, the time, the segment and the excess.
-        """
-        from quad_gym.params.trajectories.feasibility import check_trajectory
-
-        return check_trajectory(
-            self,
-            vehicle,
-            max_thrust=max_thrust,
-            max_tilt=max_tilt,
-            max_body_rates=max_body_rates,
-            max_speed=max_speed,
-            name=name,
-        )
 
     def turned(self, angle: float) -> "Trajectory":
         """Return the trajectory rotated about the vertical through the origin.
