@@ -27,7 +27,7 @@ REFUSED = [
     ("compile --stages most", "--stages"),
     ("compile --stages", "--stages"),
     ("compile --jobs 0", "--jobs"),
-    ("benchmark --batch 12", "--batch"),
+    ("benchmark --batch 9", "--batch"),
     ("benchmark --batch 0", "--batch"),
     ("benchmark --n-envs 0", "--n-envs"),
     ("benchmark --repeats 0", "--repeats"),
