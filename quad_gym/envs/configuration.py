@@ -158,7 +158,7 @@ class Flights:
             count: Number of flights.
             autoreset: When a flight whose episode is over begins the next one.
             asked: Names of the keywords that the user gave.
-            keywords: All keywords; those of `FlightBatch` are passed on.
+            keywords: All keywords; `FlightBatch` gets its own.
         """
         for name, known in (
             ("observation", OBSERVATIONS),
@@ -238,7 +238,7 @@ _NOT_OF_BATCH = (
     *("observation", "action", "layout", "task"),
     *("camera", "estimator", "reward_terms"),
 )
-"""Keywords of environments from which those of `FlightBatch` follow."""
+"""Keywords of environments that determine keywords of `FlightBatch`."""
 
 
 def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:

@@ -31,7 +31,7 @@ def require_own_task(given: Collection[str], name: str, kind: str, *, own_reward
         given: Names of fields of `TaskParams` that were given.
         name: Name of the task.
         kind: Kind of its reference.
-        own_reward: True if its class has a reward of its own.
+        own_reward: True if its class defines a reward.
 
     Raises:
         ValueError: If there is one.

@@ -97,7 +97,7 @@ _OWN_DEFAULTS: dict[str, Any] = {
     "estimator": None,
     "control_rate": 50.0,
 }
-"""Defaults that differ from those of `FlightBatch`, or that it lacks."""
+"""Defaults that differ from `FlightBatch`, or that it lacks."""
 
 DEFAULTS: dict[str, Any] = {
     **{

@@ -5,7 +5,7 @@ by making a file of that name in a folder, and compiles them into the cache. It 
 parent; a function that it was compiling is then not in the cache.
 
 `multiprocessing` would not do: a process that it spawns runs the user's script again, and daemonic
-processes, such as those of `AsyncVectorEnv`, may not start any.
+processes, as in `AsyncVectorEnv`, may not start any.
 """
 
 import contextlib
