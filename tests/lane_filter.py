@@ -6,7 +6,7 @@ from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.single import FILTER_ENTRIES, FILTER_STAGES, run_stage, start_filter
-from quad_gym.packing.aids import pack_aid_settings
+from quad_gym.packing.aids import pack_sensors
 from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
@@ -39,7 +39,7 @@ class LaneFilter:
         self.work = aligned_zeros(1, WORK_BLOCK)
         self.settings = np.zeros(1, SETTINGS)
         self.settings["run_filter"] = True
-        pack_aid_settings(self.settings[0], sensors, sensors)
+        pack_sensors(self.settings[0], sensors)
 
     def put(self, number, **values):
         """Set fields of one flight."""

@@ -272,7 +272,7 @@ def test_a_late_measurement_that_fails_leaves_the_estimate_bit_for_bit():
         status = batch.record("filter_status")
         expected = np.zeros(10, int)
         if start is bad:
-            expected[[0, 2, 4, 6]] = FilterStatus.UPDATE_FAILED
+            expected[:WIDTH:2] = FilterStatus.UPDATE_FAILED
         np.testing.assert_array_equal(status, expected)
     for name in ESTIMATE:
         np.testing.assert_array_equal(after[0][name], after[1][name], err_msg=name)
@@ -287,7 +287,7 @@ def test_an_undone_update_leaves_no_corrections_behind():
     flights["corrected"], flights["corrected_variance"] = 1.0, 1e9
     batch.restore(flights)
     steps(batch, 9 * DT)
-    failed = np.isin(np.arange(10), [0, 2, 4, 6])
+    failed = np.isin(np.arange(10), np.arange(0, WIDTH, 2))
     for name in ("corrected", "corrected_variance"):
         np.testing.assert_array_equal((batch.record(name) == 0.0).all(axis=1), failed)
 
