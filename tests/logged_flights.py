@@ -14,7 +14,7 @@ from baselines import PDPolicy
 from quad_gym import FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.frames import ecef_to_enu, ecef_to_geodetic
-from quad_gym.records import AID_BLOCKS
+from quad_gym.records import AID_BLOCKS, Aid
 from quad_gym.rotations import quaternion_to_dcm
 
 RTK = quad_gym.sensor_suite("rtk")
@@ -25,6 +25,7 @@ PX4 = RTK.replace(
 )
 """What a log of PX4 can hold, and two antennas."""
 LOST, JITTER = 0.01, 0.05
+AXES_OF_FIELD = [f"magnetometer_{axis}" for axis in "xyz"]
 
 
 def flown(suite=RTK, seconds=10.0, seed=5, task="circle"):
@@ -100,6 +101,8 @@ class Recorded:
         for quantity in ("gnss", "gnss_baseline", "gnss_velocity"):
             names += [f"{quantity}_{axis}" for axis in ("east", "north", "up")]
         names += [f"pixel_{i}_{axis}" for i in range(features) for axis in "uv"]
+        aids = {Aid.BAROMETER: ["barometer"], Aid.MAGNETOMETER: AXES_OF_FIELD}
+        names += [name for aid in self.suite.aids for name in aids[aid]]
         rows = []
 
         def add(time, received, values):
@@ -114,6 +117,9 @@ class Recorded:
             add(time, received, dict(zip(order, numbers, strict=True)))
         for time, received, values in self.camera:
             add(time, received, dict(zip(names[17:], values["pixels"].ravel(), strict=True)))
+        for aid, found in zip(self.suite.aids, self.aids, strict=True):
+            for time, received, values in found:
+                add(time, received, dict(zip(aids[aid], values, strict=False)))
         table = np.array(rows)
         table = table[np.argsort(table[:, 1], kind="stable")]
         return {name: table[:, i] for i, name in enumerate(names)}

@@ -10,21 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.estimation.samples import Measurement, Sample
+from quad_gym.estimation.tape import Tape, of_measurement, of_sample
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import Stage, needed_stages
-from quad_gym.packing.aids import pack_sensors
-from quad_gym.packing.flight import form_of, pack_tick, params_block, params_record
+from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.kernels.tape import run_tape
+from quad_gym.packing.aids import blocks_of, pack_sensors
+from quad_gym.packing.flight import (
+    form_of,
+    pack_tick,
+    params_block,
+    params_record,
+    slow_errors_of,
+)
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
-    AID_BLOCKS,
-    BASELINE_BLOCK,
-    FEATURE_SLICE,
     FLIGHT_BLOCK,
-    POSITION_BLOCK,
+    KEPT,
+    REPORTED,
     SETTINGS,
-    VELOCITY_BLOCK,
+    STEP_BLOCK,
     WIDTH,
     WORK_BLOCK,
     FilterForm,
@@ -50,9 +56,12 @@ class Engine:
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         params = params_record(VehicleParams(), sensors)
         params["gravity"] = sensors.estimator.gravity
-        self.params = params_block(params)
-        self._dt = 0.0
-        self._set_dt(sensors.imu.dt)
+        pack_tick(params[0], sensors)  # which depends on gravity
+        self.params, self._ticks = params_block(params), params_block(params)
+        self.steps = aligned_zeros(1, STEP_BLOCK)
+        errors = slow_errors_of(sensors)
+        self.steps["rate"][0, : len(errors)] = [[1.0 / error.tau] for error in errors]
+        self.steps["sigma"][0, : len(errors)] = [[error.sigma] for error in errors]
         lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
         estimator = sensors.estimator.replace(kind=kind)
         self.form = form_of(estimator, innovations=True, lever_arm=lever_arm)
@@ -116,22 +125,23 @@ class Engine:
 
     def copy(self) -> NDArray[Any]:
         """Return a copy of the filter's memory for `restore`: one lane if all are equal."""
-        words = self._words()
+        words = self.words
         return words[:, :, :1].copy() if len(words) == 1 else words.copy()
 
     def restore(self, words: NDArray[Any]) -> None:
         """Restore a copy."""
         if len(words) != len(self.blocks):
             self.allocate(len(words) * WIDTH)
-        self._words()[...] = words
+        self.words[...] = words
 
-    def _words(self) -> NDArray[Any]:
+    @property
+    def words(self) -> NDArray[Any]:
         """Return the memory of the parts that the filter uses, (blocks, words, WIDTH)."""
         raw = self.blocks.view(np.uint64).reshape(len(self.blocks), -1, WIDTH)
         first = self._room.skipped // (8 * WIDTH)
         return raw[:, first : first + self._room.dtype.itemsize // (8 * WIDTH)]
 
-    # ---- stages -------------------------------------------------------------------------------
+    # ---- operations ---------------------------------------------------------------------------
 
     def start(self, x_I: Floats) -> None:
         """Start from the fix in the record, with clocks at zero and all memory cleared."""
@@ -143,54 +153,46 @@ class Engine:
 
     def predict(self, sample: Sample) -> None:
         """Propagate the estimate over the time of a sample."""
-        self._set_dt(sample.dt)
-        blocks = self.blocks
-        blocks["tick"] += sample.dt / self.sensors.imu.dt  # a clock, independent of the steps
-        self.fill("gyro", sample.gyro)
-        self.fill("accel", sample.accel)
-        # for the lever arms of a velocity and of the accelerometer
-        self.fill("w_before", sample.gyro_before)
-        self.fill("w_meas", sample.gyro)
-        self._run(Stage.PREDICT)
+        self.run(of_sample(sample))
 
     def update(self, measurement: Measurement) -> None:
         """Update the estimate with measurements."""
-        m, blocks = measurement, self.blocks
-        valid = blocks["block_valid"]
-        valid[:] = 0.0
-        valid[:, POSITION_BLOCK] = m.position_G is not None
-        valid[:, BASELINE_BLOCK] = m.baseline_G is not None
-        valid[:, VELOCITY_BLOCK] = m.velocity_G is not None
-        for aid, value in m.aids.items():
-            valid[:, AID_BLOCKS + aid] = 1.0
-            blocks["aid_measurement"][:, aid, : len(value)] = value[:, np.newaxis]
-        given = {
-            "gnss_position": m.position_G,
-            "gnss_baseline": m.baseline_G,
-            "gnss_velocity": m.velocity_G,
-        }
-        for name, numbers in given.items():
-            if numbers is not None:
-                self.fill(name, numbers)
-        if m.pixels is not None:
-            seen = np.asarray(~np.isnan(m.pixels).any(axis=1))[:, np.newaxis]
-            valid[:, FEATURE_SLICE][:, : self.features] = seen
-            image = np.where(seen, m.pixels, 0.0)[..., np.newaxis]
-            blocks["pixels"][:, : self.features] = image
-        self._set_dt(self.sensors.imu.dt)  # `tick` counts these
-        kept = self.impose(m.noise)
-        self._run(Stage.UPDATE)
-        self.restore_noise(kept)
+        self.run(of_measurement(measurement))
+
+    def run(self, tape: Tape, slots: NDArray[Any] | None = None) -> tuple[Floats, Floats]:
+        """Run the operations of a tape.
+
+        Args:
+            tape: Inputs and operations.
+            slots: (tape.slots, words) copies that the tape restores before it makes its own; None:
+                there are none.
+
+        Returns:
+            Estimates (blocks, n, KEPT, WIDTH), and innovations (blocks, m, 8 n + 1, WIDTH) with
+            REPORTED numbers per block of a measurement, followed by the ratio of the diagonals of
+            the factors of the covariance before and after the update.
+        """
+        count, table, words = len(self.blocks), self._table(), self.words
+        if slots is None:
+            slots = np.empty((tape.slots, words[0].size), np.uint64)
+        measured = np.array(blocks_of(self.sensors), np.int64)
+        kept = np.empty((count, tape.kept, KEPT, WIDTH))
+        reported = np.empty((count, tape.reported, REPORTED * len(measured) + 1, WIDTH))
+        inputs = (tape.samples, tape.measurements, tape.operations, measured)
+        for k in range(count):
+            run_tape(
+                self.blocks[k : k + 1],
+                *(self.params, self._ticks, self.steps, self.settings, self._work, table),
+                *(*inputs, words[k].reshape(-1), slots),
+                *(kept[k].ctypes.data, reported[k].ctypes.data),
+            )
+        return kept, reported
 
     def impose(self, noise: dict[str, Any]) -> dict[str, NDArray[Any]]:
-        """Set the noise of a measurement in the parameters; return the earlier values."""
+        """Set parameters for the start; return the earlier values."""
         kept = {name: self.params[name].copy() for name in noise}
         for name, value in noise.items():
-            if name == "aid_sigma":
-                for aid, sigma in value.items():
-                    self.params[name][0, aid] = sigma
-            else:
-                self.params[name] = np.asarray(value)[..., np.newaxis]
+            self.params[name] = np.asarray(value)[..., np.newaxis]
         return kept
 
     def restore_noise(self, kept: dict[str, NDArray[Any]]) -> None:
@@ -198,18 +200,6 @@ class Engine:
         for name, numbers in kept.items():
             self.params[name] = numbers
 
-    def _set_dt(self, dt: float) -> None:
-        """Set the duration of a prediction in the parameters."""
-        if dt != self._dt:
-            self._dt = dt
-            pack_tick(self.params[0], self.sensors, dt)
-
     def _table(self) -> NDArray[Any]:
         """Return the table of the stages that the filter runs."""
         return linked_table(self._stages, single.FILTER_ENTRIES)
-
-    def _run(self, stage: Stage) -> None:
-        p = self.params
-        others = (p, p, self.settings, self._work, self._table(), self.features)
-        address, count = self.blocks.ctypes.data, len(self.blocks)
-        single.run_stage(address, FLIGHT_BLOCK.itemsize, count, int(stage), *others)

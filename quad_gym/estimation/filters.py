@@ -27,7 +27,7 @@ LONGEST_STEP = 1.0
 _OF_GATES = int(FilterForm.GATE)
 
 
-class _KalmanFilter(FilterEstimate):
+class KalmanFilter(FilterEstimate):
     """Common base of the filters: everything but the kind of their kernels."""
 
     _kind: str
@@ -155,10 +155,10 @@ class _KalmanFilter(FilterEstimate):
         step = tick
         if dt is not None:
             step = check.positive("dt", dt, least=1e-9, most=max(LONGEST_STEP, tick))
-        status, earlier = self._status_bits(), self._gyro
+        status, earlier = self.status, self._gyro
         self._gyro = rates
         self._history.add(Sample(rates, force, step, rates if earlier is None else earlier))
-        self._warn_of_news(status)
+        self.warn_of_news(status)
 
     def update(
         self,
@@ -201,7 +201,7 @@ class _KalmanFilter(FilterEstimate):
         measurement = checked_measurement(
             self.sensors, gnss_position_G, gnss_baseline_G, pixels, gnss_velocity_G, others
         )
-        status, now = self._status_bits(), self._history.time
+        status, now = self.status, self._history.time
         stamp = now if time is None else check.number("time", time)
         if stamp > now + SAME_TIME:
             raise ValueError(
@@ -220,7 +220,7 @@ class _KalmanFilter(FilterEstimate):
         else:
             self._awaited = measurement
             self._history.insert(measurement, stamp)
-        self._warn_of_news(status)
+        self.warn_of_news(status)
 
     @property
     def time(self) -> float:
@@ -287,20 +287,16 @@ class _KalmanFilter(FilterEstimate):
             form &= ~_OF_GATES
         self._engine.settings["form"] = form
 
-    def _status_bits(self) -> int:
-        return int(self._of_lane("filter_status"))
-
-    def _warn_of_news(self, before: int) -> None:
-        """Warn of new failures."""
-        bits = self._status_bits() & ~before
-        if bits:
-            news = FilterStatus(bits)
+    def warn_of_news(self, before: FilterStatus) -> None:
+        """Warn of failures that `status` did not have before."""
+        news = self.status & ~before
+        if news:
             warnings.warn(
                 f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
             )
 
 
-class UnscentedKalmanFilter(_KalmanFilter):
+class UnscentedKalmanFilter(KalmanFilter):
     """The report's UKF for one vehicle: position, velocity, attitude and IMU biases.
 
     One cycle is: `update` with the measurements at t_k, read the estimate, then `predict` to t_k+1
@@ -327,7 +323,7 @@ class UnscentedKalmanFilter(_KalmanFilter):
     _kind = "ukf"
 
 
-class ExtendedKalmanFilter(_KalmanFilter):
+class ExtendedKalmanFilter(KalmanFilter):
     """An error-state EKF for one vehicle, with the state, models, noise and interface of the UKF.
 
     Its covariance follows from analytic derivatives of the models at the estimate, which cost less

@@ -1,4 +1,8 @@
-"""A filter that processes a log event by event, in the order of arrival."""
+"""A filter that processes a log event by event, in the order of arrival.
+
+Which samples and measurements it processes, and when, depends on their times alone. So all of it is
+written on a tape first, which compiled code then runs.
+"""
 
 import bisect
 import math
@@ -6,21 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.estimate import Innovations
 from quad_gym.estimation.filters import LONGEST_STEP, ExtendedKalmanFilter, UnscentedKalmanFilter
-from quad_gym.estimation.history import SAME_TIME
+from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
 from quad_gym.estimation.results import Measured, Replay
+from quad_gym.estimation.running import run_filter
+from quad_gym.estimation.samples import Sample, checked_measurement
 from quad_gym.estimation.starts import state_at_rest
+from quad_gym.estimation.tape import TapeWriter
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
+from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid, Operation
 from quad_gym.rotations import dcm_to_quaternion
 
 ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
+
+_MEASURED = ("gnss_position_G", "gnss_baseline_G", "pixels", "gnss_velocity_G")
 
 PATIENCE = 2.0
 """Time for which a start waits for the first magnetic field [s]."""
@@ -48,11 +56,14 @@ class Player:
         self.waiting: list[tuple[float, str, int]] = []  # time stamps after the filter's time
         self.before: int | None = None  # the sample that holds now, of an IMU of instants
         self.field: int | None = None  # the last magnetic field before the start
-        self.pressure_level = 0.0 if not log.barometer_from_start else math.nan
         self.first_fix = math.inf
         self.too_late = 0
-        self.rows: list[tuple[Any, ...]] = []
-        self.reports: list[tuple[float, float, Innovations]] = []
+        self.times: list[float] = []
+        self.stamps: list[tuple[float, float]] = []  # of all updates, with their arrival
+        self.gyro: Floats | None = None  # of the prediction before
+        self.writer = TapeWriter()
+        writer = self.writer
+        self.history = InputHistory(window, writer.apply, writer.copy, writer.restore)
         self._choose_streams()
 
     def _choose_streams(self) -> None:
@@ -88,21 +99,27 @@ class Player:
 
     # ---- the log, event by event ---------------------------------------------------------------
 
-    def play(self) -> Replay:
-        """Filter the whole log."""
+    def write_tape(self) -> None:
+        """Start the filter, and write down what it does with the log.
+
+        Raises:
+            MisfitError: If the suite has no sensor of the log.
+            ValueError: If the log has no fix to start from, or its IMU samples have a gap.
+        """
         names = list(self.streams)  # the IMU first: it comes before what arrives with it
         received = np.concatenate([self.streams[name].received for name in names])
         kinds = np.concatenate([np.full(len(self.streams[n]), k) for k, n in enumerate(names)])
         places = np.concatenate([np.arange(len(self.streams[n])) for n in names])
         if "position" in self.start:
             self._start_from_state()
-        for k in np.lexsort((places, kinds, received)):
-            if kinds[k] == 0:
-                self._take_sample(int(places[k]))
+        order = np.lexsort((places, kinds, received))
+        for kind, place in zip(kinds[order].tolist(), places[order].tolist(), strict=True):
+            if kind == 0:
+                self._take_sample(place)
             else:
-                self._take_measurement(names[kinds[k]], int(places[k]))
+                self._take_measurement(names[kind], place)
         self._keep_row()
-        if not self.rows:
+        if not self.times:
             if self.unused and len(self.streams) == 1:
                 raise MisfitError(
                     f"{nothing_in_common(self.unused)}: use a suite with these sensors"
@@ -112,7 +129,13 @@ class Player:
                 "start= a position and a heading (--start-position 0 0 0 --heading 0), or all "
                 "keywords of set_state"
             )
-        return self._result()
+
+    def play(self) -> Replay:
+        """Filter the whole log."""
+        self.write_tape()
+        if self.log.barometer_from_start:  # relative to the height of the vehicle
+            self.filter._engine.steps["level"] = np.nan
+        return self._result(*run_filter(self.filter, self.writer))
 
     def _take_sample(self, i: int) -> None:
         if not self.running:
@@ -123,20 +146,22 @@ class Player:
 
     def _predict(self, i: int) -> None:
         """Propagate the estimate to the time of a sample."""
-        imu, ukf = self.log.imu, self.filter
+        imu, now = self.log.imu, self.history.time
         time = float(imu.time[i])
         chosen = i if self.averages else self.before
         self.before = i
-        step = time - ukf.time
+        step = time - now
         if step <= SAME_TIME or chosen is None:
             return
         if step > max(LONGEST_STEP, self.suite.imu.dt):
             raise ValueError(
                 f"samples of the IMU must be at most {LONGEST_STEP:g} s apart, got none from "
-                f"{ukf.time:.3f} s to {time:.3f} s: cut the log there"
+                f"{now:.3f} s to {time:.3f} s: cut the log there"
             )
-        ukf.predict(imu.values["gyro"][chosen], imu.values["accel"][chosen], dt=step)
-        while self.waiting and self.waiting[0][0] <= ukf.time + SAME_TIME:
+        gyro, accel = imu.values["gyro"][chosen], imu.values["accel"][chosen]
+        self.history.add(Sample(gyro, accel, step, gyro if self.gyro is None else self.gyro))
+        self.gyro = gyro
+        while self.waiting and self.waiting[0][0] <= self.history.time + SAME_TIME:
             _, name, k = self.waiting.pop(0)
             self._update(name, k)
 
@@ -144,21 +169,27 @@ class Player:
         stamp = float(self.streams[name].time[k])
         if not self.running:
             self._try_to_start(name, k)
-        elif stamp > self.filter.time + SAME_TIME:
+        elif stamp > self.history.time + SAME_TIME:
             bisect.insort(self.waiting, (stamp, name, k))
-        elif stamp < self.filter.oldest_time - SAME_TIME:
+        elif stamp < self.history.oldest - SAME_TIME:
             self.too_late += 1
         else:
             self._update(name, k)
 
     def _update(self, name: str, k: int) -> None:
-        stream = self.streams[name]
+        stream, history = self.streams[name], self.history
         given = self._keywords(name, stream, k)
         if not given:
             return
         stamp = float(stream.time[k])
-        self.filter.update(**given, time=min(stamp, self.filter.time))
-        self.reports.append((stamp, float(stream.received[k]), self.filter.last_update))
+        position, baseline, pixels, velocity = (given.pop(name, None) for name in _MEASURED)
+        measurement = checked_measurement(self.suite, position, baseline, pixels, velocity, given)
+        self.writer.awaited = measurement
+        if stamp >= history.time - SAME_TIME:
+            history.add(measurement)
+        else:
+            history.insert(measurement, stamp)
+        self.stamps.append((stamp, float(stream.received[k])))
 
     def _keywords(self, name: str, stream: Stream, k: int) -> dict[str, Any]:
         """Return a measurement as keywords of `update`."""
@@ -169,10 +200,6 @@ class Player:
             return {"pixels": value}
         if not np.isfinite(value).all():
             return {}
-        if name == "barometer":
-            if math.isnan(self.pressure_level):  # relative to the height of the vehicle
-                self.pressure_level = float(value - self.filter.position[2])
-            return {"barometer": float(value - self.pressure_level)}
         return {name: value}
 
     def _fix(self, stream: Stream, k: int) -> dict[str, Any]:
@@ -258,6 +285,7 @@ class Player:
     def _go_on(self) -> None:
         """Process the samples since the time of the start."""
         self.running, begin = True, self.filter.time
+        self.history.begin(begin)
         for i in self.held:
             if self.log.imu.time[i] > begin + SAME_TIME:
                 self._predict(i)
@@ -269,69 +297,50 @@ class Player:
 
     def _keep_row(self) -> None:
         """Store the estimate before the next sample arrives."""
-        f = self.filter
-        if not self.running:
-            return
-        self.rows.append(
-            (
-                f.time,
-                f.position,
-                f.velocity,
-                f.R_BI,
-                f.accel_bias,
-                f.gyro_bias,
-                np.sqrt(np.diag(f.covariance)),
-                f.heading_known,
-                f.diverged,
-            )
-        )
+        if self.running:
+            self.times.append(self.history.time)
+            self.writer.keep()
 
-    def _result(self) -> Replay:
-        time, r, v, R, b_a, b_g, sigma, known, diverged = (
-            np.array(column) for column in zip(*self.rows, strict=True)
-        )
+    def _result(self, kept: Floats, reported: Floats) -> Replay:
+        r, v, R, b_a, b_g, variances, state = np.split(kept, np.cumsum((3, 3, 9, 3, 3, 15)), 1)
         return Replay(
             estimator=self.estimator,
             sensors=self.suite,
-            time=time,
+            time=np.array(self.times),
             position=r,
             velocity=v,
-            quaternion=dcm_to_quaternion(R),
+            quaternion=dcm_to_quaternion(R.reshape(-1, 3, 3)),
             accel_bias=b_a,
             gyro_bias=b_g,
-            sigma=sigma,
-            heading_known=known,
-            diverged=diverged,
+            sigma=np.sqrt(variances),
+            heading_known=state[:, 1] > 0.0,
+            diverged=state[:, 0] > 0.0,
             status=self.filter.status,
-            measured=_measured(self.suite, self.reports),
+            measured=self._measured(reported),
             too_late=self.too_late,
             unused=self.unused,
         )
 
-
-def _measured(
-    suite: SensorSuite, reports: list[tuple[float, float, Innovations]]
-) -> dict[str, Measured]:
-    """Return innovations by kind of measurement, for the kinds that occurred."""
-    if not reports:
-        return {}
-    time, received = (np.array([report[k] for report in reports]) for k in (0, 1))
-    innovation, sigma, nis, gate = (
-        np.array([getattr(report[2], name) for report in reports]) for name in Innovations._fields
-    )
-    found = {}
-    for row, block in enumerate(blocks_of(suite)):
-        have, freedoms = np.isfinite(gate[:, row]), FREEDOMS[block]
-        if have.any():
-            found[_name_of(block)] = Measured(
-                time[have],
-                received[have],
-                innovation[have, row, :freedoms],
-                sigma[have, row, :freedoms],
-                nis[have, row],
-                gate[have, row],
-            )
-    return found
+    def _measured(self, reported: Floats) -> dict[str, Measured]:
+        """Return innovations by kind of measurement, for the kinds that occurred."""
+        tape, blocks, found = self.writer.tape(), blocks_of(self.suite), {}
+        updates = tape.operations[tape.operations["target"] >= 0]
+        updates = updates[updates["code"] == Operation.UPDATE]
+        valid = tape.measurements["valid"][updates["index"]] > 0.0
+        time, received = np.array(self.stamps).reshape(-1, 2).T
+        for row, block in enumerate(blocks):
+            have, freedoms = valid[:, block], FREEDOMS[block]
+            if have.any():
+                values = reported[have, row]
+                found[_name_of(block)] = Measured(
+                    time[have],
+                    received[have],
+                    values[:, :freedoms],
+                    values[:, 3 : 3 + freedoms],
+                    values[:, 6],
+                    values[:, 7],
+                )
+        return found
 
 
 def _name_of(block: int) -> str:

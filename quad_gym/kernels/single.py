@@ -55,7 +55,7 @@ from quad_gym.records import (
 
 FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
 """Stages that a filter runs, as far as it needs them."""
-FILTER_ENTRIES = tuple(f"{__name__}:{name}" for name in ("start_filter", "run_stage"))
+FILTER_ENTRIES = (f"{__name__}:start_filter", "quad_gym.kernels.tape:run_tape")
 """Names of the entries that a filter calls, the slowest to compile first."""
 SENSORS_AND_VEHICLE = tuple(
     f"{__name__}:{name}"

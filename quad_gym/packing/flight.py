@@ -86,7 +86,7 @@ def params_record(
         p["half_image"], p["blur"] = np.array(camera.image_size) / 2, camera.blur
         p["features"][: len(camera.features_I)] = camera.features_I
     pack_aids(p, sensors)
-    pack_tick(p, sensors, sensors.imu.dt)
+    pack_tick(p, sensors)
     _pack_filter(p, sensors)
     noisy = sensors.noisy
     p["noisy_sigma"] = (noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates)
@@ -114,26 +114,33 @@ def _pack_imu(p: Any, sensors: SensorSuite, vehicle: VehicleParams) -> None:
         p[f"{sensor}_vibration"] = getattr(imu, f"{sensor}_vibration") / hover_speed**2
 
 
-def pack_tick(p: Any, sensors: SensorSuite, dt: float) -> None:
-    """Write the numbers that depend on the duration of a prediction.
-
-    White noise is given as a density: the mean over a longer time has a smaller sigma.
+def pack_tick(p: Any, sensors: SensorSuite) -> None:
+    """Write the numbers that depend on the duration of a tick.
 
     Args:
-        p: One record of parameters, scalar or of a block; its gravity is already set.
+        p: One record of parameters; its gravity is already set.
         sensors: Sensors that the filter assumes.
-        dt: Duration of the prediction [s]; of a tick, in flights.
     """
-    imu, fewer = sensors.imu, math.sqrt(sensors.imu.dt / dt)
-    p["dt"], p["accel_error_noise"] = dt, imu.believed_accel_error * fewer
-    for sensor in ("accel", "gyro"):
-        p[f"{sensor}_noise"] = getattr(imu, f"believed_{sensor}_sigma") * fewer
+    imu, dt = sensors.imu, sensors.imu.dt
+    p["dt"], p["accel_error_noise"] = dt, imu.believed_accel_error
+    biases = slow_errors_of(sensors)
+    for sensor, error in zip(("accel", "gyro"), biases, strict=False):
+        p[f"{sensor}_noise"] = getattr(imu, f"believed_{sensor}_sigma")
         # the vibration is given for rotors in hover, whose specific force is g
-        p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / p["gravity"] * fewer
-        error = SlowError(getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau"))
+        p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / p["gravity"]
         p[f"{sensor}_bias_decay"], p[f"{sensor}_bias_drive"] = decay_and_drive(error, dt)
-    for k, error in enumerate(slow_states(sensors).errors):
+    for k, error in enumerate(biases[2:]):
         p["slow_decay"][k], p["slow_drive"][k] = decay_and_drive(error, dt)
+
+
+def slow_errors_of(sensors: SensorSuite) -> list[SlowError]:
+    """Return the bias of accelerometer and gyro, and the slow errors among the filter's states."""
+    imu = sensors.imu
+    biases = [
+        SlowError(getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau"))
+        for sensor in ("accel", "gyro")
+    ]
+    return [*biases, *slow_states(sensors).errors]
 
 
 def _pack_gnss(p: Any, sensors: SensorSuite) -> None:

@@ -17,4 +17,5 @@ from quad_gym.records.settings import *
 from quad_gym.records.shown import *
 from quad_gym.records.sizes import *
 from quad_gym.records.streams import *
+from quad_gym.records.tape import *
 from quad_gym.records.work import *

@@ -1,0 +1,290 @@
+"""Entry that runs a filter over a tape: predictions, updates and copies, in their order.
+
+Every lane is a filter of its own, with its own parameters, on the same measurements.
+"""
+
+import math
+
+import numpy as np
+from numba import types
+from numba.core.types import Array
+from numba.np.numpy_support import from_dtype
+
+from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
+from quad_gym.kernels.compiling.stages import STAGE_TABLE
+from quad_gym.kernels.maths.elementary import exp
+from quad_gym.kernels.simd.addresses import store_lanes
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import (
+    AID_BLOCKS,
+    AIDS,
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
+    FLIGHT_BLOCK,
+    MAX_BLOCKS,
+    PARAMS_BLOCK,
+    POSITION_BLOCK,
+    SETTINGS,
+    VELOCITY_BLOCK,
+    WIDTH,
+    WORK_BLOCK,
+    Aid,
+)
+from quad_gym.records.tape import (
+    KEPT,
+    MEASUREMENT,
+    OPERATION,
+    REPORTED,
+    SAMPLE,
+    STEP_BLOCK,
+    Operation,
+)
+
+_PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
+_PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
+_BAROMETER = int(Aid.BAROMETER)
+_LANES = 8 * WIDTH  # bytes
+
+
+def _arrays(*dtypes):
+    return [Array(from_dtype(np.dtype(kind)), 1, "C") for kind in dtypes]
+
+
+_RECORDS = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, STEP_BLOCK)
+_OTHERS = (SETTINGS, WORK_BLOCK, STAGE_TABLE, SAMPLE, MEASUREMENT, OPERATION, np.int64)
+_WORDS = Array(types.uint64, 1, "C")
+_SLOTS = Array(types.uint64, 2, "C")
+
+
+@kernel
+def _set_step(p, tick, step, slow_states, dt):
+    """Set the parameters that depend on the duration of a prediction.
+
+    White noise is given as a density: the mean over a longer time has a smaller sigma.
+
+    Args:
+        p: Parameters assumed by the filter; changed.
+        tick: The same for the suite's tick.
+        step: Rates and standard deviations of slow errors.
+        slow_states: Number of slow errors among the states.
+        dt: Duration of the prediction [s].
+    """
+    fewer = math.sqrt(tick.dt / dt)
+    p.dt = dt
+    p.accel_error_noise = tick.accel_error_noise * fewer
+    p.accel_noise, p.gyro_noise = tick.accel_noise * fewer, tick.gyro_noise * fewer
+    p.accel_thrust_noise = tick.accel_thrust_noise * fewer
+    p.gyro_thrust_noise = tick.gyro_thrust_noise * fewer
+    p.accel_bias_decay, p.accel_bias_drive = _decay_and_drive(step, 0, dt)
+    p.gyro_bias_decay, p.gyro_bias_drive = _decay_and_drive(step, 1, dt)
+    for k in range(slow_states):
+        p.slow_decay[k], p.slow_drive[k] = _decay_and_drive(step, 2 + k, dt)
+
+
+@kernel
+def _decay_and_drive(step, k, dt):
+    """The decay of a slow error, and the standard deviation of its driving noise."""
+    a = exp(-dt * step.rate[k])
+    return a, step.sigma[k] * math.sqrt((1.0 - a) * (1.0 + a))
+
+
+@kernel
+def _set_tick(p, tick, slow_states):
+    """Set these parameters for the suite's tick."""
+    p.dt, p.accel_error_noise = tick.dt, tick.accel_error_noise
+    p.accel_noise, p.gyro_noise = tick.accel_noise, tick.gyro_noise
+    p.accel_thrust_noise, p.gyro_thrust_noise = tick.accel_thrust_noise, tick.gyro_thrust_noise
+    p.accel_bias_decay, p.accel_bias_drive = tick.accel_bias_decay, tick.accel_bias_drive
+    p.gyro_bias_decay, p.gyro_bias_drive = tick.gyro_bias_decay, tick.gyro_bias_drive
+    for k in range(slow_states):
+        p.slow_decay[k], p.slow_drive[k] = tick.slow_decay[k], tick.slow_drive[k]
+
+
+@kernel
+def _take_sample(flight, tick, sample):
+    """Write a sample into the record."""
+    flight.tick = flight.tick + sample.dt / tick.dt  # a clock, independent of the steps
+    for i in range(3):
+        flight.gyro[i], flight.accel[i] = sample.gyro[i], sample.accel[i]
+        # for the lever arms of a velocity and of the accelerometer
+        flight.w_before[i], flight.w_meas[i] = sample.gyro_before[i], sample.gyro[i]
+
+
+@kernel
+def _take_triple(values, measured, valid):
+    """Write three numbers if they were measured."""
+    if valid > 0.0:
+        for i in range(3):
+            values[i] = measured[i]
+
+
+@kernel
+def _take_measurement(flight, step, m, features):
+    """Write the measurements of one instant into the record."""
+    for k in range(MAX_BLOCKS):
+        flight.block_valid[k] = m.valid[k]
+    _take_triple(flight.gnss_position, m.gnss_position, m.valid[POSITION_BLOCK])
+    _take_triple(flight.gnss_baseline, m.gnss_baseline, m.valid[BASELINE_BLOCK])
+    _take_triple(flight.gnss_velocity, m.gnss_velocity, m.valid[VELOCITY_BLOCK])
+    for k in range(features):
+        if m.valid[FEATURE_BLOCKS + k] > 0.0:
+            for i in range(2):
+                flight.pixels[k, i] = m.pixels[k, i]
+    for aid in range(AIDS):
+        if m.valid[AID_BLOCKS + aid] > 0.0:
+            for i in range(3):
+                flight.aid_measurement[aid, i] = m.aid_measurement[aid, i]
+    if m.valid[AID_BLOCKS + _BAROMETER] > 0.0:
+        height, level = m.aid_measurement[_BAROMETER, 0], step.level
+        step.level = select(level == level, level, height - flight.r_hat[2])
+        flight.aid_measurement[_BAROMETER, 0] = height - step.level
+
+
+@kernel
+def _replace_noise(p, m, own):
+    """Set the noise of a measurement where it has its own, or else the suite's."""
+    for i in range(3):
+        p.gnss_sigma[i] = own.gnss_sigma[i]
+        if m.gnss_sigma[i] == m.gnss_sigma[i]:
+            p.gnss_sigma[i] = m.gnss_sigma[i]
+    p.baseline_noise, p.baseline_sigma = own.baseline_noise, own.baseline_sigma
+    if m.baseline_noise == m.baseline_noise:
+        p.baseline_noise, p.baseline_sigma = m.baseline_noise, m.baseline_sigma
+    p.velocity_sigma, p.pixel_sigma = own.velocity_sigma, own.pixel_sigma
+    if m.velocity_sigma == m.velocity_sigma:
+        p.velocity_sigma = m.velocity_sigma
+    if m.pixel_sigma == m.pixel_sigma:
+        p.pixel_sigma = m.pixel_sigma
+    for aid in range(AIDS):
+        p.aid_sigma[aid] = own.aid_sigma[aid]
+        if m.aid_sigma[aid] == m.aid_sigma[aid]:
+            p.aid_sigma[aid] = m.aid_sigma[aid]
+
+
+@kernel
+def _store3(address, place, v):
+    """Write three lanes from a place of a row on; return the next place."""
+    for i in range(3):
+        store_lanes(address + (place + i) * _LANES, v[i] + 0.0)
+    return place + 3
+
+
+@kernel
+def _keep(flight, address):
+    """Store the estimate in a row, see KEPT."""
+    place = _store3(address, 0, flight.r_hat)
+    place = _store3(address, place, flight.v_hat)
+    for i in range(3):
+        place = _store3(address, place, flight.R_hat[i])
+    place = _store3(address, place, flight.b_a_hat)
+    place = _store3(address, place, flight.b_g_hat)
+    for i in range(15):
+        variance = flight.L[i, 0] * flight.L[i, 0]
+        for j in range(1, i + 1):
+            variance = variance + flight.L[i, j] * flight.L[i, j]
+        store_lanes(address + (place + i) * _LANES, variance)
+    store_lanes(address + (place + 15) * _LANES, flight.diverged + 0.0)
+
+
+@kernel
+def _diagonal(flight, slow_states):
+    """Product of the diagonal of the factor of the covariance, without exactly known errors."""
+    product = flight.L[0, 0]
+    for i in range(1, 15):
+        product = product * flight.L[i, i]
+    for i in range(slow_states):
+        sigma = flight.L_slow[i, 15 + i]
+        product = product * select(sigma > 0.0, sigma, 1.0)
+    return product
+
+
+@kernel
+def _report(flight, blocks, address, shrinkage):
+    """Store innovations in a row, see REPORTED, and the ratio of the diagonals at its end."""
+    place = 0
+    for k in range(len(blocks)):
+        s = blocks[k]
+        place = _store3(address, place, flight.innovation[s])
+        place = _store3(address, place, flight.innovation_sigma[s])
+        store_lanes(address + place * _LANES, flight.block_nis[s] + 0.0)
+        store_lanes(address + (place + 1) * _LANES, flight.gate[s] + 0.0)
+        place += 2
+    store_lanes(address + place * _LANES, shrinkage)
+
+
+def _signature():
+    records = _arrays(*_RECORDS, *_OTHERS)
+    return types.none(*records, _WORDS, _SLOTS, types.int64, types.int64)
+
+
+@entry(signature=_signature())
+def run_tape(
+    flights,
+    params,
+    ticks,
+    steps,
+    settings,
+    work,
+    table,
+    samples,
+    measurements,
+    operations,
+    blocks,
+    memory,
+    slots,
+    kept,
+    reported,
+):
+    """Run the operations of a tape on the filters of a block.
+
+    Args:
+        flights: (1,) the block.
+        params: (1,) parameters that its filters assume.
+        ticks: (1,) the same, with the suite's tick and noise.
+        steps: (1,) further numbers, see STEP_BLOCK.
+        settings: (1,) configuration.
+        work: (1,) scratch memory, with the lanes to work on as `mask`.
+        table: (1,) stages.
+        samples: (n,) SAMPLE.
+        measurements: (n,) MEASUREMENT.
+        operations: (n,) OPERATION.
+        blocks: Blocks of innovations to report.
+        memory: (words,) memory of the filters, as a part of the block.
+        slots: (n, words) room for copies of it.
+        kept: Address of the rows of estimates.
+        reported: Address of the rows of innovations.
+    """
+    flight, scratch = lanes_of(flights[0]), lanes_of(work[0])
+    p, tick, step = lanes_of(params[0]), lanes_of(ticks[0]), lanes_of(steps[0])
+    mask, features = scratch.mask, settings[0].feature_count
+    slow_states = settings[0].slow_states
+    row = (REPORTED * len(blocks) + 1) * _LANES
+    for k in range(len(operations)):
+        code, index, target = operations[k].code, operations[k].index, operations[k].target
+        if code == _PREDICT:
+            if samples[index].dt == ticks[0].dt[0]:
+                _set_tick(p, tick, slow_states)
+            else:
+                _set_step(p, tick, step, slow_states, samples[index].dt)
+            _take_sample(flight, tick, samples[index])
+            scratch.mask = mask
+            call_stage(table[0], _PREDICT_STAGE, flight, p, p, settings[0], scratch, features)
+        elif code == _UPDATE:
+            _set_tick(p, tick, slow_states)
+            _take_measurement(flight, step, measurements[index], features)
+            _replace_noise(p, measurements[index], tick)
+            before = _diagonal(flight, slow_states)
+            scratch.mask = mask
+            call_stage(table[0], _UPDATE_STAGE, flight, p, p, settings[0], scratch, features)
+            if target >= 0:
+                shrinkage = before / _diagonal(flight, slow_states)
+                _report(flight, blocks, reported + target * row, shrinkage)
+        elif code == _COPY:
+            for i in range(len(memory)):
+                slots[target, i] = memory[i]
+        elif code == _RESTORE:
+            for i in range(len(memory)):
+                memory[i] = slots[target, i]
+        elif code == _KEEP:
+            _keep(flight, kept + target * KEPT * _LANES)
