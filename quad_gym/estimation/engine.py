@@ -136,8 +136,11 @@ class Engine:
 
     @property
     def words(self) -> NDArray[Any]:
-        """Return the memory of the parts that the filter uses, (blocks, words, WIDTH)."""
-        raw = self.blocks.view(np.uint64).reshape(len(self.blocks), -1, WIDTH)
+        """The memory of the parts that the filter uses, (blocks, words, WIDTH)."""
+        return self._words_of(self.blocks)
+
+    def _words_of(self, blocks: NDArray[Any]) -> NDArray[Any]:
+        raw = blocks.view(np.uint64).reshape(len(blocks), -1, WIDTH)
         first = self._room.skipped // (8 * WIDTH)
         return raw[:, first : first + self._room.dtype.itemsize // (8 * WIDTH)]
 
@@ -168,24 +171,42 @@ class Engine:
                 there are none.
 
         Returns:
-            Estimates (blocks, n, KEPT, WIDTH), and innovations (blocks, m, 8 n + 1, WIDTH) with
-            REPORTED numbers per block of a measurement, followed by the ratio of the diagonals of
-            the factors of the covariance before and after the update.
+            Estimates (blocks, n, KEPT, WIDTH), and innovations (blocks, m, k, REPORTED, WIDTH) of
+            the k blocks of a measurement.
         """
-        count, table, words = len(self.blocks), self._table(), self.words
-        if slots is None:
-            slots = np.empty((tape.slots, words[0].size), np.uint64)
-        measured = np.array(blocks_of(self.sensors), np.int64)
-        kept = np.empty((count, tape.kept, KEPT, WIDTH))
-        reported = np.empty((count, tape.reported, REPORTED * len(measured) + 1, WIDTH))
-        inputs = (tape.samples, tape.measurements, tape.operations, measured)
-        for k in range(count):
-            run_tape(
-                self.blocks[k : k + 1],
-                *(self.params, self._ticks, self.steps, self.settings, self._work, table),
-                *(*inputs, words[k].reshape(-1), slots),
-                *(kept[k].ctypes.data, reported[k].ctypes.data),
+        slots = self.empty_slots(tape) if slots is None else slots
+        rows = [
+            self.run_block(
+                tape, slots, self.blocks[k : k + 1], self.params, self._ticks, self.steps
             )
+            for k in range(len(self.blocks))
+        ]
+        kept, reported = (np.array(found) for found in zip(*rows, strict=True))
+        return kept, reported
+
+    def empty_slots(self, tape: Tape) -> NDArray[Any]:
+        """Return room for the copies of a tape."""
+        return np.empty((tape.slots, self.words[0].size), np.uint64)
+
+    def run_block(
+        self,
+        tape: Tape,
+        slots: NDArray[Any],
+        block: NDArray[Any],
+        params: NDArray[Any],
+        ticks: NDArray[Any],
+        steps: NDArray[Any],
+    ) -> tuple[Floats, Floats]:
+        """Run the operations of a tape on a block, with its parameters; see `run`."""
+        measured = np.array(blocks_of(self.sensors), np.int64)
+        kept = np.empty((tape.kept, KEPT, WIDTH))
+        reported = np.empty((tape.reported, len(measured), REPORTED, WIDTH))
+        run_tape(
+            *(block, params, ticks, steps, self.settings, self._work.copy(), self._table()),
+            *(tape.samples, tape.measurements, tape.operations, measured),
+            *(self._words_of(block)[0].reshape(-1), slots),
+            *(kept.ctypes.data, reported.ctypes.data),
+        )
         return kept, reported
 
     def impose(self, noise: dict[str, Any]) -> dict[str, NDArray[Any]]:

@@ -22,18 +22,15 @@ SAME_TIME = 1e-6
 _EVERY = 8  # events between two copies of the state: a copy costs about as much as an event
 
 
-@dataclass
+@dataclass(slots=True)
 class _Event:
     given: Sample | Measurement
     time: float
     """time after the event"""
+    start: float
+    """time at which the event begins"""
     before: Any = None
     """copy of the state before the event, or None"""
-
-    @property
-    def start(self) -> float:
-        """Time at which the event begins."""
-        return self.time - self.given.dt if isinstance(self.given, Sample) else self.time
 
 
 class InputHistory:
@@ -72,7 +69,7 @@ class InputHistory:
     def add(self, given: Sample | Measurement) -> None:
         """Process the next input."""
         time = self.time + (given.dt if isinstance(given, Sample) else 0.0)
-        event = _Event(given, time)
+        event = _Event(given, time, self.time)
         if self.window > 0.0:
             self._since_copy += 1
             if not self._events or self._since_copy >= _EVERY:
@@ -94,14 +91,17 @@ class InputHistory:
         first = max(k for k in range(i + 1) if events[k].before is not None)
         old = events[i]
         assert isinstance(old.given, Sample)
-        added, elapsed = _Event(measurement, time), time - old.start
+        elapsed = time - old.start
         if elapsed > SAME_TIME:
             one, two = old.given.split(elapsed)
-            events[i : i + 1] = [_Event(one, time, old.before), added, _Event(two, old.time)]
+            first_part = _Event(one, time, old.start, old.before)
+            events[i : i + 1] = [
+                *(first_part, _Event(measurement, time, time)),
+                _Event(two, old.time, time),
+            ]
         else:
-            added.before, old.before = old.before, None
-            added.time = old.start
-            events.insert(i, added)
+            events.insert(i, _Event(measurement, old.start, old.start, old.before))
+            old.before = None
         self._restore(events[first].before)
         for k in range(first, len(events)):
             if k > first and events[k].before is not None:

@@ -10,25 +10,30 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.filters import LONGEST_STEP, ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.estimation.filters import (
+    LONGEST_STEP,
+    ExtendedKalmanFilter,
+    KalmanFilter,
+    UnscentedKalmanFilter,
+)
 from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
 from quad_gym.estimation.results import Measured, Replay
 from quad_gym.estimation.running import run_filter
-from quad_gym.estimation.samples import Sample, checked_measurement
+from quad_gym.estimation.samples import Measurement, Sample, checked_measurement
 from quad_gym.estimation.starts import state_at_rest
-from quad_gym.estimation.tape import TapeWriter
+from quad_gym.estimation.tape import Tape, TapeWriter
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid, Operation
+from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
 from quad_gym.rotations import dcm_to_quaternion
 
 ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
 
-_MEASURED = ("gnss_position_G", "gnss_baseline_G", "pixels", "gnss_velocity_G")
+_OF_GNSS = ("gnss_position_G", "gnss_baseline_G", "gnss_velocity_G")
 
 PATIENCE = 2.0
 """Time for which a start waits for the first magnetic field [s]."""
@@ -57,6 +62,7 @@ class Player:
         self.before: int | None = None  # the sample that holds now, of an IMU of instants
         self.field: int | None = None  # the last magnetic field before the start
         self.first_fix = math.inf
+        self.first_state: dict[str, Any] = {}
         self.too_late = 0
         self.times: list[float] = []
         self.stamps: list[tuple[float, float]] = []  # of all updates, with their arrival
@@ -135,7 +141,8 @@ class Player:
         self.write_tape()
         if self.log.barometer_from_start:  # relative to the height of the vehicle
             self.filter._engine.steps["level"] = np.nan
-        return self._result(*run_filter(self.filter, self.writer))
+        tape = self.writer.tape()
+        return self._result(tape, *run_filter(self.filter, self.writer, tape))
 
     def _take_sample(self, i: int) -> None:
         if not self.running:
@@ -178,12 +185,10 @@ class Player:
 
     def _update(self, name: str, k: int) -> None:
         stream, history = self.streams[name], self.history
-        given = self._keywords(name, stream, k)
-        if not given:
+        measurement = self._measurement(name, stream, k)
+        if measurement is None:
             return
         stamp = float(stream.time[k])
-        position, baseline, pixels, velocity = (given.pop(name, None) for name in _MEASURED)
-        measurement = checked_measurement(self.suite, position, baseline, pixels, velocity, given)
         self.writer.awaited = measurement
         if stamp >= history.time - SAME_TIME:
             history.add(measurement)
@@ -191,16 +196,20 @@ class Player:
             history.insert(measurement, stamp)
         self.stamps.append((stamp, float(stream.received[k])))
 
-    def _keywords(self, name: str, stream: Stream, k: int) -> dict[str, Any]:
-        """Return a measurement as keywords of `update`."""
+    def _measurement(self, name: str, stream: Stream, k: int) -> Measurement | None:
+        """Return a measurement of a stream; None: nothing was measured."""
         if name == "gnss":
-            return self._fix(stream, k)
-        value = stream.values[{"camera": "pixels"}.get(name, name)][k]
+            given = self._fix(stream, k)
+            position, baseline, velocity = (given.pop(key, None) for key in _OF_GNSS)
+            if position is None and baseline is None and velocity is None:
+                return None
+            return checked_measurement(self.suite, position, baseline, None, velocity, given)
         if name == "camera":
-            return {"pixels": value}
+            return Measurement(pixels=stream.values["pixels"][k])
+        value = stream.values[name][k]
         if not np.isfinite(value).all():
-            return {}
-        return {name: value}
+            return None
+        return Measurement(aids={Aid[name.upper()]: np.atleast_1d(value)})
 
     def _fix(self, stream: Stream, k: int) -> dict[str, Any]:
         """Return the GNSS measurements of one instant as keywords of `update`."""
@@ -262,8 +271,17 @@ class Player:
                 why = "the sensors take none: GnssParams.velocity_sigma is None"
             raise ValueError(f"a start by its course must have a GNSS velocity, but {why}")
         time = float(stream.time[k])
-        self.filter.initialize(**{**fix, **self.start, "time": time})
+        self.first_state = {**fix, **self.start, "time": time}
+        self.filter.initialize(**self.first_state)
         self._go_on()
+
+    def started(self, suite: SensorSuite) -> KalmanFilter:
+        """Return a filter for another suite in the state in which the tape begins."""
+        kf = ESTIMATORS[self.estimator](suite, window=self.window)
+        kf.initialize(**self.first_state)
+        if self.log.barometer_from_start:
+            kf._engine.steps["level"] = np.nan
+        return kf
 
     def _start_from_state(self) -> None:
         """Start from the state that the caller gives."""
@@ -301,7 +319,7 @@ class Player:
             self.times.append(self.history.time)
             self.writer.keep()
 
-    def _result(self, kept: Floats, reported: Floats) -> Replay:
+    def _result(self, tape: Tape, kept: Floats, reported: Floats) -> Replay:
         r, v, R, b_a, b_g, variances, state = np.split(kept, np.cumsum((3, 3, 9, 3, 3, 15)), 1)
         return Replay(
             estimator=self.estimator,
@@ -316,19 +334,16 @@ class Player:
             heading_known=state[:, 1] > 0.0,
             diverged=state[:, 0] > 0.0,
             status=self.filter.status,
-            measured=self._measured(reported),
+            measured=self._measured(tape, reported),
             too_late=self.too_late,
             unused=self.unused,
         )
 
-    def _measured(self, reported: Floats) -> dict[str, Measured]:
+    def _measured(self, tape: Tape, reported: Floats) -> dict[str, Measured]:
         """Return innovations by kind of measurement, for the kinds that occurred."""
-        tape, blocks, found = self.writer.tape(), blocks_of(self.suite), {}
-        updates = tape.operations[tape.operations["target"] >= 0]
-        updates = updates[updates["code"] == Operation.UPDATE]
-        valid = tape.measurements["valid"][updates["index"]] > 0.0
+        found, valid = {}, tape.valid
         time, received = np.array(self.stamps).reshape(-1, 2).T
-        for row, block in enumerate(blocks):
+        for row, block in enumerate(blocks_of(self.suite)):
             have, freedoms = valid[:, block], FREEDOMS[block]
             if have.any():
                 values = reported[have, row]

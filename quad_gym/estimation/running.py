@@ -9,22 +9,22 @@ from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.filters import KalmanFilter
 from quad_gym.estimation.samples import Measurement
 from quad_gym.estimation.tape import Tape, TapeWriter
-from quad_gym.packing.aids import blocks_of
-from quad_gym.records import KEPT, REPORTED, WIDTH, Operation
+from quad_gym.records import KEPT, WIDTH, Operation
 
 
-def run_filter(kf: KalmanFilter, writer: TapeWriter) -> tuple[Floats, Floats]:
+def run_filter(kf: KalmanFilter, writer: TapeWriter, tape: Tape) -> tuple[Floats, Floats]:
     """Run a tape from the present state of a filter.
 
     Args:
         kf: The filter.
-        writer: The tape.
+        writer: The inputs.
+        tape: The tape with them.
 
     Returns:
         Estimates (n, KEPT + 1), whose last number is 1 where the heading is known, and innovations
         (m, blocks, REPORTED).
     """
-    tape, status = writer.tape(), kf.status
+    status = kf.status
     first, copies, estimates, innovations = _run_while_unknown(kf, writer, tape)
     if first < len(tape.operations):
         slots = np.zeros((tape.slots, kf._engine.words[0].size), np.uint64)
@@ -33,8 +33,7 @@ def run_filter(kf: KalmanFilter, writer: TapeWriter) -> tuple[Floats, Floats]:
         rest = tape.after(first)
         kept, reported = (rows[0, ..., 0] for rows in kf._engine.run(rest, slots))
         estimates += [np.append(row, 1.0) for row in kept[len(estimates) :]]
-        n = len(blocks_of(kf.sensors))
-        innovations += list(reported[len(innovations) :, :-1].reshape(-1, n, REPORTED))
+        innovations += list(reported[len(innovations) :])
     kf.warn_of_news(status)
     return np.array(estimates).reshape(-1, KEPT + 1), np.array(innovations)
 

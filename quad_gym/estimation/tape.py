@@ -47,6 +47,18 @@ class Tape:
     reported: int = 0
     """number of updates whose innovations are stored"""
 
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(m, MAX_BLOCKS) True where a reported update has measured a block."""
+        updates = self.operations[self.operations["code"] == Operation.UPDATE]
+        updates = updates[updates["target"] >= 0]
+        return np.asarray(self.measurements["valid"][updates["index"]] > 0.0)
+
+    def without_estimates(self) -> "Tape":
+        """Return the tape without storing estimates."""
+        others = self.operations["code"] != Operation.KEEP
+        return replace(self, operations=self.operations[others], kept=0)
+
     def after(self, first: int) -> "Tape":
         """Return the tape without its first operations."""
         return replace(self, operations=self.operations[first:])

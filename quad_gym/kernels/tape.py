@@ -188,20 +188,8 @@ def _keep(flight, address):
 
 
 @kernel
-def _diagonal(flight, slow_states):
-    """Product of the diagonal of the factor of the covariance, without exactly known errors."""
-    product = flight.L[0, 0]
-    for i in range(1, 15):
-        product = product * flight.L[i, i]
-    for i in range(slow_states):
-        sigma = flight.L_slow[i, 15 + i]
-        product = product * select(sigma > 0.0, sigma, 1.0)
-    return product
-
-
-@kernel
-def _report(flight, blocks, address, shrinkage):
-    """Store innovations in a row, see REPORTED, and the ratio of the diagonals at its end."""
+def _report(flight, blocks, address):
+    """Store innovations in a row, see REPORTED."""
     place = 0
     for k in range(len(blocks)):
         s = blocks[k]
@@ -210,7 +198,6 @@ def _report(flight, blocks, address, shrinkage):
         store_lanes(address + place * _LANES, flight.block_nis[s] + 0.0)
         store_lanes(address + (place + 1) * _LANES, flight.gate[s] + 0.0)
         place += 2
-    store_lanes(address + place * _LANES, shrinkage)
 
 
 def _signature():
@@ -259,7 +246,7 @@ def run_tape(
     p, tick, step = lanes_of(params[0]), lanes_of(ticks[0]), lanes_of(steps[0])
     mask, features = scratch.mask, settings[0].feature_count
     slow_states = settings[0].slow_states
-    row = (REPORTED * len(blocks) + 1) * _LANES
+    row = REPORTED * len(blocks) * _LANES
     for k in range(len(operations)):
         code, index, target = operations[k].code, operations[k].index, operations[k].target
         if code == _PREDICT:
@@ -274,12 +261,10 @@ def run_tape(
             _set_tick(p, tick, slow_states)
             _take_measurement(flight, step, measurements[index], features)
             _replace_noise(p, measurements[index], tick)
-            before = _diagonal(flight, slow_states)
             scratch.mask = mask
             call_stage(table[0], _UPDATE_STAGE, flight, p, p, settings[0], scratch, features)
             if target >= 0:
-                shrinkage = before / _diagonal(flight, slow_states)
-                _report(flight, blocks, reported + target * row, shrinkage)
+                _report(flight, blocks, reported + target * row)
         elif code == _COPY:
             for i in range(len(memory)):
                 slots[target, i] = memory[i]

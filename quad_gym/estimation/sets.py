@@ -1,0 +1,62 @@
+"""Many filters on one log: a set of parameters for each lane, a block of lanes for each thread."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_gym.estimation.engine import Floats
+from quad_gym.estimation.player import Player
+from quad_gym.estimation.tape import Tape
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.records import WIDTH, aligned_zeros
+
+
+class SetRuns(NamedTuple):
+    """Results of several filters on the same log."""
+
+    estimates: Floats
+    """(n, KEPT, sets) estimates, see `quad_gym.records.KEPT`; n is 0 if they were not asked for"""
+    innovations: Floats
+    """(m, blocks, REPORTED, sets) innovations of each update"""
+
+
+def run_sets(
+    player: Player, tape: Tape, suites: Sequence[SensorSuite], estimates: bool = False
+) -> SetRuns:
+    """Run a tape with filters that assume different suites.
+
+    Args:
+        player: Wrote the tape; its suite has the same sensors.
+        tape: The tape.
+        suites: Suites that differ in numbers only.
+        estimates: True: store the estimates.
+    """
+    engines = [player.started(suite)._engine for suite in suites]
+    first, operations = engines[0], tape.operations
+    if not estimates:
+        tape = tape.without_estimates()
+
+    def run(k: int) -> tuple[Floats, Floats]:
+        chosen = [engines[min(i, len(engines) - 1)] for i in range(k, k + WIDTH)]
+        parts = (
+            _side_by_side([getattr(engine, name) for engine in chosen])
+            for name in ("blocks", "params", "_ticks", "steps")
+        )
+        return first.run_block(tape, first.empty_slots(tape), *parts)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = list(pool.map(run, range(0, len(engines), WIDTH)))
+    columns = zip(*found, strict=True)
+    return SetRuns(*(np.concatenate(rows, axis=-1)[..., : len(engines)] for rows in columns))
+
+
+def _side_by_side(blocks: Sequence[Any]) -> Any:
+    """Return one block with a lane of each of WIDTH blocks."""
+    found = aligned_zeros(1, blocks[0].dtype)
+    raw = found.view(np.uint64).reshape(-1, WIDTH)
+    for lane, block in enumerate(blocks):
+        raw[:, lane] = block.view(np.uint64).reshape(-1, WIDTH)[:, 0]
+    return found
