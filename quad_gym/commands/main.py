@@ -19,6 +19,7 @@ COMMANDS = {
     "tune": "tune the gains of the PD controller",
     "fly": "show a flight in a window, or render a video",
     "replay": "run the filter on the log of a real flight (CSV or PX4)",
+    "calibrate": "find the noise and delays of a vehicle's sensors from the log of a flight",
     "consistency": "test the filter's consistency: NEES and NIS over many flights",
     "ablation": "measure the effects of filter corrections and of model mismatch",
     "benchmark": "measure the speed of all parts",

@@ -1,5 +1,6 @@
 """State estimation for one vehicle: Kalman filters, replay of logs, and Wahba's problem."""
 
+from quad_gym.estimation.calibration import Calibrated, Calibration, calibrate
 from quad_gym.estimation.estimate import Innovations
 from quad_gym.estimation.filters import (
     LONGEST_STEP,
@@ -17,6 +18,8 @@ __all__ = [
     "FARTHEST_FIX",
     "LOG_COLUMNS",
     "LONGEST_STEP",
+    "Calibrated",
+    "Calibration",
     "ExtendedKalmanFilter",
     "FirstFix",
     "Innovations",
@@ -26,6 +29,7 @@ __all__ = [
     "Replay",
     "Stream",
     "UnscentedKalmanFilter",
+    "calibrate",
     "read_log",
     "replay",
     "solve_wahba",

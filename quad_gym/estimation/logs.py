@@ -6,7 +6,8 @@ Missing values are NaN, or empty cells in a file. Rows are in the order of arriv
 delayed.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,6 +122,24 @@ class Log:
         names = ("imu", "gnss", "camera", "barometer", "magnetometer")
         found = {name: getattr(self, name) for name in names}
         return {name: s for name, s in found.items() if s is not None and len(s)}
+
+    def without_delays(self, delays: Mapping[str, float]) -> "Log":
+        """Return the log with earlier time stamps, by the delays [s] of sensors by name."""
+        changes: dict[str, Any] = {
+            name: replace(stream, time=stream.time - delays[name])
+            for name, stream in self.streams.items()
+            if delays.get(name)
+        }
+        return replace(self, **changes) if changes else self
+
+    def until(self, time: float) -> "Log":
+        """Return the log up to a time of arrival [s]."""
+        changes: dict[str, Any] = {}
+        for name, stream in self.streams.items():
+            rows = stream.received <= time
+            values = {key: value[rows] for key, value in stream.values.items()}
+            changes[name] = Stream(stream.time[rows], stream.received[rows], values)
+        return replace(self, **changes)
 
     def origin(self, near_G: Floats | None, within: float = 1e5) -> Floats | None:
         """Return the origin of I in ECEF: `near_G` if the first fix is close to it, else that fix.

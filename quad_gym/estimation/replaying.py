@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.filters import UnscentedKalmanFilter
+from quad_gym.estimation.logs import Log
 from quad_gym.estimation.plausibility import problems_of
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.results import Replay
@@ -41,7 +42,7 @@ def replay(
     Args:
         log: A table or a file, see `quad_gym.estimation.read_log`, or its result.
         sensors: The suite that the filter assumes, or its name. Its rates and latencies are
-            ignored: the log has its own.
+            ignored: the log has its own. Time stamps of the log are earlier by its `log_delays`.
         estimator: "ukf" or "ekf".
         start: Keywords of `initialize`, such as `{"heading": 0.5}` or `{"course": True}`. Without
             GNSS: `{"position": (0, 0, 0), "heading": 0.0}` for a level vehicle at rest, with the
@@ -49,7 +50,7 @@ def replay(
             by default the first sample's.
         reported_noise: True: use the accuracy that the receiver reports, if the log has it, in
             place of the suite's.
-        window: Longest delay of measurements [s].
+        window: Longest delay of measurements beyond the suite's `log_delays` [s].
         body: Axes of a table, see `read_log`.
 
     Raises:
@@ -61,14 +62,21 @@ def replay(
     check.flag("reported_noise", reported_noise)
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
-    whole = read_log(log, body=body)
-    if suite.gnss is not None:
-        origin = whole.origin(np.array(suite.gnss.reference_antenna_G))
-        if origin is not None:
-            gnss = suite.gnss.replace(reference_antenna_G=tuple(origin.tolist()))
-            suite = suite.replace(gnss=gnss)
-    result = Player(whole, suite, estimator, _named(start), reported_noise, window).play()
+    whole = read_log(log, body=body).without_delays(vars(suite.log_delays))
+    suite = origin_of(whole, suite)
+    reach = window + max(0.0, *vars(suite.log_delays).values())
+    result = Player(whole, suite, estimator, _named(start), reported_noise, reach).play()
     return replace(result, problems=problems_of(whole, body, suite, result))
+
+
+def origin_of(log: Log, suite: SensorSuite) -> SensorSuite:
+    """Return a suite whose reference antenna is the origin of I of a log."""
+    if suite.gnss is None:
+        return suite
+    origin = log.origin(np.array(suite.gnss.reference_antenna_G))
+    if origin is None:
+        return suite
+    return suite.replace(gnss=suite.gnss.replace(reference_antenna_G=tuple(origin.tolist())))
 
 
 def _named(start: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def run_sets(
         estimates: True: store the estimates.
     """
     engines = [player.started(suite)._engine for suite in suites]
-    first, operations = engines[0], tape.operations
+    first = engines[0]
     if not estimates:
         tape = tape.without_estimates()
 

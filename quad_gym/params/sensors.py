@@ -16,6 +16,7 @@ from quad_gym.params.checks import Checked
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
+from quad_gym.params.log_delays import LogDelays
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
@@ -124,6 +125,8 @@ class SensorSuite(Checked):
     """Kalman filter that fuses the measurements"""
     noisy: NoisyObservationParams = field(default_factory=NoisyObservationParams)
     """noise of `observation="noisy"`"""
+    log_delays: LogDelays = field(default_factory=LogDelays)
+    """delays of time stamps in this vehicle's logs, which a replay subtracts"""
 
     def __post_init__(self) -> None:
         for name, kind in (
@@ -131,6 +134,7 @@ class SensorSuite(Checked):
             ("initial_pose", InitialPoseParams),
             ("estimator", FilterParams),
             ("noisy", NoisyObservationParams),
+            ("log_delays", LogDelays),
         ):
             check.instance(f"SensorSuite.{name}", getattr(self, name), kind)
         for name, params in SENSOR_PARAMS.items():

@@ -1,0 +1,198 @@
+"""Find the noise, delays and field of a vehicle's sensors from the log of a flight.
+
+    quad-gym calibrate flight.csv --sensors consumer
+    quad-gym calibrate flight.ulg --sensors consumer --output results/mine
+    quad-gym train --sensors results/mine/suite.toml
+
+The first part of the log is for the search, the rest judges what it found. The result is a suite
+with the rates, delays and noise of this vehicle, for `replay`, `train` and all other commands.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+
+if TYPE_CHECKING:
+    from quad_gym.estimation.calibration import Calibration
+    from quad_gym.estimation.judgment import Judgment
+
+SUITE, RESULT = "suite.toml", "calibration.json"
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the calibration."""
+
+    log: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="LOG", help="table (.csv) or log of PX4 (.ulg)")]
+    ]
+    sensors: SuiteName = "consumer"
+    share: float = 0.5
+    """share of the log that the search uses, from its beginning"""
+    delays: bool = True
+    """find the delays of time stamps, too"""
+    heading: float | None = None
+    """heading of the body x axis at the start, from east toward north [deg]; if not given, from a
+    baseline or a magnetometer"""
+    course: bool = False
+    """use the direction of the first GNSS velocity as heading"""
+    body: Literal["flu", "frd"] = "flu"
+    """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
+    output: Path | None = None
+    """folder for the results, created if it is missing; if not given, results/calibrate/LOG"""
+    overwrite: bool = False
+    """replace the results of an earlier calibration"""
+
+
+def number_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
+    """Return a row of texts for each delay and number."""
+    rows = [
+        (f"delay of {name}", "0", f"{1e3 * delay:.0f}", "", "ms")
+        for name, delay in calibration.delays.items()
+    ]
+    for found in calibration.numbers:
+        interval = f"[{found.low:.3g}, {found.high:.3g}]" if found.told else "not told by the log"
+        row = (found.number.name, f"{found.prior:.3g}", f"{found.value:.3g}", interval)
+        rows.append((*row, found.number.unit))
+    return rows
+
+
+def judgment_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
+    """Return a row of texts for each sensor, before and after."""
+    rows = []
+    pair = (calibration.before, calibration.after)
+    for name in calibration.after.sensors:
+        cells: list[str] = []
+        for judgment in pair:
+            fit = judgment.sensors.get(name)
+            cells += (
+                ["-"] * 3
+                if fit is None
+                else [
+                    f"{fit.mean_nis:.2f}",
+                    f"{100.0 * fit.rejected:.1f} %",
+                    f"{fit.correlation:.2f}",
+                ]
+            )
+        rows.append((name.replace("_", " "), *cells))
+    if calibration.after.withheld_nis is not None:
+        rows.append(("fixes withheld for 1 s", *(c for j in pair for c in _withheld(j))))
+    return rows
+
+
+def _withheld(judgment: "Judgment") -> tuple[str, str, str]:
+    if judgment.withheld_nis is None or judgment.withheld_error is None:
+        return "-", "", ""
+    level, up = judgment.withheld_error
+    return f"{judgment.withheld_nis:.2f}", f"{level:.2f} m", f"{up:.2f} m up"
+
+
+NUMBER_HEADINGS = ("number", "before", "found", "95 % interval", "unit")
+JUDGMENT_HEADINGS = {
+    "withheld part": ["of"],
+    "before": ["mean NIS", "rejected", "correlation"],
+    "after": ["mean NIS", "rejected", "correlation"],
+}
+
+
+def summary_of(calibration: "Calibration") -> dict[str, Any]:
+    """Return the contents of the JSON file."""
+
+    def judged(judgment: "Judgment") -> dict[str, Any]:
+        return {
+            "measurements": {name: fit._asdict() for name, fit in judgment.sensors.items()},
+            "withheld_error": judgment.withheld_error,
+            "withheld_nis": judgment.withheld_nis,
+            "diverged": judgment.diverged,
+            "problems": judgment.problems,
+        }
+
+    numbers = {
+        found.number.name: {
+            "before": found.prior,
+            "found": found.value,
+            "interval": (found.low, found.high),
+            "told": found.told,
+            "unit": found.number.unit,
+        }
+        for found in calibration.numbers
+    }
+    return {
+        "delays": dict(calibration.delays),
+        "numbers": numbers,
+        "split": calibration.split,
+        "before": judged(calibration.before),
+        "after": judged(calibration.after),
+        "notes": calibration.notes,
+    }
+
+
+def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Path]:
+    """Write figures and page."""
+    from quad_gym.analysis.calibration_plots import innovations_figure, numbers_figure
+    from quad_gym.analysis.plots import house_style
+    from quad_gym.experiments.pages import Report
+
+    report = Report(folder, title)
+    report.add(
+        "p",
+        "Mean NIS over degrees of freedom is 1, and the correlation of successive "
+        "innovations 0, for a consistent filter.",
+    )
+    headings = [f"{part} {name}" for part, names in JUDGMENT_HEADINGS.items() for name in names]
+    headings[0] = "withheld part"
+    report.add_table(headings, judgment_rows(calibration))
+    report.add_table(NUMBER_HEADINGS, number_rows(calibration))
+    if calibration.notes or calibration.after.problems:
+        report.add_bullets([*calibration.after.problems, *calibration.notes])
+    with house_style():
+        report.add_figure("numbers", numbers_figure(calibration), "Numbers and intervals")
+        caption = "Innovations before and after; crosses are rejected"
+        report.add_figure("innovations", innovations_figure(calibration), caption)
+    return report.write()
+
+
+def main(args: Args) -> None:
+    """Search, judge and write."""
+    from quad_gym.analysis.plots import require_matplotlib
+    from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
+    from quad_gym.estimation import calibrate
+
+    folder = args.output or Path("results/calibrate") / args.log.stem
+    with usage_errors():
+        if args.course and args.heading is not None:
+            raise ValueError("--heading must not be given with --course")
+        require_matplotlib()
+        refuse_overwriting(folder / RESULT, args.overwrite)
+        require_writable("--output", folder)
+        start: dict[str, Any] = {"course": True} if args.course else {}
+        if args.heading is not None:
+            start["heading"] = math.radians(args.heading)
+        found = calibrate(
+            args.log,
+            sensors=args.sensors,
+            start=start,
+            share=args.share,
+            delays=args.delays,
+            body=args.body,
+            progress=lambda sentence: print(f"{sentence} ...", flush=True),
+        )
+    numbers = text_table({"": list(NUMBER_HEADINGS)}, number_rows(found))
+    print(f"\n{numbers}\n\n{text_table(JUDGMENT_HEADINGS, judgment_rows(found))}\n")
+    for sentence in (*found.after.problems, *found.notes):
+        print(f"{sentence[0].upper()}{sentence[1:]}.")
+    found.suite.save(folder / SUITE)
+    files = [folder / SUITE, *write_page(folder, found, f"Calibration with {args.log.name}")]
+    contents = {
+        **summary_of(found),
+        "configuration": args,
+        "versions": versions("numpy", "numba", "scipy", "pyulog"),
+    }
+    files.append(write_json(folder / RESULT, contents))
+    print(f"\nWrote {len(files)} files to {folder}; open {folder / 'report.html'}.")
+    print(f"Next: quad-gym replay {args.log} --sensors {folder / SUITE}")

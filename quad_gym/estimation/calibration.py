@@ -1,0 +1,342 @@
+"""Calibration: the numbers of a sensor suite from the log of a flight.
+
+The search maximizes the likelihood of the innovations (`likelihood.py`) in the first part of the
+log, with priors about the numbers of a suite (`numbers.py`): delays of time stamps one after the
+other on grids, all others by quasi-Newton steps, whose derivatives are differences between filters
+that run side by side.
+
+The likelihood alone makes noise too small where errors are correlated in time, as those of a
+magnetometer near motors: innovations are then as small as predicted, but not white, and the filter
+counts the same error many times. A sensor whose errors have no correlated state of their own gets
+noise larger by sqrt(tau), where tau is the integrated autocorrelation time of its innovations in
+samples, before the others are fitted again. The other part of the log judges the result.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from quad_gym.estimation.engine import Floats
+from quad_gym.estimation.judgment import Judgment, judge
+from quad_gym.estimation.likelihood import Likelihood, in_flight
+from quad_gym.estimation.logs import Log
+from quad_gym.estimation.numbers import Number, numbers_in
+from quad_gym.estimation.replaying import origin_of, replay
+from quad_gym.estimation.tables import read_log
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import sensor_suite
+
+_STEP = 0.1
+"""Step of numerical derivatives, in standard deviations of the prior."""
+_LARGEST, _LEAST = 3.0, -0.3
+"""Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's, because a
+sensor in flight is hardly better than at rest."""
+_SILENT = 0.8
+"""Ratio of standard deviations after and before above which a log does not tell a number."""
+_CLUSTER = 5.0
+"""Length of the parts of a log that are independent of each other [s]."""
+_COARSE, _FINE = np.arange(-0.6, 0.81, 0.1), np.arange(-0.1, 0.11, 0.05)
+_DELAY_SPREAD = 0.2
+"""Standard deviation of the prior of a delay [s]."""
+_LEAST_GAIN = 3.0
+"""Gain of the log likelihood, two steps of a grid away from its maximum, that tells a delay."""
+_MOST_INFLATION = 3.0
+_UNMODELED = {
+    "gnss_velocity": "gnss.velocity_sigma",
+    "magnetometer": "magnetometer.noise_sigma",
+}
+"""Noise of the sensors without a state for an error that varies during a flight."""
+
+
+class Calibrated(NamedTuple):
+    """A number that a calibration has found."""
+
+    number: Number
+    prior: float
+    value: float
+    low: float
+    """lower end of its 95 % interval"""
+    high: float
+    told: bool
+    """False: the log does not tell it, so that it has its prior value"""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Result of `calibrate`."""
+
+    suite: SensorSuite
+    """the suite with the numbers that were found"""
+    prior: SensorSuite
+    """the suite before"""
+    numbers: tuple[Calibrated, ...]
+    delays: Mapping[str, float]
+    """times by which the stamps of sensors are late [s], also in `suite.log_delays`"""
+    before: Judgment
+    """the suite before, on the part of the log that was not used for the search"""
+    after: Judgment
+    """the suite with the numbers that were found, on this part"""
+    split: float
+    """time at which this part begins [s]"""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what the log does not tell."""
+        return tuple(
+            f"the log does not tell {found.number.name}: it keeps {found.value:.3g}"
+            for found in self.numbers
+            if not found.told
+        )
+
+
+def calibrate(
+    log: Any,
+    *,
+    sensors: SensorSuite | str,
+    start: Mapping[str, Any] | None = None,
+    share: float = 0.5,
+    delays: bool = True,
+    body: str = "flu",
+    progress: Callable[[str], None] | None = None,
+) -> Calibration:
+    """Find the numbers of a sensor suite from the log of a flight.
+
+    Args:
+        log: A table or a file, see `read_log`.
+        sensors: The suite to begin with, or its name: its sensors, mounting and filter stay, and
+            its numbers are the centers of the priors.
+        start: Keywords of `initialize`, such as `{"heading": 0.5}`.
+        share: Share of the log, from its beginning, that the search uses; the rest judges.
+        delays: True: find delays of time stamps, too; False: those of the suite hold.
+        body: Axes of a table, see `read_log`.
+        progress: Called with a sentence before each step.
+
+    Raises:
+        ValueError: If the log or an argument is invalid, or the heading at the start is unknown.
+    """
+    suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
+    check.instance("sensors", suite, SensorSuite)
+    check.number("share", share, least=0.05, most=0.95)
+    check.flag("delays", delays)
+    whole = read_log(log, body=body)
+    prior = _with_field(origin_of(whole, suite), whole)
+    time = whole.imu.time
+    split = float(time[0] + share * (time[-1] - time[0]))
+    search = _Search(whole.until(split), prior, dict(start or {}), progress or (lambda _: None))
+    if delays:
+        search.find_delays(coarse=True)
+    search.fit()
+    if delays:
+        search.find_delays(coarse=False)
+    search.inflate()
+    search.fit()
+    search.progress("Intervals")
+    found = search.intervals()
+    search.progress("The part of the log that was withheld")
+    new = _like_the_log(search.suite(), whole, search.delays)
+    before, after = (judge(whole, s, start, split) for s in (prior, new))
+    return Calibration(new, prior, found, dict(search.delays), before, after, split)
+
+
+def _with_field(suite: SensorSuite, log: Log) -> SensorSuite:
+    """Return the suite with strength and inclination of the magnetic field as the log has them."""
+    compass, stream = suite.magnetometer, log.magnetometer
+    if compass is None or stream is None:
+        return suite
+    field = stream.values["magnetometer"]
+    accel = np.column_stack(
+        [np.interp(stream.time, log.imu.time, axis) for axis in log.imu.values["accel"].T]
+    )
+    sizes = np.linalg.norm(field, axis=1)
+    up = (field * accel).sum(axis=1) / np.linalg.norm(accel, axis=1)
+    inclination = -math.asin(float(np.clip(up.mean() / sizes.mean(), -0.99, 0.99)))
+    compass = compass.replace(strength=float(sizes.mean()), inclination=inclination)
+    return suite.replace(magnetometer=compass)
+
+
+def _like_the_log(suite: SensorSuite, log: Log, delays: Mapping[str, float]) -> SensorSuite:
+    """Return the suite with rates and latencies of the log, as far as flights can have them."""
+    rate, changes = suite.imu.rate, {}
+    for name, stream in log.streams.items():
+        params = getattr(suite, name, None)
+        if name == "imu" or params is None or len(stream) < 3:
+            continue
+        measured = 1.0 / float(np.median(np.diff(stream.time)))
+        ticks = max(1, round(rate / measured))
+        late = float(np.median(stream.received - stream.time)) + delays.get(name, 0.0)
+        latency = min(max(0.0, round(late * rate) / rate), 2.0 * ticks / rate)
+        changes[name] = params.replace(rate=rate / ticks, latency=latency)
+    log_delays = suite.log_delays.replace(**delays)
+    return suite.replace(**changes, log_delays=log_delays)
+
+
+class _Search:
+    """The search for the numbers of a suite."""
+
+    def __init__(
+        self,
+        log: Log,
+        prior: SensorSuite,
+        start: dict[str, Any],
+        progress: Callable[[str], None],
+    ) -> None:
+        self.log, self.prior, self.start, self.progress = log, prior, start, progress
+        self.measured = {name for name in log.streams if getattr(prior, name, None) is not None}
+        self.numbers = numbers_in(prior, self.measured)
+        self.values = np.array([number.of(prior) for number in self.numbers])
+        self.low = np.array([_lowest(number) for number in self.numbers])
+        own = vars(prior.log_delays)
+        self.delays = {name: own[name] for name in own if name in self.measured}
+        self.x = np.clip(self._first(), self.low, _LARGEST)
+        self._updates = int(self.likelihood(self.delays).counts.sum())
+
+    def _first(self) -> Floats:
+        """Return where the search begins: with noise as wide as the log may need."""
+        x = np.zeros(len(self.numbers))
+        imu, rough = self.log.imu, {}
+        dt = float(np.median(np.diff(imu.time)))
+        for name in ("accel", "gyro"):
+            moving = np.diff(imu.values[name], axis=0).std() / math.sqrt(2.0)
+            rough[f"imu.{name}_noise_density"] = moving * math.sqrt(dt)
+        for k, (number, value) in enumerate(zip(self.numbers, self.values, strict=True)):
+            wide = {"gnss.velocity_sigma": 4.0, "magnetometer.hard_iron_sigma": 3.0}
+            first = max(rough.get(number.name, 0.0), wide.get(number.name, 1.0) * value)
+            x[k] = number.coordinate(value, first) if number.positive else 0.0
+        return x
+
+    def suite(self, x: Floats | None = None, gate: bool = True) -> SensorSuite:
+        """Return the suite at coordinates."""
+        found, x = self.prior, self.x if x is None else x
+        if not gate:  # whose decisions are no smooth function of the numbers
+            found = found.replace(estimator=found.estimator.replace(false_alarm_probability=0.0))
+        for number, value, place in zip(self.numbers, self.values, x, strict=True):
+            found = number.put(found, number.value(value, float(place)))
+        return found
+
+    def likelihood(self, delays: Mapping[str, float]) -> Likelihood:
+        """Return the likelihood of the log with delays."""
+        log = self.log.without_delays(delays)
+        return Likelihood(log, self.prior, self.start, reported_noise=False)
+
+    def find_delays(self, coarse: bool) -> None:
+        """Find the delay of each sensor, with the others as they are."""
+        for name in self.delays:
+            self.progress(f"Delay of {name}: {1e3 * self.delays[name]:.0f} ms so far")
+            if coarse:
+                self._scan(name, _COARSE)
+            self._scan(name, _FINE)
+
+    def _scan(self, name: str, steps: Floats) -> None:
+        """Find the delay of a sensor by a parabola through losses on a grid about the present one.
+
+        Delays have a normal prior about zero. A delay that hardly changes the loss stays.
+        """
+        delays = self.delays[name] + steps
+        likelihoods = (self.likelihood(self.delays | {name: float(d)}) for d in delays)
+        suite = self.suite(gate=False)
+        mean = np.array([float(found.losses([suite]).mean()) for found in likelihoods])
+        loss = self._updates * mean + 0.5 * (delays / _DELAY_SPREAD) ** 2
+        k = int(np.clip(np.argmin(loss), 2, len(loss) - 3))
+        near = slice(k - 2, k + 3)
+        bend, slope, _ = np.polyfit(delays[near] - delays[k], loss[near], 2)
+        reach = float(steps[1] - steps[0])
+        if 4.0 * bend * reach**2 < _LEAST_GAIN:
+            return
+        step = float(np.clip(-0.5 * slope / bend, -2.0 * reach, 2.0 * reach))
+        self.delays[name] = float(np.clip(delays[k] + step, -2.0, 2.0))
+
+    def fit(self) -> None:
+        """Find the numbers with the delays as they are."""
+        self.progress(f"Search for {len(self.numbers)} numbers")
+        self._current = self.likelihood(self.delays)
+        bounds = [(low, _LARGEST) for low in self.low]
+        found = minimize(
+            self._loss,
+            np.clip(self.x, self.low, _LARGEST),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"maxiter": 25, "ftol": 1e-6},
+        )
+        self.x = found.x
+
+    def _loss(self, x: Floats) -> tuple[float, Floats]:
+        """Return the loss per thousand, with the prior, and its derivative."""
+        points = [x, *(x + s * _STEP * e for e in np.eye(len(x)) for s in (1.0, -1.0))]
+        losses = self._current.losses([self.suite(p, gate=False) for p in points])
+        total = losses.sum(axis=0) + 0.5 * np.array([p @ p for p in points])
+        return total[0] / 1e3, (total[1::2] - total[2::2]) / (2.0 * _STEP * 1e3)
+
+    def inflate(self) -> None:
+        """Widen the noise of sensors whose innovations are correlated in time."""
+        log = self.log.without_delays(self.delays)
+        result = replay(log, sensors=self.suite(), start=self.start, reported_noise=False)
+        for sensor, name in _UNMODELED.items():
+            places = [k for k, number in enumerate(self.numbers) if number.name == name]
+            if not places or sensor not in result.measured:
+                continue
+            measured, k = result.measured[sensor], places[0]
+            flying = in_flight(log, measured.time)
+            scaled = (measured.innovation / measured.sigma)[flying]
+            tau = max(correlation_time(column) for column in scaled.T)
+            factor = min(math.sqrt(tau), _MOST_INFLATION)
+            value = factor * self.numbers[k].value(self.values[k], float(self.x[k]))
+            wide = self.numbers[k].coordinate(self.values[k], value)
+            self.low[k] = min(max(self.low[k], wide), _LARGEST - 0.1)
+
+    def intervals(self) -> tuple[Calibrated, ...]:
+        """Return the numbers with 95 % intervals.
+
+        The covariance is H^-1 J H^-1 (Godambe), with the curvature H from differences of
+        derivatives and J the sum of squares of the derivatives over parts of the log.
+        """
+        n, steps = len(self.x), (1.0, -1.0)
+        axes = _STEP * np.eye(n)
+        points = [self.x + s * e + t * f for e in axes for s in steps for f in axes for t in steps]
+        points += [self.x + s * e for e in axes for s in steps]
+        losses = self._current.losses([self.suite(p, gate=False) for p in points])
+        total = losses.sum(axis=0)[: 4 * n * n].reshape(n, 2, n, 2)
+        H = (total[:, 0, :, 0] - total[:, 0, :, 1] - total[:, 1, :, 0] + total[:, 1, :, 1]) / (
+            4.0 * _STEP**2
+        )
+        single = losses[:, 4 * n * n :]
+        slopes = (single[:, 0::2] - single[:, 1::2]) / (2.0 * _STEP)
+        times = self._current.times[self._current.counts]
+        parts = ((times - times[0]) // _CLUSTER).astype(int)
+        sums = np.array([slopes[parts == part].sum(axis=0) for part in np.unique(parts)])
+        J = sums.T @ sums
+        values, vectors = np.linalg.eigh(0.5 * (H + H.T))
+        information = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.eye(n)
+        root = np.linalg.solve(information, np.linalg.cholesky(J + np.eye(n)))
+        sigmas = np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0)
+        found = []
+        for k, (number, prior) in enumerate(zip(self.numbers, self.values, strict=True)):
+            value, low, high = (
+                number.value(prior, float(self.x[k] + s * sigmas[k])) for s in (0.0, -1.96, 1.96)
+            )
+            told = bool(sigmas[k] < _SILENT)
+            found.append(Calibrated(number, prior, value, low, high, told))
+        return tuple(found)
+
+
+def _lowest(number: Number) -> float:
+    """Return the lower bound of a coordinate."""
+    standard_deviation = number.positive and number.field != "strength"
+    return _LEAST / number.spread if standard_deviation else -_LARGEST
+
+
+def correlation_time(values: Floats) -> float:
+    """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white."""
+    centered = values - values.mean()
+    variance, tau = float((centered**2).mean()), 1.0
+    for lag in range(1, len(values) // 4):
+        rho = float((centered[:-lag] * centered[lag:]).mean()) / variance
+        if rho < 0.05:
+            break
+        tau += 2.0 * rho
+    return tau

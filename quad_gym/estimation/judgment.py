@@ -1,0 +1,107 @@
+"""Judgment of a suite by a part of a log that was not used to find its numbers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_gym.estimation.logs import Log
+from quad_gym.estimation.replaying import replay
+from quad_gym.estimation.results import Replay, by_sensor
+from quad_gym.params.sensors import SensorSuite
+
+_PERIOD, _GAP = 5.0, 1.0
+"""Fixes are withheld for a second in every five [s]."""
+
+
+class Fit(NamedTuple):
+    """Innovations of a sensor beside what the filter predicts."""
+
+    measurements: int
+    freedoms: int
+    mean_nis: float
+    """mean NIS over its degrees of freedom; 1 for a consistent filter"""
+    median_nis: float
+    """median NIS over its degrees of freedom"""
+    rejected: float
+    """share of the measurements that the gate rejects"""
+    correlation: float
+    """correlation of successive innovations, the largest of all axes; 0 for a consistent filter"""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgment:
+    """Consistency of a filter on a part of a log."""
+
+    sensors: dict[str, Fit]
+    withheld_error: tuple[float, float] | None
+    """root mean square difference of the prediction from the first fix after gaps: horizontal, and
+    vertical [m]; None: no fixes"""
+    withheld_nis: float | None
+    """mean NIS of these fixes over three"""
+    diverged: float
+    """share of the samples at which the filter counts as diverged"""
+    problems: tuple[str, ...]
+    """sentences of the replay, see `Replay.problems`"""
+    replay: Replay
+
+
+def judge(log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float) -> Judgment:
+    """Replay a log, and judge the part after a time.
+
+    Args:
+        log: The log.
+        suite: The suite.
+        start: Keywords of `initialize`.
+        split: Time at which the part begins [s].
+    """
+    result = replay(log, sensors=suite, start=start, reported_noise=False)
+    sensors = {}
+    for name, m in by_sensor(result.measured).items():
+        rows = (m.time > split) & np.isfinite(m.nis)
+        if rows.sum() < 3:
+            continue
+        nis, d = m.nis[rows], m.innovation.shape[1]
+        scaled = (m.innovation / m.sigma)[rows]
+        pairs = (scaled[:-1] * scaled[1:]).mean(axis=0) / (scaled**2).mean(axis=0)
+        sensors[name] = Fit(
+            len(nis),
+            d,
+            float(nis.mean() / d),
+            float(np.median(nis) / d),
+            float(m.rejected[rows].mean()),
+            float(pairs[np.argmax(np.abs(pairs))]),
+        )
+    diverged = float(np.mean(result.diverged[result.time > split]))
+    withheld = _withheld(log, suite, start, split)
+    return Judgment(sensors, *withheld, diverged, result.problems, result)
+
+
+def _withheld(
+    log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
+) -> tuple[tuple[float, float] | None, float | None]:
+    """Return errors and mean NIS of the first fixes after gaps."""
+    gnss = log.gnss
+    if gnss is None or suite.gnss is None:
+        return None, None
+    phase = (gnss.time - split) % _PERIOD
+    rows = (gnss.time < split) | (phase >= _GAP)
+    gnss = replace(
+        gnss,
+        time=gnss.time[rows],
+        received=gnss.received[rows],
+        values={name: value[rows] for name, value in gnss.values.items()},
+    )
+    result = replay(replace(log, gnss=gnss), sensors=suite, start=start, reported_noise=False)
+    fixes = result.measured.get("gnss_position")
+    if fixes is None:
+        return None, None
+    after = np.flatnonzero(np.diff(fixes.time, prepend=fixes.time[0]) > 0.9 * _GAP)
+    after = after[fixes.time[after] > split]
+    if not len(after):
+        return None, None
+    error = fixes.innovation[after]
+    level = float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
+    up = float(np.sqrt((error[:, 2] ** 2).mean()))
+    return (level, up), float(fixes.nis[after].mean() / 3.0)
