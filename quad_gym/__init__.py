@@ -17,6 +17,7 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
+from quad_gym.params.log_delays import LogDelays
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.obstacles import Cylinder, Wall
 from quad_gym.params.optical_flow import OpticalFlowParams
@@ -94,6 +95,7 @@ __all__ = [
     "GroundParams",
     "ImuParams",
     "InitialPoseParams",
+    "LogDelays",
     "LogUniform",
     "MagnetometerParams",
     "NoisyObservationParams",

@@ -268,6 +268,7 @@ def _suites_page() -> str:
         "initial_pose": quad_gym.InitialPoseParams,
         "estimator": quad_gym.FilterParams,
         "noisy": quad_gym.NoisyObservationParams,
+        "log_delays": quad_gym.LogDelays,
     }.items():
         rows = []
         said = _field_docs(kind)

@@ -55,7 +55,6 @@ def innovations_figure(calibration: Calibration) -> Any:
             axes.axvline(calibration.split, color=GREY, linewidth=1.0, linestyle=":")
             axes.set_xlim(judgment.replay.time[0], judgment.replay.time[-1])
             axes.tick_params(colors=GREY)
-    for axes in figure.axes:
-        if axes.get_subplotspec().is_last_row():
-            axes.set_xlabel("time [s]; dotted: the withheld part begins")
+            if row == len(names) - 1:
+                axes.set_xlabel("time [s]; dotted: the withheld part begins")
     return figure

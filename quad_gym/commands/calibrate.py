@@ -51,7 +51,7 @@ class Args:
 
 def number_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
     """Return a row of texts for each delay and number."""
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (f"delay of {name}", "0", f"{1e3 * delay:.0f}", "", "ms")
         for name, delay in calibration.delays.items()
     ]

@@ -7,9 +7,9 @@ that run side by side.
 
 The likelihood alone makes noise too small where errors are correlated in time, as those of a
 magnetometer near motors: innovations are then as small as predicted, but not white, and the filter
-counts the same error many times. A sensor whose errors have no correlated state of their own gets
-noise larger by sqrt(tau), where tau is the integrated autocorrelation time of its innovations in
-samples, before the others are fitted again. The other part of the log judges the result.
+counts the same error many times. Noise of such sensors becomes larger by sqrt(tau), at most
+four times, where tau is the integrated autocorrelation time of the innovations in samples, before the
+other numbers are fitted again. The rest of the log judges the result.
 """
 
 import math
@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.judgment import Judgment, judge
@@ -45,12 +44,14 @@ _DELAY_SPREAD = 0.2
 """Standard deviation of the prior of a delay [s]."""
 _LEAST_GAIN = 3.0
 """Gain of the log likelihood, two steps of a grid away from its maximum, that tells a delay."""
-_MOST_INFLATION = 3.0
-_UNMODELED = {
-    "gnss_velocity": "gnss.velocity_sigma",
-    "magnetometer": "magnetometer.noise_sigma",
+_WHITE = {
+    "gnss.position_sigma_I[0, 1]": ("gnss_position", slice(0, 2), 1.5),
+    "gnss.position_sigma_I[2]": ("gnss_position", slice(2, 3), 1.5),
+    "gnss.velocity_sigma": ("gnss_velocity", slice(3), 2.0),
+    "magnetometer.noise_sigma": ("magnetometer", slice(3), 4.0),
 }
-"""Noise of the sensors without a state for an error that varies during a flight."""
+"""White noise that is inflated where innovations are correlated: their sensor, its axes, and the
+largest factor, which is smaller where the filter estimates a correlated error of the sensor."""
 
 
 class Calibrated(NamedTuple):
@@ -252,6 +253,8 @@ class _Search:
 
     def fit(self) -> None:
         """Find the numbers with the delays as they are."""
+        from scipy.optimize import minimize
+
         self.progress(f"Search for {len(self.numbers)} numbers")
         self._current = self.likelihood(self.delays)
         bounds = [(low, _LARGEST) for low in self.low]
@@ -276,17 +279,17 @@ class _Search:
         """Widen the noise of sensors whose innovations are correlated in time."""
         log = self.log.without_delays(self.delays)
         result = replay(log, sensors=self.suite(), start=self.start, reported_noise=False)
-        for sensor, name in _UNMODELED.items():
-            places = [k for k, number in enumerate(self.numbers) if number.name == name]
-            if not places or sensor not in result.measured:
+        for k, number in enumerate(self.numbers):
+            sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
+            if sensor not in result.measured:
                 continue
-            measured, k = result.measured[sensor], places[0]
+            measured = result.measured[sensor]
             flying = in_flight(log, measured.time)
-            scaled = (measured.innovation / measured.sigma)[flying]
+            scaled = (measured.innovation / measured.sigma)[flying, axes]
             tau = max(correlation_time(column) for column in scaled.T)
-            factor = min(math.sqrt(tau), _MOST_INFLATION)
-            value = factor * self.numbers[k].value(self.values[k], float(self.x[k]))
-            wide = self.numbers[k].coordinate(self.values[k], value)
+            factor = min(math.sqrt(tau), most)
+            value = factor * number.value(self.values[k], float(self.x[k]))
+            wide = number.coordinate(self.values[k], value)
             self.low[k] = min(max(self.low[k], wide), _LARGEST - 0.1)
 
     def intervals(self) -> tuple[Calibrated, ...]:

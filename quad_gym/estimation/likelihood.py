@@ -40,10 +40,12 @@ _AT_REST = 0.6
 
 def in_flight(log: Log, times: Floats) -> Any:
     """Return True for the times at which the vehicle flies: its accelerometer vibrates."""
+    from scipy.ndimage import uniform_filter1d
+
     time, size = log.imu.time, np.linalg.norm(log.imu.values["accel"], axis=1)
     count = max(3, round(_WINDOW / float(np.median(np.diff(time)))))
-    window = np.ones(count) / count
-    spread = np.sqrt(np.convolve((size - np.convolve(size, window, "same")) ** 2, window, "same"))
+    squares = uniform_filter1d((size - uniform_filter1d(size, count)) ** 2, count)
+    spread = np.sqrt(np.maximum(squares, 0.0))
     return np.interp(times, time, spread) > _AT_REST * np.median(spread)
 
 

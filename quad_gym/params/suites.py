@@ -10,10 +10,11 @@
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
 | `crazyflie` | none: starts from a mark; optical flow, range finder | none | as `indoor` |
+| `flown` | as `consumer`, 5 Hz, with noise and delay of a real flight | none | noise of that flight |
 
 `one_wall` and `stale` were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in
-one direction only, and a filter that ignores time stamps. They and `crazyflie` are not among
-SUITES, on which results for all tasks are based.
+one direction only, and a filter that ignores time stamps. They, `crazyflie` and `flown` are not
+among SUITES, on which results for all tasks are based.
 
 The IMU runs at 200 Hz, so cameras of 30 Hz run at 25 Hz, which divides that rate. Except in `lab`,
 the phases of GNSS and camera are drawn in each episode, the fix that starts the filter is used
@@ -283,6 +284,31 @@ CRAZYFLIE = SensorSuite(
 """A small vehicle indoors that navigates by optical flow and a range finder: nothing observes its
 heading and horizontal position, whose errors grow."""
 
+FLOWN = CONSUMER.replace(
+    # noise that explains real flights of a small quadrotor: "quad122a" of P. Riseborough's
+    # InertialNav (BSD-3-Clause), an ArduPilot vehicle with a disturbed compass, replayed with the
+    # delays in its log. Roll and pitch differ by 1.2 degrees rms from the autopilot's estimate
+    imu=CONSUMER.imu.replace(accel_noise_density=0.1, gyro_noise_density=0.002),
+    gnss=None
+    if CONSUMER.gnss is None
+    else CONSUMER.gnss.replace(
+        rate=5.0,
+        latency=0.2,
+        position_sigma_I=(0.5, 0.5, 1.0),
+        drift_sigma_I=(1.5, 1.5, 2.2),
+        velocity_sigma=0.3,
+    ),
+    barometer=BarometerParams(rate=10.0, noise_sigma=0.3, bias_sigma=3.0),
+    magnetometer=MagnetometerParams(
+        rate=10.0, noise_sigma=3.0 * MICROTESLA, hard_iron_sigma=2.4 * MICROTESLA
+    ),
+    estimator=FIELD_FILTER.replace(initial_tilt_sigma=0.05),
+    noisy=NoisyObservationParams(
+        position=0.5, velocity=0.15, attitude=0.02, body_rates=0.03
+    ),  # measured, see above
+)
+"""A hobby vehicle as it flies: `consumer` with noise that explains the log of a real flight."""
+
 _SUITES = {
     "standard": STANDARD,
     "lab": SensorSuite(),
@@ -299,6 +325,7 @@ _ALL = {
     "one_wall": ONE_WALL,
     "stale": STALE,
     "crazyflie": CRAZYFLIE,
+    "flown": FLOWN,
 }
 
 ALL_SUITES = tuple(_ALL)

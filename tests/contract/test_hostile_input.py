@@ -228,6 +228,7 @@ PARAMETERS = {
     "CameraParams": (RTK.camera, lambda p: suite_of(camera=p)),
     "FilterParams": (RTK.estimator, lambda p: suite_of(estimator=p)),
     "NoisyObservationParams": (RTK.noisy, lambda p: suite_of(noisy=p)),
+    "LogDelays": (RTK.log_delays, lambda p: suite_of(log_delays=p)),
     "InitialPoseParams": (
         INDOOR.initial_pose,
         lambda p: {"sensors": INDOOR.replace(initial_pose=p)},

@@ -1,0 +1,131 @@
+"""Calibration finds the numbers with which a log was simulated."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation import calibrate
+from quad_gym.estimation.calibration import correlation_time
+from quad_gym.estimation.likelihood import in_flight
+from quad_gym.estimation.logs import Log, Stream
+from quad_gym.estimation.numbers import NUMBERS
+from quad_gym.params.suites import CONSUMER
+from tests.console_commands import run
+from tests.logged_flights import Recorded, flown
+
+DELAY = 0.15
+TRUE = CONSUMER.replace(
+    imu=CONSUMER.imu.replace(accel_noise_density=0.02, gyro_noise_density=0.002),
+    gnss=CONSUMER.gnss.replace(velocity_sigma=0.3),
+    magnetometer=CONSUMER.magnetometer.replace(noise_sigma=2e-6),
+)
+"""A consumer vehicle whose sensors are four to ten times as noisy as their data sheets."""
+
+
+@pytest.fixture(scope="module")
+def table():
+    """A log whose GNSS stamps are late."""
+    columns = Recorded(flown(TRUE, 24.0), TRUE, lost=0.0, jitter=0.0).table()
+    fixes = np.isfinite(columns["gnss_east"])
+    columns["time"] = columns["time"] + DELAY * fixes
+    columns["received"] = np.maximum(columns["received"], columns["time"])
+    order = np.argsort(columns["received"], kind="stable")
+    return {name: column[order] for name, column in columns.items() if not name.startswith("pixel")}
+
+
+@pytest.fixture(scope="module")
+def found(table):
+    return calibrate(table, sensors="consumer")
+
+
+@pytest.mark.parametrize(
+    ("part", "field"),
+    [
+        ("imu", "accel_noise_density"),
+        ("imu", "gyro_noise_density"),
+        ("gnss", "velocity_sigma"),
+        ("magnetometer", "noise_sigma"),
+    ],
+)
+def test_noise_of_a_simulated_log_is_found(found, part, field):
+    """Within the interval widened by a half: errors that are no white noise count as noise, too."""
+    true = getattr(getattr(TRUE, part), field)
+    (number,) = (n for n in found.numbers if n.number.name == f"{part}.{field}")
+    assert number.told
+    assert number.low / 1.5 < true < 1.5 * number.high, number
+
+
+def test_late_stamps_of_a_simulated_log_are_found(found):
+    assert found.delays["gnss"] == pytest.approx(DELAY, abs=0.03)
+    assert found.suite.log_delays.gnss == found.delays["gnss"]
+
+
+def test_withheld_part_fits_the_suite_that_was_found_and_not_the_one_before(found):
+    for name, fit in found.after.sensors.items():
+        assert 0.4 < fit.mean_nis < 1.5, name
+        assert fit.rejected < 0.01
+    assert found.before.sensors["gnss_velocity"].mean_nis > 5.0
+    assert not found.after.problems
+    assert 0.3 < found.after.withheld_nis < 3.0
+
+
+def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
+    again = quad_gym.sensor_suite(found.suite.save(tmp_path / "mine.toml"))
+    assert again == found.suite
+    env = quad_gym.QuadEnv("circle", sensors=str(tmp_path / "mine.toml"))
+    env.reset(seed=0)
+    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+
+
+def test_command_writes_suite_page_and_summary(table, tmp_path):
+    short = {name: column[table["received"] < 8.0] for name, column in table.items()}
+    names = list(short)
+    rows = np.column_stack([short[name] for name in names])
+    lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows]
+    (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
+    ended = run("calibrate", "flight.csv", "--no-delays", "--output", "mine", where=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    summary = json.loads((tmp_path / "mine/calibration.json").read_text())
+    assert set(summary["numbers"]) == {number.name for number in NUMBERS}
+    assert summary["after"]["measurements"]["gnss_velocity"]["mean_nis"] > 0.0
+    assert (tmp_path / "mine/report.html").stat().st_size > 10_000
+    assert quad_gym.sensor_suite(tmp_path / "mine/suite.toml").gnss.rate == 10.0
+
+
+def test_calibration_without_a_heading_is_refused(table):
+    without = {name: c for name, c in table.items() if not name.startswith("magnet")}
+    with pytest.raises(ValueError, match="must know the heading at the start"):
+        calibrate(without, sensors=CONSUMER.replace(magnetometer=None))
+
+
+def test_correlation_time_of_autoregressive_numbers_is_the_closed_form():
+    """An AR(1) process with coefficient a has (1 + a) / (1 - a)."""
+    rng = np.random.default_rng(0)
+    for a in (0.0, 0.5, 0.8):
+        values = np.zeros(40_000)
+        for k in range(1, len(values)):
+            values[k] = a * values[k - 1] + rng.normal()
+        assert correlation_time(values) == pytest.approx((1 + a) / (1 - a), rel=0.15)
+
+
+def test_vehicle_at_rest_is_not_in_flight():
+    rng, time = np.random.default_rng(1), 0.01 * np.arange(3000)
+    vibration = np.where(time > 8.0, 0.5, 0.01)[:, np.newaxis]
+    accel = [0.0, 0.0, 9.8] + vibration * rng.normal(size=(3000, 3))
+    log = Log(imu=Stream(time, time, {"accel": accel, "gyro": 0.0 * accel}))
+    flying = in_flight(log, time)
+    assert not flying[time < 7.0].any()
+    assert flying[time > 9.0].mean() > 0.98
+
+
+@pytest.mark.parametrize("number", NUMBERS, ids=lambda number: number.name)
+def test_coordinates_of_a_number_go_there_and_back(number):
+    prior = number.of(CONSUMER)
+    value = number.value(prior, 0.7)
+    assert number.coordinate(prior, value) == pytest.approx(0.7)
+    changed = number.put(CONSUMER, value)
+    assert number.of(changed) == pytest.approx(value)
+    assert dataclasses.replace(changed) == changed != CONSUMER
