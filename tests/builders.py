@@ -68,30 +68,14 @@ def _columns(rows):
     return tuple(np.array(column) for column in (observations, *others))
 
 
-def alone(base, flight, *, wait, **keywords):
-    """Fly a flight by itself: observations, rewards, terminated, truncated, (steps, ...) each.
-
-    With `wait` a new episode takes a step to begin, else it begins in the step that ends the last.
-    """
-    env = QuadEnv(base=base, **SHORT, **keywords)
-    rows, over = [(env.reset(seed=1000 + flight)[0], 0.0, False, False)], False
-    for action in actions_of(flight):
-        if over:
-            rows.append((env.reset()[0], 0.0, False, False))
-            over = False
-            continue
-        observation, reward, terminated, truncated, _ = env.step(action)
-        over = terminated or truncated
-        if over and not wait:
-            observation, over = env.reset()[0], False
-        rows.append((observation, reward, terminated, truncated))
-    return _columns(rows)
-
-
 def together(base, flights, *, mode="NextStep", threads=1, **keywords):
-    """Fly several flights in one batch: the same columns as `alone`, (steps, n, ...) each."""
+    """Fly several flights in one batch: observations, rewards, terminated, truncated.
+
+    Arrays of all steps, (steps, n, ...) each.
+    """
     count = len(flights)
-    env = QuadVectorEnv(count, base=base, autoreset_mode=mode, threads=threads, **SHORT, **keywords)
+    made = {**SHORT, "base": base, "autoreset_mode": mode, **keywords}
+    env = QuadVectorEnv(count, threads=threads, **made)
     observation, _ = env.reset(seed=[1000 + flight for flight in flights])
     rows = [(observation, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool))]
     rows += [env.step(action)[:4] for action in actions_for(flights)]

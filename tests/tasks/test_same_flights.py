@@ -1,18 +1,14 @@
 """Equal flights of a task in all interfaces and modes, and of the built-in task without changes."""
 
-import copy
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.envs.sb3 import QuadSB3VecEnv
 from quad_gym.records import Ending
-from tests.builders import SHORT, actions_for, chosen, together, vec_env
-from tests.contract.comparing import assert_alone_as_together, assert_same
+from tests.builders import SHORT, actions_for, vec_env
+from tests.contract.comparing import assert_same
 from tests.tasks.tasks import Chase, Same
 
 FLIGHTS = 11
@@ -80,41 +76,6 @@ def test_task_without_changes_with_options_changes_no_flight(keywords, mode):
         assert_same(fly(vec_env("circle", task=own, **made), range(5)), plain)
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_flight_in_a_batch_is_the_flight_alone(mode):
-    _, _, terminated, truncated = assert_alone_as_together("hover", FLIGHTS, mode, task=Chase())
-    assert (terminated | truncated).sum() >= 2 * FLIGHTS
-    assert terminated.any()
-    assert truncated.any()
-
-
-def test_batch_size_and_threads_do_not_change_flights():
-    made = {"mode": "SameStep", "task": Chase()}
-    many = together("hover", range(100), threads=2, **made)
-    assert_same(chosen(many, range(FLIGHTS)), together("hover", range(FLIGHTS), **made))
-
-
-def test_sb3_interface_returns_the_same_flights():
-    env = QuadSB3VecEnv(FLIGHTS, base="hover", task=Chase(), **SHORT)
-    env.seed(0)
-    vector = vec_env(count=FLIGHTS, autoreset_mode="SameStep", task=Chase(), **SHORT)
-    np.testing.assert_array_equal(env.reset(), vector.reset(seed=0)[0])
-    returns = np.zeros(FLIGHTS)
-    for action in actions_for(range(FLIGHTS)):
-        observations, rewards, dones, infos = env.step(action)
-        theirs, their_rewards, terminated, truncated, info = vector.step(action)
-        np.testing.assert_array_equal(observations, theirs)
-        np.testing.assert_array_equal(rewards, their_rewards.astype(np.float32))
-        np.testing.assert_array_equal(dones, terminated | truncated)
-        returns += their_rewards
-        for i in np.flatnonzero(dones):
-            np.testing.assert_array_equal(infos[i]["terminal_observation"], info["final_obs"][i])
-            assert infos[i]["ending"] == info["final_info"]["ending"][i]
-            assert infos[i]["TimeLimit.truncated"] == (truncated[i] and not terminated[i])
-            assert infos[i]["episode"]["r"] == pytest.approx(returns[i], rel=1e-12)
-            returns[i] = 0.0
-
-
 def test_endings_have_their_reasons():
     env = vec_env(count=FLIGHTS, seed=0, task=Chase(), max_episode_steps=100, max_tilt=np.pi)
     found = set()
@@ -124,19 +85,6 @@ def test_endings_have_their_reasons():
         assert (info["ending"][truncated] == Ending.TIME_LIMIT).all()
         found |= set(info["ending"][terminated])
     assert Ending.TASK in found
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize(
-    "count", [3, 256]
-)  # NumPy unpickles small arrays and large ones differently
-def test_copied_environment_has_the_same_future(count, copied):
-    env = vec_env(count=count, seed=4, task=Chase(), **SHORT)
-    for action in actions_for(range(count))[:15]:
-        env.step(action)
-    other = copied(env)
-    for action in actions_for(range(count))[15:]:
-        assert_same(env.step(action), other.step(action))
 
 
 def test_restored_snapshot_restores_the_state_of_the_task():
