@@ -55,7 +55,7 @@ SOURCES: tuple[Source, ...] = ("truth", "noisy", "estimate")
 
 
 @dataclass(frozen=True)
-class Args:
+class CompareArgs:
     """Options of the comparison."""
 
     env_id: TrackingId = "QuadGym/Circle-v0"
@@ -86,7 +86,7 @@ class Args:
     """folder; if not given, results/compare/TASK (with --quick, .../TASK_quick)"""
 
 
-def configure(args: Args) -> Comparison:
+def configure(args: CompareArgs) -> Comparison:
     """Check all options before training.
 
     Raises:
@@ -126,7 +126,7 @@ def configure(args: Args) -> Comparison:
     return comparison
 
 
-def main(args: Args) -> int:
+def main(args: CompareArgs) -> int:
     """Compare."""
     began = time.perf_counter()
     with usage_errors():

@@ -50,7 +50,7 @@ OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 
 
 @dataclass(frozen=True)
-class Args:
+class FlyArgs:
     """Options of the flight."""
 
     env_id: EnvId = "QuadGym/Circle-v0"
@@ -124,7 +124,7 @@ class Switches:
             self._turn_faults = False
 
 
-def check_options(args: Args) -> None:
+def check_options(args: FlyArgs) -> None:
     """Check the options before the flight.
 
     Raises:
@@ -156,7 +156,7 @@ def check_options(args: Args) -> None:
         Renderer(args.view, args.size)
 
 
-def faults_of_args(args: Args) -> tuple[Fault, ...]:
+def faults_of_args(args: FlyArgs) -> tuple[Fault, ...]:
     """Faults, at their default times or at `--fault-time`.
 
     Raises:
@@ -170,7 +170,7 @@ def faults_of_args(args: Args) -> tuple[Fault, ...]:
     return tuple(fault.replace(start=start, duration=end - start, rate=0.0) for fault in faults)
 
 
-def suite_of(args: Args) -> SensorSuite:
+def suite_of(args: FlyArgs) -> SensorSuite:
     """Sensor suite with the rates selected by options.
 
     Raises:
@@ -180,7 +180,7 @@ def suite_of(args: Args) -> SensorSuite:
     return suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate)
 
 
-def make_env(args: Args) -> Any:
+def make_env(args: FlyArgs) -> Any:
     """Make an environment with one flight.
 
     Raises:
@@ -231,7 +231,7 @@ def in_words(flight: Flight) -> str:
     return words
 
 
-def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switches) -> bool:
+def watch(flights: Iterator[Flight], args: FlyArgs, window: Window, switches: Switches) -> bool:
     """Show a flight in a window; return True to continue with the next one."""
     renderer, waiting, flight = Renderer(args.view, args.size), math.inf, None
     for flight in flights:
@@ -260,7 +260,7 @@ def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switc
     return True
 
 
-def open_window(args: Args) -> Window:
+def open_window(args: FlyArgs) -> Window:
     """Open a window.
 
     Raises:
@@ -272,7 +272,7 @@ def open_window(args: Args) -> Window:
         raise OSError(f"{error}; without a display, --output writes a video instead") from None
 
 
-def write(flight: Flight, path: Path, args: Args) -> list[Path]:
+def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
     """Write the flight to a file, for videos together with its data; return the files."""
     from tqdm import tqdm
 
@@ -303,7 +303,7 @@ def write(flight: Flight, path: Path, args: Args) -> list[Path]:
     return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
 
 
-def main(args: Args) -> None:
+def main(args: FlyArgs) -> None:
     """Fly or replay, and show or write."""
     with usage_errors():
         args = with_full_id(args)

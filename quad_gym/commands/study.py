@@ -53,7 +53,7 @@ QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
 
 
 @dataclass(frozen=True)
-class Args:
+class StudyArgs:
     """Options of the study."""
 
     env_id: Annotated[EnvId, arg(help=one_of(STUDIED_IDS))] = "QuadGym/LookAround-v0"
@@ -89,7 +89,7 @@ class Args:
     """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
 
 
-def studied(args: Args) -> StudiedTask:
+def studied(args: StudyArgs) -> StudiedTask:
     """Definition of the task, with the options that change it.
 
     Raises:
@@ -106,7 +106,7 @@ def studied(args: Args) -> StudiedTask:
     return replace(about, success=partial(stays, within=within), meaning=meaning)
 
 
-def arms_of(args: Args) -> tuple[Arm, ...]:
+def arms_of(args: StudyArgs) -> tuple[Arm, ...]:
     """Arms of the study, in the order of their file.
 
     Raises:
@@ -119,7 +119,7 @@ def arms_of(args: Args) -> tuple[Arm, ...]:
     return chosen_arms(known, args.arms or [arm.name for arm in known])
 
 
-def configure(args: Args) -> Study:
+def configure(args: StudyArgs) -> Study:
     """Check all options before training.
 
     Raises:
@@ -152,14 +152,14 @@ def configure(args: Args) -> Study:
     return study
 
 
-def _recipe(args: Args, algorithm: str) -> Recipe:
+def _recipe(args: StudyArgs, algorithm: str) -> Recipe:
     """Recipe of an algorithm, with the options that change it."""
     chosen = recipe(args.env_id, algorithm)
     steps = args.steps or (QUICK_STEPS if args.quick else chosen.steps)
     return chosen.replace(steps=steps, parameters={**chosen.parameters, **args.set})
 
 
-def main(args: Args) -> None:
+def main(args: StudyArgs) -> None:
     """Study."""
     began = time.perf_counter()
     with usage_errors():

@@ -34,7 +34,7 @@ from quad_gym.commands.options import (
 
 
 @dataclass(frozen=True)
-class Args:
+class TrainArgs:
     """Options of the training."""
 
     env_id: EnvId = "QuadGym/Circle-v0"
@@ -70,7 +70,7 @@ class Args:
     """also write the best policy to this .npz file, which requires only NumPy"""
 
 
-def configure(args: Args) -> tuple[Any, Path]:
+def configure(args: TrainArgs) -> tuple[Any, Path]:
     """Check all options before training.
 
     Raises:
@@ -113,7 +113,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     return plan, folder
 
 
-def main(args: Args) -> None:
+def main(args: TrainArgs) -> None:
     """Train."""
     from_start = time.perf_counter()
     with usage_errors():

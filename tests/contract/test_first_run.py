@@ -60,7 +60,7 @@ def test_tune_flies_as_many_candidates_as_it_says(candidates, tmp_path, monkeypa
         return np.log(error)
 
     monkeypatch.setattr(tune.Search, "cost", cost)
-    args = tune.Args(env_ids=("hover",), candidates=candidates, episodes=1, output=tmp_path)
+    args = tune.TuneArgs(env_ids=("hover",), candidates=candidates, episodes=1, output=tmp_path)
     found = tune.configure(args)
     best = tune.search(args, found)
     errors = [row["relative_error"] for row in found.rows]

@@ -75,7 +75,7 @@ def case_of(
     else:
         if flown.gnss is not None and flown.gnss.heading_errs:
             expected["nis_baseline"] = "counts constant heading errors as noise"
-        if flown.imu.believed_accel_error > 0.0 and (task == "waypoints" or "world" in keywords):
+        if flown.imu.accel_error_noise > 0.0 and (task == "waypoints" or "world" in keywords):
             reason = "counts errors of scale as noise"
             expected |= {"velocity": reason, "accel_bias": reason}
     return Case(f"{suite}, {task}, {start}, {condition}", flown, task, start, keywords, expected)
