@@ -5,6 +5,7 @@ import numpy as np
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.flights.record import FlightRecorder
 
 STEPS = 60
 SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
@@ -40,6 +41,38 @@ def flown(base="circle", count=5, steps=20, seed=1, **keywords):
     for _ in range(steps):
         made.step(rng.uniform(-0.2, 0.3, (count, 4)))
     return made
+
+
+def flown_batch(seeds, ticks, **keywords):
+    """A batch of one thread after some steps, with a flight for each seed."""
+    made = FlightBatch(len(seeds), **{"threads": 1, **keywords})
+    made.reset(seeds=seeds)
+    for _ in range(ticks):
+        made.step()
+    return made
+
+
+def recorded_flight(task="circle", steps=12, seed=2, **keywords):
+    """(environment, its recorded flight, observations of each row), with random actions."""
+    env = QuadEnv(task, **keywords)
+    recorder = FlightRecorder(env.flights.batch, about={"seed": seed})
+    observations = [env.reset(seed=seed)[0]]
+    recorder.keep()
+    for action in np.random.default_rng(seed).uniform(-0.3, 0.3, (steps, 4)):
+        observations.append(env.step(action)[0])
+        recorder.keep()
+    return env, recorder.flight, np.array(observations)
+
+
+def put(flights, **fields):
+    """Set fields of all flights of a batch."""
+    snapshot = flights.snapshot()
+    for name, values in fields.items():
+        lanes = np.zeros((len(snapshot) * snapshot[name].shape[-1], *np.shape(values)[1:]))
+        lanes[: flights.count] = values
+        blocks = lanes.reshape(len(snapshot), -1, *lanes.shape[1:])
+        snapshot[name] = np.moveaxis(blocks, 1, -1)
+    flights.restore(snapshot)
 
 
 def part(env, observations, name):

@@ -8,10 +8,10 @@ import quad_gym
 from quad_gym import Wall, WorldParams
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.flights.record import Flight, FlightRecorder
+from quad_gym.flights.record import Flight
 from quad_gym.records import Ending
 from quad_gym.tasks.rewards import Crash
-from tests.builders import single_env
+from tests.builders import recorded_flight, single_env
 from tests.contract.configurations import OBSTACLES
 from tests.tasks.tasks import Near
 
@@ -128,20 +128,9 @@ def test_starts_that_a_task_puts_into_obstacles_are_refused():
 # ---- records and pictures -----------------------------------------------------------------------
 
 
-def flown(world, steps=3, **keywords):
-    env = QuadEnv("hover", world=world, **keywords)
-    recorder = FlightRecorder(env.flights.batch)
-    env.reset(seed=0)
-    recorder.keep()
-    for _ in range(steps):
-        env.step(np.zeros(4, np.float32))
-        recorder.keep()
-    return recorder.flight, env.flights.batch
-
-
 def test_a_flight_keeps_its_obstacles(tmp_path):
-    flight, batch = flown(OBSTACLES)
-    centers = batch.record("obstacle_center")[0, :2]
+    env, flight, _ = recorded_flight("hover", 3, world=OBSTACLES)
+    centers = env.flights.batch.record("obstacle_center")[0, :2]
     np.testing.assert_array_equal(flight.scene.obstacles[:, 1:4], centers)
     np.testing.assert_array_equal(flight.scene.obstacles[:, 0], [0.0, 1.0])
     np.testing.assert_array_equal(flight.scene.obstacles[1, 4:7], [0.3, 0.3, 1.5])
@@ -151,7 +140,7 @@ def test_a_flight_keeps_its_obstacles(tmp_path):
 
 
 def test_files_from_before_there_were_obstacles_can_be_read(tmp_path):
-    flight, _ = flown(OBSTACLES)
+    flight = recorded_flight("hover", 3, world=OBSTACLES)[1]
     path = flight.save(tmp_path / "flight.npz")
     with np.load(path) as file:
         kept = {n: file[n] for n in file.files if "obstacles" not in n and "geofence" not in n}

@@ -9,6 +9,7 @@ import quad_gym
 from quad_gym import FlightBatch, GroundParams, TaskParams, WorldParams, vehicle_params
 from quad_gym.records import Control, Ending, Source
 from quad_gym.rotations import quaternion_to_dcm
+from tests.builders import put
 from tests.field_flights import nees
 
 GRAVITY, TICK, FLOOR = 9.8, 1.0 / 200.0, -0.1
@@ -29,17 +30,6 @@ def batch(count=1, world=None, ground=None, task=None, **options):
 
 def stopped(flights):
     return np.full((flights.count, 4), -1.0)  # voltage 0
-
-
-def put(flights, **fields):
-    """Set the true state of all flights."""
-    snapshot = flights.snapshot()
-    for name, values in fields.items():
-        lanes = np.zeros((len(snapshot) * snapshot[name].shape[-1], *np.shape(values)[1:]))
-        lanes[: flights.count] = values
-        blocks = lanes.reshape(len(snapshot), -1, *lanes.shape[1:])
-        snapshot[name] = np.moveaxis(blocks, 1, -1)
-    flights.restore(snapshot)
 
 
 def resting_rotors(flights):

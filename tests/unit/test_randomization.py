@@ -25,6 +25,7 @@ from quad_gym.records import (
     Source,
 )
 from quad_gym.rotations import euler_to_dcm
+from tests.builders import flown_batch
 from tests.unit.alarms import ALARM, alarm_score
 from tests.unit.compiled import Compiled
 
@@ -214,11 +215,7 @@ def some_distribution(name):
 
 def flown(ticks=60, seeds=(3,), **keywords):
     task = quad_gym.TaskParams(kind="circle", start="hover", duration=0.0)
-    batch = FlightBatch(len(seeds), task=task, threads=1, **({"sensors": SUITE} | keywords))
-    batch.reset(seeds=seeds)
-    for _ in range(ticks):
-        batch.step()
-    return batch
+    return flown_batch(seeds, ticks, **{"task": task, "sensors": SUITE, **keywords})
 
 
 SEEN = ("r", "v", "q", "w", "rotor_speeds", "charge", "wind", "accel", "gyro", "b_a", "b_g",

@@ -17,6 +17,7 @@ from quad_gym.records import (
     Control,
     Source,
 )
+from tests.builders import flown_batch
 
 ENDLESS = TaskParams(duration=0)
 SEEDS = np.random.default_rng(5).permutation(1000)[:100].tolist()
@@ -27,11 +28,7 @@ def new_batch(count, **options):
 
 
 def fly(seeds, steps=60, **options):
-    batch = new_batch(len(seeds), **options)
-    batch.reset(seeds=seeds)
-    for _ in range(steps):
-        batch.step()
-    return batch
+    return flown_batch(seeds, steps, **{"task": ENDLESS, **options})
 
 
 def assert_same_flights(batch, other, flights=None, others=None):
