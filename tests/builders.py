@@ -1,12 +1,22 @@
 """Builders of environments, batches and flights for tests."""
 
+import gymnasium
 import numpy as np
 
+import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.flights.record import FlightRecorder
 
+MAKERS = {
+    "make": lambda **keywords: gymnasium.make("QuadGym/Circle-v0", **keywords),
+    "make_vec": lambda **keywords: gymnasium.make_vec("QuadGym/Circle-v0", num_envs=2, **keywords),
+    "make_sb3_vec_env": lambda **keywords: quad_gym.make_sb3_vec_env(
+        "QuadGym/Circle-v0", 2, **keywords
+    ),
+}
+"""Every interface, on the circle."""
 STEPS = 60
 SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 """Episodes end by the time limit and by tipping over, at different steps in different flights."""
@@ -93,12 +103,17 @@ def actions_for(flights, steps=STEPS):
     return np.stack([actions_of(flight, steps) for flight in flights], axis=1)
 
 
+def flat(observation):
+    """An observation; of a dictionary, both parts side by side."""
+    if isinstance(observation, dict):
+        return np.concatenate(list(observation.values()), axis=-1)
+    return observation
+
+
 def _columns(rows):
-    """Columns of rows; both parts of observations that are dictionaries, side by side."""
+    """Columns of rows."""
     observations, *others = zip(*rows, strict=True)
-    if isinstance(observations[0], dict):
-        observations = [np.concatenate(list(o.values()), axis=-1) for o in observations]
-    return tuple(np.array(column) for column in (observations, *others))
+    return tuple(np.array(column) for column in (list(map(flat, observations)), *others))
 
 
 def together(base, flights, *, mode="NextStep", threads=1, **keywords):

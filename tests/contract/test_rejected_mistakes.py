@@ -9,8 +9,9 @@ import pytest
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from tests.builders import actions_of, single_env
+from tests.builders import MAKERS, actions_of, flat, single_env
 from tests.contract.comparing import IDS, assert_same
+from tests.contract.configurations import CONFIGURATIONS
 
 TASKS = tuple(quad_gym.IDS.values())
 
@@ -18,25 +19,18 @@ TASKS = tuple(quad_gym.IDS.values())
 # ---- seeds and options ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_the_seed_of_reset_is_honoured_at_any_time(env_id):
-    env = gymnasium.make(env_id)
-    first, _ = env.reset(seed=5)
-    after = [env.step(action)[0] for action in actions_of(1, 5)]
-    env.reset()
-    again, _ = env.reset(seed=5)
-    assert_same(first, again)
-    assert_same(after, [env.step(action)[0] for action in actions_of(1, 5)])
-    other, _ = env.reset(seed=6)
-    assert (other != first).any()
-
-
-@pytest.mark.parametrize("env_id", IDS)
-def test_episodes_after_a_seed_differ_and_repeat(env_id):
-    env = gymnasium.make(env_id)
-    run = [env.reset(seed=5)[0], *(env.reset()[0] for _ in range(4))]
-    assert len({observation.tobytes() for observation in run}) == 5
-    assert_same(run, [env.reset(seed=5)[0], *(env.reset()[0] for _ in range(4))])
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_the_seed_of_reset_is_honoured_at_any_time(name):
+    base, keywords = CONFIGURATIONS[name]
+    env = QuadEnv(base=base, **keywords)
+    first = env.reset(seed=5)
+    after = [env.step(action)[:4] for action in actions_of(1, 5)]
+    others = [env.reset() for _ in range(4)]
+    assert_same(env.reset(seed=5), first)
+    assert_same([env.step(action)[:4] for action in actions_of(1, 5)], after)
+    assert_same([env.reset() for _ in range(4)], others)
+    episodes = [flat(observation) for observation, _ in (first, *others, env.reset(seed=6))]
+    assert len({episode.tobytes() for episode in episodes}) == 6
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -92,13 +86,6 @@ def test_the_global_random_states_do_not_touch_the_flights():
 
 # ---- keywords ------------------------------------------------------------------------------------
 
-MAKERS = {
-    "make": lambda **keywords: gymnasium.make("QuadGym/Circle-v0", **keywords),
-    "make_vec": lambda **keywords: gymnasium.make_vec("QuadGym/Circle-v0", num_envs=2, **keywords),
-    "make_sb3_vec_env": lambda **keywords: quad_gym.make_sb3_vec_env(
-        "QuadGym/Circle-v0", 2, **keywords
-    ),
-}
 NONSENSE = [
     {"observations": "truth"},
     {"observation": "camera"},

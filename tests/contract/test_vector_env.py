@@ -72,10 +72,11 @@ def test_it_returns_what_a_loop_over_single_environments_returns(name, mode):
     assert terminated + truncated > 11
 
 
-@pytest.mark.parametrize("privileged", [False, True])
-def test_spaces_hold_what_is_returned_with_the_stated_types(privileged):
-    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=6, privileged=privileged)
-    single = gymnasium.make("QuadGym/Circle-v0", privileged=privileged)
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_spaces_hold_what_is_returned_with_the_stated_types(name):
+    base, keywords = CONFIGURATIONS[name]
+    env = QuadVectorEnv(6, base=base, **keywords)
+    single = QuadEnv(base=base, **keywords)
     assert env.single_observation_space == single.observation_space
     assert env.single_action_space == single.action_space
     assert env.action_space.shape == (6, 4)
@@ -85,15 +86,9 @@ def test_spaces_hold_what_is_returned_with_the_stated_types(privileged):
     assert observation in env.observation_space
     assert (reward.dtype, reward.shape) == (np.float64, (6,))
     assert terminated.dtype == truncated.dtype == np.bool_
-    for name in (
-        "position_error",
-        "estimation_error",
-        "ending",
-        "filter_status",
-        "gates_passed",
-    ):
-        assert info[name].shape == (6,)
-        assert info[f"_{name}"].all()
+    for entry in ("position_error", "estimation_error", "ending", "filter_status", "gates_passed"):
+        assert info[entry].shape == (6,)
+        assert info[f"_{entry}"].all()
 
 
 def arrays_in(value):

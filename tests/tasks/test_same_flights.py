@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.records import Ending
 from tests.builders import SHORT, actions_for, vec_env
 from tests.contract.comparing import assert_same
+from tests.contract.configurations import CONFIGURATIONS
 from tests.tasks.tasks import Chase, Same
 
 FLIGHTS = 11
@@ -47,33 +48,24 @@ def fly(env, seeds):
     return rows
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("task", TASK_DEFAULTS)
-def test_task_without_changes_changes_no_flight(task, mode):
-    made = {"autoreset_mode": mode, **SHORT}
-    plain = fly(vec_env(task, FLIGHTS, **made), range(FLIGHTS))
-    for own in (Empty(), Same(), Repeated()):
-        env = vec_env(task, FLIGHTS, task=own, **made)
-        assert_same(fly(env, range(FLIGHTS)), plain, type(own).__name__)
+WITHOUT_TASK = {
+    name: (base, keywords)
+    for name, (base, keywords) in CONFIGURATIONS.items()
+    if base not in BENCHMARKS and "task" not in keywords
+}
+WITHOUT_TASK["per second"] = ("circle", {"reward_per": "second", "privileged": True})
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    "keywords",
-    [
-        {"observation": "noisy", "start": "mixed"},
-        {"sensors": "rtk", "innovations": True, "truncate_when_diverged": True},
-        {"observation": "measurements", "privileged": True, "reward_per": "second"},
-        {"sensors": "consumer", "randomization": {"mass": quad_gym.Uniform(0.5, 1.0)}},
-        {"faults": "rotor_loss", "include_std": True, "filter_start": "warm"},
-    ],
-    ids=lambda keywords: "+".join(keywords),
-)
-def test_task_without_changes_with_options_changes_no_flight(keywords, mode):
+@pytest.mark.parametrize("name", WITHOUT_TASK)
+def test_task_without_changes_changes_no_flight(name, mode):
+    base, keywords = WITHOUT_TASK[name]
     made = {"autoreset_mode": mode, **SHORT, **keywords}
-    plain = fly(vec_env("circle", **made), range(5))
-    for own in (Empty(), None if "reward_per" in keywords else Same()):
-        assert_same(fly(vec_env("circle", task=own, **made), range(5)), plain)
+    plain = fly(vec_env(base, 5, **made), range(5))
+    repeats = () if "observation" in keywords else (Repeated(),)
+    for own in (Empty(), *(() if name == "per second" else (Same(), *repeats))):
+        env = vec_env(base, 5, task=own, **made)
+        assert_same(fly(env, range(5)), plain, type(own).__name__)
 
 
 def test_endings_have_their_reasons():
