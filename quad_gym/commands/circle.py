@@ -109,13 +109,7 @@ class Setup:
 
 
 def configure(args: CircleArgs) -> Setup:
-    """Check all options before the flights.
-
-    Raises:
-        ValueError: If an option is invalid.
-        OSError: If the output folder is not writable.
-        ImportError: If matplotlib or tqdm is missing.
-    """
+    """Check all options before the flights."""
     require_at_least(args, episodes=1, seed=0, threads=1)
     if args.camera_rate is not None and not args.camera:
         raise ValueError("--camera-rate has no effect with --no-camera")

@@ -87,13 +87,7 @@ class CompareArgs:
 
 
 def configure(args: CompareArgs) -> Comparison:
-    """Check all options before training.
-
-    Raises:
-        ValueError: If an option is invalid, or the folder contains another comparison.
-        OSError: If the folder is not writable.
-        ImportError: If a package is missing.
-    """
+    """Check all options before training."""
     plots.require_matplotlib()
     args = with_full_id(args, TRACKING)
     require_at_least(args, seeds=1, episodes=2, seed=0, jobs=1)

@@ -84,13 +84,7 @@ Pairing = tuple[str, str]
 
 
 def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:
-    """Check all options, and make every policy with its environment.
-
-    Raises:
-        ValueError: If an option is invalid or a policy does not fit.
-        OSError: If the folder is not writable.
-        ImportError: If a package is missing.
-    """
+    """Check all options, and make every policy with its environment."""
     args = with_full_id(args)
     require_at_least(args, episodes=1, seed=0, threads=1)
     if not args.observation:
@@ -121,11 +115,7 @@ def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Pa
 
 
 def default_policies(args: EvaluateArgs) -> tuple[str, ...]:
-    """Tuned PD control, and the included policy if there is one that fits.
-
-    Raises:
-        ValueError: If an option is invalid.
-    """
+    """Tuned PD control, and the included policy if there is one that fits."""
     load_policy("pd", make_flights(args, args.observation[0], 1, "pd"))
     try:
         load_policy("pretrained", make_flights(args, args.observation[0], 1, "pretrained"))

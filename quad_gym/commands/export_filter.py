@@ -29,22 +29,6 @@ class ExportFilterArgs:
     """replace an existing file"""
 
 
-def configure(args: ExportFilterArgs) -> Path:
-    """Check the options, and create the folder.
-
-    Returns:
-        File to write.
-
-    Raises:
-        ValueError: If options contradict each other, or the file exists.
-        OSError: If the folder is not writable.
-    """
-    from quad_gym.params.suites import suite_label
-
-    name = f"filter_{suite_label(args.sensors)}"
-    return writable_file(args.output, name, _SUFFIXES[args.to], args.overwrite)
-
-
 def export(args: ExportFilterArgs, file: Path) -> str:
     """Write the parameters of a filter; return a message for the user."""
     from baselines.exporting.filter_numbers import filter_header, filter_json
@@ -58,7 +42,10 @@ def export(args: ExportFilterArgs, file: Path) -> str:
 
 def main(args: ExportFilterArgs) -> None:
     """Export a filter."""
+    from quad_gym.params.suites import suite_label
+
     with usage_errors():
-        file = configure(args)
+        name = f"filter_{suite_label(args.sensors)}"
+        file = writable_file(args.output, name, _SUFFIXES[args.to], args.overwrite)
         message = export(args, file)
     print(f"Wrote {file}. {message}")

@@ -60,19 +60,6 @@ class ExportPolicyArgs:
     """replace an existing file"""
 
 
-def configure(args: ExportPolicyArgs) -> Path:
-    """Check the options that do not depend on the policy, and create the folder.
-
-    Returns:
-        File to write.
-
-    Raises:
-        ValueError: If options contradict each other, or the file exists.
-        OSError: If the folder is not writable.
-    """
-    return writable_file(args.output, _name(args), _SUFFIXES[args.to], args.overwrite)
-
-
 def _name(args: ExportPolicyArgs) -> str:
     """Default name of the file, without extension."""
     from quad_gym import IDS
@@ -109,6 +96,6 @@ def export(args: ExportPolicyArgs, file: Path) -> str:
 def main(args: ExportPolicyArgs) -> None:
     """Export a policy."""
     with usage_errors():
-        file = configure(args)
+        file = writable_file(args.output, _name(args), _SUFFIXES[args.to], args.overwrite)
         message = export(args, file)
     print(f"Wrote {file}. {message}")

@@ -125,12 +125,7 @@ class Switches:
 
 
 def check_options(args: FlyArgs) -> None:
-    """Check the options before the flight.
-
-    Raises:
-        ValueError: If an option is invalid.
-        ImportError: If a library for drawing or writing is not installed.
-    """
+    """Check the options before the flight."""
     args = with_full_id(args)
     require_at_least(args, seed=0)
     for name in ("speed", "fps"):
@@ -157,11 +152,7 @@ def check_options(args: FlyArgs) -> None:
 
 
 def faults_of_args(args: FlyArgs) -> tuple[Fault, ...]:
-    """Faults, at their default times or at `--fault-time`.
-
-    Raises:
-        ValueError: If a fault is unknown, or concerns a sensor that the suite does not have.
-    """
+    """Faults, at their default times or at `--fault-time`."""
     sensors = sensor_suite(sensors_of(args.env_id, args.sensors))
     faults = faults_of(args.faults, sensors if args.camera else sensors.replace(camera=None))
     if args.fault_time is None:
@@ -171,21 +162,13 @@ def faults_of_args(args: FlyArgs) -> tuple[Fault, ...]:
 
 
 def suite_of(args: FlyArgs) -> SensorSuite:
-    """Sensor suite with the rates selected by options.
-
-    Raises:
-        ValueError: If a rate is invalid, or given for a sensor that the suite does not have.
-    """
+    """Sensor suite with the rates selected by options."""
     suite = sensor_suite(sensors_of(args.env_id, args.sensors))
     return suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate)
 
 
 def make_env(args: FlyArgs) -> Any:
-    """Make an environment with one flight.
-
-    Raises:
-        ValueError: If an option is invalid.
-    """
+    """Make an environment with one flight."""
     args = with_full_id(args)
     options = ("observation", "action", "sensors", "camera", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
@@ -261,11 +244,7 @@ def watch(flights: Iterator[Flight], args: FlyArgs, window: Window, switches: Sw
 
 
 def open_window(args: FlyArgs) -> Window:
-    """Open a window.
-
-    Raises:
-        OSError: If there is no display.
-    """
+    """Open a window."""
     try:
         return Window(args.size, f"quad_gym: {IDS[args.env_id]}")
     except RuntimeError as error:

@@ -90,11 +90,7 @@ class StudyArgs:
 
 
 def studied(args: StudyArgs) -> StudiedTask:
-    """Definition of the task, with the options that change it.
-
-    Raises:
-        ValueError: If there are no studies of it, or an option does not belong to it.
-    """
+    """Definition of the task, with the options that change it."""
     args = with_full_id(args, STUDIED_IDS)
     about = STUDIED[IDS[args.env_id]]
     if args.success_within is None:
@@ -107,11 +103,7 @@ def studied(args: StudyArgs) -> StudiedTask:
 
 
 def arms_of(args: StudyArgs) -> tuple[Arm, ...]:
-    """Arms of the study, in the order of their file.
-
-    Raises:
-        ValueError: If there is no such file or arm.
-    """
+    """Arms of the study, in the order of their file."""
     about = studied(args)
     if args.arms_file is None:
         return chosen_arms(about.arms, args.arms or about.carrying)
@@ -120,13 +112,7 @@ def arms_of(args: StudyArgs) -> tuple[Arm, ...]:
 
 
 def configure(args: StudyArgs) -> Study:
-    """Check all options before training.
-
-    Raises:
-        ValueError: If an option is invalid, or the folder contains another study.
-        OSError: If the folder is not writable.
-        ImportError: If matplotlib is missing, or a library that a film needs.
-    """
+    """Check all options before training."""
     plots.require_matplotlib()
     args = with_full_id(args, STUDIED_IDS)
     require_at_least(args, seeds=1, episodes=2, seed=0, first_episode=0, threads=1)

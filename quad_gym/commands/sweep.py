@@ -91,13 +91,7 @@ class SweepArgs:
 
 
 def configure(args: SweepArgs) -> tuple[list[Training], Path]:
-    """Check all options, and expand them to trainings.
-
-    Raises:
-        ValueError: If an option or the file is invalid, or a folder contains another training.
-        OSError: If the file cannot be read.
-        ImportError: If a package is missing.
-    """
+    """Check all options, and expand them to trainings."""
     require_at_least(args, seeds=1, evaluations=1, episodes=1, jobs=1, threads=1, retries=0)
     given = _given(args, {} if args.file is None else read(args.file))
     leave(given["env"], {"threads": "--threads"})

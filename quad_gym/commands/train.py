@@ -71,13 +71,7 @@ class TrainArgs:
 
 
 def configure(args: TrainArgs) -> tuple[Any, Path]:
-    """Check all options before training.
-
-    Raises:
-        ValueError: If an option is invalid.
-        OSError: If the folder is not writable.
-        ImportError: If Stable-Baselines3 is missing.
-    """
+    """Check all options before training."""
     from baselines.plans import Plan
     from baselines.recipes import recipe
     from baselines.training import require_model, run_in

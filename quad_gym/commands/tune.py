@@ -196,12 +196,7 @@ def make_envs(args: TuneArgs, episodes: int) -> dict[str, Any]:
 
 
 def configure(args: TuneArgs) -> Search:
-    """Check all options before anything flies.
-
-    Raises:
-        ValueError: If an option is invalid.
-        OSError: If nothing can be written to the folder.
-    """
+    """Check all options before anything flies."""
     for env_id in args.env_ids:
         known_id("--env-ids", env_id, TRACKING)
     require_at_least(args, candidates=1, episodes=1, fresh_episodes=2, seed=0, threads=1)

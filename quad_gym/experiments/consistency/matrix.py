@@ -22,7 +22,7 @@ from quad_gym.experiments.consistency.cases import (
     markdown,
     remark,
 )
-from quad_gym.faults.presets import PRESETS, faults_of
+from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.distributions import Uniform
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
@@ -121,9 +121,7 @@ def _conditions(name: str) -> Iterator[dict[str, Any]]:
     for fault, parts in PRESETS.items():
         if not parts or any(getattr(part, "duration", math.inf) == math.inf for part in parts):
             continue  # it does not end
-        try:
-            faults_of(fault, suite)
-        except ValueError:  # the suite lacks its sensor
+        if not possible(fault, suite):
             continue
         corrupted = "corrupted measurements" if fault == "gnss_jump" else ""
         yield {"condition": fault, "wrong": corrupted, "faults": fault}
