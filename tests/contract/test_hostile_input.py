@@ -121,13 +121,6 @@ def test_keywords_of_environments(interface, name):
         assert_refused_or_flown(lambda v: INTERFACES[interface](task, **{name: v}), name, value)
 
 
-@pytest.mark.parametrize("interface", INTERFACES)
-def test_a_keyword_that_there_is_not(interface):
-    for value in OTHERS:
-        with pytest.raises(TypeError, match="colour is not a keyword"):
-            INTERFACES[interface]("Hover", colour=value)
-
-
 @pytest.mark.parametrize("name", ["position", "velocity", "yaw", "seed", "options", "colour"])
 def test_arguments_of_reset(name):
     env = quad_gym.QuadEnv("hover")

@@ -349,21 +349,6 @@ def test_a_start_that_the_caller_gives_stays():
     np.testing.assert_array_equal(batch.record("r"), [[0.5, 0.6, 0.7]] * 3)
 
 
-def test_a_snapshot_keeps_what_was_drawn():
-    keywords = {"world": WORLD, "randomization": {"mass": Uniform(0.6, 0.9)}}
-    batch = flown(20, range(11), **keywords)
-    instant, mass = batch.snapshot(), batch.read("mass")
-    for _ in range(20):
-        batch.step()
-    future = batch.snapshot()
-    fresh = flown(1, range(50, 61), **keywords)
-    fresh.restore(instant)
-    np.testing.assert_array_equal(fresh.read("mass"), mass)
-    for _ in range(20):
-        fresh.step()
-    assert fresh.snapshot().tobytes() == future.tobytes()
-
-
 def test_parameter_record_begins_with_the_columns_of_draws():
     record = params_record(LAB, SUITE, world=WORLD)
     columns = record.view(np.float64)[:PARAMETERS_DRAWN]
