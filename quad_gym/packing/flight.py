@@ -125,9 +125,9 @@ def pack_tick(p: Any, sensors: SensorSuite, dt: float) -> None:
         dt: Duration of the prediction [s]; of a tick, in flights.
     """
     imu, fewer = sensors.imu, math.sqrt(sensors.imu.dt / dt)
-    p["dt"], p["accel_error_noise"] = dt, imu.believed_accel_error * fewer
+    p["dt"], p["accel_error_noise"] = dt, imu.accel_error_noise * fewer
     for sensor in ("accel", "gyro"):
-        p[f"{sensor}_noise"] = getattr(imu, f"believed_{sensor}_sigma") * fewer
+        p[f"{sensor}_noise"] = getattr(imu, f"{sensor}_noise") * fewer
         # the vibration is given for rotors in hover, whose specific force is g
         p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / p["gravity"] * fewer
         error = SlowError(getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau"))
@@ -151,13 +151,12 @@ def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
     if gnss is not None and gnss.has_baseline:
         p["baseline"], p["baseline_length"] = gnss.baseline_B, portable.norm(gnss.baseline_B)
         p["first_baseline_sigma"] = gnss.first_baseline_sigma
-        p["baseline_noise"] = gnss.believed_baseline_sigma
+        p["baseline_noise"] = gnss.baseline_noise
     else:  # with GNSS a vertical one, which does not observe the heading either
         p["baseline"] = (1.0, 0.0, 0.0) if gnss is None else (0.0, 0.0, 1.0)
         p["baseline_length"] = 1.0
         for name in ("baseline_sigma", "first_baseline_sigma", "baseline_noise"):
             p[name] = pose.heading_sigma
-    p["gnss_sigma"] = p["position_sigma_I"]
     p["secondary_antenna_B"] = p["antenna"] + p["baseline"]
 
 
