@@ -1,11 +1,22 @@
 """Builders of environments, batches and flights for tests."""
 
+import gymnasium
 import numpy as np
 
+import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.flights.record import FlightRecorder
 
+MAKERS = {
+    "make": lambda **keywords: gymnasium.make("QuadGym/Circle-v0", **keywords),
+    "make_vec": lambda **keywords: gymnasium.make_vec("QuadGym/Circle-v0", num_envs=2, **keywords),
+    "make_sb3_vec_env": lambda **keywords: quad_gym.make_sb3_vec_env(
+        "QuadGym/Circle-v0", 2, **keywords
+    ),
+}
+"""Every interface, on the circle."""
 STEPS = 60
 SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 """Episodes end by the time limit and by tipping over, at different steps in different flights."""
@@ -42,6 +53,38 @@ def flown(base="circle", count=5, steps=20, seed=1, **keywords):
     return made
 
 
+def flown_batch(seeds, ticks, **keywords):
+    """A batch of one thread after some steps, with a flight for each seed."""
+    made = FlightBatch(len(seeds), **{"threads": 1, **keywords})
+    made.reset(seeds=seeds)
+    for _ in range(ticks):
+        made.step()
+    return made
+
+
+def recorded_flight(task="circle", steps=12, seed=2, **keywords):
+    """(environment, its recorded flight, observations of each row), with random actions."""
+    env = QuadEnv(task, **keywords)
+    recorder = FlightRecorder(env.flights.batch, about={"seed": seed})
+    observations = [env.reset(seed=seed)[0]]
+    recorder.keep()
+    for action in np.random.default_rng(seed).uniform(-0.3, 0.3, (steps, 4)):
+        observations.append(env.step(action)[0])
+        recorder.keep()
+    return env, recorder.flight, np.array(observations)
+
+
+def put(flights, **fields):
+    """Set fields of all flights of a batch."""
+    snapshot = flights.snapshot()
+    for name, values in fields.items():
+        lanes = np.zeros((len(snapshot) * snapshot[name].shape[-1], *np.shape(values)[1:]))
+        lanes[: flights.count] = values
+        blocks = lanes.reshape(len(snapshot), -1, *lanes.shape[1:])
+        snapshot[name] = np.moveaxis(blocks, 1, -1)
+    flights.restore(snapshot)
+
+
 def part(env, observations, name):
     """One part of observations, by its name in the table."""
     field = next(f for f in env.unwrapped.flights.table if f.name == name)
@@ -60,38 +103,27 @@ def actions_for(flights, steps=STEPS):
     return np.stack([actions_of(flight, steps) for flight in flights], axis=1)
 
 
+def flat(observation):
+    """An observation; of a dictionary, both parts side by side."""
+    if isinstance(observation, dict):
+        return np.concatenate(list(observation.values()), axis=-1)
+    return observation
+
+
 def _columns(rows):
-    """Columns of rows; both parts of observations that are dictionaries, side by side."""
+    """Columns of rows."""
     observations, *others = zip(*rows, strict=True)
-    if isinstance(observations[0], dict):
-        observations = [np.concatenate(list(o.values()), axis=-1) for o in observations]
-    return tuple(np.array(column) for column in (observations, *others))
-
-
-def alone(base, flight, *, wait, **keywords):
-    """Fly a flight by itself: observations, rewards, terminated, truncated, (steps, ...) each.
-
-    With `wait` a new episode takes a step to begin, else it begins in the step that ends the last.
-    """
-    env = QuadEnv(base=base, **SHORT, **keywords)
-    rows, over = [(env.reset(seed=1000 + flight)[0], 0.0, False, False)], False
-    for action in actions_of(flight):
-        if over:
-            rows.append((env.reset()[0], 0.0, False, False))
-            over = False
-            continue
-        observation, reward, terminated, truncated, _ = env.step(action)
-        over = terminated or truncated
-        if over and not wait:
-            observation, over = env.reset()[0], False
-        rows.append((observation, reward, terminated, truncated))
-    return _columns(rows)
+    return tuple(np.array(column) for column in (list(map(flat, observations)), *others))
 
 
 def together(base, flights, *, mode="NextStep", threads=1, **keywords):
-    """Fly several flights in one batch: the same columns as `alone`, (steps, n, ...) each."""
+    """Fly several flights in one batch: observations, rewards, terminated, truncated.
+
+    Arrays of all steps, (steps, n, ...) each.
+    """
     count = len(flights)
-    env = QuadVectorEnv(count, base=base, autoreset_mode=mode, threads=threads, **SHORT, **keywords)
+    made = {**SHORT, "base": base, "autoreset_mode": mode, **keywords}
+    env = QuadVectorEnv(count, threads=threads, **made)
     observation, _ = env.reset(seed=[1000 + flight for flight in flights])
     rows = [(observation, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool))]
     rows += [env.step(action)[:4] for action in actions_for(flights)]

@@ -9,7 +9,10 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+import pytest
+
 from quad_gym.commands.main import main
+from tests.console import plain
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -42,3 +45,11 @@ def run(command, *options, where=None):
                 print(end.code, file=err)
             code = 0 if end.code is None else end.code if isinstance(end.code, int) else 1
     return Ended(code, out.getvalue(), err.getvalue())
+
+
+def refused(words, capsys):
+    """The message of a command line that ends with a usage error."""
+    with pytest.raises(SystemExit) as end:
+        main(words.split() if isinstance(words, str) else words)
+    assert end.value.code == 2
+    return plain(capsys.readouterr().err)

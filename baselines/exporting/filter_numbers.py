@@ -22,7 +22,7 @@ _FIELDS = {
         *("accel_bias_decay", "gyro_bias_decay", "accel_bias_drive", "gyro_bias_drive"),
         *("accel_bias_sigma", "gyro_bias_sigma"),
         *("imu_lever_arm", "sigma_spread", "sigma_beta", "sigma_kappa", "direction_floor"),
-        *("gnss_sigma", "heading_sigma", "R_IG", "antenna", "velocity_sigma"),
+        *("position_sigma_I", "heading_sigma", "R_IG", "antenna", "velocity_sigma"),
         *("initial_velocity_variance", "initial_covariance_scale", "initial_tilt_sigma"),
         *("gate_position", "gate_direction", "gate_uncertainty", "max_rejections"),
     ),

@@ -8,6 +8,7 @@ import numpy as np
 
 import quad_gym
 from baselines.exporting.controller import Controller
+from quad_gym.params import checks as check
 
 OPSET = 17
 """Version of the operator set, old enough for runtimes on companion computers."""
@@ -29,7 +30,7 @@ def onnx_model(controller: Controller) -> Any:
     Raises:
         ImportError: If onnx is missing.
     """
-    onnx = _require("onnx")
+    onnx = check.package("onnx", "ONNX", "export")
     from onnx import TensorProto, helper, numpy_helper
 
     low, high = controller.bounds
@@ -85,7 +86,7 @@ def save_onnx(controller: Controller, file: Path) -> float:
         RuntimeError: If the actions of model and policy differ.
     """
     content = onnx_model(controller).SerializeToString()
-    runtime = _require("onnxruntime")
+    runtime = check.package("onnxruntime", "ONNX", "export")
     session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
     seen = controller.samples(1000, np.random.default_rng(0))
     (found,) = session.run(None, {"observation": seen})
@@ -114,12 +115,3 @@ def _metadata(controller: Controller) -> dict[str, Any]:
         ],
         "action": [field.formula(i) for i, field in enumerate(controller.action_fields)],
     }
-
-
-def _require(package: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise ImportError(f'ONNX needs {package}: pip install "quad-gym[export]"') from error

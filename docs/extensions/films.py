@@ -10,7 +10,7 @@ import quad_gym
 from baselines.policies import pretrained_file
 from extensions.environment_pages import FILM
 from quad_gym.commands import fly
-from quad_gym.commands.fly import Args
+from quad_gym.commands.fly import FlyArgs
 
 FOLDER = "generated/films"
 """Inside the sources of the site; Git ignores it."""
@@ -50,7 +50,7 @@ def write_films(app: Sphinx) -> None:
         quad_gym.IDS.items(), "filming... ", "brown", len(quad_gym.IDS)
     ):
         film = folder / f"{kind}.webp"
-        options = Args(
+        options = FlyArgs(
             env_id=env_id, policy=policy_of(env_id), size=SIZE, speed=SPEED, fps=RATE, output=film
         )
         fly.main(options)

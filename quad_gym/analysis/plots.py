@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.params import checks as check
+
 BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 """Colors of the path flown, of the heading, and of further curves."""
 INK, GREY, PALE = "#222222", "#767676", "#DDDDDD"
@@ -98,17 +100,8 @@ class Band:
 
 
 def require_matplotlib() -> None:
-    """Check that matplotlib is installed.
-
-    Raises:
-        ImportError: If matplotlib is missing; the message explains how to install it.
-    """
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        raise ImportError(
-            'Figures need matplotlib, which is not installed: pip install "quad-gym[plot]"'
-        ) from None
+    """Check that matplotlib is installed, or raise an ImportError."""
+    check.package("matplotlib.figure", "A figure", "plot")
 
 
 @contextmanager

@@ -211,7 +211,7 @@ QUANTITIES = {
     "estimated_gyro_bias": Quantity("b_g_hat", (3,), "rad/s", "B", "the filter's estimate of `gyro_bias`", filtered=True),
     "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "the filter's estimate of `gnss_drift`", filtered=True),
     "filter_status": Quantity("filter_status", (), "bits", "-", "numerical failures of the filter so far, see `FilterStatus`", int),
-    "filter_diverged": Quantity("diverged", (), "-", "-", "the covariance does not explain the last innovations", bool),
+    "filter_diverged": Quantity("diverged", (), "-", "-", "the filter flags itself as diverged: the covariance does not explain the last innovations (filters with an innovation gate, or with `faults`, `truncate_when_diverged` or `innovations`)", bool),
     "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update", filtered=True),
     "nis_dimension": Quantity("nis_dimension", (), "-", "-", "measurements in the last update", int, filtered=True),
     # the state that the controller observes: the truth, the estimate, or the truth with noise
@@ -247,8 +247,8 @@ QUANTITIES = {
     "position_error": Quantity("position_error", (), "m", "-", "distance of the true position from the reference"),
     "estimation_error": Quantity("estimation_error", (), "m", "-", "distance of the observed from the true position"),
     # the surroundings
-    "features": Quantity(_features, ("features", 3), "m", "I", "features of the camera, where the filter assumes them"),
-    "obstacles": Quantity(_obstacles, ("obstacles", 3), "m", "I", "centers of the world's obstacles"),
+    "features": Quantity(_features, ("features", 3), "m", "I", "features of the camera, in the filter's map of this episode"),
+    "obstacles": Quantity(_obstacles, ("obstacles", 3), "m", "I", "centers of the world's obstacles in this episode, in the order given"),
     "obstacle_distance": Quantity(_obstacle_distance, (), "m", "-", "from the nearest obstacle's surface, negative inside, infinite without obstacles"),
     "on_ground": Quantity("footing", (), "-", "-", "the ground pushes a foot, in a world whose ground carries vehicles", bool),
 }

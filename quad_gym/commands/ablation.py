@@ -30,7 +30,7 @@ from quad_gym.experiments.consistency.cases import CaseFlights
 
 
 @dataclass(frozen=True)
-class Args:
+class AblationArgs:
     """Options of the tables."""
 
     table: Positional[Literal["models", "filters"]] = "models"
@@ -56,7 +56,7 @@ class Args:
             raise ValueError(f"--duration must be at least {least:g} s, got {self.duration:g}")
 
 
-def main(args: Args) -> None:
+def main(args: AblationArgs) -> None:
     """Fly all cases, and print and write the table."""
     with usage_errors():
         cases = cases_of(args.table, sensor_suite(args.sensors), args.filter_start)

@@ -40,7 +40,7 @@ ALONE = ("compile", "learning")
 
 
 @dataclass(frozen=True)
-class Args:
+class BenchmarkArgs:
     """Options of the benchmark."""
 
     only: Literal[
@@ -106,13 +106,13 @@ SECTIONS = {
 }
 
 
-def chosen_sections(args: Args) -> list[str]:
+def chosen_sections(args: BenchmarkArgs) -> list[str]:
     """Names of the sections to run."""
     whole = [name for name in SECTIONS if name not in ALONE]
     return whole if args.only == "all" else [args.only]
 
 
-def main(args: Args) -> None:
+def main(args: BenchmarkArgs) -> None:
     """Run the chosen sections."""
     with usage_errors():
         require_writable("--output", args.output)

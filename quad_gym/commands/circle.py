@@ -51,7 +51,7 @@ NEES_TAIL = 0.001  # probability that the NEES of a consistent filter exceeds th
 
 
 @dataclass(frozen=True)
-class Args:
+class CircleArgs:
     """Options of the experiment."""
 
     episodes: int = 1000
@@ -108,14 +108,8 @@ class Setup:
     output: Path
 
 
-def configure(args: Args) -> Setup:
-    """Check all options before the flights.
-
-    Raises:
-        ValueError: If an option is invalid.
-        OSError: If the output folder is not writable.
-        ImportError: If matplotlib or tqdm is missing.
-    """
+def configure(args: CircleArgs) -> Setup:
+    """Check all options before the flights."""
     require_at_least(args, episodes=1, seed=0, threads=1)
     if args.camera_rate is not None and not args.camera:
         raise ValueError("--camera-rate has no effect with --no-camera")
@@ -242,7 +236,7 @@ def consistency_table(results: dict[str, Recording]) -> str:
     )
 
 
-def in_words(results: dict[str, Recording], args: Args) -> str:
+def in_words(results: dict[str, Recording], args: CircleArgs) -> str:
     """Describe the effects of flying on the estimate, and of the camera."""
     seen = ESTIMATE if args.camera else NO_CAMERA
     sentences = [in_a_sentence("Flying on the estimate", compare(results, seen, TRUTH))]
@@ -336,7 +330,7 @@ def write_numbers(results: dict[str, Recording], setup: Setup) -> Path:
 
 
 def summary_of(
-    results: dict[str, Recording], setup: Setup, args: Args, seconds: float
+    results: dict[str, Recording], setup: Setup, args: CircleArgs, seconds: float
 ) -> dict[str, Any]:
     """Summary of all results and the configuration."""
     cases: dict[str, dict[str, Any]] = {}
@@ -372,7 +366,7 @@ def summary_of(
     }
 
 
-def main(args: Args) -> None:
+def main(args: CircleArgs) -> None:
     """Run the experiment."""
     with usage_errors():
         setup = configure(args)

@@ -55,7 +55,7 @@ SOURCES: tuple[Source, ...] = ("truth", "noisy", "estimate")
 
 
 @dataclass(frozen=True)
-class Args:
+class CompareArgs:
     """Options of the comparison."""
 
     env_id: TrackingId = "QuadGym/Circle-v0"
@@ -86,14 +86,8 @@ class Args:
     """folder; if not given, results/compare/TASK (with --quick, .../TASK_quick)"""
 
 
-def configure(args: Args) -> Comparison:
-    """Check all options before training.
-
-    Raises:
-        ValueError: If an option is invalid, or the folder contains another comparison.
-        OSError: If the folder is not writable.
-        ImportError: If a package is missing.
-    """
+def configure(args: CompareArgs) -> Comparison:
+    """Check all options before training."""
     plots.require_matplotlib()
     args = with_full_id(args, TRACKING)
     require_at_least(args, seeds=1, episodes=2, seed=0, jobs=1)
@@ -126,7 +120,7 @@ def configure(args: Args) -> Comparison:
     return comparison
 
 
-def main(args: Args) -> int:
+def main(args: CompareArgs) -> int:
     """Compare."""
     began = time.perf_counter()
     with usage_errors():

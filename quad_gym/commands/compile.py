@@ -28,7 +28,7 @@ Kind = Literal["plain", "truth", "single", "all"]
 
 
 @dataclass(frozen=True)
-class Args:
+class CompileArgs:
     """Options of the compilation."""
 
     stages: tuple[Kind, ...] = ("all",)
@@ -67,7 +67,7 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def main(args: Args) -> int:
+def main(args: CompileArgs) -> int:
     """Compile, and list on stdout the functions compiled and found in the cache.
 
     Returns:

@@ -14,14 +14,14 @@ import tyro
 
 
 @dataclass(frozen=True)
-class Args:
+class CompletionArgs:
     """Option of the script."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh"]]
     """name of the shell"""
 
 
-def main(args: Args) -> int:
+def main(args: CompletionArgs) -> int:
     """Print the script."""
     from quad_gym.commands import main as program
 

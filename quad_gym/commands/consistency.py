@@ -53,7 +53,7 @@ from quad_gym.records import Source
 
 
 @dataclass(frozen=True)
-class Args:
+class ConsistencyArgs:
     """Options of the experiment."""
 
     env_id: TrackingId = "QuadGym/RandomTrajectory-v0"
@@ -154,7 +154,7 @@ class Args:
         return self.output
 
 
-def suite_of(args: Args) -> SensorSuite:
+def suite_of(args: ConsistencyArgs) -> SensorSuite:
     """Sensor suite of the options."""
     suite = sensor_suite(args.sensors)
     if not args.camera:
@@ -176,7 +176,7 @@ def suite_of(args: Args) -> SensorSuite:
     return suite.with_rates(imu=args.imu_rate, gnss=args.gnss_rate, camera=camera_rate)
 
 
-def case_of(args: Args) -> Case:
+def case_of(args: ConsistencyArgs) -> Case:
     """Configuration of the options."""
     suite, vehicle = suite_of(args), vehicle_params("lab")
     keywords: dict[str, Any] = {
@@ -194,7 +194,7 @@ def case_of(args: Args) -> Case:
     return Case(title_of(suite, args), suite, IDS[args.env_id], start, keywords)
 
 
-def title_of(suite: SensorSuite, args: Args) -> str:
+def title_of(suite: SensorSuite, args: ConsistencyArgs) -> str:
     """Title of the report and of the figures."""
     choices = suite.estimator
     parts = [
@@ -208,7 +208,7 @@ def title_of(suite: SensorSuite, args: Args) -> str:
     return ", ".join(parts)
 
 
-def main(args: Args) -> None:
+def main(args: ConsistencyArgs) -> None:
     """Run the experiment."""
     if args.matrix or args.recovery:
         fly_table(args)
@@ -229,7 +229,7 @@ def main(args: Args) -> None:
     )
 
 
-def fly_table(args: Args) -> None:
+def fly_table(args: ConsistencyArgs) -> None:
     """Fly the cases of a table, and print where it is."""
     with usage_errors():
         require_writable("--output", args.folder)

@@ -51,7 +51,7 @@ from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 
 
 @dataclass(frozen=True)
-class Args:
+class EvaluateArgs:
     """Options of the evaluation."""
 
     env_id: EnvId = "QuadGym/Circle-v0"
@@ -83,14 +83,8 @@ Pairing = tuple[str, str]
 """A policy and an observation."""
 
 
-def configure(args: Args) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:
-    """Check all options, and make every policy with its environment.
-
-    Raises:
-        ValueError: If an option is invalid or a policy does not fit.
-        OSError: If the folder is not writable.
-        ImportError: If a package is missing.
-    """
+def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:
+    """Check all options, and make every policy with its environment."""
     args = with_full_id(args)
     require_at_least(args, episodes=1, seed=0, threads=1)
     if not args.observation:
@@ -120,12 +114,8 @@ def configure(args: Args) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:
     return cases, folder
 
 
-def default_policies(args: Args) -> tuple[str, ...]:
-    """Tuned PD control, and the included policy if there is one that fits.
-
-    Raises:
-        ValueError: If an option is invalid.
-    """
+def default_policies(args: EvaluateArgs) -> tuple[str, ...]:
+    """Tuned PD control, and the included policy if there is one that fits."""
     load_policy("pd", make_flights(args, args.observation[0], 1, "pd"))
     try:
         load_policy("pretrained", make_flights(args, args.observation[0], 1, "pretrained"))
@@ -135,7 +125,7 @@ def default_policies(args: Args) -> tuple[str, ...]:
     return ("pd", "pretrained")
 
 
-def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
+def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) -> Any:
     """Make the environment with an observation, for a policy."""
     names = ("observation", "sensors", "threads")
     given = leave(args.env, {name: f"--{name}" for name in names})
@@ -150,7 +140,9 @@ def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
     )
 
 
-def write_videos(cases: dict[Pairing, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
+def write_videos(
+    cases: dict[Pairing, tuple[Policy, Any]], args: EvaluateArgs, folder: Path
+) -> list[Path]:
     """Write a video of the first episode of each case."""
     from tqdm import tqdm
 
@@ -211,7 +203,10 @@ def _rate(happened: Any) -> str:
 
 
 def write(
-    results: dict[Pairing, Episodes], tracers: dict[Pairing, Tracer], args: Args, folder: Path
+    results: dict[Pairing, Episodes],
+    tracers: dict[Pairing, Tracer],
+    args: EvaluateArgs,
+    folder: Path,
 ) -> list[Path]:
     """Write numbers and figures; return the files."""
     tables = (
@@ -249,7 +244,7 @@ def write(
     return written
 
 
-def main(args: Args) -> None:
+def main(args: EvaluateArgs) -> None:
     """Evaluate."""
     from tqdm import tqdm
 

@@ -17,7 +17,7 @@ _SUFFIXES = {"json": ".json", "header": ".h"}
 
 
 @dataclass(frozen=True)
-class Args:
+class ExportFilterArgs:
     """Options of the export."""
 
     sensors: SuiteName = "standard"
@@ -29,23 +29,7 @@ class Args:
     """replace an existing file"""
 
 
-def configure(args: Args) -> Path:
-    """Check the options, and create the folder.
-
-    Returns:
-        File to write.
-
-    Raises:
-        ValueError: If options contradict each other, or the file exists.
-        OSError: If the folder is not writable.
-    """
-    from quad_gym.params.suites import suite_label
-
-    name = f"filter_{suite_label(args.sensors)}"
-    return writable_file(args.output, name, _SUFFIXES[args.to], args.overwrite)
-
-
-def export(args: Args, file: Path) -> str:
+def export(args: ExportFilterArgs, file: Path) -> str:
     """Write the parameters of a filter; return a message for the user."""
     from baselines.exporting.filter_numbers import filter_header, filter_json
     from quad_gym.params.suites import sensor_suite, suite_label
@@ -56,9 +40,12 @@ def export(args: Args, file: Path) -> str:
     return f'Parameters of the {suite.estimator.kind.upper()} of the suite "{args.sensors}".'
 
 
-def main(args: Args) -> None:
+def main(args: ExportFilterArgs) -> None:
     """Export a filter."""
+    from quad_gym.params.suites import suite_label
+
     with usage_errors():
-        file = configure(args)
+        name = f"filter_{suite_label(args.sensors)}"
+        file = writable_file(args.output, name, _SUFFIXES[args.to], args.overwrite)
         message = export(args, file)
     print(f"Wrote {file}. {message}")

@@ -28,7 +28,7 @@ _C_KEYWORDS = re.compile(
 
 
 @dataclass(frozen=True)
-class Args:
+class ExportPolicyArgs:
     """Options of the export."""
 
     policy: tyro.conf.Positional[
@@ -60,20 +60,7 @@ class Args:
     """replace an existing file"""
 
 
-def configure(args: Args) -> Path:
-    """Check the options that do not depend on the policy, and create the folder.
-
-    Returns:
-        File to write.
-
-    Raises:
-        ValueError: If options contradict each other, or the file exists.
-        OSError: If the folder is not writable.
-    """
-    return writable_file(args.output, _name(args), _SUFFIXES[args.to], args.overwrite)
-
-
-def _name(args: Args) -> str:
+def _name(args: ExportPolicyArgs) -> str:
     """Default name of the file, without extension."""
     from quad_gym import IDS
 
@@ -89,7 +76,7 @@ def function_name(file: Path) -> str:
     return name if name[:1].isalpha() and not _C_KEYWORDS.fullmatch(name) else f"policy_{name}"
 
 
-def export(args: Args, file: Path) -> str:
+def export(args: ExportPolicyArgs, file: Path) -> str:
     """Write a policy; return a message for the user."""
     from baselines.exporting import c_source, controller_of, save_onnx
 
@@ -106,9 +93,9 @@ def export(args: Args, file: Path) -> str:
     )
 
 
-def main(args: Args) -> None:
+def main(args: ExportPolicyArgs) -> None:
     """Export a policy."""
     with usage_errors():
-        file = configure(args)
+        file = writable_file(args.output, _name(args), _SUFFIXES[args.to], args.overwrite)
         message = export(args, file)
     print(f"Wrote {file}. {message}")

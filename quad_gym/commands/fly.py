@@ -50,7 +50,7 @@ OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 
 
 @dataclass(frozen=True)
-class Args:
+class FlyArgs:
     """Options of the flight."""
 
     env_id: EnvId = "QuadGym/Circle-v0"
@@ -124,13 +124,8 @@ class Switches:
             self._turn_faults = False
 
 
-def check_options(args: Args) -> None:
-    """Check the options before the flight.
-
-    Raises:
-        ValueError: If an option is invalid.
-        ImportError: If a library for drawing or writing is not installed.
-    """
+def check_options(args: FlyArgs) -> None:
+    """Check the options before the flight."""
     args = with_full_id(args)
     require_at_least(args, seed=0)
     for name in ("speed", "fps"):
@@ -156,12 +151,8 @@ def check_options(args: Args) -> None:
         Renderer(args.view, args.size)
 
 
-def faults_of_args(args: Args) -> tuple[Fault, ...]:
-    """Faults, at their default times or at `--fault-time`.
-
-    Raises:
-        ValueError: If a fault is unknown, or concerns a sensor that the suite does not have.
-    """
+def faults_of_args(args: FlyArgs) -> tuple[Fault, ...]:
+    """Faults, at their default times or at `--fault-time`."""
     sensors = sensor_suite(sensors_of(args.env_id, args.sensors))
     faults = faults_of(args.faults, sensors if args.camera else sensors.replace(camera=None))
     if args.fault_time is None:
@@ -170,22 +161,14 @@ def faults_of_args(args: Args) -> tuple[Fault, ...]:
     return tuple(fault.replace(start=start, duration=end - start, rate=0.0) for fault in faults)
 
 
-def suite_of(args: Args) -> SensorSuite:
-    """Sensor suite with the rates selected by options.
-
-    Raises:
-        ValueError: If a rate is invalid, or given for a sensor that the suite does not have.
-    """
+def suite_of(args: FlyArgs) -> SensorSuite:
+    """Sensor suite with the rates selected by options."""
     suite = sensor_suite(sensors_of(args.env_id, args.sensors))
     return suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate)
 
 
-def make_env(args: Args) -> Any:
-    """Make an environment with one flight.
-
-    Raises:
-        ValueError: If an option is invalid.
-    """
+def make_env(args: FlyArgs) -> Any:
+    """Make an environment with one flight."""
     args = with_full_id(args)
     options = ("observation", "action", "sensors", "camera", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
@@ -231,7 +214,7 @@ def in_words(flight: Flight) -> str:
     return words
 
 
-def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switches) -> bool:
+def watch(flights: Iterator[Flight], args: FlyArgs, window: Window, switches: Switches) -> bool:
     """Show a flight in a window; return True to continue with the next one."""
     renderer, waiting, flight = Renderer(args.view, args.size), math.inf, None
     for flight in flights:
@@ -260,19 +243,15 @@ def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switc
     return True
 
 
-def open_window(args: Args) -> Window:
-    """Open a window.
-
-    Raises:
-        OSError: If there is no display.
-    """
+def open_window(args: FlyArgs) -> Window:
+    """Open a window."""
     try:
         return Window(args.size, f"quad_gym: {IDS[args.env_id]}")
     except RuntimeError as error:
         raise OSError(f"{error}; without a display, --output writes a video instead") from None
 
 
-def write(flight: Flight, path: Path, args: Args) -> list[Path]:
+def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
     """Write the flight to a file, for videos together with its data; return the files."""
     from tqdm import tqdm
 
@@ -303,7 +282,7 @@ def write(flight: Flight, path: Path, args: Args) -> list[Path]:
     return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
 
 
-def main(args: Args) -> None:
+def main(args: FlyArgs) -> None:
     """Fly or replay, and show or write."""
     with usage_errors():
         args = with_full_id(args)

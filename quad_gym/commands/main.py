@@ -3,7 +3,7 @@
 import importlib
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Union, get_type_hints
 
 from tyro.conf import subcommand
 
@@ -70,7 +70,7 @@ def subcommands(words: Sequence[str]) -> Any:
         name = command.split()
         if everything or list(words[: len(name)]) == name:
             module = module_of(command)
-            kind, text = module.Args, module.__doc__
+            kind, text = options_of(module), module.__doc__
         chosen = subcommand(name[-1], constructor=kind, description=text)
         unions.setdefault(name[0], []).append(Annotated[Any, chosen])
     export = subcommand("export", description="export a policy or a filter to an autopilot")
@@ -83,8 +83,13 @@ def _not_called() -> None:
 
 
 def module_of(command: str) -> Any:
-    """Import the module of one of `COMMANDS`, with its `Args` and its `main`."""
+    """Import the module of one of `COMMANDS`, with its options and its `main`."""
     return importlib.import_module(f"quad_gym.commands.{command.replace(' ', '_')}")
+
+
+def options_of(module: Any) -> Any:
+    """Dataclass of a command's options, the argument of its `main`."""
+    return get_type_hints(module.main)["args"]
 
 
 def _interrupted(error: BaseException | None) -> bool:

@@ -53,7 +53,7 @@ QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
 
 
 @dataclass(frozen=True)
-class Args:
+class StudyArgs:
     """Options of the study."""
 
     env_id: Annotated[EnvId, arg(help=one_of(STUDIED_IDS))] = "QuadGym/LookAround-v0"
@@ -89,12 +89,8 @@ class Args:
     """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
 
 
-def studied(args: Args) -> StudiedTask:
-    """Definition of the task, with the options that change it.
-
-    Raises:
-        ValueError: If there are no studies of it, or an option does not belong to it.
-    """
+def studied(args: StudyArgs) -> StudiedTask:
+    """Definition of the task, with the options that change it."""
     args = with_full_id(args, STUDIED_IDS)
     about = STUDIED[IDS[args.env_id]]
     if args.success_within is None:
@@ -106,12 +102,8 @@ def studied(args: Args) -> StudiedTask:
     return replace(about, success=partial(stays, within=within), meaning=meaning)
 
 
-def arms_of(args: Args) -> tuple[Arm, ...]:
-    """Arms of the study, in the order of their file.
-
-    Raises:
-        ValueError: If there is no such file or arm.
-    """
+def arms_of(args: StudyArgs) -> tuple[Arm, ...]:
+    """Arms of the study, in the order of their file."""
     about = studied(args)
     if args.arms_file is None:
         return chosen_arms(about.arms, args.arms or about.carrying)
@@ -119,14 +111,8 @@ def arms_of(args: Args) -> tuple[Arm, ...]:
     return chosen_arms(known, args.arms or [arm.name for arm in known])
 
 
-def configure(args: Args) -> Study:
-    """Check all options before training.
-
-    Raises:
-        ValueError: If an option is invalid, or the folder contains another study.
-        OSError: If the folder is not writable.
-        ImportError: If matplotlib is missing, or a library that a film needs.
-    """
+def configure(args: StudyArgs) -> Study:
+    """Check all options before training."""
     plots.require_matplotlib()
     args = with_full_id(args, STUDIED_IDS)
     require_at_least(args, seeds=1, episodes=2, seed=0, first_episode=0, threads=1)
@@ -152,14 +138,14 @@ def configure(args: Args) -> Study:
     return study
 
 
-def _recipe(args: Args, algorithm: str) -> Recipe:
+def _recipe(args: StudyArgs, algorithm: str) -> Recipe:
     """Recipe of an algorithm, with the options that change it."""
     chosen = recipe(args.env_id, algorithm)
     steps = args.steps or (QUICK_STEPS if args.quick else chosen.steps)
     return chosen.replace(steps=steps, parameters={**chosen.parameters, **args.set})
 
 
-def main(args: Args) -> None:
+def main(args: StudyArgs) -> None:
     """Study."""
     began = time.perf_counter()
     with usage_errors():

@@ -39,7 +39,7 @@ from quad_gym.experiments.sweep_table import FILES, row_of, table_text, write_ta
 
 
 @dataclass(frozen=True)
-class Args:
+class SweepArgs:
     """Options of the sweep; they override the file."""
 
     file: tyro.conf.Positional[
@@ -90,14 +90,8 @@ class Args:
     """show a progress bar, on a terminal"""
 
 
-def configure(args: Args) -> tuple[list[Training], Path]:
-    """Check all options, and expand them to trainings.
-
-    Raises:
-        ValueError: If an option or the file is invalid, or a folder contains another training.
-        OSError: If the file cannot be read.
-        ImportError: If a package is missing.
-    """
+def configure(args: SweepArgs) -> tuple[list[Training], Path]:
+    """Check all options, and expand them to trainings."""
     require_at_least(args, seeds=1, evaluations=1, episodes=1, jobs=1, threads=1, retries=0)
     given = _given(args, {} if args.file is None else read(args.file))
     leave(given["env"], {"threads": "--threads"})
@@ -109,7 +103,7 @@ def configure(args: Args) -> tuple[list[Training], Path]:
     return trainings, folder
 
 
-def _given(args: Args, found: dict[str, Any]) -> dict[str, Any]:
+def _given(args: SweepArgs, found: dict[str, Any]) -> dict[str, Any]:
     """Values of the file, overridden by the options."""
     for name in DEFAULTS:
         value = getattr(args, name)
@@ -133,13 +127,13 @@ def _listed(given: Any) -> Any:
     return given
 
 
-def _arms(given: dict[str, Any], args: Args) -> dict[str, Arm]:
+def _arms(given: dict[str, Any], args: SweepArgs) -> dict[str, Arm]:
     """Arms by name."""
     known = ARMS if args.arms_file is None else read_arms(args.arms_file)
     return {arm.name: arm for arm in chosen_arms(known, given.get("arms", []))}
 
 
-def main(args: Args) -> int:
+def main(args: SweepArgs) -> int:
     """Sweep."""
     with usage_errors():
         trainings, folder = configure(args)

@@ -34,7 +34,7 @@ from quad_gym.commands.options import (
 
 
 @dataclass(frozen=True)
-class Args:
+class TrainArgs:
     """Options of the training."""
 
     env_id: EnvId = "QuadGym/Circle-v0"
@@ -70,14 +70,8 @@ class Args:
     """also write the best policy to this .npz file, which requires only NumPy"""
 
 
-def configure(args: Args) -> tuple[Any, Path]:
-    """Check all options before training.
-
-    Raises:
-        ValueError: If an option is invalid.
-        OSError: If the folder is not writable.
-        ImportError: If Stable-Baselines3 is missing.
-    """
+def configure(args: TrainArgs) -> tuple[Any, Path]:
+    """Check all options before training."""
     from baselines.plans import Plan
     from baselines.recipes import recipe
     from baselines.training import require_model, run_in
@@ -113,7 +107,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     return plan, folder
 
 
-def main(args: Args) -> None:
+def main(args: TrainArgs) -> None:
     """Train."""
     from_start = time.perf_counter()
     with usage_errors():

@@ -62,7 +62,7 @@ POPULATION = 8
 
 
 @dataclass(frozen=True)
-class Args:
+class TuneArgs:
     """Options of the search."""
 
     env_ids: Annotated[
@@ -180,7 +180,7 @@ def _flat(gains: PDGains) -> dict[str, float]:
     }
 
 
-def make_envs(args: Args, episodes: int) -> dict[str, Any]:
+def make_envs(args: TuneArgs, episodes: int) -> dict[str, Any]:
     """The environment of each task."""
     return {
         env_id: gymnasium.make_vec(
@@ -195,13 +195,8 @@ def make_envs(args: Args, episodes: int) -> dict[str, Any]:
     }
 
 
-def configure(args: Args) -> Search:
-    """Check all options before anything flies.
-
-    Raises:
-        ValueError: If an option is invalid.
-        OSError: If nothing can be written to the folder.
-    """
+def configure(args: TuneArgs) -> Search:
+    """Check all options before anything flies."""
     for env_id in args.env_ids:
         known_id("--env-ids", env_id, TRACKING)
     require_at_least(args, candidates=1, episodes=1, fresh_episodes=2, seed=0, threads=1)
@@ -218,7 +213,7 @@ def configure(args: Args) -> Search:
     return Search(envs, Knobs(pd_gains(args.gains), torques), first)
 
 
-def search(args: Args, found: Search) -> PDGains:
+def search(args: TuneArgs, found: Search) -> PDGains:
     """The best gains that differential evolution finds with `--candidates` of them."""
     from scipy.optimize import differential_evolution
     from tqdm import tqdm
@@ -251,7 +246,7 @@ def search(args: Args, found: Search) -> PDGains:
     return found.best
 
 
-def judge(args: Args, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
+def judge(args: TuneArgs, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
     """Fly gains on fresh episodes: a table, and the numbers."""
     first = first_seed("test", args.seed, args.fresh_episodes)
     rows, numbers = [], {}
@@ -271,7 +266,7 @@ def judge(args: Args, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
     return text_table(groups, rows), numbers
 
 
-def main(args: Args) -> None:
+def main(args: TuneArgs) -> None:
     """Tune."""
     began = time.perf_counter()
     with usage_errors():

@@ -6,10 +6,10 @@ import quad_gym
 
 
 @dataclass(frozen=True)
-class Args:
+class VersionArgs:
     """`version` has no options."""
 
 
-def main(args: Args) -> None:
+def main(args: VersionArgs) -> None:
     """Print the version."""
     print(quad_gym.__version__)

@@ -61,7 +61,7 @@ def update_with_correlated(
     expected = _innovation_sigmas(engine, covariance)
     R_IG = engine.params["R_IG"].copy()
     turn_state(engine, T)
-    noise = {**measurement.noise, "gnss_sigma": sigmas}
+    noise = {**measurement.noise, "position_sigma_I": sigmas}
     condition(dataclasses.replace(measurement, noise=noise))
     turn_state(engine, T.T)
     engine.params["R_IG"] = R_IG

@@ -109,7 +109,7 @@ class FilterStart:
         """Start the filters in an engine's memory."""
         engine.fill("gnss_position", self.position_G)
         engine.fill("gnss_baseline", self.baseline_G)
-        kept = engine.impose({"gnss_sigma": self.sigmas})
+        kept = engine.impose({"position_sigma_I": self.sigmas})
         engine.start(self.x_I)
         engine.restore_noise(kept)
         if self.estimates:

@@ -226,7 +226,7 @@ def _checked_noise(
         if not measured[name]:
             raise ValueError(f"{name} must come with its measurement")
         if name == "gnss_sigma":
-            noise["gnss_sigma"], covariance = gnss_noise(name, value)
+            noise["position_sigma_I"], covariance = gnss_noise(name, value)
             continue
         sigma = check.positive(name, value, least=1e-12)
         if name == "baseline_sigma":

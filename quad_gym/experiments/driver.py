@@ -29,12 +29,7 @@ INTERRUPTED = 130
 
 
 def train_here(trainings: Sequence[Training]) -> None:
-    """Complete trainings one after the other in this process.
-
-    Raises:
-        SystemExit: If a training was stopped; it can be resumed.
-        ValueError: If a folder contains another training, or another process trains in it.
-    """
+    """Complete trainings one after the other in this process."""
     for number, training in enumerate(trainings, 1):
         done = train(training.plan, training.folder, resume=True, tensorboard=False, quiet=True)
         if not done.finished:

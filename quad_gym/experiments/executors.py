@@ -4,7 +4,6 @@ All run the same function, `work`, which trains in a folder and returns how the 
 job reports when it has ended, for whatever reason.
 """
 
-import importlib
 import multiprocessing
 import os
 import traceback
@@ -19,6 +18,7 @@ from baselines.locks import BusyError
 from baselines.plans import Plan
 from baselines.training import train
 from quad_gym.experiments.experiment import Training
+from quad_gym.params import checks as check
 
 _DAY = 24 * 60  # minutes
 
@@ -63,12 +63,7 @@ def work(plan: Plan, folder: Path) -> Ended:
 def make_executor(
     name: str, folder: Path, threads: int = 1, options: Mapping[str, Any] = MappingProxyType({})
 ) -> Executor:
-    """Make an executor: "local", "slurm" or "ray", with options of submitit or Ray.
-
-    Raises:
-        ValueError: If an option is invalid.
-        ImportError: If a package is missing.
-    """
+    """Make an executor: "local", "slurm" or "ray", with options of submitit or Ray."""
     if name == "slurm":
         return _submitit(folder / "logs", threads, options)
     if name == "ray":
@@ -143,7 +138,7 @@ class _RemoteJob:
 
 def _submitit(logs: Path, threads: int, options: Mapping[str, Any]) -> Executor:
     """Executor with one Slurm job per training; with cluster=local, processes of this machine."""
-    submitit = _optional("submitit")
+    submitit = check.package("submitit", "this executor", "sweep")
     given = {"timeout_min": _DAY, "cpus_per_task": threads, "name": "quad-gym", **options}
     cluster = given.pop("cluster", "slurm")
     try:
@@ -161,7 +156,7 @@ def _submitit(logs: Path, threads: int, options: Mapping[str, Any]) -> Executor:
 
 def _ray(threads: int, options: Mapping[str, Any]) -> Executor:
     """Executor with one Ray task per training; all nodes need the folder under the same path."""
-    ray = _optional("ray")
+    ray = check.package("ray", "this executor", "sweep")
     try:
         ray.init(**{"log_to_driver": False, "logging_level": "warning", **options})
     except (TypeError, ConnectionError, RuntimeError) as error:
@@ -174,12 +169,3 @@ def _ray(threads: int, options: Mapping[str, Any]) -> Executor:
         return _RemoteJob(done, result, partial(ray.cancel, task))  # KeyboardInterrupt in work
 
     return start
-
-
-def _optional(package: str) -> Any:
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise ImportError(
-            f'this executor needs {package}: pip install "quad-gym[sweep]" ({error})'
-        ) from None

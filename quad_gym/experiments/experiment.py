@@ -35,11 +35,7 @@ class Training:
         return f"{self.case}/seed_{self.plan.seed}"
 
     def record(self) -> dict[str, Any]:
-        """Contents of `training.json`; empty before the first checkpoint.
-
-        Raises:
-            ValueError: If the folder contains a training with another plan.
-        """
+        """Contents of `training.json`; empty before the first checkpoint."""
         return run_in(self.folder, self.plan, resume=True) or {}
 
     @property
@@ -82,12 +78,7 @@ def make_trainings(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path
 
 
 def check_trainings(trainings: Iterable[Training]) -> None:
-    """Check all folders, and make model and environment of each unfinished case once.
-
-    Raises:
-        ValueError: If a folder contains another training, or a plan is invalid.
-        ImportError: If a package is missing.
-    """
+    """Check all folders, and make model and environment of each unfinished case once."""
     for training in {each.case: each for each in trainings if not each.finished}.values():
         try:
             require_model(training.plan)

@@ -79,12 +79,7 @@ def _first_crash(flown: Flown) -> int:
 
 
 def require_film(study: Study, kind: str) -> None:
-    """Check, before training, that a film of a kind ("webp", "gif" or "mp4") can be made.
-
-    Raises:
-        ValueError: If the study has no two policies to compare.
-        ImportError: If a library for drawing or writing is not installed.
-    """
+    """Check, before training, that a film of a kind ("webp", "gif" or "mp4") can be made."""
     trained = [arm.name for arm in study.arms if arm.trained]
     if "truth" not in trained or len(trained) < 2:
         given = ", ".join(arm.name for arm in study.arms)

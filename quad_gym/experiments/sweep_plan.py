@@ -42,12 +42,7 @@ Axis = tuple[str, str]
 
 
 def read(file: Path) -> dict[str, Any]:
-    """Read a sweep file.
-
-    Raises:
-        ValueError: If it is invalid.
-        OSError: If it cannot be read.
-    """
+    """Read a sweep file."""
     try:
         found = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -72,9 +67,6 @@ def expand(
         arms: Arms in `given`, by name.
         folder: Folder of the sweep.
         threads: Number of threads of each training.
-
-    Raises:
-        ValueError: If a value is invalid.
     """
     spec = {**DEFAULTS, **given}
     axes: dict[Axis, Any] = {(table, k): v for table in TABLES for k, v in spec[table].items()}

@@ -101,11 +101,7 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def write_tables(rows: Sequence[dict[str, Any]], folder: Path) -> None:
-    """Write `FILES` atomically.
-
-    Raises:
-        OSError: If the folder is not writable.
-    """
+    """Write `FILES` atomically."""
     parts = [folder / f"{name}.{os.getpid()}.part" for name in FILES]  # of this sweep alone
     for part, table in zip(parts, (rows, groups_of(rows)), strict=False):
         write_csv(part, columns_of(table))

@@ -112,14 +112,15 @@ def _named(names: str, sensors: SensorSuite) -> Iterable[Fault]:
     for name in names.split("+"):
         if name == ALL:
             everything = (fault for preset in PRESETS.values() for fault in preset)
-            yield from (fault for fault in everything if _possible(fault, sensors))
+            yield from (fault for fault in everything if possible(fault, sensors))
         else:
             yield from PRESETS[check.choice("faults", name, (*PRESETS, ALL))]
 
 
-def _possible(fault: Fault, sensors: SensorSuite) -> bool:
+def possible(faults: Any, sensors: SensorSuite) -> bool:
+    """True if a sensor suite has the sensors that some faults need."""
     try:
-        fault.check_suite(sensors)
+        faults_of(faults, sensors)
     except ValueError:
         return False
     return True

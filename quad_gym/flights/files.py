@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.flights.record import COLUMNS, Column, Flight, row_dtype
+from quad_gym.params import checks as check
 
 if TYPE_CHECKING:
     import pandas
@@ -191,10 +192,5 @@ def flight_frame(flight: Flight) -> "pandas.DataFrame":
     Raises:
         ImportError: If pandas is not installed.
     """
-    try:
-        import pandas
-    except ImportError:
-        raise ImportError(
-            'to_pandas needs pandas, which is not installed: pip install "quad-gym[pandas]"'
-        ) from None
+    pandas = check.package("pandas", "to_pandas", "pandas")
     return pandas.DataFrame(table(flight)).set_index("time")

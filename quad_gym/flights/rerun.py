@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
 from quad_gym.flights.record import Flight
+from quad_gym.params import checks as check
 from quad_gym.records import GateDecision, Shape
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
@@ -69,18 +70,8 @@ def rerun_recording(flight: Flight) -> Any:
 
 
 def load_rerun() -> Any:
-    """Return the module `rerun`.
-
-    Raises:
-        ImportError: If it is missing; the message explains the installation.
-    """
-    try:
-        import rerun
-    except ImportError:
-        raise ImportError(
-            'to_rerun needs rerun-sdk, which is not installed: pip install "quad-gym[rerun]"'
-        ) from None
-    return rerun
+    """Return the module `rerun`, or raise an ImportError."""
+    return check.package("rerun", "to_rerun", "rerun")
 
 
 class _Log:

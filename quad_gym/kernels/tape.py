@@ -145,9 +145,9 @@ def _take_measurement(flight, step, m, features):
 def _replace_noise(p, m, own):
     """Set the noise of a measurement where it has its own, or else the suite's."""
     for i in range(3):
-        p.gnss_sigma[i] = own.gnss_sigma[i]
-        if m.gnss_sigma[i] == m.gnss_sigma[i]:
-            p.gnss_sigma[i] = m.gnss_sigma[i]
+        p.position_sigma_I[i] = own.position_sigma_I[i]
+        if m.position_sigma_I[i] == m.position_sigma_I[i]:
+            p.position_sigma_I[i] = m.position_sigma_I[i]
     p.baseline_noise, p.baseline_sigma = own.baseline_noise, own.baseline_sigma
     if m.baseline_noise == m.baseline_noise:
         p.baseline_noise, p.baseline_sigma = m.baseline_noise, m.baseline_sigma

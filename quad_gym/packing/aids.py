@@ -51,9 +51,9 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
         tau = sensors.gnss.drift_tau
         errors = [SlowError(max(s, LEAST_DRIFT), tau) for s in sensors.gnss.drift_sigma_I]
     for aid, params in sensors.aids.items():
-        if params.believed_vector is not None:
+        if params.assumed_vector is not None:
             vectors[aid] = len(errors)
-            errors += [params.believed_vector] * 3
+            errors += [params.assumed_vector] * 3
     for aid, params in sensors.aids.items():
         if params.slow_scalar is not None:
             scalars[aid] = len(errors)

@@ -122,10 +122,10 @@ def pack_tick(p: Any, sensors: SensorSuite) -> None:
         sensors: Sensors that the filter assumes.
     """
     imu, dt = sensors.imu, sensors.imu.dt
-    p["dt"], p["accel_error_noise"] = dt, imu.believed_accel_error
+    p["dt"], p["accel_error_noise"] = dt, imu.accel_error_noise
     biases = slow_errors_of(sensors)
     for sensor, error in zip(("accel", "gyro"), biases, strict=False):
-        p[f"{sensor}_noise"] = getattr(imu, f"believed_{sensor}_sigma")
+        p[f"{sensor}_noise"] = getattr(imu, f"{sensor}_noise")
         # the vibration is given for rotors in hover, whose specific force is g
         p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / p["gravity"]
         p[f"{sensor}_bias_decay"], p[f"{sensor}_bias_drive"] = decay_and_drive(error, dt)
@@ -158,13 +158,12 @@ def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
     if gnss is not None and gnss.has_baseline:
         p["baseline"], p["baseline_length"] = gnss.baseline_B, portable.norm(gnss.baseline_B)
         p["first_baseline_sigma"] = gnss.first_baseline_sigma
-        p["baseline_noise"] = gnss.believed_baseline_sigma
+        p["baseline_noise"] = gnss.baseline_noise
     else:  # with GNSS a vertical one, which does not observe the heading either
         p["baseline"] = (1.0, 0.0, 0.0) if gnss is None else (0.0, 0.0, 1.0)
         p["baseline_length"] = 1.0
         for name in ("baseline_sigma", "first_baseline_sigma", "baseline_noise"):
             p[name] = pose.heading_sigma
-    p["gnss_sigma"] = p["position_sigma_I"]
     p["secondary_antenna_B"] = p["antenna"] + p["baseline"]
 
 

@@ -22,15 +22,15 @@ from quad_gym.records import (
     RewardTerm,
     Sensor,
     Start,
-    Task,
+    TaskKind,
 )
 
 _HARMONICS = {
-    Task.HOVER: 0,
-    Task.CIRCLE: 1,
-    Task.LEMNISCATE: 2,
-    Task.WAYPOINTS: 0,
-    Task.TRAJECTORY: FOLLOWED,
+    TaskKind.HOVER: 0,
+    TaskKind.CIRCLE: 1,
+    TaskKind.LEMNISCATE: 2,
+    TaskKind.WAYPOINTS: 0,
+    TaskKind.TRAJECTORY: FOLLOWED,
 }
 """Terms in the series of a task's reference, for tasks that do not use all of them."""
 
@@ -71,7 +71,7 @@ def settings_record(c: FlightConfiguration) -> NDArray[Any]:
 
 def _pack_task(s: Any, task: TaskParams) -> None:
     """Write reference, start, reward and endings of a task."""
-    kind = Task[task.kind.upper()]
+    kind = TaskKind[task.kind.upper()]
     s["task"], s["start"] = kind, Start[task.start.upper()]
     s["pad"] = task.pad and task.may_start_on_ground
     weights = task.reward_params

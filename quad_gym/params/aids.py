@@ -53,7 +53,7 @@ class AidParams(Checked):
         return None
 
     @property
-    def believed_vector(self) -> SlowError | None:
+    def assumed_vector(self) -> SlowError | None:
         """`slow_vector` as the filter assumes it, increased by errors without a model."""
         return self.slow_vector
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import importlib
 import inspect
 import math
 from collections.abc import Iterable, Sequence
@@ -22,6 +23,15 @@ SMALLEST = 1e-15
 
 FARTHEST_ON_VEHICLE = 100.0
 """No part of a vehicle is farther from its center of mass [m]."""
+
+
+def package(module: str, what: str, extra: str) -> Any:
+    """Import an optional package, or raise an ImportError that explains how to install it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        name = module.partition(".")[0]
+        raise ImportError(f'{what} needs {name}: pip install "quad-gym[{extra}]"') from None
 
 
 class UnknownKeywordError(TypeError, ValueError):

@@ -159,7 +159,7 @@ class GnssParams(Checked):
         return math.hypot(self.baseline_sigma, self.heading_error_sigma)
 
     @property
-    def believed_baseline_sigma(self) -> float:
+    def baseline_noise(self) -> float:
         """Standard deviation that the filter assumes for the white noise of a baseline [rad].
 
         Averaging reduces white noise, but not a constant error. The constant error is therefore

@@ -119,7 +119,7 @@ class ImuParams(Checked):
         return self.accel_vibration > 0.0 or self.gyro_vibration > 0.0
 
     @property
-    def believed_accel_sigma(self) -> float:
+    def accel_noise(self) -> float:
         """Standard deviation that the filter assumes for an accelerometer's white noise [m/s^2].
 
         The value is for hover; the filter scales the vibration in it with the measured specific
@@ -128,7 +128,7 @@ class ImuParams(Checked):
         return math.hypot(self.accel_noise_density / math.sqrt(self.dt), self.accel_vibration)
 
     @property
-    def believed_accel_error(self) -> float:
+    def accel_error_noise(self) -> float:
         """White noise by which the filter models errors of scale and alignment, per m/s^2 [-].
 
         The errors are proportional to the difference of the specific force from its value at rest,
@@ -140,6 +140,6 @@ class ImuParams(Checked):
         return math.sqrt(mean_square * MANEUVER / self.dt)
 
     @property
-    def believed_gyro_sigma(self) -> float:
+    def gyro_noise(self) -> float:
         """Standard deviation that the filter assumes for a gyro's white noise [rad/s]."""
         return math.hypot(self.gyro_noise_density / math.sqrt(self.dt), self.gyro_vibration)

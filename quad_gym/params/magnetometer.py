@@ -79,7 +79,7 @@ class MagnetometerParams(AidParams):
         return SlowError(self.hard_iron_sigma)
 
     @property
-    def believed_vector(self) -> SlowError:
+    def assumed_vector(self) -> SlowError:
         """Hard iron, increased by the effect of soft iron on the field, per axis [T]."""
         return SlowError(math.hypot(self.hard_iron_sigma, self.soft_iron_sigma * self.strength))
 

@@ -11,9 +11,9 @@ from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
 from quad_gym.params.reward import RewardParams
 from quad_gym.params.trajectories import Trajectory
-from quad_gym.records import MAX_GATES, Start, Task
+from quad_gym.records import MAX_GATES, Start, TaskKind
 
-TASKS = tuple(task.name.lower() for task in Task)
+TASKS = tuple(task.name.lower() for task in TaskKind)
 """Kinds of task."""
 
 STARTS = tuple(start.name.lower() for start in Start)

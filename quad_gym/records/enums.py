@@ -143,7 +143,7 @@ class Act(IntEnum):
     """initialize the heading, if the sensor is the `heading_sensor` of the settings"""
 
 
-class Task(IntEnum):
+class TaskKind(IntEnum):
     """Kind of task."""
 
     HOVER = 1

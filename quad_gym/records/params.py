@@ -66,7 +66,6 @@ PARAMS_FIELDS = (
     Field("antenna", (3,), "m", "primary antenna in B"),
     Field("baseline", (3,), "m", "primary to secondary antenna in B"),
     Field("baseline_length", (), "m", "its length"),
-    Field("gnss_sigma", (3,), "m", "white position noise in I; of the placement where there is no GNSS"),
     Field("drift_decay", (), "-", "of the slow position error between two measurements"),
     Field("drift_drive", (3,), "m", "sigma of its driving noise"),
     Field("heading_error_sigma", (), "rad", "of the baseline's constant error"),

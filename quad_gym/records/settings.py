@@ -40,7 +40,7 @@ SETTINGS_FIELDS = (
     Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),
     Field("control", (), "-", "what the action means, see Control", "i8"),
     Field("action_delays", (), "steps", "the longest delay of an action, rounded up; 0: none", "i8"),
-    Field("task", (), "-", "see Task", "i8"),
+    Field("task", (), "-", "see TaskKind", "i8"),
     Field("harmonics", (), "-", "terms of the reference's series in use; FOLLOWED: it is a trajectory", "i8"),
     Field("path_count", (), "-", "trajectories that flights may follow", "i8"),
     Field("paths", (), "bytes", "address of these, (path_count,) of PATH", "i8"),

@@ -10,7 +10,13 @@ from quad_gym.records.sizes import AIDS, MAX_BLOCKS, MAX_FEATURES, MAX_SLOW, Fie
 SAMPLE = np.dtype([("gyro", "f8", 3), ("accel", "f8", 3), ("dt", "f8"), ("gyro_before", "f8", 3)])
 """An IMU sample that propagates the estimate; see `quad_gym.estimation.samples.Sample`."""
 
-NOISE_FIELDS = ("gnss_sigma", "baseline_noise", "baseline_sigma", "velocity_sigma", "pixel_sigma")
+NOISE_FIELDS = (
+    "position_sigma_I",
+    "baseline_noise",
+    "baseline_sigma",
+    "velocity_sigma",
+    "pixel_sigma",
+)
 """Parameters that a measurement may replace, in addition to `aid_sigma`."""
 
 MEASUREMENT = np.dtype(
@@ -20,7 +26,7 @@ MEASUREMENT = np.dtype(
         ("pixels", "f8", (MAX_FEATURES, 2)),
         ("aid_measurement", "f8", (AIDS, 3)),
         # noise; NaN: as in the parameters
-        ("gnss_sigma", "f8", 3),
+        ("position_sigma_I", "f8", 3),
         *((name, "f8") for name in NOISE_FIELDS[1:]),
         ("aid_sigma", "f8", AIDS),
     ]

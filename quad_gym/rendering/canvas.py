@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.params import checks as check
 from quad_gym.rendering import colors
 from quad_gym.rendering.colors import Color
 from quad_gym.rendering.shrink import halve
@@ -33,19 +34,10 @@ overflow."""
 
 
 def load_pygame() -> Any:
-    """Import pygame without its greeting.
-
-    Raises:
-        ImportError: If it is missing; the message explains how to install it.
-    """
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            import pygame
-            import pygame.font
-    except ImportError:
-        raise ImportError(
-            'Rendering needs pygame, which is not installed: pip install "quad-gym[render]"'
-        ) from None
+    """Import pygame without its greeting, or raise an ImportError."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        pygame = check.package("pygame", "Rendering", "render")
+        check.package("pygame.font", "Rendering", "render")
     return pygame
 
 

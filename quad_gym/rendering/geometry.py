@@ -23,7 +23,7 @@ AROUND = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Perspective:
     """Perspective view of the inertial frame."""
 
     eye: Floats
@@ -90,18 +90,18 @@ class View:
         return self.focal / max(float(self.in_view(point)[2]), NEAR)
 
 
-def look_at(eye: Floats, target: Floats, focal: float, center: Floats) -> View:
+def look_at(eye: Floats, target: Floats, focal: float, center: Floats) -> Perspective:
     """View from `eye` toward `target`, with the vertical upright."""
     into = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(into, (0.0, 0.0, 1.0))
     length = np.linalg.norm(right)
     right = right / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
-    return View(eye, np.stack([right, np.cross(into, right), into]), focal, center)
+    return Perspective(eye, np.stack([right, np.cross(into, right), into]), focal, center)
 
 
 def fit_view(
     points: Floats, azimuth: float, elevation: float, focal: float, low: Floats, high: Floats
-) -> View:
+) -> Perspective:
     """Closest view from a given direction that shows all points within a rectangle of pixels.
 
     Args:
@@ -126,10 +126,12 @@ def fit_view(
         eye[k] = (right + left) / 2  # both edges at equal distances
         edges.append(-(right - left) / 2 / slope)
     eye[2] = min(edges)
-    return View(eye @ axes, axes, focal, center)
+    return Perspective(eye @ axes, axes, focal, center)
 
 
-def fixed_view(flight: Flight, width: float, height: float, also: Floats | None = None) -> View:
+def fixed_view(
+    flight: Flight, width: float, height: float, also: Floats | None = None
+) -> Perspective:
     """View that shows the whole reference, the start, and the markers for the camera.
 
     Args:
@@ -158,7 +160,7 @@ def fixed_view(flight: Flight, width: float, height: float, also: Floats | None 
     return fit_view(corners, azimuth, elevation, 1.15 * width, low, high)
 
 
-def chase_view(flight: Flight, width: float, height: float) -> View:
+def chase_view(flight: Flight, width: float, height: float) -> Perspective:
     """View from behind and above the vehicle, a little to its right, that follows it smoothly.
 
     It depends only on the last half second, so a replay is identical to the live view.
@@ -174,7 +176,7 @@ def chase_view(flight: Flight, width: float, height: float) -> View:
     return look_at(eye, target, 1.15 * width, np.array([0.5 * width, 0.5 * height]))
 
 
-def course_view(flight: Flight, width: float, height: float) -> View:
+def course_view(flight: Flight, width: float, height: float) -> Perspective:
     """View along a course of obstacles, from behind and above the vehicle.
 
     It moves with the true position along the course and does not turn, so that sideways motion of
@@ -199,7 +201,7 @@ def ellipsoid_axes(covariance: Floats, sigmas: float) -> Floats:
     return np.asarray((sigmas * np.sqrt(np.maximum(values, 0.0)) * vectors).T)
 
 
-def ellipsoid_outline(center: Floats, axes: Floats, view: View, count: int = 48) -> Floats:
+def ellipsoid_outline(center: Floats, axes: Floats, view: Perspective, count: int = 48) -> Floats:
     """Outline of an ellipsoid in perspective, (count, 2) pixels; (0, 2) if it is too near.
 
     In dual form the ellipsoid is [[A - c c^T, -c], [-c^T, -1]], where A is the sum of the outer
@@ -209,7 +211,7 @@ def ellipsoid_outline(center: Floats, axes: Floats, view: View, count: int = 48)
     Args:
         center: Center, (3,) in I [m].
         axes: Half-axes in rows, (3, 3) in I [m].
-        view: View to project to.
+        view: Perspective to project to.
         count: Number of points on the outline.
     """
     c = view.in_view(center)

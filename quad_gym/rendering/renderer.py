@@ -13,7 +13,7 @@ from quad_gym.records import FaultKind, FilterStatus, GateDecision
 from quad_gym.rendering import colors
 from quad_gym.rendering.canvas import Canvas
 from quad_gym.rendering.colors import Color
-from quad_gym.rendering.geometry import View, chase_view, fixed_view
+from quad_gym.rendering.geometry import Perspective, chase_view, fixed_view
 from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.scene import Scene, ellipsoid_scale
 from quad_gym.rendering.strip import Box, Strip
@@ -49,7 +49,7 @@ class Renderer:
         self._strip = Strip(self._canvas, strip, self._text)
         self._scene: FlightScene | None = None
         """Scene of the flight to which the stored view and background belong."""
-        self._fixed: View
+        self._fixed: Perspective
 
     def draw(self, flight: Flight) -> NDArray[np.uint8]:
         """Draw the last instant of a flight; `flight.until(t)` ends at a time t.
@@ -84,7 +84,7 @@ class Renderer:
     def __reduce__(self) -> Any:
         return Renderer, (self.view, self.size)
 
-    def _view_of(self, flight: Flight) -> View:
+    def _view_of(self, flight: Flight) -> Perspective:
         width = self.size[0]
         if self.view == "chase":
             return chase_view(flight, width, self._scene_height)

@@ -7,7 +7,7 @@ from quad_gym.flights.record import Flight
 from quad_gym.records import GateDecision
 from quad_gym.rendering import colors
 from quad_gym.rendering.canvas import Canvas, Label
-from quad_gym.rendering.geometry import View, ellipsoid_axes, ellipsoid_outline
+from quad_gym.rendering.geometry import Perspective, ellipsoid_axes, ellipsoid_outline
 from quad_gym.rendering.inset import last_image
 from quad_gym.rendering.solids import faces_of
 from quad_gym.rotations import quaternion_to_dcm
@@ -66,7 +66,7 @@ class Scene:
     Args:
         canvas: Canvas to draw on.
         flight: Flight whose last row is the present.
-        view: View to draw.
+        view: Perspective to draw.
         moving: True if the view follows the vehicle, so that the grid on the ground must, too.
         magnified: True to magnify small ellipsoids, see `ellipsoid_scale`.
         spacing: Distance between the grid lines on the ground [m].
@@ -76,7 +76,7 @@ class Scene:
         self,
         canvas: Canvas,
         flight: Flight,
-        view: View,
+        view: Perspective,
         moving: bool,
         magnified: bool = True,
         spacing: float = 1.0,

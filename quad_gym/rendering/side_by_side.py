@@ -12,7 +12,7 @@ from quad_gym.flights.record import Flight
 from quad_gym.rendering import colors
 from quad_gym.rendering.canvas import Canvas
 from quad_gym.rendering.colors import Color
-from quad_gym.rendering.geometry import View, course_view, fixed_view
+from quad_gym.rendering.geometry import Perspective, course_view, fixed_view
 from quad_gym.rendering.history import ErrorHistory
 from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.renderer import active_faults
@@ -119,7 +119,7 @@ class _Half:
         self._scene = Box(0.0, _BAND, width, height - _BAND - _PLOT)
         plot = Box(0.0, height - _PLOT, width, _PLOT)
         self._history = ErrorHistory(self._canvas, plot, side.flight, end, _SMALL, side.course)
-        self._fixed: View | None = None
+        self._fixed: Perspective | None = None
 
     def draw(self, time: float) -> NDArray[np.uint8]:
         """Draw the picture at a time [s]."""
@@ -160,7 +160,7 @@ class _Half:
         """True if the view moves, because a course of obstacles is too long for one picture."""
         return len(self._side.flight.scene.obstacles) > 0
 
-    def _view(self, flight: Flight) -> View:
+    def _view(self, flight: Flight) -> Perspective:
         box = self._scene
         if self._moves:
             view = course_view(flight, box.width, box.height)
@@ -171,7 +171,7 @@ class _Half:
             view = self._fixed
         return dataclasses.replace(view, center=view.center + np.array([0.0, box.top]))
 
-    def _mark(self, flight: Flight, view: View) -> None:
+    def _mark(self, flight: Flight, view: Perspective) -> None:
         """Mark truth and estimate where they are hardly visible."""
         now = flight.rows[-1]
         if view.scale_at(np.array(now["position"])) < _FAR:
@@ -180,7 +180,7 @@ class _Half:
             )
             self._canvas.disc(view.project(now["position"])[0], 4.0, colors.BLUE)
 
-    def _wedge(self, flight: Flight, view: View) -> None:
+    def _wedge(self, flight: Flight, view: Perspective) -> None:
         """Draw a horizontal slice of the camera's field of view, up to `WEDGE`."""
         now = flight.rows[-1]
         R_BI = quaternion_to_dcm(now["quaternion"])

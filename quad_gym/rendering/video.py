@@ -200,13 +200,7 @@ def checked_video_path(path: Path | str) -> Path:
     target = Path(path)
     check.choice("the ending of the video's path", target.suffix.lower(), VIDEO_ENDINGS)
     module = "imageio_ffmpeg" if target.suffix.lower() == ".mp4" else "PIL.Image"
-    try:
-        __import__(module)
-    except ImportError:
-        raise ImportError(
-            f"{target.suffix} videos need {module}, which is not installed: pip install "
-            '"quad-gym[render]"'
-        ) from None
+    check.package(module, f"a {target.suffix} video", "render")
     return target
 
 

@@ -7,8 +7,10 @@ from typing import Any, Generic, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.tasks.memory import ReadableBatch
 
+Floats = NDArray[np.float64]
 T = TypeVar("T")
 
 
@@ -55,14 +57,38 @@ def field(
     return lambda read: GroupField(read, shape, unit, frame, meaning)
 
 
+_LETTERS = {"features": "m", "obstacles": "o"}
+
+
+def quantity(name: str, shown: str | None = None) -> GroupField[NDArray[Any]]:
+    """Make a field of one of `quad_gym.batch.quantities.QUANTITIES`.
+
+    Args:
+        name: Name of the quantity.
+        shown: Field of `quad_gym.records.SHOWN` with its values; None: the records.
+    """
+    q = QUANTITIES[name]
+    kind: type[np.generic] = {bool: np.bool_, int: np.int64}.get(q.kind, np.float64)
+
+    def read(group: Group) -> NDArray[Any]:
+        if shown is not None:
+            return group._flights.shown(shown)
+        of = q.of
+        return group._flights.rows(of, kind) if isinstance(of, str) else group._flights.read(name)
+
+    sizes = "".join(f" {_LETTERS.get(str(size), size)}," for size in q.shape)
+    shape = f"(n,{sizes})".replace(",)", ")") if sizes else "(n,)"
+    kinds = "" if q.kind is float else f" {q.kind.__name__}"
+    return GroupField(read, shape + kinds, q.unit, q.frame, q.meaning)
+
+
 def record(name: str, shape: str, unit: str, frame: str, meaning: str) -> GroupField[NDArray[Any]]:
-    """Make a field of the flights' records."""
-    kind = {"int": np.int64, "bool": np.bool_}.get(shape.rpartition(" ")[2], np.float64)
-    return GroupField(lambda group: group._flights.rows(name, kind), shape, unit, frame, meaning)
+    """Make a field of the flights' records that is no quantity of its own."""
+    return GroupField(lambda group: group._flights.rows(name), shape, unit, frame, meaning)
 
 
-def shown(name: str, shape: str, unit: str, frame: str, meaning: str) -> GroupField[NDArray[Any]]:
-    """Make a field of `quad_gym.records.SHOWN`."""
+def shown(name: str, shape: str, unit: str, frame: str, meaning: str) -> GroupField[Floats]:
+    """Make a field of `quad_gym.records.SHOWN` that is no quantity of its own."""
     return GroupField(lambda group: group._flights.shown(name), shape, unit, frame, meaning)
 
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
 from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK
-from quad_gym.rotations import dcm_to_quaternion
-from quad_gym.tasks.fields import Group, GroupField, field, record, shown
+from quad_gym.tasks.fields import Group, GroupField, field, quantity, record, shown
 from quad_gym.tasks.memory import ReadableBatch
 
 Floats = NDArray[np.float64]
@@ -43,20 +42,12 @@ class EstimateView(Group):
                 "include_std=True or innovations=True"
             )
 
-    position = record("r_hat", "(n, 3)", "m", "I", "position")
-    velocity = record("v_hat", "(n, 3)", "m/s", "I", "velocity")
-    R_BI = record("R_hat", "(n, 3, 3)", "-", "I to B", "attitude, v_B = R_BI v_I")
-
-    @field("(n, 4)", "-", "B to I", "attitude as a quaternion (w, x, y, z)")
-    def quaternion(self) -> Floats:
-        return dcm_to_quaternion(self.R_BI)
-
-    @field("(n, 3)", "rad/s", "B", "body rates: gyro measurement minus estimated bias")
-    def body_rates(self) -> Floats:
-        return self._flights.rows("w_meas") - self.gyro_bias
-
-    accel_bias = record("b_a_hat", "(n, 3)", "m/s^2", "B", "accelerometer bias")
-    gyro_bias = record("b_g_hat", "(n, 3)", "rad/s", "B", "gyro bias")
+    position = quantity("estimated_position")
+    velocity = quantity("estimated_velocity")
+    R_BI = quantity("estimated_R_BI")
+    quaternion, body_rates = quantity("estimated_quaternion"), quantity("estimated_body_rates")
+    accel_bias = quantity("estimated_accel_bias")
+    gyro_bias = quantity("estimated_gyro_bias")
 
     @field("(n, 15, 15)", "mixed", "mixed", "covariance of position and velocity in I, attitude, accelerometer and gyro bias in B")
     def covariance(self) -> Floats:
@@ -73,10 +64,10 @@ class EstimateView(Group):
     attitude_covariance, attitude_sigma = _block(6, "rad", "B", "attitude")
     accel_bias_covariance, accel_bias_sigma = _block(9, "m/s^2", "B", "accelerometer bias")
     gyro_bias_covariance, gyro_bias_sigma = _block(12, "rad/s", "B", "gyro bias")
-    status = record("filter_status", "(n,) int", "bits", "-", "numerical failures so far, see `FilterStatus`; 0: none")
-    diverged = record("diverged", "(n,) bool", "-", "-", "True where the filter flags itself as diverged (filters with an innovation gate, or with `faults`, `truncate_when_diverged` or `innovations`)")
-    nis = record("nis", "(n,)", "-", "-", "normalized innovation squared of the last update")
-    nis_dimension = record("nis_dimension", "(n,) int", "-", "-", "number of scalar measurements in the last update")
+    status = quantity("filter_status")
+    diverged = quantity("filter_diverged")
+    nis = quantity("nis")
+    nis_dimension = quantity("nis_dimension")
 
 
 class TruthView(Group):
@@ -88,9 +79,9 @@ class TruthView(Group):
         super().__init__(flights)
         self._estimate = estimate
 
-    position = record("r", "(n, 3)", "m", "I", "position of the center of mass; short: `view.position`")
-    velocity = record("v", "(n, 3)", "m/s", "I", "velocity; short: `view.velocity`")
-    R_BI = shown("R_BI", "(n, 3, 3)", "-", "I to B", "attitude, v_B = R_BI v_I; short: `view.R_BI`")
+    position = quantity("position")
+    velocity = quantity("velocity")
+    R_BI = quantity("R_BI", "R_BI")
 
     @field("(n, 3)", "-", "I", "body x axis, the first row of R_BI")
     def forward(self) -> Floats:
@@ -100,14 +91,14 @@ class TruthView(Group):
     def up(self) -> Floats:
         return np.asfortranarray(self.R_BI[:, :, 2])
 
-    quaternion = record("q", "(n, 4)", "-", "B to I", "attitude as a quaternion (w, x, y, z); short: `view.quaternion`")
-    body_rates = record("w", "(n, 3)", "rad/s", "B", "body rates; short: `view.body_rates`")
-    rotor_speeds = record("rotor_speeds", "(n, 4)", "rad/s", "-", "rotor speeds; short: `view.rotor_speeds`")
-    accel_bias = record("b_a", "(n, 3)", "m/s^2", "B", "accelerometer bias; short: `view.accel_bias`")
-    gyro_bias = record("b_g", "(n, 3)", "rad/s", "B", "gyro bias; short: `view.gyro_bias`")
-    wind = record("wind", "(n, 3)", "m/s", "I", "wind velocity")
-    position_error = record("position_error", "(n,)", "m", "-", "distance of the position from the reference; short: `view.position_error`")
-    estimation_error = record("estimation_error", "(n,)", "m", "-", "distance between observed and true position; short: `view.estimation_error`")
+    quaternion = quantity("quaternion")
+    body_rates = quantity("body_rates")
+    rotor_speeds = quantity("rotor_speeds")
+    accel_bias = quantity("accel_bias")
+    gyro_bias = quantity("gyro_bias")
+    wind = quantity("wind")
+    position_error = quantity("position_error")
+    estimation_error = quantity("estimation_error")
 
     @field("(n,)", "m/s", "-", "speed toward the reference; on a course, toward the gate that was next")
     def progress(self) -> Floats:
@@ -145,12 +136,9 @@ class TruthView(Group):
             seen &= ~hidden_points(obstacles, centers, eyes, features)
         return seen
 
-    @field("(n,)", "m", "-", "distance of the position from the nearest obstacle surface, negative inside, infinite without obstacles; short: `view.obstacle_distance`")
-    def obstacle_distance(self) -> Floats:
-        return self._flights.read("obstacle_distance")
-
+    obstacle_distance = quantity("obstacle_distance")
     obstacle_vector = record("obstacle_vector", "(n, 3)", "m", "I", "vector from the vehicle to the nearest point of an obstacle surface")
-    on_ground = record("footing", "(n,) bool", "-", "-", "True where the ground supports a foot, in worlds whose ground carries vehicles")
+    on_ground = quantity("on_ground")
 
     @field("dict of (n,) bool", "-", "-", "active faults, by name")
     def faults(self) -> Any:
@@ -164,10 +152,10 @@ class TruthView(Group):
 class ObservedView(Group):
     """State observed by the controller: the estimate, the truth, or the truth with noise."""
 
-    position = record("r_seen", "(n, 3)", "m", "I", "position from the source that `observation` names")
-    velocity = record("v_seen", "(n, 3)", "m/s", "I", "velocity")
-    R_BI = record("R_seen", "(n, 3, 3)", "-", "I to B", "attitude, v_B = R_BI v_I")
-    body_rates = shown("w_seen", "(n, 3)", "rad/s", "B", "body rates")
+    position = quantity("observed_position")
+    velocity = quantity("observed_velocity")
+    R_BI = quantity("observed_R_BI")
+    body_rates = quantity("observed_body_rates", "w_seen")
     position_error = shown("position_gap", "(n, 3)", "m", "B", "reference position minus observed position")
     velocity_error = shown("velocity_gap", "(n, 3)", "m/s", "B", "reference velocity minus observed velocity")
     up = shown("up", "(n, 3)", "-", "B", "vertical")
@@ -200,8 +188,8 @@ class MeasuredView(Group):
                 "or include_std=True or innovations=True"
             )
 
-    gyro = record("gyro", "(n, 3)", "rad/s", "B", "angular rate measured by the gyro")
-    accel = record("accel", "(n, 3)", "m/s^2", "B", "specific force measured by the accelerometer")
+    gyro = quantity("gyro")
+    accel = quantity("accel")
 
     @field("(n, 3)", "m", "I", "position of the primary antenna")
     def gnss_position(self) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params.world import WorldParams
-from quad_gym.tasks.fields import Group, GroupField, field, record, shown
+from quad_gym.tasks.fields import Group, GroupField, field, quantity, shown
 from quad_gym.tasks.groups import BuiltinView, EstimateView, MeasuredView, ObservedView, TruthView
 from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.state import State
@@ -110,45 +110,37 @@ class View(Group):
     def period(self) -> float:
         return self._flights.period
 
-    @field("(n,)", "s", "-", "time since the start of the episode")
-    def time(self) -> Floats:
-        return self._flights.read("time")
+    time = quantity("time")
 
-    step = record("step", "(n,) int", "steps", "-", "steps since the start of the episode")
+    step = quantity("step")
 
     @field("(n,) bool", "-", "-", "True where an episode has just begun and no step of it has been flown")
     def is_first(self) -> Truths:
         return self._flights.began.copy()
 
-    action = record("action", "(n, 4)", "-", "-", "action of this step, in [-1, 1]")
-    last_action = record("last_action", "(n, 4)", "-", "-", "action of the step before, in [-1, 1]")
-    reference_position = shown("r_ref", "(n, 3)", "m", "I", "reference position; on a course, the next gate")
-    reference_velocity = shown("v_ref", "(n, 3)", "m/s", "I", "velocity of the reference")
-    reference_acceleration = shown("a_ref", "(n, 3)", "m/s^2", "I", "acceleration of the reference")
-    reference_heading = shown("x_ref", "(n, 3)", "-", "I", "desired heading: horizontal unit vector for body x")
+    action = quantity("action")
+    last_action = quantity("last_action")
+    reference_position = quantity("reference_position", "r_ref")
+    reference_velocity = quantity("reference_velocity", "v_ref")
+    reference_acceleration = quantity("reference_acceleration", "a_ref")
+    reference_heading = quantity("reference_heading", "x_ref")
     preview = shown("preview", "(n, 2, 3)", "m", "I", "reference after each of the two times `preview`; on a course, the two gates after the next")
 
-    @field("(n, gates, 3)", "m", "I", "gates of a course, in order")
-    def gates(self) -> Floats:
-        return self._flights.read("gates")
+    gates = quantity("gates")
 
-    gates_passed = record("gate_next", "(n,) int", "-", "-", "number of gates passed in this episode")
+    gates_passed = quantity("gates_passed")
 
     @field("(n,) bool", "-", "-", "True where this step passed a gate")
     def gate_passed(self) -> Truths:
         return self._flights.gate_passed()
 
-    @field("(n, m, 3)", "m", "I", "positions of the markers in the filter's map of this episode")
-    def features(self) -> Floats:
-        return self._flights.feature_places()
+    features = quantity("features")
 
     @field("", "-", "-", "nominal `WorldParams`, without parameters drawn for the episode")
     def world(self) -> WorldParams:
         return self._flights.world
 
-    @field("(n, o, 3)", "m", "I", "centers of the obstacles in this episode, in the order given")
-    def obstacles(self) -> Floats:
-        return self._flights.read("obstacles")
+    obstacles = quantity("obstacles")
 
     @field("(n, k)", "mixed", "mixed", "built-in observation without its privileged part")
     def observation(self) -> NDArray[np.float32]:
@@ -176,8 +168,18 @@ GROUPS: dict[str, type[Group]] = {
     "builtin.": BuiltinView,
 }
 """Groups of a view by their prefixes."""
+
+
+def _short(prefix: str, name: str) -> str:
+    """The shorter name of a field of `view.truth`, where it has one."""
+    has_one = prefix == "truth." and isinstance(vars(View).get(name), Short)
+    return f"; short: `view.{name}`" if has_one else ""
+
+
 VIEW_FIELDS = tuple(
-    ViewField(prefix + name, value.shape, value.unit, value.frame, value.meaning)
+    ViewField(
+        prefix + name, value.shape, value.unit, value.frame, value.meaning + _short(prefix, name)
+    )
     for prefix, group in GROUPS.items()
     for name, value in vars(group).items()
     if isinstance(value, GroupField)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.builders import SHORT, actions_of, alone, chosen, together, vec_env
+from tests.builders import actions_of
 
 IDS = (
     "QuadGym/Hover-v0",
@@ -46,15 +46,6 @@ def state_of(env):
     return getattr(env, "unwrapped", env).flights.batch.snapshot().tobytes()
 
 
-def assert_alone_as_together(base, count, mode, threads=1, **keywords):
-    """Flights in a batch are the flights alone; returns the columns of the batch."""
-    many = together(base, range(count), mode=mode, threads=threads, **keywords)
-    for i in range(count):
-        one = alone(base, i, wait=mode == "NextStep", **keywords)
-        assert_same(chosen(many, i), one, f"flight {i}")
-    return many
-
-
 def future_of(env, count, vector):
     """Everything that the next 80 steps and two resets return."""
     seen = []
@@ -65,17 +56,3 @@ def future_of(env, count, vector):
         if not vector and (result[2] or result[3]):
             seen.append(env.reset())
     return [*seen, env.reset(), env.reset(seed=4)]
-
-
-def assert_snapshot_restores(count, **keywords):
-    """A snapshot in mid-episode has the same future in its own environment and in another one."""
-    made = {"autoreset_mode": "SameStep", **SHORT, **keywords}
-    env = vec_env("circle", count, seed=8, threads=2, **made)
-    for k in range(10):
-        env.step(np.tile(actions_of(k, 1), (count, 1)))
-    instant = env.flights.batch.snapshot()
-    future = future_of(env, count, vector=True)
-    fresh = vec_env("circle", count, seed=99, **made)
-    for other in (env, fresh):
-        other.flights.batch.restore(instant)
-        assert_same(future, future_of(other, count, vector=True))

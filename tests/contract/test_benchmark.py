@@ -19,7 +19,7 @@ from quad_gym.records import POSITION_BLOCK, WIDTH
 
 
 def run(folder, *options):
-    script.main(parse(script.Args, ["--quick", "--output", str(folder), *options]))
+    script.main(parse(script.BenchmarkArgs, ["--quick", "--output", str(folder), *options]))
     return json.loads((folder / "benchmark.json").read_text())
 
 

@@ -8,9 +8,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
+import quad_gym
 from quad_gym import sensor_suite
 from quad_gym.commands.options import sensors_of
 from tests.contract.comparing import ACTIONS, IDS, LAYOUTS, OBSERVATIONS
+from tests.contract.configurations import CONFIGURATIONS
 
 EVERYTHING = list(itertools.product(IDS, OBSERVATIONS, ACTIONS, LAYOUTS))
 COVERING = [
@@ -67,6 +69,16 @@ def test_checkers_pass_for_every_combination():
 )
 def test_both_checkers_pass_with_more_and_with_less_to_see(observation, keywords):
     passes_both_checkers("QuadGym/Circle-v0", observation=observation, **keywords)
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_both_checkers_pass_in_every_configuration(name):
+    base, keywords = CONFIGURATIONS[name]
+    # innovations without a measurement are NaN, which to Gymnasium's checker equals nothing
+    keywords = {key: value for key, value in keywords.items() if key != "innovations"}
+    ids = {task: env_id for env_id, task in quad_gym.IDS.items()}
+    for _ in range(2):
+        passes_both_checkers(ids[base], **keywords)
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -17,7 +17,7 @@ CASES = ("truth", "estimate", "estimate_without_camera")
 
 
 def run(folder, line=""):
-    script.main(parse(script.Args, [*line.split(), "--output", str(folder)]))
+    script.main(parse(script.CircleArgs, [*line.split(), "--output", str(folder)]))
     return json.loads((folder / "summary.json").read_text())
 
 
@@ -120,7 +120,7 @@ def test_crashes_are_counted(tmp_path, capsys):
 
 
 def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
-    args = script.Args(episodes=1, duration=0.5, output=tmp_path)
+    args = script.CircleArgs(episodes=1, duration=0.5, output=tmp_path)
     trace = script.fly("estimate", script.configure(args)).trace
     distance = np.linalg.norm(trace.position - trace.reference, axis=1)
     np.testing.assert_allclose(trace.error, distance, atol=1e-12)

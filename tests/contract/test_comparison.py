@@ -62,7 +62,9 @@ def test_evaluate_without_included_policy_flies_pd(tmp_path, capsys):
         env_id, env = args[0], dict(*args[1:])
         folder = tmp_path / "made"
         cases, _ = evaluate.configure(
-            evaluate.Args(env_id=env_id, env=env, observation=("truth",), output=folder, episodes=2)
+            evaluate.EvaluateArgs(
+                env_id=env_id, env=env, observation=("truth",), output=folder, episodes=2
+            )
         )
         assert [name for name, _ in cases] == policies
         assert told in capsys.readouterr().out

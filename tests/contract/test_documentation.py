@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 import quad_gym
-from quad_gym.commands.main import COMMANDS, module_of
+from quad_gym.commands.main import COMMANDS, module_of, options_of
 from quad_gym.commands.options import parse
 from quad_gym.commands.study import arms_of
 
@@ -128,7 +128,7 @@ def test_command_lines_are_found():
 def exit_code(module, options):
     """What parsing the options of a command ends with; --help ends with 0."""
     try:
-        args = parse(module_of(module).Args, options)
+        args = parse(options_of(module_of(module)), options)
     except SystemExit as end:
         return end.code
     if module == "study" and (args.arms_file is None or args.arms_file.exists()):

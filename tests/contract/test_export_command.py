@@ -5,20 +5,12 @@ import json
 import pytest
 
 from quad_gym.commands.main import main
-from tests.console import plain
+from tests.console_commands import refused
 
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def refused(line, capsys):
-    """The message of a command line that ends with a usage error."""
-    with pytest.raises(SystemExit) as end:
-        main(line.split())
-    assert end.value.code == 2
-    return plain(capsys.readouterr().err)
 
 
 def test_a_policy_becomes_a_c_file_named_after_its_task(tmp_path, capsys):

@@ -5,20 +5,12 @@ import pytest
 
 from quad_gym.commands import tune
 from quad_gym.commands.main import main
-from tests.console import plain
+from tests.console_commands import refused
 
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def refused(words, capsys):
-    """The message of a command line that ends with a usage error."""
-    with pytest.raises(SystemExit) as end:
-        main(words)
-    assert end.value.code == 2
-    return plain(capsys.readouterr().err)
 
 
 def test_evaluate_replaces_results_only_when_told(tmp_path, capsys):
@@ -60,7 +52,7 @@ def test_tune_flies_as_many_candidates_as_it_says(candidates, tmp_path, monkeypa
         return np.log(error)
 
     monkeypatch.setattr(tune.Search, "cost", cost)
-    args = tune.Args(env_ids=("hover",), candidates=candidates, episodes=1, output=tmp_path)
+    args = tune.TuneArgs(env_ids=("hover",), candidates=candidates, episodes=1, output=tmp_path)
     found = tune.configure(args)
     best = tune.search(args, found)
     errors = [row["relative_error"] for row in found.rows]

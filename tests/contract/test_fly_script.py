@@ -49,25 +49,25 @@ def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_every_task_is_made_with_the_default_options(env_id):
-    env = script.make_env(script.Args(env_id=env_id))
+    env = script.make_env(script.FlyArgs(env_id=env_id))
     assert env.unwrapped.flights.batch.sensors.camera is not None or "outage" in IDS[env_id]
 
 
 def test_actions_and_faults_default_to_those_of_the_task():
-    flights = script.make_env(script.Args(env_id="outage_dash")).unwrapped.flights
+    flights = script.make_env(script.FlyArgs(env_id="outage_dash")).unwrapped.flights
     assert flights.action == "velocity"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
-    given = script.Args(env_id="outage_dash", action="ctbr", faults=("rotor_loss",))
+    given = script.FlyArgs(env_id="outage_dash", action="ctbr", faults=("rotor_loss",))
     flights = script.make_env(given).unwrapped.flights
     assert flights.action == "ctbr"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["RotorLoss"]
-    assert script.make_env(script.Args()).unwrapped.flights.action == "ctbr"
+    assert script.make_env(script.FlyArgs()).unwrapped.flights.action == "ctbr"
 
 
 @pytest.mark.parametrize("suite", ["standard", "consumer"])
 @pytest.mark.parametrize("camera", [True, False])
 def test_any_suite_is_made_with_and_without_a_camera(suite, camera):
-    env = script.make_env(script.Args(sensors=suite, camera=camera))
+    env = script.make_env(script.FlyArgs(sensors=suite, camera=camera))
     wanted = camera and suite == "standard"
     assert (env.unwrapped.flights.batch.sensors.camera is not None) == wanted
 
@@ -117,7 +117,7 @@ def test_keys_change_the_flight_while_one_watches():
             return self.presses.pop(self.shown, [])
 
     fault = {"faults": ("imu_bias_step",), "fault_time": (90.0, 99.0)}
-    args = script.Args(
+    args = script.FlyArgs(
         env_id="QuadGym/Hover-v0", duration=2.0, camera=False, size=(320, 240), **fault
     )
     env = script.make_env(args)

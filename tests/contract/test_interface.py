@@ -183,7 +183,7 @@ def test_they_are_accepted_where_they_have_one(keywords):
 
 
 def test_a_comparison_gives_the_filters_keywords_where_a_filter_runs(tmp_path):
-    args = evaluate.Args(env={"filter_start": "warm", "estimator": "ekf"}, output=tmp_path)
+    args = evaluate.EvaluateArgs(env={"filter_start": "warm", "estimator": "ekf"}, output=tmp_path)
     for observation in ("truth", "noisy", "estimate"):
         evaluate.make_flights(args, observation, 1, "pd").close()
     given = {**args.env, "sensors": "rtk"}

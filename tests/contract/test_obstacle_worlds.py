@@ -1,36 +1,21 @@
-"""Environments whose world has obstacles: endings, interfaces, autoreset, snapshots, pictures."""
+"""Environments whose world has obstacles: endings, autoreset, views, records, pictures."""
 
 import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import Cylinder, Wall, WorldParams
+from quad_gym import Wall, WorldParams
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.flights.record import Flight, FlightRecorder
+from quad_gym.flights.record import Flight
 from quad_gym.records import Ending
 from quad_gym.tasks.rewards import Crash
-from tests.builders import single_env
+from tests.builders import recorded_flight, single_env
+from tests.contract.configurations import OBSTACLES
+from tests.tasks.tasks import Near
 
-WORLD = WorldParams(
-    obstacles=(
-        Wall(center_I=(5.5, 0.0, 1.0), size=(0.2, 6.0, 3.0), shift_I=(0.4, 0.0, 0.0)),
-        Cylinder(center_I=(2.0, 0.5, 1.0), radius=0.3, shift_I=(0.3, 0.3, 0.0)),
-    ),
-    geofence=((-1.0, -2.0, -1.0), (9.0, 2.0, 5.0)),
-)
 EASTWARD = np.array([0.0, 0.0, -0.03, 0.0], np.float32)  # pitches the vehicle, which looks west
-
-
-class Near(quad_gym.Task):
-    """Observes where the nearest obstacle is, as the controller believes."""
-
-    def observe(self, view):
-        return {
-            "wall_distance": view.observed.obstacle_distance,
-            "wall_vector": view.observed.obstacle_vector,
-        }
 
 
 def actions(count, steps, seed=0):
@@ -39,32 +24,11 @@ def actions(count, steps, seed=0):
 
 
 def hovering(count=6, **keywords):
-    return QuadVectorEnv(count, base="hover", world=WORLD, **keywords)
-
-
-def test_all_three_interfaces_fly_the_same_flights():
-    many = hovering(3, task=Near)
-    lone = [QuadEnv(base="hover", world=WORLD, task=Near) for _ in range(3)]
-    seen, _ = many.reset(seed=4)
-    for i, env in enumerate(lone):
-        np.testing.assert_array_equal(env.reset(seed=4 + i)[0], seen[i])
-    over = np.zeros(3, bool)
-    for action in actions(3, 80):
-        seen, reward, terminated, truncated, info = many.step(action)
-        for i in np.flatnonzero(~over):
-            one = lone[i].step(action[i])
-            np.testing.assert_array_equal(one[0], seen[i])
-            assert one[1:4] == (reward[i], terminated[i], truncated[i])
-            assert one[4]["ending"] == info["ending"][i]
-        over |= terminated | truncated
-    pytest.importorskip("stable_baselines3")
-    third = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=4, world=WORLD, task=Near)
-    first = QuadVectorEnv(3, base="hover", world=WORLD, task=Near).reset(seed=4)[0]
-    np.testing.assert_array_equal(third.reset(), first)
+    return QuadVectorEnv(count, base="hover", world=OBSTACLES, **keywords)
 
 
 def test_hitting_a_wall_is_a_crash_and_info_says_so():
-    env = single_env(seed=0, world=WORLD, observation="truth", task=Near)
+    env = single_env(seed=0, world=OBSTACLES, observation="truth", task=Near)
     for _ in range(400):
         _, _, terminated, truncated, info = env.step(EASTWARD)
         if terminated or truncated:
@@ -73,13 +37,16 @@ def test_hitting_a_wall_is_a_crash_and_info_says_so():
     assert not truncated
     assert info["ending"] == Ending.COLLISION
     view = env.flights.batch.view
-    assert 0.3 < view.obstacle_distance[0] <= WORLD.vehicle_radius
+    assert 0.3 < view.obstacle_distance[0] <= OBSTACLES.vehicle_radius
     assert Crash()(view)[0] == 1.0
 
 
 def test_leaving_the_geofence_is_a_crash_too():
-    fenced = WORLD.replace(obstacles=())
-    env = QuadEnv(base="hover", world=fenced, observation="truth", task=Near, out_of_bounds=50.0)
+    fenced = OBSTACLES.replace(obstacles=())
+    nearest = quad_gym.Task.of(
+        observe=lambda view: {"wall_distance": view.observed.obstacle_distance}
+    )
+    env = QuadEnv(base="hover", world=fenced, observation="truth", task=nearest)
     with pytest.raises(quad_gym.TaskError, match=r"finite 'wall_distance', got array\(\[inf\]\)"):
         env.reset(seed=0)
     env = single_env(seed=0, world=fenced, observation="truth", out_of_bounds=50.0)
@@ -94,7 +61,7 @@ def test_leaving_the_geofence_is_a_crash_too():
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
     env = gymnasium.make_vec(
-        "QuadGym/Hover-v0", num_envs=4, world=WORLD, observation="truth", autoreset_mode=mode
+        "QuadGym/Hover-v0", num_envs=4, world=OBSTACLES, observation="truth", autoreset_mode=mode
     )
     env.reset(seed=0)
     batch = env.unwrapped.flights.batch
@@ -110,32 +77,6 @@ def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
     assert episodes >= 1
     # nobody collides at once in the next episode, as one whose collision is not forgotten would
     assert np.array(lasted).max() > 50
-
-
-def test_a_snapshot_brings_back_obstacles_and_contact():
-    env = hovering(5)
-    env.reset(seed=1)
-    batch = env.flights.batch
-    for action in actions(5, 10):
-        env.step(action)
-    kept = batch.snapshot()
-
-    def on():
-        found = []
-        for action in actions(5, 60, seed=2):
-            seen, reward, *_ = env.step(action)
-            found += [
-                seen.copy(),
-                reward,
-                batch.record("obstacle_center"),
-                batch.record("collided"),
-            ]
-        return found
-
-    first = on()
-    batch.restore(kept)
-    for a, b in zip(first, on(), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_view_has_observed_and_true_obstacle_distances():
@@ -161,7 +102,7 @@ class Peeking(quad_gym.Task):
 
 def test_the_true_distance_is_hidden_from_the_controller():
     with pytest.raises(quad_gym.TaskError, match="observe cannot read the truth"):
-        QuadEnv(base="hover", world=WORLD, task=Peeking)
+        QuadEnv(base="hover", world=OBSTACLES, task=Peeking)
 
 
 def test_starts_within_obstacles_are_refused():
@@ -187,30 +128,19 @@ def test_starts_that_a_task_puts_into_obstacles_are_refused():
 # ---- records and pictures -----------------------------------------------------------------------
 
 
-def flown(world, steps=3, **keywords):
-    env = QuadEnv("hover", world=world, **keywords)
-    recorder = FlightRecorder(env.flights.batch)
-    env.reset(seed=0)
-    recorder.keep()
-    for _ in range(steps):
-        env.step(np.zeros(4, np.float32))
-        recorder.keep()
-    return recorder.flight, env.flights.batch
-
-
 def test_a_flight_keeps_its_obstacles(tmp_path):
-    flight, batch = flown(WORLD)
-    centers = batch.record("obstacle_center")[0, :2]
+    env, flight, _ = recorded_flight("hover", 3, world=OBSTACLES)
+    centers = env.flights.batch.record("obstacle_center")[0, :2]
     np.testing.assert_array_equal(flight.scene.obstacles[:, 1:4], centers)
     np.testing.assert_array_equal(flight.scene.obstacles[:, 0], [0.0, 1.0])
     np.testing.assert_array_equal(flight.scene.obstacles[1, 4:7], [0.3, 0.3, 1.5])
     again = Flight.load(flight.save(tmp_path / "flight.npz")).scene
     np.testing.assert_array_equal(again.obstacles, flight.scene.obstacles)
-    np.testing.assert_array_equal(again.geofence_I, WORLD.geofence)
+    np.testing.assert_array_equal(again.geofence_I, OBSTACLES.geofence)
 
 
 def test_files_from_before_there_were_obstacles_can_be_read(tmp_path):
-    flight, _ = flown(WORLD)
+    flight = recorded_flight("hover", 3, world=OBSTACLES)[1]
     path = flight.save(tmp_path / "flight.npz")
     with np.load(path) as file:
         kept = {n: file[n] for n in file.files if "obstacles" not in n and "geofence" not in n}
@@ -225,7 +155,7 @@ def test_obstacles_are_drawn(view):
     pytest.importorskip("pygame")
     frames = []
     # beside the vehicle, and around the eye of the chase view
-    for obstacles in ((), (*WORLD.obstacles, Wall(center_I=(3.0, 1.5, 1.0)))):
+    for obstacles in ((), (*OBSTACLES.obstacles, Wall(center_I=(3.0, 1.5, 1.0)))):
         env = gymnasium.make(
             "QuadGym/Hover-v0",
             world=WorldParams(obstacles=obstacles),

@@ -3,29 +3,31 @@
 import pytest
 
 from quad_gym.commands import compare, consistency, evaluate, fly, study, train
-from quad_gym.commands.main import module_of
+from quad_gym.commands.main import module_of, options_of
 from quad_gym.commands.options import parse
 
 
 def args_of(command):
-    return module_of(command).Args
+    return options_of(module_of(command))
 
 
 def test_ids_may_be_short_without_the_command_line(tmp_path):
     few = {"env_id": "circle", "output": tmp_path / "out"}
-    cases, _ = evaluate.configure(evaluate.Args(**few, policy=("pd",), episodes=2))
+    cases, _ = evaluate.configure(evaluate.EvaluateArgs(**few, policy=("pd",), episodes=2))
     assert {env.unwrapped.flights.name for _, env in cases.values()} == {"circle"}
-    plan, _ = train.configure(train.Args(**few, engine="compiled"))
+    plan, _ = train.configure(train.TrainArgs(**few, engine="compiled"))
     assert plan.env_id == "QuadGym/Circle-v0"
-    assert fly.make_env(fly.Args(env_id="circle")).unwrapped.flights.name == "circle"
-    race = study.Args(env_id="stale_race", arms=("pd",), output=tmp_path / "out")
+    assert fly.make_env(fly.FlyArgs(env_id="circle")).unwrapped.flights.name == "circle"
+    race = study.StudyArgs(env_id="stale_race", arms=("pd",), output=tmp_path / "out")
     assert study.configure(race).env_id == "QuadGym/StaleRace-v0"
-    assert consistency.Args(env_id="circle").env_id == "QuadGym/Circle-v0"
+    assert consistency.ConsistencyArgs(env_id="circle").env_id == "QuadGym/Circle-v0"
 
 
 def test_a_comparison_may_be_of_a_short_id(tmp_path):
     pytest.importorskip("stable_baselines3")
-    args = compare.Args(env_id="hover", seeds=1, train_on=("truth",), output=tmp_path / "out")
+    args = compare.CompareArgs(
+        env_id="hover", seeds=1, train_on=("truth",), output=tmp_path / "out"
+    )
     assert compare.configure(args).env_id == "QuadGym/Hover-v0"
 
 

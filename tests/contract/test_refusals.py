@@ -226,7 +226,7 @@ def test_completion_script_has_all_commands_and_options(shell):
 
 @pytest.mark.parametrize("again", [KeyboardInterrupt, RuntimeError])
 def test_ctrl_c_ends_a_command_with_a_message(again, monkeypatch, capsys):
-    def interrupted(args):
+    def interrupted(args: circle.CircleArgs):
         try:
             raise KeyboardInterrupt
         except KeyboardInterrupt:
@@ -238,7 +238,7 @@ def test_ctrl_c_ends_a_command_with_a_message(again, monkeypatch, capsys):
 
 
 def test_other_errors_are_raised(monkeypatch):
-    def fail(args):
+    def fail(args: circle.CircleArgs):
         raise RuntimeError("a bug")
 
     monkeypatch.setattr(circle, "main", fail)

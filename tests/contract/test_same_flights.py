@@ -12,46 +12,21 @@ import numpy as np
 import pytest
 
 import quad_gym
-from tests.builders import SHORT, STEPS, actions_for, actions_of, chosen, together, vec_env
-from tests.contract.comparing import (
-    assert_alone_as_together,
-    assert_same,
-    assert_snapshot_restores,
-    future_of,
-    state_of,
-)
+from tests.builders import SHORT, actions_for, actions_of, chosen, together, vec_env
+from tests.contract.comparing import assert_same, future_of, state_of
+from tests.contract.configurations import CONFIGURATIONS
 
-LAB = quad_gym.sensor_suite("lab")
 STANDARD = quad_gym.sensor_suite("standard")
-SLOW = STANDARD.with_rates(gnss=10.0, camera=25.0)
 QUIETER = STANDARD.replace(camera=STANDARD.camera.replace(pixel_sigma=19.0))
-AVERAGES = LAB.replace(
-    imu=LAB.imu.replace(samples="average"),
-    estimator=LAB.estimator.replace(integration="midpoint"),
-)
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-@pytest.mark.parametrize("task", list(quad_gym.IDS.values()))
-def test_flight_in_a_batch_is_the_flight_alone(task, mode):
-    *_, terminated, truncated = assert_alone_as_together(task, 7, mode)
-    assert (terminated | truncated).sum() >= 2 * 7
-
-
-@pytest.mark.parametrize(
-    "keywords",
-    [
-        {"observation": "noisy", "action": "attitude"},
-        {"observation": "measurements", "sensors": SLOW, "action": "motor"},
-        {"observation": "truth", "action": "velocity", "randomize_reference": True},
-        {"include_std": True, "layout": "absolute", "action": "wrench"},
-        {"camera": False, "control_rate": 100},
-        {"sensors": AVERAGES.with_rates(gnss=20.0)},
-    ],
-    ids=lambda keywords: "+".join(map(str, keywords)),
-)
-def test_flight_with_other_options_is_the_flight_alone(keywords):
-    assert_alone_as_together("circle", 3, "SameStep", **keywords)
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_size_and_order_of_a_batch_and_threads_do_not_change_flights(name):
+    base, keywords = CONFIGURATIONS[name]
+    many = together(base, range(40), mode="SameStep", threads=2, **keywords)
+    order = np.random.default_rng(1).permutation(40)[:11]
+    few = together(base, order.tolist(), mode="SameStep", **keywords)
+    assert_same(few, chosen(many, order))
 
 
 @pytest.fixture(scope="module")
@@ -79,22 +54,6 @@ def test_actions_of_one_flight_do_not_change_others():
     for k in range(50):
         mine, other = env.step(calm[k])[0], twin.step(wild[k])[0]
         np.testing.assert_array_equal(np.delete(mine, 3, axis=0), np.delete(other, 3, axis=0))
-
-
-@pytest.mark.parametrize("n_envs", [1, 7, 64])
-def test_sb3_interface_returns_the_same_flights(n_envs):
-    expected = together("hover", range(n_envs), mode="SameStep")
-    env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=n_envs, seed=1000, **SHORT)
-    observation = env.reset()
-    assert_same(observation, expected[0][0].copy())
-    actions = actions_for(range(n_envs))
-    for k in range(STEPS):
-        observation, reward, done, infos = env.step(actions[k])
-        assert_same(observation, expected[0][k + 1].copy(), f"step {k}")
-        np.testing.assert_array_equal(reward, expected[1][k + 1].astype(np.float32))
-        np.testing.assert_array_equal(done, expected[2][k + 1] | expected[3][k + 1])
-        cut = [info["TimeLimit.truncated"] for info in infos]
-        np.testing.assert_array_equal(cut, expected[3][k + 1] & ~expected[2][k + 1])
 
 
 def digest():
@@ -136,13 +95,23 @@ def test_copied_environment_has_the_same_future(twin_of, wrapped):
     assert_same(future, future_of(twin, 1, vector=False))
 
 
-@pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-@pytest.mark.parametrize("count", [1, 5, 70])
-def test_copied_vector_environment_has_the_same_future(twin_of, mode, count):
-    env = vec_env("circle", count, seed=6, autoreset_mode=mode, threads=2, **SHORT)
-    for action in actions_for(range(count), 25):
+def in_mid_episode(name, count=5, seed=6, steps=25, **more):
+    """A vector environment of a configuration after some steps."""
+    base, keywords = CONFIGURATIONS[name]
+    env = vec_env(
+        count=count, seed=seed, **{**SHORT, "base": base, "threads": 2, **keywords, **more}
+    )
+    for action in actions_for(range(count), steps):
         env.step(action)
+    return env
+
+
+@pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
+@pytest.mark.parametrize(
+    ("name", "count"), [*((name, 5) for name in CONFIGURATIONS), ("circle", 1), ("circle", 256)]
+)
+def test_copied_vector_environment_has_the_same_future(name, count, twin_of):
+    env = in_mid_episode(name, count)
     twin = twin_of(env)
     past = state_of(twin)
     future = future_of(env, count, vector=True)
@@ -166,9 +135,17 @@ def test_copied_sb3_environment_has_the_same_future(twin_of):
     assert_same(env.reset(), twin.reset())
 
 
-@pytest.mark.parametrize("count", [1, 5, 70])
-def test_restored_snapshot_has_the_same_future(count):
-    assert_snapshot_restores(count)
+@pytest.mark.parametrize(
+    ("name", "count"), [*((name, 5) for name in CONFIGURATIONS), ("circle", 1), ("circle", 70)]
+)
+def test_restored_snapshot_has_the_same_future(name, count):
+    made = {"autoreset_mode": "SameStep", "count": count}
+    env, fresh = in_mid_episode(name, **made), in_mid_episode(name, seed=99, steps=1, **made)
+    instant = env.flights.batch.snapshot()
+    future = future_of(env, count, vector=True)
+    for other in (env, fresh):
+        other.flights.batch.restore(instant)
+        assert_same(future, future_of(other, count, vector=True))
 
 
 def test_snapshot_of_another_batch_is_refused():

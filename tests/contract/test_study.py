@@ -113,7 +113,7 @@ def test_invalid_arms_are_rejected():
 
 
 def test_reward_of_an_arm_applies_in_training_only():
-    args = command.Args(arms=("std_certainty",))
+    args = command.StudyArgs(arms=("std_certainty",))
     setting = command.configure(args)
     plan = setting.trainings[0].plan
     learned = plan.make_vector_flights().unwrapped.flights.batch

@@ -52,7 +52,7 @@ def test_film_lasts_as_long_as_the_episode_and_loops(filmed):
 def test_film_shows_the_episode_of_the_test(filmed):
     folder, _ = filmed
     study = command.configure(
-        command.Args(
+        command.StudyArgs(
             *("look_around", ("truth", "std")),
             quick=True,
             steps=4096,

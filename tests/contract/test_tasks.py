@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from baselines import PDPolicy
+from quad_gym import RewardParams
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
@@ -60,15 +61,41 @@ def reference_of(task, t, batch):
     return np.tile(r, (n, 1)), np.tile(heading, (n, 1))
 
 
-def costs(action, last_action, body_rates):
-    change = ((action - last_action) ** 2).sum(axis=1)
-    return 0.02 * change + 0.002 * (body_rates**2).sum(axis=1)
+DOCUMENTED = {"near": 1.0, "near_decay": 2.0, "fine": 0.5, "fine_decay": 20.0, "progress": 1.0}
+DOCUMENTED |= {"gate_passed": 1.0, "heading": 0.1, "action_rate": 0.02, "body_rates": 0.002}
+OTHERS = {"near": 0.7, "near_decay": 1.5, "fine": 0.4, "fine_decay": 9.0, "progress": 0.8}
+OTHERS |= {"gate_passed": 3.0, "heading": 0.3, "action_rate": 0.05, "body_rates": 0.01}
+"""Weights by default, and other ones."""
 
 
+def weights_for(task, weights):
+    """Keywords of an environment: none for the default weights."""
+    others = ("near", "near_decay", "fine", "fine_decay")
+    others = others if task == "waypoints" else ("progress", "gate_passed")
+    mine = {name: weight for name, weight in weights.items() if name not in others}
+    return {} if weights is DOCUMENTED else {"reward_params": RewardParams(**mine)}
+
+
+def common_terms(weights, action, last_action, batch, aligned):
+    return {
+        "heading": weights["heading"] * aligned,
+        "action_rate": -weights["action_rate"] * ((action - last_action) ** 2).sum(axis=1),
+        "body_rates": -weights["body_rates"] * (batch.record("w") ** 2).sum(axis=1),
+    }
+
+
+def assert_terms(info, reward, expected, atol):
+    for name, value in expected.items():
+        np.testing.assert_allclose(info["reward_terms"][name], value, rtol=1e-9, atol=atol)
+    np.testing.assert_allclose(reward, sum(expected.values()), rtol=1e-9, atol=atol)
+
+
+@pytest.mark.parametrize("weights", [DOCUMENTED, OTHERS], ids=["default", "others"])
 @pytest.mark.parametrize("task", ["hover", "circle", "lemniscate", "random_trajectory"])
-def test_the_reward_of_a_tracking_task_is_the_documented_formula(task):
-    n = 20
-    env = QuadVectorEnv(n, task, autoreset_mode="Disabled", **UNBOUNDED)
+def test_the_reward_of_a_tracking_task_is_the_documented_formula(task, weights):
+    n, W = 20, weights
+    made = {"reward_terms": True, **weights_for(task, weights), **UNBOUNDED}
+    env = QuadVectorEnv(n, task, autoreset_mode="Disabled", **made)
     batch = env.flights.batch
     env.reset(seed=12)
     last = np.zeros((n, 4))
@@ -80,18 +107,21 @@ def test_the_reward_of_a_tracking_task_is_the_documented_formula(task):
         r_ref, x_ref = reference_of(task, (k + 1) * SECONDS, batch)
         e = np.linalg.norm(r_ref - batch.record("r"), axis=1)
         aligned = (body_axes(batch.record("q"))[:, 0] * x_ref).sum(axis=1)
-        expected = np.exp(-2 * e) + 0.5 * np.exp(-20 * e) + 0.1 * aligned
-        expected -= costs(action, last, batch.record("w"))
-        np.testing.assert_allclose(reward, expected, rtol=1e-9, atol=1e-12)
+        expected = common_terms(W, action, last, batch, aligned)
+        expected["near"] = W["near"] * np.exp(-W["near_decay"] * e)
+        expected["fine"] = W["fine"] * np.exp(-W["fine_decay"] * e)
+        assert_terms(info, reward, expected, atol=1e-12)
         np.testing.assert_allclose(info["position_error"], e, rtol=1e-9)
         seen = np.linalg.norm(batch.record("r_hat") - batch.record("r"), axis=1)
         np.testing.assert_allclose(info["estimation_error"], seen, rtol=1e-9, atol=1e-12)
         last = action
 
 
-def test_the_reward_of_waypoints_is_the_documented_formula():
+@pytest.mark.parametrize("weights", [DOCUMENTED, OTHERS], ids=["default", "others"])
+def test_the_reward_of_waypoints_is_the_documented_formula(weights):
     n = 40
-    env = QuadVectorEnv(n, "waypoints", autoreset_mode="Disabled", gate_count=4)
+    made = {"reward_terms": True, "gate_count": 4, **weights_for("waypoints", weights)}
+    env = QuadVectorEnv(n, "waypoints", autoreset_mode="Disabled", **made)
     batch, policy = env.flights.batch, PDPolicy(env, gains="lab")
     observation, info = env.reset(seed=3)
     gates, passed = batch.record("gates"), np.zeros(n, int)
@@ -108,9 +138,10 @@ def test_the_reward_of_waypoints_is_the_documented_formula():
         passed += through
         aligned = body_axes(batch.record("q"))[:, 0, 0]  # body x with east
         action = action.astype(float)
-        expected = (before - distance + through) / SECONDS
-        expected += 0.1 * aligned - costs(action, last, batch.record("w"))
-        np.testing.assert_allclose(reward, expected, rtol=1e-9, atol=1e-7)
+        expected = common_terms(weights, action, last, batch, aligned)
+        expected["progress"] = weights["progress"] * (before - distance) / SECONDS
+        expected["gate_passed"] = weights["gate_passed"] * through / SECONDS
+        assert_terms(info, reward, expected, atol=1e-7)
         np.testing.assert_array_equal(info["gates_passed"], passed)
         np.testing.assert_array_equal(terminated, passed == 4)
         last = action

@@ -1,8 +1,5 @@
 """Trajectories of a user's own in all interfaces: kernels against `Trajectory`, and options."""
 
-import copy
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
@@ -13,7 +10,7 @@ from quad_gym import FlightBatch, FlightRecorder, TaskParams, Trajectory
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Control, Source
-from tests.builders import actions_of, single_env
+from tests.builders import single_env
 
 FIVE = [(0, 0, 1.5), (1, 0.5, 2), (1, -0.5, 1), (-1, 0.5, 2), (-1, -0.5, 1)]
 WHEN = [0.0, 1.0, 2.2, 3.2, 4.8]
@@ -107,56 +104,6 @@ def test_an_episode_draws_its_trajectory_phase_and_turn():
     again = drawn.record("path")
     drawn.reset()
     assert (drawn.record("path") != again).any()
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_flights_are_the_same_in_every_interface(mode):
-    keywords = {
-        "trajectory": SEVERAL,
-        "randomize_reference": True,
-        "observation": "truth",
-        "duration": 1.0,
-    }
-    envs = QuadVectorEnv(5, "trajectory", autoreset_mode=mode, **keywords)
-    observations, _ = envs.reset(seed=7)
-    actions = 0.1 * np.stack([actions_of(i, 40) for i in range(5)], axis=1)
-    singles = [QuadEnv("trajectory", **keywords) for _ in range(5)]
-    for i, env in enumerate(singles):
-        observation, _ = env.reset(seed=7 + i)
-        np.testing.assert_array_equal(observation, observations[i])
-    for k in range(40):
-        observations, rewards, *_ = envs.step(actions[k])
-        for i, env in enumerate(singles):
-            observation, reward, *_ = env.step(actions[k, i])
-            np.testing.assert_array_equal(observation, observations[i])
-            assert reward == rewards[i]
-
-
-def test_stable_baselines():
-    pytest.importorskip("stable_baselines3")
-    env = quad_gym.make_sb3_vec_env(
-        "QuadGym/Trajectory-v0", n_envs=3, seed=1, trajectory=OPEN, observation="truth"
-    )
-    other = QuadVectorEnv(3, "trajectory", trajectory=OPEN, observation="truth")
-    first, _ = other.reset(seed=1)
-    np.testing.assert_array_equal(env.reset(), first)
-
-
-def test_snapshots_copies_and_pickles_go_on_bit_for_bit():
-    batch = batch_of(SEVERAL, randomize_reference=True)
-    batch.reset(seeds=range(9))
-    for _ in range(20):
-        batch.step()
-    kept = batch.snapshot()
-    copies = [copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
-    for _ in range(60):
-        batch.step()
-    end = batch.snapshot()
-    batch.restore(kept)
-    for one in (batch, *copies):
-        for _ in range(60):
-            one.step()
-        assert one.snapshot().tobytes() == end.tobytes()
 
 
 def test_a_users_task_sees_the_reference():

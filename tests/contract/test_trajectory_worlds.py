@@ -2,10 +2,9 @@
 
 import gymnasium
 import numpy as np
-import pytest
 
 import quad_gym
-from quad_gym import Cylinder, TaskParams, Trajectory, Wall, WorldParams
+from quad_gym import TaskParams, Trajectory, Wall, WorldParams
 from quad_gym.batch.surroundings import nearest_obstacle
 from quad_gym.records import Source
 from tests.builders import batch, part
@@ -50,33 +49,6 @@ def test_trajectory_into_a_wall_collides():
     for flight, k in enumerate(first):
         assert distance[k, flight] <= radius < distance[k - 1, flight]
         assert abs(r[k, flight, 0]) < 0.1 + radius + 1e-9
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_each_episode_draws_a_trajectory_and_its_obstacles(mode):
-    made = {
-        "trajectory": [THROUGH, INTO_A_WALL],
-        "world": WorldParams(obstacles=(*GAP, Cylinder(center_I=(2.0, -2.0, 1.5)))),
-        "randomize_reference": False,
-        "sensors": "indoor",
-        "action": "velocity",
-    }
-    together = gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=16, autoreset_mode=mode, **made)
-    alone = gymnasium.make("QuadGym/Trajectory-v0", **made)
-    many, _ = together.reset(seed=list(range(16)))
-    one, _ = alone.reset(seed=3)
-    many_flights, one_flight = (env.unwrapped.flights.batch for env in (together, alone))
-    drawn = many_flights.record("path")
-    assert set(drawn) == {0.0, 1.0}
-    centers = many_flights.record("obstacle_center")[3]
-    assert (centers == one_flight.record("obstacle_center")[0]).all()
-    for _ in range(80):
-        assert (many[3] == one).all()
-        action = np.array([0.3, 0.0, 0.0, 0.0], np.float32)
-        many, *_ = together.step(np.tile(action, (16, 1)))
-        one, _, terminated, truncated, _ = alone.step(action)
-        if terminated or truncated:
-            break
 
 
 def test_a_task_sees_the_wall_and_the_way_ahead():

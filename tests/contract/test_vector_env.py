@@ -9,38 +9,35 @@ import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
-from tests.builders import actions_of, vec_env
+from tests.builders import SHORT, STEPS, actions_for, actions_of, vec_env
 from tests.contract.comparing import assert_same, state_of
+from tests.contract.configurations import CONFIGURATIONS
 
 MODES = ("NextStep", "SameStep", "Disabled")
-SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
-"""Some flights tip over before the limit, others do not."""
 
 
-def both(env_id, count, mode, **keywords):
-    """Ours, and Gymnasium's loop over single environments."""
-    ours = gymnasium.make_vec(env_id, num_envs=count, autoreset_mode=mode, **keywords)
-    envs = [lambda: QuadEnv(quad_gym.IDS[env_id], **keywords)] * count
+def both(name, count, mode):
+    """Ours, and Gymnasium's loop over single environments, of a configuration."""
+    base, keywords = CONFIGURATIONS[name]
+    keywords = {**SHORT, "base": base, **keywords}
+    envs = [lambda: QuadEnv(**keywords)] * count
+    ours = QuadVectorEnv(count, autoreset_mode=mode, threads=2, **keywords)
     return ours, SyncVectorEnv(envs, autoreset_mode=AutoresetMode(mode))
 
 
 def spoken_of(infos):
-    """Infos with zeros wherever the mask beside them says that they hold nothing."""
+    """Infos by flight, without what the masks next to them say that they do not hold."""
     kept = {}
     for name, values in infos.items():
         mask = infos.get(f"_{name}")
         if isinstance(values, dict):
             kept[name] = spoken_of(values)
-        elif name == "ending":  # of Gymnasium's loop an array of objects, with numbers in ours
-            kept[name] = [
-                int(value) if said else 0 for value, said in zip(values, mask, strict=True)
-            ]
-        elif mask is not None and values.dtype != object:
-            kept[name] = np.where(mask, values, np.zeros_like(values))
-        elif mask is not None:
-            kept[name] = [value if said else None for value, said in zip(values, mask, strict=True)]
-        else:
+        elif mask is None:
             kept[name] = values
+        elif values.dtype == object and name != "ending":
+            kept[name] = [value for value, said in zip(values, mask, strict=True) if said]
+        else:  # endings of Gymnasium's loop are objects, numbers in ours
+            kept[name] = values[mask].astype(float)
     return kept
 
 
@@ -52,8 +49,7 @@ def assert_alike(mine, other, where):
 
 def fly_both(ours, theirs, steps, seed):
     """Step both alike and compare everything; return how many episodes ended in which way."""
-    count = ours.num_envs
-    actions = np.stack([actions_of(i, steps) for i in range(count)], axis=1)
+    actions = actions_for(range(ours.num_envs), steps)
     assert_alike(ours.reset(seed=seed), theirs.reset(seed=seed), "start")
     ended = np.zeros(2, int)
     for k in range(steps):
@@ -70,30 +66,17 @@ def fly_both(ours, theirs, steps, seed):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("env_id", ["QuadGym/Hover-v0", "QuadGym/Waypoints-v0"])
-def test_it_returns_what_a_loop_over_single_environments_returns(env_id, mode):
-    terminated, truncated = fly_both(*both(env_id, 19, mode, **SHORT), steps=90, seed=5)
-    assert truncated > 10
-    assert terminated > 10
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_it_returns_what_a_loop_over_single_environments_returns(name, mode):
+    terminated, truncated = fly_both(*both(name, 11, mode), steps=STEPS, seed=5)
+    assert terminated + truncated > 11
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_it_does_so_with_a_dict_of_policy_and_privileged(mode):
-    keywords = {"observation": "noisy", "privileged": True, "include_std": True, **SHORT}
-    fly_both(*both("QuadGym/RandomTrajectory-v0", 5, mode, **keywords), steps=40, seed=11)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_it_does_so_with_sensors_at_low_rates(mode):
-    suite = quad_gym.sensor_suite("standard").with_rates(gnss=10.0, camera=20.0)
-    keywords = {"observation": "measurements", "sensors": suite, **SHORT}
-    fly_both(*both("QuadGym/Hover-v0", 5, mode, **keywords), steps=40, seed=12)
-
-
-@pytest.mark.parametrize("privileged", [False, True])
-def test_spaces_hold_what_is_returned_with_the_stated_types(privileged):
-    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=6, privileged=privileged)
-    single = gymnasium.make("QuadGym/Circle-v0", privileged=privileged)
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_spaces_hold_what_is_returned_with_the_stated_types(name):
+    base, keywords = CONFIGURATIONS[name]
+    env = QuadVectorEnv(6, base=base, **keywords)
+    single = QuadEnv(base=base, **keywords)
     assert env.single_observation_space == single.observation_space
     assert env.single_action_space == single.action_space
     assert env.action_space.shape == (6, 4)
@@ -103,15 +86,9 @@ def test_spaces_hold_what_is_returned_with_the_stated_types(privileged):
     assert observation in env.observation_space
     assert (reward.dtype, reward.shape) == (np.float64, (6,))
     assert terminated.dtype == truncated.dtype == np.bool_
-    for name in (
-        "position_error",
-        "estimation_error",
-        "ending",
-        "filter_status",
-        "gates_passed",
-    ):
-        assert info[name].shape == (6,)
-        assert info[f"_{name}"].all()
+    for entry in ("position_error", "estimation_error", "ending", "filter_status", "gates_passed"):
+        assert info[entry].shape == (6,)
+        assert info[f"_{entry}"].all()
 
 
 def arrays_in(value):

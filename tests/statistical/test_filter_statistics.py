@@ -12,25 +12,12 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.estimation import UnscentedKalmanFilter
 from quad_gym.params.task import TaskParams
 from quad_gym.records import Source
+from tests.field_flights import nees, small_euler_angles
 from tests.reference_ukf import rotation_312
 
 LAB = quad_gym.sensor_suite("lab")
 PREDICTED = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at="predicted"))
 FLIGHTS = 1000
-
-
-def small_euler_angles(R):
-    """The 3-1-2 angles (n, 3) of rotations (n, 3, 3) near the identity."""
-    yaw, pitch = np.arctan2(-R[:, 1, 0], R[:, 1, 1]), np.arctan2(-R[:, 0, 2], R[:, 2, 2])
-    return np.stack([np.arcsin(R[:, 1, 2]), pitch, yaw], axis=-1)
-
-
-def attitudes_of_quaternions(q):
-    """R_BI (n, 3, 3) of unit quaternions (w, x, y, z), by Rodrigues' formula."""
-    w, axis = q[:, 0, np.newaxis, np.newaxis], q[:, 1:]
-    cross = np.zeros((len(q), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = axis, -axis
-    return np.eye(3) - 2 * w * cross + 2 * cross @ cross
 
 
 def circle_batch(sensors=LAB, source=Source.ESTIMATE, **options):
@@ -107,22 +94,6 @@ def test_a_rolling_vehicle_turns_its_covariance_less_than_it_should():
     whitened = whitened_errors_on_imu_alone((0.5, 0.0, 0.0), 4000, seed=12)
     eigenvalues = np.linalg.eigvalsh(np.cov(whitened))
     assert 1.3 < eigenvalues[-1] < 2.5
-
-
-def nees(batch):
-    """Normalized estimation error squared of every flight, the attitude's in error Euler angles."""
-    R_BI, R_hat = attitudes_of_quaternions(batch.record("q")), batch.record("R_hat")
-    errors = np.concatenate(
-        [
-            batch.record("r") - batch.record("r_hat"),
-            batch.record("v") - batch.record("v_hat"),
-            small_euler_angles(R_BI @ R_hat.transpose(0, 2, 1)),
-            batch.record("b_a") - batch.record("b_a_hat"),
-            batch.record("b_g") - batch.record("b_g_hat"),
-        ],
-        axis=1,
-    )[:, :, np.newaxis]
-    return (errors * np.linalg.solve(batch.covariance(), errors)).sum(axis=(1, 2))
 
 
 def nees_after_five_seconds(sensors):

@@ -1,4 +1,4 @@
-"""Tasks that tests fly: one that uses everything, and one that changes nothing."""
+"""Tasks that tests fly: one uses everything, one changes nothing, one observes surroundings."""
 
 import numpy as np
 
@@ -52,3 +52,14 @@ class Same(quad_gym.Task):
 
     def truncated(self, view):
         return view.builtin.truncated
+
+
+class Near(quad_gym.Task):
+    """Observe the nearest obstacle, where there are any, and the first feature."""
+
+    def observe(self, view):
+        seen = {"feature": (view.features - view.observed.position[:, None])[:, 0]}
+        if view.obstacles.shape[1]:
+            seen["wall_distance"] = view.observed.obstacle_distance
+            seen["wall_vector"] = view.observed.obstacle_vector
+        return seen

@@ -225,15 +225,6 @@ def test_rules_fly_the_plain_task_and_arms_the_scaled_one():
             load_policy(arm.policy, env)
 
 
-def assert_shown(env, observations, want):
-    """That the last parts of an observation are these."""
-    names = [field.name for field in env.unwrapped.flights.table]
-    assert names[-len(want) :] == list(want)
-    for name, value in want.items():
-        found = part(env, observations, name)
-        np.testing.assert_allclose(found, value.reshape(found.shape), rtol=1e-5, atol=1e-5)
-
-
 def true_state(env, target):
     """Of flights whose reference stands at targets: errors, vertical, rates; rotated by SciPy."""
     batch = env.unwrapped.flights.batch

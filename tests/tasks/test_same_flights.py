@@ -1,18 +1,15 @@
 """Equal flights of a task in all interfaces and modes, and of the built-in task without changes."""
 
-import copy
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.envs.sb3 import QuadSB3VecEnv
+from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.records import Ending
-from tests.builders import SHORT, actions_for, chosen, together, vec_env
-from tests.contract.comparing import assert_alone_as_together, assert_same
+from tests.builders import SHORT, actions_for, vec_env
+from tests.contract.comparing import assert_same
+from tests.contract.configurations import CONFIGURATIONS
 from tests.tasks.tasks import Chase, Same
 
 FLIGHTS = 11
@@ -51,68 +48,24 @@ def fly(env, seeds):
     return rows
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("task", TASK_DEFAULTS)
-def test_task_without_changes_changes_no_flight(task, mode):
-    made = {"autoreset_mode": mode, **SHORT}
-    plain = fly(vec_env(task, FLIGHTS, **made), range(FLIGHTS))
-    for own in (Empty(), Same(), Repeated()):
-        env = vec_env(task, FLIGHTS, task=own, **made)
-        assert_same(fly(env, range(FLIGHTS)), plain, type(own).__name__)
+WITHOUT_TASK = {
+    name: (base, keywords)
+    for name, (base, keywords) in CONFIGURATIONS.items()
+    if base not in BENCHMARKS and "task" not in keywords
+}
+WITHOUT_TASK["per second"] = ("circle", {"reward_per": "second", "privileged": True})
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    "keywords",
-    [
-        {"observation": "noisy", "start": "mixed"},
-        {"sensors": "rtk", "innovations": True, "truncate_when_diverged": True},
-        {"observation": "measurements", "privileged": True, "reward_per": "second"},
-        {"sensors": "consumer", "randomization": {"mass": quad_gym.Uniform(0.5, 1.0)}},
-        {"faults": "rotor_loss", "include_std": True, "filter_start": "warm"},
-    ],
-    ids=lambda keywords: "+".join(keywords),
-)
-def test_task_without_changes_with_options_changes_no_flight(keywords, mode):
+@pytest.mark.parametrize("name", WITHOUT_TASK)
+def test_task_without_changes_changes_no_flight(name, mode):
+    base, keywords = WITHOUT_TASK[name]
     made = {"autoreset_mode": mode, **SHORT, **keywords}
-    plain = fly(vec_env("circle", **made), range(5))
-    for own in (Empty(), None if "reward_per" in keywords else Same()):
-        assert_same(fly(vec_env("circle", task=own, **made), range(5)), plain)
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_flight_in_a_batch_is_the_flight_alone(mode):
-    _, _, terminated, truncated = assert_alone_as_together("hover", FLIGHTS, mode, task=Chase())
-    assert (terminated | truncated).sum() >= 2 * FLIGHTS
-    assert terminated.any()
-    assert truncated.any()
-
-
-def test_batch_size_and_threads_do_not_change_flights():
-    made = {"mode": "SameStep", "task": Chase()}
-    many = together("hover", range(100), threads=2, **made)
-    assert_same(chosen(many, range(FLIGHTS)), together("hover", range(FLIGHTS), **made))
-
-
-def test_sb3_interface_returns_the_same_flights():
-    env = QuadSB3VecEnv(FLIGHTS, base="hover", task=Chase(), **SHORT)
-    env.seed(0)
-    vector = vec_env(count=FLIGHTS, autoreset_mode="SameStep", task=Chase(), **SHORT)
-    np.testing.assert_array_equal(env.reset(), vector.reset(seed=0)[0])
-    returns = np.zeros(FLIGHTS)
-    for action in actions_for(range(FLIGHTS)):
-        observations, rewards, dones, infos = env.step(action)
-        theirs, their_rewards, terminated, truncated, info = vector.step(action)
-        np.testing.assert_array_equal(observations, theirs)
-        np.testing.assert_array_equal(rewards, their_rewards.astype(np.float32))
-        np.testing.assert_array_equal(dones, terminated | truncated)
-        returns += their_rewards
-        for i in np.flatnonzero(dones):
-            np.testing.assert_array_equal(infos[i]["terminal_observation"], info["final_obs"][i])
-            assert infos[i]["ending"] == info["final_info"]["ending"][i]
-            assert infos[i]["TimeLimit.truncated"] == (truncated[i] and not terminated[i])
-            assert infos[i]["episode"]["r"] == pytest.approx(returns[i], rel=1e-12)
-            returns[i] = 0.0
+    plain = fly(vec_env(base, 5, **made), range(5))
+    repeats = () if "observation" in keywords else (Repeated(),)
+    for own in (Empty(), *(() if name == "per second" else (Same(), *repeats))):
+        env = vec_env(base, 5, task=own, **made)
+        assert_same(fly(env, range(5)), plain, type(own).__name__)
 
 
 def test_endings_have_their_reasons():
@@ -126,32 +79,10 @@ def test_endings_have_their_reasons():
     assert Ending.TASK in found
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize(
-    "count", [3, 256]
-)  # NumPy unpickles small arrays and large ones differently
-def test_copied_environment_has_the_same_future(count, copied):
-    env = vec_env(count=count, seed=4, task=Chase(), **SHORT)
-    for action in actions_for(range(count))[:15]:
-        env.step(action)
-    other = copied(env)
-    for action in actions_for(range(count))[15:]:
-        assert_same(env.step(action), other.step(action))
-
-
-def test_restored_snapshot_restores_the_state_of_the_task():
-    env = vec_env(count=3, seed=4, task=Chase(), **SHORT)
-    batch = env.flights.batch
-    for action in actions_for(range(3))[:12]:
-        env.step(action)
-    instant = batch.snapshot()
-    after = [env.step(action) for action in actions_for(range(3))[12:18]]
-    batch.restore(instant)
-    assert batch.snapshot().tobytes() == instant.tobytes()
-    env._over[:] = False
-    assert_same([env.step(action) for action in actions_for(range(3))[12:18]], after)
+def test_snapshot_of_another_task_is_refused():
+    own = vec_env(count=3, seed=4, task=Chase()).flights.batch
     with pytest.raises(ValueError, match="snapshot must be one of a batch with Chase"):
-        batch.restore(vec_env(count=3).flights.batch.snapshot())
+        own.restore(vec_env(count=3).flights.batch.snapshot())
 
 
 def test_options_of_reset_precede_the_start_of_the_task():

@@ -23,7 +23,6 @@ TILTED = LAB.replace(
     inertia=((0.002, 3e-4, 0.0), (3e-4, 0.004, 1e-4), (0.0, 1e-4, 0.005)),
     rotor_spins=(-1.0, 1.0, -1.0, 1.0),
 )
-WEIGHT = LAB.mass * LAB.gravity
 FMAX = LAB.max_rotor_force
 
 seeds = st.integers(0, 2**32 - 1)

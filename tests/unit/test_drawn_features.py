@@ -1,6 +1,5 @@
 """Features that are elsewhere in each episode, and a filter that knows where."""
 
-import gymnasium
 import numpy as np
 import pytest
 from scipy import stats
@@ -11,21 +10,17 @@ from quad_gym.batch.surroundings import hidden_points
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import FEATURE_SLICE
 from quad_gym.rotations import quaternion_to_dcm
+from tests.contract.configurations import FEATURES
 from tests.field_flights import nees
 from tests.unit.alarms import alarm_score
 
 INDOOR = quad_gym.sensor_suite("indoor").simplified()
 NOMINAL = np.array(INDOOR.camera.features_I)
-DRAWS = {
-    "features_yaw": Uniform(-np.pi, np.pi),
-    "features_shift_I": (Uniform(-1.0, 1.0), Uniform(0.0, 2.0), Uniform(-0.2, 0.2)),
-    "feature_offsets_I": (Uniform(-0.3, 0.3), None, Uniform(-0.4, 0.4)),
-}
 TASK = TaskParams(kind="circle", start="hover", duration=0.0)
 
 
 def batch(count=4, **options):
-    options = {"sensors": INDOOR, "randomization": DRAWS, "task": TASK} | options
+    options = {"sensors": INDOOR, "randomization": FEATURES, "task": TASK} | options
     flights = FlightBatch(count, **options)
     flights.reset(seeds=range(count))
     return flights
@@ -62,7 +57,7 @@ def test_draws_are_those_of_their_distributions():
 
 @pytest.mark.parametrize("known", [False, True])
 def test_a_flight_that_draws_features_is_the_flight_that_has_them(known):
-    flights = batch(3, randomization=Randomization(DRAWS, known=known))
+    flights = batch(3, randomization=Randomization(FEATURES, known=known))
     for _ in range(100):
         flights.step()
     place = tuple(map(tuple, flights.feature_places()[1]))
@@ -112,7 +107,7 @@ def test_a_filter_that_knows_the_sensors_knows_the_true_map(drawn):
     wrong = NOMINAL + np.array([0.2, 0.0, 0.0])
     true = INDOOR.replace(camera=INDOOR.camera.replace(features_I=tuple(map(tuple, wrong))))
     for known, map_I in ((True, wrong), (False, NOMINAL)):
-        randomization = Randomization(DRAWS if drawn else {}, known=known)
+        randomization = Randomization(FEATURES if drawn else {}, known=known)
         flights = batch(3, true_sensors=true, randomization=randomization)
         expected = places(flights.drawn(), map_I) if drawn else [map_I] * 3
         np.testing.assert_allclose(flights.feature_places(), expected, atol=1e-12)
@@ -153,33 +148,6 @@ def test_obstacles_hide_features_where_they_are():
         hid, saw = hid + int(hidden.sum()), saw + int(seen.sum())
     assert hid > 100
     assert saw > 100
-
-
-def test_every_interface_flies_the_same_and_a_task_is_told():
-    class Told(quad_gym.Task):
-        def observe(self, view):
-            return {"nearest": (view.features - view.observed.position[:, None])[:, 0]}
-
-    made = {"sensors": "indoor", "randomization": DRAWS, "privileged": True, "task": Told()}
-    together = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, **made)
-    alone = gymnasium.make("QuadGym/Hover-v0", **made)
-    many, infos = together.reset(seed=[4, 5, 6])
-    one, info = alone.reset(seed=5)
-    drawn = info["drawn"]["feature_offsets_I"]
-    assert (infos["drawn"]["feature_offsets_I"][1] == drawn).all()
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        for part in many:
-            assert (many[part][1] == one[part]).all()
-        action = np.float32(rng.uniform(-0.1, 0.1, 4))
-        many, *_ = together.step(np.tile(action, (3, 1)))
-        one, *_ = alone.step(action)
-    kept = together.unwrapped.flights.batch.snapshot()
-    ends = []
-    for _ in range(2):
-        together.unwrapped.flights.batch.restore(kept)
-        ends.append(together.step(np.zeros((3, 4)))[0])
-    assert all((ends[0][part] == ends[1][part]).all() for part in ends[0])
 
 
 def test_a_record_has_the_features_of_its_episode():

@@ -23,7 +23,6 @@ from tests.unit.compiled import Compiled
 
 FOOT = 0.3048
 WIND, HEIGHT = 8.0, 6.0
-ROOT3 = np.sqrt(3.0)
 
 
 def military_scales(height, wind_speed):

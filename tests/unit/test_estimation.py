@@ -35,48 +35,6 @@ def assert_same(before, after):
         np.testing.assert_array_equal(was, now, err_msg=name)
 
 
-BAD_TRIPLES = [(1.0, 2.0), np.zeros((3, 3)), 1.0, "abc", (np.nan, 0, 1), (0, np.inf, 1), [None] * 3]
-BAD_IMAGES = [np.zeros((3, 2)), np.zeros(2), np.zeros((2, 3)), [[0, np.inf], [0, 0]], "abc"]
-
-
-@pytest.mark.parametrize("value", BAD_TRIPLES, ids=repr)
-@pytest.mark.parametrize(
-    ("method", "name"),
-    [
-        ("update", "gnss_position_G"),
-        ("update", "gnss_baseline_G"),
-        ("initialize", "gnss_position_G"),
-        ("initialize", "gnss_baseline_G"),
-        ("predict", "gyro"),
-        ("predict", "accel"),
-    ],
-)
-def test_bad_vectors_raise_and_leave_the_estimate_as_it_was(method, name, value):
-    good = {
-        "update": {"gnss_position_G": RECORDING.gnss_position[5]},
-        "initialize": {
-            "gnss_position_G": RECORDING.gnss_position[5],
-            "gnss_baseline_G": RECORDING.gnss_baseline[5],
-        },
-        "predict": {"gyro": RECORDING.gyro[5], "accel": RECORDING.accel[5]},
-    }
-    ukf = running_filter()
-    before = estimate(ukf)
-    with pytest.raises(ValueError, match=name):
-        getattr(ukf, method)(**{**good[method], name: value})
-    assert_same(before, estimate(ukf))
-    assert ukf.status == FilterStatus(0)
-
-
-@pytest.mark.parametrize("value", BAD_IMAGES, ids=repr)
-def test_bad_pixels_raise_and_leave_the_estimate_as_it_was(value):
-    ukf = running_filter()
-    before = estimate(ukf)
-    with pytest.raises(ValueError, match="pixels"):
-        ukf.update(RECORDING.gnss_position[5], RECORDING.gnss_baseline[5], value)
-    assert_same(before, estimate(ukf))
-
-
 def test_a_refused_measurement_has_no_later_effect():
     calm, upset = running_filter(), running_filter()
     for call in (

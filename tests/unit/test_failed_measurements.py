@@ -81,7 +81,7 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
     if how in ("nan", "infinity"):
         filters.put(BAD, **{VALUES[last]: np.nan if how == "nan" else np.inf})
     elif how == "singular":  # neither the estimate nor the measurements have any noise
-        for name in ("gnss_sigma", "baseline_noise", "velocity_sigma", "pixel_sigma"):
+        for name in ("position_sigma_I", "baseline_noise", "velocity_sigma", "pixel_sigma"):
             filters.put_params(BAD, **{name: 0.0})
         filters.put_params(BAD, direction_floor=0.0)
         filters.put(BAD, L=0.0)

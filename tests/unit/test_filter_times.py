@@ -248,7 +248,7 @@ def test_noise_of_a_measurement_is_that_of_a_suite_with_it(kind, given, sigma, c
     assert_same(ours, theirs)
     ours.update(**given)  # the suite's numbers hold again
     plain = params_record(VehicleParams(), SUITE)
-    for field in ("gnss_sigma", "velocity_sigma", "aid_sigma"):
+    for field in ("position_sigma_I", "velocity_sigma", "aid_sigma"):
         np.testing.assert_array_equal(ours._engine.params[field][0, ..., 0], plain[field][0])
 
 

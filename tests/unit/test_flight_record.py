@@ -22,22 +22,11 @@ from quad_gym.frames import ecef_to_enu
 from quad_gym.records import FaultKind, GateDecision
 from quad_gym.rendering import record_flight
 from quad_gym.rotations import quaternion_to_dcm
+from tests.builders import recorded_flight
 
 
 def at_rates(**rates):
     return quad_gym.sensor_suite("standard").with_rates(**rates)
-
-
-def recorded(task="circle", steps=12, seed=2, **keywords):
-    """(environment, its flight, observations of each row)."""
-    env = QuadEnv(task, **keywords)
-    recorder = FlightRecorder(env.flights.batch, about={"seed": seed})
-    observations = [env.reset(seed=seed)[0]]
-    recorder.keep()
-    for action in np.random.default_rng(seed).uniform(-0.3, 0.3, (steps, 4)):
-        observations.append(env.step(action)[0])
-        recorder.keep()
-    return env, recorder.flight, np.array(observations)
 
 
 def assert_same_flights(ours, theirs):
@@ -54,7 +43,7 @@ def assert_same_flights(ours, theirs):
 
 
 def test_rows_are_control_steps_from_the_start():
-    _, flight, _ = recorded(steps=12, control_rate=100.0)
+    _, flight, _ = recorded_flight(steps=12, control_rate=100.0)
     assert len(flight) == 13
     np.testing.assert_allclose(flight["time"], np.arange(13) / 100.0, atol=1e-12)
     assert len(flight.until(0.05)) == 6
@@ -62,7 +51,7 @@ def test_rows_are_control_steps_from_the_start():
 
 
 def test_estimate_and_reference_are_those_that_the_controller_observed():
-    _, flight, observed = recorded(layout="absolute")
+    _, flight, observed = recorded_flight(layout="absolute")
     part = {f.name: f.slice for f in quad_gym.observation_layout(layout="absolute")}
     for name, column in (
         ("position", "estimated_position"),
@@ -80,7 +69,7 @@ def test_estimate_and_reference_are_those_that_the_controller_observed():
     "task", ["hover", "lemniscate", "random_trajectory", "trajectory", "waypoints"]
 )
 def test_errors_are_distances_between_columns(task):
-    _, flight, _ = recorded(task)
+    _, flight, _ = recorded_flight(task)
     gap = np.linalg.norm(flight["position"] - flight["reference_position"], axis=1)
     np.testing.assert_allclose(gap, flight["position_error"], atol=1e-12)
     gap = np.linalg.norm(flight["position"] - flight["observed_position"], axis=1)
@@ -91,7 +80,7 @@ def test_errors_are_distances_between_columns(task):
 
 
 def test_nees_is_that_of_the_error_and_the_covariance():
-    _, flight, _ = recorded("hover", steps=25)
+    _, flight, _ = recorded_flight("hover", steps=25)
     row = flight.rows[-1]
     P = row["covariance"]
     error = np.zeros(15)
@@ -108,7 +97,7 @@ def test_nees_is_that_of_the_error_and_the_covariance():
 
 def test_fixes_are_kept_in_the_inertial_frame_and_only_when_they_come():
     keywords = {"sensors": at_rates(gnss=5.0), "control_rate": 50.0, "out_of_bounds": 50.0}
-    env, flight, _ = recorded("hover", steps=100, **keywords)
+    env, flight, _ = recorded_flight("hover", steps=100, **keywords)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
     np.testing.assert_array_equal(np.flatnonzero(measured), np.arange(0, 101, 10))
     lever = quad_gym.sensor_suite("lab").gnss.primary_antenna_B
@@ -122,7 +111,7 @@ def test_fixes_are_kept_in_the_inertial_frame_and_only_when_they_come():
 
 def test_what_the_gate_made_of_measurements_is_kept():
     faults = {"faults": GnssOutliers(share=0.5, size=(50.0, 100.0))}
-    env, flight, _ = recorded("hover", steps=100, sensors="rtk", **faults)
+    env, flight, _ = recorded_flight("hover", steps=100, sensors="rtk", **faults)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
     np.testing.assert_array_equal(np.isfinite(flight["gnss_decision"][:, 0]), measured)
     antenna_B = env.flights.batch.sensors.gnss.primary_antenna_B
@@ -136,23 +125,23 @@ def test_what_the_gate_made_of_measurements_is_kept():
     np.testing.assert_array_equal(
         np.isfinite(flight["feature_decision"]), np.isfinite(flight["pixels"]).all(axis=2)
     )
-    lab = recorded("hover")[1]
+    lab = recorded_flight("hover")[1]
     assert (lab["gnss_decision"][:, 0] == GateDecision.NONE).all()
     assert np.isnan(lab["gnss_decision"][:, 2]).all()  # its receiver gives no velocity
 
 
 def test_velocities_are_kept_where_the_receiver_gives_them():
-    _, flight, _ = recorded("hover", steps=100, sensors="rtk")
+    _, flight, _ = recorded_flight("hover", steps=100, sensors="rtk")
     measured = np.isfinite(flight["gnss_velocity"]).all(axis=1)
     np.testing.assert_array_equal(measured, np.isfinite(flight["gnss_position"]).all(axis=1))
     miss = (flight["gnss_velocity"] - flight["velocity"])[measured]
     assert np.abs(miss).max() < 6 * 0.05 + 0.3  # the antenna turns, and the row ends later
-    assert np.isnan(recorded("hover")[1]["gnss_velocity"]).all()
+    assert np.isnan(recorded_flight("hover")[1]["gnss_velocity"]).all()
 
 
 def test_wind_and_faults_are_kept():
     outage = GnssOutage(start=0.1, duration=0.1)
-    _, flight, _ = recorded(world="fresh_breeze", faults=outage)
+    _, flight, _ = recorded_flight(world="fresh_breeze", faults=outage)
     assert np.linalg.norm(flight["wind"], axis=1).min() > 1.0
     bit = 2.0**FaultKind.GNSS_OUTAGE
     away = (flight["time"] > 0.099) & (flight["time"] < 0.199)
@@ -160,16 +149,16 @@ def test_wind_and_faults_are_kept():
 
 
 def test_without_a_filter_nothing_is_estimated():
-    _, flight, _ = recorded(observation="truth")
+    _, flight, _ = recorded_flight(observation="truth")
     assert not flight.estimated
     for name in ("estimated_position", "covariance", "nees", "gnss_position", "pixels", "gyro"):
         assert np.isnan(flight[name]).all(), name
     assert np.isfinite(flight["position"]).all()
-    assert recorded()[1].estimated
+    assert recorded_flight()[1].estimated
 
 
 def test_a_new_episode_is_a_new_flight_and_the_old_one_lives_on():
-    env, first, _ = recorded(steps=5)
+    env, first, _ = recorded_flight(steps=5)
     recorder = FlightRecorder(env.flights.batch)
     env.reset(seed=1)
     recorder.keep()
@@ -183,7 +172,7 @@ def test_a_new_episode_is_a_new_flight_and_the_old_one_lives_on():
 
 
 def test_long_flights_have_room():
-    _, flight, _ = recorded(
+    _, flight, _ = recorded_flight(
         "hover", steps=600, duration=0.0, out_of_bounds=1e6, min_height=-1e6, max_tilt=np.pi
     )
     assert len(flight) == 601
@@ -258,14 +247,14 @@ def test_a_recorded_policy_flies_what_it_flies_unrecorded():
     ids=str,
 )
 def test_a_saved_flight_loads_bit_for_bit(tmp_path, keywords):
-    _, flight, _ = recorded(**keywords)
+    _, flight, _ = recorded_flight(**keywords)
     file = flight.save(tmp_path / "new" / "flight.npz")
     assert [f.name for f in file.parent.iterdir()] == ["flight.npz"]
     assert_same_flights(Flight.load(file), flight)
 
 
 def test_a_file_can_be_read_with_numpy_alone(tmp_path):
-    _, flight, _ = recorded()
+    _, flight, _ = recorded_flight()
     with np.load(flight.save(tmp_path / "flight.npz")) as archive:
         header = json.loads(str(archive["header"]))
         assert (header["format"], header["version"]) == ("quad_gym flight", 1)
@@ -303,7 +292,7 @@ def with_header(**changes):
     ],
 )
 def test_files_of_another_kind_are_clear_errors(tmp_path, change, message):
-    file = changed_file(recorded()[1], tmp_path / "flight.npz", change)
+    file = changed_file(recorded_flight()[1], tmp_path / "flight.npz", change)
     with pytest.raises(ValueError, match=message) as caught:
         Flight.load(file)
     assert "flight.npz" in str(caught.value)
@@ -311,7 +300,7 @@ def test_files_of_another_kind_are_clear_errors(tmp_path, change, message):
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
 def test_truncated_files_are_clear_errors(tmp_path, share):
-    file = recorded()[1].save(tmp_path / "flight.npz")
+    file = recorded_flight()[1].save(tmp_path / "flight.npz")
     whole = file.read_bytes()
     file.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(ValueError, match=r"flight\.npz"):
@@ -319,7 +308,7 @@ def test_truncated_files_are_clear_errors(tmp_path, share):
 
 
 def test_damaged_bytes_are_noticed(tmp_path):
-    file = recorded()[1].save(tmp_path / "flight.npz")
+    file = recorded_flight()[1].save(tmp_path / "flight.npz")
     whole = bytearray(file.read_bytes())
     whole[len(whole) // 2] ^= 0xFF
     file.write_bytes(bytes(whole))
@@ -339,7 +328,7 @@ def test_other_files_are_clear_errors(tmp_path):
 
 
 def test_an_interrupted_save_leaves_the_old_file(tmp_path):
-    _, flight, _ = recorded()
+    _, flight, _ = recorded_flight()
     file = flight.save(tmp_path / "flight.npz")
     before = file.read_bytes()
     with pytest.raises(TypeError):
@@ -349,7 +338,7 @@ def test_an_interrupted_save_leaves_the_old_file(tmp_path):
 
 
 def test_csv_keeps_every_number(tmp_path):
-    _, flight, _ = recorded(sensors=at_rates(gnss=10.0))
+    _, flight, _ = recorded_flight(sensors=at_rates(gnss=10.0))
     with flight.to_csv(tmp_path / "flight.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(flight)
@@ -360,7 +349,7 @@ def test_csv_keeps_every_number(tmp_path):
 
 
 def test_the_table_names_every_number_once():
-    _, flight, _ = recorded()
+    _, flight, _ = recorded_flight()
     columns = table(flight)
     numbers = sum(int(np.prod(flight[c.name].shape[1:])) for c in COLUMNS)
     assert len(columns) == numbers - 225 + 15  # the covariance has its standard deviations
@@ -375,7 +364,7 @@ def test_the_table_names_every_number_once():
 
 def test_pandas_gets_the_same_table(monkeypatch):
     pytest.importorskip("pandas")
-    _, flight, _ = recorded()
+    _, flight, _ = recorded_flight()
     frame = flight.to_pandas()
     assert frame.index.name == "time"
     np.testing.assert_array_equal(frame.index, flight["time"])

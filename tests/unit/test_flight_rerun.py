@@ -7,20 +7,12 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.envs.single import QuadEnv
-from quad_gym.flights.record import FlightRecorder
 from quad_gym.rotations import quaternion_to_dcm
+from tests.builders import recorded_flight
 
 
 def flown(task="hover", steps=30, **keywords):
-    env = QuadEnv(task, **keywords)
-    recorder = FlightRecorder(env.flights.batch, about={"seed": 3})
-    env.reset(seed=3)
-    recorder.keep()
-    for action in np.random.default_rng(3).uniform(-0.2, 0.2, (steps, 4)):
-        env.step(action)
-        recorder.keep()
-    return recorder.flight
+    return recorded_flight(task, steps, seed=3, **keywords)[1]
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.records import FLIGHT_BLOCK, WIDTH, Autoreset, offset_of, words_of_update
+from tests.builders import flown_batch
 from tests.golden.flights import AIDED
 
 COUNT = 5 * WIDTH + 3
@@ -25,13 +25,8 @@ SUITES = {
 
 def flown(suite, seeds, **options):
     task = TASK_DEFAULTS["circle"].replace(duration=1.0)
-    batch = FlightBatch(
-        len(seeds), sensors=suite, task=task, autoreset=Autoreset.SAME_STEP, threads=1, **options
-    )
-    batch.reset(seeds=seeds)
-    for _ in range(250):
-        batch.step()
-    return batch
+    same_step = {"task": task, "autoreset": Autoreset.SAME_STEP}
+    return flown_batch(seeds, 250, sensors=suite, **same_step, **options)
 
 
 @pytest.mark.parametrize("name", SUITES)

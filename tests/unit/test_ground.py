@@ -9,6 +9,7 @@ import quad_gym
 from quad_gym import FlightBatch, GroundParams, TaskParams, WorldParams, vehicle_params
 from quad_gym.records import Control, Ending, Source
 from quad_gym.rotations import quaternion_to_dcm
+from tests.builders import put
 from tests.field_flights import nees
 
 GRAVITY, TICK, FLOOR = 9.8, 1.0 / 200.0, -0.1
@@ -29,17 +30,6 @@ def batch(count=1, world=None, ground=None, task=None, **options):
 
 def stopped(flights):
     return np.full((flights.count, 4), -1.0)  # voltage 0
-
-
-def put(flights, **fields):
-    """Set the true state of all flights."""
-    snapshot = flights.snapshot()
-    for name, values in fields.items():
-        lanes = np.zeros((len(snapshot) * snapshot[name].shape[-1], *np.shape(values)[1:]))
-        lanes[: flights.count] = values
-        blocks = lanes.reshape(len(snapshot), -1, *lanes.shape[1:])
-        snapshot[name] = np.moveaxis(blocks, 1, -1)
-    flights.restore(snapshot)
 
 
 def resting_rotors(flights):
@@ -75,11 +65,29 @@ def energy(flights):
     )
 
 
+def standing(support, count, world=None, **options):
+    """Vehicles on the launch pad, or on ground that carries them."""
+    if support == "ground":
+        flights = batch(count, world, task={"start": "ground"}, **options)
+    else:
+        task = TaskParams(start="ground", duration=0.0, out_of_bounds=1e3)
+        made = {"sensors": "lab", "source": Source.TRUTH, "control_rate": 200.0, "task": task}
+        made |= {"control": Control.MOTOR, "world": WorldParams(**(world or {}))}
+        flights = FlightBatch(count, **made | options)
+    flights.reset(seeds=range(count))
+    return flights
+
+
+def stands(support, flights):
+    """(n,) True where a vehicle stands."""
+    return flights.record("footing") == 4.0 if support == "ground" else flights.record("on_pad") > 0
+
+
 @pytest.mark.parametrize("wind", [0.0, 3.0])
-def test_a_vehicle_stands_still_for_a_minute(wind):
+@pytest.mark.parametrize("support", ["pad", "ground"])
+def test_a_vehicle_stands_still_for_a_minute(support, wind):
     world = {"wind_I": (wind, 0.0, 0.0), "linear_drag_B": (0.3, 0.3, 0.3)}
-    flights = batch(3, world=world, run_filter=True, task={"start": "ground"})
-    flights.reset(seeds=[1, 2, 3])
+    flights = standing(support, 3, world, run_filter=True)
     before = {name: flights.record(name) for name in ("r", "q")}
     actions = np.full((3, 4), -0.4)  # the rotors carry a part of the weight
     for _ in range(60 * 200):
@@ -87,14 +95,14 @@ def test_a_vehicle_stands_still_for_a_minute(wind):
     for name, value in before.items():
         assert (flights.record(name) == value).all(), name
     assert (flights.record("v") == 0.0).all()
-    assert (flights.record("footing") == 4.0).all()
+    assert stands(support, flights).all()
     assert (flights.record("needs_reset") == 0.0).all()
 
 
 @pytest.mark.parametrize("sensors", ["lab", "standard"])
-def test_the_accelerometer_reads_gravity(sensors):
-    flights = batch(128, sensors=sensors, run_filter=True, task={"start": "ground"})
-    flights.reset(seeds=range(128))
+@pytest.mark.parametrize("support", ["pad", "ground"])
+def test_the_accelerometer_reads_gravity(support, sensors):
+    flights = standing(support, 128, sensors=sensors, run_filter=True)
     f, w = np.zeros((2, 128, 3))
     for _ in range(100):
         flights.step(stopped(flights))
@@ -193,18 +201,25 @@ def test_wind_beyond_friction_pushes_it_along():
         assert (np.linalg.norm(flights.record("r") - start) > 0.01) == moves
 
 
-def test_it_lifts_off_when_thrust_exceeds_weight():
+@pytest.mark.parametrize("action", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize("support", ["pad", "ground"])
+def test_it_lifts_off_when_thrust_exceeds_weight(support, action):
+    """W(t) = cm ea (1 - exp(-t / tau)) reaches the speed of hover at a time in closed form."""
     lab = vehicle_params("lab")
-    flights = batch(task={"start": "ground"}, vehicle=lab)
-    flights.reset(seeds=[0])
-    voltage = 1.2 * lab.hover_voltage
+    flights = standing(support, 1, vehicle=lab)
+    voltage = min(lab.hover_voltage * (1.0 + action), lab.max_voltage)
     expected = -lab.motor_time_constant * math.log(1.0 - lab.hover_voltage / voltage)
     ticks = 0
-    while flights.record("footing")[0] > 0.0:
-        flights.step(np.full((1, 4), 0.2))
+    while stands(support, flights)[0]:
+        flights.step(np.full((1, 4), action))
         ticks += 1
     assert abs(ticks * TICK - expected) <= 2.0 * TICK
     assert abs(flights.record("r")[0, 2]) < 1e-3
+    heights = []
+    for _ in range(50):
+        flights.step(np.full((1, 4), action))
+        heights.append(flights.record("r")[0, 2])
+    assert (np.diff(heights) > 0.0).all()
 
 
 def test_thrust_on_one_side_tips_it_over():

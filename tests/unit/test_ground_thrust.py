@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from tests.unit.test_ground import CALM, FLOOR, TOUGH, at_random, batch, points, put
+from tests.builders import put
+from tests.unit.test_ground import CALM, FLOOR, TOUGH, at_random, batch, points
 
 STILL_GAP = 2e-4
 

@@ -231,7 +231,7 @@ def test_baselines_of_an_episode_share_a_turn_about_body_z():
 def test_the_filter_counts_a_constant_heading_error_for_the_length_of_a_flight():
     """Conditioned on white baselines for a minute, its variance is half that of the constant."""
     gnss = LAB.gnss.replace(rate=10.0, baseline_sigma=1e-4, heading_error_sigma=0.05)
-    information = 60.0 * gnss.rate / gnss.believed_baseline_sigma**2
+    information = 60.0 * gnss.rate / gnss.baseline_noise**2
     assert 1.0 / (1.0 / gnss.first_baseline_sigma**2 + information) == pytest.approx(
         0.05**2 / 2.0, rel=1e-3
     )

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import FlightBatch, TaskParams, Trajectory, Uniform, vehicle_params
+from quad_gym import FlightBatch, TaskParams, Trajectory, Uniform
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Control, Source
 
-LAB = vehicle_params("lab")
 GRAVITY = 9.8
 
 
@@ -26,59 +25,6 @@ def batch(count=3, control=Control.MOTOR, **options):
 
 def stopped(count):
     return np.full((count, 4), -1.0)  # voltage 0
-
-
-def test_a_vehicle_stands_still_for_a_minute():
-    flights = batch(run_filter=True)
-    flights.reset(seeds=[1, 2, 3])
-    start = {name: flights.record(name) for name in ("r", "q", "v", "w")}
-    for _ in range(60 * 200):
-        flights.step(stopped(3))
-    for name, value in start.items():
-        assert (flights.record(name) == value).all(), name
-    assert (flights.record("on_pad") == 1.0).all()
-    assert (flights.record("needs_reset") == 0.0).all()
-
-
-@pytest.mark.parametrize("sensors", ["lab", "standard"])
-def test_the_accelerometer_feels_the_pad(sensors):
-    flights = batch(256, sensors=sensors, run_filter=True)
-    flights.reset(seeds=range(256))
-    means = np.zeros((256, 3))
-    gyro = np.zeros((256, 3))
-    for _ in range(100):
-        flights.step(stopped(256))
-        means += (flights.record("accel") - flights.record("b_a")) / 100
-        gyro += (flights.record("gyro") - flights.record("b_g")) / 100
-    suite = quad_gym.sensor_suite(sensors)
-    sigma = suite.imu.accel_noise_density * np.sqrt(suite.imu.rate)
-    error = (means - [0.0, 0.0, GRAVITY]) / (sigma / np.sqrt(100))
-    # the bias is read after its step, which is far smaller than the noise of a sample
-    assert np.abs(error.mean(0)).max() < 5 / np.sqrt(256)
-    sigma = suite.imu.gyro_noise_density * np.sqrt(suite.imu.rate)
-    assert np.abs((gyro / (sigma / np.sqrt(100))).mean(0)).max() < 5 / np.sqrt(256)
-
-
-@pytest.mark.parametrize("action", [0.05, 0.3, 1.0])
-def test_it_lifts_off_when_thrust_exceeds_weight(action):
-    """W(t) = cm ea (1 - exp(-t / tau)) reaches the speed of hover at a time in closed form."""
-    flights = batch(1)
-    flights.reset(seeds=[0])
-    hover = LAB.hover_voltage
-    voltage = min(hover * (1.0 + action), LAB.max_voltage)
-    expected = -LAB.motor_time_constant * np.log(1.0 - hover / voltage)
-    ticks = 0
-    while flights.record("on_pad")[0]:
-        flights.step(np.full((1, 4), action))
-        ticks += 1
-    assert abs(ticks / 200.0 - expected) <= 1.0 / 200.0 + 1e-9
-    assert flights.record("v")[0, 2] == 0.0
-    heights = []
-    for _ in range(50):
-        flights.step(np.full((1, 4), action))
-        heights.append(flights.record("r")[0, 2])
-    assert (np.diff(heights) > 0.0).all()
-    assert heights[0] > 0.0
 
 
 def test_thrust_below_the_weight_does_not_lift_it():
@@ -111,16 +57,6 @@ def test_a_hovering_start_is_not_on_the_pad():
     on_ground = flights.record("r")[:, 2] == 0.0
     assert 10 < on_ground.sum() < 54
     assert (flights.record("on_pad") == on_ground).all()
-
-
-def test_wind_does_not_move_it():
-    still = batch(
-        1, world=quad_gym.WorldParams(wind_I=(8.0, 0.0, 0.0), linear_drag_B=(0.3, 0.3, 0.3))
-    )
-    still.reset(seeds=[0])
-    for _ in range(200):
-        still.step(stopped(1))
-    assert (still.record("v") == 0.0).all()
 
 
 def test_an_environment_has_a_pad_and_the_reports_has_not():

@@ -33,11 +33,13 @@ CLASSES = [
     quad_gym.BatteryParams,
     quad_gym.GroundParams,
 ]
-NO_NUMBERS = ["fast", None, float("nan"), float("inf"), [1.0, 2.0]]
+NO_NUMBERS = ["fast", "3", b"3", True, np.True_, 3j, np.array([3.0]), 10**400]
+NO_NUMBERS += [None, float("nan"), float("inf"), [1.0, 2.0]]
 BELOW_ZERO = [-1.0, *NO_NUMBERS]
 NOT_POSITIVE = [0.0, *BELOW_ZERO]
 NO_PHASES = [-0.1, 1.0, "soon", float("nan")]
 NO_VECTORS = [(1.0, 2.0), 1.0, "abc", None, (1.0, 2.0, float("nan")), (1.0, 2.0, 3.0, 4.0)]
+NO_VECTORS += [("1", "2", "3"), (True, 1.0, 1.0), (None, 1.0, 1.0), np.ones(3, bool)]
 NO_MATRICES = [np.zeros((3, 2)), np.zeros(3), "abc", None, np.full((3, 3), np.nan)]
 
 BAD_VALUES = {

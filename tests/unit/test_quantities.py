@@ -11,6 +11,7 @@ from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.flights.record import COLUMNS
 from quad_gym.records import FLIGHT_FIELDS, Source
 from quad_gym.tasks.view import VIEW_FIELDS
+from tests import builders
 
 ONLY_IN_FLIGHTS = {"covariance", "nees", "gnss_decision", "feature_decision"}
 AIDED = sensor_suite("rtk").replace(
@@ -18,16 +19,9 @@ AIDED = sensor_suite("rtk").replace(
 )
 
 
-class Nothing(quad_gym.Task):
-    """Only there so that there is a view."""
-
-
-def flown(task="Circle", steps=30, count=5, **keywords):
-    env = gymnasium.make_vec(f"QuadGym/{task}-v0", num_envs=count, task=Nothing(), **keywords)
-    env.reset(seed=1)
-    for _ in range(steps):
-        env.step(np.full((count, 4), 0.02))
-    return env.unwrapped.flights.batch
+def flown(task="circle", **keywords):
+    """The batch of five flights after some steps, with a view."""
+    return builders.flown(task, **{"steps": 30, "task": quad_gym.Task(), **keywords}).flights.batch
 
 
 def test_flights_and_views_have_the_words_of_the_table():
@@ -44,7 +38,7 @@ def test_flights_and_views_have_the_words_of_the_table():
 def test_every_quantity_has_the_shape_of_the_table():
     room = {"features": 4, "gates": 5, "obstacles": 1}
     wall = quad_gym.Wall(center_I=(9.0, 0.0, 1.0))
-    batch = flown("Waypoints", sensors=AIDED, world=quad_gym.WorldParams(obstacles=(wall,)))
+    batch = flown("waypoints", sensors=AIDED, world=quad_gym.WorldParams(obstacles=(wall,)))
     room["features"] = len(AIDED.camera.features_I)
     for name, quantity in QUANTITIES.items():
         shape = tuple(room.get(n, n) for n in quantity.shape)
@@ -79,8 +73,8 @@ def test_attitudes_agree_with_scipy():
 @pytest.mark.parametrize(
     "task",
     [
-        *("Hover", "Circle", "Lemniscate", "RandomTrajectory", "Waypoints", "Trajectory"),
-        *("LookAround", "OutageDash"),
+        *("hover", "circle", "lemniscate", "random_trajectory", "waypoints", "trajectory"),
+        *("look_around", "outage_dash"),
     ],
 )
 def test_the_reference_is_the_one_that_tasks_are_shown(task):
@@ -96,7 +90,7 @@ def test_the_reference_is_the_one_that_tasks_are_shown(task):
 
 def test_measurements_are_those_of_a_view_and_nan_where_there_was_none():
     suite = AIDED.with_rates(gnss=10.0, camera=20.0)
-    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=Nothing(), sensors=suite)
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=quad_gym.Task(), sensors=suite)
     env.reset(seed=2)
     batch, fixes = env.unwrapped.flights.batch, 0
     for _ in range(20):

@@ -25,6 +25,7 @@ from quad_gym.records import (
     Source,
 )
 from quad_gym.rotations import euler_to_dcm
+from tests.builders import flown_batch
 from tests.unit.alarms import ALARM, alarm_score
 from tests.unit.compiled import Compiled
 
@@ -214,11 +215,7 @@ def some_distribution(name):
 
 def flown(ticks=60, seeds=(3,), **keywords):
     task = quad_gym.TaskParams(kind="circle", start="hover", duration=0.0)
-    batch = FlightBatch(len(seeds), task=task, threads=1, **({"sensors": SUITE} | keywords))
-    batch.reset(seeds=seeds)
-    for _ in range(ticks):
-        batch.step()
-    return batch
+    return flown_batch(seeds, ticks, **{"task": task, "sensors": SUITE, **keywords})
 
 
 SEEN = ("r", "v", "q", "w", "rotor_speeds", "charge", "wind", "accel", "gyro", "b_a", "b_g",
@@ -350,21 +347,6 @@ def test_a_start_that_the_caller_gives_stays():
     batch = FlightBatch(3, randomization={"start_position_I": Uniform(1.0, 2.0)})
     batch.reset(seeds=range(3), position=(0.5, 0.6, 0.7))
     np.testing.assert_array_equal(batch.record("r"), [[0.5, 0.6, 0.7]] * 3)
-
-
-def test_a_snapshot_keeps_what_was_drawn():
-    keywords = {"world": WORLD, "randomization": {"mass": Uniform(0.6, 0.9)}}
-    batch = flown(20, range(11), **keywords)
-    instant, mass = batch.snapshot(), batch.read("mass")
-    for _ in range(20):
-        batch.step()
-    future = batch.snapshot()
-    fresh = flown(1, range(50, 61), **keywords)
-    fresh.restore(instant)
-    np.testing.assert_array_equal(fresh.read("mass"), mass)
-    for _ in range(20):
-        fresh.step()
-    assert fresh.snapshot().tobytes() == future.tobytes()
 
 
 def test_parameter_record_begins_with_the_columns_of_draws():

@@ -8,7 +8,7 @@ from quad_gym.envs.configuration import Flights
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import Autoreset
 from quad_gym.rendering.geometry import (
-    View,
+    Perspective,
     chase_view,
     ellipsoid_axes,
     ellipsoid_outline,
@@ -204,7 +204,7 @@ def test_the_inset_shows_the_image_upright_and_to_scale():
 
 def test_views_are_rotations():
     for view in (fixed_view(a_flight(), 640, 367), chase_view(a_flight(), 640, 367)):
-        assert isinstance(view, View)
+        assert isinstance(view, Perspective)
         np.testing.assert_allclose(view.R_VI @ view.R_VI.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(view.R_VI) == pytest.approx(1.0)
 

@@ -10,6 +10,7 @@ import quad_gym.batch.flight_batch as flight_batch
 from quad_gym import Uniform
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import FLIGHT_BLOCK, FLIGHT_FIELDS, PARTS, Source, room_of
+from tests.builders import flown_batch
 
 EVERYTHING = frozenset(name for name, _ in PARTS)
 
@@ -47,18 +48,10 @@ CASES = {
 }
 
 
-def flown(options):
-    batch = FlightBatch(11, threads=1, **options)
-    batch.reset(seeds=range(11))
-    for _ in range(60):
-        batch.step()
-    return batch
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_flights_touch_nothing_beyond_their_room(name, monkeypatch):
     """The same flights in full records, of which what there was no room for is filled before."""
-    small = flown(CASES[name])
+    small = flown_batch(range(11), 60, **CASES[name])
     kept = set(small.snapshot().dtype.names)
     monkeypatch.setattr(flight_batch, "room_of", lambda used: room_of(EVERYTHING))
     begin = FlightBatch.reset
@@ -69,7 +62,7 @@ def test_flights_touch_nothing_beyond_their_room(name, monkeypatch):
         return begin(batch, **options)
 
     monkeypatch.setattr(FlightBatch, "reset", fill_and_reset)
-    full = flown(CASES[name])
+    full = flown_batch(range(11), 60, **CASES[name])
     assert full.snapshot().dtype == FLIGHT_BLOCK
     for field in FLIGHT_BLOCK.names:
         if field in kept:
@@ -100,7 +93,7 @@ def test_what_is_not_used_takes_no_memory():
 
 
 def test_fields_without_room_read_as_nothing():
-    batch = flown(TRUTH)
+    batch = flown_batch(range(11), 60, **TRUTH)
     assert batch.record("L").shape == (11, 15, 15)
     assert (batch.record("L") == 0.0).all()
     assert np.isnan(batch.record("block_nis")).all()

@@ -17,6 +17,7 @@ from quad_gym.records import (
     Control,
     Source,
 )
+from tests.builders import flown_batch
 
 ENDLESS = TaskParams(duration=0)
 SEEDS = np.random.default_rng(5).permutation(1000)[:100].tolist()
@@ -27,50 +28,12 @@ def new_batch(count, **options):
 
 
 def fly(seeds, steps=60, **options):
-    batch = new_batch(len(seeds), **options)
-    batch.reset(seeds=seeds)
-    for _ in range(steps):
-        batch.step()
-    return batch
-
-
-def assert_same_flights(batch, other, flights=None, others=None):
-    """Every field of every flight is bitwise the same (of `flights` and `others`, where given)."""
-    here = slice(None) if flights is None else flights
-    there = slice(None) if others is None else others
-    for name in FLIGHT.names:
-        np.testing.assert_array_equal(
-            batch.record(name)[here], other.record(name)[there], err_msg=name
-        )
+    return flown_batch(seeds, steps, **{"task": ENDLESS, **options})
 
 
 @pytest.fixture(scope="module")
 def hundred():
     return fly(SEEDS)
-
-
-@pytest.mark.parametrize("source", list(Source))
-def test_a_snapshot_in_mid_flight_comes_back_bit_for_bit(source):
-    batch = fly(SEEDS[:11], source=source)
-    kept = batch.snapshot()
-    path = []
-    for _ in range(40):
-        batch.step()
-        path.append(batch.record("r"))
-    after = batch.snapshot()
-    batch.reset(seeds=list(range(11)))
-    batch.step()
-    batch.restore(kept)
-    for position in path:
-        batch.step()
-        np.testing.assert_array_equal(batch.record("r"), position)
-    assert batch.snapshot().tobytes() == after.tobytes()
-
-    elsewhere = new_batch(11, source=source)
-    elsewhere.restore(kept)
-    for _ in range(40):
-        elsewhere.step()
-    assert_same_flights(elsewhere, batch)
 
 
 def test_a_snapshot_is_a_copy():

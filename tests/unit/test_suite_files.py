@@ -9,7 +9,7 @@ import pytest
 
 import quad_gym
 from baselines.plans import Plan, description
-from quad_gym.commands.compare import Args, configure
+from quad_gym.commands.compare import CompareArgs, configure
 from quad_gym.commands.main import main
 from quad_gym.params.suites import ALL_SUITES
 from tests.contract.test_sweep import pretend
@@ -176,12 +176,12 @@ def test_a_comparison_refuses_two_files_of_one_name(tmp_path):
         (tmp_path / folder).mkdir()
         files.append(str(quad_gym.sensor_suite("rtk").save(tmp_path / folder / "mine.toml")))
     with pytest.raises(ValueError, match="--sensors must have different names, got mine mine"):
-        configure(Args(sensors=tuple(files), engine="compiled", output=tmp_path / "out"))
+        configure(CompareArgs(sensors=tuple(files), engine="compiled", output=tmp_path / "out"))
 
 
 def test_comparison_with_a_changed_suite_file_is_rejected(tmp_path):
     file = str(quad_gym.sensor_suite("rtk").save(tmp_path / "mine.toml"))
-    args = Args(sensors=(file,), engine="compiled", output=tmp_path / "out")
+    args = CompareArgs(sensors=(file,), engine="compiled", output=tmp_path / "out")
     training = configure(args).trainings[0]
     assert training.folder == tmp_path / "out/runs/mine/truth/seed_0"
     pretend(training, 0.1)

@@ -12,6 +12,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Control, Source
 from quad_gym.rotations import quaternion_to_dcm
 from quad_gym.vehicle import state_derivative
+from tests.builders import flown_batch
 from tests.unit.test_vehicle import LAB, NO_FORCE, SKEWED, at_rest, newton_and_euler, random_state
 
 FULL = WorldParams(
@@ -355,27 +356,22 @@ def test_the_true_vehicles_largest_voltage_holds_whatever_the_controller_believe
 # ---- off is off ----------------------------------------------------------------------------------
 
 
-def states_after(ticks=100, **keywords):
-    batch = FlightBatch(9, threads=1, **keywords)
-    batch.reset(seeds=range(9))
-    for _ in range(ticks):
-        batch.step()
-    return batch
-
-
 def test_a_calm_world_flies_the_same_bits():
-    plain = states_after().snapshot()
+    plain = flown_batch(range(9), 100).snapshot()
     for world in ("calm", WorldParams(), WorldParams(rotor_radius=0.3, ground_height=-5.0)):
-        calm = states_after(world=world, randomization={}).snapshot()
+        calm = flown_batch(range(9), 100, world=world, randomization={}).snapshot()
         calm["configuration"] = plain["configuration"]
         assert calm.tobytes() == plain.tobytes()
 
 
 def test_air_that_does_nothing_changes_nothing_but_rounding():
     vehicle = LAB.replace(disc_area=0.0)
-    plain = states_after(vehicle=vehicle)
-    blown = states_after(
-        vehicle=vehicle, world=WorldParams(wind_I=(5.0, 0.0, 0.0), gust_wind_speed=5.0)
+    plain = flown_batch(range(9), 100, vehicle=vehicle)
+    blown = flown_batch(
+        range(9),
+        100,
+        vehicle=vehicle,
+        world=WorldParams(wind_I=(5.0, 0.0, 0.0), gust_wind_speed=5.0),
     )
     for name in ("b_a", "b_g", "key", "instant"):  # random draws are those of the calm flight
         np.testing.assert_array_equal(blown.record(name), plain.record(name))
@@ -386,7 +382,7 @@ def test_air_that_does_nothing_changes_nothing_but_rounding():
 
 def test_presets_are_known_by_name_and_fly():
     for name in ("calm", "breeze", "fresh_breeze"):
-        batch = states_after(world=name)
+        batch = flown_batch(range(9), 100, world=name)
         assert batch.world == quad_gym.world_params(name)
         assert np.isfinite(batch.record("r")).all()
     with pytest.raises(ValueError, match="world must be one of calm"):

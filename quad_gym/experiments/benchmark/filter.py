@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.peers import Measured, peers
+from quad_gym.experiments.benchmark.peers import MeasuredTick, peers
 from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.kernels.compiling import Stage
 from quad_gym.records import FEATURE_SLICE, WIDTH, aligned_zeros
 
 
-def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
+def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[MeasuredTick]:
     """Measurements of one flight in the next ticks."""
     recorded = []
     for _ in range(ticks):
         names = ("gyro", "accel", "gnss_position", "gnss_baseline", "pixels")
         gyro, accel, position, baseline, pixels = (batch.record(name)[flight] for name in names)
         features = int(batch.record("block_valid")[flight, FEATURE_SLICE].sum())
-        recorded.append(Measured(gyro, accel, position, baseline, pixels[:features]))
+        recorded.append(MeasuredTick(gyro, accel, position, baseline, pixels[:features]))
         batch.step()
     return recorded
 

@@ -17,7 +17,7 @@ REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "reference_ukf.py"
 """The plain filter, present in a checkout only."""
 
 
-class Measured(NamedTuple):
+class MeasuredTick(NamedTuple):
     """Measurements of one flight at one instant."""
 
     gyro: NDArray[np.float64]
@@ -37,7 +37,7 @@ def load_reference() -> ModuleType | None:
     return module
 
 
-def peers(sensors: SensorSuite, flight: list[Measured]) -> dict[str, Callable[[], None]]:
+def peers(sensors: SensorSuite, flight: list[MeasuredTick]) -> dict[str, Callable[[], None]]:
     """Functions that run the filters over a flight, by name, as far as they are available."""
     found = {"UnscentedKalmanFilter": _cycles(UnscentedKalmanFilter, sensors, flight)}
     module = load_reference()
@@ -54,7 +54,7 @@ def peers(sensors: SensorSuite, flight: list[Measured]) -> dict[str, Callable[[]
     return found
 
 
-def _cycles(kind: Any, sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None]:
+def _cycles(kind: Any, sensors: SensorSuite, flight: list[MeasuredTick]) -> Callable[[], None]:
     def run() -> None:
         ukf = kind(sensors)
         ukf.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
@@ -66,7 +66,7 @@ def _cycles(kind: Any, sensors: SensorSuite, flight: list[Measured]) -> Callable
 
 
 def _filterpy_cycles(
-    kalman: Any, module: Any, sensors: SensorSuite, flight: list[Measured]
+    kalman: Any, module: Any, sensors: SensorSuite, flight: list[MeasuredTick]
 ) -> Callable[[], None]:
     """Cycles of filterpy's filter over a flight.
 
@@ -93,7 +93,7 @@ def _filterpy_cycles(
             parts.append(plain.R_CB @ unit(R_BI @ (X_I - r) - plain.l_c))
         return np.concatenate(parts)
 
-    def measurement(now: Measured, R: Any, r: Any) -> tuple[Any, Any]:
+    def measurement(now: MeasuredTick, R: Any, r: Any) -> tuple[Any, Any]:
         z = [plain.R_IG @ now.gnss_position_G, unit(plain.R_IG @ now.gnss_baseline_G)]
         direction = unit(R.T @ plain.l_b)
         noise = [plain.R_position, plain._direction_noise(direction, plain.baseline_variance)]

@@ -22,7 +22,7 @@ from quad_gym.experiments.consistency.cases import (
     markdown,
     remark,
 )
-from quad_gym.faults.presets import PRESETS, faults_of
+from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.distributions import Uniform
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
@@ -75,7 +75,7 @@ def case_of(
     else:
         if flown.gnss is not None and flown.gnss.heading_errs:
             expected["nis_baseline"] = "counts constant heading errors as noise"
-        if flown.imu.believed_accel_error > 0.0 and (task == "waypoints" or "world" in keywords):
+        if flown.imu.accel_error_noise > 0.0 and (task == "waypoints" or "world" in keywords):
             reason = "counts errors of scale as noise"
             expected |= {"velocity": reason, "accel_bias": reason}
     return Case(f"{suite}, {task}, {start}, {condition}", flown, task, start, keywords, expected)
@@ -121,9 +121,7 @@ def _conditions(name: str) -> Iterator[dict[str, Any]]:
     for fault, parts in PRESETS.items():
         if not parts or any(getattr(part, "duration", math.inf) == math.inf for part in parts):
             continue  # it does not end
-        try:
-            faults_of(fault, suite)
-        except ValueError:  # the suite lacks its sensor
+        if not possible(fault, suite):
             continue
         corrupted = "corrupted measurements" if fault == "gnss_jump" else ""
         yield {"condition": fault, "wrong": corrupted, "faults": fault}

@@ -19,8 +19,7 @@ from quad_gym.experiments.consistency.cases import (
     remark,
 )
 from quad_gym.faults import AccelBiasStep, Fault, GnssOutage, GyroBiasStep, PositionJump
-from quad_gym.faults.presets import PRESETS, faults_of
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.suites import SUITES, sensor_suite
 
 FAULT_START, FAULT_DURATION, RECOVERY_TIME = 3.0, 5.0, 10.0
@@ -78,7 +77,7 @@ def cases() -> Iterator[Case]:
         gated = suite.estimator.false_alarm_probability > 0.0
         expected = {} if gated else {"": "no gate, so it cannot correct itself"}
         for fault, parts in catalog.items():
-            if _possible(parts, suite):
+            if possible(parts, suite):
                 yield Case(
                     f"{name}, {fault}",
                     suite,
@@ -89,14 +88,6 @@ def cases() -> Iterator[Case]:
     for name in SUITES:
         for task in CALM_TASKS:
             yield Case(f"{name}, {task}", sensor_suite(name), task, "warm")
-
-
-def _possible(faults: tuple[Fault, ...], suite: SensorSuite) -> bool:
-    try:
-        faults_of(faults, suite)
-    except ValueError:
-        return False
-    return True
 
 
 def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:

@@ -98,7 +98,7 @@ class Stage(IntEnum):
         vars()[sensor.name] = auto()
 
 
-class Source(NamedTuple):
+class Kernel(NamedTuple):
     """A compiled function for a slot, and the settings that need it."""
 
     stage: Stage
@@ -157,87 +157,87 @@ def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
     return lambda s: _filter(s) and bool(s["sensor_blocks"][sensor])
 
 
-def _sensor_source(sensor: Sensor) -> Source:
+def _sensor_source(sensor: Sensor) -> Kernel:
     name, parts = sensor.name.lower(), () if sensor < FIRST_AID else ("aids",)
-    return Source(Stage[sensor.name], f"sensors.{name}:{name}", _sensor(sensor), parts)
+    return Kernel(Stage[sensor.name], f"sensors.{name}:{name}", _sensor(sensor), parts)
 
 
 SOURCES = (
-    Source(Stage.UPDATE, "filter.update:update_with_slow", _slow, ("filter", "slow")),
-    Source(Stage.UPDATE, "filter.update:update", _filter, ("filter",)),
-    Source(Stage.PREDICT, "filter.predict:predict_with_slow", _slow, ("filter", "slow")),
-    Source(Stage.PREDICT, "filter.predict:predict", _filter, ("filter",)),
-    Source(
+    Kernel(Stage.UPDATE, "filter.update:update_with_slow", _slow, ("filter", "slow")),
+    Kernel(Stage.UPDATE, "filter.update:update", _filter, ("filter",)),
+    Kernel(Stage.PREDICT, "filter.predict:predict_with_slow", _slow, ("filter", "slow")),
+    Kernel(Stage.PREDICT, "filter.predict:predict", _filter, ("filter",)),
+    Kernel(
         Stage.LATE_UPDATE,
         "filter.delayed:late_update_with_slow",
         _with("run_filter", "slow_states", "late", "rewinds"),
         ("late",),
     ),
-    Source(
+    Kernel(
         Stage.LATE_UPDATE,
         "filter.delayed:late_update",
         _with("run_filter", "late", "rewinds"),
         ("late",),
     ),
     *map(_sensor_source, Sensor),
-    Source(Stage.SAMPLE, "sensors.imu:sample", _filter, ("filter",)),
-    Source(Stage.DRAW, "task.draws:draw", _drawn, ("draws",)),
-    Source(Stage.IMPOSE, "task.draws:impose", _drawn, ("draws",)),
-    Source(
+    Kernel(Stage.SAMPLE, "sensors.imu:sample", _filter, ("filter",)),
+    Kernel(Stage.DRAW, "task.draws:draw", _drawn, ("draws",)),
+    Kernel(Stage.IMPOSE, "task.draws:impose", _drawn, ("draws",)),
+    Kernel(
         Stage.PLACE_FEATURES, "task.places:place_features", _with("features_drawn"), ("places",)
     ),
-    Source(Stage.BEGIN, "task.episode:begin", _always),
-    Source(Stage.MOVE, "vehicle.air:move_in_air", _air),
-    Source(Stage.ALIGN, "filter.align:align", _filter, ("filter",)),
-    Source(Stage.OBSERVE, "task.observation:observe", _always),
-    Source(Stage.SHOW, "task.show:show", _with("shown")),
-    Source(Stage.ADVANCE_FAULTS, "sensors.faults:advance_faults", _faults, ("faults",)),
-    Source(Stage.BEGIN_FAULTS, "sensors.faults:begin_faults", _faults, ("faults",)),
-    Source(Stage.CONTROL, "vehicle.control:control", _always),
-    Source(Stage.MOVE, "vehicle.dynamics:move", _always),
-    Source(Stage.BEGIN_IN_AIR, "vehicle.air:begin_in_air", _air),
-    Source(Stage.WARM, "filter.warm:warm_with_slow", _with("run_filter", "slow_states", "warm")),
-    Source(Stage.WARM, "filter.warm:warm", _with("run_filter", "warm")),
-    Source(Stage.AVERAGE_IMU, "sensors.imu:average_imu", _with("run_filter", "imu_averages")),
-    Source(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features", _corrupts),
-    Source(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss", _corrupts),
-    Source(Stage.INCREMENT, "filter.preintegration:increment", _late, ("late",)),
-    Source(Stage.LOOK, "task.look:look", _always),
-    Source(Stage.JUDGE, "task.reward_and_endings:judge", _always),
-    Source(Stage.DRIFT_BIASES, "sensors.imu:drift_biases", _filter),
-    Source(
+    Kernel(Stage.BEGIN, "task.episode:begin", _always),
+    Kernel(Stage.MOVE, "vehicle.air:move_in_air", _air),
+    Kernel(Stage.ALIGN, "filter.align:align", _filter, ("filter",)),
+    Kernel(Stage.OBSERVE, "task.observation:observe", _always),
+    Kernel(Stage.SHOW, "task.show:show", _with("shown")),
+    Kernel(Stage.ADVANCE_FAULTS, "sensors.faults:advance_faults", _faults, ("faults",)),
+    Kernel(Stage.BEGIN_FAULTS, "sensors.faults:begin_faults", _faults, ("faults",)),
+    Kernel(Stage.CONTROL, "vehicle.control:control", _always),
+    Kernel(Stage.MOVE, "vehicle.dynamics:move", _always),
+    Kernel(Stage.BEGIN_IN_AIR, "vehicle.air:begin_in_air", _air),
+    Kernel(Stage.WARM, "filter.warm:warm_with_slow", _with("run_filter", "slow_states", "warm")),
+    Kernel(Stage.WARM, "filter.warm:warm", _with("run_filter", "warm")),
+    Kernel(Stage.AVERAGE_IMU, "sensors.imu:average_imu", _with("run_filter", "imu_averages")),
+    Kernel(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features", _corrupts),
+    Kernel(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss", _corrupts),
+    Kernel(Stage.INCREMENT, "filter.preintegration:increment", _late, ("late",)),
+    Kernel(Stage.LOOK, "task.look:look", _always),
+    Kernel(Stage.JUDGE, "task.reward_and_endings:judge", _always),
+    Kernel(Stage.DRIFT_BIASES, "sensors.imu:drift_biases", _filter),
+    Kernel(
         Stage.FOLLOW, "task.follow:follow", lambda s: bool(s["harmonics"] == FOLLOWED), ("path",)
     ),
-    Source(Stage.REST_ON_PAD, "vehicle.pad:rest_on_pad", _pad),
-    Source(Stage.KEEP_START, "vehicle.pad:keep_start", _keeps_start),
-    Source(Stage.SUPPLY, "vehicle.air:supply", lambda s: s["supply"] != Supply.NOMINAL),
-    Source(Stage.BEGIN_LATE, "filter.preintegration:begin_late", _late, ("late",)),
-    Source(
+    Kernel(Stage.REST_ON_PAD, "vehicle.pad:rest_on_pad", _pad),
+    Kernel(Stage.KEEP_START, "vehicle.pad:keep_start", _keeps_start),
+    Kernel(Stage.SUPPLY, "vehicle.air:supply", lambda s: s["supply"] != Supply.NOMINAL),
+    Kernel(Stage.BEGIN_LATE, "filter.preintegration:begin_late", _late, ("late",)),
+    Kernel(
         Stage.BEGIN_IMPERFECT,
         "sensors.imperfect:begin_imperfect",
         _has_constant_errors,
         ("errors",),
     ),
-    Source(Stage.DISTURB_IMU, "sensors.imperfect:disturb_imu", _imu_disturbed),
-    Source(
+    Kernel(Stage.DISTURB_IMU, "sensors.imperfect:disturb_imu", _imu_disturbed),
+    Kernel(
         Stage.TURN_BASELINE, "sensors.imperfect:turn_baseline", _with("run_filter", "heading_errs")
     ),
-    Source(
+    Kernel(
         Stage.LIMIT_CAMERA, "sensors.imperfect:limit_camera", _with("run_filter", "camera_limited")
     ),
-    Source(Stage.DELAY_ACTION, "vehicle.delay:delay_action", _with("action_delays"), ("actions",)),
-    Source(Stage.HIDE_FEATURES, "obstacles.sight:hide_features", _hides),
-    Source(Stage.BEGIN_CONTACTS, "obstacles.contact:begin_contacts", _contacts),
-    Source(Stage.TOUCH, "obstacles.contact:touch", _contacts, ("contacts",)),
-    Source(Stage.JUDGE_CONTACTS, "obstacles.contact:judge_contacts", _contacts),
-    Source(Stage.BEGIN_GROUND, "vehicle.ground:begin_ground", _grounded),
-    Source(Stage.STAND, "vehicle.ground:stand", _grounded, ("ground",)),
-    Source(Stage.FEEL_GROUND, "vehicle.ground:feel_ground", _with("run_filter", "grounded")),
-    Source(Stage.JUDGE_LANDING, "vehicle.ground:judge_landing", _grounded),
-    Source(Stage.SATURATE_IMU, "sensors.faults:saturate_imu", _corrupts),
-    Source(Stage.MEET_ROTORS, "sensors.faults:meet_rotors", _faults),
-    Source(Stage.SUM_IMU, "sensors.imu:sum_imu", _observes_measurements, ("raw",)),
-    Source(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations", _watches, ("watch",)),
+    Kernel(Stage.DELAY_ACTION, "vehicle.delay:delay_action", _with("action_delays"), ("actions",)),
+    Kernel(Stage.HIDE_FEATURES, "obstacles.sight:hide_features", _hides),
+    Kernel(Stage.BEGIN_CONTACTS, "obstacles.contact:begin_contacts", _contacts),
+    Kernel(Stage.TOUCH, "obstacles.contact:touch", _contacts, ("contacts",)),
+    Kernel(Stage.JUDGE_CONTACTS, "obstacles.contact:judge_contacts", _contacts),
+    Kernel(Stage.BEGIN_GROUND, "vehicle.ground:begin_ground", _grounded),
+    Kernel(Stage.STAND, "vehicle.ground:stand", _grounded, ("ground",)),
+    Kernel(Stage.FEEL_GROUND, "vehicle.ground:feel_ground", _with("run_filter", "grounded")),
+    Kernel(Stage.JUDGE_LANDING, "vehicle.ground:judge_landing", _grounded),
+    Kernel(Stage.SATURATE_IMU, "sensors.faults:saturate_imu", _corrupts),
+    Kernel(Stage.MEET_ROTORS, "sensors.faults:meet_rotors", _faults),
+    Kernel(Stage.SUM_IMU, "sensors.imu:sum_imu", _observes_measurements, ("raw",)),
+    Kernel(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations", _watches, ("watch",)),
 )
 """Every function of a stage, the longest to compile first. A slot with several functions gets the
 first one that is needed."""
@@ -246,8 +246,8 @@ STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
 """The addresses of the stages, 0 where a slot is empty."""
 
 
-def _chosen(settings: Any) -> dict[Stage, Source]:
-    chosen: dict[Stage, Source] = {}
+def _chosen(settings: Any) -> dict[Stage, Kernel]:
+    chosen: dict[Stage, Kernel] = {}
     for source in SOURCES:
         if source.stage not in chosen and source.needed(settings):
             chosen[source.stage] = source

@@ -129,7 +129,7 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
         for j in range(i + 1):
             L[i, j] = select(mask, 0.0, L[i, j])
     for i in range(3):
-        L[R + i, R + i] = select(mask, inflation * p.gnss_sigma[i], L[R + i, R + i])
+        L[R + i, R + i] = select(mask, inflation * p.position_sigma_I[i], L[R + i, R + i])
         speed = math.sqrt(p.initial_velocity_variance + v_variance[i])
         L[V + i, V + i] = select(mask, speed, L[V + i, V + i])
         tilt = select(level, p.initial_tilt_sigma, attitude)

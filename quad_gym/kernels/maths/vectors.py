@@ -162,7 +162,7 @@ def _operator(operation: Any, shape_of: Callable[..., Any], emit: Callable[..., 
     """
 
     @infer_global(operation)
-    class _Typing(AbstractTemplate):
+    class _OperatorTyping(AbstractTemplate):
         metadata = ASKED_FIRST
 
         def generic(self, args, kws):  # type: ignore[no-untyped-def]

@@ -39,18 +39,13 @@ _DRAWS = np.uint64(DRAWS_OF_FAULT)
 NEVER = 1e18
 """A tick that no flight reaches."""
 
-_ONE, _TWO = np.uint64(1), np.uint64(2)
-_THREE, _FOUR, _FIVE = np.uint64(3), np.uint64(4), np.uint64(5)
+_ONE, _TWO, _THREE, _FOUR, _FIVE = (np.uint64(number) for number in range(1, 6))
 _GNSS_OUTAGE, _BASELINE_LOSS = int(FaultKind.GNSS_OUTAGE), int(FaultKind.BASELINE_LOSS)
-_OUTLIERS, _RAMP, _JUMP = (
-    int(FaultKind.GNSS_OUTLIERS),
-    int(FaultKind.GNSS_RAMP),
-    int(FaultKind.GNSS_JUMP),
-)
+_OUTLIERS, _RAMP = int(FaultKind.GNSS_OUTLIERS), int(FaultKind.GNSS_RAMP)
+_JUMP, _ROTOR_LOSS = int(FaultKind.GNSS_JUMP), int(FaultKind.ROTOR_LOSS)
 _POSITION_JUMP, _OCCLUSION = int(FaultKind.POSITION_JUMP), int(FaultKind.CAMERA_OCCLUSION)
 _ASSOCIATIONS, _SATURATION = int(FaultKind.WRONG_ASSOCIATIONS), int(FaultKind.IMU_SATURATION)
 _ACCEL_STEP, _GYRO_STEP = int(FaultKind.ACCEL_BIAS_STEP), int(FaultKind.GYRO_BIAS_STEP)
-_ROTOR_LOSS = int(FaultKind.ROTOR_LOSS)
 
 
 @kernel
@@ -272,7 +267,7 @@ def _draw_outlier(flight, p, settings, mask):
     size = settings.fault_size[k, 0] + settings.fault_size[k, 1] * u
     size = select(struck, size, 0.0)
     direction = _any_direction(stream, _draw_of(k) + _FIVE)
-    white, drive = load3(p.gnss_sigma), load3(p.drift_drive)
+    white, drive = load3(p.position_sigma_I), load3(p.drift_drive)
     kept = (1.0 - p.drift_decay) * (1.0 + p.drift_decay)
     flight.outlier = select(mask, select(struck, 1.0, 0.0), flight.outlier)
     return (
@@ -292,9 +287,8 @@ def corrupt_gnss(flight, p, settings, mask):
         seconds = select(flight.fault_active[_RAMP] > 0.0, seconds, 0.0)
         offset_I = add(offset_I, scale(seconds, load3(flight.fault_vector[_RAMP])))
     if settings.fault_on[_JUMP]:
-        offset_I = add(
-            offset_I, scale(flight.fault_active[_JUMP], load3(flight.fault_vector[_JUMP]))
-        )
+        jump_I = scale(flight.fault_active[_JUMP], load3(flight.fault_vector[_JUMP]))
+        offset_I = add(offset_I, jump_I)
     if settings.fault_on[_OUTLIERS]:
         offset_I = add(offset_I, _draw_outlier(flight, p, settings, mask))
     offset_G = apply_transposed(load33(p.R_IG), offset_I)

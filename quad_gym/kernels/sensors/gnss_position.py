@@ -53,7 +53,7 @@ _EKF = int(FilterForm.EKF)
 @kernel
 def measure(flight, p, R_BI, normals, mask):
     """Measure the antenna's position in G, in the lanes `mask`."""
-    s = load3(p.gnss_sigma)
+    s = load3(p.position_sigma_I)
     antenna_I = add(load3(flight.r), apply_transposed(R_BI, load3(p.antenna)))
     noise_I = (s[0] * normals[0], s[1] * normals[1], s[2] * normals[2])
     noise_I = add(noise_I, load3(flight.gnss_drift))
@@ -85,7 +85,7 @@ def _center(flight, p, work, settings, k, valid, R_BI):
         antenna_I = add(antenna_I, load3(flight.slow_hat))
     put_three(work.z_hat, k, valid, antenna_I)
     put_three(work.z, k, valid, apply(load33(p.R_IG), load3(flight.gnss_position)))
-    s = load3(p.gnss_sigma)
+    s = load3(p.position_sigma_I)
     zero = 0.0 * s[0]
     noise = ((s[0] * s[0], zero, zero), (zero, s[1] * s[1], zero), (zero, zero, s[2] * s[2]))
     put_noise(work, k, valid, noise)

@@ -169,7 +169,11 @@ def _tie_position(p, P, R_BI, iron, delta):
     x, y, z = load3(p.antenna)
     J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
     J_t = transpose(J)
-    with_attitude, s, k = multiply(_full(P), J_t), load3(p.gnss_sigma), p.initial_covariance_scale
+    with_attitude, s, k = (
+        multiply(_full(P), J_t),
+        load3(p.position_sigma_I),
+        p.initial_covariance_scale,
+    )
     white = (
         (k * s[0] * s[0], zero, zero),
         (zero, k * s[1] * s[1], zero),

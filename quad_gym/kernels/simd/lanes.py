@@ -132,7 +132,7 @@ def _binary(
     """Define `operation` for operands of the vector type `operand`, one of which may be plain."""
 
     @infer_global(operation)
-    class _Typing(AbstractTemplate):
+    class _BinaryTyping(AbstractTemplate):
         metadata = ASKED_FIRST
 
         def generic(self, args, kws):  # type: ignore[no-untyped-def]
@@ -225,7 +225,7 @@ for _operation, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
 
 def _unary(operation: Any, emit: Callable[[Any, ir.IRBuilder, Any], Any]) -> None:
     @infer_global(operation)
-    class _Typing(AbstractTemplate):
+    class _UnaryTyping(AbstractTemplate):
         metadata = ASKED_FIRST
 
         def generic(self, args, kws):  # type: ignore[no-untyped-def]

@@ -123,7 +123,6 @@ def _derive_sensors(own, nominal, settings):
         own.baseline[i] = nominal.baseline[i] + (secondary - primary)
         own.imu_lever_arm[i] = own.lever_arm_B[i] - center
         own.camera[i] = own.camera_position_B[i] - center
-        own.gnss_sigma[i] = own.position_sigma_I[i]
     own.baseline_length = norm(load3(own.baseline))
     k, kinds = _CAMERA_ROTATION, settings.draw_kind
     if kinds[k] != FIXED or kinds[k + 1] != FIXED or kinds[k + 2] != FIXED:

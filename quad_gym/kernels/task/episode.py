@@ -20,7 +20,7 @@ from quad_gym.records import (
     HEADING_VELOCITY,
     MAX_GATES,
     MAX_HARMONICS,
-    Task,
+    TaskKind,
 )
 
 
@@ -110,24 +110,24 @@ def draw_reference(flight, settings, stream, mask):
     over_origin = (zero, zero, zero + settings.height)
     origin, ahead = (zero, zero, zero), (c, s, zero)
 
-    if settings.task == Task.HOVER:
+    if settings.task == TaskKind.HOVER:
         place = (radius * c, radius * s, zero + settings.height)
         _clear_reference(flight, mask, place, zero, HEADING_TOWARD, origin)
-    elif settings.task == Task.CIRCLE:
+    elif settings.task == TaskKind.CIRCLE:
         _clear_reference(flight, mask, over_origin, omega, HEADING_TOWARD, origin)
         keep3(flight.ref_cos[0], mask, (radius * c, radius * s, zero))
         keep3(flight.ref_sin[0], mask, (-sense * radius * s, sense * radius * c, zero))
-    elif settings.task == Task.LEMNISCATE:
+    elif settings.task == TaskKind.LEMNISCATE:
         # r(t) = radius (sin wt, sin(2wt)/2) rotated by the phase
         _clear_reference(flight, mask, over_origin, omega, HEADING_VELOCITY, origin)
         half = 0.5 * sense * radius
         keep3(flight.ref_sin[0], mask, (radius * c, radius * s, zero))
         keep3(flight.ref_sin[1], mask, (-half * s, half * c, zero))
-    elif settings.task == Task.RANDOM_TRAJECTORY:
+    elif settings.task == TaskKind.RANDOM_TRAJECTORY:
         _clear_reference(flight, mask, over_origin, omega, HEADING_ALONG, ahead)
         flight.ref_omega = select(mask, 2.0 * math.pi / settings.period, flight.ref_omega)
         _draw_series(flight, settings, stream, mask)
-    elif settings.task == Task.TRAJECTORY:
+    elif settings.task == TaskKind.TRAJECTORY:
         _clear_reference(flight, mask, over_origin, zero, HEADING_TOWARD, origin)
         draw_path(flight, settings, stream, mask)
     else:

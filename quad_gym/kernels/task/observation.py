@@ -23,7 +23,7 @@ from quad_gym.records import (
     VELOCITY_BLOCK,
     Layout,
     Source,
-    Task,
+    TaskKind,
 )
 
 
@@ -49,7 +49,7 @@ def _upcoming_gate(flight, ahead):
 @kernel
 def _previewed(flight, p, settings, i):
     """Return preview i of the reference: a later time or, on a course, a gate after the next."""
-    if settings.task == Task.WAYPOINTS:
+    if settings.task == TaskKind.WAYPOINTS:
         return _upcoming_gate(flight, 1.0 + i)
     if settings.harmonics == FOLLOWED:
         return load3(flight.path_ahead[i])

@@ -7,7 +7,7 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import logical_not, select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import MAX_GATES, Ending, RewardTerm, Task
+from quad_gym.records import MAX_GATES, Ending, RewardTerm, TaskKind
 
 _NEAR, _FINE = RewardTerm.NEAR.value, RewardTerm.FINE.value
 _PROGRESS, _GATE_PASSED = RewardTerm.PROGRESS.value, RewardTerm.GATE_PASSED.value
@@ -51,7 +51,7 @@ def _reward(flight, p, settings, work, active, R_BI, w_B):
     costs = weight[_ACTION_RATE] * change + weight[_BODY_RATES] * spin
     scale = settings.reward_scale
     finished = active & (change < 0.0)  # false in all lanes so far
-    if settings.task == Task.WAYPOINTS:
+    if settings.task == TaskKind.WAYPOINTS:
         passed, progress = _pass_gate(flight, settings, active)
         _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
         facing, bonus = dot(R_BI[0], x_ref), select(passed, weight[_GATE_PASSED], 0.0)
@@ -85,7 +85,7 @@ def judge(flight, p, settings, work, active):
     Args:
         flight: Record.
         p: Parameters, for the tick.
-        settings: Task, weights of the reward, and bounds.
+        settings: TaskKind, weights of the reward, and bounds.
         work: Workspace, for the terms of the reward.
         active: Lanes that have flown a step, as opposed to lanes about to begin an episode.
     """

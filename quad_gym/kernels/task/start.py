@@ -16,7 +16,7 @@ from quad_gym.records import (
     MAX_START_RATE,
     MAX_START_VELOCITY,
     Start,
-    Task,
+    TaskKind,
 )
 
 START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 0.3, 0.2, 0.03, 0.03
@@ -57,7 +57,7 @@ def draw_start(flight, p, model, settings, work, stream, mask):
         u_ground, _ = uniform_pair(stream, DRAW_GROUND)
         share = GROUND_SHARE if settings.start == Start.MIXED else 0.0
         on_ground = u_ground < share
-        if settings.task == Task.WAYPOINTS:
+        if settings.task == TaskKind.WAYPOINTS:
             x, y, z = load3(flight.gates[0])
             x, y, z = 0.25 * x, 0.25 * y, zero + settings.height
         r_I = (
