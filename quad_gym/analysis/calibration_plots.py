@@ -1,4 +1,4 @@
-"""Figures of a calibration: numbers before and after, and innovations of the withheld part."""
+"""Figures of a calibration: numbers before and after, and innovations of the validation part."""
 
 from typing import Any
 
@@ -23,18 +23,18 @@ def numbers_figure(calibration: Calibration) -> Any:
     axes = figure.add_subplot()
     for row, found in enumerate(reversed(scaled)):
         low, value, high = (n / found.prior for n in (found.low, found.value, found.high))
-        color = AFTER if found.told else GREY
+        color = AFTER if found.determined else GREY
         axes.plot([low, high], [row, row], color=color, linewidth=2.0)
         axes.plot([value], [row], "o", color=color, markersize=5.0)
     axes.axvline(1.0, color=BEFORE, linewidth=1.0)
     axes.set_xscale("log")
     axes.set_yticks(range(len(scaled)), [found.number.name for found in reversed(scaled)])
-    axes.set_title("numbers over those of the suite before, with 95 % intervals", loc="left")
+    axes.set_title("numbers relative to the suite before, with 95 % intervals", loc="left")
     return figure
 
 
 def innovations_figure(calibration: Calibration) -> Any:
-    """Make a figure of the NIS of each sensor on the withheld part, before and after.
+    """Make a figure of the NIS of each sensor before and after.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -46,15 +46,15 @@ def innovations_figure(calibration: Calibration) -> Any:
     names = list(sensors_of(calibration.after.replay))
     figure = Figure(figsize=(9.0, 0.6 + 1.9 * len(names)), layout="constrained")
     grid = figure.add_gridspec(len(names), 2)
-    for column, (label, judgment) in enumerate(columns):
-        kinds = sensors_of(judgment.replay)
+    for column, (label, validation) in enumerate(columns):
+        kinds = sensors_of(validation.replay)
         for row, name in enumerate(names):
             axes = figure.add_subplot(grid[row, column])
             if name in kinds:
                 draw_nis(axes, kinds[name], f"{name.replace('_', ' ')}, {label}")
             axes.axvline(calibration.split, color=GREY, linewidth=1.0, linestyle=":")
-            axes.set_xlim(judgment.replay.time[0], judgment.replay.time[-1])
+            axes.set_xlim(validation.replay.time[0], validation.replay.time[-1])
             axes.tick_params(colors=GREY)
             if row == len(names) - 1:
-                axes.set_xlabel("time [s]; dotted: the withheld part begins")
+                axes.set_xlabel("time [s]; dotted: start of the validation part")
     return figure

@@ -4,7 +4,7 @@
     quad-gym calibrate flight.ulg --sensors consumer --output results/mine
     quad-gym train --sensors results/mine/suite.toml
 
-The first part of the log is for the search, the rest judges what it found. The result is a suite
+The first part of the log is for the search, the rest for validation. The result is a suite
 with the rates, delays and noise of this vehicle, for `replay`, `train` and all other commands.
 """
 
@@ -19,7 +19,7 @@ from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_error
 
 if TYPE_CHECKING:
     from quad_gym.estimation.calibration import Calibration
-    from quad_gym.estimation.judgment import Judgment
+    from quad_gym.estimation.validation import Validation
 
 SUITE, RESULT = "suite.toml", "calibration.json"
 
@@ -56,20 +56,24 @@ def number_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
         for name, delay in calibration.delays.items()
     ]
     for found in calibration.numbers:
-        interval = f"[{found.low:.3g}, {found.high:.3g}]" if found.told else "not told by the log"
+        interval = (
+            f"[{found.low:.3g}, {found.high:.3g}]"
+            if found.determined
+            else "not determined by the log"
+        )
         row = (found.number.name, f"{found.prior:.3g}", f"{found.value:.3g}", interval)
         rows.append((*row, found.number.unit))
     return rows
 
 
-def judgment_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
+def validation_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
     """Return a row of texts for each sensor, before and after."""
     rows = []
     pair = (calibration.before, calibration.after)
     for name in calibration.after.sensors:
         cells: list[str] = []
-        for judgment in pair:
-            fit = judgment.sensors.get(name)
+        for validation in pair:
+            fit = validation.sensors.get(name)
             cells += (
                 ["-"] * 3
                 if fit is None
@@ -80,21 +84,21 @@ def judgment_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
                 ]
             )
         rows.append((name.replace("_", " "), *cells))
-    if calibration.after.withheld_nis is not None:
-        rows.append(("fixes withheld for 1 s", *(c for j in pair for c in _withheld(j))))
+    if calibration.after.held_out_nis is not None:
+        rows.append(("fixes left out for 1 s", *(c for j in pair for c in _held_out(j))))
     return rows
 
 
-def _withheld(judgment: "Judgment") -> tuple[str, str, str]:
-    if judgment.withheld_nis is None or judgment.withheld_error is None:
+def _held_out(validation: "Validation") -> tuple[str, str, str]:
+    if validation.held_out_nis is None or validation.held_out_error is None:
         return "-", "", ""
-    level, up = judgment.withheld_error
-    return f"{judgment.withheld_nis:.2f}", f"{level:.2f} m", f"{up:.2f} m up"
+    level, up = validation.held_out_error
+    return f"{validation.held_out_nis:.2f}", f"{level:.2f} m", f"{up:.2f} m up"
 
 
 NUMBER_HEADINGS = ("number", "before", "found", "95 % interval", "unit")
-JUDGMENT_HEADINGS = {
-    "withheld part": ["of"],
+VALIDATION_HEADINGS = {
+    "validation": ["of"],
     "before": ["mean NIS", "rejected", "correlation"],
     "after": ["mean NIS", "rejected", "correlation"],
 }
@@ -103,13 +107,13 @@ JUDGMENT_HEADINGS = {
 def summary_of(calibration: "Calibration") -> dict[str, Any]:
     """Return the contents of the JSON file."""
 
-    def judged(judgment: "Judgment") -> dict[str, Any]:
+    def summary(validation: "Validation") -> dict[str, Any]:
         return {
-            "measurements": {name: fit._asdict() for name, fit in judgment.sensors.items()},
-            "withheld_error": judgment.withheld_error,
-            "withheld_nis": judgment.withheld_nis,
-            "diverged": judgment.diverged,
-            "problems": judgment.problems,
+            "measurements": {name: fit._asdict() for name, fit in validation.sensors.items()},
+            "held_out_error": validation.held_out_error,
+            "held_out_nis": validation.held_out_nis,
+            "diverged": validation.diverged,
+            "problems": validation.problems,
         }
 
     numbers = {
@@ -117,7 +121,7 @@ def summary_of(calibration: "Calibration") -> dict[str, Any]:
             "before": found.prior,
             "found": found.value,
             "interval": (found.low, found.high),
-            "told": found.told,
+            "determined": found.determined,
             "unit": found.number.unit,
         }
         for found in calibration.numbers
@@ -126,8 +130,8 @@ def summary_of(calibration: "Calibration") -> dict[str, Any]:
         "delays": dict(calibration.delays),
         "numbers": numbers,
         "split": calibration.split,
-        "before": judged(calibration.before),
-        "after": judged(calibration.after),
+        "before": summary(calibration.before),
+        "after": summary(calibration.after),
         "notes": calibration.notes,
     }
 
@@ -144,9 +148,9 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
         "Mean NIS over degrees of freedom is 1, and the correlation of successive "
         "innovations 0, for a consistent filter.",
     )
-    headings = [f"{part} {name}" for part, names in JUDGMENT_HEADINGS.items() for name in names]
-    headings[0] = "withheld part"
-    report.add_table(headings, judgment_rows(calibration))
+    headings = [f"{part} {name}" for part, names in VALIDATION_HEADINGS.items() for name in names]
+    headings[0] = "validation"
+    report.add_table(headings, validation_rows(calibration))
     report.add_table(NUMBER_HEADINGS, number_rows(calibration))
     if calibration.notes or calibration.after.problems:
         report.add_bullets([*calibration.after.problems, *calibration.notes])
@@ -158,7 +162,7 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
 
 
 def main(args: Args) -> None:
-    """Search, judge and write."""
+    """Search, validate and write."""
     from quad_gym.analysis.plots import require_matplotlib
     from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
     from quad_gym.estimation import calibrate
@@ -183,7 +187,7 @@ def main(args: Args) -> None:
             progress=lambda sentence: print(f"{sentence} ...", flush=True),
         )
     numbers = text_table({"": list(NUMBER_HEADINGS)}, number_rows(found))
-    print(f"\n{numbers}\n\n{text_table(JUDGMENT_HEADINGS, judgment_rows(found))}\n")
+    print(f"\n{numbers}\n\n{text_table(VALIDATION_HEADINGS, validation_rows(found))}\n")
     for sentence in (*found.after.problems, *found.notes):
         print(f"{sentence[0].upper()}{sentence[1:]}.")
     found.suite.save(folder / SUITE)

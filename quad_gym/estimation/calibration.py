@@ -5,11 +5,11 @@ log, with priors about the numbers of a suite (`numbers.py`): delays of time sta
 other on grids, all others by quasi-Newton steps, whose derivatives are differences between filters
 that run side by side.
 
-The likelihood alone makes noise too small where errors are correlated in time, as those of a
+The likelihood alone makes noise too small where errors are correlated in time, such as errors of a
 magnetometer near motors: innovations are then as small as predicted, but not white, and the filter
-counts the same error many times. Noise of such sensors becomes larger by sqrt(tau), at most
-four times, where tau is the integrated autocorrelation time of the innovations in samples, before the
-other numbers are fitted again. The rest of the log judges the result.
+counts the same error many times. Noise of such sensors becomes larger by sqrt(tau), at most four
+times, where tau is the integrated autocorrelation time of the innovations in samples, before the
+other numbers are fitted again. The rest of the log validates the result.
 """
 
 import math
@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_gym.estimation.engine import Floats
-from quad_gym.estimation.judgment import Judgment, judge
 from quad_gym.estimation.likelihood import Likelihood, in_flight
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.numbers import Number, numbers_in
 from quad_gym.estimation.replaying import origin_of, replay
 from quad_gym.estimation.tables import read_log
+from quad_gym.estimation.validation import Validation, validate
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -36,14 +36,14 @@ _LARGEST, _LEAST = 3.0, -0.3
 """Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's, because a
 sensor in flight is hardly better than at rest."""
 _SILENT = 0.8
-"""Ratio of standard deviations after and before above which a log does not tell a number."""
+"""Ratio of standard deviations after and before above which a log does not determine a number."""
 _CLUSTER = 5.0
 """Length of the parts of a log that are independent of each other [s]."""
 _COARSE, _FINE = np.arange(-0.6, 0.81, 0.1), np.arange(-0.1, 0.11, 0.05)
 _DELAY_SPREAD = 0.2
 """Standard deviation of the prior of a delay [s]."""
 _LEAST_GAIN = 3.0
-"""Gain of the log likelihood, two steps of a grid away from its maximum, that tells a delay."""
+"""Drop of the log likelihood, two steps of a grid from its maximum, that determines a delay."""
 _WHITE = {
     "gnss.position_sigma_I[0, 1]": ("gnss_position", slice(0, 2), 1.5),
     "gnss.position_sigma_I[2]": ("gnss_position", slice(2, 3), 1.5),
@@ -63,8 +63,8 @@ class Calibrated(NamedTuple):
     low: float
     """lower end of its 95 % interval"""
     high: float
-    told: bool
-    """False: the log does not tell it, so that it has its prior value"""
+    determined: bool
+    """False: the log does not determine it, so that it keeps its prior value"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +78,20 @@ class Calibration:
     numbers: tuple[Calibrated, ...]
     delays: Mapping[str, float]
     """times by which the stamps of sensors are late [s], also in `suite.log_delays`"""
-    before: Judgment
-    """the suite before, on the part of the log that was not used for the search"""
-    after: Judgment
+    before: Validation
+    """the suite before, on the validation part of the log"""
+    after: Validation
     """the suite with the numbers that were found, on this part"""
     split: float
     """time at which this part begins [s]"""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what the log does not tell."""
+        """Sentences on numbers that the log does not determine."""
         return tuple(
-            f"the log does not tell {found.number.name}: it keeps {found.value:.3g}"
+            f"the log does not determine {found.number.name}: it keeps {found.value:.3g}"
             for found in self.numbers
-            if not found.told
+            if not found.determined
         )
 
 
@@ -112,8 +112,9 @@ def calibrate(
         sensors: The suite to begin with, or its name: its sensors, mounting and filter stay, and
             its numbers are the centers of the priors.
         start: Keywords of `initialize`, such as `{"heading": 0.5}`.
-        share: Share of the log, from its beginning, that the search uses; the rest judges.
-        delays: True: find delays of time stamps, too; False: those of the suite hold.
+        share: Share of the log, from its beginning, that the search uses; the rest is for
+            validation.
+        delays: True: find delays of time stamps, too; False: keep the suite's.
         body: Axes of a table, see `read_log`.
         progress: Called with a sentence before each step.
 
@@ -138,9 +139,9 @@ def calibrate(
     search.fit()
     search.progress("Intervals")
     found = search.intervals()
-    search.progress("The part of the log that was withheld")
+    search.progress("Validation")
     new = _like_the_log(search.suite(), whole, search.delays)
-    before, after = (judge(whole, s, start, split) for s in (prior, new))
+    before, after = (validate(whole, s, start, split) for s in (prior, new))
     return Calibration(new, prior, found, dict(search.delays), before, after, split)
 
 
@@ -299,15 +300,15 @@ class _Search:
         derivatives and J the sum of squares of the derivatives over parts of the log.
         """
         n, steps = len(self.x), (1.0, -1.0)
-        axes = _STEP * np.eye(n)
-        points = [self.x + s * e + t * f for e in axes for s in steps for f in axes for t in steps]
+        axes, (row, column) = _STEP * np.eye(n), np.triu_indices(n)
+        pairs = zip(axes[row], axes[column], strict=True)
+        points = [self.x + s * e + t * f for e, f in pairs for s in steps for t in steps]
         points += [self.x + s * e for e in axes for s in steps]
         losses = self._current.losses([self.suite(p, gate=False) for p in points])
-        total = losses.sum(axis=0)[: 4 * n * n].reshape(n, 2, n, 2)
-        H = (total[:, 0, :, 0] - total[:, 0, :, 1] - total[:, 1, :, 0] + total[:, 1, :, 1]) / (
-            4.0 * _STEP**2
-        )
-        single = losses[:, 4 * n * n :]
+        total = losses[:, : 4 * len(row)].sum(axis=0).reshape(-1, 4)
+        H = np.zeros((n, n))
+        H[row, column] = H[column, row] = total @ [1.0, -1.0, -1.0, 1.0] / (4.0 * _STEP**2)
+        single = losses[:, 4 * len(row) :]
         slopes = (single[:, 0::2] - single[:, 1::2]) / (2.0 * _STEP)
         times = self._current.times[self._current.counts]
         parts = ((times - times[0]) // _CLUSTER).astype(int)
@@ -322,8 +323,8 @@ class _Search:
             value, low, high = (
                 number.value(prior, float(self.x[k] + s * sigmas[k])) for s in (0.0, -1.96, 1.96)
             )
-            told = bool(sigmas[k] < _SILENT)
-            found.append(Calibrated(number, prior, value, low, high, told))
+            determined = bool(sigmas[k] < _SILENT)
+            found.append(Calibrated(number, prior, value, low, high, determined))
         return tuple(found)
 
 

@@ -33,6 +33,7 @@ NU = 5.0
 SETTLING = 5.0
 """Time after the start whose measurements do not count [s]."""
 _REACH = 3.0  # longest delay [s]
+_FEWEST = 100
 _TOGETHER = 64  # suites, as their innovations take memory
 _WINDOW = 0.5  # [s]
 _AT_REST = 0.6
@@ -77,6 +78,12 @@ class Likelihood:
         self.times = np.array(player.stamps).reshape(-1, 2)[:, 0]
         self.counts = in_flight(self.log, self.times)
         self.counts &= self.times > self.times[0] + SETTLING
+        if self.counts.sum() < _FEWEST:
+            raise ValueError(
+                f"a calibration must have at least {_FEWEST} measurements in flight, from "
+                f"{SETTLING:g} s after the start on, got {self.counts.sum()}: use a longer part of "
+                "the log (share=, --share)"
+            )
         self._valid = self._tape.valid
 
     def losses(self, suites: Sequence[SensorSuite]) -> Floats:

@@ -83,8 +83,8 @@ NUMBERS = (
     Number(sensor="magnetometer", field="strength", spread=0.2, unit="T"),
 )
 # fmt: on
-"""What a calibration finds; the spreads are engineering judgment: data sheets describe a sensor at
-rest, and vibration, airflow and motor currents multiply its noise."""
+"""Numbers that a calibration finds. The spreads are engineering judgment: data sheets describe a
+sensor at rest, and vibration, airflow and motor currents multiply its noise."""
 
 
 def numbers_in(suite: SensorSuite, measured: set[str]) -> list[Number]:

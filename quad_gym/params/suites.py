@@ -10,7 +10,7 @@
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
 | `crazyflie` | none: starts from a mark; optical flow, range finder | none | as `indoor` |
-| `flown` | as `consumer`, 5 Hz, with noise and delay of a real flight | none | noise of that flight |
+| `flown` | as `consumer`, with noise and delay of a real flight | none | noise of that flight |
 
 `one_wall` and `stale` were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in
 one direction only, and a filter that ignores time stamps. They, `crazyflie` and `flown` are not
@@ -304,7 +304,7 @@ FLOWN = CONSUMER.replace(
     ),
     estimator=FIELD_FILTER.replace(initial_tilt_sigma=0.05),
     noisy=NoisyObservationParams(
-        position=0.5, velocity=0.15, attitude=0.02, body_rates=0.03
+        position=0.607, velocity=0.145, attitude=0.0111, body_rates=0.0303
     ),  # measured, see above
 )
 """A hobby vehicle as it flies: `consumer` with noise that explains the log of a real flight."""

@@ -54,22 +54,22 @@ def test_noise_of_a_simulated_log_is_found(found, part, field):
     """Within the interval widened by a half: errors that are no white noise count as noise, too."""
     true = getattr(getattr(TRUE, part), field)
     (number,) = (n for n in found.numbers if n.number.name == f"{part}.{field}")
-    assert number.told
+    assert number.determined
     assert number.low / 1.5 < true < 1.5 * number.high, number
 
 
 def test_late_stamps_of_a_simulated_log_are_found(found):
-    assert found.delays["gnss"] == pytest.approx(DELAY, abs=0.03)
+    assert found.delays["gnss"] == pytest.approx(DELAY, abs=0.05)
     assert found.suite.log_delays.gnss == found.delays["gnss"]
 
 
-def test_withheld_part_fits_the_suite_that_was_found_and_not_the_one_before(found):
+def test_validation_part_fits_the_suite_that_was_found_and_not_the_one_before(found):
     for name, fit in found.after.sensors.items():
         assert 0.4 < fit.mean_nis < 1.5, name
         assert fit.rejected < 0.01
     assert found.before.sensors["gnss_velocity"].mean_nis > 5.0
     assert not found.after.problems
-    assert 0.3 < found.after.withheld_nis < 3.0
+    assert 0.3 < found.after.held_out_nis < 3.0
 
 
 def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
@@ -81,7 +81,7 @@ def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
 
 
 def test_command_writes_suite_page_and_summary(table, tmp_path):
-    short = {name: column[table["received"] < 8.0] for name, column in table.items()}
+    short = {name: column[table["received"] < 15.0] for name, column in table.items()}
     names = list(short)
     rows = np.column_stack([short[name] for name in names])
     lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows]
@@ -99,6 +99,12 @@ def test_calibration_without_a_heading_is_refused(table):
     without = {name: c for name, c in table.items() if not name.startswith("magnet")}
     with pytest.raises(ValueError, match="must know the heading at the start"):
         calibrate(without, sensors=CONSUMER.replace(magnetometer=None))
+
+
+def test_calibration_with_too_short_a_log_is_refused(table):
+    short = {name: column[table["received"] < 8.0] for name, column in table.items()}
+    with pytest.raises(ValueError, match="at least 100 measurements in flight"):
+        calibrate(short, sensors="consumer")
 
 
 def test_correlation_time_of_autoregressive_numbers_is_the_closed_form():

@@ -1,4 +1,4 @@
-"""Judgment of a suite by a part of a log that was not used to find its numbers."""
+"""Validation of a suite with a part of a log that was not used to find its numbers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from quad_gym.estimation.results import Replay, by_sensor
 from quad_gym.params.sensors import SensorSuite
 
 _PERIOD, _GAP = 5.0, 1.0
-"""Fixes are withheld for a second in every five [s]."""
+"""Fixes are left out for a second in every five [s]."""
 
 
 class Fit(NamedTuple):
@@ -31,14 +31,14 @@ class Fit(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Judgment:
+class Validation:
     """Consistency of a filter on a part of a log."""
 
     sensors: dict[str, Fit]
-    withheld_error: tuple[float, float] | None
+    held_out_error: tuple[float, float] | None
     """root mean square difference of the prediction from the first fix after gaps: horizontal, and
     vertical [m]; None: no fixes"""
-    withheld_nis: float | None
+    held_out_nis: float | None
     """mean NIS of these fixes over three"""
     diverged: float
     """share of the samples at which the filter counts as diverged"""
@@ -47,8 +47,10 @@ class Judgment:
     replay: Replay
 
 
-def judge(log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float) -> Judgment:
-    """Replay a log, and judge the part after a time.
+def validate(
+    log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
+) -> Validation:
+    """Replay a log, and compare the part after a time with the filter's predictions.
 
     Args:
         log: The log.
@@ -74,11 +76,11 @@ def judge(log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: 
             float(pairs[np.argmax(np.abs(pairs))]),
         )
     diverged = float(np.mean(result.diverged[result.time > split]))
-    withheld = _withheld(log, suite, start, split)
-    return Judgment(sensors, *withheld, diverged, result.problems, result)
+    held_out = _held_out(log, suite, start, split)
+    return Validation(sensors, *held_out, diverged, result.problems, result)
 
 
-def _withheld(
+def _held_out(
     log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
 ) -> tuple[tuple[float, float] | None, float | None]:
     """Return errors and mean NIS of the first fixes after gaps."""
