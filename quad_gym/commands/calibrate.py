@@ -56,11 +56,7 @@ def number_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
         for name, delay in calibration.delays.items()
     ]
     for found in calibration.numbers:
-        interval = (
-            f"[{found.low:.3g}, {found.high:.3g}]"
-            if found.determined
-            else "not determined by the log"
-        )
+        interval = f"[{found.low:.3g}, {found.high:.3g}]" if found.determined else "not determined"
         row = (found.number.name, f"{found.prior:.3g}", f"{found.value:.3g}", interval)
         rows.append((*row, found.number.unit))
     return rows

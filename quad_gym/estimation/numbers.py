@@ -1,4 +1,4 @@
-"""Numbers of a sensor suite that a calibration finds, with what is assumed of them beforehand."""
+"""Numbers of a sensor suite that a calibration finds, with their priors."""
 
 import math
 from dataclasses import dataclass

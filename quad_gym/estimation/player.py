@@ -1,7 +1,7 @@
 """A filter that processes a log event by event, in the order of arrival.
 
-Which samples and measurements it processes, and when, depends on their times alone. So all of it is
-written on a tape first, which compiled code then runs.
+Times alone determine which samples and measurements are processed, and when. The operations are
+therefore written to a tape first, which compiled code then runs.
 """
 
 import bisect
@@ -106,7 +106,7 @@ class Player:
     # ---- the log, event by event ---------------------------------------------------------------
 
     def write_tape(self) -> None:
-        """Start the filter, and write down what it does with the log.
+        """Start the filter, and write the operations on the log to a tape.
 
         Raises:
             MisfitError: If the suite has no sensor of the log.

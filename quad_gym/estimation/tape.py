@@ -1,4 +1,4 @@
-"""Tapes: what a filter does with a log, as a list of operations that compiled code runs."""
+"""Tapes: the operations of a filter on a log, as a list that compiled code runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

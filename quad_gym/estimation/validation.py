@@ -16,7 +16,7 @@ _PERIOD, _GAP = 5.0, 1.0
 
 
 class Fit(NamedTuple):
-    """Innovations of a sensor beside what the filter predicts."""
+    """Innovations of a sensor compared with the filter's predictions."""
 
     measurements: int
     freedoms: int
