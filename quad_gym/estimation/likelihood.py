@@ -1,6 +1,7 @@
 """Likelihood of a log: innovations of filters with many sets of numbers at once.
 
-The innovation of each measurement is Gaussian with the covariance that the filter predicts, if its numbers are correct. Real measurements have heavier tails, so that the sum over measurements is of
+The innovation of each measurement is Gaussian with the covariance that the filter predicts, if its
+numbers are correct. Real measurements have heavier tails; the loss of a measurement is therefore
 
     (nu + d) / 2 log(1 + NIS / (nu - 2)) + sum log sigma_i,
 
