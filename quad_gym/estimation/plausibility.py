@@ -53,7 +53,7 @@ NAMES = {
 
 ADVICE = (
     "Check the units, axes and time stamps of the log, or use a suite with the noise, delays and "
-    "mounting of these sensors."
+    "mounting of these sensors: `quad-gym calibrate LOG` finds noise and delays."
 )
 
 
