@@ -135,10 +135,10 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         measure(flight, p, settings.feature_count, due)
         _corrupt(flight, p, settings, work, stages, due)
     if delayed:
-        taken = stamp(flight, settings, _CAMERA, mask)
+        taken, under_way = stamp(flight, settings, _CAMERA, mask), settings.under_way[_CAMERA]
         for i in range(settings.feature_count):
             block, pixels = FEATURE_BLOCKS + i, flight.pixels[i]
-            exchange(flight, work, block, pixels, 2, mask, taken)
+            exchange(flight, work, block, pixels, 2, under_way, mask, taken)
             deliver_arrived(work, block, pixels, 2, mask)
     else:
         for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + settings.feature_count):
