@@ -140,7 +140,8 @@ def update_group(call, first, last, model, settings, work, stages):
                     kind = int(plain.kind[lane])
                     if kind > 0:
                         _put(call, kind, block + 8 * lane, block, model, settings, work, stages)
-    for kind in range(1, KINDS):
+    for place in range(1, KINDS):
+        kind = 2 * place % KINDS + 2 * place // KINDS  # even ones first, and then those with GNSS
         for k in range(plain.queued[kind, 0]):
             source, block = plain.source[kind, k], plain.source_block[kind, k]
             _put(call, 0, source, block, model, settings, work, stages)
