@@ -96,10 +96,11 @@ def measure(flight, p, feature_count, mask):
     R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
     for i in range(feature_count):
         x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
-        n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
         seen = seen & mask
-        flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
-        flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
+        if any_of(seen):
+            n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
+            flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
+            flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
         before = flight.block_valid[FEATURE_BLOCKS + i]
         flight.block_valid[FEATURE_BLOCKS + i] = select(mask, select(seen, 1.0, 0.0), before)
 
