@@ -37,7 +37,7 @@ from quad_gym.records import (
     words_of_update,
 )
 
-_GROUP_MEMORY = 1 << 22
+_GROUP_MEMORY = 1 << 23
 """Memory of the blocks that a thread flies side by side [bytes]: less leaves gathered blocks half
 empty."""
 _NO_BOUNDS = np.zeros(0)

@@ -57,7 +57,7 @@ class BenchmarkArgs:
     batch: int = 256
     """number of flights in the batches of filter, tick and options, a multiple of eight"""
     n_envs: int = 1024
-    """number of environments in the batches of interfaces"""
+    """number of environments in the batches of interfaces, of flights with each suite in tick"""
     threads: int | None = None
     """largest number of threads; if not given, one per core"""
     seeds: int = 10

@@ -304,8 +304,10 @@ def fly(call, board, number, command, serving):
             if first == last:
                 break
             posted = read_shared(board, COMMAND)
-            for one in range(first, last, call[_GROUP]):
-                end = min(one + call[_GROUP], last)
+            groups = (last - first - 1) // call[_GROUP] + 1
+            group = (last - first - 1) // groups + 1
+            for one in range(first, last, group):
+                end = min(one + group, last)
                 _fly_group(call, one, end, posted, nominal, true, believed, settings, work, stages)
             add_shared(board, FINISHED, last - first)
         if not serving:

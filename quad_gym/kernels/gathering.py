@@ -11,7 +11,14 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel, routine
 from quad_gym.kernels.flight import update
-from quad_gym.kernels.simd.addresses import array_at, lanes_at, record_at
+from quad_gym.kernels.simd.addresses import (
+    array_at,
+    gather_lanes,
+    lanes_at,
+    record_at,
+    scatter_lanes,
+)
+from quad_gym.kernels.simd.blocks import numbers_of
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import (
     DELAY_SLOTS,
@@ -29,13 +36,12 @@ from quad_gym.records import (
 _BLOCKS, _PITCH, _WORK = int(Call.BLOCKS), int(Call.PITCH), int(Call.WORK)
 _GATHERED, _WORDS = int(Call.GATHERED), int(Call.WORDS)
 _WORD_COUNT, _WRITTEN_COUNT = int(Call.WORD_COUNT), int(Call.WRITTEN_COUNT)
-_SIZE = FLIGHT_BLOCK.itemsize // 8
 _MANY = 6 * WIDTH // 8
 """Smallest number of lanes with a measurement for which a block is updated in place."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
 _plain_work_at = record_at(WORK_BLOCK)
-_numbers_at, _words_at = array_at("f8"), array_at("u8")
+_words_at = array_at("u8")
 
 
 @kernel
@@ -82,23 +88,21 @@ def _update_gathered(call, kind, model, settings, work, stages):
         return
     words = _words_at(call[_WORDS], call[_WORD_COUNT])
     gathered = _plain_flight_at(call[_GATHERED])
-    for k in range(count):
-        inside, outside = _numbers_at(call[_GATHERED] + 8 * k, _SIZE), _numbers_at(source[k], _SIZE)
-        for i in range(call[_WORD_COUNT]):
-            inside[words[i]] = outside[words[i]]
-        if settings.late:
+    for k in range(WIDTH):
+        if k >= count:  # copied from and to itself
+            source[k] = call[_GATHERED] + 8 * k
+            for i in range(MAX_BLOCKS):
+                gathered.block_valid[i, k] = 0.0
+        elif settings.late:
             lane = (source[k] - block[k]) // 8
             _gather_stamps(gathered, k, _plain_flight_at(block[k]), lane, settings)
-        plain.mask[k] = 1.0
-    for k in range(count, WIDTH):
-        plain.mask[k] = 0.0
-        for block in range(MAX_BLOCKS):
-            gathered.block_valid[block, k] = 0.0
+        plain.mask[k] = 1.0 if k < count else 0.0
+    sources, inside = work.source[kind], numbers_of(_flight_at(call[_GATHERED]))
+    for i in range(call[_WORD_COUNT]):
+        inside[words[i] // WIDTH] = gather_lanes(sources, 8 * words[i])
     update((_flight_at(call[_GATHERED]), model, model, settings, work, stages))
-    for k in range(count):
-        inside, outside = _numbers_at(call[_GATHERED] + 8 * k, _SIZE), _numbers_at(source[k], _SIZE)
-        for i in range(call[_WRITTEN_COUNT]):
-            outside[words[i]] = inside[words[i]]
+    for i in range(call[_WRITTEN_COUNT]):
+        scatter_lanes(sources, 8 * words[i], inside[words[i] // WIDTH])
 
 
 @kernel
@@ -136,7 +140,8 @@ def update_group(call, first, last, model, settings, work, stages):
                     kind = int(plain.kind[lane])
                     if kind > 0:
                         _put(call, kind, block + 8 * lane, block, model, settings, work, stages)
-    for kind in range(1, KINDS):
+    for place in range(1, KINDS):
+        kind = 2 * place % KINDS + 2 * place // KINDS  # even ones first, and then those with GNSS
         for k in range(plain.queued[kind, 0]):
             source, block = plain.source[kind, k], plain.source_block[kind, k]
             _put(call, 0, source, block, model, settings, work, stages)

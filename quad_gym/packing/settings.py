@@ -106,7 +106,7 @@ def _pack_sensors(s: Any, c: FlightConfiguration) -> None:
         s["sensor_ticks"][place] = ticks
         s["sensor_phase"][place] = _phase_ticks(sensor.phase, ticks)
         delay = delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, true.imu.rate)
-        s["sensor_delay"][place] = delay
+        s["sensor_delay"][place], s["under_way"][place] = delay, -(-delay // ticks)
     s["late"] = s["sensor_delay"].max() > 0
     s["rewinds"] = assumed.estimator.delay_compensation == "retrodict"
 

@@ -22,6 +22,7 @@ SETTINGS_FIELDS = (
     Field("sensor_ticks", (SENSORS,), "ticks", "between its measurements; 0: none", "i8"),
     Field("sensor_phase", (SENSORS,), "ticks", "from the start to the first one; -1: at random", "i8"),
     Field("sensor_delay", (SENSORS,), "ticks", "until a measurement reaches the filter", "i8"),
+    Field("under_way", (SENSORS,), "-", "measurements in transit, at most", "i8"),
     Field("gnss_velocity", (), "0 or 1", "whether GNSS measures velocity", "i8"),
     Field("gnss_baseline", (), "0 or 1", "whether there is a baseline: GNSS has two antennas, or a mark stands for them", "i8"),
     Field("gnss_drifts", (), "0 or 1", "whether GNSS positions have a slow error", "i8"),

@@ -72,8 +72,8 @@ WORK_FIELDS = (
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
     Field("kind", (), "bits", "sensors of which a measurement reaches the filter"),
     Field("queued", (KINDS,), "-", "lanes of each kind that wait for an update, first number", "i8"),
-    Field("source", (KINDS,), "-", "their addresses", "i8"),
-    Field("source_block", (KINDS,), "-", "addresses of their blocks", "i8"),
+    Field("source", (KINDS,), "-", "their addresses", "u8"),
+    Field("source_block", (KINDS,), "-", "addresses of their blocks", "u8"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
     # delayed measurements
     Field("arrives", (DELAY_SLOTS,), "0 or 1", "which of a sensor's measurements in transit arrives now"),

@@ -15,6 +15,7 @@ from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.experiments.benchmark.timing import Timing, by_turns
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.params.suites import SUITES
 from quad_gym.records import POSITION_BLOCK, WIDTH
 
 
@@ -47,7 +48,11 @@ def test_the_filter_section_compares_all_filters(tmp_path, capsys):
 
 
 def test_the_tick_section_names_every_stage_that_the_suites_fly_through(tmp_path):
-    rows = run(tmp_path, "--only", "tick", "--batch", "16")["sections"]["tick"]
+    rows = run(tmp_path, "--only", "tick", "--batch", "16", "--n-envs", "16")["sections"]["tick"]
+    speeds = {row["suite"]: row["speed"] for row in rows if row["kind"] == "suite"}
+    assert set(speeds) == set(SUITES)
+    assert speeds["standard"] == 1.0
+    rows = [row for row in rows if row["kind"] != "suite"]
     for suite in ("standard", "lab"):
         mine = {row["part"]: row for row in rows if row["suite"] == suite}
         batch = quad_gym.FlightBatch(1, sensors=suite, task=TASK_DEFAULTS["hover"])

@@ -25,7 +25,7 @@ class Scope:
     batch: int
     """Number of flights in the batches of filter, tick and options"""
     envs: int
-    """Number of environments in the batches of interfaces"""
+    """Number of environments in the batches of interfaces, and of flights in those of all suites"""
     threads: int
     """Largest number of threads"""
     seeds: int

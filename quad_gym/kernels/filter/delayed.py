@@ -55,7 +55,7 @@ from quad_gym.kernels.maths.linalg import (
 )
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import DELAY_SLOTS, SENSORS, FilterForm, FilterStatus
+from quad_gym.records import SENSORS, FilterForm, FilterStatus
 
 _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
@@ -88,7 +88,7 @@ def _matrix_of(row, k):
 
 
 @kernel
-def _find_stamp(flight, p, work, sensor, delay, arrived):
+def _find_stamp(flight, p, work, sensor, delay, under_way, arrived):
     """Fill work.since_* with the IMU's sums at the arrival's time stamp, or with the present ones.
 
     Where a measurement arrives, w_meas becomes the rates at that instant, for lever arms.
@@ -98,7 +98,7 @@ def _find_stamp(flight, p, work, sensor, delay, arrived):
     store3(work.since_velocity, load3(flight.imu_velocity))
     store3(work.since_position, load3(flight.imu_position))
     stamps = flight.stamps[sensor]
-    for slot in range(DELAY_SLOTS):
+    for slot in range(under_way + 1):
         row, here = stamps[slot], arrived & (stamps[slot, 0] == flight.tick - delay)
         keep33(work.since_turn, here, _matrix_of(row, 1))
         keep33(work.since_bias_gain, here, _matrix_of(row, 16))
@@ -234,7 +234,7 @@ def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
             continue
         if delayed:
             _keep_estimate(flight, work, slow)
-            _find_stamp(flight, p, work, sensor, delay, arrived)
+            _find_stamp(flight, p, work, sensor, delay, settings.under_way[sensor], arrived)
         good = arrived
         for leg in range(2 if delayed else 1):  # a loop, so that `_carry` is compiled once
             if delayed:

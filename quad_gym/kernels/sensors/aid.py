@@ -107,7 +107,7 @@ def deliver(flight, work, settings, s, mask, due, values):
         keep_arrived(work, block, measurement, 3)
         keep3(measurement, due, values)
         taken = stamp(flight, settings, sensor, mask)
-        exchange(flight, work, block, measurement, 3, mask, taken)
+        exchange(flight, work, block, measurement, 3, settings.under_way[sensor], mask, taken)
         deliver_arrived(work, block, measurement, 3, mask)
 
 

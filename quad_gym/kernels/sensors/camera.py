@@ -96,10 +96,11 @@ def measure(flight, p, feature_count, mask):
     R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
     for i in range(feature_count):
         x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
-        n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
         seen = seen & mask
-        flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
-        flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
+        if any_of(seen):
+            n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
+            flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
+            flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
         before = flight.block_valid[FEATURE_BLOCKS + i]
         flight.block_valid[FEATURE_BLOCKS + i] = select(mask, select(seen, 1.0, 0.0), before)
 
@@ -135,10 +136,10 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         measure(flight, p, settings.feature_count, due)
         _corrupt(flight, p, settings, work, stages, due)
     if delayed:
-        taken = stamp(flight, settings, _CAMERA, mask)
+        taken, under_way = stamp(flight, settings, _CAMERA, mask), settings.under_way[_CAMERA]
         for i in range(settings.feature_count):
             block, pixels = FEATURE_BLOCKS + i, flight.pixels[i]
-            exchange(flight, work, block, pixels, 2, mask, taken)
+            exchange(flight, work, block, pixels, 2, under_way, mask, taken)
             deliver_arrived(work, block, pixels, 2, mask)
     else:
         for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + settings.feature_count):

@@ -113,10 +113,10 @@ def _deliver_delayed(flight, work, settings, mask, starting):
 
     At the start of an episode the fix stays in the record, for the initialization of the filter.
     """
-    taken = stamp(flight, settings, _GNSS, mask)
-    exchange(flight, work, POSITION_BLOCK, flight.gnss_position, 3, mask, taken)
-    exchange(flight, work, BASELINE_BLOCK, flight.gnss_baseline, 3, mask, taken)
-    exchange(flight, work, VELOCITY_BLOCK, flight.gnss_velocity, 3, mask, taken)
+    taken, n = stamp(flight, settings, _GNSS, mask), settings.under_way[_GNSS]
+    exchange(flight, work, POSITION_BLOCK, flight.gnss_position, 3, n, mask, taken)
+    exchange(flight, work, BASELINE_BLOCK, flight.gnss_baseline, 3, n, mask, taken)
+    exchange(flight, work, VELOCITY_BLOCK, flight.gnss_velocity, 3, n, mask, taken)
     if not starting:
         deliver_arrived(work, POSITION_BLOCK, flight.gnss_position, 3, mask)
         deliver_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3, mask)

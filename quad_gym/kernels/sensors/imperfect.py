@@ -26,7 +26,7 @@ from quad_gym.kernels.maths.linalg import (
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.simd.lanes import logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import (
     DRAW_BLUR,
     DRAW_HEADING,
@@ -133,9 +133,9 @@ def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
         valid = flight.block_valid[FEATURE_BLOCKS + i]
         kept = select(lost, 0.0, valid)
         flight.block_valid[FEATURE_BLOCKS + i] = select(mask, kept, valid)
-        if blurs:
+        seen = mask & (kept > 0.0)
+        if blurs and any_of(seen):
             u, v = uniform_pair(stream, DRAW_BLUR + i)
-            seen = mask & (kept > 0.0)
             for axis in range(2):
                 shift = reach * (2.0 * (u if axis == 0 else v) - 1.0)
                 pixel = flight.pixels[i, axis]

@@ -19,9 +19,9 @@ def forget_stamps(stamps, mask):
 
 
 @kernel
-def _put_stamp(stamps, flight, taken):
+def _put_stamp(stamps, flight, under_way, taken):
     """Shift the stamps of a sensor, (DELAY_SLOTS, STAMP), and stamp the first with the present."""
-    for slot in range(DELAY_SLOTS - 1, 0, -1):
+    for slot in range(under_way, 0, -1):
         for i in range(STAMP):
             stamps[slot, i] = select(taken, stamps[slot - 1, i], stamps[slot, i])
     row = stamps[0]
@@ -48,11 +48,10 @@ def find_arrivals(flight, work, settings, sensor, mask):
     """Fill work.arrives with the slot that arrives now; return the lanes in which one does."""
     stamps, delay = flight.stamps[sensor], settings.sensor_delay[sensor]
     some = mask & (flight.tick < 0.0)  # all false
-    if delay > 0:
-        for slot in range(DELAY_SLOTS):
-            here = mask & (stamps[slot, 0] == flight.tick - delay)
-            work.arrives[slot] = select(here, 1.0, 0.0)
-            some = some | here
+    for slot in range(settings.under_way[sensor]):
+        here = mask & (stamps[slot, 0] == flight.tick - delay)
+        work.arrives[slot] = select(here, 1.0, 0.0)
+        some = some | here
     return some
 
 
@@ -64,12 +63,12 @@ def stamp(flight, settings, sensor, mask):
         valid = valid + flight.block_valid[block]
     taken = mask & (valid > 0.0)
     if any_of(taken):
-        _put_stamp(flight.stamps[sensor], flight, taken)
+        _put_stamp(flight.stamps[sensor], flight, settings.under_way[sensor], taken)
     return taken
 
 
 @kernel
-def exchange(flight, work, block, values, numbers, mask, taken):
+def exchange(flight, work, block, values, numbers, under_way, mask, taken):
     """Hold back the block that has just been measured, and deliver the one that arrives.
 
     Args:
@@ -78,19 +77,20 @@ def exchange(flight, work, block, values, numbers, mask, taken):
         block: Number of the block.
         values: Its numbers in the record.
         numbers: Count of these numbers.
+        under_way: Largest number of measurements in transit.
         mask: Lanes to work on.
         taken: Lanes in which the sensor has measured.
     """
     waiting, flags = flight.waiting[block], flight.waiting_valid[block]
     valid, arrived = flight.block_valid[block], 0.0 * flight.tick
-    for slot in range(DELAY_SLOTS):
+    for slot in range(under_way):
         here = work.arrives[slot] > 0.0
         for i in range(numbers):
             kept = work.arrived[block, i]
             work.arrived[block, i] = select(here, waiting[slot, i], kept)
         arrived = select(here, flags[slot], arrived)
     if any_of(taken):
-        for slot in range(DELAY_SLOTS - 1, 0, -1):
+        for slot in range(under_way - 1, 0, -1):
             for i in range(numbers):
                 waiting[slot, i] = select(taken, waiting[slot - 1, i], waiting[slot, i])
             flags[slot] = select(taken, flags[slot - 1], flags[slot])

@@ -14,7 +14,7 @@ from numba.np.arrayobj import make_array, populate_array
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.simd.blocks import LaneRecord
-from quad_gym.kernels.simd.lanes import lanes
+from quad_gym.kernels.simd.lanes import lanes, words
 from quad_gym.records import WIDTH
 
 _BYTES = ir.IntType(8).as_pointer()
@@ -87,6 +87,42 @@ def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     return types.none(types.int64, lanes), lower
+
+
+def _lane_pointer(builder: ir.IRBuilder, addresses: Any, offset: Any, lane: int) -> Any:
+    address = builder.extract_element(addresses, _INDEX(lane))
+    return builder.inttoptr(builder.add(address, offset), ir.DoubleType().as_pointer())
+
+
+@intrinsic
+def gather_lanes(typing_context, addresses, offset):  # type: ignore[no-untyped-def]
+    """Read a float64 for each lane, at an offset from its address (words)."""
+    if addresses != words:
+        return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        value = ir.Constant(lanes.llvm_type, ir.Undefined)
+        for lane in range(WIDTH):
+            number = builder.load(_lane_pointer(builder, *args, lane), align=8)
+            value = builder.insert_element(value, number, _INDEX(lane))
+        return value
+
+    return lanes(words, types.int64), lower
+
+
+@intrinsic
+def scatter_lanes(typing_context, addresses, offset, value):  # type: ignore[no-untyped-def]
+    """Write each lane at an offset from its address (words)."""
+    if addresses != words or value != lanes:
+        return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        for lane in range(WIDTH):
+            number = builder.extract_element(args[2], _INDEX(lane))
+            builder.store(number, _lane_pointer(builder, *args[:2], lane), align=8)
+        return context.get_dummy_value()
+
+    return types.none(words, types.int64, lanes), lower
 
 
 @intrinsic
