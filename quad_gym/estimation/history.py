@@ -87,8 +87,12 @@ class InputHistory:
             time: Its time stamp, at least `oldest` and less than the present [s].
         """
         events = self._events
-        i = next(k for k, e in enumerate(events) if e.time > time + SAME_TIME)
-        first = max(k for k in range(i + 1) if events[k].before is not None)
+        i = len(events) - 1  # the first event that ends later
+        while i and events[i - 1].time > time + SAME_TIME:
+            i -= 1
+        first = i
+        while events[first].before is None:
+            first -= 1
         old = events[i]
         assert isinstance(old.given, Sample)
         elapsed = time - old.start

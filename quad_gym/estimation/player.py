@@ -56,6 +56,8 @@ class Player:
         self.filter = ESTIMATORS[estimator](suite, window=window)
         self.window = window
         self.averages = suite.imu.samples == "average"
+        self.imu_times: list[float] = log.imu.time.tolist()
+        self.gyros, self.accels = list(log.imu.values["gyro"]), list(log.imu.values["accel"])
         self.running = False
         self.held: list[int] = []  # samples before the start
         self.waiting: list[tuple[float, str, int]] = []  # time stamps after the filter's time
@@ -153,8 +155,7 @@ class Player:
 
     def _predict(self, i: int) -> None:
         """Propagate the estimate to the time of a sample."""
-        imu, now = self.log.imu, self.history.time
-        time = float(imu.time[i])
+        time, now = self.imu_times[i], self.history.time
         chosen = i if self.averages else self.before
         self.before = i
         step = time - now
@@ -165,7 +166,7 @@ class Player:
                 f"samples of the IMU must be at most {LONGEST_STEP:g} s apart, got none from "
                 f"{now:.3f} s to {time:.3f} s: cut the log there"
             )
-        gyro, accel = imu.values["gyro"][chosen], imu.values["accel"][chosen]
+        gyro, accel = self.gyros[chosen], self.accels[chosen]
         self.history.add(Sample(gyro, accel, step, gyro if self.gyro is None else self.gyro))
         self.gyro = gyro
         while self.waiting and self.waiting[0][0] <= self.history.time + SAME_TIME:

@@ -32,10 +32,14 @@ def run_filter(kf: KalmanFilter, writer: TapeWriter, tape: Tape) -> tuple[Floats
             slot.reshape(-1, WIDTH)[:] = words[0]
         rest = tape.after(first)
         kept, reported = (rows[0, ..., 0] for rows in kf._engine.run(rest, slots))
-        estimates += [np.append(row, 1.0) for row in kept[len(estimates) :]]
-        innovations += list(reported[len(innovations) :])
+        kept = np.column_stack([kept, np.ones(len(kept))])
+        kept[: len(estimates)] = np.reshape(estimates, (-1, KEPT + 1))
+        if innovations:
+            reported[: len(innovations)] = innovations
+    else:
+        kept, reported = np.array(estimates).reshape(-1, KEPT + 1), np.array(innovations)
     kf.warn_of_news(status)
-    return np.array(estimates).reshape(-1, KEPT + 1), np.array(innovations)
+    return kept, reported
 
 
 def _run_while_unknown(
