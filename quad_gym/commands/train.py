@@ -24,6 +24,7 @@ from quad_gym.commands.options import (
     Engine,
     EnvId,
     Keywords,
+    OwnSuite,
     Parameters,
     Threads,
     flying_options,
@@ -41,8 +42,9 @@ class TrainArgs:
     algorithm: Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"] = "ppo"
     """reinforcement learning algorithm"""
     engine: Engine = "sb3"
+    sensors: OwnSuite = None
     env: Keywords = field(default_factory=dict)
-    """keywords of the environment, such as observation=truth sensors=rtk camera=false"""
+    """keywords of the environment, such as observation=truth action=motor camera=false"""
     steps: int | None = None
     """number of environment steps; if not given, the recipe's"""
     n_envs: int | None = None
@@ -78,6 +80,11 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     from quad_gym.analysis.reports import require_writable
 
     args = with_full_id(args)
+    environment = dict(args.env)
+    if args.sensors is not None:
+        if "sensors" in environment:
+            raise ValueError("--sensors must not be given with --env sensors=...")
+        environment["sensors"] = args.sensors
     require_at_least(args, steps=1, n_envs=1, evaluations=1, episodes=1, threads=1, seed=0)
     chosen = recipe(args.env_id, args.algorithm)
     given = {"steps": args.steps, "n_envs": args.n_envs}
@@ -85,7 +92,7 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     chosen = chosen.replace(parameters={**chosen.parameters, **args.set})
     plan = Plan(
         env_id=args.env_id,
-        environment=args.env,
+        environment=environment,
         recipe=chosen,
         seed=args.seed,
         threads=args.threads,
