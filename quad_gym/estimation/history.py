@@ -5,7 +5,7 @@ the result is bitwise the result with the same samples and measurements in the o
 stamps. An IMU sample whose interval contains the stamp is split there, with the same sample on both
 sides.
 
-Flights in an environment use another method, `kernels/filter/late.py`: they keep sums of the IMU
+Flights in an environment use another method, `kernels/filter/delayed.py`: they keep sums of the IMU
 samples, and retrodict estimate and covariance over them. That costs less, but requires stamps on
 ticks and sensors whose measurements arrive in order, and is exact to first order only.
 """
