@@ -174,8 +174,25 @@ def _keywords_page() -> str:
     return (
         "# Keywords of every environment\n\nOf `gymnasium.make`, `gymnasium.make_vec` and "
         "`quad_gym.make_sb3_vec_env`, besides those of the task, which the page of each "
-        "environment lists.\n\n" + _table(("keyword", "default", "meaning"), rows)
+        "environment lists.\n\n" + _table(("keyword", "default", "meaning"), rows) + _vehicles()
     )
+
+
+def _vehicles() -> str:
+    """The numbers of the included vehicles side by side."""
+    vehicles = {name: quad_gym.vehicle_params(name) for name in ("lab", "crazyflie")}
+    rows = []
+    for name, said in _field_docs(quad_gym.VehicleParams).items():
+        numbers = (getattr(vehicle, name) for vehicle in vehicles.values())
+        cells = (
+            ", ".join(map(_value, n))
+            if isinstance(n, tuple) and isinstance(n[0], tuple)
+            else _value(n)
+            for n in numbers
+        )
+        rows.append((f"`{name}`", *cells, said.split("; ")[0]))
+    text = "\n## `vehicle`: VehicleParams\n\nThe included vehicles; the default is `lab`.\n\n"
+    return text + _table(("field", *vehicles, "meaning"), rows)
 
 
 def _task_class(name: str) -> type[quad_gym.Task]:

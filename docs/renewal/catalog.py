@@ -128,6 +128,7 @@ CATALOG = {
                     "truth",
                     "noisy",
                     "noisier",
+                    "certainty",
                     "std",
                     "std_certainty",
                 ),

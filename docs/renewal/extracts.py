@@ -26,13 +26,14 @@ def study_rows(
     """
     labels = {arm["name"]: arm["label"] for arm in summary["study"]["arms"]}
     rows = [
-        [labels[name], *(_cell(summary["rows"][name][column], column) for column in columns)]
+        [labels[name], *(cell(summary["rows"][name][column], column) for column in columns)]
         for name in arms or labels
     ]
     return table((head, *(HEADINGS[column] for column in columns)), rows)
 
 
-def _cell(found: Mapping[str, float], column: str) -> str:
+def cell(found: Mapping[str, float], column: str) -> str:
+    """A value with its 95 % interval in brackets."""
     scale, digits = (1.0, 3) if column == "error" else (100.0, 0)
     value, low, high = (scale * found[name] for name in ("value", "low", "high"))
     if column != "error" and value < 10.0:

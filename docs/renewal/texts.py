@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from docs.renewal.extracts import compile_seconds, interface_speeds, study_rows
+from docs.renewal.extracts import cell, compile_seconds, interface_speeds, study_rows
 from docs.renewal.pages import console as block
 from docs.renewal.pages import table
 
@@ -172,7 +172,7 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
 
 
 def study(name: str, *arms: str) -> Texts:
-    """The whole table, success and crashes of some arms, and single crash rates."""
+    """The whole table, success and crashes of some arms, and each arm's crashes."""
 
     def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
         summary = _read(folder / "0/summary.json")
@@ -181,10 +181,7 @@ def study(name: str, *arms: str) -> Texts:
             f"{name}.short": study_rows(summary, "trained on", arms, ("success", "crashed")),
         }
         for arm, row in summary["rows"].items():
-            percent = 100.0 * row["crashed"]["value"]
-            found[f"{name}.{arm}.crashed"] = (
-                f"{percent:.1f} %" if percent < 10 else f"{percent:.0f} %"
-            )
+            found[f"{name}.{arm}.crashed"] = cell(row["crashed"], "crashed")
         return found
 
     return texts

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.cold_start import check_cold_start
-from quad_gym.batch.following import check_trajectories, followed
+from quad_gym.batch.following import check_reference, followed
 from quad_gym.batch.innovations import innovations_of
 from quad_gym.batch.memory import FlightMemory, configuration_digest
 from quad_gym.batch.standing import check_standing
@@ -69,7 +69,7 @@ class FlightBatch(FlightMemory):
         self.threads = resolve_threads(c.threads)
         if c.filters and c.filter_start == "cold":
             check_cold_start(c.sensors, c.draws)
-        check_trajectories(c.task, c.vehicle, c.actions, c.control)
+        check_reference(c.task, c.vehicle, c.actions, c.control)
         check_standing(c.task, c.flown_vehicle, c.world, c.draws)
         model = params_record(c.vehicle, c.sensors, c.pd_gains, c.actions)
         true = params_record(c.flown_vehicle, c.flown_sensors, c.pd_gains, c.actions, c.world)

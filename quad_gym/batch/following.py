@@ -1,4 +1,4 @@
-"""Flights that follow user-defined trajectories: feasibility, and the one of each flight."""
+"""References: feasibility, and the user-defined trajectory of each flight."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -17,20 +17,26 @@ if TYPE_CHECKING:
 MOST_THRUST = 2.0
 """Largest thrust-to-weight ratio that an action commands; motor voltages have no such limit."""
 
+SHARPNESS = {"circle": 1.0, "lemniscate": 17.0 / 8.0}
+"""Largest acceleration of a reference over its radius times its squared frequency, by task."""
 
-def check_trajectories(
+LARGER, FASTER = 1.25, 0.8
+"""Factors on radius and period of the sharpest draw, with `randomize_reference`."""
+
+
+def check_reference(
     task: TaskParams, vehicle: VehicleParams, actions: ActionParams, control: Control
 ) -> None:
-    """Refuse trajectories that the vehicle cannot fly, or that no action commands.
+    """Refuse trajectories, circles and lemniscates that the vehicle cannot fly.
 
     Args:
-        task: Task with the trajectories, and the tilt at which episodes end.
+        task: Task with the reference, and the tilt at which episodes end.
         vehicle: The vehicle that the controller assumes.
         actions: Scales of the actions.
         control: Meaning of an action.
 
     Raises:
-        ValueError: If a trajectory is refused.
+        ValueError: If a reference needs more than the vehicle or the actions allow.
     """
     limits: dict[str, Any] = {"max_tilt": task.max_tilt}
     if control in (Control.WRENCH, Control.CTBR, Control.ATTITUDE):
@@ -47,6 +53,22 @@ def check_trajectories(
     for k, trajectory in enumerate(task.trajectories):
         name = "trajectory" if len(task.trajectories) == 1 else f"trajectory[{k}]"
         trajectory.check(vehicle, name=name, **limits)
+    if task.kind in SHARPNESS:
+        _check_period(task, vehicle, limits.get("max_thrust", 4.0 * vehicle.max_rotor_force))
+
+
+def _check_period(task: TaskParams, vehicle: VehicleParams, limit: float) -> None:
+    """Refuse a period whose centripetal acceleration needs more thrust than the limit [N]."""
+    larger, faster = (LARGER, FASTER) if task.randomize_reference else (1.0, 1.0)
+    omega = 2.0 * math.pi / (faster * task.period)
+    acceleration = SHARPNESS[task.kind] * larger * task.radius * omega**2
+    thrust = vehicle.mass * math.hypot(acceleration, vehicle.gravity)
+    if thrust > limit:
+        raise ValueError(
+            f"period must be one that the vehicle can fly: with radius={task.radius:g} m, "
+            f"{task.period:g} s need an acceleration of {acceleration:.4g} m/s^2 and a thrust of "
+            f"{thrust:.4g} N, above the limit of {limit:.4g} N"
+        )
 
 
 def followed(batch: "FlightBatch", flight: int) -> tuple[Trajectory, float] | None:

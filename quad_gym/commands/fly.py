@@ -132,6 +132,8 @@ def check_options(args: FlyArgs) -> None:
         value = getattr(args, name)
         if not (math.isfinite(value) and value > 0.0):
             raise ValueError(f"--{name} must be greater than 0, got {value:g}")
+    if args.replay is None:
+        suite_of(args)
     if args.fault_time is not None:
         start, end = args.fault_time
         if not 0.0 <= start < end:

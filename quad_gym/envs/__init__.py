@@ -97,9 +97,12 @@ def make_sb3_vec_env(
         The environment, ready for any Stable-Baselines3 algorithm.
 
     Raises:
-        ValueError: If the id or a keyword is unknown, or a value is invalid.
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
+        ValueError: If the id is unknown, or a value is invalid.
         ImportError: If Stable-Baselines3 is not installed.
     """
+    if "num_envs" in keywords:
+        raise check.UnknownKeywordError("num_envs is n_envs here, as in Stable-Baselines3")
     given: dict[str, Any] = keywords_of(env_id) | dict(keywords)
     check.seed("seed", seed)
     try:

@@ -60,6 +60,9 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
 }
 """Defaults of each task, which keywords override."""
 
+SLOWEST = 1.0
+"""Least control rate [Hz]: smaller ones are periods."""
+
 MAX_STEPS = 10**9
 """Longest time limit in steps; a duration of 0 has none."""
 
@@ -142,7 +145,7 @@ class Flights:
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
         if steps is not None and "duration" not in given:  # in place of the task's own limit
-            rate = check.positive("control_rate", keywords["control_rate"])
+            rate = check.positive("control_rate", keywords["control_rate"], least=SLOWEST)
             self.task = self.task.replace(duration=steps / rate)
         require_effect(asked, keywords)
         self._build(count, autoreset, asked, keywords)
@@ -188,7 +191,7 @@ class Flights:
             privileged=privileged,
             drawn=drawn.names if drawn.names or place != WorldParams() else None,
         )
-        self.control_rate = check.positive("control_rate", flown["control_rate"])
+        self.control_rate = check.positive("control_rate", flown["control_rate"], least=SLOWEST)
         check_limit(self.task, self.control_rate, "control_rate")
         raw = self.observation == "measurements"
         make = partial(
@@ -219,6 +222,8 @@ class Flights:
         given = checked_start(
             self.batch.count, position, velocity, yaw, self.task, self.batch.world
         )
+        if given is not None and yaw is not None:
+            check.angle("yaw", float(given[np.abs(given[:, 6]).argmax(), 6]))
         ends_by_itself = "terminated" in getattr(self.batch, "methods", ())  # a user's task
         if position is not None and given is not None and not ends_by_itself:
             check_in_bounds(self.task, given[:, :3])

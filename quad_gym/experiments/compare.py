@@ -40,8 +40,9 @@ _ENGINES = {"sb3": "Stable-Baselines3", "compiled": "the compiled engine"}
 MANY_CRASHES = 0.01
 """Share of crashes above which mean errors are not compared."""
 ONE_SEED = (
-    "One training seed proves nothing: another seed may turn any of these differences round. "
-    "Run with five for intervals."
+    "One training seed proves nothing: another seed could reverse any of these differences. "
+    "Run with five for intervals. Where good sensors determine the state, as on the circle, no "
+    "difference is expected; quad-gym study look_around shows where it matters."
 )
 
 

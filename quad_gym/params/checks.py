@@ -154,6 +154,15 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def angle(name: str, value: Any) -> float:
+    """`value` as an angle of at most a turn either way [rad]; larger ones are in degrees."""
+    result = number(name, value)
+    if abs(result) > 2.0 * math.pi:
+        meant = f"; did you mean {math.radians(result):.4g}?" if abs(result) <= 360.0 else ""
+        raise ValueError(f"{name} must be in rad, at most 2 pi either way, got {result:g}{meant}")
+    return result
+
+
 def phase(name: str, value: Any) -> float | None:
     """`value` as a share of a period in [0, 1), or None."""
     if value is None:

@@ -64,7 +64,7 @@ class Randomization:
         if unknown:
             raise ValueError(
                 f"randomization of {unknown[0]!r} is unknown; parameters that can be drawn are "
-                f"{', '.join(COLUMNS)}"
+                f"{', '.join(COLUMNS)}{check.did_you_mean(unknown[0], COLUMNS)}"
             )
         if {"wind_speed", "wind_direction"} & set(self.parameters) and {
             "wind_east",

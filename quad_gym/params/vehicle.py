@@ -23,6 +23,12 @@ LEAST_GYRATION = 1.0 / 30.0
 """Radius of gyration over the distance of the rotors, below which numbers are mistaken: the rotors
 would turn the vehicle faster than a tick resolves. Quadrotors have 0.2 to 0.8."""
 
+MOST_GYRATION = 10.0
+"""The same ratio, above which numbers are mistakes, such as moments in kg mm^2."""
+
+SLOWEST_ROTORS = 1.0
+"""Time constant of rotors above which numbers are mistakes, such as milliseconds [s]."""
+
 MAX_LIFT = 1000.0
 """Thrust-to-weight ratio above which numbers are mistakes; racing drones reach 15."""
 
@@ -79,11 +85,11 @@ class VehicleParams(Checked):
             check.positive,
             "thrust_coefficient",
             "torque_coefficient",
-            "motor_time_constant",
             "motor_speed_per_volt",
             "max_voltage",
             "gravity",
         )
+        self._check(check.positive, "motor_time_constant", most=SLOWEST_ROTORS)
         self._check(check.positive, "mass", least=1e-3)
         self._check(check.number, "disc_area", "drag_coefficient", "air_density", least=0.0)
         self._check(check.matrix, "inertia", rows=3, columns=3)
@@ -171,7 +177,7 @@ def check_moments(name: str, moments: ArrayLike) -> None:
 
 
 def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike) -> None:
-    """Refuse moments of inertia that are too small for the mass and the size of the vehicle.
+    """Refuse moments of inertia that are too small or too large for the vehicle's mass and size.
 
     Args:
         name: Name of the argument in messages.
@@ -180,15 +186,21 @@ def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike
         rotors: (4, 3) rotor hubs relative to the center of mass [m].
 
     Raises:
-        ValueError: If one is smaller than the radius of gyration LEAST_GYRATION allows.
+        ValueError: If a radius of gyration over the distance of the rotors is less than
+            LEAST_GYRATION, or more than MOST_GYRATION.
     """
     reach = float(np.linalg.norm(rotors, axis=1).max())
     smallest = max(LEAST_MOMENT, mass * (LEAST_GYRATION * reach) ** 2)
-    if np.min(moments) < smallest:
-        raise ValueError(
-            f"{name} must be at least {smallest:.3g} kg m^2 about every axis, with a mass of "
-            f"{mass:g} kg and rotor_positions_B {reach:.3g} m away, got {np.min(moments):g} kg m^2"
-        )
+    largest = mass * (MOST_GYRATION * reach) ** 2
+    for limit, bound, found in (
+        ("least", smallest, float(np.min(moments))),
+        ("most", largest, float(np.max(moments))),
+    ):
+        if not smallest <= found <= largest:
+            raise ValueError(
+                f"{name} must be at {limit} {bound:.3g} kg m^2 about every axis, with a mass of "
+                f"{mass:g} kg and rotor_positions_B {reach:.3g} m away, got {found:g} kg m^2"
+            )
 
 
 def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:

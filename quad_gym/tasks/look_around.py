@@ -51,8 +51,8 @@ class LookAround(Task):
     The endings of `QuadEnv`, with a bound of 8 m on the distance from the reference, so that a
     controller with a wrong position estimate has time to recover. The minimum height is -5 m.
 
-    Simple rules fail: PD control that tracks the desired heading loses its position in two thirds
-    of the episodes, and PD control that faces the wall forgoes the reward for the heading.
+    These two rules fail: PD control that tracks the desired heading loses its position in two
+    thirds of the episodes, and PD control that faces the wall forgoes the reward for the heading.
 
     Args:
         heading_weight: Weight of h in the reward.

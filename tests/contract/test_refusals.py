@@ -200,6 +200,13 @@ def test_wrong_option_ends_with_exit_code_2_and_names_it(line, message, tmp_path
     assert sorted(p.name for p in tmp_path.iterdir()) == ["binary.npz", "folder", "text.toml"]
 
 
+def test_a_wrong_suite_is_refused_before_a_missing_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    done = console_commands.run("fly", "--sensors", "rkt")
+    assert done.returncode == 2
+    assert "did you mean rtk?" in plain(done.stderr)
+
+
 def test_help_lists_all_commands():
     done = console_commands.run("--help")
     export = console_commands.run("export", "--help")

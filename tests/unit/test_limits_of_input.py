@@ -153,6 +153,22 @@ def test_references_beyond_what_is_observed_are_refused(name):
     assert getattr(TaskParams(**{name: 1000.0}), name) == 1000.0
 
 
+@pytest.mark.parametrize(
+    ("task", "least", "options"),
+    [  # the least period, by the thrust of twice the weight
+        ("circle", 3.05, {}),
+        ("circle", 4.26, {"randomize_reference": True}),
+        ("circle", 0.98, {"action": "motor"}),
+        ("lemniscate", 3.85, {}),
+    ],
+)
+def test_periods_that_no_thrust_allows_are_refused(task, least, options):
+    refused(
+        "period must be one that the vehicle can fly", QuadEnv, task, period=0.99 * least, **options
+    )
+    QuadEnv(task, period=1.01 * least, **options)
+
+
 # ---- starts and seeds ----------------------------------------------------------------------------
 
 
@@ -166,6 +182,7 @@ def test_a_start_that_is_out_of_all_bounds_is_refused_and_changes_nothing():
             ({"position": [1e300, 0.0, 0.0]}, "position must be .* out_of_bounds=1.6 m"),
             ({"velocity": [0.0, 1e9, 0.0]}, "velocity must be at most"),
             ({"yaw": 1e300}, "yaw must be at most"),
+            ({"yaw": 90.0}, r"yaw must be in rad, .* got 90; did you mean 1\.571\?"),
             ({"position": ["1", "2", "3"]}, "position must be numbers"),
         ):
             refused(message, one.reset, seed=5, options=options)
@@ -227,6 +244,7 @@ def test_keywords_that_do_not_belong_there_are_refused(maker):
     refused("gate_count belongs to the task waypoints", make, gate_count=3)
     refused("max_speed belongs to the task random_trajectory", make, max_speed=1.0)
     refused("camera must not be True", make, camera=True, sensors="consumer")
+    refused("control_rate must be at least 1, got 0.02", make, control_rate=0.02)
     make(camera=False, sensors="consumer")
     make(camera=True, sensors="rtk")
 
@@ -241,6 +259,10 @@ def test_faults_of_sensors_need_sensors(maker, observation):
     make(observation=observation, faults=(RotorLoss(), PositionJump()))
     make(observation=observation, faults="gnss_outage", innovations=True)
     make(observation="measurements", faults="gnss_outage")
+
+
+def test_the_number_of_stable_baselines_environments_has_another_name():
+    refused("num_envs is n_envs here", quad_gym.make_sb3_vec_env, "QuadGym/Hover-v0", num_envs=2)
 
 
 # ---- policies ------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ BAD_VALUES = {
     ("VehicleParams", "mass"): NOT_POSITIVE,
     ("VehicleParams", "thrust_coefficient"): NOT_POSITIVE,
     ("VehicleParams", "torque_coefficient"): NOT_POSITIVE,
-    ("VehicleParams", "motor_time_constant"): NOT_POSITIVE,
+    ("VehicleParams", "motor_time_constant"): [*NOT_POSITIVE, 50.0],
     ("VehicleParams", "motor_speed_per_volt"): NOT_POSITIVE,
     ("VehicleParams", "max_voltage"): NOT_POSITIVE,
     ("VehicleParams", "gravity"): NOT_POSITIVE,
@@ -57,6 +57,7 @@ BAD_VALUES = {
         *NO_MATRICES,
         np.zeros((3, 3)),
         np.diag([1.0, 1.0, 0.0]),
+        np.diag([2600.0, 5000.0, 7000.0]),  # kg mm^2
         np.diag([1.0, -1.0, 1.0]),
         np.eye(3) + np.eye(3, k=1),
     ],

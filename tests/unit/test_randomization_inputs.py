@@ -16,6 +16,7 @@ SUITE = quad_gym.sensor_suite("lab")
     [
         ({"colour": Uniform(0, 1)}, "'colour' is unknown"),
         ({3: Uniform(0, 1)}, "3 is unknown"),
+        ({"masss": Uniform(0, 1)}, "'masss' is unknown.*did you mean mass"),
         ({"mass": 0.8}, "'mass' must be a distribution"),
         ({"mass": None}, "'mass' must be a distribution"),
         ({"inertia": (Uniform(1, 2), Uniform(1, 2))}, "'inertia' must be a distribution or 3"),

@@ -42,7 +42,7 @@ def heading_choice(yaw: Any, look_at: Any) -> tuple[str, tuple[float, float], An
         return "given", (0.0, 0.0), 0.0
     if callable(yaw) or np.ndim(yaw) > 0:
         return "given", (0.0, 0.0), yaw
-    return "given", (0.0, 0.0), check.number("yaw", yaw)
+    return "given", (0.0, 0.0), check.angle("yaw", yaw)
 
 
 def yaw_angles(trajectory: "Trajectory", times: Floats) -> tuple[Floats, Floats, Floats]:
