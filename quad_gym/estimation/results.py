@@ -92,20 +92,7 @@ class Replay:
 
     def columns(self) -> dict[str, Floats]:
         """Return the estimates as a table: columns of one number each, by name."""
-        table = {"time": self.time}
-        names = {
-            "position": self.position,
-            "velocity": self.velocity,
-            "quaternion": self.quaternion,
-            "accel_bias": self.accel_bias,
-            "gyro_bias": self.gyro_bias,
-        }
-        for name, values in names.items():
-            axes = "wxyz" if values.shape[1] == 4 else "xyz"
-            table.update({f"{name}_{axis}": values[:, i] for i, axis in enumerate(axes)})
-        words = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
-        for k in range(15):
-            table[f"{words[k // 3]}_sigma_{'xyz'[k % 3]}"] = self.sigma[:, k]
+        table = columns_of(self)
         table["diverged"] = self.diverged.astype(np.float64)
         return table
 
@@ -142,3 +129,22 @@ def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
         parts = (np.concatenate([getattr(m, name) for m in features]) for name in names)
         found["features"] = Measured(*parts)
     return found
+
+
+def columns_of(estimates: Any) -> dict[str, Floats]:
+    """Return the estimates of a replay or a smoother as columns of one number each, by name."""
+    table = {"time": estimates.time}
+    names = {
+        "position": estimates.position,
+        "velocity": estimates.velocity,
+        "quaternion": estimates.quaternion,
+        "accel_bias": estimates.accel_bias,
+        "gyro_bias": estimates.gyro_bias,
+    }
+    for name, values in names.items():
+        axes = "wxyz" if values.shape[1] == 4 else "xyz"
+        table.update({f"{name}_{axis}": values[:, i] for i, axis in enumerate(axes)})
+    words = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+    for k in range(15):
+        table[f"{words[k // 3]}_sigma_{'xyz'[k % 3]}"] = estimates.sigma[:, k]
+    return table
