@@ -4,9 +4,10 @@
     quad-gym replay flight.csv --sensors rtk --smooth
     quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
 
-A log is a CSV table, or a log of PX4 (which requires `pip install 'quad-gym[ulog]'`). docs/logs.md
-describes the columns of a table and the topics of PX4. If units or axes are implausible, the suite
-does not describe the log, or the filter diverges, the last lines report it and the exit code is 1.
+A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
+some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. If units
+or axes are implausible, the suite does not describe the log, or the filter diverges, the last lines
+report it and the exit code is 1.
 """
 
 import math
@@ -35,7 +36,9 @@ class Args:
     """Options of the replay."""
 
     log: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="LOG", help="table (.csv) or log of PX4 (.ulg)")]
+        Annotated[
+            Path, tyro.conf.arg(metavar="LOG", help="table (.csv), .ulg, .bin, bag or folder")
+        ]
     ]
     sensors: SuiteName = "standard"
     estimator: Literal["ukf", "ekf"] = "ukf"

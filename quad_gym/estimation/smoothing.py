@@ -31,81 +31,19 @@ from quad_gym.estimation.filters import KalmanFilter
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.replaying import named_start, prepared
-from quad_gym.estimation.results import columns_of
+from quad_gym.estimation.results import Smoothed
 from quad_gym.estimation.running import run_while_unknown
 from quad_gym.estimation.tape import Tape
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import OPERATION, FilterStatus, Operation
+from quad_gym.records import OPERATION, Operation
 from quad_gym.rotations import dcm_to_euler, dcm_to_quaternion, euler_to_dcm
 
 _AT_ONCE = 256  # operations between two readings of the filter's memory
 _LEAST_JUMP = 1e-9  # share of a variance, at least, that an inflation adds
 _LEAST_CHANGE = 1e-6  # share of a variance that smoothing must remove for the consistency test
+_LEAST_VARIANCE = 1e-14  # added to all variances, in units of these, against rounding
 _E = slice(6, 9)
-
-
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """Smoothed trajectory of a log, at each IMU sample since the heading is known."""
-
-    sensors: SensorSuite
-    """sensor suite that the filter assumed; `gnss.reference_antenna_G` is the origin of I"""
-    time: Floats
-    """(n,) times of the samples [s]"""
-    position: Floats
-    """(n, 3) position in I [m]"""
-    velocity: Floats
-    """(n, 3) velocity in I [m/s]"""
-    quaternion: Floats
-    """(n, 4) attitude: unit quaternions (w, x, y, z), body to inertial"""
-    accel_bias: Floats
-    """(n, 3) accelerometer bias in B [m/s^2]"""
-    gyro_bias: Floats
-    """(n, 3) gyro bias in B [rad/s]"""
-    covariance: Floats
-    """(n, 15, 15) of position, velocity, error angles, accelerometer and gyro bias"""
-    difference: Floats
-    """(n, 15) filtered minus smoothed estimates, divided by the square root of the difference of
-    their variances; NaN where this is less than a millionth of the filter's, as at the end"""
-    status: FilterStatus
-    """numerical failures of the filter"""
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    @property
-    def sigma(self) -> Floats:
-        """(n, 15) standard deviations."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
-
-    def columns(self) -> dict[str, Floats]:
-        """Return the estimates as a table: columns of one number each, by name."""
-        return columns_of(self)
-
-    def consistency(self, limit: float = 3.0) -> dict[str, float]:
-        """Return McReynolds' test of consistency: shares of large differences, by state.
-
-        The covariance of (filtered - smoothed) is the difference of their covariances if the suite
-        describes the sensors, whatever the motion: no reference trajectory is necessary. Then a
-        share of 0.0027 is beyond 3 standard deviations on average; as differences are correlated
-        over time, single flights scatter about it. A much larger share shows a process model or
-        noise that does not describe the log.
-
-        Args:
-            limit: Limit in standard deviations.
-
-        Returns:
-            Shares by the names of the columns of standard deviations; NaN where nothing was tested.
-        """
-        names = [name for name in columns_of(self) if "_sigma_" in name]
-        large, tested = np.abs(self.difference) > limit, np.isfinite(self.difference)
-        with np.errstate(invalid="ignore"):
-            shares = large.sum(axis=0) / tested.sum(axis=0)
-        return {
-            name.replace("_sigma", ""): float(share)
-            for name, share in zip(names, shares, strict=True)
-        }
 
 
 def smooth(
@@ -313,7 +251,9 @@ def _smooth_back(f: _Forward) -> tuple[Floats, Floats, Floats]:
         if not (predicts or noise.any()):
             continue
         after = moved @ Phi.T + noise
-        gain = cho_solve((np.linalg.cholesky(after), True), moved, check_finite=False).T
+        units = _units(np.diag(after))
+        scaled = after / units[:, np.newaxis] / units + _LEAST_VARIANCE * np.eye(len(units))
+        gain = cho_solve((np.linalg.cholesky(scaled), True), moved / units[:, np.newaxis]).T / units
         origin = k if predicts else k - 1
         error, angles = x - f.x[origin], dcm_to_euler(R_BI @ f.R_BI[origin].T)
         if f.resets:  # to the angles about the filter's attitude
@@ -352,11 +292,15 @@ def _added(f: _Forward, k: int, expected: Floats, least: float) -> Floats:
     if f.resets and f.sample[k - 1] < 0:
         moved = dcm_to_euler(f.R_BI[k] @ f.R_BI[k - 1].T)
         after = _turned(after, _resets(moved), back=True)
-    variances = np.diag(expected)
-    units = np.sqrt(np.where(variances > 0.0, variances, 1.0))  # a drift starts with none
+    units = _units(np.diag(expected))
     values, vectors = np.linalg.eigh((after - expected) / units[:, np.newaxis] / units)
     root = units[:, np.newaxis] * vectors * np.sqrt(np.where(values > least, values, 0.0))
     return np.asarray(root @ root.T)
+
+
+def _units(variances: Floats) -> Floats:
+    """Return standard deviations, and 1 for zero: a drift may start without any."""
+    return np.asarray(np.sqrt(np.where(variances > 0.0, variances, 1.0)))
 
 
 # ---- rotations -----------------------------------------------------------------------------------

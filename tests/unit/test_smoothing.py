@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from quad_gym.estimation import read_log, replay, smooth
+from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import quaternion_to_dcm
 from tests.console_commands import run
 from tests.filter_states import at_rest
@@ -175,6 +176,14 @@ def test_covariances_are_positive_and_smaller_than_the_filters(flights):
         units = result.sigma[:, :, np.newaxis] * result.sigma[:, np.newaxis]
         assert np.linalg.eigvalsh(result.covariance / units).min() > 0.0
         assert np.isfinite(result.difference).mean() > 0.95
+
+
+def test_covariances_are_positive_where_the_first_updates_turn_the_attitude():
+    """Drift of GNSS begins without variance, and the first magnetic headings are far off."""
+    suite = CONSUMER.replace(barometer=PX4.barometer, magnetometer=PX4.magnetometer)
+    result = smooth(Recorded(flown(suite, 2.0, seed=42), suite, seed=42).table(), sensors=suite)
+    units = result.sigma[:, :, np.newaxis] * result.sigma[:, np.newaxis]
+    assert np.linalg.eigvalsh(result.covariance / units).min() > 0.0
 
 
 def test_differences_of_filter_and_smoother_are_consistent_for_the_right_suite_only(flights):
