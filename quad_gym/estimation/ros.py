@@ -1,6 +1,6 @@
 """Logs of ROS: bags of ROS 1 (.bag) and of ROS 2 (folders with metadata.yaml).
 
-Axes are those of REP 103: body x forward, y left, z up; world east, north, up.
+Axes follow REP 103: body x forward, y left, z up; world east, north, up.
 
 | message | contents used |
 |---|---|
@@ -126,7 +126,7 @@ def _stream(rows: list[tuple[float, float, Any]], **fields: str) -> Stream | Non
 def _gnss(
     fixes: list[tuple[float, float, Any]], velocities: list[tuple[float, float, Any]]
 ) -> Stream | None:
-    """Return positions, and velocities in rows of their own."""
+    """Return positions, and velocities in separate rows."""
     fixes = [row for row in fixes if row[2].status.status >= 0]
     rows = fixes + velocities
     if not rows:

@@ -57,8 +57,8 @@ def smooth(
 ) -> Smoothed:
     """Return the best trajectory of a log, with its covariance.
 
-    Each estimate contains all measurements of the log, earlier and later ones. The arguments are
-    those of `quad_gym.estimation.replay`, whose `problems` also apply here.
+    Each estimate contains all measurements of the log, earlier and later ones. The arguments are as
+    in `quad_gym.estimation.replay`, whose `problems` also apply here.
 
     Args:
         log: A table or a file, see `quad_gym.estimation.read_log`, or its result.
@@ -247,10 +247,11 @@ def _smooth_back(f: _Forward) -> tuple[Floats, Floats, Floats]:
         predicts = f.sample[k - 1] >= 0
         Phi = _transition(f, k - 1) if predicts else np.eye(len(before))
         moved = Phi @ before
-        noise = _added(f, k, moved @ Phi.T, 0.0 if predicts else _LEAST_JUMP)
+        expected = moved @ Phi.T
+        noise = _added(f, k, expected, 0.0 if predicts else _LEAST_JUMP)
         if not (predicts or noise.any()):
             continue
-        after = moved @ Phi.T + noise
+        after = expected + noise
         units = _units(np.diag(after))
         scaled = after / units[:, np.newaxis] / units + _LEAST_VARIANCE * np.eye(len(units))
         gain = cho_solve((np.linalg.cholesky(scaled), True), moved / units[:, np.newaxis]).T / units
