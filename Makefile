@@ -26,7 +26,7 @@ $(VENV)/.trainer: $(VENV)/.user
 	touch $@
 
 $(VENV)/.developer: pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) ".[train,plot,render,pandas,ulog,rerun,export,dev]"
+	$(INSTALL) ".[train,plot,render,pandas,ulog,ardupilot,ros,rerun,export,dev]"
 	$(BYTECODE)
 	touch $(VENV)/.user $(VENV)/.trainer $@  # which it holds
 

@@ -1,11 +1,13 @@
 """Run the filter on the log of a real flight: estimates, innovations, rejected measurements.
 
     quad-gym replay flight.csv --sensors rtk
+    quad-gym replay flight.csv --sensors rtk --smooth
     quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
 
-A log is a CSV table, or a log of PX4 (which requires `pip install 'quad-gym[ulog]'`). docs/logs.md
-describes the columns of a table and the topics of PX4. If units or axes are implausible, the suite
-does not describe the log, or the filter diverges, the last lines report it and the exit code is 1.
+A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
+some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. If units
+or axes are implausible, the suite does not describe the log, or the filter diverges, the last lines
+report it and the exit code is 1.
 """
 
 import math
@@ -34,7 +36,9 @@ class Args:
     """Options of the replay."""
 
     log: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="LOG", help="table (.csv) or log of PX4 (.ulg)")]
+        Annotated[
+            Path, tyro.conf.arg(metavar="LOG", help="table (.csv), .ulg, .bin, bag or folder")
+        ]
     ]
     sensors: SuiteName = "standard"
     estimator: Literal["ukf", "ekf"] = "ukf"
@@ -59,6 +63,8 @@ class Args:
     """longest delay of measurements [s]"""
     reported_noise: bool = True
     """use the accuracy reported by the receiver, if the log contains it"""
+    smooth: bool = False
+    """write the smoothed trajectory as well"""
     figure: bool = True
     """draw a figure"""
     output: Path | None = None
@@ -174,27 +180,32 @@ def _lists(columns: "dict[str, Floats]") -> dict[str, list[float]]:
 def main(args: Args) -> None:
     """Read, filter, draw and write."""
     from quad_gym.analysis.reports import versions, write_csv, write_json
-    from quad_gym.estimation import replay
+    from quad_gym.estimation import read_log, replay, smooth
     from quad_gym.estimation.plausibility import MisfitError
 
+    smoothed = None
     with usage_errors():
         folder = folder_of(args)
+        options: dict[str, Any] = {
+            "sensors": suite_of(args),
+            "estimator": args.estimator,
+            "start": start_of(args),
+            "reported_noise": args.reported_noise,
+            "body": args.body,
+        }
         try:
-            result = replay(
-                args.log,
-                sensors=suite_of(args),
-                estimator=args.estimator,
-                start=start_of(args),
-                reported_noise=args.reported_noise,
-                window=args.window,
-                body=args.body,
-            )
+            log = read_log(args.log, body=args.body)
+            result = replay(log, window=args.window, **options)
+            if args.smooth:
+                smoothed = smooth(log, **options)
         except MisfitError as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(MISFIT) from None
     print(report_of(result))
     files = [write_csv(folder / "estimates.csv", _lists(result.columns()))]
     files.append(write_csv(folder / "innovations.csv", innovations_of(result)))
+    if smoothed is not None:
+        files.append(write_csv(folder / "smoothed.csv", _lists(smoothed.columns())))
     if args.figure:
         from quad_gym.analysis.plots import house_style, save_figure
         from quad_gym.analysis.replay_plots import replay_figure
@@ -206,6 +217,7 @@ def main(args: Args) -> None:
         **result.summary(),
         "configuration": args,
         "sensors": result.sensors,
+        **({} if smoothed is None else {"smoothed": smoothed.consistency()}),
         "versions": versions("numpy", "numba", "scipy", "pyulog"),
     }
     files.append(write_json(folder / RESULT, found))

@@ -10,7 +10,8 @@ from quad_gym.estimation.filters import (
 from quad_gym.estimation.first_fix import FARTHEST_FIX, FirstFix
 from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Stream
 from quad_gym.estimation.replaying import replay
-from quad_gym.estimation.results import Measured, Replay
+from quad_gym.estimation.results import Measured, Replay, Smoothed
+from quad_gym.estimation.smoothing import smooth
 from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.wahba import solve_wahba
 
@@ -27,10 +28,12 @@ __all__ = [
     "LogColumn",
     "Measured",
     "Replay",
+    "Smoothed",
     "Stream",
     "UnscentedKalmanFilter",
     "calibrate",
     "read_log",
     "replay",
+    "smooth",
     "solve_wahba",
 ]

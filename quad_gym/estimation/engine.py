@@ -144,6 +144,10 @@ class Engine:
         first = self._room.skipped // (8 * WIDTH)
         return raw[:, first : first + self._room.dtype.itemsize // (8 * WIDTH)]
 
+    def of_copies(self, slots: NDArray[Any], name: str) -> NDArray[Any]:
+        """Return a field of the first lane in the copies (n, words) of a tape, (n, ...)."""
+        return slots.view(self._room.dtype)[name][:, 0, ..., 0]
+
     # ---- operations ---------------------------------------------------------------------------
 
     def start(self, x_I: Floats) -> None:

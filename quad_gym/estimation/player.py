@@ -167,8 +167,15 @@ class Player:
                 f"{now:.3f} s to {time:.3f} s: cut the log there"
             )
         gyro, accel = self.gyros[chosen], self.accels[chosen]
-        self.history.add(Sample(gyro, accel, step, gyro if self.gyro is None else self.gyro))
+        sample = Sample(gyro, accel, step, gyro if self.gyro is None else self.gyro)
         self.gyro = gyro
+        while self.waiting and self.waiting[0][0] < time - SAME_TIME:  # taken within the sample
+            stamp, name, k = self.waiting.pop(0)
+            if (elapsed := stamp - self.history.time) > SAME_TIME:
+                first, sample = sample.split(elapsed)
+                self.history.add(first)
+            self._update(name, k)
+        self.history.add(sample)
         while self.waiting and self.waiting[0][0] <= self.history.time + SAME_TIME:
             _, name, k = self.waiting.pop(0)
             self._update(name, k)

@@ -60,13 +60,22 @@ def replay(
     """
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
+    whole, suite = prepared(log, sensors, body)
+    reach = window + max(0.0, *vars(suite.log_delays).values())
+    result = Player(whole, suite, estimator, named_start(start), reported_noise, reach).play()
+    return replace(result, problems=problems_of(whole, body, suite, result))
+
+
+def prepared(log: Any, sensors: SensorSuite | str, body: str) -> tuple[Log, SensorSuite]:
+    """Return a log without its delays, and a suite with the origin of I.
+
+    Raises:
+        ValueError: As `replay`.
+    """
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
     whole = read_log(log, body=body).without_delays(vars(suite.log_delays))
-    suite = origin_of(whole, suite)
-    reach = window + max(0.0, *vars(suite.log_delays).values())
-    result = Player(whole, suite, estimator, _named(start), reported_noise, reach).play()
-    return replace(result, problems=problems_of(whole, body, suite, result))
+    return whole, origin_of(whole, suite)
 
 
 def origin_of(log: Log, suite: SensorSuite) -> SensorSuite:
@@ -79,7 +88,7 @@ def origin_of(log: Log, suite: SensorSuite) -> SensorSuite:
     return suite.replace(gnss=suite.gnss.replace(reference_antenna_G=tuple(origin.tolist())))
 
 
-def _named(start: Mapping[str, Any] | None) -> dict[str, Any]:
+def named_start(start: Mapping[str, Any] | None) -> dict[str, Any]:
     """A start as keywords of `initialize`, or with a position as those that the player checks.
 
     Raises:

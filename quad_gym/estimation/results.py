@@ -1,4 +1,4 @@
-"""Results of a replay: estimates, innovations and problems."""
+"""Results of a replay: estimates, innovations and problems; smoothed estimates."""
 
 import math
 from collections.abc import Mapping
@@ -92,20 +92,7 @@ class Replay:
 
     def columns(self) -> dict[str, Floats]:
         """Return the estimates as a table: columns of one number each, by name."""
-        table = {"time": self.time}
-        names = {
-            "position": self.position,
-            "velocity": self.velocity,
-            "quaternion": self.quaternion,
-            "accel_bias": self.accel_bias,
-            "gyro_bias": self.gyro_bias,
-        }
-        for name, values in names.items():
-            axes = "wxyz" if values.shape[1] == 4 else "xyz"
-            table.update({f"{name}_{axis}": values[:, i] for i, axis in enumerate(axes)})
-        words = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
-        for k in range(15):
-            table[f"{words[k // 3]}_sigma_{'xyz'[k % 3]}"] = self.sigma[:, k]
+        table = columns_of(self)
         table["diverged"] = self.diverged.astype(np.float64)
         return table
 
@@ -133,6 +120,69 @@ class Replay:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Smoothed trajectory of a log, at each IMU sample since the heading is known."""
+
+    sensors: SensorSuite
+    """sensor suite that the filter assumed; `gnss.reference_antenna_G` is the origin of I"""
+    time: Floats
+    """(n,) times of the samples [s]"""
+    position: Floats
+    """(n, 3) position in I [m]"""
+    velocity: Floats
+    """(n, 3) velocity in I [m/s]"""
+    quaternion: Floats
+    """(n, 4) attitude: unit quaternions (w, x, y, z), body to inertial"""
+    accel_bias: Floats
+    """(n, 3) accelerometer bias in B [m/s^2]"""
+    gyro_bias: Floats
+    """(n, 3) gyro bias in B [rad/s]"""
+    covariance: Floats
+    """(n, 15, 15) of position, velocity, error angles, accelerometer and gyro bias"""
+    difference: Floats
+    """(n, 15) filtered minus smoothed estimates, divided by the square root of the difference of
+    their variances; NaN where this is less than a millionth of the filter's, as at the end"""
+    status: FilterStatus
+    """numerical failures of the filter"""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def sigma(self) -> Floats:
+        """(n, 15) standard deviations."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
+
+    def columns(self) -> dict[str, Floats]:
+        """Return the estimates as a table: columns of one number each, by name."""
+        return columns_of(self)
+
+    def consistency(self, limit: float = 3.0) -> dict[str, float]:
+        """Return McReynolds' test of consistency: shares of large differences, by state.
+
+        The covariance of (filtered - smoothed) is the difference of their covariances if the suite
+        describes the sensors, whatever the motion: no reference trajectory is necessary. Then a
+        share of 0.0027 is beyond 3 standard deviations on average; as differences are correlated
+        over time, single flights scatter about it. A much larger share shows a process model or
+        noise that does not describe the log.
+
+        Args:
+            limit: Limit in standard deviations.
+
+        Returns:
+            Shares by the names of the columns of standard deviations; NaN where nothing was tested.
+        """
+        names = [name for name in columns_of(self) if "_sigma_" in name]
+        large, tested = np.abs(self.difference) > limit, np.isfinite(self.difference)
+        with np.errstate(invalid="ignore"):
+            shares = large.sum(axis=0) / tested.sum(axis=0)
+        return {
+            name.replace("_sigma", ""): float(share)
+            for name, share in zip(names, shares, strict=True)
+        }
+
+
 def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
     """Return the innovations of a replay by sensor, with all features together as "features"."""
     found = {name: m for name, m in measured.items() if not name.startswith("feature_")}
@@ -142,3 +192,22 @@ def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
         parts = (np.concatenate([getattr(m, name) for m in features]) for name in names)
         found["features"] = Measured(*parts)
     return found
+
+
+def columns_of(estimates: Any) -> dict[str, Floats]:
+    """Return the estimates of a replay or a smoother as columns of one number each, by name."""
+    table = {"time": estimates.time}
+    names = {
+        "position": estimates.position,
+        "velocity": estimates.velocity,
+        "quaternion": estimates.quaternion,
+        "accel_bias": estimates.accel_bias,
+        "gyro_bias": estimates.gyro_bias,
+    }
+    for name, values in names.items():
+        axes = "wxyz" if values.shape[1] == 4 else "xyz"
+        table.update({f"{name}_{axis}": values[:, i] for i, axis in enumerate(axes)})
+    words = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+    for k in range(15):
+        table[f"{words[k // 3]}_sigma_{'xyz'[k % 3]}"] = estimates.sigma[:, k]
+    return table

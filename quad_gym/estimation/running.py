@@ -25,7 +25,7 @@ def run_filter(kf: KalmanFilter, writer: TapeWriter, tape: Tape) -> tuple[Floats
         (m, blocks, REPORTED).
     """
     status = kf.status
-    first, copies, estimates, innovations = _run_while_unknown(kf, writer, tape)
+    first, copies, estimates, innovations = run_while_unknown(kf, writer, tape)
     if first < len(tape.operations):
         slots = np.zeros((tape.slots, kf._engine.words[0].size), np.uint64)
         for slot, (words, _) in ((slots[k], copy) for k, copy in copies.items()):
@@ -42,7 +42,7 @@ def run_filter(kf: KalmanFilter, writer: TapeWriter, tape: Tape) -> tuple[Floats
     return kept, reported
 
 
-def _run_while_unknown(
+def run_while_unknown(
     kf: KalmanFilter, writer: TapeWriter, tape: Tape
 ) -> tuple[int, dict[int, Any], list[Floats], list[Floats]]:
     """Run a tape until the heading is known, also in all copies that may be restored.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.euroc import is_euroc, read_euroc
 from quad_gym.estimation.logs import LOG_COLUMNS, Floats, Log, Stream
 from quad_gym.frames import geodetic_to_ecef
 from quad_gym.params import checks as check
@@ -24,16 +25,17 @@ def read_log(log: Any, *, body: str = "flu") -> Log:
 
     Args:
         log: A pandas DataFrame, a mapping of columns, or a path: of a comma-separated table with a
-            line of names (.csv), or of a log of PX4 (.ulg, see `quad_gym.estimation.px4`). A
-            mapping may hold the numbers of a quantity together, such as `"gyro"` (n, 3). See
-            LOG_COLUMNS.
+            line of names (.csv), of a log of PX4 (.ulg) or ArduPilot (.bin), of a bag of ROS 1
+            (.bag) or ROS 2 (a folder), or of a folder in the format of EuRoC; see the modules
+            `px4`, `ardupilot`, `ros` and `euroc` of `quad_gym.estimation`. A mapping may hold the
+            numbers of a quantity together, such as `"gyro"` (n, 3). See LOG_COLUMNS.
         body: Axes of IMU and magnetometer in a table: "flu" (x forward, y left, z up), or "frd" (x
             forward, y right, z down).
 
     Raises:
         ValueError: If columns are missing, unknown, or of unequal length, hold values that are
             infinite or not numbers, or the IMU samples are not in the order of time.
-        ImportError: If a log of PX4 is given and pyulog is not installed.
+        ImportError: If the library that reads this format is not installed.
         OSError: If there is no such file.
     """
     check.choice("body", body, ("flu", "frd"))
@@ -45,13 +47,24 @@ def read_log(log: Any, *, body: str = "flu") -> Log:
             from quad_gym.estimation.px4 import read_ulog
 
             return read_ulog(path)
+        if path.suffix.lower() == ".bin":
+            from quad_gym.estimation.ardupilot import read_bin
+
+            return read_bin(path)
+        if path.suffix.lower() == ".bag" or (path / "metadata.yaml").is_file():
+            from quad_gym.estimation.ros import read_bag
+
+            return read_bag(path)
+        if is_euroc(path):
+            return read_euroc(path)
         return _log_of(_csv_columns(path), body, {"file": path.name})
     if isinstance(log, Mapping):
         return _log_of(_columns(log), body, {})
     if hasattr(log, "columns") and hasattr(log, "to_numpy"):
         return _log_of(_columns({name: log[name] for name in log.columns}), body, {})
     raise ValueError(
-        "log must be a DataFrame, a mapping of columns, or a path of a .csv or .ulg, got "
+        "log must be a DataFrame, a mapping of columns, or a path of a .csv, .ulg, .bin, bag "
+        f"or folder, got "
         f"{type(log).__name__}"
     )
 
