@@ -11,11 +11,9 @@ with the rates, delays and noise of this vehicle, for `replay`, `train` and all 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-
-from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.options import LogFile, SuiteName, refuse_overwriting, usage_errors
 
 if TYPE_CHECKING:
     from quad_gym.estimation.calibration import Calibration
@@ -28,9 +26,7 @@ SUITE, RESULT = "suite.toml", "calibration.json"
 class Args:
     """Options of the calibration."""
 
-    log: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="LOG", help="table (.csv) or log of PX4 (.ulg)")]
-    ]
+    log: LogFile
     sensors: SuiteName = "consumer"
     share: float = 0.5
     """share of the log that the search uses, from its beginning"""

@@ -286,3 +286,14 @@ SuiteNames = Annotated[
     tyro.conf.arg(help=f"sensor suites: {', '.join(SUITES)}, or files of suites (.toml)"),
 ]
 """Names or files of sensor suites."""
+
+LogFile = tyro.conf.Positional[
+    Annotated[
+        Path,
+        tyro.conf.arg(
+            metavar="LOG",
+            help="table (.csv), log of PX4 (.ulg) or ArduPilot (.bin), ROS bag, or EuRoC folder",
+        ),
+    ]
+]
+"""Log of a flight."""

@@ -14,12 +14,11 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import tyro
 
-from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.options import LogFile, SuiteName, refuse_overwriting, usage_errors
 
 if TYPE_CHECKING:
     from quad_gym.estimation import Replay
@@ -35,11 +34,7 @@ MISFIT = 1
 class Args:
     """Options of the replay."""
 
-    log: tyro.conf.Positional[
-        Annotated[
-            Path, tyro.conf.arg(metavar="LOG", help="table (.csv), .ulg, .bin, bag or folder")
-        ]
-    ]
+    log: LogFile
     sensors: SuiteName = "standard"
     estimator: Literal["ukf", "ekf"] = "ukf"
     """filter: unscented or extended Kalman filter"""
