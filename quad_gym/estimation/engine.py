@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.estimation.samples import Measurement, Sample
-from quad_gym.estimation.tape import Tape, of_measurement, of_sample
+from quad_gym.estimation.tape import BLANK, ONE_PREDICTION, ONE_UPDATE, Tape, write_measurement
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
@@ -28,7 +28,9 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
     FLIGHT_BLOCK,
     KEPT,
+    MEASUREMENT,
     REPORTED,
+    SAMPLE,
     SETTINGS,
     STEP_BLOCK,
     WIDTH,
@@ -40,6 +42,10 @@ from quad_gym.records import (
 
 Floats = NDArray[np.float64]
 
+_NO_RESULTS = (
+    *(np.empty(0, np.int64), np.empty(0, np.uint64), np.empty((0, 0), np.uint64)),
+    *(0, 0),
+)
 _PARTS = frozenset({"filter", "watch", "slow", "aids"})
 
 
@@ -75,6 +81,8 @@ class Engine:
         self._work = aligned_zeros(1, WORK_BLOCK)
         self._work["mask"] = 1.0
         self.blocks = aligned_zeros(1, FLIGHT_BLOCK)
+        self._linked: NDArray[Any] | None = None
+        self._sample, self._measurement = np.zeros(1, SAMPLE), np.zeros(1, MEASUREMENT)
 
     # ---- memory -------------------------------------------------------------------------------
 
@@ -160,11 +168,22 @@ class Engine:
 
     def predict(self, sample: Sample) -> None:
         """Propagate the estimate over the time of a sample."""
-        self.run(of_sample(sample))
+        for name in SAMPLE.names or ():
+            self._sample[name] = getattr(sample, name)
+        self._run_one(ONE_PREDICTION)
 
     def update(self, measurement: Measurement) -> None:
         """Update the estimate with measurements."""
-        self.run(of_measurement(measurement))
+        self._measurement[:] = BLANK
+        write_measurement(self._measurement[0], measurement)
+        self._run_one(ONE_UPDATE)
+
+    def _run_one(self, operation: NDArray[Any]) -> None:
+        """Run one operation on all blocks."""
+        numbers = (self.params, self._ticks, self.steps, self.settings, self._work, self._table())
+        for k in range(len(self.blocks)):
+            block = self.blocks[k : k + 1]
+            run_tape(block, *numbers, self._sample, self._measurement, operation, *_NO_RESULTS)
 
     def run(self, tape: Tape, slots: NDArray[Any] | None = None) -> tuple[Floats, Floats]:
         """Run the operations of a tape.
@@ -179,12 +198,9 @@ class Engine:
             the k blocks of a measurement.
         """
         slots = self.empty_slots(tape) if slots is None else slots
-        rows = [
-            self.run_block(
-                tape, slots, self.blocks[k : k + 1], self.params, self._ticks, self.steps
-            )
-            for k in range(len(self.blocks))
-        ]
+        numbers = (self.params, self._ticks, self.steps)
+        blocks = (self.blocks[k : k + 1] for k in range(len(self.blocks)))
+        rows = [self.run_block(tape, slots, block, *numbers) for block in blocks]
         kept, reported = (np.array(found) for found in zip(*rows, strict=True))
         return kept, reported
 
@@ -227,4 +243,6 @@ class Engine:
 
     def _table(self) -> NDArray[Any]:
         """Return the table of the stages that the filter runs."""
-        return linked_table(self._stages, single.FILTER_ENTRIES)
+        if self._linked is None:
+            self._linked = linked_table(self._stages, single.FILTER_ENTRIES)
+        return self._linked

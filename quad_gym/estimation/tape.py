@@ -29,6 +29,11 @@ _TRIPLES = (
 _NOISE = (*NOISE_FIELDS, "aid_sigma")
 _PREDICT, _UPDATE = int(Operation.PREDICT), int(Operation.UPDATE)
 
+BLANK = np.zeros(1, MEASUREMENT)
+"""Record of a measurement of nothing, with the noise of the parameters."""
+for _name in _NOISE:
+    BLANK[_name] = np.nan
+
 
 @dataclass(frozen=True, eq=False)
 class Tape:
@@ -64,16 +69,6 @@ class Tape:
         return replace(self, operations=self.operations[first:])
 
 
-def of_sample(sample: Sample) -> Tape:
-    """Return the tape of one prediction."""
-    return Tape(samples_record([sample]), _NONE, _ONE_PREDICTION)
-
-
-def of_measurement(measurement: Measurement) -> Tape:
-    """Return the tape of one update."""
-    return Tape(_NO_SAMPLE, measurements_record([measurement]), _ONE_UPDATE)
-
-
 def samples_record(samples: Sequence[Sample]) -> NDArray[Any]:
     """Return samples as records."""
     found = np.empty(len(samples), SAMPLE)
@@ -85,29 +80,32 @@ def samples_record(samples: Sequence[Sample]) -> NDArray[Any]:
 
 def measurements_record(measurements: Sequence[Measurement]) -> NDArray[Any]:
     """Return measurements as records."""
-    found = np.zeros(len(measurements), MEASUREMENT)
-    for name in _NOISE:
-        found[name] = np.nan
-    for row, m in zip(found, measurements, strict=True):
-        valid = row["valid"]
-        for name, place, block in _TRIPLES:
-            values = getattr(m, name)
-            if values is not None:
-                valid[block], row[place] = 1.0, values
-        if m.pixels is not None:
-            seen = np.asarray(~np.isnan(m.pixels).any(axis=1))
-            valid[FEATURE_BLOCKS : FEATURE_BLOCKS + len(seen)] = seen
-            row["pixels"][: len(seen)] = np.where(seen[:, np.newaxis], m.pixels, 0.0)
-        for aid, values in m.aids.items():
-            valid[AID_BLOCKS + aid] = 1.0
-            row["aid_measurement"][aid, : len(values)] = values
-        for name, value in m.noise.items():
-            if name == "aid_sigma":
-                for aid, sigma in value.items():
-                    row[name][aid] = sigma
-            else:
-                row[name] = value
+    found = np.repeat(BLANK, len(measurements))
+    for row, measurement in zip(found, measurements, strict=True):
+        write_measurement(row, measurement)
     return found
+
+
+def write_measurement(row: Any, m: Measurement) -> None:
+    """Write a measurement into a blank record."""
+    valid = row["valid"]
+    for name, place, block in _TRIPLES:
+        values = getattr(m, name)
+        if values is not None:
+            valid[block], row[place] = 1.0, values
+    if m.pixels is not None:
+        seen = np.asarray(~np.isnan(m.pixels).any(axis=1))
+        valid[FEATURE_BLOCKS : FEATURE_BLOCKS + len(seen)] = seen
+        row["pixels"][: len(seen)] = np.where(seen[:, np.newaxis], m.pixels, 0.0)
+    for aid, values in m.aids.items():
+        valid[AID_BLOCKS + aid] = 1.0
+        row["aid_measurement"][aid, : len(values)] = values
+    for name, value in m.noise.items():
+        if name == "aid_sigma":
+            for aid, sigma in value.items():
+                row[name][aid] = sigma
+        else:
+            row[name] = value
 
 
 @dataclass(eq=False)
@@ -177,6 +175,5 @@ class TapeWriter:
         )
 
 
-_NONE, _NO_SAMPLE = measurements_record(()), samples_record(())
-_ONE_PREDICTION = np.array([(_PREDICT, 0, -1)], OPERATION)
-_ONE_UPDATE = np.array([(_UPDATE, 0, -1)], OPERATION)
+ONE_PREDICTION = np.array([(_PREDICT, 0, -1)], OPERATION)
+ONE_UPDATE = np.array([(_UPDATE, 0, -1)], OPERATION)
