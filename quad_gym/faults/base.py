@@ -90,11 +90,7 @@ class Fault(Checked):
         return {}
 
     def check_suite(self, sensors: SensorSuite) -> None:
-        """Refuse a sensor suite that lacks the sensor of the fault.
-
-        Raises:
-            ValueError: If the sensor is missing.
-        """
+        """Refuse a sensor suite that lacks the sensor of the fault."""
         if self.needs and getattr(sensors, self.needs) is None:
             what = _SENSORS.get(self.needs, f"a {self.needs}")
             raise ValueError(

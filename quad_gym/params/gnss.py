@@ -21,15 +21,7 @@ LEAST_BASELINE = 1e-3
 
 
 def check_baseline(name: str, baseline: np.ndarray) -> None:
-    """Refuse antennas at one place.
-
-    Args:
-        name: Of both antennas.
-        baseline: (3,) from one to the other [m].
-
-    Raises:
-        ValueError: If they are.
-    """
+    """Refuse antennas at one place, with a baseline (3,) below LEAST_BASELINE [m]."""
     if np.linalg.norm(baseline) < LEAST_BASELINE:
         raise ValueError(f"{name} must be apart, by at least {LEAST_BASELINE:g} m")
 
@@ -111,11 +103,7 @@ class GnssParams(Checked):
         )
 
     def require_filter(self) -> None:
-        """Refuse positions with hardly any noise, by the square of which a filter divides.
-
-        Raises:
-            ValueError: If they have.
-        """
+        """Refuse positions with hardly any noise, by the square of which a filter divides."""
         if min(self.position_sigma_I) < 1e-9:
             raise ValueError(
                 "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "

@@ -117,15 +117,7 @@ class Cylinder(Obstacle):
 
 
 def check_obstacles(name: str, obstacles: tuple[Obstacle, ...]) -> None:
-    """Refuse anything that is not an obstacle, and obstacles that follow a later one.
-
-    Args:
-        name: Name of the argument in messages.
-        obstacles: All obstacles of a world.
-
-    Raises:
-        ValueError: If one is refused.
-    """
+    """Refuse anything that is not an obstacle, and obstacles that follow a later one."""
     for k, obstacle in enumerate(obstacles):
         if not isinstance(obstacle, Wall | Cylinder):
             raise ValueError(f"{name} must hold Wall and Cylinder, got {obstacle!r}")

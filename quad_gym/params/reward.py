@@ -48,11 +48,7 @@ class RewardParams(Checked):
         return _COURSE if kind == "waypoints" else _TRACKING
 
     def require_effect(self, kind: str) -> None:
-        """Refuse changed weights of terms that the reward of a kind of task does not have.
-
-        Raises:
-            ValueError: If there is one.
-        """
+        """Refuse changed weights of terms that the reward of a kind of task does not have."""
         used = {term.name.lower() for term in self.terms(kind)}
         for field in fields(self):
             changed = getattr(self, field.name) != field.default

@@ -87,11 +87,7 @@ class NoisyObservationParams(Checked):
 
 
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
-    """Return a latency [s] in ticks.
-
-    Raises:
-        ValueError: If more than MAX_UNDER_WAY measurements would be in transit at a time.
-    """
+    """Return a latency [s] in ticks, with at most MAX_UNDER_WAY measurements in transit."""
     ticks, longest = round(latency * imu_rate), MAX_UNDER_WAY * check.ticks(name, rate, imu_rate)
     if ticks > longest:
         raise ValueError(

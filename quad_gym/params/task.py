@@ -136,12 +136,7 @@ def figure_of_eight() -> Trajectory:
 
 
 def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None:
-    """Return the trajectories of a task as a tuple, or None.
-
-    Raises:
-        ValueError: If an element is not a trajectory or leads too far away, or the task follows
-            none.
-    """
+    """Return the trajectories of a task as a tuple, or None; files are read."""
     if given is None:
         return None
     if kind != "trajectory":
@@ -174,16 +169,7 @@ def _read(file: str | Path) -> Trajectory:
 
 
 def check_limit(task: TaskParams, rate: float, name: str) -> None:
-    """Refuse a time limit of less than a step, which would be rounded to no limit.
-
-    Args:
-        task: The task with the limit.
-        rate: Rate of the steps [Hz].
-        name: Name of that rate in messages.
-
-    Raises:
-        ValueError: If the limit is refused.
-    """
+    """Refuse a time limit of less than a step, which would be rounded to no limit."""
     if task.duration > 0.0 and round(task.duration * rate) == 0:
         raise ValueError(
             f"duration must be 0 (no limit) or at least one step, {1.0 / rate:g} s at {name}="

@@ -159,15 +159,7 @@ class VehicleParams(Checked):
 
 
 def check_moments(name: str, moments: ArrayLike) -> None:
-    """Refuse moments of inertia that no body has: each is at most the sum of the other two.
-
-    Args:
-        name: Name of the argument in messages.
-        moments: (3,) about the principal axes, or about any three orthogonal ones [kg m^2].
-
-    Raises:
-        ValueError: If one is larger, by more than rounding.
-    """
+    """Refuse moments of inertia (3,) that no body has: each is at most the sum of the other two."""
     values = np.asarray(moments, np.float64)
     if 2.0 * values.max() > values.sum() * (1.0 + 1e-9):
         raise ValueError(
@@ -177,18 +169,7 @@ def check_moments(name: str, moments: ArrayLike) -> None:
 
 
 def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike) -> None:
-    """Refuse moments of inertia that are too small or too large for the vehicle's mass and size.
-
-    Args:
-        name: Name of the argument in messages.
-        moments: (3,) about three orthogonal axes [kg m^2].
-        mass: Mass of the vehicle [kg].
-        rotors: (4, 3) rotor hubs relative to the center of mass [m].
-
-    Raises:
-        ValueError: If a radius of gyration over the distance of the rotors is less than
-            LEAST_GYRATION, or more than MOST_GYRATION.
-    """
+    """Refuse moments of inertia (3,) too small or too large for mass and rotor hubs (4, 3) [SI]."""
     reach = float(np.linalg.norm(rotors, axis=1).max())
     smallest = max(LEAST_MOMENT, mass * (LEAST_GYRATION * reach) ** 2)
     largest = mass * (MOST_GYRATION * reach) ** 2
@@ -204,16 +185,7 @@ def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike
 
 
 def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
-    """Refuse rotors that are too fast for the integration.
-
-    Args:
-        name: Name of the time constant in messages.
-        time_constant: Time constant of the rotor speeds [s].
-        clocks: Rates, for the duration of a Runge-Kutta step.
-
-    Raises:
-        ValueError: If the step is too long, so that the computed rotor speeds would diverge.
-    """
+    """Refuse rotors that are too fast for the integration, so that their speeds would diverge."""
     step = 1.0 / (clocks.imu_rate * clocks.substeps)
     if step > RK4_LIMIT * time_constant:
         raise ValueError(

@@ -17,17 +17,10 @@ LEAST_SPEED = 1e-3
 
 
 def heading_choice(yaw: Any, look_at: Any) -> tuple[str, tuple[float, float], Any]:
-    """Return the rule that a heading follows.
+    """Return the rule that a heading follows, one of HEADINGS, and its point (2,).
 
-    Args:
-        yaw: None, an angle, "along", a function, or an array of angles.
-        look_at: None, or a point.
-
-    Returns:
-        One of HEADINGS, the point (2,), and the source of the angles: a number, or `yaw` itself.
-
-    Raises:
-        ValueError: If both are given, or one is invalid.
+    The third value is the source of the angles: a number, or `yaw` itself if it is a function or an
+    array.
     """
     if look_at is not None:
         if yaw is not None:
