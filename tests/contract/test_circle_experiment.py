@@ -121,7 +121,7 @@ def test_crashes_are_counted(tmp_path, capsys):
 
 def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
     args = script.CircleArgs(episodes=1, duration=0.5, output=tmp_path)
-    trace = script.fly("estimate", script.configure(args)).trace
+    trace = script.configure(args).fly("estimate").trace
     distance = np.linalg.norm(trace.position - trace.reference, axis=1)
     np.testing.assert_allclose(trace.error, distance, atol=1e-12)
     assert trace.time[-1] == pytest.approx(0.5)

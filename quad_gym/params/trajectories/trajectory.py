@@ -1,7 +1,6 @@
 """Trajectories: references as piecewise polynomials in time."""
 
 import dataclasses
-import functools
 import math
 from dataclasses import dataclass
 from functools import cached_property, partial
