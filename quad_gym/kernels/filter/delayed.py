@@ -44,15 +44,13 @@ from quad_gym.kernels.maths.linalg import (
     keep33,
     load3,
     load33,
-    load_column3,
     multiply,
     scale,
     store3,
     store33,
-    store_block,
     sub,
-    sum_of_outers,
 )
+from quad_gym.kernels.maths.matrices import load_column3, store_block, sum_of_outers
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import SENSORS, FilterForm, FilterStatus
