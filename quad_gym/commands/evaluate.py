@@ -234,7 +234,7 @@ def write(
     ]
     labels = {case: f"{short_name(case[0])} on {case[1]}" for case in results}
     figures = {
-        "paths": paths_figure({labels[c]: t.trace(0) for c, t in tracers.items()}),
+        "paths": paths_figure({labels[c]: t.trace() for c, t in tracers.items()}),
         "errors": error_over_time_figure(
             {labels[c]: (t.time, t.percentiles) for c, t in tracers.items()}
         ),
