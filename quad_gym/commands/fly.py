@@ -136,6 +136,8 @@ def check_options(args: FlyArgs) -> None:
             raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
         if not args.faults:
             raise ValueError("--fault-time needs --faults")
+    if args.replay is None:
+        sensor_suite(sensors_of(args.env_id, args.sensors))  # before missing packages
     ending = None if args.output is None else args.output.suffix.lower()
     if args.output is not None:
         if ending not in VIDEO_ENDINGS + OTHER_ENDINGS:
