@@ -225,6 +225,14 @@ def test_other_errors_are_raised(monkeypatch):
         main(["circle"])
 
 
+def test_a_closed_pipe_ends_a_command_quietly():
+    line = [sys.executable, "-m", "quad_gym", "circle", "--help"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
 @pytest.mark.skipif(shutil.which("sh") is None, reason="signals as of Unix")
 def test_ctrl_c_in_the_middle_leaves_no_traceback(tmp_path):
     line = [sys.executable, "-m", "quad_gym", "circle", "--episodes", "100000", "--output", "it"]

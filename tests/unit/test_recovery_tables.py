@@ -72,11 +72,11 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     assert values["consistent"] >= 90.0
     assert set(values) == set(recovery.COLUMNS)
     assert "| rtk, camera_occlusion | " in (tmp_path / "recovery.md").read_text()
-    calm = {"values": {"alarms_per_hour": 0.25, "flagged": 0.01, "hours": 6.0}, "miss": False}
-    calm |= {"expected": "", "filters_failed": 0}
-    lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "miss": True, "expected": ""}
-    lost |= {"filters_failed": 1}
-    rows = {"a": lost, "b": lost | {"expected": "why"}, "c": calm}
+    calm = {"values": {"alarms_per_hour": 0.25, "flagged": 0.01, "hours": 6.0}, "misses": []}
+    calm |= {"expected": {}, "filters_failed": 0}
+    lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "misses": ["undetected"]}
+    lost |= {"expected": {}, "filters_failed": 1}
+    rows = {"a": lost, "b": lost | {"expected": {"": "why"}}, "c": calm}
     text = recovery.table_of(rows, CaseFlights(32))
     assert "| **5.0** |" in text.splitlines()[4]
     assert "**1 filters failed**" in text
