@@ -33,7 +33,7 @@ from quad_gym.kernels.filter.recovery import (
     raise_variances,
     time_of,
 )
-from quad_gym.kernels.filter.rows import put_block, put_column
+from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
 from quad_gym.kernels.maths.matrices import load_column3
@@ -148,7 +148,7 @@ def _center(flight, p, work, settings, k, i, R_BI, pixel_sigma):
 
 
 @kernel
-def _column(flight, p, work, settings, k, j, R_BI):
+def _column(flight, p, work, settings, k, j, A, S, R_BI):
     """Fill the rows of all features in column j, with a derivative or a pair of sigma points."""
     L, c, inverse_c, camera = flight.L, work.spread, work.inverse_spread, load3(p.camera)
     d, dr_B = load_column3(L, E, j), load_column3(L, R, j)
@@ -162,13 +162,14 @@ def _column(flight, p, work, settings, k, j, R_BI):
             if by_derivative:
                 u_B = load3(work.z_hat[k : k + 3])
                 v = per_distance * (cross(X_B, d) - dr_B)
-                a, s = v + -dot(u_B, v) * u_B, 0.0 * v
+                put_three(A, k, valid, v + -dot(u_B, v) * u_B)
+                put_three(S, k, valid, 0.0 * v)
             else:
                 # (I + even +- odd) (X_B -+ dr_B) - l_c
                 v_odd, v_even = turn_pair(even, odd, X_B, dr_B)
                 a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
-                a, s = inverse_c * a, inverse_c * s
-            put_column(work, settings, k, j, valid, a, s)
+                put_three(A, k, valid, inverse_c * a)
+                put_three(S, k, valid, inverse_c * s)
             k += 3
 
 
@@ -181,8 +182,9 @@ def _expect(flight, p, work, settings, k):
         if any_of(flight.block_valid[FEATURE_BLOCKS + i] > 0.0):
             _center(flight, p, work, settings, end, i, R_BI, pixel_sigma)
             end += 3
+    last = columns_of(settings) - 1
     for j in range(9):
-        _column(flight, p, work, settings, k, j, R_BI)
+        _column(flight, p, work, settings, k, j, work.A[last - j], work.E[8 - j], R_BI)
 
 
 @kernel
