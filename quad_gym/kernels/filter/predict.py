@@ -240,7 +240,7 @@ def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
 
 
 @kernel
-def _predict(flight, p, work, form, slow):
+def predict(flight, p, work, form, slow):
     """Predict over one tick with its IMU sample.
 
     In the report's form, the sample is taken at the tick's start:
@@ -313,10 +313,10 @@ def _predict(flight, p, work, form, slow):
 @stage
 def predict_stage(flight, world, model, settings, work, stages, flag):
     """Predict over a tick."""
-    _predict(flight, model, work, settings.form, None)
+    predict(flight, model, work, settings.form, None)
 
 
 @stage
 def predict_with_slow_stage(flight, world, model, settings, work, stages, flag):
     """Predict over a tick with slow errors of sensors in the state."""
-    _predict(flight, model, work, settings.form, settings)
+    predict(flight, model, work, settings.form, settings)

@@ -99,7 +99,7 @@ _VAGUE = 0.2
 
 
 @kernel
-def _update(flight, p, work, settings, stages, slow):
+def update(flight, p, work, settings, stages, slow):
     """Update the estimate with the valid measurements of the present instant, where `work.mask`.
 
     A lane whose result is not finite keeps its state bit for bit, sets UPDATE_FAILED and counts it.
@@ -320,10 +320,10 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
 @stage
 def update_stage(flight, world, model, settings, work, stages, flag):
     """Update the estimate with the valid measurements."""
-    _update(flight, model, work, settings, stages, None)
+    update(flight, model, work, settings, stages, None)
 
 
 @stage
 def update_with_slow_stage(flight, world, model, settings, work, stages, flag):
     """Update the estimate of a filter with slow errors of sensors among its states."""
-    _update(flight, model, work, settings, stages, settings)
+    update(flight, model, work, settings, stages, settings)
