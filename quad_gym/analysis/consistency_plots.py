@@ -18,8 +18,8 @@ from quad_gym.analysis.plots import (
     INK,
     PALE,
     VERMILLION,
+    house_style,
     panels,
-    require_matplotlib,
 )
 
 _TITLES = {
@@ -42,7 +42,6 @@ _TOLERANCE = f"tolerance (gray): 95 % band of a mean over at most {BAND_FLIGHTS:
 
 def _grid(count: int, title: str, label: str = "time [s]") -> tuple[Any, Any]:
     """Make a figure with `count` axes, three in a row; four are two by two."""
-    require_matplotlib()
     columns = 2 if count == 4 else 3
     rows = -(-count // columns)
     figure, grid = panels(rows, columns, (10.0, 0.6 + 2.1 * rows), title)
@@ -77,6 +76,7 @@ def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     axes.set_xlim(0.0, part.time[-1])
 
 
+@house_style()
 def mean_square_figure(
     quantity: str, parts: dict[str, MeanSquare], title: str, settle: float = 0.0
 ) -> Any:
@@ -88,6 +88,7 @@ def mean_square_figure(
     return figure
 
 
+@house_style()
 def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
     """Figure of root mean square errors and standard deviations of the filter, (t, 15) each."""
     text = (
@@ -110,6 +111,7 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
     return figure
 
 
+@house_style()
 def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
     """Figure of the autocorrelation of each sensor's innovations, with the band of white noise."""
     text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white noise (gray)"

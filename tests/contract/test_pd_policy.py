@@ -94,7 +94,7 @@ def test_it_flies_with_every_action(action):
     assert episodes.late_error.mean() < 0.1
 
 
-@pytest.mark.parametrize("observation", ["estimate", "truth", "noisy"])
+@pytest.mark.parametrize("observation", ["truth", "noisy"])
 @pytest.mark.parametrize("layout", ["relative", "absolute"])
 def test_it_flies_on_every_observation_of_a_state(observation, layout):
     env = gymnasium.make_vec(
