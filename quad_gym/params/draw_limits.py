@@ -49,7 +49,8 @@ def _check_values(
     drawable: Drawable, values: NDArray[np.float64], parts: Mapping[str, Any]
 ) -> None:
     """Refuse values that the parameter itself refuses."""
-    part, vehicle, world = parts.get(drawable.of), parts["vehicle"], parts["world"]
+    part: Any = parts.get(drawable.of)
+    vehicle, world = parts["vehicle"], parts["world"]
     value: Any = float(values[0]) if values.size == 1 else tuple(values.tolist())
     east, north, up = world.wind_I
     winds = {
