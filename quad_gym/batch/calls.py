@@ -12,19 +12,21 @@ from numpy.typing import NDArray
 from quad_gym.kernels.batch import fly
 from quad_gym.records import Call, Room
 
+Word = int | NDArray[Any] | Sequence[NDArray[Any]]
+"""A number, an array of which the kernel gets the address, or an array for each thread."""
+
 
 class Calls:
     """The calls of all threads of a batch; they keep its memory alive, not the batch.
 
-    A word is a number, the address of an array, or an address for each thread. `kept` are arrays
-    whose addresses others hold.
+    `kept` are arrays whose addresses others hold.
     """
 
     def __init__(
         self,
         blocks: NDArray[Any],
         room: Room,
-        words: Mapping[Call, int | NDArray[Any] | Sequence[NDArray[Any]]],
+        words: Mapping[Call, Word],
         kept: Sequence[NDArray[Any]],
     ) -> None:
         self._memory = (blocks, dict(words), kept)

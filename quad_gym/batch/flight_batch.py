@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.calls import Calls, address_of
+from quad_gym.batch.calls import Calls, Word, address_of
 from quad_gym.batch.cold_start import check_cold_start
 from quad_gym.batch.following import check_reference, followed
 from quad_gym.batch.innovations import innovations_of
@@ -219,7 +219,7 @@ class FlightBatch(FlightMemory):
     def _calls_of_threads(self) -> Calls:
         """Return the arguments with which the threads call the compiled code."""
         self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
-        words = {
+        words: dict[Call, Word] = {
             Call.COUNT: self.count,
             Call.GROUP: self._group,
             Call.WORD_COUNT: len(self._words),

@@ -35,6 +35,7 @@ class Term:
     """Term of a reward; called with a view, it returns its values (n,)."""
 
     def __call__(self, view: "View") -> Floats:
+        """Return the value of the term in this step, (n,)."""
         raise NotImplementedError
 
     def __add__(self, other: Any) -> "Term":
@@ -70,6 +71,7 @@ class Sum(Term):
     """Pairs of a weight and a term"""
 
     def __call__(self, view: "View") -> Floats:
+        """Return the weighted sum, (n,)."""
         (weight, piece), *rest = self.terms
         total = weight * piece(view)
         for weight, piece in rest:
@@ -85,6 +87,7 @@ class Constant(Term):
     """Value in every step"""
 
     def __call__(self, view: "View") -> Floats:
+        """Return the constant, (n,)."""
         return np.full(view.count, self.value)
 
 
@@ -96,6 +99,7 @@ class FunctionTerm(Term):
     """Function that takes a `View` and returns (n,)"""
 
     def __call__(self, view: "View") -> Floats:
+        """Return the values of the function, (n,)."""
         return self.function(view)
 
 
@@ -118,6 +122,7 @@ class Tracking(Term):
     """Rate of decay with distance [1/m]"""
 
     def __call__(self, view: "View") -> Floats:
+        """Return values in [0, 1], (n,)."""
         return np.exp(-self.rate * view.position_error)
 
 
@@ -126,6 +131,7 @@ class Heading(Term):
     """Alignment of body x with the desired heading, x_B . x*: 1 if aligned, -1 if opposite."""
 
     def __call__(self, view: "View") -> Floats:
+        """Return values in [-1, 1], (n,)."""
         return _dot(view.truth.forward, view.reference_heading)
 
 
@@ -134,6 +140,7 @@ class ActionRate(Term):
     """Squared change of the action, `|a - a_last|^2`."""
 
     def __call__(self, view: "View") -> Floats:
+        """Return non-negative values, (n,)."""
         change = view.action - view.last_action
         return _dot(change, change)
 
@@ -143,6 +150,7 @@ class BodyRates(Term):
     """Squared norm of the true body rates, `|w|^2` [rad^2/s^2]."""
 
     def __call__(self, view: "View") -> Floats:
+        """Return non-negative values [rad^2/s^2], (n,)."""
         return _dot(view.body_rates, view.body_rates)
 
 
@@ -151,6 +159,7 @@ class Progress(Term):
     """True speed toward the reference; on a course, toward the gate that was next [m/s]."""
 
     def __call__(self, view: "View") -> Floats:
+        """Return speeds [m/s], (n,)."""
         return view.truth.progress * 1.0
 
 
@@ -162,6 +171,7 @@ class GatePassed(Term):
     """
 
     def __call__(self, view: "View") -> Floats:
+        """Return values [1/s], (n,)."""
         return view.gate_passed / view.period
 
 
@@ -170,6 +180,7 @@ class Crash(Term):
     """1 in a step in which the built-in task ends the episode with a crash, else 0."""
 
     def __call__(self, view: "View") -> Floats:
+        """Return 0 or 1, (n,)."""
         return _CRASHED[view.builtin.ending]
 
 
@@ -189,6 +200,7 @@ class Uncertainty(Term):
         check.choice("measure", self.measure, ("trace", "log_det"))
 
     def __call__(self, view: "View") -> Floats:
+        """Return the measure, (n,).
 
         Its unit is the squared unit of the block for "trace"; for "log_det" it is the logarithm of
         a number in the sixth power of that unit.
@@ -204,6 +216,7 @@ class Visibility(Term):
     """Number of features in the camera's field of view that no obstacle hides."""
 
     def __call__(self, view: "View") -> Floats:
+        """Return counts, (n,)."""
         return view.truth.features_in_view.sum(axis=1).astype(np.float64)
 
 
