@@ -224,15 +224,10 @@ class FlightMemory:
         for name in aids:
             check.choice("switch_sensors", name, tuple(a.name.lower() for a in self.sensors.aids))
         for name, measures in {"gnss": gnss, "camera": camera, **aids}.items():
-            self._switch(self._blocks["wait"][:, Sensor[name.upper()]], name, measures)
-
-    @staticmethod
-    def _switch(waits: NDArray[Any], sensor: str, measures: bool | None) -> None:
-        """Make a sensor due again, or never; None: leave it as it is."""
-        if measures is not None and check.flag(sensor, measures):
-            waits[np.isinf(waits)] = 0.0
-        elif measures is not None:
-            waits[:] = np.inf
+            if measures is not None:
+                waits = self._blocks["wait"][:, Sensor[name.upper()]]
+                on = check.flag(name, measures)
+                waits[:] = np.where(np.isinf(waits), 0.0, waits) if on else np.inf
 
     def switch_faults(self, active: bool) -> None:
         """Activate or deactivate the faults of all flights at the next tick, at any time.

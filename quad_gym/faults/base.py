@@ -1,6 +1,7 @@
 """The base of all faults: start, duration and rate, sizes and directions."""
 
 import math
+import re
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar
@@ -70,6 +71,13 @@ class Fault(Checked):
     kind: ClassVar[FaultKind]
     needs: ClassVar[str] = ""
     """field of the sensor suite that the fault concerns"""
+
+    def __init_subclass__(cls) -> None:
+        """Set the kind: the one with the name of the class."""
+        super().__init_subclass__()
+        name = re.sub("(?<=[a-z])(?=[A-Z])", "_", cls.__name__).upper()
+        if name in FaultKind.__members__:
+            cls.kind = FaultKind[name]
 
     def __post_init__(self) -> None:
         if type(self) is Fault:

@@ -6,7 +6,6 @@ from typing import Any, Literal
 from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import FaultKind
 
 __all__ = ["CameraOcclusion", "WrongAssociations"]
 
@@ -19,7 +18,6 @@ class CameraOcclusion(Fault):
     """probability that a feature is hidden, drawn for each feature at each onset; 1: all
     features"""
 
-    kind = FaultKind.CAMERA_OCCLUSION
     needs = "camera"
 
 
@@ -37,7 +35,6 @@ class WrongAssociations(Fault):
     """form of the error: "swap": two features, drawn among the visible ones, are swapped; "copy":
     one of them is reported in the direction of the other, which is reported in its own"""
 
-    kind = FaultKind.WRONG_ASSOCIATIONS
     needs = "camera"
 
     def check_suite(self, sensors: SensorSuite) -> None:

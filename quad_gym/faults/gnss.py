@@ -5,7 +5,6 @@ from typing import Any
 
 from quad_gym.faults.base import DirectedFault, Fault, Size
 from quad_gym.params import checks as check
-from quad_gym.records import FaultKind
 
 __all__ = ["BaselineLoss", "GnssJump", "GnssOutage", "GnssOutliers", "GnssRamp"]
 
@@ -18,7 +17,6 @@ class GnssOutage(Fault):
     Cannon, GPS Solutions 11(3), 2007. The fix that starts the filter is always available and valid.
     """
 
-    kind = FaultKind.GNSS_OUTAGE
     needs = "gnss"
 
 
@@ -38,7 +36,6 @@ class GnssOutliers(Fault):
     size: Size = (10.0, 100.0)
     """size of an outlier [standard deviations of a fix]"""
 
-    kind = FaultKind.GNSS_OUTLIERS
     needs = "gnss"
 
 
@@ -54,7 +51,6 @@ class GnssRamp(DirectedFault):
     speed: Size = (0.1, 0.5)
     """rate of the ramp [m/s]"""
 
-    kind = FaultKind.GNSS_RAMP
     needs = "gnss"
 
     @property
@@ -73,7 +69,6 @@ class GnssJump(DirectedFault):
     size: Size = (0.19, 0.95)
     """length of the offset [m]; default: one to five wavelengths"""
 
-    kind = FaultKind.GNSS_JUMP
     needs = "gnss"
 
 
@@ -81,5 +76,4 @@ class GnssJump(DirectedFault):
 class BaselineLoss(Fault):
     """Loss of the baseline while positions continue, as with a shaded secondary antenna."""
 
-    kind = FaultKind.BASELINE_LOSS
     needs = "gnss"

@@ -6,7 +6,6 @@ from typing import Any
 
 from quad_gym.faults.base import DirectedFault, Fault, Size
 from quad_gym.params import checks as check
-from quad_gym.records import FaultKind
 
 __all__ = ["AccelBiasStep", "GyroBiasStep", "ImuSaturation"]
 
@@ -22,8 +21,6 @@ class AccelBiasStep(DirectedFault):
     size: Size = (0.05, 0.2)
     """length of the step [m/s^2]"""
 
-    kind = FaultKind.ACCEL_BIAS_STEP
-
 
 @dataclass(frozen=True, kw_only=True)
 class GyroBiasStep(DirectedFault):
@@ -35,8 +32,6 @@ class GyroBiasStep(DirectedFault):
 
     size: Size = (math.radians(0.2), math.radians(1.0))
     """length of the step [rad/s]"""
-
-    kind = FaultKind.GYRO_BIAS_STEP
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +46,6 @@ class ImuSaturation(Fault):
     """largest specific force along each axis, in either direction [m/s^2]"""
     gyro_range: check.Positive = math.radians(250.0)
     """largest angular rate about each axis, in either direction [rad/s]"""
-
-    kind = FaultKind.IMU_SATURATION
 
     @property
     def numbers(self) -> dict[str, Any]:

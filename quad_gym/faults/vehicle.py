@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 from quad_gym.faults.base import DirectedFault, Fault, Size, ends
 from quad_gym.params import checks as check
-from quad_gym.records import FaultKind
 
 __all__ = ["PositionJump", "RotorLoss"]
 
@@ -24,8 +23,6 @@ class PositionJump(DirectedFault):
     size: Size = (1.0, 2.0)
     """length of the displacement [m]"""
 
-    kind = FaultKind.POSITION_JUMP
-
 
 @dataclass(frozen=True, kw_only=True)
 class RotorLoss(Fault):
@@ -40,8 +37,6 @@ class RotorLoss(Fault):
     blades"""
     rotor: Annotated[int, partial(check.whole, least=0)] | None = None
     """index of the rotor, 0 to 3; None: drawn at each onset"""
-
-    kind = FaultKind.ROTOR_LOSS
 
     def __post_init__(self) -> None:
         super().__post_init__()

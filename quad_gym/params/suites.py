@@ -232,14 +232,19 @@ INDOOR = SensorSuite(
 )
 """A hall without GNSS, with markers on all walls in the view of the camera."""
 
-ONE_WALL = INDOOR.replace(
-    imu=CONSUMER.imu,
-    camera=None
-    if INDOOR.camera is None
-    else INDOOR.camera.replace(
-        focal_length=3325.0,  # 3840 pixels over 60 degrees: 1920 / tan(30 degrees)
-        features_I=tuple((-8.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (0.8, 2.8)),
-    ),
+
+def _changed(suite: SensorSuite, **parts: dict[str, Any]) -> SensorSuite:
+    """Return a suite with changed fields of its parts."""
+    return suite.replace(**{n: getattr(suite, n).replace(**fields) for n, fields in parts.items()})
+
+
+ONE_WALL = _changed(
+    INDOOR.replace(imu=CONSUMER.imu),
+    camera={
+        "focal_length": 3325.0,  # 3840 pixels over 60 degrees: 1920 / tan(30 degrees)
+        "features_I": tuple((-8.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (0.8, 2.8)),
+    },
+).replace(
     # as above, but of LookAround with PD control that faces the wall, 127 flights
     noisy=NoisyObservationParams(
         position=0.0079, velocity=0.0139, attitude=0.00089, body_rates=0.0107
@@ -248,12 +253,13 @@ ONE_WALL = INDOOR.replace(
 """The suite of `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west
 wall."""
 
-STALE = RTK.replace(
+STALE = _changed(
+    RTK,
     # smaller than in `rtk`, whose filter compensates them: with 0.1 s and 0.04 s a controller that
     # passes 97 % of the gates on the true state passes 20 %, with these 64 %
-    gnss=None if RTK.gnss is None else RTK.gnss.replace(latency=0.04),
-    camera=None if RTK.camera is None else RTK.camera.replace(latency=0.01),
-    estimator=RTK.estimator.replace(delay_compensation="none"),
+    gnss={"latency": 0.04},
+    camera={"latency": 0.01},
+    estimator={"delay_compensation": "none"},
 )
 """The suite of `StaleRace`: `rtk` with a filter that does not compensate delays."""
 
@@ -284,25 +290,25 @@ CRAZYFLIE = SensorSuite(
 """A small vehicle indoors that navigates by optical flow and a range finder: nothing observes its
 heading and horizontal position, whose errors grow."""
 
-FLOWN = CONSUMER.replace(
+FLOWN = _changed(
+    CONSUMER,
     # noise that explains real flights of a small quadrotor: "quad122a" of P. Riseborough's
     # InertialNav (BSD-3-Clause), an ArduPilot vehicle with a disturbed compass, replayed with the
     # delays in its log. Roll and pitch differ by 1.2 degrees rms from the autopilot's estimate
-    imu=CONSUMER.imu.replace(accel_noise_density=0.1, gyro_noise_density=0.002),
-    gnss=None
-    if CONSUMER.gnss is None
-    else CONSUMER.gnss.replace(
-        rate=5.0,
-        latency=0.2,
-        position_sigma_I=(0.5, 0.5, 1.0),
-        drift_sigma_I=(1.5, 1.5, 2.2),
-        velocity_sigma=0.3,
-    ),
+    imu={"accel_noise_density": 0.1, "gyro_noise_density": 0.002},
+    gnss={
+        "rate": 5.0,
+        "latency": 0.2,
+        "position_sigma_I": (0.5, 0.5, 1.0),
+        "drift_sigma_I": (1.5, 1.5, 2.2),
+        "velocity_sigma": 0.3,
+    },
+    estimator={"initial_tilt_sigma": 0.05},
+).replace(
     barometer=BarometerParams(rate=10.0, noise_sigma=0.3, bias_sigma=3.0),
     magnetometer=MagnetometerParams(
         rate=10.0, noise_sigma=3.0 * MICROTESLA, hard_iron_sigma=2.4 * MICROTESLA
     ),
-    estimator=FIELD_FILTER.replace(initial_tilt_sigma=0.05),
     noisy=NoisyObservationParams(
         position=0.607, velocity=0.145, attitude=0.0111, body_rates=0.0303
     ),  # measured, see above
