@@ -1,53 +1,19 @@
-"""Distances from obstacles and lines of sight, in NumPy: for starts, views of tasks and records.
+"""Distances from obstacles and lines of sight: for starts, and for the views of tasks."""
 
-The kernels in `quad_gym.kernels.obstacles.shapes` compute the same for places of flights.
-"""
-
+import functools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels.obstacles.shapes import AT_THE_END
+from quad_gym.kernels import single
+from quad_gym.packing.world import pack_obstacles
 from quad_gym.params.obstacles import Obstacle
 from quad_gym.params.world import WorldParams
-from quad_gym.records import Shape
+from quad_gym.records import SETTINGS
 
 Floats = NDArray[np.float64]
-
-
-def _turned(obstacle: Obstacle, vectors: Floats) -> Floats:
-    """(..., 3) vectors of I in the axes of an obstacle."""
-    c, s = obstacle.axis
-    x, y, z = (vectors[..., i] for i in range(3))
-    return np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
-
-
-def _turned_back(obstacle: Obstacle, vectors: Floats) -> Floats:
-    """(..., 3) vectors in the axes of an obstacle in I."""
-    c, s = obstacle.axis
-    x, y, z = (vectors[..., i] for i in range(3))
-    return np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
-
-
-def _length(vectors: Floats) -> Floats:
-    """(...,) lengths, summed in a fixed order."""
-    x, y, z = (vectors[..., i] for i in range(3))
-    return np.sqrt(x * x + y * y + z * z)
-
-
-def _depths(obstacle: Obstacle, p: Floats) -> tuple[Floats, Floats]:
-    """Return distances beyond each face, (n, 2 or 3), and outward directions, (n, 2 or 3, 3)."""
-    signs, half = np.where(p < 0.0, -1.0, 1.0), np.array(obstacle.half_size)
-    if obstacle.shape == Shape.WALL:
-        return np.abs(p) - half, signs[:, :, np.newaxis] * np.eye(3)
-    rho = np.sqrt(p[:, 0] * p[:, 0] + p[:, 1] * p[:, 1])
-    aside = rho > 1e-12
-    outward = np.zeros((len(p), 2, 3))
-    outward[:, 0, :2] = np.where(aside[:, None], p[:, :2] / np.where(aside, rho, 1.0)[:, None], 0.0)
-    outward[~aside, 0, 0] = 1.0
-    outward[:, 1, 2] = signs[:, 2]
-    return np.stack([rho - half[0], np.abs(p[:, 2]) - half[2]], axis=1), outward
 
 
 def nearest_obstacle(
@@ -55,28 +21,13 @@ def nearest_obstacle(
 ) -> tuple[Floats, Floats]:
     """Return distances (n,) of points (n, 3) in I from the nearest obstacle's surface [m].
 
-    They are negative inside. The second array (n, 3) holds vectors to the nearest points, in I [m].
-    `centers` (n, obstacles, 3) are those of at least one obstacle, in I [m].
+    They are negative inside, and infinite without obstacles. The second array (n, 3) holds vectors
+    to the nearest points, in I [m]; `centers` (n, obstacles, 3) are those of the obstacles.
     """
-    best, found = np.full(len(points), np.inf), np.zeros((len(points), 3))
-    for k, obstacle in enumerate(obstacles):
-        p = _turned(obstacle, points - centers[:, k])
-        depths, outward = _depths(obstacle, p)
-        beyond = np.maximum(depths, 0.0)[:, :, np.newaxis] * outward
-        out = np.zeros_like(p)
-        for i in range(beyond.shape[1]):
-            out -= beyond[:, i]
-        deepest = depths.argmax(axis=1)
-        every = np.arange(len(points))
-        depth = depths[every, deepest]
-        inside = -depth[:, np.newaxis] * outward[every, deepest]
-        is_outside = depth > 0.0
-        distance = np.where(is_outside, _length(out), depth)
-        vector = _turned_back(obstacle, np.where(is_outside[:, np.newaxis], out, inside))
-        closer = distance < best
-        best = np.where(closer, distance, best)
-        found = np.where(closer[:, np.newaxis], vector, found)
-    return best, found
+    distances, vectors = np.full(len(points), np.inf), np.zeros((len(points), 3))
+    given = (np.ascontiguousarray(array, np.float64) for array in (points, centers))
+    single.nearest_obstacles(*given, _settings(tuple(obstacles)), distances, vectors)
+    return distances, vectors
 
 
 def hidden_points(
@@ -86,42 +37,19 @@ def hidden_points(
 
     All are in I [m], as are the centers (n, obstacles, 3) of the obstacles.
     """
-    along_I = points - eyes[:, np.newaxis]
-    end = 1.0 - AT_THE_END / np.maximum(_length(along_I), AT_THE_END)
-    hidden = np.zeros(along_I.shape[:2], bool)
-    for k, obstacle in enumerate(obstacles):
-        start = _turned(obstacle, eyes - centers[:, k])[:, np.newaxis]
-        along, half = _turned(obstacle, along_I), obstacle.half_size
-        enters, leaves = _slab(start[..., 2], along[..., 2], half[2])
-        if obstacle.shape == Shape.CYLINDER:
-            spans = [_disc(start, along, half[0])]
-        else:
-            spans = [_slab(start[..., i], along[..., i], half[i]) for i in range(2)]
-        for into, out in spans:
-            enters, leaves = np.maximum(enters, into), np.minimum(leaves, out)
-        hidden |= np.maximum(enters, 0.0) < np.minimum(leaves, end)
+    each = np.broadcast_to(points, (len(eyes), *points.shape[-2:]))
+    hidden = np.zeros(each.shape[:2], bool)
+    given = (np.ascontiguousarray(array, np.float64) for array in (eyes, each, centers))
+    single.hide_points(*given, _settings(tuple(obstacles)), hidden)
     return hidden
 
 
-def _slab(start: Floats, along: Floats, half: float) -> tuple[Floats, Floats]:
-    """Return the fractions of lines at which they enter and leave [-half, half]."""
-    across, within = np.abs(along) > 1e-12, np.abs(start) < half
-    per = np.where(across, along, 1.0)
-    a, b = (-half - start) / per, (half - start) / per
-    far = np.where(within, np.inf, -np.inf)
-    return np.where(across, np.minimum(a, b), -far), np.where(across, np.maximum(a, b), far)
-
-
-def _disc(start: Floats, along: Floats, radius: float) -> tuple[Floats, Floats]:
-    """Return the fractions of lines at which they enter and leave a vertical infinite cylinder."""
-    x, y, u, v = start[..., 0], start[..., 1], along[..., 0], along[..., 1]
-    a, b, c = u * u + v * v, x * u + y * v, x * x + y * y - radius * radius
-    across, root = a > 1e-24, b * b - a * c
-    meets, per = root > 0.0, np.where(across, a, 1.0)
-    reach, middle = np.sqrt(np.maximum(root, 0.0)) / per, -b / per
-    far = np.where(np.where(across, meets, c < 0.0), np.inf, -np.inf)
-    here = across & meets
-    return np.where(here, middle - reach, -far), np.where(here, middle + reach, far)
+@functools.lru_cache(maxsize=64)
+def _settings(obstacles: tuple[Obstacle, ...]) -> NDArray[Any]:
+    """Return settings with the shapes of obstacles, shape (1,)."""
+    settings = np.zeros(1, SETTINGS)
+    pack_obstacles(settings[0], obstacles)
+    return settings
 
 
 def require_room(name: str, points: Floats, world: WorldParams) -> None:

@@ -18,6 +18,7 @@ from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.linalg import diagonal, load3, load4, load33, outer, store
+from quad_gym.kernels.obstacles.shapes import crosses, distance_from
 from quad_gym.kernels.sensors import camera
 from quad_gym.kernels.sensors.gnss import measure_gnss
 from quad_gym.kernels.sensors.gnss_position import drift_gnss
@@ -65,6 +66,8 @@ SENSORS_AND_VEHICLE = tuple(
         "disturb_imu",
         "turn_gnss_baseline",
         "limit_features",
+        "nearest_obstacles",
+        "hide_points",
     )
 )
 """Names of the other entries of this module, the slowest to compile first."""
@@ -76,7 +79,7 @@ def _array(kind, dimensions=1):
 
 _FLIGHT, _PARAMS, _SETTINGS = map(_array, (FLIGHT, PARAMS, SETTINGS))
 _BLOCK, _BLOCK_PARAMS, _BLOCK_WORK = map(_array, (FLIGHT_BLOCK, PARAMS_BLOCK, WORK_BLOCK))
-_VECTOR, _MATRIX = _array(np.float64), _array(np.float64, 2)
+_VECTOR, _MATRIX, _CUBE = (_array(np.float64, n) for n in (1, 2, 3))
 _flight_at = lanes_at(FLIGHT_BLOCK)
 
 
@@ -206,6 +209,27 @@ def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, se
     a, dw = accelerations_in_air(r, R, v, w, W, d, wind, p, settings[0])
     store(a_I, a)
     store(dw_B, dw)
+
+
+@_entry(_MATRIX, _CUBE, _SETTINGS, _VECTOR, _MATRIX)
+def nearest_obstacles(points, centers, settings, distances, vectors):
+    """Write distances (n,) of points (n, 3) from obstacles at (n, k, 3), and vectors to them."""
+    for i in range(len(points)):
+        for k in range(centers.shape[1]):
+            distance, vector = distance_from(load3(points[i]), load3(centers[i, k]), settings[0], k)
+            if distance < distances[i]:
+                distances[i] = distance
+                store(vectors[i], vector)
+
+
+@_entry(_MATRIX, _CUBE, _CUBE, _SETTINGS, _array(np.bool_, 2))
+def hide_points(eyes, points, centers, settings, hidden):
+    """Write which points (n, m, 3) are behind an obstacle, as seen from eyes (n, 3)."""
+    for i in range(len(eyes)):
+        for j in range(points.shape[1]):
+            for k in range(centers.shape[1]):
+                line = (load3(eyes[i]), load3(points[i, j]), load3(centers[i, k]))
+                hidden[i, j] |= crosses(*line, settings[0], k)
 
 
 @_entry(_VECTOR, _MATRIX, _MATRIX, _MATRIX, returns=types.float64)

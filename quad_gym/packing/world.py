@@ -1,11 +1,13 @@
 """World and randomization as numbers in the records that kernels read."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.params.obstacles import Obstacle
 from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
@@ -39,7 +41,7 @@ def pack_options(
     s["observe_world"] = s["privileged"] and (world != WorldParams() or bool(draws.names))
     pack_start(s, draws)
     s["randomized"], s["known"] = bool(draws.names), known
-    pack_obstacles(s, world)
+    _pack_limits(s, world)
     for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))
 
@@ -68,15 +70,20 @@ def pack_places(
             s["feature_places"][k, : len(suite.camera.features_I)] = suite.camera.features_I
 
 
-def pack_obstacles(s: Any, world: WorldParams) -> None:
-    """Write the obstacles, geofence and ground of a world into a settings record."""
-    s["obstacle_count"] = len(world.obstacles)
-    s["vehicle_radius"] = world.vehicle_radius
-    for k, obstacle in enumerate(world.obstacles):
+def pack_obstacles(s: Any, obstacles: Sequence[Obstacle]) -> None:
+    """Write obstacles into a settings record."""
+    s["obstacle_count"] = len(obstacles)
+    for k, obstacle in enumerate(obstacles):
         s["obstacle_shape"][k] = obstacle.shape
         s["obstacle_center"][k], s["obstacle_shift"][k] = obstacle.center_I, obstacle.shift_I
         s["obstacle_half"][k], s["obstacle_axis"][k] = obstacle.half_size, obstacle.axis
         s["obstacle_follows"][k] = -1 if obstacle.follows is None else obstacle.follows
+
+
+def _pack_limits(s: Any, world: WorldParams) -> None:
+    """Write obstacles, geofence and ground into a settings record."""
+    pack_obstacles(s, world.obstacles)
+    s["vehicle_radius"] = world.vehicle_radius
     if world.geofence is not None:
         s["fenced"], s["fence"] = True, world.geofence
     if world.ground is not None:
