@@ -118,7 +118,7 @@ def measure_consistency(
     """
     if not (duration > 0.0 and every > 0.0):
         raise ValueError(f"duration and every must be above 0, got {duration} and {every}")
-    if batch.clocks.ticks_between("control") != 1:
+    if batch.clocks.ticks_per_step != 1:
         raise ValueError("batch must be controlled at its IMU rate, so that no sample is missed")
     dt = batch.sensors.imu.dt
     steps, stride = round(duration / dt), max(1, round(every / dt))

@@ -1,5 +1,6 @@
 """`FlightBatch`: many flights of one configuration, flown together."""
 
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -9,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.calls import Calls, Word, address_of
 from quad_gym.batch.cold_start import check_cold_start
-from quad_gym.batch.following import check_reference, followed
+from quad_gym.batch.following import check_reference
 from quad_gym.batch.innovations import innovations_of
 from quad_gym.batch.memory import FlightMemory, configuration_digest
+from quad_gym.batch.quantities import read
 from quad_gym.batch.standing import check_standing
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
@@ -259,7 +261,32 @@ class FlightBatch(FlightMemory):
             The trajectory, and the time on it at which the episode began [s]; None if the task has
             another reference.
         """
-        return followed(self, flight)
+        if not self.task.trajectories:
+            return None
+        which = np.array([flight])
+        chosen = self.task.trajectories[int(self.record("path", which)[0])]
+        cosine, sine = self.record("path_turn", which)[0]
+        if cosine == 0.0 == sine:  # never reset
+            cosine = 1.0
+        share = float(self.record("path_share", which)[0])
+        return chosen.turned(math.atan2(sine, cosine)), share * chosen.duration * chosen.closed
+
+    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """Return a quantity of the flights, as a new array (n, ...).
+
+        Args:
+            name: One of `quad_gym.batch.quantities.QUANTITIES`, such as "position",
+                "estimated_velocity" or "reference_position"; or a parameter that `randomization`
+                draws, such as "mass".
+            flights: Indices of the flights; None: all of them.
+
+        Raises:
+            ValueError: If there is no such quantity, or no filter runs that would estimate it.
+        """
+        if name in self.randomization.names:
+            values = self.drawn()[name]
+            return values if flights is None else values[flights]
+        return read(self, name, flights)
 
     def limit(self, max_steps: int) -> None:
         """Truncate episodes after this many steps; 0: no limit."""

@@ -1,18 +1,12 @@
-"""References: feasibility, and the user-defined trajectory of each flight."""
+"""Feasibility of references."""
 
 import math
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from quad_gym.params.control import ActionParams
 from quad_gym.params.task import TaskParams
-from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import Control
-
-if TYPE_CHECKING:
-    from quad_gym.batch.flight_batch import FlightBatch
 
 MOST_THRUST = 2.0
 """Largest thrust-to-weight ratio that an action commands; motor voltages have no such limit."""
@@ -59,17 +53,3 @@ def _check_period(task: TaskParams, vehicle: VehicleParams, limit: float) -> Non
             f"{task.period:g} s need an acceleration of {acceleration:.4g} m/s^2 and a thrust of "
             f"{thrust:.4g} N, above the limit of {limit:.4g} N"
         )
-
-
-def followed(batch: "FlightBatch", flight: int) -> tuple[Trajectory, float] | None:
-    """See `FlightBatch.trajectory`."""
-    trajectories = batch.task.trajectories
-    if not trajectories:
-        return None
-    which = np.array([flight])
-    chosen = trajectories[int(batch.record("path", which)[0])]
-    cosine, sine = batch.record("path_turn", which)[0]
-    if cosine == 0.0 == sine:  # never reset
-        cosine = 1.0
-    share = float(batch.record("path_share", which)[0])
-    return chosen.turned(math.atan2(sine, cosine)), share * chosen.duration * chosen.closed

@@ -1,17 +1,15 @@
 """The last innovations of flights, block by block."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.memory import FlightMemory
 from quad_gym.packing.aids import blocks_of
 
-if TYPE_CHECKING:
-    from quad_gym.batch.flight_batch import FlightBatch
 
-
-def innovations_of(batch: "FlightBatch") -> dict[str, NDArray[Any]]:
+def innovations_of(batch: FlightMemory) -> dict[str, NDArray[Any]]:
     """Return the last innovations of all flights, block by block.
 
     The blocks are position, baseline, velocity and features, followed by barometer and magnetometer

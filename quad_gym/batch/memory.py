@@ -7,12 +7,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.batch import quantities
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import named_faults
 from quad_gym.params import checks as check
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.task import TaskParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import (
     COLUMNS,
     FLIGHT_BLOCK,
@@ -51,6 +52,9 @@ class FlightMemory:
     """The records of `count` flights, in blocks of WIDTH."""
 
     count: int
+    run_filter: bool
+    task: TaskParams
+    world: WorldParams
     sensors: SensorSuite
     faults: tuple[Fault, ...]
     randomization: Randomization
@@ -72,23 +76,6 @@ class FlightMemory:
             self._blocks["drawn"] = undrawn[:, np.newaxis]
 
     # ---- reading ------------------------------------------------------------------------------
-
-    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """Return a quantity of the flights, as a new array (n, ...).
-
-        Args:
-            name: One of `quad_gym.batch.quantities.QUANTITIES`, such as "position",
-                "estimated_velocity" or "reference_position"; or a parameter that `randomization`
-                draws, such as "mass".
-            flights: Indices of the flights; None: all of them.
-
-        Raises:
-            ValueError: If there is no such quantity, or no filter runs that would estimate it.
-        """
-        if name in self.randomization.names:
-            values = self.drawn()[name]
-            return values if flights is None else values[flights]
-        return quantities.read(self, name, flights)  # type: ignore[arg-type]
 
     @property
     def R_IG(self) -> NDArray[np.float64]:

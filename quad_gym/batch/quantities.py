@@ -6,11 +6,12 @@ only table of both.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.memory import FlightMemory
 from quad_gym.params import checks as check
 from quad_gym.records import (
     AID_BLOCKS,
@@ -25,12 +26,9 @@ from quad_gym.records import (
 )
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
-if TYPE_CHECKING:
-    from quad_gym.batch.flight_batch import FlightBatch
-
 Floats = NDArray[np.float64]
 Flights = NDArray[np.intp] | None
-Computed = Callable[["FlightBatch", Flights], NDArray[Any]]
+Computed = Callable[[FlightMemory, Flights], NDArray[Any]]
 
 
 class Quantity(NamedTuple):
@@ -49,7 +47,7 @@ class Quantity(NamedTuple):
     """True if only flights have it in which a filter, and so sensors, run"""
 
 
-def read(batch: "FlightBatch", name: str, flights: Flights) -> NDArray[Any]:
+def read(batch: FlightMemory, name: str, flights: Flights) -> NDArray[Any]:
     """A quantity of flights as a new array (n, ...); see `FlightBatch.read`."""
     quantity = QUANTITIES.get(name) if isinstance(name, str) else None
     if quantity is None:
@@ -84,34 +82,34 @@ def _quaternions(field: str) -> Computed:
     return lambda batch, flights: _of_rows(dcm_to_quaternion, batch.record(field, flights), (4,))
 
 
-def _true_R_BI(batch: "FlightBatch", flights: Flights) -> Floats:
+def _true_R_BI(batch: FlightMemory, flights: Flights) -> Floats:
     return _of_rows(quaternion_to_dcm, batch.record("q", flights), (3, 3))
 
 
-def _time(batch: "FlightBatch", flights: Flights) -> Floats:
+def _time(batch: FlightMemory, flights: Flights) -> Floats:
     return np.asarray(batch.record("tick", flights) * batch.sensors.imu.dt)
 
 
-def _estimated_rates(batch: "FlightBatch", flights: Flights) -> Floats:
+def _estimated_rates(batch: FlightMemory, flights: Flights) -> Floats:
     return np.asarray(batch.record("w_meas", flights) - batch.record("b_g_hat", flights))
 
 
-def _gates(batch: "FlightBatch", flights: Flights) -> Floats:
+def _gates(batch: FlightMemory, flights: Flights) -> Floats:
     count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
     return np.ascontiguousarray(batch.record("gates", flights)[:, :count])
 
 
-def _obstacles(batch: "FlightBatch", flights: Flights) -> Floats:
+def _obstacles(batch: FlightMemory, flights: Flights) -> Floats:
     count = len(batch.world.obstacles)
     return np.ascontiguousarray(batch.record("obstacle_center", flights)[:, :count])
 
 
-def _obstacle_distance(batch: "FlightBatch", flights: Flights) -> Floats:
+def _obstacle_distance(batch: FlightMemory, flights: Flights) -> Floats:
     found = batch.record("obstacle_distance", flights)
     return found if batch.world.obstacles else np.full_like(found, np.inf)
 
 
-def _features(batch: "FlightBatch", flights: Flights) -> Floats:
+def _features(batch: FlightMemory, flights: Flights) -> Floats:
     places = batch.feature_places()
     return np.array(places if flights is None else places[flights])
 
@@ -119,7 +117,7 @@ def _features(batch: "FlightBatch", flights: Flights) -> Floats:
 def _reference(which: int) -> Computed:
     """Position, velocity, acceleration or heading of the reference at the present instant."""
 
-    def of(batch: "FlightBatch", flights: Flights) -> Floats:
+    def of(batch: FlightMemory, flights: Flights) -> Floats:
         if batch.task.kind == "trajectory":
             return batch.record(f"path_{'rvax'[which]}", flights)
         return _series(batch, flights)[which]
@@ -127,7 +125,7 @@ def _reference(which: int) -> Computed:
     return of
 
 
-def _series(batch: "FlightBatch", flights: Flights) -> tuple[Floats, Floats, Floats, Floats]:
+def _series(batch: FlightMemory, flights: Flights) -> tuple[Floats, Floats, Floats, Floats]:
     """(r*, v*, a*, x*) of a reference that is a finite Fourier series, (n, 3) each."""
     cosines, sines = batch.record("ref_cos", flights), batch.record("ref_sin", flights)
     rate = batch.record("ref_omega", flights)[:, np.newaxis] * np.arange(1, 1 + cosines.shape[1])
@@ -146,7 +144,7 @@ def _series(batch: "FlightBatch", flights: Flights) -> tuple[Floats, Floats, Flo
     return r_ref, v_ref, a_ref, x_ref
 
 
-def _measured(batch: "FlightBatch", flights: Flights) -> NDArray[np.bool_]:
+def _measured(batch: FlightMemory, flights: Flights) -> NDArray[np.bool_]:
     """A mask of blocks measured since the last step, or at the start of the episode."""
     fresh = batch.record("block_fresh", flights) + batch.record("block_valid", flights)
     return np.asarray(fresh > 0.0)
@@ -155,7 +153,7 @@ def _measured(batch: "FlightBatch", flights: Flights) -> NDArray[np.bool_]:
 def _gnss(field: str, block: int) -> Computed:
     """A vector that GNSS measures, turned from G to I."""
 
-    def of(batch: "FlightBatch", flights: Flights) -> Floats:
+    def of(batch: FlightMemory, flights: Flights) -> Floats:
         x, y, z = batch.record(field, flights).T  # each sum in one order, in batches of any size
         turned = [row[0] * x + row[1] * y + row[2] * z for row in batch.R_IG]
         return np.where(_measured(batch, flights)[:, block], turned, np.nan).T
@@ -163,7 +161,7 @@ def _gnss(field: str, block: int) -> Computed:
     return of
 
 
-def _pixels(batch: "FlightBatch", flights: Flights) -> Floats:
+def _pixels(batch: FlightMemory, flights: Flights) -> Floats:
     count = 0 if batch.sensors.camera is None else len(batch.sensors.camera.features_I)
     measured = _measured(batch, flights)[:, FEATURE_SLICE][:, :count, np.newaxis]
     return np.where(measured, batch.record("pixels", flights)[:, :count], np.nan)
@@ -172,7 +170,7 @@ def _pixels(batch: "FlightBatch", flights: Flights) -> Floats:
 def _aid(aid: Aid) -> Computed:
     """The measurement of a sensor other than GNSS and camera."""
 
-    def of(batch: "FlightBatch", flights: Flights) -> Floats:
+    def of(batch: FlightMemory, flights: Flights) -> Floats:
         measured = _measured(batch, flights)[:, AID_BLOCKS + aid, np.newaxis]
         found = np.where(measured, batch.record("aid_measurement", flights)[:, aid], np.nan)
         numbers = AID_FREEDOMS[aid]

@@ -178,9 +178,9 @@ class FlightConfiguration:
 
     @cached_property
     def clocks(self) -> Clocks:
-        """Rates of simulation, sensors and control."""
+        """Rates of simulation and control."""
         rate = self.sensors.imu.rate if self.control_rate is None else self.control_rate
-        return Clocks.of(self.sensors, rate, self.substeps)
+        return Clocks(imu_rate=self.sensors.imu.rate, control_rate=rate, substeps=self.substeps)
 
     @cached_property
     def possible_faults(self) -> tuple[Fault, ...]:

@@ -39,7 +39,7 @@ def settings_record(c: FlightConfiguration) -> NDArray[Any]:
     """Return the settings of a batch as one scalar record, shape (1,)."""
     record = np.zeros(1, SETTINGS)
     s, task, assumed = record[0], c.task, c.sensors
-    s["substeps"], s["ticks_per_step"] = c.clocks.substeps, c.clocks.ticks_between("control")
+    s["substeps"], s["ticks_per_step"] = c.clocks.substeps, c.clocks.ticks_per_step
     s["source"], s["control"], s["layout"] = c.source, c.control, c.layout
     s["include_std"], s["privileged"] = c.include_std, c.privileged
     s["autoreset"] = Autoreset.DISABLED if c.begins_after_step else c.autoreset

@@ -1,8 +1,8 @@
 """Limits of draws: within the bounds of the parameters, able to hover, and stable."""
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,28 @@ from quad_gym.params.vehicle import (
 from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import COLUMNS, Drawable
 
-if TYPE_CHECKING:
-    from quad_gym.params.randomization import DrawingTable
-
 FAST = 100.0
 """Speed that no vehicle reaches [m/s]."""
 
 
-def check_bounds(table: "DrawingTable", parts: Mapping[str, Any]) -> None:
+class Ranges:
+    """Parameters that are drawn, and the least and largest draw of every column of `drawn`."""
+
+    drawables: Sequence[Drawable]
+    names: tuple[str, ...]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    def least(self, name: str) -> float:
+        """Return the least draw of any component of a parameter."""
+        return float(self.low[COLUMNS[name]].min())
+
+    def most(self, name: str) -> float:
+        """Return the largest draw of any component of a parameter."""
+        return float(self.high[COLUMNS[name]].max())
+
+
+def check_bounds(table: Ranges, parts: Mapping[str, Any]) -> None:
     """Refuse draws whose smallest or largest values the parameters themselves refuse."""
     for drawable in table.drawables:
         for ends in (table.low[drawable.columns], table.high[drawable.columns]):
@@ -82,7 +96,7 @@ def _check_center(place: NDArray[np.float64], vehicle: VehicleParams) -> None:
         )
 
 
-def _check_antennas(table: "DrawingTable") -> None:
+def _check_antennas(table: Ranges) -> None:
     """Refuse antennas whose draws may coincide."""
     one, other = COLUMNS["primary_antenna_B"], COLUMNS["secondary_antenna_B"]
     gap = np.maximum(table.low[one] - table.high[other], table.low[other] - table.high[one])
@@ -91,7 +105,7 @@ def _check_antennas(table: "DrawingTable") -> None:
     )
 
 
-def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldParams) -> None:
+def check_hovering(table: Ranges, vehicle: VehicleParams, world: WorldParams) -> None:
     """Refuse draws whose worst case lacks the thrust or the power to hover."""
     least, most = table.least, table.most
     mass = most("mass")
@@ -124,9 +138,7 @@ def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldPa
         )
 
 
-def check_draws(
-    table: "DrawingTable", vehicle: VehicleParams, world: WorldParams, clocks: Clocks
-) -> None:
+def check_draws(table: Ranges, vehicle: VehicleParams, world: WorldParams, clocks: Clocks) -> None:
     """Refuse rotors that are too fast, or drag that is too large, for the integration."""
     _check_drag(table, vehicle, world, clocks)
     name = "motor_time_constant"
@@ -136,9 +148,7 @@ def check_draws(
         check_lag(name, vehicle.motor_time_constant, clocks)
 
 
-def _check_drag(
-    table: "DrawingTable", vehicle: VehicleParams, world: WorldParams, clocks: Clocks
-) -> None:
+def _check_drag(table: Ranges, vehicle: VehicleParams, world: WorldParams, clocks: Clocks) -> None:
     """Refuse drag that slows the vehicle down within a Runge-Kutta step, which would diverge."""
 
     def most(name: str) -> float:
@@ -150,7 +160,7 @@ def _check_drag(
     rotor_speeds = 4.0 * most("motor_speed_per_volt") * most("max_voltage")
     drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds
     mass = table.least("mass")
-    step = 1.0 / (clocks.imu_rate * clocks.substeps)
+    step = clocks.step
     if step * drag > RK4_LIMIT * mass:
         raise ValueError(
             f"drag must slow the vehicle down by less than {RK4_LIMIT * mass / step:.3g} N s/m, "
@@ -160,7 +170,7 @@ def _check_drag(
         )
 
 
-def _check_inertia(table: "DrawingTable") -> None:
+def _check_inertia(table: Ranges) -> None:
     """Refuse a range of moments of inertia all of which no body has.
 
     A range in which some draws break the rule that each moment is at most the sum of the other two

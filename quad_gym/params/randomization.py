@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.distributions import Distribution, Uniform
-from quad_gym.params.draw_limits import check_bounds, check_hovering
+from quad_gym.params.draw_limits import Ranges, check_bounds, check_hovering
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
@@ -107,7 +107,7 @@ class Randomization:
         return tuple(given)
 
 
-class DrawingTable:
+class DrawingTable(Ranges):
     """A randomization in numbers: the distribution of each column of a flight's field `drawn`.
 
     Vehicle, sensors, world and delay of actions [control steps] are those without draws. Ranges
@@ -138,14 +138,6 @@ class DrawingTable:
                 self._fill(drawable, column, part, nominal[column])
         check_bounds(self, parts_of(vehicle, sensors, world))
         check_hovering(self, vehicle, world)
-
-    def least(self, name: str) -> float:
-        """Return the least draw of any component of a parameter."""
-        return float(self.low[COLUMNS[name]].min())
-
-    def most(self, name: str) -> float:
-        """Return the largest draw of any component of a parameter."""
-        return float(self.high[COLUMNS[name]].max())
 
     def mean_square(self, name: str) -> NDArray[np.float64]:
         """Return the mean squares (size,) of a parameter's components over their distributions."""

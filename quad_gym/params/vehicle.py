@@ -179,7 +179,7 @@ def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike
 
 def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
     """Refuse rotors that are too fast for the integration, so that their speeds would diverge."""
-    step = 1.0 / (clocks.imu_rate * clocks.substeps)
+    step = clocks.step
     if step > RK4_LIMIT * time_constant:
         raise ValueError(
             f"{name} must be at least {step / RK4_LIMIT:.3g} s at {clocks.imu_rate:g} Hz with "

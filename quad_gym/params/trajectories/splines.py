@@ -79,14 +79,7 @@ def through(
     order = ORDERS[check.choice("minimize", minimize, tuple(ORDERS))]
     check.flag("closed", closed)
     check.flag("at_rest", at_rest)
-    places = check.array("points", points, (None, 3))
-    if len(places) < 2:
-        raise ValueError(f"points must be at least two, got {len(places)}")
-    if not (at_rest or closed) and len(places) < order:
-        raise ValueError(
-            f"at_rest must be True with fewer than {order} points, which leave the ends open, got "
-            f"{len(places)}"
-        )
+    places = _places(points, 2 if at_rest or closed else order)
     rule, point, angles = heading_choice(yaw, look_at)
     if callable(angles):
         raise ValueError("yaw must be angles at the points, not a function; see Trajectory.of")
@@ -117,6 +110,19 @@ def through(
     else:
         terms[-1, :, 3] = angles
     return cls(times=when, coefficients=terms, closed=closed, heading=rule, point=point)
+
+
+def _places(points: ArrayLike, fewest: int) -> Floats:
+    """Return the points (n, 3), at least two, and as many as open ends require."""
+    places = check.array("points", points, (None, 3))
+    if len(places) < 2:
+        raise ValueError(f"points must be at least two, got {len(places)}")
+    if len(places) < fewest:
+        raise ValueError(
+            f"at_rest must be True with fewer than {fewest} points, which leave the ends open, got "
+            f"{len(places)}"
+        )
+    return places
 
 
 def _bounds(given: dict[str, float | None]) -> list[float]:
