@@ -161,9 +161,6 @@ def _advance_faults(flight, world, settings, mask):
         _weaken_rotors(flight, world)
 
 
-# ---- effects on measurements ------------------------------------------------------------------
-
-
 @kernel
 def gnss_heard(flight, settings, due):
     """Lanes in which GNSS has a position, and lanes in which it has a baseline, among those due."""
@@ -246,9 +243,6 @@ def _mistake_features(flight, settings, mask):
         mistaken = select(here | there, 1.0, 0.0)
         flight.feature_mistaken[i] = select(mask, mistaken, flight.feature_mistaken[i])
         rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
-
-
-# ---- stages ----------------------------------------------------------------------------------
 
 
 @stage
