@@ -33,6 +33,7 @@ from quad_gym.analysis.reports import (
 )
 from quad_gym.commands.options import (
     EnvId,
+    EstimatorName,
     Keywords,
     OwnSuite,
     Threads,
@@ -42,6 +43,7 @@ from quad_gym.commands.options import (
     require_at_least,
     sensors_of,
     usage_errors,
+    with_estimator,
     with_full_id,
 )
 from quad_gym.envs.effects import with_effect
@@ -63,6 +65,7 @@ class EvaluateArgs:
     """observations on which the policies fly: truth, estimate, noisy, or measurements (for policies
     trained on raw measurements)"""
     sensors: OwnSuite = None
+    estimator: EstimatorName = None
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
@@ -131,7 +134,7 @@ def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) 
     given = leave(args.env, {name: f"--{name}" for name in names})
     keywords = {
         **keywords_of_policy(policy, args.env_id),
-        **given,
+        **with_estimator(given, args.estimator),
         "observation": observation,
         "sensors": sensors_of(args.env_id, args.sensors),
     }

@@ -29,12 +29,14 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import (
     EnvId,
+    EstimatorName,
     Keywords,
     OwnSuite,
     leave,
     require_at_least,
     sensors_of,
     usage_errors,
+    with_estimator,
     with_full_id,
 )
 from quad_gym.evaluation import Policy
@@ -66,9 +68,10 @@ class FlyArgs:
     duration: float | None = None
     """time limit [s]; if not given, the task's default"""
     env: Keywords = field(default_factory=dict)
-    """further keywords of the environment, such as control_rate=100 estimator=ekf"""
+    """further keywords of the environment, such as control_rate=100 world=breeze"""
 
     sensors: OwnSuite = None
+    estimator: EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
     gnss_rate: float | None = None
@@ -174,7 +177,7 @@ def make_env(args: FlyArgs) -> Any:
     args = with_full_id(args)
     options = ("observation", "action", "sensors", "camera", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
-    given = leave(args.env, {**named, "faults": "--faults"})
+    given = with_estimator(leave(args.env, {**named, "faults": "--faults"}), args.estimator)
     keywords = {**keywords_of_policy(args.policy, args.env_id), **given}
     if not args.camera:
         keywords["camera"] = False

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.starts import checked_mask
+from quad_gym.batch.state import State
 from quad_gym.params import checks as check
 from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
 from quad_gym.tasks import answers
@@ -16,7 +17,6 @@ from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.observing import Joiner, Part
 from quad_gym.tasks.starts import Start, starts
-from quad_gym.tasks.state import State
 from quad_gym.tasks.task import METHODS, Task, label
 from quad_gym.tasks.view import View
 
@@ -315,13 +315,7 @@ class TaskBatch(ReadableBatch):
 
     def snapshot(self) -> NDArray[Any]:
         """Copy all flights and the task's state, for `restore`."""
-        flights = super().snapshot()
-        if not len(self._state):
-            return flights
-        kept = np.zeros(len(flights), [("flights", flights.dtype), ("state", self._state.dtype())])
-        kept["flights"] = flights
-        self._state.write_to(kept["state"])
-        return kept
+        return self._state.kept_with(super().snapshot())
 
     def restore(self, snapshot: NDArray[Any]) -> None:
         """Restore all flights from a snapshot of this batch, or of another one of equal size.
@@ -329,15 +323,7 @@ class TaskBatch(ReadableBatch):
         Raises:
             ValueError: If the snapshot has another size, kind or task.
         """
-        flights = snapshot
-        if len(self._state):
-            kind = getattr(snapshot, "dtype", None)
-            if getattr(kind, "names", None) != ("flights", "state") or (
-                snapshot["state"].dtype != self._state.dtype()
-            ):
-                raise ValueError(f"snapshot must be one of a batch with {label(self.own_task)}")
-            flights = snapshot["flights"]
-        super().restore(flights)
+        super().restore(self._state.flights_of(snapshot, label(self.own_task)))
         if len(self._state):
             self._state.read_from(snapshot["state"])
         self._returns = self.record("episode_return")

@@ -122,7 +122,14 @@ def _with(*names: str) -> Callable[[Any], bool]:
 _always, _filter, _faults = _with(), _with("run_filter"), _with("faults")
 _corrupts, _air = _with("run_filter", "faults"), _with("air")
 _late, _slow = _with("run_filter", "late"), _with("run_filter", "slow_states")
+_own = _with("run_filter", "own_estimator")
 _grounded, _contacts, _drawn = _with("grounded"), _with("contacts"), _with("randomized")
+
+
+def _built_in(*names: str) -> Callable[[Any], bool]:
+    """Make a test of settings: the built-in filter runs, and all of these are set."""
+    runs = _with("run_filter", *names)
+    return lambda settings: runs(settings) and not settings["own_estimator"]
 
 
 def _pad(s: Any) -> bool:
@@ -163,20 +170,27 @@ def _sensor_source(sensor: Sensor) -> Kernel:
 
 
 SOURCES = (
-    Kernel(Stage.UPDATE, "filter.update:update_with_slow", _slow, ("filter", "slow")),
-    Kernel(Stage.UPDATE, "filter.update:update", _filter, ("filter",)),
-    Kernel(Stage.PREDICT, "filter.predict:predict_with_slow", _slow, ("filter", "slow")),
-    Kernel(Stage.PREDICT, "filter.predict:predict", _filter, ("filter",)),
+    Kernel(
+        Stage.UPDATE, "filter.update:update_with_slow", _built_in("slow_states"), ("filter", "slow")
+    ),
+    Kernel(Stage.UPDATE, "filter.update:update", _built_in(), ("filter",)),
+    Kernel(
+        Stage.PREDICT,
+        "filter.predict:predict_with_slow",
+        _built_in("slow_states"),
+        ("filter", "slow"),
+    ),
+    Kernel(Stage.PREDICT, "filter.predict:predict", _built_in(), ("filter",)),
     Kernel(
         Stage.LATE_UPDATE,
         "filter.delayed:late_update_with_slow",
-        _with("run_filter", "slow_states", "late", "rewinds"),
+        _built_in("slow_states", "late", "rewinds"),
         ("late",),
     ),
     Kernel(
         Stage.LATE_UPDATE,
         "filter.delayed:late_update",
-        _with("run_filter", "late", "rewinds"),
+        _built_in("late", "rewinds"),
         ("late",),
     ),
     *map(_sensor_source, Sensor),
@@ -188,6 +202,7 @@ SOURCES = (
     ),
     Kernel(Stage.BEGIN, "task.episode:begin", _always),
     Kernel(Stage.MOVE, "vehicle.air:move_in_air", _air),
+    Kernel(Stage.ALIGN, "filter.align:align", _slow, ("filter", "slow")),
     Kernel(Stage.ALIGN, "filter.align:align", _filter, ("filter",)),
     Kernel(Stage.OBSERVE, "task.observation:observe", _always),
     Kernel(Stage.SHOW, "task.show:show", _with("shown")),
@@ -202,6 +217,7 @@ SOURCES = (
     Kernel(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features", _corrupts),
     Kernel(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss", _corrupts),
     Kernel(Stage.INCREMENT, "filter.preintegration:increment", _late, ("late",)),
+    Kernel(Stage.LOOK, "task.look:look_at_own", _own, ("own",)),
     Kernel(Stage.LOOK, "task.look:look", _always),
     Kernel(Stage.JUDGE, "task.reward_and_endings:judge", _always),
     Kernel(Stage.DRIFT_BIASES, "sensors.imu:drift_biases", _filter),

@@ -1,4 +1,4 @@
-"""State variables that a task keeps for each flight."""
+"""State variables that a task or an estimator of a user keeps for each flight."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -46,7 +46,7 @@ class State:
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         if name[0] == "_" or name not in self._arrays:
-            raise AttributeError(f"the task declares no state {name!r}: add it to `state`")
+            raise AttributeError(f"its class declares no state {name!r}: add it to `state`")
         return self._arrays[name]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -112,3 +112,27 @@ class State:
         for name, array in self._arrays.items():
             array[:] = blocks[name].reshape(-1, *array.shape[1:])[: len(array)]
         self.lock(True)
+
+    def kept_with(self, flights: NDArray[Any]) -> NDArray[Any]:
+        """Join a snapshot of flights with this state, if there is any."""
+        if not len(self):
+            return flights
+        kept = np.zeros(len(flights), [("flights", flights.dtype), ("state", self.dtype())])
+        kept["flights"] = flights
+        self.write_to(kept["state"])
+        return kept
+
+    def flights_of(self, snapshot: NDArray[Any], owner: str) -> NDArray[Any]:
+        """Return the flights of a snapshot that `kept_with` has joined with a state like this.
+
+        Raises:
+            ValueError: If it has no such state; `owner` is the task or estimator that needs it.
+        """
+        if not len(self):
+            return snapshot
+        kind = getattr(snapshot, "dtype", None)
+        if getattr(kind, "names", None) != ("flights", "state") or (
+            snapshot["state"].dtype != self.dtype()
+        ):
+            raise ValueError(f"snapshot must be one of a batch with {owner}")
+        return np.asarray(snapshot["flights"])
