@@ -1,6 +1,7 @@
 """Estimators that tests fly on: simple ones, and those of docs/gallery/estimators."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,7 +19,7 @@ def gallery(name):
 class Simple(quad_gym.Estimator):
     """Positions filtered by a constant gain, velocities of the start, attitudes of the gyro."""
 
-    state = {"r": np.zeros(3), "v": np.zeros(3), "R": np.eye(3), "ticks": 0}
+    state: ClassVar = {"r": np.zeros(3), "v": np.zeros(3), "R": np.eye(3), "ticks": 0}
 
     def reset(self, view, mask):
         self.state.r, self.state.v, self.state.R = view.position, view.velocity, view.R_BI

@@ -63,9 +63,8 @@ class OwnFilter:
 
     def restore(self, batch: "FlightBatch", snapshot: NDArray[Any]) -> None:
         """Restore the state from a snapshot of `State.kept_with`."""
-        if len(self.state):
-            self.state.read_from(snapshot["state"])
-            self.state.lock(False)
+        self.state.restore(snapshot)
+        self.state.lock(False)
         for name in EXCHANGE_BLOCK.names or ():
             put_in_flights(batch._exchange, name, batch.record(name))
         self._failed, self._has_covariance = False, True
@@ -114,14 +113,13 @@ class OwnFilter:
 
     def _begin(self, batch: "FlightBatch", mask: Truths) -> None:
         """Begin the episodes of flights in `mask`."""
-        others = None if mask.all() else self.state.copies()
+        others = self.state.rows()
         self.state.begin(mask)
         self.state.lock(False)
         view = Start(batch, _sample(batch), mask)
         estimate = self._estimator.reset(view, mask)
-        if others is not None:
-            self.state.bring_back(others, ~mask)
-            self.state.lock(False)
+        self.state.put(others[~mask], ~mask)
+        self.state.lock(False)
         if estimate is None:
             names = ("position", "velocity", "R_BI", "gyro_bias", "accel_bias", "covariance")
             estimate = {name: getattr(view, name) for name in names}

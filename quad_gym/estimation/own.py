@@ -1,6 +1,7 @@
 """`Estimator`: a user's own filter in place of the built-in one, and checks of its estimates."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,12 +43,14 @@ class Estimator:
     | name | shape | meaning |
     |---|---|---|
     | `position`, `velocity` | (n, 3) | of the center of mass, in I [m, m/s] |
-    | `R_BI` or `quaternion` | (n, 3, 3) or (n, 4) | attitude, v_B = R_BI v_I, or B to I (w, x, y, z) |
+    | `R_BI` | (n, 3, 3) | attitude, v_B = R_BI v_I |
+    | `quaternion` | (n, 4) | instead of `R_BI`: B to I, (w, x, y, z) |
     | `body_rates` | (n, 3) | in B [rad/s]; optional: the gyro minus `gyro_bias` |
     | `accel_bias`, `gyro_bias` | (n, 3) | in B [m/s^2, rad/s]; optional: zero |
-    | `covariance` | (n, 15, 15) | positive definite, of the errors of position and velocity in I, attitude, accelerometer and gyro bias in B; optional |
+    | `covariance` | (n, 15, 15) | of the errors, positive definite; optional |
 
-    The attitude error e is the rotation from the estimated to the true body frame, R_BI = R(e)
+    The covariance has the order position and velocity in I, attitude, accelerometer and gyro bias
+    in B. The attitude error e is the rotation from the estimated to the true body frame, R_BI = R(e)
     R_BI_hat; for small angles R(e) = 1 - [e x]. The covariance at the end of a control period is
     used, by `include_std`, NEES, recorded flights and videos; without one, these have NaN, and
     `include_std=True` is refused.
@@ -60,7 +63,7 @@ class Estimator:
     provided that the methods compute each row independently of the others.
     """
 
-    state: Any = {}
+    state: Any = MappingProxyType({})
 
     def reset(self, view: "Start", mask: Truths) -> Mapping[str, ArrayLike] | None:
         """Begin episodes.

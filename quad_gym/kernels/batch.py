@@ -350,8 +350,8 @@ def fly(call, board, number, command, serving):
         call: (len(Call),) arguments of this thread; their memory outlives the call.
         board: Words that the threads share, see `board.py`.
         number: Index of this thread; thread 0 posts steps.
-        command: A `Command` (TICK: plus a number) to post, unless `serving`; if negative, nothing is posted, and the
-            thread waits for the last command.
+        command: A `Command` to post (TICK: plus a number), unless `serving`; if negative, nothing
+            is posted, and the thread waits for the last command.
         serving: True: fly the steps that thread 0 posts, until none comes for a while.
 
     Returns:

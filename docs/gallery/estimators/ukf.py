@@ -1,6 +1,6 @@
 """The report's unscented Kalman filter in plain NumPy, for all flights at once.
 
-State x = (r, v, e, b_a, b_g), where e are the angles of the error of the attitude, R_BI = R(e) R_hat.
+State x = (r, v, e, b_a, b_g), where e are the angles of the attitude's error, R_BI = R(e) R_hat.
 A sigma point is at a distance of c times a column of the Cholesky factor of P, c^2 = alpha^2 (n +
 kappa), with the noises among the n states. With half the difference a_j and the half sum s_j of a
 model at the two points of column j, s_j minus its value f_0 at the mean, the moments are

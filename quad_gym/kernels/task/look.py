@@ -1,22 +1,9 @@
 """Observed state of the controller: the truth, the estimate, or the truth with noise."""
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import (
-    add,
-    keep3,
-    keep33,
-    load3,
-    load4,
-    load33,
-    multiply,
-    norm,
-    scale,
-    store3,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import keep, load3, load4, load33, norm, store
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_NOISY, Control, Source
 
@@ -26,11 +13,11 @@ def _estimated_rates(flight, own):
     """Body rates of the estimate: the gyro minus its bias, or those of a user's estimator."""
     if own is not None:
         return load3(flight.w_hat)
-    return sub(load3(flight.w_meas), load3(flight.b_g_hat))
+    return load3(flight.w_meas) - load3(flight.b_g_hat)
 
 
 @kernel
-def look(flight, model, settings, mask, own=None):
+def _look(flight, model, settings, mask, own=None):
     """Set the state that the controller observes from its source, where `mask`.
 
     `own`: the settings, if the estimate is a user's; else None.
@@ -43,22 +30,21 @@ def look(flight, model, settings, mask, own=None):
         if settings.source == Source.ESTIMATE:
             w_B = _estimated_rates(flight, own)
     elif settings.source == Source.NOISY:
-        stream = stream_of(flight)
-        s = load4(model.noisy_sigma)
+        stream, s = stream_of(flight), load4(model.noisy_sigma)
         n_r, n_v = six_normals(stream, DRAW_NOISY)
         n_e, n_w = six_normals(stream, DRAW_NOISY + 3)
-        r, v = add(r, scale(s[0], n_r)), add(v, scale(s[1], n_v))
-        R_BI, w_B = multiply(euler_to_dcm(scale(s[2], n_e)), R_BI), add(w_B, scale(s[3], n_w))
-    keep3(flight.r_seen, mask, r)
-    keep3(flight.v_seen, mask, v)
-    keep33(flight.R_seen, mask, R_BI)
-    keep3(flight.w_seen, mask, w_B)
-    error = norm(sub(load3(flight.r_seen), load3(flight.r)))
+        r, v, w_B = s[0] * n_r + r, s[1] * n_v + v, s[3] * n_w + w_B
+        R_BI = euler_to_dcm(s[2] * n_e) @ R_BI
+    keep(flight.r_seen, mask, r)
+    keep(flight.v_seen, mask, v)
+    keep(flight.R_seen, mask, R_BI)
+    keep(flight.w_seen, mask, w_B)
+    error = norm(load3(flight.r_seen) - load3(flight.r))
     flight.estimation_error = select(mask, error, flight.estimation_error)
 
 
 @kernel
-def look_within(flight, model, settings, own=None):
+def _look_within(flight, model, settings, own=None):
     """Set the body rates that an inner loop reads, at an instant within a control period."""
     control, source = settings.control, settings.source
     if control != Control.MOTOR and control != Control.WRENCH:
@@ -69,25 +55,23 @@ def look_within(flight, model, settings, own=None):
             w_B = load3(flight.w_meas)
         elif source == Source.NOISY:
             _, n_w = six_normals(stream_of(flight), DRAW_NOISY + 3)
-            w_B = add(w_B, scale(model.noisy_sigma[3], n_w))
-        store3(flight.w_seen, w_B)
+            w_B = model.noisy_sigma[3] * n_w + w_B
+        store(flight.w_seen, w_B)
 
 
 @stage
 def look_stage(flight, world, model, settings, work, stages, flag):
     """Set the state that the controller observes; `flag`: 1 within a control period."""
-    flying, believed = lanes_of(flight), lanes_of(model)
     if flag and settings.control <= Control.CTBR:
-        look_within(flying, believed, settings)
+        _look_within(flight, model, settings)
     else:
-        look(flying, believed, settings, lanes_of(work).mask > 0.0)
+        _look(flight, model, settings, work.mask > 0.0)
 
 
 @stage
 def look_at_own_stage(flight, world, model, settings, work, stages, flag):
     """Set the state that the controller observes, where a user's estimator runs."""
-    flying, believed = lanes_of(flight), lanes_of(model)
     if flag and settings.control <= Control.CTBR:
-        look_within(flying, believed, settings, settings)
+        _look_within(flight, model, settings, settings)
     else:
-        look(flying, believed, settings, lanes_of(work).mask > 0.0, settings)
+        _look(flight, model, settings, work.mask > 0.0, settings)
