@@ -34,6 +34,7 @@ class Simple(quad_gym.Estimator):
         s.R[:, 0] += z * rows[1] - y * rows[2]
         s.R[:, 1] += x * rows[2] - z * rows[0]
         s.R[:, 2] += y * rows[0] - x * rows[1]
+        s.R /= np.linalg.norm(s.R, axis=2, keepdims=True)
         if fix is not None:
             s.r += np.where(fix.new[:, np.newaxis], 0.2 * (fix.value - s.r), 0.0)
         return self.estimate()

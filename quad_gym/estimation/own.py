@@ -50,13 +50,13 @@ class Estimator:
     | `covariance` | (n, 15, 15) | of the errors, positive definite; optional |
 
     The covariance has the order position and velocity in I, attitude, accelerometer and gyro bias
-    in B. The attitude error e is the rotation from the estimated to the true body frame, R_BI = R(e)
-    R_BI_hat; for small angles R(e) = 1 - [e x]. The covariance at the end of a control period is
-    used, by `include_std`, NEES, recorded flights and videos; without one, these have NaN, and
+    in B. The attitude error e is the rotation from the estimated to the true body frame, R_BI =
+    R(e) R_BI_hat; for small angles R(e) = 1 - [e x]. `include_std`, NEES, recorded flights and
+    videos use the covariance at the end of a control period; without one, they have NaN, and
     `include_std=True` is refused.
 
-    An environment has its own copy of the estimator. What changes from tick to tick belongs in
-    `state`: a class attribute with initial values by name, which define shape and type for one
+    An environment has its own copy of the estimator. Variables that change from tick to tick
+    belong in `state`: a class attribute with initial values by name, which define shape and type for one
     flight: {"position": np.zeros(3), "P": np.eye(15)}. In the methods `self.state.P` is the array
     (n, 15, 15) of all flights. It is saved, restored, copied and pickled with the flights, and has
     the initial values again in each new episode. Flights are the same in batches of any size,
@@ -119,7 +119,7 @@ def checked_estimate(method: str, given: Any, count: int, rows: Truths) -> dict[
     values = found[attitude].reshape(count, -1)
     squares = np.einsum("ni,ni->n", values, values)
     norm = 3.0 if attitude == "R_BI" else 1.0
-    good = np.abs(squares - norm) < _NORM_ERROR
+    good = np.asarray(np.abs(squares - norm) < _NORM_ERROR)
     if not good.all():
         _require(method, f'rotations for "{attitude}"', good, found[attitude], rows)
     if attitude == "quaternion":
@@ -144,7 +144,7 @@ def _checked(method: str, name: str, value: Any, count: int, rows: Truths) -> Fl
     return array
 
 
-def _require(method: str, what: str, good: Truths, values: Floats, rows: Truths) -> None:
+def _require(method: str, what: str, good: Any, values: Floats, rows: Truths) -> None:
     """Refuse values of flights in `rows` that are not `good`."""
     wrong = np.flatnonzero(~good & rows)
     if wrong.size:

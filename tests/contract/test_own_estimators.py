@@ -40,7 +40,6 @@ def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one():
     names = [
         f"{of}{name}" for of in ("", "estimated_") for name in ("position", "velocity", "R_BI")
     ]
-    names += ["estimated_accel_bias", "estimated_gyro_bias", "estimated_body_rates"]
     while not over.any():
         found = [
             env.step(policy.predict(observation)[0])
@@ -53,6 +52,7 @@ def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one():
         assert not found[0][2].any()
         np.testing.assert_array_equal(over, found[1][3])
         assert max(differences(a, b, *names)) < 1e-9
+        assert max(differences(a, b, "estimated_accel_bias", "estimated_gyro_bias")) < 1e-8
         np.testing.assert_allclose(b.covariance(), a.covariance(), rtol=0.0, atol=1e-9)
     assert steps == 500
 
@@ -90,11 +90,12 @@ def test_body_rates_are_the_gyro_less_its_bias_unless_they_are_given():
     np.testing.assert_array_equal(made.read("estimated_body_rates"), expected)
     np.testing.assert_array_equal(made.read("observed_body_rates"), expected)
     rates = Given(body_rates=lambda n: np.tile(RATES, (n, 1)))
-    made = batch(estimator=rates, control=Control.CTBR, control_rate=50.0)
+    task = quad_gym.TaskParams(kind="hover", start="hover")
+    made = batch(estimator=rates, control=Control.CTBR, control_rate=50.0, task=task)
     for _ in range(5):
         made.step(np.zeros((5, 4)))  # the inner loop brakes rates that the vehicle does not have
     np.testing.assert_array_equal(made.read("observed_body_rates"), np.tile(RATES, (5, 1)))
-    assert (made.read("body_rates")[:, 0] < -1.0).all()
+    assert (made.read("body_rates")[:, 0] < -0.05).all()
 
 
 def test_covariance_is_observed_and_evaluated():
@@ -136,7 +137,6 @@ def test_measurements_arrive_as_the_sensors_deliver_them(sensors):
     """Compared with what `read` has in flights that are stepped tick by tick."""
     seen = Log()
     made = FlightBatch(3, sensors=sensors, estimator=seen, source=Source.TRUTH, run_filter=True)
-    plain = FlightBatch(3, sensors=sensors, source=Source.TRUTH)
     plain = FlightBatch(3, sensors=sensors, source=Source.TRUTH, run_filter=True)
     seen = made._own_filter._estimator.seen
     arrivals = 0
@@ -153,7 +153,7 @@ def test_measurements_arrive_as_the_sensors_deliver_them(sensors):
         np.testing.assert_array_equal(gyro, sample[0][0])
         np.testing.assert_array_equal(accel, sample[1][0])
         np.testing.assert_array_equal(m.time, plain.read("time"))
-        np.testing.assert_array_equal(fix.value, plain.read("gnss_position"))
+        np.testing.assert_allclose(fix.value, plain.read("gnss_position"), atol=1e-14)
         np.testing.assert_array_equal(pixels.value, plain.read("pixels"))
         np.testing.assert_array_equal(fix.new, np.isfinite(fix.value).all(axis=1))
         np.testing.assert_array_equal(pixels.new, np.isfinite(pixels.value).all(axis=2))
@@ -197,7 +197,10 @@ class Counting(Simple):
 
     def estimate(self):
         position = np.repeat(self.state.ticks[:, np.newaxis], 3, axis=1).astype(float)
-        return super().estimate() | {"position": position, "R_BI": np.tile(np.eye(3), (3, 1, 1))}
+        return super().estimate() | {
+            "position": position,
+            "R_BI": np.tile(np.eye(3), (len(position), 1, 1)),
+        }
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
@@ -239,10 +242,9 @@ def test_without_a_reset_episodes_begin_with_the_built_in_start():
         def reset(self, view, mask):
             return None
 
-    made, plain = batch(estimator=Start()), batch()
+    made, plain = batch(estimator=Start(), sensors="rtk"), batch(sensors="rtk")
     names = ("estimated_position", "estimated_R_BI", "observed_body_rates")
-    plain_start = batch(sensors=plain.sensors)
-    assert max(differences(made, plain_start, *names)) < 1e-12
+    assert differences(made, plain, *names) == [0.0, 0.0, 0.0]
     np.testing.assert_allclose(made.covariance(), plain.covariance())
 
 

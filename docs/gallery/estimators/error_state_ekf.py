@@ -1,7 +1,7 @@
 """An error-state extended Kalman filter: the form of PX4's EKF2 and of most flight controllers.
 
-The nominal state (r, v, R_BI, b_a, b_g) is integrated. The covariance is the error's, (r, v, e, b_a,
-b_g) with R_BI = (1 - [e x]) R_hat. Each sensor updates with the Jacobian of its model; its
+The nominal state (r, v, R_BI, b_a, b_g) is integrated. The covariance is the error's, (r, v, e,
+b_a, b_g) with R_BI = (1 - [e x]) R_hat. Each sensor updates with the Jacobian of its model; its
 time-correlated errors are not estimated, but added to the noise.
 """
 
