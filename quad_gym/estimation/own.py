@@ -56,11 +56,11 @@ class Estimator:
     `include_std=True` is refused.
 
     An environment has its own copy of the estimator. Variables that change from tick to tick
-    belong in `state`: a class attribute with initial values by name, which define shape and type for one
-    flight: {"position": np.zeros(3), "P": np.eye(15)}. In the methods `self.state.P` is the array
-    (n, 15, 15) of all flights. It is saved, restored, copied and pickled with the flights, and has
-    the initial values again in each new episode. Flights are the same in batches of any size,
-    provided that the methods compute each row independently of the others.
+    belong in `state`: a class attribute with initial values by name, which define shape and type
+    for one flight: {"position": np.zeros(3), "P": np.eye(15)}. In the methods `self.state.P` is the
+    array (n, 15, 15) of all flights. It is saved, restored, copied and pickled with the flights,
+    and has the initial values again in each new episode. Flights are the same in batches of any
+    size, provided that the methods compute each row independently of the others.
     """
 
     state: Any = MappingProxyType({})
