@@ -37,9 +37,8 @@ def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one():
     observations = [env.reset(seed=3)[0] for env in (built_in, own)]
     over, steps = np.zeros(2, bool), 0
     a, b = (env.unwrapped.flights.batch for env in (built_in, own))
-    names = [
-        f"{of}{name}" for of in ("", "estimated_") for name in ("position", "velocity", "R_BI")
-    ]
+    paths = ("position", "velocity", "estimated_position", "estimated_velocity")
+    others = ("R_BI", "estimated_R_BI", "estimated_accel_bias", "estimated_gyro_bias")
     while not over.any():
         found = [
             env.step(policy.predict(observation)[0])
@@ -51,8 +50,8 @@ def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one():
         over, steps = found[0][3], steps + 1
         assert not found[0][2].any()
         np.testing.assert_array_equal(over, found[1][3])
-        assert max(differences(a, b, *names)) < 1e-9
-        assert max(differences(a, b, "estimated_accel_bias", "estimated_gyro_bias")) < 1e-8
+        assert max(differences(a, b, *paths)) < 1e-9
+        assert max(differences(a, b, *others)) < 1e-8
         np.testing.assert_allclose(b.covariance(), a.covariance(), rtol=0.0, atol=1e-9)
     assert steps == 500
 
@@ -183,7 +182,7 @@ def test_state_is_saved_restored_copied_and_pickled(source):
         found = made.step(action)
     np.testing.assert_array_equal(found, expected)
     assert (made._own_filter.state.ticks == 4 * 25).all()
-    with pytest.raises(ValueError, match="snapshot must be one of a batch with Simple"):
+    with pytest.raises(ValueError, match="snapshot must be one of a batch with (Simple|Chase)"):
         made.restore(np.zeros(1))
 
 
@@ -245,7 +244,7 @@ def test_without_a_reset_episodes_begin_with_the_built_in_start():
     made, plain = batch(estimator=Start(), sensors="rtk"), batch(sensors="rtk")
     names = ("estimated_position", "estimated_R_BI", "observed_body_rates")
     assert differences(made, plain, *names) == [0.0, 0.0, 0.0]
-    np.testing.assert_allclose(made.covariance(), plain.covariance())
+    np.testing.assert_allclose(made.covariance(), plain.covariance(), atol=1e-15)
 
 
 WRONG = [
@@ -352,7 +351,7 @@ def test_commands_fly_on_an_estimator(named, tmp_path):
         *("fly", "hover", "--duration", 0.5, "--output", tmp_path / "flight.npz"), *own
     )
     assert flown.returncode == 0, flown.stderr
-    assert np.isnan(quad_gym.Flight.load(tmp_path / "flight.npz")["nees"]).all()
+    assert np.isnan(quad_gym.Flight.load(tmp_path / "flight.npz")["nees"][1:]).all()
     film = console_commands.run(
         *("fly", "hover", "--duration", 0.2, "--output", tmp_path / "flight.gif"), *own
     )
@@ -374,7 +373,8 @@ def test_consistency_of_an_estimator(tmp_path, monkeypatch):
         done = console_commands.run(
             "consistency", *options, "--estimator", "ukf:PlainUKF", *option.split()
         )
-        assert f"{option} has no effect with an own --estimator" in done.stderr
+        message = " ".join(done.stderr.replace("│", " ").split())
+        assert f"{option} has no effect with an own --estimator" in message
 
 
 def test_training_on_an_estimator(named, tmp_path):
