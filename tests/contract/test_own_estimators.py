@@ -182,7 +182,7 @@ def test_state_is_saved_restored_copied_and_pickled(source):
         found = made.step(action)
     np.testing.assert_array_equal(found, expected)
     assert (made._own_filter.state.ticks == 4 * 25).all()
-    with pytest.raises(ValueError, match="snapshot must be one of a batch with (Simple|Chase)"):
+    with pytest.raises(ValueError, match=r"snapshot must be one of a batch with (Simple|Chase)"):
         made.restore(np.zeros(1))
 
 

@@ -182,19 +182,21 @@ class PlainUKF(quad_gym.Estimator):
         s, count, size = self.state, len(blocks[0][0]), 3 * len(blocks)
         new = np.stack([block[0] for block in blocks], axis=1)
         rows = np.repeat(new, 3, axis=1)
+        W = np.zeros((count, size, size))  # W noise W^T = I: noises of directions differ 1e4-fold
+        for k, (valid, _, _, noise) in enumerate(blocks):
+            part = slice(3 * k, 3 * k + 3)
+            noise = np.where(valid[:, None, None], noise, np.eye(3))
+            W[:, part, part] = np.linalg.inv(np.linalg.cholesky(noise))
         z = np.where(rows, np.concatenate([block[1] for block in blocks], axis=1), 0.0)
 
         def model(x):
             r, R_BI = s.r[:, np.newaxis] + x[..., R], rotation(x[..., E]) @ s.R[:, np.newaxis]
             z_hat = [block[2](r, R_BI.swapaxes(-1, -2)) for block in blocks]
-            return np.where(rows[:, np.newaxis], np.concatenate(z_hat, axis=-1), 0.0)
+            z_hat = np.where(rows[:, np.newaxis], np.concatenate(z_hat, axis=-1), 0.0)
+            return apply(W[:, np.newaxis], z_hat)
 
         z_hat, P_zz, a, L = self.transform(model, 15.0 + rows.sum(axis=1), choice)
-        noise = np.zeros((count, size, size))
-        for k, (valid, _, _, of_block) in enumerate(blocks):
-            part = slice(3 * k, 3 * k + 3)
-            noise[:, part, part] = np.where(valid[:, None, None], of_block, np.eye(3))
-        P_zz, P_xz = P_zz + noise, L @ a
+        P_zz, P_xz, z = P_zz + np.eye(size), L @ a, apply(W, z)
         K = np.linalg.solve(P_zz, P_xz.transpose(0, 2, 1)).transpose(0, 2, 1)
         P = s.P - K @ P_zz @ K.transpose(0, 2, 1)
         measured = new.any(axis=1)
