@@ -37,8 +37,8 @@ def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one():
     observations = [env.reset(seed=3)[0] for env in (built_in, own)]
     over, steps = np.zeros(2, bool), 0
     a, b = (env.unwrapped.flights.batch for env in (built_in, own))
-    paths = ("position", "velocity", "estimated_position", "estimated_velocity")
-    others = ("R_BI", "estimated_R_BI", "estimated_accel_bias", "estimated_gyro_bias")
+    paths, others = ("position", "estimated_position"), ("velocity", "R_BI")
+    others += ("estimated_velocity", "estimated_R_BI", "estimated_accel_bias")
     while not over.any():
         found = [
             env.step(policy.predict(observation)[0])
