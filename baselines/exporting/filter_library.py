@@ -1,0 +1,141 @@
+"""A suite's filter as a static library for another processor, with its header and an example.
+
+The library has the kernels of `quad_gym.estimation` for one vehicle, one flight a block. Records
+have another layout then, so a separate process writes the files.
+"""
+
+import concurrent.futures
+import multiprocessing
+import os
+import pickle
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+
+LIBRARY, HEADER = "libquad_gym_filter.a", "quad_gym_filter.h"
+
+
+class Target(NamedTuple):
+    """A processor for which filters are exported."""
+
+    triple: str
+    cpu: str
+    words: str
+    """description"""
+    compiler: str
+    """C compiler of the example; empty: the system's"""
+
+
+TARGETS = {
+    "x86-64": Target(
+        "x86_64-unknown-linux-gnu", "x86-64-v3", "x86-64 with AVX2 and FMA, Linux", ""
+    ),
+    "aarch64": Target(
+        "aarch64-unknown-linux-gnu", "generic", "AArch64, Linux", "aarch64-linux-gnu-gcc"
+    ),
+    "cortex-m7": Target(
+        "thumbv7em-none-eabihf", "cortex-m7", "Cortex-M7 with double precision", "arm-none-eabi-gcc"
+    ),
+    "wasm32": Target("wasm32-unknown-unknown", "generic", "WebAssembly", "clang"),
+}
+"""Processors by the names that users write."""
+
+
+def export_filter(suite: SensorSuite, label: str, target: str, folder: Path) -> list[Path]:
+    """Write a filter's library, header, example, and files to build and explain them.
+
+    Args:
+        suite: Sensor suite with its filter.
+        label: Name of the suite.
+        target: One of TARGETS.
+        folder: Folder to write to; created if it does not exist.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: If the target is unknown, or the filter of the suite cannot run.
+        RuntimeError: If the kernels cannot be emitted for the target.
+    """
+    check.choice("target", target, tuple(TARGETS))
+    suite.require_filter()
+    env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
+    done = subprocess.run(
+        [sys.executable, "-c", f"from {__name__} import write; write()"],
+        input=pickle.dumps((suite, label, target)),
+        stdout=subprocess.PIPE,
+        env={**os.environ, **env, "PYTHONPATH": path},
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(f"the filter could not be compiled for {target}, see above")
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, content in pickle.loads(done.stdout).items():
+        files.append(folder / name)
+        files[-1].write_bytes(content)
+    return files
+
+
+def contents(suite: SensorSuite, label: str, target: str) -> dict[str, bytes]:
+    """Return the files by name; records must have one lane."""
+    from baselines.exporting.filter_sources import Sources
+
+    sources = Sources(suite, label, target)
+    tasks = [(name, symbol, target) for symbol, name in sources.functions.items()]
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(min(4, os.cpu_count() or 1), context) as pool:
+        objects = dict(zip(sources.functions, pool.map(_object, tasks), strict=True))
+    for symbol, numbers in sources.constants.items():
+        objects[symbol] = _constant(symbol, numbers, target)
+    return {LIBRARY: archive(objects), **sources.texts({k: len(v) for k, v in objects.items()})}
+
+
+def _object(task: tuple[str, str, str]) -> bytes:
+    """Return the object file of a compiled function, under another name."""
+    from quad_gym.kernels.compiling.foreign import Processor, emitted, linked_ir
+
+    name, symbol, target = task
+    chosen = TARGETS[target]
+    return emitted(linked_ir(name), symbol, Processor(chosen.triple, chosen.cpu))
+
+
+def _constant(symbol: str, numbers: bytes, target: str) -> bytes:
+    """Return an object file with constant memory."""
+    from quad_gym.kernels.compiling.foreign import Processor, emitted
+
+    text = "".join(f"\\{byte:02X}" for byte in numbers)
+    ir = f'@{symbol} = constant [{len(numbers)} x i8] c"{text}", align 64\n'
+    chosen = TARGETS[target]
+    return emitted(("", ir), symbol, Processor(chosen.triple, chosen.cpu))
+
+
+def archive(objects: dict[str, bytes]) -> bytes:
+    """Return a static library of object files, each with one symbol, in the format of GNU ar."""
+    index_size = 4 + 4 * len(objects) + sum(len(name) + 1 for name in objects)
+    place, offsets = 8 + 60 + index_size + index_size % 2, []
+    members = b""
+    for k, content in enumerate(objects.values()):
+        offsets.append(place)
+        member = _member(f"{k}.o/", content)
+        members += member
+        place += len(member)
+    index = struct.pack(f">{1 + len(offsets)}I", len(offsets), *offsets)
+    index += b"".join(name.encode() + b"\0" for name in objects)
+    return b"!<arch>\n" + _member("/", index) + members
+
+
+def _member(name: str, content: bytes) -> bytes:
+    head = f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(content):<10}`\n"
+    return head.encode() + content + b"\n" * (len(content) % 2)
+
+
+def write() -> None:
+    """Write the files for a pickled suite on standard input, pickled, to standard output."""
+    sys.stdout.buffer.write(pickle.dumps(contents(*pickle.load(sys.stdin.buffer))))
