@@ -50,11 +50,7 @@ class Quantity(NamedTuple):
 
 
 def read(batch: "FlightBatch", name: str, flights: Flights) -> NDArray[Any]:
-    """A quantity of flights as a new array (n, ...); see `FlightBatch.read`.
-
-    Raises:
-        ValueError: If there is no such quantity, or no filter runs that would estimate it.
-    """
+    """A quantity of flights as a new array (n, ...); see `FlightBatch.read`."""
     quantity = QUANTITIES.get(name) if isinstance(name, str) else None
     if quantity is None:
         drawn = batch.randomization.names

@@ -32,11 +32,7 @@ def rendering_of(
     render_size: tuple[int, int] | None = None,
     render_flights: Sequence[int] | None = None,
 ) -> "Rendering | None":
-    """Return the renderer of an environment; None if it does not render.
-
-    Raises:
-        ValueError: If an argument is invalid.
-    """
+    """Return the renderer of an environment; None if it does not render."""
     given: dict[str, Any] = {"view": render_view, "size": render_size, "flights": render_flights}
     given = {name: value for name, value in given.items() if value is not None}
     if render_mode is None:

@@ -312,11 +312,7 @@ def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:
-    """Return one seed per flight: seed + i for a number, the list itself for a list.
-
-    Raises:
-        ValueError: If a seed is not an integer of at least 0, or a list has another length.
-    """
+    """Return one seed per flight: seed + i for a number, the list itself for a list."""
     if seed is None:
         return [None] * count
     if not isinstance(seed, (list, tuple, np.ndarray)):

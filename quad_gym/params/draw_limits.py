@@ -33,17 +33,7 @@ _OF_PARTS |= {"camera_position_B": "position_B"}
 def check_bounds(
     table: "DrawingTable", vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams
 ) -> None:
-    """Refuse draws that the parameters themselves refuse.
-
-    Args:
-        table: The draws.
-        vehicle: The vehicle without draws.
-        sensors: The sensors without draws.
-        world: The world without draws.
-
-    Raises:
-        ValueError: If the smallest or the largest draws of a parameter are beyond its bounds.
-    """
+    """Refuse draws whose smallest or largest values the parameters themselves refuse."""
     parts = (vehicle, world, world.battery, sensors.imu, sensors.gnss, sensors.camera)
     present = [part for part in parts if part is not None]
     for name in table.names:
@@ -108,16 +98,7 @@ def _check_antennas(table: "DrawingTable") -> None:
 
 
 def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldParams) -> None:
-    """Refuse draws whose worst case lacks the thrust or the power to hover.
-
-    Args:
-        table: The draws.
-        vehicle: The vehicle without draws.
-        world: The world without draws.
-
-    Raises:
-        ValueError: If there are such draws.
-    """
+    """Refuse draws whose worst case lacks the thrust or the power to hover."""
     least, most = table.least, table.most
     mass = most("mass")
     full = least("max_voltage")
@@ -152,17 +133,7 @@ def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldPa
 def check_draws(
     table: "DrawingTable", vehicle: VehicleParams, world: WorldParams, clocks: Clocks
 ) -> None:
-    """Refuse rotors that are too fast, or drag that is too large, for the integration.
-
-    Args:
-        table: The draws.
-        vehicle: The vehicle without draws.
-        world: The world without draws.
-        clocks: Rates, for the duration of a Runge-Kutta step.
-
-    Raises:
-        ValueError: If the nominal values or any draw are refused.
-    """
+    """Refuse rotors that are too fast, or drag that is too large, for the integration."""
     _check_drag(table, vehicle, world, clocks)
     name = "motor_time_constant"
     if name in table.names:

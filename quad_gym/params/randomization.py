@@ -110,15 +110,8 @@ class Randomization:
 class DrawingTable:
     """A randomization in numbers: the distribution of each column of a flight's field `drawn`.
 
-    Args:
-        randomization: The distributions.
-        vehicle: The vehicle without draws.
-        sensors: The sensors without draws.
-        world: The world without draws.
-        action_delay: The delay of actions without draws [control steps].
-
-    Raises:
-        ValueError: If a range holds invalid values, such as a vehicle too heavy to hover.
+    Vehicle, sensors, world and delay of actions [control steps] are those without draws. Ranges
+    with invalid values are refused, such as a vehicle too heavy to hover.
     """
 
     def __init__(

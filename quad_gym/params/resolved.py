@@ -14,12 +14,7 @@ Owner = TypeVar("Owner")
 
 
 class Resolved(Generic[Given, Value]):
-    """Field of a dataclass that is given in one of several forms and read in one.
-
-    Args:
-        resolve: Returns the value from the field's name and from what is given.
-        default: Default of what is given.
-    """
+    """Field of a dataclass that is given in one of several forms; `resolve` takes its name, too."""
 
     def __init__(self, resolve: Callable[[str, Given], Value], default: Given) -> None:
         self._resolve, self._default = resolve, default
@@ -71,12 +66,7 @@ def taking(
     [Callable[[Owner, Value], None]],
     Callable[Concatenate[Owner, Arguments], None],
 ]:
-    """Return a decorator for a method of a dataclass, which then takes the fields as arguments.
-
-    Args:
-        kind: The dataclass, whose fields the signature shows.
-        name: Name of the method in messages.
-    """
+    """Return a decorator for a method of a dataclass, which then takes the fields as arguments."""
     make: Callable[..., Value] = kind
     fields = {
         name: parameter.replace(annotation=_given_type(parameter.annotation))

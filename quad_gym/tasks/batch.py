@@ -36,17 +36,8 @@ class TaskBatch(ReadableBatch):
     of the results. Episodes begin in the kernel with next-step autoreset, and by masked resets
     otherwise, so that the flights' random streams continue as without a task.
 
-    Args:
-        count: Number of flights.
-        own_task: User-defined task.
-        parts: Arrays that its `observe` returns, by name; None: `observe` is not called.
-        split: Index in the built-in observation at which these are inserted.
-        kept: Indices of the built-in observation that are kept; None: all.
-        autoreset: Mode that determines when the next episode begins after one has ended.
-        keywords: Keywords of `FlightBatch`.
-
-    Raises:
-        ValueError: If an argument is invalid.
+    `parts` are the arrays that `observe` returns, inserted at index `split` of the built-in
+    observation, of which the indices `kept` are kept (None: all).
     """
 
     def __init__(
@@ -199,11 +190,7 @@ class TaskBatch(ReadableBatch):
         return answers.truths(self.own_task, method, self.view)
 
     def _write_rewards(self, terms: Mapping[str, Floats]) -> None:
-        """Write rewards; flights that begin, or whose state is not finite, have none.
-
-        Raises:
-            TaskError: If another reward is not finite; nothing is written then.
-        """
+        """Write rewards; flights that begin, or whose state is not finite, have none."""
         rewards = reduce(np.add, terms.values())
         sound = np.abs(rewards) <= LARGEST_REWARD  # NaN is not
         if not sound.all():
@@ -324,11 +311,7 @@ class TaskBatch(ReadableBatch):
         return kept
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Restore all flights from a snapshot of this batch, or of another one of equal size.
-
-        Raises:
-            ValueError: If the snapshot has another size, kind or task.
-        """
+        """Restore all flights from a snapshot of this batch, or of another one of equal size."""
         flights = snapshot
         if len(self._state):
             kind = getattr(snapshot, "dtype", None)

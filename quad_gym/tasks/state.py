@@ -12,15 +12,7 @@ _KINDS = {"b": np.bool_, "i": np.int64, "u": np.int64, "f": np.float64}
 
 
 class State:
-    """Named arrays (n, ...), one row per flight, which have the same values in each new episode.
-
-    Args:
-        count: Number of flights.
-        start: Values at the start of an episode, by name.
-
-    Raises:
-        ValueError: If a name is not an identifier, or a value is not a number or array of numbers.
-    """
+    """Named arrays (n, ...), one row per flight, which have the same values in each new episode."""
 
     __slots__ = ("_arrays", "_start")
     _arrays: dict[str, NDArray[Any]]

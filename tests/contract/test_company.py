@@ -1,5 +1,6 @@
 """The environments among processes, threads and caches that are not theirs alone."""
 
+import contextlib
 import functools
 import os
 import pickle
@@ -8,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -80,23 +81,12 @@ def test_stable_baselines3s_processes_fly_the_same(start_method):
         env.close()
 
 
-def test_two_environments_may_be_stepped_from_two_threads_at_once():
-    runs, errors = {}, []
-
-    def run(seed):
-        try:
-            runs[seed] = expected_run(200, "SameStep", seed=seed, batch_threads=2)
-        except BaseException as error:
-            errors.append(error)
-
-    workers = [threading.Thread(target=run, args=(seed,)) for seed in (1, 2, 3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join(PATIENCE)
-    assert not errors
-    for seed in (1, 2, 3):
-        assert_same(runs[seed], expected_run(200, "SameStep", seed=seed))
+def test_environments_may_be_stepped_from_several_threads():
+    run = functools.partial(expected_run, 200, "SameStep", batch_threads=2)
+    with ThreadPoolExecutor(3) as pool:
+        runs = [pool.submit(run, seed=seed) for seed in (1, 2, 3)]
+        for seed, flown in zip((1, 2, 3), runs, strict=True):
+            assert_same(flown.result(PATIENCE), run(seed=seed))
 
 
 def in_a_fork(work):
@@ -186,19 +176,13 @@ def test_changed_kernel_is_compiled_again(tmp_path):
     copy = tmp_path / "quad_gym"
     source = Path(quad_gym.__file__).parent
     shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    anew = functools.partial(start, tmp_path / "cache", PYTHONPATH=str(tmp_path))
-    where = subprocess.run(
-        [sys.executable, "-c", "import quad_gym; print(quad_gym.__file__)"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    if not where.stdout.startswith(str(tmp_path)):
-        pytest.skip("the installed package comes before PYTHONPATH")
-    assert run_in(tmp_path, anew)
-    assert not run_in(tmp_path, anew)
+
+    def compiles():
+        with contextlib.chdir(tmp_path):  # where the copy is imported from
+            return outcome(start(tmp_path / "cache", PYTHONPATH=str(tmp_path)))
+
+    assert compiles()
+    assert not compiles()
     for room, change, stale in (
         ("maths/rotation.py", "# a comment", False),
         ("task/reference.py", "_CHANGED = True", False),
@@ -206,60 +190,21 @@ def test_changed_kernel_is_compiled_again(tmp_path):
     ):
         with (copy / "kernels" / room).open("a") as file:
             file.write(f"\n{change}\n")
-        assert run_in(tmp_path, anew) == stale
-        assert not run_in(tmp_path, anew)
-
-
-def run_in(folder, begin):
-    """`outcome(begin())` with another working folder, where another copy of the package lies."""
-    here = Path.cwd()
-    os.chdir(folder)
-    try:
-        return outcome(begin())
-    finally:
-        os.chdir(here)
+        assert compiles() == stale
+        assert not compiles()
 
 
 # ---- cores and imports ---------------------------------------------------------------------------
 
 
-def cores_in_a_process(code, **environment):
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            f"{code}; from quad_gym.batch.threads import *; print(available_cores())",
-        ],
-        env={**{k: v for k, v in os.environ.items() if k != "NUMBA_NUM_THREADS"}, **environment},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return int(done.stdout)
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no affinity on this system")
-def test_cores_are_limited_by_affinity_and_by_numbas_variable():
-    one = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
-    assert cores_in_a_process(one) == 1
-    assert cores_in_a_process("pass", NUMBA_NUM_THREADS="1") == 1
-
-
-def test_cores_are_limited_by_a_containers_quota(monkeypatch):
+def test_cores_are_limited_by_quota_affinity_and_variable(monkeypatch):
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
     for quota, expected in ((None, 16), (4, 4), (64, 16)):
         monkeypatch.setattr(cores, "_cgroup_cores", lambda quota=quota: quota)
         assert cores.available_cores() == expected
-    for limit, expected in (
-        ("3", 3),
-        ("999", 16),
-        ("", 16),
-        ("0", 16),
-        ("-2", 16),
-        ("many", 16),
-    ):
-        monkeypatch.setattr(cores, "_cgroup_cores", lambda: None)
+    monkeypatch.setattr(cores, "_cgroup_cores", lambda: None)
+    for limit, expected in (("3", 3), ("999", 16), ("", 16), ("0", 16), ("-2", 16), ("many", 16)):
         monkeypatch.setenv("NUMBA_NUM_THREADS", limit)
         assert cores.available_cores() == expected
 

@@ -15,18 +15,8 @@ def elsewhere(tmp_path, monkeypatch):
 
 def test_evaluate_replaces_results_only_when_told(tmp_path, capsys):
     pytest.importorskip("matplotlib")
-    line = [
-        "evaluate",
-        "hover",
-        "--policy",
-        "pd",
-        "--observation",
-        "truth",
-        "--episodes",
-        "2",
-        "--env",
-        "duration=0.4",
-    ]
+    few = "--policy pd --observation truth --episodes 2 --env duration=0.4"
+    line = ["evaluate", "hover", *few.split()]
     main(line)
     folder = tmp_path / "results" / "evaluate"
     file = folder / "hover" / "summary.json"

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import QuadEnv, QuadVectorEnv, RewardParams, TaskParams, rewards
+from quad_gym import QuadEnv, QuadVectorEnv, RewardParams, rewards
 from quad_gym.envs.benchmarks import BENCHMARKS
 from tests.builders import actions_of
 
@@ -107,11 +107,6 @@ def test_weights_without_effect_are_refused(keywords, message):
         QuadEnv(**keywords)
 
 
-def test_task_of_weights_is_a_parameter():
-    task = TaskParams(reward_params=RewardParams(near=3.0))
-    assert task.replace(radius=2.0).reward_params.near == 3.0
-
-
 def test_own_task_shows_the_terms_that_it_returns():
     def reward(view):
         return {"near": rewards.Tracking()(view), "crash": -5.0 * rewards.Crash()(view)}
@@ -129,7 +124,7 @@ def test_own_task_shows_the_terms_that_it_returns():
     assert crashes > 0
 
 
-def test_own_task_with_one_array_has_one_term_and_without_a_reward_those_of_its_base():
+def test_own_task_has_one_term_or_those_of_its_base():
     task = quad_gym.Task.of(reward=rewards.Heading())
     paid, terms, _ = flown(task, 5, base="hover")
     np.testing.assert_array_equal(terms["reward"], paid)

@@ -119,18 +119,10 @@ def test_options_hold_for_the_next_reset_only():
     np.testing.assert_array_equal(env.flights.batch.record("r"), np.tile([3.5, 1.0, 1.5], (3, 1)))
     env.reset()
     assert (env.flights.batch.record("r") != [3.5, 1.0, 1.5]).all()
-
-
-def test_options_may_be_given_one_by_one():
-    env = make(2)
-    env.set_options([{"position": [4.0, 0.0, 1.5]}, {"position": [4.0, 1.0, 2.0]}])
+    places = [[4.0, 0.0, 1.5], [4.0, 1.0, 2.0], [4.0, 0.5, 1.0]]
+    env.set_options([{"position": place} for place in places])
     env.reset()
-    np.testing.assert_array_equal(env.flights.batch.record("r"), [[4.0, 0.0, 1.5], [4.0, 1.0, 2.0]])
-
-
-def test_unknown_options_change_nothing():
-    env = make(2)
-    env.reset()
+    np.testing.assert_array_equal(env.flights.batch.record("r"), places)
     before = state_of(env)
     env.set_options({"height": 2.0})
     with pytest.raises(ValueError, match="height"):
@@ -153,16 +145,13 @@ def test_what_is_returned_has_the_stated_types_and_is_fresh():
     assert not np.shares_memory(dones, second[2])
 
 
-def test_waiting_for_a_step_that_was_not_asked_for_is_an_error():
+def test_step_before_reset_and_wait_before_step_are_errors():
     env = make(2)
+    with pytest.raises((RuntimeError, gymnasium.error.ResetNeeded), match="reset"):
+        env.step(np.zeros((2, 4)))
     env.reset()
     with pytest.raises(RuntimeError, match="step_async"):
         env.step_wait()
-
-
-def test_stepping_before_the_first_reset_is_an_error():
-    with pytest.raises((RuntimeError, gymnasium.error.ResetNeeded), match="reset"):
-        make(2).step(np.zeros((2, 4)))
 
 
 def test_attributes_and_methods_are_shared_by_all_flights():

@@ -200,29 +200,6 @@ def test_gates_and_progress_of_a_course_match_the_positions():
     assert passed.any()
 
 
-def test_faults_when_active_are_true_by_name():
-    batch, view = view_of(sensors="rtk", faults="gnss_outage")
-    batch.switch_faults(True)
-    batch.step(np.zeros((FLIGHTS, 4)))
-    view = batch.view
-    assert list(view.truth.faults) == list(batch.active_faults())
-    assert all(active.all() for active in view.truth.faults.values())
-
-
-def test_misspelled_field_raises_an_error_with_its_group():
-    _, view = view_of(steps=1)
-    for group, misspelt, meant in (
-        (view, "positon", "position"),
-        (view, "reference_postion", "reference_position"),
-        (view.observed, "velocty", "velocity"),
-        (view.estimate, "covarance", "covariance"),
-    ):
-        with pytest.raises(AttributeError) as caught:
-            getattr(group, misspelt)
-        assert (caught.value.name, caught.value.obj) == (misspelt, group)
-        assert meant in dir(group)
-
-
 def test_estimate_without_a_filter_is_refused():
     _, view = view_of(observation="truth")
     with pytest.raises(ValueError, match=r"view.estimate needs a filter"):

@@ -41,7 +41,7 @@ def test_the_camera_looks_ahead_and_thirty_degrees_down():
 
 
 @given(seeds, st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(0.01, 100.0))
-def test_a_feature_is_reported_where_it_projects_if_that_is_inside_the_image(seed, x, y, depth):
+def test_feature_inside_the_image_is_reported_where_it_projects(seed, x, y, depth):
     position, R_BI = random_pose(seed)
     pixel = np.array([x, y]) * HALF_IMAGE
     assume(np.abs(np.abs([x, y]) - 1.0).min() > 1e-6)
@@ -67,7 +67,7 @@ def test_a_feature_behind_the_camera_is_never_reported(seed, x, y, depth):
 
 
 @given(seeds)
-def test_random_features_are_seen_as_an_independent_projection_says(seed):
+def test_random_features_have_the_pixels_of_a_plain_projection(seed):
     position, R_BI = random_pose(seed)
     features = position + np.random.default_rng(seed).normal(0.0, 3.0, (16, 3))
     got = picture(SHARP.replace(features_I=features), position, R_BI)
@@ -90,7 +90,7 @@ def test_pixel_noise_is_white_and_of_the_given_size():
     assert np.abs(serial).max() < 5.5 / np.sqrt(count)
 
 
-def test_noise_may_carry_a_pixel_over_the_edge_but_decides_nothing():
+def test_visibility_does_not_depend_on_noise():
     # a feature just inside the image is always reported, one just outside never
     pose = np.zeros(3), np.eye(3)
     for x, reported in ((0.999, True), (1.001, False)):

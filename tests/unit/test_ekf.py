@@ -34,17 +34,6 @@ def test_the_filter_equals_the_plain_filter(choices):
     assert len(cases) > 3
 
 
-def test_fields_of_the_unscented_transform_do_not_concern_it():
-    flights = []
-    for choices in ({}, {"alpha": 0.7, "beta": 0.0, "kappa": 2.0}):
-        ekf = started(estimator(**choices), ExtendedKalmanFilter, seed=1)
-        for _ in range(3):
-            ekf.predict(np.array([0.3, -0.2, 0.1]), np.array([0.4, 0.1, 9.9]))
-            ekf.update(ekf.sensors.gnss.reference_antenna_G, [1.0, 2.0, 0.5])
-        flights.append(np.append(ekf.covariance, ekf.R_BI))
-    np.testing.assert_array_equal(*flights)
-
-
 def started(sensors, filter_class, seed, covariance=None):
     """A filter at a random state."""
     rng = np.random.default_rng(seed)

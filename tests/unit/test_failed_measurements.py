@@ -34,12 +34,8 @@ TICK = int(np.flatnonzero(np.isfinite(RECORDING.pixels).all(axis=(1, 2)))[0])
 BAD = 2
 """The flight whose measurement fails."""
 KEPT = (*STATE, "nis", "nis_dimension")
-VALUES = {
-    "position": "gnss_position",
-    "baseline": "gnss_baseline",
-    "velocity": "gnss_velocity",
-    "features": "pixels",
-}
+VALUES = {name: f"gnss_{name}" for name in ("position", "baseline", "velocity")}
+VALUES |= {"features": "pixels"}
 BLOCKS = {
     "position": [POSITION_BLOCK],
     "baseline": [BASELINE_BLOCK],

@@ -106,11 +106,15 @@ def test_there_is_no_baseline_ever():
         assert not batch.record("block_valid")[:, BASELINE_BLOCK].any()
         assert not batch.record("block_fresh")[:, BASELINE_BLOCK].any()
         assert not batch.record("gnss_baseline").any()
+    receiver = GnssReceiver(GNSS, np.random.default_rng(1))
+    position, baseline = receiver.measure(np.zeros(3), np.eye(3))
+    assert np.isfinite(position).all()
+    assert np.isnan(baseline).all()
     assert np.isnan(batch.record("block_nis")[:, BASELINE_BLOCK]).all()
     assert np.isfinite(batch.record("block_nis")[:, 0]).all()
 
 
-def test_without_a_magnetometer_the_mark_of_the_start_tells_the_heading():
+def test_mark_of_the_start_gives_the_heading_without_a_field():
     alone = CONSUMER.replace(magnetometer=None)
     batch = fly(alone, 1000, task="hover")
     heading = state_errors(batch)[:, 8]
@@ -119,19 +123,10 @@ def test_without_a_magnetometer_the_mark_of_the_start_tells_the_heading():
     np.testing.assert_allclose(np.linalg.norm(batch.record("L")[:, 8], axis=1), sigma, rtol=1e-3)
 
 
-def test_a_receiver_with_one_antenna_measures_no_baseline():
-    receiver = GnssReceiver(GNSS, np.random.default_rng(1))
-    position, baseline = receiver.measure(np.zeros(3), np.eye(3))
-    assert np.isfinite(position).all()
-    assert np.isnan(baseline).all()
-
-
 def test_what_belongs_to_two_antennas_is_refused():
     ukf, fix, field = UnscentedKalmanFilter(CONSUMER), np.zeros(3), MAGNETOMETER.field_I
     with pytest.raises(ValueError, match="gnss_baseline_G must be None"):
         ukf.initialize(fix, (1.0, 0.0, 0.0), magnetometer=field)
-    with pytest.raises(ValueError, match="magnetometer must have shape"):
-        ukf.initialize(fix, magnetometer=np.zeros(2))
     with pytest.raises(RuntimeError):
         _ = ukf.position
     ukf.initialize(fix, magnetometer=field)

@@ -27,12 +27,9 @@ LINEAR = RTK.replace(
     camera=None,
     gnss=RTK.gnss.replace(primary_antenna_B=(0.0, 0.0, 0.0), secondary_antenna_B=None),
     imu=RTK.imu.replace(
-        accel_vibration=0.0,
-        gyro_vibration=0.0,
-        accel_scale_sigma=0.0,
-        accel_misalignment_sigma=0.0,
-        accel_bias_tau=2.0,
-        gyro_bias_tau=3.0,
+        **dict.fromkeys(("accel_vibration", "gyro_vibration"), 0.0),
+        **dict.fromkeys(("accel_scale_sigma", "accel_misalignment_sigma"), 0.0),
+        **{"accel_bias_tau": 2.0, "gyro_bias_tau": 3.0},
     ),
     estimator=RTK.estimator.replace(false_alarm_probability=0.0, recursive_update_threshold=None),
 )
@@ -111,7 +108,7 @@ def least_squares(table):
 
 
 @pytest.mark.parametrize("estimator", ["ukf", "ekf"])
-def test_a_linear_case_equals_least_squares_over_the_whole_trajectory(estimator):
+def test_linear_case_equals_least_squares(estimator):
     """Means within 0.2 % of their standard deviations, covariances within 0.2 %."""
     table = log_at_rest()
     start = at_rest(covariance=P0, time=0.0)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.vehicle import state_derivative
+from tests.body_states import random_state
 
 LAB = quad_gym.vehicle_params("lab")
 SKEWED = quad_gym.VehicleParams(
@@ -23,26 +24,9 @@ SKEWED = quad_gym.VehicleParams(
 NO_FORCE = np.zeros(3)
 
 
-def random_state(seed):
-    rng = np.random.default_rng(seed)
-    return {
-        "position": rng.normal(0.0, 10.0, 3),
-        "velocity": rng.normal(0.0, 5.0, 3),
-        "R_BI": Rotation.random(rng=rng).as_matrix(),
-        "body_rates": rng.normal(0.0, 3.0, 3),
-        "rotor_speeds": rng.uniform(0.0, 2000.0, 4),
-    }
-
-
 def at_rest(**changes):
-    state = {
-        "position": np.zeros(3),
-        "velocity": np.zeros(3),
-        "R_BI": np.eye(3),
-        "body_rates": np.zeros(3),
-        "rotor_speeds": np.zeros(4),
-    }
-    return {**state, **changes}
+    still = dict.fromkeys(("position", "velocity", "body_rates"), np.zeros(3))
+    return {**still, "R_BI": np.eye(3), "rotor_speeds": np.zeros(4), **changes}
 
 
 def cross_matrix(w):

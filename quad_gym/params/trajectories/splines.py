@@ -153,7 +153,7 @@ def _refuse_equal_neighbors(places: Floats, closed: bool) -> None:
 def coefficients(
     times: Floats, values: Floats, order: int, *, closed: bool = False, at_rest: bool = True
 ) -> Floats:
-    """Polynomials of the least integral of a squared derivative through values at times.
+    """Polynomials of the least integral of a squared derivative through values (m + 1, n) at times.
 
     Args:
         times: (m + 1,) increasing.
