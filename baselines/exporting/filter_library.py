@@ -1,7 +1,7 @@
 """A suite's filter as a static library for another processor, with its header and an example.
 
-The library has the kernels of `quad_gym.estimation` for one vehicle, one flight a block. Records
-have another layout then, so a separate process writes the files.
+The library has the kernels of `quad_gym.estimation` for one vehicle, with one flight in a block.
+Records have another layout then, so a separate process writes the files.
 """
 
 import concurrent.futures
@@ -27,27 +27,42 @@ class Target(NamedTuple):
     cpu: str
     words: str
     """description"""
-    compiler: str
-    """C compiler of the example; empty: the system's"""
+    build: str
+    """commands that build the example"""
 
 
+_CMAKE = "cmake -B build && cmake --build build"
+_BARE = """\
+arm-none-eabi-gcc -std=c99 -O2 -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-d16 \\
+    main.c libquad_gym_filter.a -lm  # with the start-up code and linker script of your board"""
+_WASM = """\
+clang --target=wasm32-wasi -std=c99 -O2 main.c libquad_gym_filter.a -lm  # with the WASI SDK"""
 TARGETS = {
     "x86-64": Target(
-        "x86_64-unknown-linux-gnu", "x86-64-v3", "x86-64 with AVX2 and FMA, Linux", ""
+        "x86_64-unknown-linux-gnu",
+        "x86-64-v3",
+        "Linux on x86-64 with AVX2 and FMA (since 2013)",
+        _CMAKE,
     ),
     "aarch64": Target(
-        "aarch64-unknown-linux-gnu", "generic", "AArch64, Linux", "aarch64-linux-gnu-gcc"
+        "aarch64-unknown-linux-gnu",
+        "generic",
+        "Linux on AArch64",
+        f"{_CMAKE.replace('build &&', 'build -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc &&', 1)}",
     ),
     "cortex-m7": Target(
-        "thumbv7em-none-eabihf", "cortex-m7", "Cortex-M7 with double precision", "arm-none-eabi-gcc"
+        "thumbv7em-none-eabihf",
+        "cortex-m7",
+        "Cortex-M7 with double-precision FPU, hard-float ABI",
+        _BARE,
     ),
-    "wasm32": Target("wasm32-unknown-unknown", "generic", "WebAssembly", "clang"),
+    "wasm32": Target("wasm32-unknown-unknown", "generic", "WebAssembly", _WASM),
 }
 """Processors by the names that users write."""
 
 
 def export_filter(suite: SensorSuite, label: str, target: str, folder: Path) -> list[Path]:
-    """Write a filter's library, header, example, and files to build and explain them.
+    """Write a filter's library, header, example, and files that build and explain them.
 
     Args:
         suite: Sensor suite with its filter.
@@ -83,49 +98,49 @@ def export_filter(suite: SensorSuite, label: str, target: str, folder: Path) -> 
     return files
 
 
-def contents(suite: SensorSuite, label: str, target: str) -> dict[str, bytes]:
+def write() -> None:
+    """Write the files for a pickled suite on standard input, pickled, to standard output."""
+    sys.stdout.buffer.write(pickle.dumps(_contents(*pickle.load(sys.stdin.buffer))))
+
+
+def _contents(suite: SensorSuite, label: str, target: str) -> dict[str, bytes]:
     """Return the files by name; records must have one lane."""
     from baselines.exporting.filter_sources import Sources
+    from quad_gym.kernels.compiling.cache import say
+    from quad_gym.kernels.compiling.foreign import (
+        Processor,
+        emitted,
+        is_cached,
+        loaded_size,
+        object_of,
+        symbol_of,
+    )
 
-    sources = Sources(suite, label, target)
-    tasks = [(name, symbol, target) for symbol, name in sources.functions.items()]
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(min(4, os.cpu_count() or 1), context) as pool:
-        objects = dict(zip(sources.functions, pool.map(_object, tasks), strict=True))
+    sources, processor = Sources(suite, label, target), Processor(*TARGETS[target][:2])
+    missing = [name for name in sources.functions if not is_cached(name, processor)]
+    if missing:
+        say(f"quad_gym: compiling {len(missing)} parts of the filter for {target} (once)")
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(min(4, os.cpu_count() or 1), context) as pool:
+            tasks = [pool.submit(object_of, name, processor) for name in missing]
+            for task in tasks:
+                task.result()
+    objects = {symbol_of(name): object_of(name, processor) for name in sources.functions}
     for symbol, numbers in sources.constants.items():
-        objects[symbol] = _constant(symbol, numbers, target)
-    return {LIBRARY: archive(objects), **sources.texts({k: len(v) for k, v in objects.items()})}
-
-
-def _object(task: tuple[str, str, str]) -> bytes:
-    """Return the object file of a compiled function, under another name."""
-    from quad_gym.kernels.compiling.foreign import Processor, emitted, linked_ir
-
-    name, symbol, target = task
-    chosen = TARGETS[target]
-    return emitted(linked_ir(name), symbol, Processor(chosen.triple, chosen.cpu))
-
-
-def _constant(symbol: str, numbers: bytes, target: str) -> bytes:
-    """Return an object file with constant memory."""
-    from quad_gym.kernels.compiling.foreign import Processor, emitted
-
-    text = "".join(f"\\{byte:02X}" for byte in numbers)
-    ir = f'@{symbol} = constant [{len(numbers)} x i8] c"{text}", align 64\n'
-    chosen = TARGETS[target]
-    return emitted(("", ir), symbol, Processor(chosen.triple, chosen.cpu))
+        text = "".join(f"\\{byte:02X}" for byte in numbers)
+        ir = f'@{symbol} = constant [{len(numbers)} x i8] c"{text}", align 64\n'
+        objects[symbol] = emitted(ir, processor)
+    flash = sum(map(loaded_size, objects.values()))
+    return {LIBRARY: archive(objects), **sources.texts(flash)}
 
 
 def archive(objects: dict[str, bytes]) -> bytes:
     """Return a static library of object files, each with one symbol, in the format of GNU ar."""
     index_size = 4 + 4 * len(objects) + sum(len(name) + 1 for name in objects)
-    place, offsets = 8 + 60 + index_size + index_size % 2, []
-    members = b""
+    place, offsets, members = 8 + 60 + index_size + index_size % 2, [], b""
     for k, content in enumerate(objects.values()):
-        offsets.append(place)
-        member = _member(f"{k}.o/", content)
-        members += member
-        place += len(member)
+        offsets.append(place + len(members))
+        members += _member(f"{k}.o/", content)
     index = struct.pack(f">{1 + len(offsets)}I", len(offsets), *offsets)
     index += b"".join(name.encode() + b"\0" for name in objects)
     return b"!<arch>\n" + _member("/", index) + members
@@ -134,8 +149,3 @@ def archive(objects: dict[str, bytes]) -> bytes:
 def _member(name: str, content: bytes) -> bytes:
     head = f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(content):<10}`\n"
     return head.encode() + content + b"\n" * (len(content) % 2)
-
-
-def write() -> None:
-    """Write the files for a pickled suite on standard input, pickled, to standard output."""
-    sys.stdout.buffer.write(pickle.dumps(contents(*pickle.load(sys.stdin.buffer))))

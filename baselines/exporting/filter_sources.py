@@ -17,6 +17,7 @@ from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.first_fix import FARTHEST_FIX, LEAST_COURSE
 from quad_gym.estimation.starts import LEVEL_SIGMA, state_at_rest
+from quad_gym.kernels.compiling.foreign import symbol_of
 from quad_gym.kernels.compiling.stages import Stage, needed_stages
 from quad_gym.kernels.single import FILTER_STAGES
 from quad_gym.packing.aids import slow_states
@@ -39,12 +40,7 @@ from quad_gym.records import (
 )
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_ENTRIES = {
-    "qg_core_predict": "quad_gym.kernels.exported:predict",
-    "qg_core_update": "quad_gym.kernels.exported:update",
-    "qg_core_start": "quad_gym.kernels.exported:start",
-    "qg_core_keep": "quad_gym.kernels.exported:keep",
-}
+_ENTRIES = tuple(f"quad_gym.kernels.exported:{n}" for n in ("predict", "update", "start", "keep"))
 _LEVEL = "quad_gym.kernels.single:start_level"
 _WINDOW = 0.5
 """Longest delay of measurements beyond the suite's `log_delays` [s], as in a replay."""
@@ -72,14 +68,10 @@ class Sources:
         self.copied = self._copied(used)
 
     @property
-    def functions(self) -> dict[str, str]:
-        """Compiled functions by their symbols in the library."""
-        level = {"qg_core_start_level": _LEVEL} if self.suite.gnss is not None else {}
-        return {
-            **_ENTRIES,
-            **level,
-            **{_symbol(stage): name for stage, name in self.stages.items()},
-        }
+    def functions(self) -> tuple[str, ...]:
+        """Names of the compiled functions in the library."""
+        level = (_LEVEL,) if self.suite.gnss is not None else ()
+        return (*self.stages.values(), *_ENTRIES, *level)
 
     @property
     def constants(self) -> dict[str, bytes]:
@@ -92,16 +84,16 @@ class Sources:
             "qg_core_first": self.first.tobytes(),
         }
 
-    def texts(self, sizes: dict[str, int]) -> dict[str, bytes]:
+    def texts(self, flash: int) -> dict[str, bytes]:
         """Return header, example, CMake file and README, by name.
 
         Args:
-            sizes: Sizes of the objects in the library, by symbol.
+            flash: Size of the library [bytes].
         """
         values = {**self._suite_values(), **self._record_values(), **self._sensor_values()}
         values |= {"POLICY_API": "", "POLICY_SOURCE": ""}
         values["IMPLEMENTATION"] = _filled("implementation.c", values)
-        values["FLASH"] = f"{sum(sizes.values()) / 1e3:.0f}"
+        values["FLASH"] = f"{flash:,}"
         files = {HEADER: "quad_gym_filter.h"} | {
             name: name for name in ("main.c", "CMakeLists.txt", "README.md")
         }
@@ -168,9 +160,12 @@ class Sources:
             _struct(f"qg_{name}_record", kind)
             for name, kind in (("sample", SAMPLE), ("measurement", MEASUREMENT), ("start", START))
         )
-        values["STAGE_DECLARATIONS"] = "\n".join(f"QGI_STAGE({_symbol(s)});" for s in self.stages)
+        values["STAGE_DECLARATIONS"] = "\n".join(
+            f"QGI_STAGE({symbol_of(name)});" for name in self.stages.values()
+        )
         values["FILL_TABLE"] = "\n".join(
-            f"    f->table[{int(s)}] = (uint64_t)(uintptr_t){_symbol(s)};" for s in self.stages
+            f"    f->table[{int(s)}] = (uint64_t)(uintptr_t){symbol_of(name)};"
+            for s, name in self.stages.items()
         )
         noise = [f"    r.{name} = NAN;" for name in NOISE_FIELDS[1:]]
         noise += [f"    r.position_sigma_I[{i}] = NAN;" for i in range(3)]
@@ -203,14 +198,14 @@ class Sources:
             "SUITE": self.label,
             "ESTIMATOR": suite.estimator.kind,
             "TARGET": TARGETS[self.target].words,
-            "COMPILER": TARGETS[self.target].compiler or "cc",
+            "BUILD": TARGETS[self.target].build,
             "TICK": repr(suite.imu.dt),
             "AVERAGES": int(suite.imu.samples == "average"),
             "LONGEST": repr(max(LONGEST_STEP, suite.imu.dt)),
             "WINDOW": repr(window),
             "EVENTS": events,
             "MEASUREMENTS": measurements,
-            "RAM": f"about {words:,}",
+            "RAM": f"{words:,}",
             "REST_SIGMA": _numbers(np.sqrt(np.diag(rest))),
             "REFERENCE": _numbers(suite.gnss.reference_antenna_G if suite.gnss else (0, 0, 0)),
             "R_IG": _numbers(engine.params["R_IG"].ravel()),
@@ -262,11 +257,6 @@ class Sources:
                 "DECLINATION": self.slow.scalars[Aid.MAGNETOMETER],
             }
         return values
-
-
-def _symbol(stage: Stage) -> str:
-    """Return the name of a stage's function in the library."""
-    return f"qg_stage_{stage.name.lower()}"
 
 
 def _numbers(values: Any) -> str:

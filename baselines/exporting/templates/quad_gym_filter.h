@@ -8,7 +8,7 @@
  * SI units. I: inertial, east, north, up, from the reference antenna; G: Earth-centered (ECEF);
  * B: body, x ahead, y left, z up. Vectors have 3 numbers. Times are time stamps with one common
  * zero. No function allocates memory; all memory of a filter is its `qg_filter`, for which a static
- * variable is the right place: @RAM@ bytes. Filters are independent of each other.
+ * variable is the right place: about @RAM@ bytes. Filters are independent of each other.
  *
  * A call that returns an error has changed nothing. */
 #ifndef QUAD_GYM_FILTER_H
