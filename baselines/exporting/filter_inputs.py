@@ -92,7 +92,7 @@ def _aid(aid: Aid) -> Input:
         (f"const double *{name}; /* {count}: {note} */", f"double {name}_sigma;"),
         _code(
             (
-                f"if (!error)",
+                "if (!error)",
                 f"    error = qgi_block(m->{name}, {count}, &r.valid[{AID_BLOCKS + aid}],",
                 f"                      r.aid_measurement[{int(aid)}]);",
                 f"if (!error && m->{name}_sigma != 0.0)",
@@ -116,7 +116,8 @@ def _camera(count: int) -> Input:
                 "for (int i = 0; !error && m->pixels && i < QG_FEATURES; i++) {",
                 "    const double *pixel = m->pixels + 2 * i;",
                 "    if (!isnan(pixel[0]) && !isnan(pixel[1]))",
-                f"        error = qgi_block(pixel, 2, &r.valid[{FEATURE_BLOCKS} + i], r.pixels[i]);",
+                f"        error = qgi_block(pixel, 2, &r.valid[{FEATURE_BLOCKS} + i],",
+                "                          r.pixels[i]);",
                 "}",
                 "if (!error && m->pixel_sigma != 0.0)",
                 "    error = qgi_noise(m->pixels, &m->pixel_sigma, 1, 1e-12, &r.pixel_sigma);",
@@ -189,6 +190,4 @@ def _gnss(has_baseline: bool, has_velocity: bool) -> Input:
     macros += ["#define QG_GNSS_BASELINE 1"] * has_baseline
     macros += ["#define QG_GNSS_VELOCITY 1"] * has_velocity
     together = " || ".join(measured)
-    return Input(
-        2, together, tuple(macros), tuple(fields), _code(take), tuple(functions)
-    )
+    return Input(2, together, tuple(macros), tuple(fields), _code(take), tuple(functions))

@@ -23,8 +23,8 @@ LIBRARY, HEADER = "libquad_gym_filter.a", "quad_gym_filter.h"
 class Target(NamedTuple):
     """A processor for which filters are exported."""
 
-    triple: str
-    cpu: str
+    processor: tuple[str, ...]
+    """triple of four parts, processor and relocation, in LLVM's words"""
     words: str
     """description"""
     build: str
@@ -39,24 +39,21 @@ _WASM = """\
 clang --target=wasm32-wasi -std=c99 -O2 main.c libquad_gym_filter.a -lm  # with the WASI SDK"""
 TARGETS = {
     "x86-64": Target(
-        "x86_64-unknown-linux-gnu",
-        "x86-64-v3",
+        ("x86_64-unknown-linux-gnu", "x86-64-v3"),
         "Linux on x86-64 with AVX2 and FMA (since 2013)",
         _CMAKE,
     ),
     "aarch64": Target(
-        "aarch64-unknown-linux-gnu",
-        "generic",
+        ("aarch64-unknown-linux-gnu", "generic"),
         "Linux on AArch64",
-        f"{_CMAKE.replace('build &&', 'build -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc &&', 1)}",
+        _CMAKE.replace("build &&", "build -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc &&", 1),
     ),
     "cortex-m7": Target(
-        "thumbv7em-none-eabihf",
-        "cortex-m7",
+        ("thumbv7em-unknown-none-eabihf", "cortex-m7", "static"),
         "Cortex-M7 with double-precision FPU, hard-float ABI",
         _BARE,
     ),
-    "wasm32": Target("wasm32-unknown-unknown", "generic", "WebAssembly", _WASM),
+    "wasm32": Target(("wasm32-unknown-unknown", "generic", "static"), "WebAssembly", _WASM),
 }
 """Processors by the names that users write."""
 
@@ -116,7 +113,7 @@ def _contents(suite: SensorSuite, label: str, target: str) -> dict[str, bytes]:
         symbol_of,
     )
 
-    sources, processor = Sources(suite, label, target), Processor(*TARGETS[target][:2])
+    sources, processor = Sources(suite, label, target), Processor(*TARGETS[target].processor)
     missing = [name for name in sources.functions if not is_cached(name, processor)]
     if missing:
         say(f"quad_gym: compiling {len(missing)} parts of the filter for {target} (once)")

@@ -47,7 +47,7 @@ _WINDOW = 0.5
 
 
 class Sources:
-    """What the files of an exported filter contain.
+    """Contents of the files of an exported filter.
 
     Args:
         suite: Sensor suite with its filter.
@@ -63,7 +63,9 @@ class Sources:
         self.slow = slow_states(suite)
         self.first = self._first()
         used = {"core", "filter", "watch"}
-        used |= ({"slow"} if self.engine.slow_states else set()) | ({"aids"} if suite.aids else set())
+        used |= ({"slow"} if self.engine.slow_states else set()) | (
+            {"aids"} if suite.aids else set()
+        )
         self.room = room_of(frozenset(used))
         self.copied = self._copied(used)
 
@@ -193,7 +195,7 @@ class Sources:
         )
         rest = state_at_rest(suite, (0.0, 0.0, 0.0), 0.0, 0.0)["covariance"]
         return {
-            "TITLE": f'State estimator: {suite.estimator.kind.upper()} of the sensor suite '
+            "TITLE": f"State estimator: {suite.estimator.kind.upper()} of the sensor suite "
             f'"{self.label}", quad_gym {quad_gym.__version__}.',
             "SUITE": self.label,
             "ESTIMATOR": suite.estimator.kind,

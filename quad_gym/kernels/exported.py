@@ -37,18 +37,14 @@ _NUMBERS = (_FLIGHT, _PARAMS, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE)
 def predict(flight, params, ticks, steps, settings, work, table, sample):
     """Propagate the estimate over the time of a sample."""
     mask = lanes_of(work).mask
-    predict_sample(
-        lanes_of(flight), params, ticks, steps, settings, work, table, mask, sample
-    )
+    predict_sample(lanes_of(flight), params, ticks, steps, settings, work, table, mask, sample)
 
 
 @entry(signature=types.none(*_NUMBERS, _MEASUREMENT))
 def update(flight, params, ticks, steps, settings, work, table, measurement):
     """Update the estimate with the measurements of an instant."""
     mask = lanes_of(work).mask
-    update_with(
-        lanes_of(flight), params, ticks, steps, settings, work, table, mask, measurement
-    )
+    update_with(lanes_of(flight), params, ticks, steps, settings, work, table, mask, measurement)
 
 
 @entry(signature=types.none(_FLIGHT, _PARAMS, _SETTINGS, _WORK, _START))

@@ -274,12 +274,26 @@ def run_tape(
         code, index, target = operations[k].code, operations[k].index, operations[k].target
         if code == _PREDICT:
             predict_sample(
-                flight, params[0], ticks[0], steps[0], settings[0], work[0], table[0], mask,
+                flight,
+                params[0],
+                ticks[0],
+                steps[0],
+                settings[0],
+                work[0],
+                table[0],
+                mask,
                 samples[index],
             )
         elif code == _UPDATE:
             update_with(
-                flight, params[0], ticks[0], steps[0], settings[0], work[0], table[0], mask,
+                flight,
+                params[0],
+                ticks[0],
+                steps[0],
+                settings[0],
+                work[0],
+                table[0],
+                mask,
                 measurements[index],
             )
             if target >= 0:

@@ -45,11 +45,13 @@ static int qgi_finite(const double *x, int n)
     return 1;
 }
 
+#ifdef QG_GNSS
 static void qgi_turn(const double m[9], const double v[3], double out[3])
 {
     for (int i = 0; i < 3; i++)
         out[i] = m[3 * i] * v[0] + m[3 * i + 1] * v[1] + m[3 * i + 2] * v[2];
 }
+#endif
 
 /* ---- one operation of the filter ---- */
 
@@ -334,6 +336,7 @@ static int qgi_block(const double *given, int n, double *valid, double *place)
     return QG_OK;
 }
 
+#ifdef QG_GNSS
 /* Scale a baseline by a power of two: its length is not used. */
 static int qgi_baseline(const double *given, double out[3])
 {
@@ -350,6 +353,7 @@ static int qgi_baseline(const double *given, double out[3])
         out[i] = ldexp(given[i], -exponent);
     return QG_OK;
 }
+#endif
 
 int qg_update(qg_filter *f, const qg_measurements *m, double time)
 {

@@ -42,6 +42,7 @@ class Processor(NamedTuple):
 
     triple: str
     cpu: str
+    reloc: str = "pic"
 
 
 class _ForeignLibrary(EntryLibrary):
@@ -175,7 +176,10 @@ def emitted(text: str, processor: Processor) -> bytes:
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     machine = llvm.Target.from_triple(processor.triple).create_target_machine(
-        cpu=processor.cpu, opt=2, reloc="pic", codemodel="small"
+        cpu=processor.cpu,
+        opt=2,
+        reloc=processor.reloc,
+        codemodel="small",
     )
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = processor.triple, str(machine.target_data)

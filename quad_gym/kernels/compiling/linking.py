@@ -163,6 +163,8 @@ with arguments that vary; together a tenth of the time that kernels take to comp
 
 
 def compiler_with(lowering: type, left_out: frozenset[str] = frozenset()) -> type:
+    """Return Numba's compiler with another lowering, and without some passes."""
+
     class Compiler(CompilerBase):  # type: ignore[misc]
         def define_pipelines(self) -> list[Any]:
             passes = DefaultPassBuilder.define_nopython_pipeline(self.state)

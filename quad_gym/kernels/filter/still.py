@@ -7,8 +7,15 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import apply_transposed, load3, load33, multiply, store3, store33
-from quad_gym.kernels.maths.linalg import sub
+from quad_gym.kernels.maths.linalg import (
+    apply_transposed,
+    load3,
+    load33,
+    multiply,
+    store3,
+    store33,
+    sub,
+)
 
 _R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
 
@@ -39,7 +46,11 @@ def start_still(s):
     G[_E + 2, n] = -bend * k[0] * k[1]
     for j in range(n + 1):  # r = antenna - R^T l
         a, b, c = G[_E, j], G[_E + 1, j], G[_E + 2, j]
-        arm = (lever[1] * c - lever[2] * b, lever[2] * a - lever[0] * c, lever[0] * b - lever[1] * a)
+        arm = (
+            lever[1] * c - lever[2] * b,
+            lever[2] * a - lever[0] * c,
+            lever[0] * b - lever[1] * a,
+        )
         moved = apply_transposed(R_BI, arm)
         for i in range(3):
             G[_R + i, j] = moved[i]
