@@ -156,8 +156,9 @@ def _gnss(field: str, block: int) -> Computed:
     """A vector that GNSS measures, turned from G to I."""
 
     def of(batch: "FlightBatch", flights: Flights) -> Floats:
-        measured = _measured(batch, flights)[:, block, np.newaxis]
-        return np.where(measured, batch.record(field, flights) @ batch.R_IG.T, np.nan)
+        x, y, z = batch.record(field, flights).T  # each sum in one order, in batches of any size
+        turned = [row[0] * x + row[1] * y + row[2] * z for row in batch.R_IG]
+        return np.where(_measured(batch, flights)[:, block], turned, np.nan).T
 
     return of
 

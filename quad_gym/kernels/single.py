@@ -18,16 +18,7 @@ from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.still import start_still
 from quad_gym.kernels.filter.wahba import wahba
-from quad_gym.kernels.maths.linalg import (
-    add_outer,
-    load3,
-    load4,
-    load33,
-    scale,
-    scale33,
-    store3,
-    store33,
-)
+from quad_gym.kernels.maths.linalg import diagonal, load3, load4, load33, outer, store
 from quad_gym.kernels.sensors import camera
 from quad_gym.kernels.sensors.gnss import measure_gnss
 from quad_gym.kernels.sensors.gnss_position import drift_gnss
@@ -216,45 +207,35 @@ def integrate_flight(flights, params, substeps):
 @_entry(_MATRIX, *[_VECTOR] * 4, _PARAMS, _VECTOR, _VECTOR)
 def body_accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, params, a_I, dw_B):
     """Write the acceleration in I and the angular acceleration in B."""
-    a, dw = accelerations(
-        load33(R_BI), load3(v_I), load3(w_B), load4(rotor_speeds), load3(d_I), params[0]
-    )
-    store3(a_I, a)
-    store3(dw_B, dw)
+    R, W = load33(R_BI), load4(rotor_speeds)
+    a, dw = accelerations(R, load3(v_I), load3(w_B), W, load3(d_I), params[0])
+    store(a_I, a)
+    store(dw_B, dw)
 
 
 @_entry(_VECTOR, _MATRIX, *[_VECTOR] * 4, _PARAMS, _SETTINGS, _VECTOR, _VECTOR)
 def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, settings, a_I, dw_B):
     """Write the acceleration in I and the angular acceleration in B in moving air."""
-    a, dw = accelerations_in_air(
-        load3(r_I),
-        load33(R_BI),
-        load3(v_I),
-        load3(w_B),
-        load4(rotor_speeds),
-        load3(d_I),
-        load3(params[0].wind_I),
-        params[0],
-        settings[0],
-    )
-    store3(a_I, a)
-    store3(dw_B, dw)
+    r, R, v, w, W = load3(r_I), load33(R_BI), load3(v_I), load3(w_B), load4(rotor_speeds)
+    p, d, wind = params[0], load3(d_I), load3(params[0].wind_I)
+    a, dw = accelerations_in_air(r, R, v, w, W, d, wind, p, settings[0])
+    store(a_I, a)
+    store(dw_B, dw)
 
 
 @_entry(_VECTOR, _MATRIX, _MATRIX, _MATRIX, returns=types.float64)
 def wahba_of_vectors(weights, v_I, v_B, R_BI):
     """Write the solution of Wahba's problem for (n, 3) vectors; return its uniqueness."""
-    zeros = (0.0, 0.0, 0.0)
-    profile = (zeros, zeros, zeros)
+    profile = diagonal((0.0, 0.0, 0.0))
     for i in range(len(weights)):
-        profile = add_outer(profile, scale(weights[i], load3(v_B[i])), load3(v_I[i]))
+        profile = profile + outer(weights[i] * load3(v_B[i]), load3(v_I[i]))
     # only ratios matter: scale the largest entry to one, to avoid under- and overflow
     largest = 0.0
     for i in range(3):
         for j in range(3):
             largest = max(largest, abs(profile[i][j]))
     if largest > 0.0:
-        profile = scale33(1.0 / largest, profile)
+        profile = (1.0 / largest) * profile
     rotation, uniqueness = wahba(profile)
-    store33(R_BI, rotation)
+    store(R_BI, rotation)
     return uniqueness

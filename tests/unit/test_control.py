@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.maths.linalg import load3, load4, scale, store4
+from quad_gym.kernels.maths.linalg import load3, load4, store
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.control import act, allocate
 from quad_gym.packing.flight import params_block, params_record
@@ -29,7 +29,7 @@ def allocate_all(demands, params, voltages):
     for i in range(len(demands)):
         demand = demands[i]
         torque = (demand[1], demand[2], demand[3])
-        store4(voltages[i], allocate(demand[0], torque, params[0]))
+        store(voltages[i], allocate(demand[0], torque, params[0]))
 
 
 @entry
@@ -42,8 +42,8 @@ def act_on_floats(flights, params, mode, ref):
 def act_on_lanes(blocks, params, mode, ref):
     flight = lanes_of(blocks[0])
     one = 1.0 + 0.0 * flight.tick
-    r_ref, v_ref = scale(one, load3(ref[0])), scale(one, load3(ref[1]))
-    reference = (r_ref, v_ref, scale(one, load3(ref[2])), scale(one, load3(ref[3])))
+    r_ref, v_ref = one * load3(ref[0]), one * load3(ref[1])
+    reference = (r_ref, v_ref, one * load3(ref[2]), one * load3(ref[3]))
     act(flight, load4(flight.action), lanes_of(params[0]), mode, reference)
 
 

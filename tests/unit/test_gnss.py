@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.frames import ecef_to_enu
-from quad_gym.kernels.maths.linalg import load3, store3
+from quad_gym.kernels.maths.linalg import load3, store
 from quad_gym.kernels.sensors.gnss_baseline import noisy_baseline
 from quad_gym.sensors import GnssReceiver
 from tests.unit.alarms import assert_normal
@@ -27,7 +27,7 @@ directions = (
 
 
 def measure_baseline(f, option):
-    store3(f.measured, noisy_baseline(load3(f.r_b), load3(f.normals), f.sigma_b, f.floor, f.length))
+    store(f.measured, noisy_baseline(load3(f.r_b), load3(f.normals), f.sigma_b, f.floor, f.length))
 
 
 kernels = Compiled(

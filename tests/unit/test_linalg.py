@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from quad_gym.kernels.maths import linalg
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
-from quad_gym.kernels.maths.linalg import load3, load33, store3, store33
+from quad_gym.kernels.maths.linalg import load3, load33, store
 from quad_gym.kernels.maths.vectors import outer
 from tests.unit.compiled import Compiled
 
@@ -23,15 +23,15 @@ def factor_and_solve(f, n):
 
 def small(f, option):
     u, v, m = load3(f.u), load3(f.v), load33(f.m)
-    store3(f.vectors[0], linalg.cross(u, v))
-    store3(f.vectors[1], linalg.apply(m, u))
-    store3(f.vectors[2], linalg.apply_transposed(m, u))
-    store3(f.vectors[3], linalg.unit_or(u, v))
-    store3(f.vectors[4], linalg.sub(linalg.add(u, v), linalg.scale(2.0, v)))
-    store33(f.matrices[0], linalg.multiply(m, linalg.transpose(m)))
-    store33(f.matrices[1], outer(u, v) - outer(v, u))
-    store33(f.matrices[2], linalg.add_to_diagonal(linalg.scale33(2.0, m), 3.0))
-    store33(f.matrices[3], linalg.add33(m, linalg.add_outer(m, u, u)))
+    store(f.vectors[0], linalg.cross(u, v))
+    store(f.vectors[1], m @ u)
+    store(f.vectors[2], m.T @ u)
+    store(f.vectors[3], linalg.unit_or(u, v))
+    store(f.vectors[4], u + v - 2.0 * v)
+    store(f.matrices[0], m @ m.T)
+    store(f.matrices[1], outer(u, v) - outer(v, u))
+    store(f.matrices[2], linalg.add_to_diagonal(2.0 * m, 3.0))
+    store(f.matrices[3], m + (m + outer(u, u)))
     f.dot, f.norm = linalg.dot(u, v), linalg.norm(u)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.maths.linalg import store3
+from quad_gym.kernels.maths.linalg import store
 from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.task.episode import draw_reference
@@ -35,11 +35,11 @@ def evaluate_on_floats(flights, times, out):
     for i in range(len(flights)):
         for k in range(len(times)):
             r, v, a, x = evaluate_reference(flights[i], times[k])
-            store3(out[i, k, 0], r)
-            store3(out[i, k, 1], v)
-            store3(out[i, k, 2], a)
-            store3(out[i, k, 3], x)
-            store3(out[i, k, 4], position_on_reference(flights[i], times[k]))
+            store(out[i, k, 0], r)
+            store(out[i, k, 1], v)
+            store(out[i, k, 2], a)
+            store(out[i, k, 3], x)
+            store(out[i, k, 4], position_on_reference(flights[i], times[k]))
 
 
 def evaluated(flights, times):

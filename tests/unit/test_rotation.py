@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from quad_gym import rotations
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.linalg import load3, store3, store4, store33
+from quad_gym.kernels.maths.linalg import load3, store
 from quad_gym.kernels.maths.rotation import (
     dcm_to_quaternion,
     euler_to_dcm,
@@ -23,31 +23,31 @@ from tests.unit.compiled import Compiled
 
 @kernel
 def store_rows(array, matrix):
-    """Like `store33` for a matrix some of whose entries are plain zeros."""
-    store3(array[0], matrix[0])
-    store3(array[1], matrix[1])
-    store3(array[2], matrix[2])
+    """Like `store` for a matrix some of whose entries are plain zeros."""
+    store(array[0], matrix[0])
+    store(array[1], matrix[1])
+    store(array[2], matrix[2])
 
 
 def attitude(f, option):
     e = load3(f.e)
     R_BI = euler_to_dcm(e)
-    store33(f.R, R_BI)
+    store(f.R, R_BI)
     q = dcm_to_quaternion(R_BI)
-    store4(f.q, q)
-    store33(f.R_again, quaternion_to_dcm(q))
-    store4(f.q_rate, quaternion_rate(q, load3(f.w)))
+    store(f.q, q)
+    store(f.R_again, quaternion_to_dcm(q))
+    store(f.q_rate, quaternion_rate(q, load3(f.w)))
     even, odd, parts = split_rotation(e)
     store_rows(f.even, even)
     store_rows(f.odd, odd)
-    store4(f.parts, parts)
+    store(f.parts, parts)
     x, d = load3(f.x), load3(f.d)
     there = turn_pair(even, odd, x, d)
-    store3(f.pair[0], there[0])
-    store3(f.pair[1], there[1])
+    store(f.pair[0], there[0])
+    store(f.pair[1], there[1])
     back = turn_pair_back(even, odd, x, d)
-    store3(f.pair_back[0], back[0])
-    store3(f.pair_back[1], back[1])
+    store(f.pair_back[0], back[0])
+    store(f.pair_back[1], back[1])
 
 
 FIELDS = {"e": (3,), "w": (3,), "q": (4,), "q_rate": (4,), "parts": (4,), "x": (3,), "d": (3,)}

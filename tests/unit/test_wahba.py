@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from quad_gym.estimation import solve_wahba
 from quad_gym.kernels.filter.wahba import wahba
-from quad_gym.kernels.maths.linalg import load33, store33
+from quad_gym.kernels.maths.linalg import load33, store
 from quad_gym.rotations import euler_to_dcm
 from tests.unit.compiled import Compiled
 
@@ -150,7 +150,7 @@ def test_bad_input_is_refused_by_name(name, weights, v_I, v_B):
 
 def solve(f, option):
     R_BI, f.uniqueness = wahba(load33(f.B))
-    store33(f.R, R_BI)
+    store(f.R, R_BI)
 
 
 compiled = Compiled(solve, B=(3, 3), R=(3, 3), uniqueness=())

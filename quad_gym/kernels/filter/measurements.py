@@ -5,6 +5,8 @@ The stacked measurement has three rows for each block that any lane has measured
 with an `Act` and an argument. The filter accesses sensors by these calls only.
 """
 
+import numpy as np
+
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import (
@@ -12,13 +14,13 @@ from quad_gym.records import (
     FIRST_BLOCK,
     SENSORS,
     Act,
+    FilterStatus,
     GateDecision,
     Sensor,
 )
 
 ACTS = len(Act)
-_FIRST = int(Stage[Sensor(0).name])
-_FAILED = float(GateDecision.FAILED)
+_FIRST = Stage[Sensor(0).name].value
 _NUMBERS = tuple(map(float, BLOCK_NUMBERS))
 
 for _sensor in Sensor:  # their stages are in the same order
@@ -129,4 +131,12 @@ def mark_failed(flight, settings, failed):
         first = FIRST_BLOCK[sensor]
         for block in range(first, first + settings.sensor_blocks[sensor]):
             lost = failed & (flight.block_valid[block] > 0.0)
-            flight.gate[block] = select(lost, _FAILED, flight.gate[block])
+            flight.gate[block] = select(lost, GateDecision.FAILED, flight.gate[block])
+
+
+@kernel
+def flag_failure(flight, failed):
+    """Flag an update that failed."""
+    status = flight.filter_status
+    failure = np.uint64(FilterStatus.UPDATE_FAILED.value)
+    flight.filter_status = select(failed, status | failure, status)

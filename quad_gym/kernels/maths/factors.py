@@ -4,7 +4,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import load_block, load_column3, store_block
+from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block
 from quad_gym.kernels.maths.vectors import outer
 from quad_gym.kernels.simd.lanes import select
 

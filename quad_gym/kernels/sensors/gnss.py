@@ -2,7 +2,7 @@
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import keep3, load4
+from quad_gym.kernels.maths.linalg import keep, load4
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors import gnss_baseline, gnss_position, gnss_velocity
@@ -35,7 +35,7 @@ _GNSS = int(Sensor.GNSS)
 def _begin(flight, p, settings, mask):
     share, _ = uniform_pair(stream_of(flight), DRAW_PHASE)
     begin_clock(flight, settings, _GNSS, share, mask)
-    keep3(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
+    keep(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
 
 
 @kernel
@@ -72,7 +72,8 @@ def _flag(flags, mask, position, baseline, settings):
 @kernel
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Measure when due, and at the start for the initialization of the filter."""
-    due, delayed = tick_clock(flight, settings, _GNSS, mask), settings.sensor_delay[_GNSS] > 0
+    due = tick_clock(flight, settings, _GNSS, mask)
+    delayed, period = settings.sensor_delay[_GNSS] > 0, settings.sensor_ticks[_GNSS]
     arrives = find_arrivals(flight, work, settings, _GNSS, mask)
     if not starting and not any_of(due | arrives):
         nothing = 0.0 * flight.tick
@@ -83,7 +84,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         keep_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3)
         keep_arrived(work, VELOCITY_BLOCK, flight.gnss_velocity, 3)
     if settings.gnss_drifts > 0 and not starting and any_of(due):
-        share = minimum(flight.tick / settings.sensor_ticks[_GNSS], 1.0)
+        share = minimum(flight.tick / period, 1.0)
         gnss_position.drift_gnss(flight, p, due, share)
     measured = mask if starting else due
     paired = measured
@@ -96,11 +97,11 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         paired = paired & logical_not(measured)
     unpaired = measured & logical_not(paired)
     if starting or not delayed:
-        fresh = measured & (settings.sensor_ticks[_GNSS] > 0)
+        fresh = measured & (period > 0)
         one = 1.0 + 0.0 * flight.tick
         _flag(flight.block_fresh, fresh, one, select(unpaired, 0.0, one), settings)
     if starting and settings.reuse_first_fix == 0 and not settings.warm:
-        due = due & (settings.sensor_ticks[_GNSS] < 0)  # none
+        due = due & (period < 0)  # none
     valid = select(due & measured, 1.0, 0.0)
     _flag(flight.block_valid, mask, valid, select(unpaired, 0.0, valid), settings)
     if delayed:

@@ -8,7 +8,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import exp, sin_cos
-from quad_gym.kernels.maths.linalg import load3, load33, multiply, norm, store33
+from quad_gym.kernels.maths.linalg import load3, load33, norm, store
 from quad_gym.kernels.maths.rotation import euler_to_dcm
 from quad_gym.records import COLUMNS, FIXED
 
@@ -126,8 +126,7 @@ def _derive_sensors(own, nominal, settings):
     own.baseline_length = norm(load3(own.baseline))
     k, kinds = _CAMERA_ROTATION, settings.draw_kind
     if kinds[k] != FIXED or kinds[k + 1] != FIXED or kinds[k + 2] != FIXED:
-        turned = multiply(euler_to_dcm(load3(own.camera_rotation)), load33(nominal.R_CB))
-        store33(own.R_CB, turned)
+        store(own.R_CB, euler_to_dcm(load3(own.camera_rotation)) @ load33(nominal.R_CB))
     if kinds[_FOCAL_LENGTH] != FIXED:
         own.blur = nominal.blur * (own.focal_length / nominal.focal_length)
 
@@ -136,10 +135,7 @@ def _derive_sensors(own, nominal, settings):
 def derive(own, nominal, settings):
     """Derive the parameters of flights from the drawn ones.
 
-    Args:
-        own: Parameters that begin with the drawn ones; the others are initially equal to `nominal`.
-        nominal: Parameters without draws.
-        settings: Kinds of draws; FIXED where nothing is drawn.
+    `own` begins with the drawn ones; the others are initially equal to the ones in `nominal`.
     """
     _derive_body(own, nominal, settings)
     _derive_air(own, nominal, settings)
