@@ -7,15 +7,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import (
-    apply_transposed,
-    load3,
-    load33,
-    multiply,
-    store3,
-    store33,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import cross, load3, load33, store, vector
 
 _R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
 
@@ -32,9 +24,9 @@ def start_still(s):
             e[i, j] = 0.0
     sine, cosine = sin_cos(s.heading)
     level = ((cosine, sine, 0.0), (-sine, cosine, 0.0), (0.0, 0.0, 1.0))
-    R_BI, lever = multiply(load33(T), level), load3(s.lever_B)
-    store33(s.R_BI, R_BI)
-    store3(s.position, sub(load3(s.antenna_I), apply_transposed(R_BI, lever)))
+    R_BI, lever = load33(T) @ level, load3(s.lever_B)
+    store(s.R_BI, R_BI)
+    store(s.position, load3(s.antenna_I) - R_BI.T @ lever)
     _error_angles(s, e, T, n)
     for j in range(n + 1):
         e_x, e_y, e_z = e[0, j], e[1, j], e[2, j]
@@ -45,13 +37,8 @@ def start_still(s):
     G[_E, n], G[_E + 1, n] = bend * k[1] * k[2], -bend * k[0] * k[2]
     G[_E + 2, n] = -bend * k[0] * k[1]
     for j in range(n + 1):  # r = antenna - R^T l
-        a, b, c = G[_E, j], G[_E + 1, j], G[_E + 2, j]
-        arm = (
-            lever[1] * c - lever[2] * b,
-            lever[2] * a - lever[0] * c,
-            lever[0] * b - lever[1] * a,
-        )
-        moved = apply_transposed(R_BI, arm)
+        e_j = vector(G[_E, j], G[_E + 1, j], G[_E + 2, j])
+        moved = R_BI.T @ cross(lever, e_j)
         for i in range(3):
             G[_R + i, j] = moved[i]
     for i in range(3):
