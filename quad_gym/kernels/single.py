@@ -14,7 +14,7 @@ from numba.np.numpy_support import from_dtype
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.align import initialize
-from quad_gym.kernels.filter.innovations import forget_innovations
+from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.still import start_still
 from quad_gym.kernels.filter.wahba import wahba
@@ -53,21 +53,10 @@ FILTER_ENTRIES = (f"{__name__}:start_filter", "quad_gym.kernels.tape:run_tape")
 SENSORS_AND_VEHICLE = tuple(
     f"{__name__}:{name}"
     for name in (
-        "sense_features",
-        "sense_gnss",
-        "body_accelerations_in_air",
-        "integrate_flight",
-        "sense_imu_average",
-        "sense_imu",
-        "body_accelerations",
-        "start_level",
-        "wahba_of_vectors",
-        "step_biases",
-        "step_gnss_drift",
-        "draw_sensor_errors",
-        "disturb_imu",
-        "turn_gnss_baseline",
-        "limit_features",
+        *("sense_features", "sense_gnss", "body_accelerations_in_air", "integrate_flight"),
+        *("sense_imu_average", "sense_imu", "body_accelerations", "start_level"),
+        *("wahba_of_vectors", "step_biases", "step_gnss_drift", "draw_sensor_errors"),
+        *("disturb_imu", "turn_gnss_baseline", "limit_features"),
     )
 )
 """Names of the other entries of this module, the slowest to compile first."""
@@ -117,15 +106,9 @@ def start_level(start):
     types.int64,
 )
 def run_stage(address, pitch, count, number, world, model, settings, work, table, flag):
-    """Run a stage of the table once for every block, where `work.mask`.
+    """Run a stage of the table, its number, once for every block, where `work.mask`.
 
-    Args:
-        address: Address of the first block, as in `Call`.
-        pitch: Bytes from one block to the next.
-        count: Number of blocks.
-        number: A `Stage`.
-        world, model, settings, work, table: As for `fly`.
-        flag: The stage's flag.
+    The first block is at `address`; each next one is `pitch` bytes further.
     """
     true, believed = lanes_of(world[0]), lanes_of(model[0])
     scratch = lanes_of(work[0])

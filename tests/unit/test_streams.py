@@ -103,7 +103,7 @@ def draws_of_call(name, function, call):
     source, values = ast.unparse(call.args[1]), {}
     for variable, end in loops_around(function, call):
         values[variable] = range(LARGEST.get(end) or eval(end, scope))
-    if "_draw_of(k)" in source:
+    if "_draw_of(k" in source:
         values["k"] = FAULTS
         assert len(values) == 1  # so that the places of kinds are told apart
     elif name.endswith("sensors.aid"):  # of sensor s, or of the slow state k

@@ -27,9 +27,6 @@ _NO_CODE = {f"{__package__}.{name}" for name in ("cache", "cores", "digest", "wo
 """Modules that determine when code is compiled, but do not change the code."""
 
 
-# ---- modules ---------------------------------------------------------------------------------
-
-
 def digest_of(module: str) -> str:
     """Digest of an imported module and of all modules that it imports, directly or not.
 
@@ -129,9 +126,6 @@ def _known_sources() -> dict[str, tuple[str, list[str]]]:
                 temporary.replace(file)
 
     return known
-
-
-# ---- functions -------------------------------------------------------------------------------
 
 
 def digest_of_function(function: Callable[..., Any]) -> str:

@@ -126,43 +126,28 @@ def _with(*names: str) -> Callable[[Any], bool]:
     return lambda settings: all(settings[name] > 0 for name in names)
 
 
+def _filter_and(needed: Callable[[Any], Any]) -> Callable[[Any], bool]:
+    """Make a test of settings: there is a filter, and `needed`."""
+    return lambda settings: bool(settings["run_filter"] and needed(settings))
+
+
 _always, _filter, _faults = _with(), _with("run_filter"), _with("faults")
 _corrupts, _air = _with("run_filter", "faults"), _with("air")
 _late, _slow = _with("run_filter", "late"), _with("run_filter", "slow_states")
 _REWINDS = ("run_filter", "late", "rewinds")
 _grounded, _contacts, _drawn = _with("grounded"), _with("contacts"), _with("randomized")
-
-
-def _pad(s: Any) -> bool:
-    return bool(s["pad"]) and not _grounded(s)
-
-
-def _keeps_start(s: Any) -> bool:
-    return bool(_pad(s) or _grounded(s) or (_filter(s) and s["imu_averages"]))
-
-
-def _imu_disturbed(s: Any) -> bool:
-    return _filter(s) and bool(s["imu_errs"] or s["imu_vibrates"])
-
-
-def _has_constant_errors(s: Any) -> bool:
-    return _filter(s) and bool(s["imu_errs"] or s["heading_errs"])
-
-
-def _watches(s: Any) -> bool:
-    return _filter(s) and bool(int(s["form"]) & (FilterForm.GATE | FilterForm.INNOVATIONS))
-
-
-def _observes_measurements(s: Any) -> bool:
-    return _filter(s) and bool(s["layout"] == Layout.MEASUREMENTS)
-
-
-def _hides(s: Any) -> bool:
-    return _sensor(Sensor.CAMERA)(s) and bool(s["obstacle_count"])
+_MONITORED = FilterForm.GATE | FilterForm.INNOVATIONS
 
 
 def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
-    return lambda s: _filter(s) and bool(s["sensor_blocks"][sensor])
+    return _filter_and(lambda s: s["sensor_blocks"][sensor])
+
+
+_camera = _sensor(Sensor.CAMERA)
+
+
+def _keeps_start(s: Any) -> bool:
+    return bool(s["pad"] or s["grounded"] or (s["run_filter"] and s["imu_averages"]))
 
 
 def _sensor_source(sensor: Sensor) -> Kernel:
@@ -202,16 +187,22 @@ SOURCES = (
     _stage("task.reward_and_endings:judge", _always),
     _stage("sensors.imu:drift_biases", _filter),
     _stage("task.follow:follow", lambda s: bool(s["harmonics"] == FOLLOWED), "path"),
-    _stage("vehicle.pad:rest_on_pad", _pad),
+    _stage("vehicle.pad:rest_on_pad", lambda s: bool(s["pad"] and not s["grounded"])),
     _stage("vehicle.pad:keep_start", _keeps_start),
     _stage("vehicle.air:supply", lambda s: s["supply"] != Supply.NOMINAL),
     _stage("filter.preintegration:begin_late", _late, "late"),
-    _stage("sensors.imperfect:begin_imperfect", _has_constant_errors, "errors"),
-    _stage("sensors.imperfect:disturb_imu", _imu_disturbed),
+    _stage(
+        "sensors.imperfect:begin_imperfect",
+        _filter_and(lambda s: s["imu_errs"] or s["heading_errs"]),
+        "errors",
+    ),
+    _stage(
+        "sensors.imperfect:disturb_imu", _filter_and(lambda s: s["imu_errs"] or s["imu_vibrates"])
+    ),
     _stage("sensors.imperfect:turn_baseline", _with("run_filter", "heading_errs")),
     _stage("sensors.imperfect:limit_camera", _with("run_filter", "camera_limited")),
     _stage("vehicle.delay:delay_action", _with("action_delays"), "actions"),
-    _stage("obstacles.sight:hide_features", _hides),
+    _stage("obstacles.sight:hide_features", lambda s: _camera(s) and bool(s["obstacle_count"])),
     _stage("obstacles.contact:begin_contacts", _contacts),
     _stage("obstacles.contact:touch", _contacts, "contacts"),
     _stage("obstacles.contact:judge_contacts", _contacts),
@@ -221,8 +212,12 @@ SOURCES = (
     _stage("vehicle.ground:judge_landing", _grounded),
     _stage("sensors.faults:saturate_imu", _corrupts),
     _stage("sensors.faults:meet_rotors", _faults),
-    _stage("sensors.imu:sum_imu", _observes_measurements, "raw"),
-    _stage("filter.align:forget_innovations", _watches, "watch"),
+    _stage("sensors.imu:sum_imu", _filter_and(lambda s: s["layout"] == Layout.MEASUREMENTS), "raw"),
+    _stage(
+        "filter.align:forget_innovations",
+        _filter_and(lambda s: int(s["form"]) & _MONITORED),
+        "watch",
+    ),
 )
 """Every function of a stage, the longest to compile first. A slot with several functions gets the
 first one that is needed."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
-from quad_gym.kernels.filter.innovations import forget_innovations
+from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.wahba import wahba

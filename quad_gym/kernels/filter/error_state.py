@@ -16,7 +16,13 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block, store_column3
+from quad_gym.kernels.maths.matrices import (
+    load_block,
+    load_column3,
+    store_block,
+    store_column3,
+    sum_of_outers,
+)
 
 R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
 """First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
@@ -34,6 +40,14 @@ def reset_matrix(m):
         (zero, zero + 1.0, s_phi),
         (s_th, zero, c_phi * c_th),
     )
+
+
+@kernel
+def put_covariance(P, L, factor):
+    """P <- factor L L^T, in the lower triangle by blocks of three."""
+    for i in range(0, D, 3):
+        for j in range(0, i + 3, 3):
+            store_block(P, i, j, factor * sum_of_outers(L, i, L, j, j + 3))
 
 
 @kernel

@@ -6,6 +6,9 @@ degrees of freedom: its innovation is taken across the predicted direction, as t
 vector carries no information. A block whose normalized innovation squared (NIS), chi-square in a
 consistent filter, lies beyond the gate is masked as if it had not been measured.
 
+Where a group of measurements has been rejected `max_rejections` times in a row, the filter is more
+likely wrong than the sensor, see `recovery.py`.
+
 Source: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
 Navigation, 2001, section 5.4.
 """
@@ -15,12 +18,14 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.recovery import follow_drift
+from quad_gym.kernels.filter.measurements import call_measured
+from quad_gym.kernels.filter.recovery import follow_drift, follow_ratio, forget_corrections
 from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or
 from quad_gym.kernels.maths.matrices import load_block, sum_of_outers_of_rows
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import logical_not, select
-from quad_gym.records import FilterForm, GateDecision
+from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, Act, FilterForm, GateDecision
 
 
 @kernel
@@ -178,3 +183,37 @@ def mask_rejected(flight, work, settings, k, group, valid, rejected, numbers):
         work.left_out = work.left_out + select(rejected, numbers, 0.0)
     else:
         accept_group(flight, group, valid)
+
+
+MONITORED = int(FilterForm.GATE | FilterForm.INNOVATIONS)
+"""Bits of a `FilterForm` with which innovations are stored, and the filter is monitored."""
+
+
+@kernel
+def gate_innovations(flight, p, work, settings, stages, mask, again):
+    """Store the innovations of the present measurements and mask those beyond the gate.
+
+    Where measurements are processed in steps, the first step decides for all: `again` are the lanes
+    in a later step. On return, work.left_out counts the masked numbers of each lane.
+    """
+    zero = 0.0 * p.sigma_beta
+    work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
+    work.judged_nis, work.judged_freedoms, work.left_out = zero, zero, zero
+    call_measured(flight, p, work, settings, stages, Act.GATE)
+    first = mask & (work.measured > 0.0) & logical_not(again)
+    follow_ratio(flight, p, work.judged_nis, work.judged_freedoms, first)
+
+
+@kernel
+def forget_innovations(flight, feature_count, mask):
+    """Reset the innovations at the start of an episode, in the lanes `mask`."""
+    blocks, none = FEATURE_BLOCKS + feature_count, (np.nan, np.nan, np.nan)
+    for k in range(blocks + AIDS):
+        s = k if k < blocks else k - blocks + AID_BLOCKS
+        flight.block_nis[s] = select(mask, np.nan, flight.block_nis[s])
+        flight.gate[s] = select(mask, 0.0, flight.gate[s])
+        flight.rejections[s] = select(mask, 0.0, flight.rejections[s])
+        keep(flight.innovation[s], mask, none)
+        keep(flight.innovation_sigma[s], mask, none)
+    forget_corrections(flight, mask)
+    reset(flight, mask, 0.0, "rejected_in_row reopened")

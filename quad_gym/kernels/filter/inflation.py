@@ -29,7 +29,7 @@ Source: ours.
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covariance
 from quad_gym.kernels.filter.jumps import (
     drifts_suddenly,
     forget_drift_corrections,
@@ -51,11 +51,11 @@ from quad_gym.kernels.filter.recovery import (
     raise_variance,
     variance_of,
 )
-from quad_gym.kernels.filter.slow import fill_slow, keep_slow_factor
+from quad_gym.kernels.filter.slow import fill_slow, keep_factor
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import diagonal, dot, load33, outer
-from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_outers
+from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import (
@@ -128,7 +128,7 @@ def bound_inflation(flight, P, inflated, states):
     lanes in which it was inflated.
     """
     R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
-    k = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+    k = R_BI.T[2]
     heading = dot(k, P_ee @ k)
     both = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)
     tilted = _share(both, MOST_TILT, inflated)
@@ -183,10 +183,8 @@ def inflate(flight, p, work, settings, mask, slow, stages):
     if not any_of(alarmed):
         return
 
-    L, P, factor = flight.L, work.P, select(inflated, _FACTOR, 1.0)
-    for i in range(0, 15, 3):
-        for j in range(0, i + 3, 3):
-            store_block(P, i, j, factor * sum_of_outers(L, i, L, j, j + 3))
+    P = work.P
+    put_covariance(P, flight.L, select(inflated, _FACTOR, 1.0))
     states = 15
     if slow is not None:
         states = 15 + slow.slow_states
@@ -202,11 +200,7 @@ def inflate(flight, p, work, settings, mask, slow, stages):
             inflate_position_and_drift(flight, P, moved)
 
     ok = alarmed & (cholesky(P, states, work.inverse_diagonal) > 0.0)
-    for i in range(15):
-        for j in range(i + 1):
-            L[i, j] = select(ok, P[i, j], L[i, j])
-    if slow is not None:
-        keep_slow_factor(flight, slow, work, ok)
+    keep_factor(flight, slow, work, ok)
     failed = alarmed & logical_not(ok)
     flag_failure(flight, failed)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)

@@ -13,7 +13,13 @@ Source: ours.
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.recovery import MOST_POSITION, enlarge, raise_variance, variance_of
+from quad_gym.kernels.filter.recovery import (
+    MOST_POSITION,
+    add_correction,
+    enlarge,
+    raise_variance,
+    variance_of,
+)
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
@@ -35,16 +41,13 @@ def follow_drift_corrections(flight, p, L9, dx, columns, ok):
     L9 is the updated factor, last column first; the record still has the factor before.
     """
     kept = maximum(1.0 - (flight.tick - flight.corrected_tick) * p.dt / _TIME, 0.0)
+    sums, variances = flight.drift_corrected, flight.drift_corrected_variance
     for i in range(3):
-        variance = 0.0 * kept
+        removed = 0.0 * kept
         for j in range(columns):
             before, after = flight.L_slow[i, j], L9[D + i, j]
-            variance = variance + before * before - after * after
-        before, total = flight.drift_corrected[i], kept * flight.drift_corrected[i] + dx[D + i]
-        flight.drift_corrected[i] = select(ok, total, before)
-        before = flight.drift_corrected_variance[i]
-        variance = kept * kept * before + maximum(variance, 0.0)
-        flight.drift_corrected_variance[i] = select(ok, variance, before)
+            removed = removed + before * before - after * after
+        add_correction(sums, variances, i, ok, kept, dx[D + i], maximum(removed, 0.0))
 
 
 @kernel

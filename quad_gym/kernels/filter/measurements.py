@@ -12,6 +12,7 @@ from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import (
     BLOCK_NUMBERS,
     FIRST_BLOCK,
+    MAX_BLOCKS,
     SENSORS,
     Act,
     FilterStatus,
@@ -25,9 +26,6 @@ _NUMBERS = tuple(map(float, BLOCK_NUMBERS))
 
 for _sensor in Sensor:  # their stages are in the same order
     assert Stage[_sensor.name] == _FIRST + _sensor
-
-
-# ---- calls -----------------------------------------------------------------------------------
 
 
 @kernel
@@ -59,9 +57,6 @@ def call_measured(flight, p, work, settings, stages, act):
             k += rows
 
 
-# ---- validity --------------------------------------------------------------------------------
-
-
 @kernel
 def _rows_of(flight, settings, sensor):
     """Count the rows of a sensor in the stacked measurement."""
@@ -90,10 +85,8 @@ def count_measured(flight, work, settings):
 @kernel
 def store_valid(flight, work, settings):
     """Store the validity of all blocks, to update with one delayed sensor after the other."""
-    for sensor in range(SENSORS):
-        first = FIRST_BLOCK[sensor]
-        for block in range(first, first + settings.sensor_blocks[sensor]):
-            work.kept_valid[block] = flight.block_valid[block]
+    for block in range(MAX_BLOCKS):
+        work.kept_valid[block] = flight.block_valid[block]
 
 
 @kernel
@@ -118,20 +111,16 @@ def choose_valid(flight, work, settings, turn):
 @kernel
 def restore_valid(flight, work, settings):
     """Restore the stored validity of all blocks."""
-    for sensor in range(SENSORS):
-        first = FIRST_BLOCK[sensor]
-        for block in range(first, first + settings.sensor_blocks[sensor]):
-            flight.block_valid[block] = work.kept_valid[block]
+    for block in range(MAX_BLOCKS):
+        flight.block_valid[block] = work.kept_valid[block]
 
 
 @kernel
-def mark_failed(flight, settings, failed):
+def mark_failed(flight, failed):
     """Mark the valid blocks of an update that failed."""
-    for sensor in range(SENSORS):
-        first = FIRST_BLOCK[sensor]
-        for block in range(first, first + settings.sensor_blocks[sensor]):
-            lost = failed & (flight.block_valid[block] > 0.0)
-            flight.gate[block] = select(lost, GateDecision.FAILED, flight.gate[block])
+    for block in range(MAX_BLOCKS):
+        lost = failed & (flight.block_valid[block] > 0.0)
+        flight.gate[block] = select(lost, GateDecision.FAILED, flight.gate[block])
 
 
 @kernel

@@ -30,7 +30,7 @@ from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.filter.preintegration import accel_variance, gyro_sigma
-from quad_gym.kernels.filter.slow import decay_slow, keep_slow_factor, predict_slow, turn_slow
+from quad_gym.kernels.filter.slow import decay_slow, keep_factor, predict_slow, turn_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -299,12 +299,9 @@ def predict(flight, p, work, form, slow):
     keep(flight.R_hat, ok, R_pred)
     keep(flight.b_a_hat, ok, p.accel_bias_decay * load3(flight.b_a_hat))
     keep(flight.b_g_hat, ok, p.gyro_bias_decay * load3(flight.b_g_hat))
-    for i in range(15):
-        for j in range(i + 1):
-            flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    keep_factor(flight, slow, work, ok)
     if slow is not None:
         decay_slow(flight, slow, p, ok)
-        keep_slow_factor(flight, slow, work, ok)
     status, failure = flight.filter_status, np.uint64(FilterStatus.PREDICTION_FAILED.value)
     flight.filter_status = select(ok, status, status | failure)
     flight.prediction_failures = flight.prediction_failures + select(ok, 0.0, 1.0)

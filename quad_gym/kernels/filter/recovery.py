@@ -91,20 +91,23 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
     kept = maximum(1.0 - passed / _CORRECTION_TIME, 0.0)
     kept_long = maximum(1.0 - passed / _LONG_TIME, 0.0)
     for i in range(6):
-        variance = 0.0 * kept
+        removed = 0.0 * kept
         for j in range(columns):
             if j < 15:
-                variance = variance + L[BA + i, j] * L[BA + i, j]
-            variance = variance - L9[BA + i, j] * L9[BA + i, j]
-        variance = maximum(variance, 0.0)
-        before, spread = flight.corrected[i], flight.corrected_variance[i]
-        flight.corrected[i] = select(ok, kept * before + dx[BA + i], before)
-        flight.corrected_variance[i] = select(ok, kept * kept * spread + variance, spread)
-        before, spread = flight.corrected_long[i], flight.corrected_long_variance[i]
-        flight.corrected_long[i] = select(ok, kept_long * before + dx[BA + i], before)
-        total = kept_long * kept_long * spread + variance
-        flight.corrected_long_variance[i] = select(ok, total, spread)
+                removed = removed + L[BA + i, j] * L[BA + i, j]
+            removed = removed - L9[BA + i, j] * L9[BA + i, j]
+        removed, shift = maximum(removed, 0.0), dx[BA + i]
+        add_correction(flight.corrected, flight.corrected_variance, i, ok, kept, shift, removed)
+        sums, variances = flight.corrected_long, flight.corrected_long_variance
+        add_correction(sums, variances, i, ok, kept_long, shift, removed)
     flight.corrected_tick = select(ok, flight.tick, flight.corrected_tick)
+
+
+@kernel
+def add_correction(sums, variances, i, ok, kept, shift, variance):
+    """Add a correction and its variance to sums of which a share is `kept`, where `ok`."""
+    sums[i] = select(ok, kept * sums[i] + shift, sums[i])
+    variances[i] = select(ok, kept * kept * variances[i] + variance, variances[i])
 
 
 @kernel
@@ -233,7 +236,7 @@ def inflate_gyro_bias(P, rate, alarm):
 @kernel
 def inflate_heading(P, R_BI, square, alarm):
     """Raise the variance of the heading, the angle about the vertical."""
-    P_ee, vertical = load_block(P, E, E), (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+    P_ee, vertical = load_block(P, E, E), R_BI.T[2]
     heading = dot(vertical, P_ee @ vertical)
     wanted = select(alarm, minimum(square, MOST_ANGLE * MOST_ANGLE), 0.0)
     more = maximum(wanted - heading, 0.0)

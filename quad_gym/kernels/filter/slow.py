@@ -82,7 +82,14 @@ def keep_slow_factor(flight, slow, work, ok):
             flight.L_slow[i, j] = select(ok, work.P[D + i, j], flight.L_slow[i, j])
 
 
-# ---- prediction ------------------------------------------------------------------------------
+@kernel
+def keep_factor(flight, slow, work, ok):
+    """Store the factor in work.P, where `ok`."""
+    for i in range(15):
+        for j in range(i + 1):
+            flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    if slow is not None:
+        keep_slow_factor(flight, slow, work, ok)
 
 
 @kernel
@@ -117,9 +124,6 @@ def turn_slow(slow, P, T):
     """Transform the correlation of d with the error angles, as `turn_covariance` the other ones."""
     for i in range(0, slow.slow_states, 3):
         store_block(P, D + i, E, load_block(P, D + i, E) @ T.T)
-
-
-# ---- update ----------------------------------------------------------------------------------
 
 
 @kernel
@@ -176,9 +180,6 @@ def shift_slow(flight, slow, columns, ok, shift):
             flight.L_slow[i, j] = select(ok, columns[D + i, last - j], flight.L_slow[i, j])
 
 
-# ---- inflation -------------------------------------------------------------------------------
-
-
 @kernel
 def fill_slow(flight, slow, P):
     """Fill the rows of d in P with the present ones."""
@@ -189,9 +190,6 @@ def fill_slow(flight, slow, P):
         for j in range(0, i, 3):
             store_block(P, D + i, D + j, sum_of_outers(M, i, M, j, D + j + 3))
         store_block(P, D + i, D + i, sum_of_squares(M, i, D + i + 3))
-
-
-# ---- delayed measurements --------------------------------------------------------------------
 
 
 @kernel

@@ -16,8 +16,8 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
+from quad_gym.kernels.filter.gate import MONITORED, gate_innovations
 from quad_gym.kernels.filter.inflation import inflate
-from quad_gym.kernels.filter.innovations import MONITORED, gate_innovations
 from quad_gym.kernels.filter.jumps import follow_drift_corrections
 from quad_gym.kernels.filter.measurements import (
     call_measured,
@@ -309,7 +309,7 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     flag_failure(flight, failed)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
     if (form & MONITORED) != 0 and any_of(failed):
-        mark_failed(flight, settings, failed)
+        mark_failed(flight, failed)
     updated = mask & (work.measured > 0.0)
     if (form & FilterForm.GATE.value) != 0:
         inflate(flight, p, work, settings, updated & logical_not(failed), slow, stages)

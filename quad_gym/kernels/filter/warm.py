@@ -9,7 +9,7 @@ sensors are correlated with the true ones in the same way.
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
-from quad_gym.kernels.filter.slow import keep_slow_factor
+from quad_gym.kernels.filter.slow import keep_factor
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import diagonal, keep, load3, load4, store, unit_or
 from quad_gym.kernels.maths.matrices import load_block, store_block
@@ -128,11 +128,8 @@ def _start_warm(flight, settings, work, slow):
                 right = _turn_of_slow(slow, j, T, right)
             store_block(P, i, j, left @ load_block(settings.warm_covariance, i, j) @ right.T)
     cholesky(P, states, work.inverse_diagonal)  # P is known to be positive definite
-    for i in range(15):
-        for j in range(i + 1):
-            flight.L[i, j] = select(mask, P[i, j], flight.L[i, j])
+    keep_factor(flight, slow, work, mask)
     if slow is not None:
-        keep_slow_factor(flight, slow, work, mask)
         if slow.estimates_drift:
             s = load3(settings.warm_drift_sigma)
             true = T @ (s[0] * n_d[0], s[1] * n_d[1], s[2] * n_d[2])

@@ -69,17 +69,11 @@ def is_finite(x):
 
 
 @kernel
-def sin_near_zero(x):
-    """Sin x for |x| <= pi/4."""
+def near_zero(x):
+    """(sin x, cos x) for |x| <= pi/4."""
     z = x * x
-    return x + x * z * polynomial(z, _SIN)
-
-
-@kernel
-def cos_near_zero_minus_one(x):
-    """Cos x - 1 for |x| <= pi/4."""
-    z = x * x
-    return -0.5 * z + z * z * polynomial(z, _COS)
+    cosine = 1.0 + (-0.5 * z + z * z * polynomial(z, _COS))
+    return x + x * z * polynomial(z, _SIN), cosine
 
 
 @kernel
@@ -102,9 +96,8 @@ def sin_cos(x):
     reduced = fused_multiply_add(-turns, _PIO2_3, reduced)
     reduced = fused_multiply_add(-turns, _PIO2_REST, reduced)
     quadrant = turns - 4.0 * round_to_even(0.25 * turns - 0.375)
-    sine, cosine = quarter_turns(
-        sin_near_zero(reduced), 1.0 + cos_near_zero_minus_one(reduced), quadrant
-    )
+    sine, cosine = near_zero(reduced)
+    sine, cosine = quarter_turns(sine, cosine, quadrant)
     small_enough = abs(x) < _REDUCIBLE
     if any_of(abs(x) >= _REDUCIBLE):
         sine = select(small_enough, sine, library_sin(x))
@@ -113,7 +106,7 @@ def sin_cos(x):
 
 
 @kernel
-def _near_zero(x):
+def _tiny(x):
     """(sin x, cos x - 1) for |x| < 0.05 rad."""
     z = x * x
     sine = polynomial(z, (-1.0 / 6.0, 1.0 / 120.0, -1.0 / 5040.0))
@@ -136,7 +129,7 @@ def sin_cos_minus_one(angles):
     Sigma points have such angles. One branch for all three lets the processor go ahead.
     """
     x, y, z = angles
-    of_x, of_y, of_z = _near_zero(x), _near_zero(y), _near_zero(z)
+    of_x, of_y, of_z = _tiny(x), _tiny(y), _tiny(z)
     large = (abs(x) >= _SMALL_ANGLE) | (abs(y) >= _SMALL_ANGLE) | (abs(z) >= _SMALL_ANGLE)
     if any_of(large):
         of_x, of_y, of_z = _where_large(x, of_x), _where_large(y, of_y), _where_large(z, of_z)

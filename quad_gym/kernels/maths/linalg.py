@@ -14,8 +14,6 @@ from quad_gym.kernels.maths.vectors import store as store
 from quad_gym.kernels.maths.vectors import vector as vector
 from quad_gym.kernels.simd.lanes import select
 
-# ---- vectors and matrices of three -----------------------------------------------------------
-
 
 @kernel
 def dot(a, b):

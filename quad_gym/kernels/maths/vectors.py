@@ -157,12 +157,9 @@ def _matrix_product(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
 
 
 def _operator(operation: Any, shape_of: Callable[..., Any], emit: Callable[..., Any]) -> None:
-    """Define `operation`.
+    """Define a function of `operator` by the shape and the value of its result.
 
-    Args:
-        operation: A function of `operator`.
-        shape_of: The result's shape, given the operands' shapes; None for undefined results.
-        emit: The result, given the operands' values.
+    `shape_of` gets the operands' shapes, and returns None for undefined results.
     """
 
     @infer_global(operation)

@@ -54,8 +54,6 @@ from quad_gym.records import DRAW_FEATURE, DRAW_PHASE, FEATURE_BLOCKS, FilterFor
 _CAMERA = int(Sensor.CAMERA)
 _PIXEL = 2e-6  # [m]; it cancels, so it is no parameter: the report writes rays in meters
 
-# ---- simulation ------------------------------------------------------------------------------
-
 
 @kernel
 def project(X_I, r_I, R_BI, p):
@@ -120,9 +118,6 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + count):
             seen = due & (flight.block_valid[block] > 0.0)
             flight.block_fresh[block] = select(seen, 1.0, flight.block_fresh[block])
-
-
-# ---- update ----------------------------------------------------------------------------------
 
 
 @kernel
@@ -227,9 +222,6 @@ def _gate(flight, p, work, settings, k):
         flight.fit_tick = select(fits, flight.tick, flight.fit_tick)
     else:
         accept_group(flight, FEATURE_BLOCKS, fresh > 0.0)
-
-
-# ---- inflation -------------------------------------------------------------------------------
 
 
 @kernel

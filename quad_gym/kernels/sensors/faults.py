@@ -30,16 +30,16 @@ NEVER = 1e18
 
 
 @kernel
-def _draws(stream, k, number):
-    """Two uniform numbers from a draw of faults of kind k."""
-    return uniform_pair(stream, _FIRST + np.uint64(DRAWS_OF_FAULT * k + number))
+def _draw_of(k, number):
+    """One of the draws of faults of kind k."""
+    return _FIRST + np.uint64(DRAWS_OF_FAULT * k + number)
 
 
 @kernel
 def _draw_when(flight, settings, stream, k, mask):
     """Draw when fault k begins, from the present instant on, and when it ends, where `mask`."""
-    chance, u = _draws(stream, k, 0)
-    length, _ = _draws(stream, k, 1)
+    chance, u = uniform_pair(stream, _draw_of(k, 0))
+    length, _ = uniform_pair(stream, _draw_of(k, 1))
     if settings.fault_rate[k] > 0.0:  # waits of a Poisson process
         wait = -log(1.0 - u) / settings.fault_rate[k]
     else:
@@ -52,9 +52,9 @@ def _draw_when(flight, settings, stream, k, mask):
 
 
 @kernel
-def _any_direction(stream, k, number):
+def _any_direction(stream, draw):
     """A unit vector, uniform on the sphere."""
-    height, turn = _draws(stream, k, number)
+    height, turn = uniform_pair(stream, draw)
     z = 2.0 * height - 1.0
     s, c = sin_cos(6.28318530717958647692 * turn - 3.14159265358979323846)
     level = math.sqrt((1.0 - z) * (1.0 + z))
@@ -64,11 +64,11 @@ def _any_direction(stream, k, number):
 @kernel
 def _draw_what(flight, settings, stream, k, mask):
     """Draw size and direction of fault k, where `mask`."""
-    _, u = _draws(stream, k, 1)
+    _, u = uniform_pair(stream, _draw_of(k, 1))
     size = settings.fault_size[k, 0] + settings.fault_size[k, 1] * u
-    given, drawn = load3(settings.fault_direction[k]), _any_direction(stream, k, 2)
+    given, drawn = load3(settings.fault_direction[k]), _any_direction(stream, _draw_of(k, 2))
     direction = select(dot(given, given) + 0.0 * size > 0.0, given, drawn)
-    pick, _ = _draws(stream, k, 3)
+    pick, _ = uniform_pair(stream, _draw_of(k, 3))
     pick = settings.fault_pick[0] + settings.fault_pick[1] * pick
     flight.fault_size[k] = select(mask, size, flight.fault_size[k])
     keep(flight.fault_vector[k], mask, size * direction)
@@ -161,9 +161,6 @@ def _advance_faults(flight, world, settings, mask):
         _weaken_rotors(flight, world)
 
 
-# ---- effects on measurements ------------------------------------------------------------------
-
-
 @kernel
 def gnss_heard(flight, settings, due):
     """Lanes in which GNSS has a position, and lanes in which it has a baseline, among those due."""
@@ -184,10 +181,10 @@ def _draw_outlier(flight, p, settings, mask):
     the variance drive^2 / (1 - decay^2).
     """
     k, stream = FaultKind.GNSS_OUTLIERS, stream_of(flight)
-    chance, u = _draws(stream, k, 4)
+    chance, u = uniform_pair(stream, _draw_of(k, 4))
     struck = mask & (flight.fault_active[k] > 0.0) & (chance < settings.fault_share[k])
     size = settings.fault_size[k, 0] + settings.fault_size[k, 1] * u
-    size, direction = select(struck, size, 0.0), _any_direction(stream, k, 5)
+    size, direction = select(struck, size, 0.0), _any_direction(stream, _draw_of(k, 5))
     white, drive = load3(p.position_sigma_I), load3(p.drift_drive)
     kept = (1.0 - p.drift_decay) * (1.0 + p.drift_decay)
     flight.outlier = select(mask, select(struck, 1.0, 0.0), flight.outlier)
@@ -218,8 +215,8 @@ def _mistake_features(flight, settings, mask):
     seen = zero
     for i in range(count):
         seen = seen + flight.block_valid[FEATURE_BLOCKS + i]
-    chance, u = _draws(stream, k, 4)
-    w, _ = _draws(stream, k, 5)
+    chance, u = uniform_pair(stream, _draw_of(k, 4))
+    w, _ = uniform_pair(stream, _draw_of(k, 5))
     struck = mask & (flight.fault_active[k] > 0.0) & (chance < settings.fault_share[k])
     struck = struck & (seen > 1.0)
     first, second = _nth(count, u, seen), _nth(count, w, seen - 1.0)
@@ -246,9 +243,6 @@ def _mistake_features(flight, settings, mask):
         mistaken = select(here | there, 1.0, 0.0)
         flight.feature_mistaken[i] = select(mask, mistaken, flight.feature_mistaken[i])
         rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
-
-
-# ---- stages ----------------------------------------------------------------------------------
 
 
 @stage

@@ -38,13 +38,11 @@ from quad_gym.kernels.maths.linalg import (
     rounded,
 )
 from quad_gym.kernels.maths.matrices import load_block, store_block
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import logical_not, select
 from quad_gym.records import BASELINE_BLOCK
 
 _COARSE = 0.05
 """Noise up to which this term is left out [rad], as in the laboratory: it makes no difference."""
-
-# ---- simulation ------------------------------------------------------------------------------
 
 
 @kernel
@@ -70,15 +68,9 @@ def measure(flight, p, R_BI, normals, mask):
     keep(flight.gnss_baseline, mask, noisy_baseline(r_b, normals, sigma, floor, length))
 
 
-# ---- update ----------------------------------------------------------------------------------
-
-
 @kernel
-def expect(flight, p, work, settings, k):
-    """Fill the rows from k on, if any lane has a baseline; return the next row."""
-    valid = flight.block_valid[BASELINE_BLOCK] > 0.0
-    if not any_of(valid):
-        return k
+def expect(flight, p, work, settings, k, valid):
+    """Fill rows k to k + 2."""
     R_BI, u_B = load33(flight.R_hat), (1.0 / p.baseline_length) * load3(p.baseline)
     u_I, z = R_BI.T @ u_B, load33(p.R_IG) @ load3(flight.gnss_baseline)
     noise = direction_noise(u_I, p.baseline_noise * p.baseline_noise, p.direction_floor)
@@ -89,7 +81,6 @@ def expect(flight, p, work, settings, k):
     for j in range(9):
         a, s = lever_column(flight, work, settings, j, R_BI, u_B)
         put_column(work, settings, k, j, valid, a, s)
-    return k + 3
 
 
 @kernel
@@ -99,30 +90,27 @@ def gate(flight, p, work, settings, k):
     As for positions, a rejection while the camera fits does not count against the filter.
     """
     s = BASELINE_BLOCK
-    if not any_of(flight.block_valid[s] > 0.0):
-        return k
     valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
     rejected, _, nu, nis = gate_direction(flight, p, work, settings, k, s, valid, np.inf)
     first = valid & logical_not(work.again > 0.0)
     follow_drift(flight, s, first, (nu[0], nu[1], 0.0 * p.sigma_beta))
     add_nis(work, first & logical_not(rejected & camera_fits(flight, p)), nis, 2.0)
     mask_rejected(flight, work, settings, k, s, valid, rejected, 3.0)
-    return k + 3
-
-
-# ---- inflation -------------------------------------------------------------------------------
 
 
 @kernel
-def inflate(flight, p, work, settings):
+def inflate(flight, p, work, settings, alarm, nu):
     """Inflate the attitude and the gyro biases.
 
     The heading is inflated by the sideward innovation, roll and pitch by the upward one.
     """
-    R_BI, P, alarm = load33(flight.R_hat), work.P, work.alarm[BASELINE_BLOCK] > 0.0
-    vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-    side = select(alarm, flight.innovation[BASELINE_BLOCK, 0], 0.0)
-    up = select(alarm, flight.innovation[BASELINE_BLOCK, 1], 0.0)
+    P, R_BI, side, up = (
+        work.P,
+        load33(flight.R_hat),
+        select(alarm, nu[0], 0.0),
+        select(alarm, nu[1], 0.0),
+    )
+    vertical = R_BI.T[2]
     P_ee = load_block(P, E, E)
     heading = dot(vertical, P_ee @ vertical)
     tilt = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)

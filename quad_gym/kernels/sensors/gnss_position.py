@@ -13,7 +13,6 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.gate import gate_numbers
 from quad_gym.kernels.filter.recovery import (
     MOST_POSITION,
     camera_fits,
@@ -28,10 +27,8 @@ from quad_gym.kernels.maths.elementary import exp, log, maximum
 from quad_gym.kernels.maths.linalg import diagonal, keep, load3, load33, norm, rounded, vector
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import logical_not, select
 from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, SENSOR_GROUPS
-
-# ---- simulation ------------------------------------------------------------------------------
 
 
 @kernel
@@ -58,15 +55,9 @@ def drift_gnss(flight, p, mask, share):
     keep(flight.gnss_drift, mask, decay * d + rounded(drive))
 
 
-# ---- update ----------------------------------------------------------------------------------
-
-
 @kernel
-def expect(flight, p, work, settings, k):
-    """Fill the rows from k on, if any lane has a position; return the next row."""
-    valid = flight.block_valid[POSITION_BLOCK] > 0.0
-    if not any_of(valid):
-        return k
+def expect(flight, p, work, settings, k, valid):
+    """Fill rows k to k + 2."""
     R_BI, l_B, s = load33(flight.R_hat), load3(p.antenna), load3(p.position_sigma_I)
     antenna_I = load3(flight.r_hat) + R_BI.T @ l_B
     if settings.estimates_drift:
@@ -83,36 +74,16 @@ def expect(flight, p, work, settings, k):
             row = work.A[last - j]
             for i in range(3):
                 row[k + i] = row[k + i] + select(valid, flight.L_slow[i, j], 0.0)
-    return k + 3
 
 
 @kernel
-def gate(flight, p, work, settings, k):
-    """Store the innovation in the rows from k on, and mask it beyond the gate.
-
-    A fix that is rejected while the camera fits shows an error of GNSS, not of the filter.
-    """
-    block, limit = POSITION_BLOCK, p.gate_position
-    if not any_of(flight.block_valid[block] > 0.0):
-        return k
-    excused = camera_fits(flight, p)
-    gate_numbers(flight, p, work, settings, k, block, block, limit, 3.0, excused)
-    return k + 3
-
-
-# ---- inflation -------------------------------------------------------------------------------
-
-
-@kernel
-def inflate(flight, p, work, settings):
+def inflate(flight, p, work, settings, alarm, nu):
     """Inflate the position or its slow error, accelerometer biases and tilt.
 
     Where positions drift, a jump may be three times the innovation, as the drift has followed it in
     part; but an innovation beyond `MOST_POSITION` counts in full, so that any jump is followed.
     """
-    nu, P = load3(flight.innovation[POSITION_BLOCK]), work.P
-    T, alarm = time_of(flight, p, POSITION_BLOCK), work.alarm[POSITION_BLOCK] > 0.0
-    jumped = alarm
+    P, T, jumped = work.P, time_of(flight, p, POSITION_BLOCK), alarm
     if settings.estimates_drift:
         jumped = _has_jumped(flight, p, work)
     for i in range(3):

@@ -9,17 +9,13 @@ linear: dz = dv.
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import V
-from quad_gym.kernels.filter.gate import gate_numbers
 from quad_gym.kernels.filter.recovery import inflate_accel_bias, raise_variance, time_of
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
 from quad_gym.kernels.maths.linalg import cross, diagonal, keep, load3, load4, load33, norm
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import any_of
 from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK
-
-# ---- simulation ------------------------------------------------------------------------------
 
 
 @kernel
@@ -31,15 +27,9 @@ def measure(flight, p, mask):
     keep(flight.gnss_velocity, mask, R_IG.T @ (p.velocity_sigma * n + v_I))
 
 
-# ---- update ----------------------------------------------------------------------------------
-
-
 @kernel
-def expect(flight, p, work, settings, k):
-    """Fill the rows from k on, if any lane has a velocity; return the next row."""
-    valid = flight.block_valid[VELOCITY_BLOCK] > 0.0
-    if not any_of(valid):
-        return k
+def expect(flight, p, work, settings, k, valid):
+    """Fill rows k to k + 2."""
     R_BI, variance = load33(flight.R_hat), p.velocity_sigma * p.velocity_sigma
     lever_B = cross(load3(flight.w_meas) - load3(flight.b_g_hat), load3(p.antenna))
     z, z_hat = load33(p.R_IG) @ load3(flight.gnss_velocity), load3(flight.v_hat) + R_BI.T @ lever_B
@@ -51,23 +41,11 @@ def expect(flight, p, work, settings, k):
             a, s = lever_column(flight, work, settings, j, R_BI, lever_B)
             dv = dv + a
         put_column(work, settings, k, j, valid, dv, s)
-    return k + 3
 
 
 @kernel
-def gate(flight, p, work, settings, k):
-    """Store the innovation in the rows from k on, and mask it beyond the gate."""
-    block, limit, never = VELOCITY_BLOCK, p.gate_position, flight.tick < 0.0
-    if not any_of(flight.block_valid[block] > 0.0):
-        return k
-    gate_numbers(flight, p, work, settings, k, block, block, limit, 3.0, never)
-    return k + 3
-
-
-@kernel
-def inflate(flight, p, work, settings):
+def inflate(flight, p, work, settings, alarm, nu):
     """Inflate the velocity, accelerometer biases and tilt."""
-    nu, alarm = load3(flight.innovation[VELOCITY_BLOCK]), work.alarm[VELOCITY_BLOCK] > 0.0
     for i in range(3):
         raise_variance(work.P, V + i, alarm, nu[i] * nu[i])
     inflate_accel_bias(p, work.P, norm(nu) / time_of(flight, p, VELOCITY_BLOCK), alarm)

@@ -115,9 +115,6 @@ def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
                 flight.pixels[i, axis] = select(seen, pixel + shift, pixel)
 
 
-# ---- stages ----------------------------------------------------------------------------------
-
-
 @stage
 def begin_imperfect_stage(flight, world, model, settings, work, stages, flag):
     """Draw the errors that last an episode."""

@@ -79,9 +79,6 @@ def measure_imu_average(flight, p, start, mask):
     _sample_imu(flight, p, rate * rotation_between(q_start, q_end), f_B, mask)
 
 
-# ---- stages ----------------------------------------------------------------------------------
-
-
 @stage
 def sample_stage(flight, world, model, settings, work, stages, flag):
     """Sample the IMU at the present instant; `flag`: 1 at the start of an episode."""

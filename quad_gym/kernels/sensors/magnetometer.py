@@ -25,7 +25,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.align import lever_of_attitude
-from quad_gym.kernels.filter.error_state import BA, D, E, R, V
+from quad_gym.kernels.filter.error_state import BA, D, E, R, V, put_covariance
 from quad_gym.kernels.filter.recovery import (
     MOST_ANGLE,
     drifts,
@@ -50,7 +50,7 @@ from quad_gym.kernels.maths.linalg import (
     store,
     vector,
 )
-from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block, sum_of_outers
+from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
@@ -81,18 +81,13 @@ def _measure(flight, p):
     return p.aid_sigma[_S] * vector(a, b, c) + field_B, flight.tick >= 0.0
 
 
-# ---- alignment -------------------------------------------------------------------------------
-
-
 @kernel
 def _align(flight, p, work, settings, mask):
     """Initialize the heading with the direction of the field, and the covariance to match."""
     P, L, R_BI = work.P, flight.L, load33(flight.R_hat)
     m, z = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S])
     R_BI = R_BI @ level_attitude(R_BI.T @ z, m)
-    for i in range(0, D, 3):
-        for j in range(0, i + 3, 3):
-            store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
+    put_covariance(P, L, 1.0)
     for i in range(settings.slow_states):
         for j in range(D + i):
             P[D + i, j] = 0.0 * p.dt
@@ -159,9 +154,6 @@ def _full(P):
     return ((a, b, d), (b, c, e), (d, e, f))
 
 
-# ---- update ----------------------------------------------------------------------------------
-
-
 @kernel
 def _expected_field(flight, p, settings):
     """R_BI (m_I + delta m_I x e3) and R_BI (m_I x e3)."""
@@ -191,9 +183,6 @@ def _expect(flight, p, work, settings, k, valid):
                 s = odd @ turned + inverse_c * (even @ f_B)
             put_three(work.E[8 - j], k, valid, s)
         put_three(work.A[last - j], k, valid, a)
-
-
-# ---- inflation -------------------------------------------------------------------------------
 
 
 @kernel

@@ -73,7 +73,7 @@ def _expect(flight, p, work, settings, k, valid):
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
     h, W = maximum(h, 0.5 * p.aid_numbers[_S, 0]), R_BI @ load3(flight.v_hat)
-    G, z_B, zero = u / h, (R_BI[0][2], R_BI[1][2], R_BI[2][2]), 0.0 * h
+    G, z_B, zero = u / h, R_BI.T[2], 0.0 * h
     _put_center(flight, p, work, settings, k, valid, G, W)
     for j in range(9):
         dV, dh = R_BI @ load_column3(L, V, j), L[R + 2, j] if j <= R + 2 else zero

@@ -54,7 +54,7 @@ def _expect(flight, p, work, settings, k, valid):
     u = maximum(u, LEAST_COSINE)
     z, noise = load3(flight.aid_measurement[_S]), (sigma * sigma, zero + 1.0, zero + 1.0)
     put_block(work, settings, k, valid, z, (h / u, zero, zero), diagonal(noise))
-    z_B = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+    z_B = R_BI.T[2]
     for j in range(9):
         dh = L[R + 2, j] if j <= R + 2 else zero
         if (settings.form & FilterForm.EKF.value) != 0:

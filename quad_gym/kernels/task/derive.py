@@ -40,7 +40,8 @@ def _derive_body(own, nominal, settings):
 
     kF, kN = own.thrust_coefficient, own.torque_coefficient
     turn = (kN / kF) / (nominal.torque_coefficient / nominal.thrust_coefficient)
-    x, y, z = load3(own.center_of_mass_B)
+    center = load3(own.center_of_mass_B)
+    x, y, _ = center
     for i in range(4):
         # E' = M E D and so A' = D^-1 A M^-1: D scales the rotors, M moves the center of mass
         e, E, A = own.rotor_efficiency[i], nominal.effectiveness, nominal.allocation
@@ -52,13 +53,9 @@ def _derive_body(own, nominal, settings):
         own.allocation[i, 1] = A[i, 1] / e
         own.allocation[i, 2] = A[i, 2] / e
         own.allocation[i, 3] = A[i, 3] / (turn * e)
-        own.rotor_positions_B[i, 0] = nominal.rotor_positions_B[i, 0] - x
-        own.rotor_positions_B[i, 1] = nominal.rotor_positions_B[i, 1] - y
-        own.rotor_positions_B[i, 2] = nominal.rotor_positions_B[i, 2] - z
+        store(own.rotor_positions_B[i], load3(nominal.rotor_positions_B[i]) - center)
         if settings.grounded:
-            own.feet_B[i, 0] = nominal.feet_B[i, 0] - x
-            own.feet_B[i, 1] = nominal.feet_B[i, 1] - y
-            own.feet_B[i, 2] = nominal.feet_B[i, 2] - z
+            store(own.feet_B[i], load3(nominal.feet_B[i]) - center)
 
     gain, full = own.motor_speed_per_volt, own.max_voltage
     own.max_rotor_force = kF * (gain * full) * (gain * full)

@@ -66,7 +66,7 @@ def put_relative(reference, row, k, r, v, R_BI, w_B):
     r_ref, v_ref, a_ref, x_ref, first, second = reference
     k = _put3(row, k, R_BI @ (r_ref - r))
     k = _put3(row, k, R_BI @ (v_ref - v))
-    k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
+    k = _put3(row, k, R_BI.T[2])
     k = _put3(row, k, R_BI @ x_ref)
     k = _put3(row, k, w_B)
     k = _put3(row, k, R_BI @ a_ref)
@@ -158,7 +158,7 @@ def _put_privileged(flight, p, settings, row, k):
     r_ref, v_ref, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
     k = _put3(row, k, R_BI @ (r_ref - load3(flight.r)))
     k = _put3(row, k, R_BI @ (v_ref - load3(flight.v)))
-    k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
+    k = _put3(row, k, R_BI.T[2])
     k = _put3(row, k, R_BI @ x_ref)
     k = _put3(row, k, load3(flight.w))
     k = _put3(row, k, load3(flight.b_a))

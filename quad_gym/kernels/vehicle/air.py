@@ -50,7 +50,7 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
         D = load3(p.linear_drag_B) + (W[0] + W[1] + W[2] + W[3]) * load3(p.rotor_drag_B)
         force_I = force_I - R_BI.T @ (D[0] * v_B[0], D[1] * v_B[1], D[2] * v_B[2])
     if settings.ground_effect:
-        up_B = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+        up_B = R_BI.T[2]
         level = maximum(up_B[2], 0.0)
         thrust, torque_x, torque_y = zero, zero, zero
         for i in range(4):
@@ -130,9 +130,6 @@ def battery_voltage(charge, power, current, p):
     loaded = minimum(loaded, 0.25 * U0 * U0 / maximum(R * current, 1e-300))
     delivered = minimum(power, 0.25 * U0 * U0 / maximum(R, 1e-300))
     return select(charge > 0.0, loaded, 0.0), delivered
-
-
-# ---- stages ----------------------------------------------------------------------------------
 
 
 @stage
