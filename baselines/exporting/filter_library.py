@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+from baselines.exporting.controller import Controller
+from baselines.exporting.filter_policy import PolicySources, policy_sources
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 
@@ -36,7 +38,8 @@ _BARE = """\
 arm-none-eabi-gcc -std=c99 -O2 -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-d16 \\
     main.c libquad_gym_filter.a -lm  # with the start-up code and linker script of your board"""
 _WASM = """\
-clang --target=wasm32-wasi -std=c99 -O2 main.c libquad_gym_filter.a -lm  # with the WASI SDK"""
+clang --target=wasm32-wasi --sysroot=/usr -std=c99 -O2 -D_WASI_EMULATED_PROCESS_CLOCKS \\
+    main.c libquad_gym_filter.a -lm -lwasi-emulated-process-clocks -o example.wasm  # wasi-libc"""
 TARGETS = {
     "x86-64": Target(
         ("x86_64-unknown-linux-gnu", "x86-64-v3"),
@@ -58,7 +61,9 @@ TARGETS = {
 """Processors by the names that users write."""
 
 
-def export_filter(suite: SensorSuite, label: str, target: str, folder: Path) -> list[Path]:
+def export_filter(
+    suite: SensorSuite, label: str, target: str, folder: Path, policy: Controller | None = None
+) -> list[Path]:
     """Write a filter's library, header, example, and files that build and explain them.
 
     Args:
@@ -66,21 +71,24 @@ def export_filter(suite: SensorSuite, label: str, target: str, folder: Path) -> 
         label: Name of the suite.
         target: One of TARGETS.
         folder: Folder to write to; created if it does not exist.
+        policy: Policy that acts on the estimate; None: the filter alone.
 
     Returns:
         The files.
 
     Raises:
-        ValueError: If the target is unknown, or the filter of the suite cannot run.
+        ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
+            observes more than the estimate.
         RuntimeError: If the kernels cannot be emitted for the target.
     """
     check.choice("target", target, tuple(TARGETS))
     suite.require_filter()
+    text = PolicySources() if policy is None else policy_sources(policy)
     env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
     done = subprocess.run(
         [sys.executable, "-c", f"from {__name__} import write; write()"],
-        input=pickle.dumps((suite, label, target)),
+        input=pickle.dumps((suite, label, target, tuple(text))),
         stdout=subprocess.PIPE,
         env={**os.environ, **env, "PYTHONPATH": path},
         check=False,
@@ -100,7 +108,9 @@ def write() -> None:
     sys.stdout.buffer.write(pickle.dumps(_contents(*pickle.load(sys.stdin.buffer))))
 
 
-def _contents(suite: SensorSuite, label: str, target: str) -> dict[str, bytes]:
+def _contents(
+    suite: SensorSuite, label: str, target: str, policy: tuple[str, ...]
+) -> dict[str, bytes]:
     """Return the files by name; records must have one lane."""
     from baselines.exporting.filter_sources import Sources
     from quad_gym.kernels.compiling.cache import say
@@ -113,7 +123,10 @@ def _contents(suite: SensorSuite, label: str, target: str) -> dict[str, bytes]:
         symbol_of,
     )
 
-    sources, processor = Sources(suite, label, target), Processor(*TARGETS[target].processor)
+    sources, processor = (
+        Sources(suite, label, target, policy),
+        Processor(*TARGETS[target].processor),
+    )
     missing = [name for name in sources.functions if not is_cached(name, processor)]
     if missing:
         say(f"quad_gym: compiling {len(missing)} parts of the filter for {target} (once)")

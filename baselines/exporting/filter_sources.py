@@ -53,10 +53,13 @@ class Sources:
         suite: Sensor suite with its filter.
         label: Name of the suite.
         target: One of TARGETS.
+        policy: `PolicySources` of a policy.
     """
 
-    def __init__(self, suite: SensorSuite, label: str, target: str) -> None:
-        self.suite, self.label, self.target = suite, label, target
+    def __init__(
+        self, suite: SensorSuite, label: str, target: str, policy: tuple[str, ...]
+    ) -> None:
+        self.suite, self.label, self.target, self.policy = suite, label, target, policy
         self.engine = Engine(suite, suite.estimator.kind)
         needed = needed_stages(self.engine.settings[0])
         self.stages = {stage: needed[stage] for stage in FILTER_STAGES if stage in needed}
@@ -93,7 +96,8 @@ class Sources:
             flash: Size of the library [bytes].
         """
         values = {**self._suite_values(), **self._record_values(), **self._sensor_values()}
-        values |= {"POLICY_API": "", "POLICY_SOURCE": ""}
+        names = ("POLICY_API", "POLICY_NETWORK", "POLICY_ACTION")
+        values |= dict(zip(names, self.policy, strict=True))
         values["IMPLEMENTATION"] = _filled("implementation.c", values)
         values["FLASH"] = f"{flash:,}"
         files = {HEADER: "quad_gym_filter.h"} | {

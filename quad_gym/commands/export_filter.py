@@ -2,6 +2,7 @@
 
     quad-gym export filter --sensors rtk --output filter
     quad-gym export filter --sensors mine.toml --target cortex-m7 --output filter
+    quad-gym export filter --policy pretrained --env-id QuadGym/Circle-v0 --output pilot
 
 Writes a folder with a static library, a C99 header, an example that filters a log, and a CMake
 file. The estimates are bitwise those of `quad-gym replay`. docs/deployment.md explains the use.
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.options import SuiteName, full_id, refuse_overwriting, usage_errors
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,10 @@ class ExportFilterArgs:
     sensors: SuiteName = "standard"
     target: Literal["x86-64", "aarch64", "cortex-m7", "wasm32"] = "x86-64"
     """processor: x86-64 (with AVX2) or aarch64 with Linux, cortex-m7, or WebAssembly"""
+    policy: str | None = None
+    """also export a policy that acts on the estimate: pretrained, or a file of quad-gym train"""
+    env_id: str | None = None
+    """environment of the policy; if not given, from its training record"""
     output: Path | None = None
     """folder to write; if not given, in results/export"""
     overwrite: bool = False
@@ -29,6 +34,7 @@ class ExportFilterArgs:
 
 def main(args: ExportFilterArgs) -> None:
     """Export a filter."""
+    from baselines.exporting import controller_of
     from baselines.exporting.filter_library import LIBRARY, export_filter
     from quad_gym.analysis.reports import require_writable
     from quad_gym.params.suites import sensor_suite, suite_label
@@ -38,7 +44,11 @@ def main(args: ExportFilterArgs) -> None:
         folder = args.output or Path("results/export") / f"filter_{label}_{args.target}"
         refuse_overwriting(folder / LIBRARY, args.overwrite)
         require_writable("--output", folder)
-        files = export_filter(suite, label, args.target, folder)
+        if args.env_id is not None and args.policy is None:
+            raise ValueError("--env-id must come with --policy")
+        env_id = None if args.env_id is None else full_id(args.env_id)
+        policy = None if args.policy is None else controller_of(args.policy, env_id)
+        files = export_filter(suite, label, args.target, folder, policy)
     print(
         f"Wrote {len(files)} files to {folder}: the {suite.estimator.kind.upper()} of the suite "
         f'"{args.sensors}" for {args.target}. README.md there explains how to build and call it.'

@@ -1,6 +1,7 @@
 """Exported filters: the example's estimates are bitwise those of a replay, on any processor."""
 
 import ctypes
+import dataclasses
 import functools
 import math
 import shutil
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from baselines.exporting import export_filter
+from baselines.exporting import controller_of, export_filter
 from baselines.exporting.filter_library import LIBRARY, archive
 from quad_gym.estimation import UnscentedKalmanFilter, replay
 from quad_gym.estimation.starts import state_at_rest
@@ -21,6 +22,10 @@ from tests.logged_flights import Recorded, flown
 FOLDER = Path(tempfile.mkdtemp(prefix="quad_gym_filters_"))
 CROSS = "aarch64-linux-gnu-gcc"
 needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler (cc)")
+needs_wasm = pytest.mark.skipif(
+    not (shutil.which("clang") and shutil.which("node") and Path("/usr/lib/wasm32-wasi").exists()),
+    reason="no clang, wasi-libc or node",
+)
 needs_cmake = pytest.mark.skipif(not shutil.which("cmake"), reason="no CMake")
 needs_aarch64 = pytest.mark.skipif(
     not (shutil.which(CROSS) and shutil.which("qemu-aarch64-static")),
@@ -36,10 +41,10 @@ def _folder():
     shutil.rmtree(FOLDER)
 
 
-@functools.cache
-def exported(name, target="x86-64"):
-    folder = FOLDER / f"{name}_{target}"
-    export_filter(quad_gym.sensor_suite(name), name, target, folder)
+def exported(name, target="x86-64", policy=None):
+    folder = FOLDER / f"{name}_{target}_{policy is None}"
+    if not folder.exists():
+        export_filter(quad_gym.sensor_suite(name), name, target, folder, policy)
     return folder
 
 
@@ -110,6 +115,24 @@ def test_example_on_aarch64_prints_what_a_replay_computes_here(name):
     require_equal(found, logged(name), quad_gym.sensor_suite(name), {})
 
 
+@needs_wasm
+def test_example_as_webassembly_prints_what_a_replay_computes_here(tmp_path):
+    folder, log = exported("rtk", "wasm32"), logged("rtk")
+    program, run = tmp_path / "example.wasm", tmp_path / "run.mjs"
+    clock = ["-D_WASI_EMULATED_PROCESS_CLOCKS", "-lwasi-emulated-process-clocks", "-lm"]
+    files = [folder / "main.c", folder / LIBRARY]
+    line = ["clang", "--target=wasm32-wasi", "--sysroot=/usr", "-std=c99", "-O2", *files, *clock]
+    subprocess.run([*line, "-o", program], check=True, capture_output=True)
+    run.write_text(
+        "import { readFile } from 'node:fs/promises';\nimport { WASI } from 'node:wasi';\n"
+        f"const given = {{ version: 'preview1', args: ['example', '{log}'], "
+        f"preopens: {{ '{log.parent}': '{log.parent}' }} }};\nconst wasi = new WASI(given);\n"
+        f"const program = await WebAssembly.instantiate(await readFile('{program}'), "
+        "wasi.getImportObject());\nwasi.start(program.instance);\n"
+    )
+    require_equal(estimates("node", run), log, quad_gym.sensor_suite("rtk"), {})
+
+
 @needs_compiler
 @needs_cmake
 def test_cmake_builds_the_example_without_warnings(tmp_path):
@@ -143,8 +166,8 @@ OK, NOT_STARTED, NOT_FINITE, OUT_OF_RANGE, TOO_OLD, TOO_NEW = range(6)
 class Library:
     """The exported filter of a suite, called from here."""
 
-    def __init__(self, name):
-        folder = exported(name)
+    def __init__(self, name, policy=None):
+        folder = exported(name, "x86-64", policy)
         source = folder / "all.c"
         source.write_text(
             '#define QUAD_GYM_FILTER_IMPLEMENTATION\n#include "quad_gym_filter.h"\n'
@@ -281,6 +304,45 @@ def test_full_memory_shortens_the_window_only():
             assert c.call("update_range_finder", height, ukf.time) == OK
     np.testing.assert_array_equal(c.estimate()[:3], ukf.position)
     assert ukf.oldest_time < c._c.qg_oldest_time(c.memory) < ukf.time
+
+
+# ---- with a policy ---------------------------------------------------------------------------
+
+
+@needs_compiler
+def test_policy_acts_on_the_estimate_as_its_network_does():
+    controller = controller_of("pretrained", "QuadGym/Circle-v0")
+    c, rng, last = Library("crazyflie", controller), np.random.default_rng(2), np.zeros(4)
+    reference, action = rng.normal(0.0, 1.0, (6, 3)), (ctypes.c_float * 4)()
+    r, v, a, h, *later = reference
+    pointer = np.ascontiguousarray(reference).ctypes.data_as(ctypes.c_void_p)
+
+    def act():
+        return c._c.qg_action(c.memory, pointer, action)
+
+    assert act() == NOT_STARTED
+    assert c.call("init_at_rest", [1.0, -2.0, 0.8], 0.4, 0.0) == OK
+    for _ in range(5):
+        gyro = rng.normal(0.0, 0.2, 3)
+        assert c.call("predict", gyro, [0.1, 0.2, 9.7], 0.005) == OK
+        assert act() == OK
+        position, velocity, R, _, _, b_g, _ = np.split(c.estimate(), np.cumsum([3, 3, 9, 4, 3, 3]))
+        seen = [r - position, v - velocity, [0.0, 0.0, 1.0], h, a, later[0] - r, later[1] - r]
+        seen = [R.reshape(3, 3) @ x for x in seen]
+        observation = np.concatenate([*seen[:4], gyro - b_g, *seen[4:], last])
+        last = controller.act(observation)
+        np.testing.assert_allclose(list(action), last, atol=1e-6)
+    before, reference[0, 0] = c.memory.raw, np.nan
+    assert act() == NOT_FINITE
+    assert c.memory.raw == before
+
+
+def test_policy_that_observes_more_than_the_estimate_is_refused(tmp_path):
+    controller = controller_of("pretrained", "QuadGym/Circle-v0")
+    field = controller.table[0]._replace(name="true_position_error")
+    controller = dataclasses.replace(controller, table=(field, *controller.table[1:]))
+    with pytest.raises(ValueError, match="true_position_error"):
+        export_filter(quad_gym.sensor_suite("rtk"), "rtk", "x86-64", tmp_path, controller)
 
 
 # ---- files -----------------------------------------------------------------------------------

@@ -480,7 +480,7 @@ unsigned qg_status(const qg_filter *f)
 {
     return f->started ? (unsigned)*(const uint64_t *)(const void *)qgi_field(f, @OF_STATUS@) : 0;
 }
-
+@POLICY_ACTION@
 #ifdef __cplusplus
 }
 #endif

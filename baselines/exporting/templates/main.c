@@ -51,7 +51,7 @@ static double *table;
 static arrival *arrivals;
 static size_t rows, arrival_count;
 static double heading = NAN, position[3];
-static int course, starts_at_position, silent;
+static int course, starts_at_position, silent, too_late;
 
 static void stop(const char *why, const char *what)
 {
@@ -414,7 +414,7 @@ static void update(const arrival *a)
 #endif
     result = qg_update(&filter, &m, a->time);
     if (result == QG_TOO_OLD)
-        fprintf(stderr, "a measurement at %.6f s came too late\n", a->time);
+        too_late++;
     else
         demand(result, "measurement");
 }
@@ -461,6 +461,8 @@ static void replay(void)
         stop("the log must have a GNSS position to start from, or give --start-position X Y Z "
              "--heading DEGREES", "");
     print_estimate();
+    if (too_late && !silent)
+        fprintf(stderr, "%d measurements came too late for the window\n", too_late);
 }
 
 int main(int count, char **words)

@@ -129,6 +129,7 @@ struct qg_filter {
     uint64_t table[@STAGES@];
     qg_start_record first;
     double time, gyro[3];
+    float last_action[4];
     int started, has_gyro, events, since_copy, waiting;
     qg_event event[QG_EVENTS];
     qg_pending waits[QG_WAITING];
@@ -144,6 +145,6 @@ struct qg_filter {
 
 #if defined(QUAD_GYM_FILTER_IMPLEMENTATION) && !defined(QUAD_GYM_FILTER_IMPLEMENTED)
 #define QUAD_GYM_FILTER_IMPLEMENTED
-@POLICY_SOURCE@
+@POLICY_NETWORK@
 @IMPLEMENTATION@
 #endif
