@@ -105,14 +105,6 @@ def test_the_absolute_layout(source):
     close(seen["last_action"], actions)
 
 
-def test_the_estimate_is_not_the_truth_but_near_it():
-    env, observation, _ = flown(steps=100, start="hover", layout="absolute")
-    seen = parts_of(observation, layout="absolute")
-    off = np.linalg.norm(seen["position"] - env.flights.batch.record("r"), axis=1)
-    assert (off > 1e-5).all()
-    assert (off < 0.1).all()
-
-
 def test_on_a_course_the_previews_are_the_coming_gates():
     env = QuadVectorEnv(5, "waypoints", observation="truth", gate_count=3)
     observation, _ = env.reset(seed=2)

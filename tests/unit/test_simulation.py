@@ -123,25 +123,6 @@ def test_four_thousand_flights_fit_in_two_hundred_megabytes():
     assert batch.snapshot().nbytes < 100e6
 
 
-def test_more_substeps_converge_as_runge_kutta_does():
-    """The truth's path converges with the fourth power of the step."""
-
-    def path(substeps):
-        batch = new_batch(1, source=Source.TRUTH, substeps=substeps)
-        batch.reset(seeds=[0])
-        states = []
-        for _ in range(200):
-            batch.step()
-            states.append(np.concatenate([batch.record(name)[0] for name in ("r", "v", "q")]))
-        return np.array(states)
-
-    best = path(32)
-    errors = [abs(path(substeps) - best).max() for substeps in (1, 2, 4)]
-    assert errors[0] < 1e-5
-    assert 13.0 < errors[0] / errors[1] < 20.0
-    assert 13.0 < errors[1] / errors[2] < 20.0
-
-
 def test_step_after_the_time_limit_begins_another_episode():
     task = TaskParams(duration=0.05, out_of_bounds=100.0)
     batch = new_batch(9, task=task, autoreset=Autoreset.NEXT_STEP)
