@@ -108,6 +108,7 @@ BAD_VALUES = {
     ("BarometerParams", "bias_tau"): NOT_POSITIVE,
     ("MagnetometerParams", "noise_sigma"): NOT_POSITIVE,
     ("MagnetometerParams", "hard_iron_sigma"): NOT_POSITIVE,
+    ("MagnetometerParams", "hard_iron_tau"): [0.0, -1.0, float("nan")],
     ("MagnetometerParams", "soft_iron_sigma"): BELOW_ZERO,
     ("MagnetometerParams", "strength"): [*NOT_POSITIVE, 46.0],
     ("MagnetometerParams", "declination"): [4.0, -4.0, *NO_NUMBERS],
