@@ -309,7 +309,7 @@ FLOWN = CONSUMER.replace(
     ),
     estimator=FIELD_FILTER.replace(initial_tilt_sigma=0.05),
     noisy=NoisyObservationParams(
-        position=0.607, velocity=0.145, attitude=0.0111, body_rates=0.0303
+        position=0.572, velocity=0.136, attitude=0.0087, body_rates=0.0176
     ),  # measured, see above
 )
 """A hobby vehicle as it flies: `consumer` with noise that explains the log of a real flight."""

@@ -58,7 +58,7 @@ def test_replay_far_from_the_laboratory_has_the_field_there():
     table = {
         "time": time,
         "gyro": still,
-        "accel": still + [0.0, 0.0, 9.8],
+        "accel": still + np.array([0.0, 0.0, 9.8]),
         "gnss": still + spot,
         "magnetometer": still + heading_east,
     }
