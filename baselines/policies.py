@@ -42,13 +42,16 @@ _ALGORITHM_OF_MODULE = {
 }
 
 
-def interface_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> dict[str, Any]:
+def interface_of(env: Any) -> dict[str, Any]:
     """Describe the observations and actions of an environment for a policy.
 
     The source of the observation is left out: a policy trained on the truth may fly on the
     estimate.
+
+    Raises:
+        ValueError: If it is no environment of this package.
     """
-    flights = env.unwrapped.flights  # type: ignore[attr-defined]
+    flights = _flights_of(env)
     return {
         "observation": [field.name for field in flights.table],
         "action": flights.action,
@@ -56,7 +59,7 @@ def interface_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> dict[str, An
     }
 
 
-def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Policy:
+def load_policy(name: str, env: Any) -> Policy:
     """Load a policy for an environment.
 
     Args:
@@ -66,7 +69,7 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
             "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
             the task of the environment), or a file: `.npz` written by `MlpPolicy`, or `.zip`
             written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
-        env: A `QuadVectorEnv`.
+        env: Environment of this package: single, vector or Stable-Baselines3.
 
     Raises:
         ValueError: If the policy does not exist, or does not fit the environment.
@@ -142,13 +145,26 @@ def pretrained_file(env_id: str) -> Path:
     return file
 
 
-def task_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> str:
+def task_of(env: Any) -> str:
     """Id of an environment."""
-    name = env.unwrapped.flights.name  # type: ignore[attr-defined]
+    name = _flights_of(env).name
     return next(env_id for env_id, task in IDS.items() if task == name)
 
 
-def _stable_baselines_policy(file: Path, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Policy:
+def _flights_of(env: Any) -> Any:
+    flights = getattr(getattr(env, "unwrapped", env), "flights", None)
+    if flights is None:
+        raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
+    return flights
+
+
+def _space_of(env: Any) -> gymnasium.Space[Any]:
+    """Space of the observations of one flight."""
+    space: gymnasium.Space[Any] = getattr(env, "single_observation_space", env.observation_space)
+    return space
+
+
+def _stable_baselines_policy(file: Path, env: Any) -> Policy:
     if not file.exists():
         raise ValueError(f"there is no policy {file}")
     try:
@@ -171,7 +187,7 @@ def _stable_baselines_policy(file: Path, env: gymnasium.vector.VectorEnv[Any, An
         model = algorithm_class(_ALGORITHM_OF_MODULE[module]).load(file, device="cpu")
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
         raise ValueError(f"{file} cannot be loaded: {error}") from None
-    space = env.single_observation_space
+    space = _space_of(env)
     if model.observation_space != space:
         size = gymnasium.spaces.flatdim(model.observation_space)
         _require_size(file, size, env)
@@ -179,8 +195,8 @@ def _stable_baselines_policy(file: Path, env: gymnasium.vector.VectorEnv[Any, An
     return model
 
 
-def _require_size(file: Path, size: int, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
-    here = gymnasium.spaces.flatdim(env.single_observation_space)
+def _require_size(file: Path, size: int, env: Any) -> None:
+    here = gymnasium.spaces.flatdim(_space_of(env))
     if size != here:
         raise ValueError(
             f"{file} expects observations of {size} numbers, but the environment returns {here}: "
@@ -188,9 +204,7 @@ def _require_size(file: Path, size: int, env: gymnasium.vector.VectorEnv[Any, An
         )
 
 
-def _require_agreement(
-    file: Path, record: Mapping[str, Any], env: gymnasium.vector.VectorEnv[Any, Any, Any]
-) -> None:
+def _require_agreement(file: Path, record: Mapping[str, Any], env: Any) -> None:
     """Reject a policy that was trained with other actions or observations."""
     trained, here = record.get("interface", {}), interface_of(env)
     for name in trained:

@@ -26,11 +26,7 @@ STATE_SHAPES: dict[str, tuple[int, ...]] = {
 
 
 def checked_state(state: State, name: str = "state") -> dict[str, NDArray[np.float64]]:
-    """Return a copy of a state as float64 arrays; messages call it `name`.
-
-    Raises:
-        ValueError: If a key is missing or unknown, or a value has another shape or is not finite.
-    """
+    """Return a copy of a state as float64 arrays; messages call it `name`."""
     if set(state) != set(STATE_SHAPES):
         raise ValueError(f"{name} must have the keys {sorted(STATE_SHAPES)}, got {sorted(state)}")
     return {

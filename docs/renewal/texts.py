@@ -151,15 +151,15 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
             for label, cell in chosen.items():
                 values = [cell["values"][column] for column in columns]
                 shown = ["" if value is None else f"{value:.4g}" for value in values]
-                writer.writerow([label, *shown, cell["expected"]])
+                writer.writerow([label, *shown, "; ".join(cell["expected"].values())])
     rows = [
         [
             label,
             *(f"{cell['values'][n]:.1f}" for n in ("consistent", "flagged", "undetected")),
-            cell["expected"],
+            "; ".join(cell["expected"].values()),
         ]
         for label, cell in faulty.items()
-        if cell["miss"]
+        if cell["misses"]
     ]
     alarms = max(cell["values"]["alarms_per_hour"] for cell in calm.values())
     return {

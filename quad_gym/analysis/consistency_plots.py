@@ -12,7 +12,15 @@ from quad_gym.analysis.consistency import (
     MeanSquare,
     Whiteness,
 )
-from quad_gym.analysis.plots import BLUE, GREY, INK, PALE, VERMILLION, require_matplotlib
+from quad_gym.analysis.plots import (
+    BLUE,
+    GREY,
+    INK,
+    PALE,
+    VERMILLION,
+    house_style,
+    panels,
+)
 
 _TITLES = {
     "state": "whole state",
@@ -32,21 +40,16 @@ _UNITS = {
 _TOLERANCE = f"tolerance (gray): 95 % band of a mean over at most {BAND_FLIGHTS:,} flights"
 
 
-def _grid(count: int, title: str, height: float = 2.1) -> tuple[Any, Any]:
+def _grid(count: int, title: str, label: str = "time [s]") -> tuple[Any, Any]:
     """Make a figure with `count` axes, three in a row; four are two by two."""
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
     columns = 2 if count == 4 else 3
     rows = -(-count // columns)
-    figure = Figure(figsize=(10.0, 0.6 + height * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for spare in axes[count:]:
+    figure, grid = panels(rows, columns, (10.0, 0.6 + 2.1 * rows), title)
+    for spare in grid.ravel()[count:]:
         spare.set_visible(False)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11.0)
-    for axis in axes[max(0, count - columns) : count]:
-        axis.set_xlabel("time [s]")
-    return figure, axes[:count]
+    for axes in grid.ravel()[max(0, count - columns) : count]:
+        axes.set_xlabel(label)
+    return figure, grid.ravel()[:count]
 
 
 def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
@@ -73,6 +76,7 @@ def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     axes.set_xlim(0.0, part.time[-1])
 
 
+@house_style()
 def mean_square_figure(
     quantity: str, parts: dict[str, MeanSquare], title: str, settle: float = 0.0
 ) -> Any:
@@ -84,11 +88,9 @@ def mean_square_figure(
     return figure
 
 
+@house_style()
 def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
     """Figure of root mean square errors and standard deviations of the filter, (t, 15) each."""
-    require_matplotlib()
-    from matplotlib.ticker import LogLocator
-
     text = (
         f"{title}\nError (blue) and standard deviation of the filter (dashed), "
         "root mean square over flights"
@@ -97,24 +99,23 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
     figure, axes = _grid(len(blocks), text)
     for axis, (name, part) in zip(axes, blocks.items(), strict=True):
         unit, factor = _UNITS[name]
-        for values, style in ((errors, {"color": BLUE}), (sigmas, {"color": INK})):
+        for values, color, dashes in ((errors, BLUE, "-"), (sigmas, INK, (0, (4, 3)))):
             size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
-            dashed = (0, (4, 3)) if values is sigmas else "-"
-            axis.plot(time, size, linestyle=dashed, linewidth=1.3, **style)
+            axis.plot(time, size, color=color, linestyle=dashes, linewidth=1.3)
         axis.set_title(f"{_TITLES[name]} [{unit}]")
-        axis.set_yscale("log")
+        axis.set_yscale("log", subs=(2.0, 5.0))
         axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(axis="y", which="minor", labelsize=7.0)
         axis.set_xlim(0.0, time[-1])
     return figure
 
 
+@house_style()
 def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
     """Figure of the autocorrelation of each sensor's innovations, with the band of white noise."""
     text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white noise (gray)"
-    figure, axes = _grid(len(found), text)
+    figure, axes = _grid(len(found), text, "lag [measurements]")
     for axis, part in zip(axes, found.values(), strict=True):
         lags = np.arange(1, part.correlation.size + 1)
         axis.fill_between(lags, -part.band, part.band, color=PALE, linewidth=0.0)
@@ -124,5 +125,4 @@ def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
         limit = 1.2 * max(2.5 * NEGLIGIBLE_CORRELATION, np.abs(part.correlation).max())
         axis.set_ylim(-limit, limit)
         axis.set_title(f"{_TITLES.get(part.name, part.name)}: largest {part.largest:+.3f}")
-        axis.set_xlabel("lag [measurements]")
     return figure

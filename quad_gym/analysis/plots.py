@@ -6,14 +6,14 @@ closed, and no display is required. The palette is by Okabe and Ito, which peopl
 vision deficiency can distinguish.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
 
@@ -71,7 +71,7 @@ _START: dict[str, Any] = {
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Trace:
     """One flight at n instants."""
 
@@ -87,7 +87,7 @@ class Trace:
     """Distance of the true position from the reference, (n,) [m]"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Band:
     """Range of an error over many flights at n instants."""
 
@@ -106,7 +106,7 @@ def require_matplotlib() -> None:
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Context in which figures are drawn and saved in the project's style."""
+    """Context, or decorator, in which figures are drawn and saved in the project's style."""
     require_matplotlib()
     import matplotlib
 
@@ -114,29 +114,27 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def heading_ticks(
-    time: ArrayLike, position: ArrayLike, heading: ArrayLike, *, every: float, length: float
-) -> Floats:
-    """Ticks along a path in the direction of the body x axis, seen from above.
+def panels(
+    rows: int, columns: int, size: tuple[float, float], title: str = "", **options: Any
+) -> tuple[Any, NDArray[Any]]:
+    """Make a matplotlib Figure with axes, (rows, columns).
 
     Args:
-        time: Increasing times, (n,) [s].
-        position: Positions, (n, 2) or (n, 3) in I [m]; only x and y are used.
-        heading: Horizontal components of the body x axis, (n, 2) in I, of any length.
-        every: Time between ticks [s]; the first one is at the start.
-        length: Length of a tick [m].
-
-    Returns:
-        Both ends of each tick, (m, 2, 2), x and y in I [m].
+        rows: Number of rows.
+        columns: Number of columns.
+        size: Width and height [inch].
+        title: Title of the figure.
+        **options: Further options of `Figure.subplots`.
     """
-    t, here = np.asarray(time, np.float64), np.asarray(position, np.float64)[:, :2]
-    direction = np.asarray(heading, np.float64)
-    # half an instant of tolerance, so that rounding of times loses no tick
-    grace = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
-    wanted = t[0] + every * np.arange(1 + int((t[-1] - t[0] + grace) / every))
-    chosen = np.minimum(np.searchsorted(t, wanted - grace), t.size - 1)
-    unit = direction[chosen] / np.linalg.norm(direction[chosen], axis=1, keepdims=True)
-    return np.stack([here[chosen], here[chosen] + length * unit], axis=1)
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    if rows * columns == 1:
+        axes[0, 0].set_title(title)
+    elif title:
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11.0)
+    return figure, axes
 
 
 def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool = True) -> None:
@@ -152,14 +150,19 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
 
     both = np.concatenate([trace.position, trace.reference])[:, :2]
     low, high = both.min(axis=0), both.max(axis=0)
-    extent = float(max(high - low))
-    ticks = heading_ticks(
-        trace.time, trace.position, trace.heading, every=tick_every, length=0.075 * extent
+    extent, t = float(max(high - low)), trace.time
+    chosen = slice(None, None, max(1, round(tick_every / (t[1] - t[0]))) if t.size > 1 else 1)
+    here, x_B = trace.position[chosen, :2], trace.heading[chosen]
+    tips = here + 0.075 * extent * x_B / np.linalg.norm(x_B, axis=1, keepdims=True)
+    rests = float(np.ptp(trace.reference[:, :2], axis=0).max()) < 1e-6
+    axes.plot(*trace.position[:, :2].T, color=BLUE, linewidth=2.2, label="flown")
+    axes.plot(
+        *trace.reference[:, :2].T, label="reference", **{**_REFERENCE, **(_REST if rests else {})}
     )
-    axes.add_collection(LineCollection(list(ticks), colors=VERMILLION, linewidths=1.3))
-    axes.plot(*trace.position[:, :2].T, color=BLUE, linewidth=2.2)
-    axes.plot(*trace.reference[:, :2].T, **_reference_style(trace))
-    axes.plot(*trace.position[0, :2], **_START)
+    ticks: dict[str, Any] = {"colors": VERMILLION, "linewidths": 1.3, "zorder": 1.9}
+    words = f"body x axis every {tick_every:g} s"
+    axes.add_collection(LineCollection(list(np.stack([here, tips], axis=1)), label=words, **ticks))
+    axes.plot(*trace.position[0, :2], label="start", **_START)
     margin = 0.09 * extent
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
@@ -167,28 +170,7 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
     axes.set_xlabel("x, east [m]")
     axes.set_ylabel("y, north [m]")
     if legend:
-        axes.legend(handles=path_handles(trace, tick_every=tick_every), loc="best")
-
-
-def path_handles(trace: Trace, *, tick_every: float = 0.5) -> list[Any]:
-    """Handles for a legend of `draw_path`.
-
-    Args:
-        trace: Flight.
-        tick_every: Time between heading ticks [s].
-    """
-    return [
-        _line("flown", BLUE, width=2.2),
-        _sample("reference", _reference_style(trace)),
-        _line(f"body x axis every {tick_every:g} s", VERMILLION, width=1.3),
-        _sample("start", _START),
-    ]
-
-
-def _reference_style(trace: Trace) -> dict[str, Any]:
-    """Style of a reference from above: a line, or a marker if the reference does not move."""
-    rests = float(np.ptp(trace.reference[:, :2], axis=0).max()) < 1e-6
-    return {**_REFERENCE, **(_REST if rests else {})}
+        axes.legend(loc="best")
 
 
 def draw_height(axes: Any, trace: Trace) -> None:
@@ -198,20 +180,14 @@ def draw_height(axes: Any, trace: Trace) -> None:
         axes: matplotlib Axes.
         trace: Flight.
     """
-    axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2)
-    axes.plot(trace.time, trace.reference[:, 2], **_REFERENCE)
-    axes.plot(trace.time[0], trace.position[0, 2], **_START, clip_on=False)
+    axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2, label="flown")
+    axes.plot(trace.time, trace.reference[:, 2], label="reference", **_REFERENCE)
+    start = (trace.time[0], trace.position[0, 2])
+    axes.plot(*start, label="start", clip_on=False, **_START)
     axes.set_xlim(trace.time[0] - 0.01 * np.ptp(trace.time), trace.time[-1])
     axes.set_xlabel("time [s]")
     axes.set_ylabel("height z [m]")
-    axes.legend(
-        handles=[
-            _line("flown", BLUE, width=2.2),
-            _sample("reference", _REFERENCE),
-            _sample("start", _START),
-        ],
-        loc="lower right",
-    )
+    axes.legend(loc="lower right")
 
 
 def draw_error(
@@ -231,67 +207,52 @@ def draw_error(
         label: Name of the flight in the legend.
         limits: Lowest and highest error shown [m], to compare figures; None: chosen by matplotlib.
     """
-    handles = [_line(label, BLUE, width=1.1)]
+    axes.plot(trace.time, trace.error, color=BLUE, linewidth=1.1, label=label)
     if band is not None:
-        axes.fill_between(trace.time, band.low, band.high, color=ORANGE, alpha=0.45, linewidth=0)
-        if np.allclose(band.low, band.high, equal_nan=True):
-            # a band without width would be invisible
-            axes.plot(trace.time, band.high, color=ORANGE, alpha=0.45, linewidth=6.0)
-        handles.append(_patch(band.label, ORANGE))
-    axes.plot(trace.time, trace.error, color=BLUE, linewidth=1.1)
-    axes.set_yscale("log")
+        # the edge keeps a band without width visible
+        alike = np.allclose(band.low, band.high, equal_nan=True)
+        area: dict[str, Any] = {"color": ORANGE, "alpha": 0.45, "linewidth": 6.0 if alike else 0.0}
+        axes.fill_between(trace.time, band.low, band.high, label=band.label, **area)
     axes.set_xlim(trace.time[0], trace.time[-1])
     axes.set_ylim(limits or error_limits([trace], [band] if band else []))
-    plain_numbers(axes.yaxis)
     axes.grid(True, which="minor", axis="y", linewidth=0.3)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("position error [m]")
-    axes.legend(handles=handles, loc="upper right")
+    logarithmic(axes)
+    axes.legend(loc="upper right")
 
 
-def error_limits(traces: list[Trace], bands: list[Band]) -> tuple[float, float]:
+def error_limits(traces: Sequence[Trace], bands: Sequence[Band]) -> tuple[float, float]:
     """Common limits of the logarithmic error axes of several figures [m].
 
     The lowest percent of the errors is left out, because flights may pass through their reference.
     """
-    curves = [trace.error for trace in traces] + [band.low for band in bands]
-    low = min(float(np.nanpercentile(curve, 1.0)) for curve in curves)
-    tops = [trace.error for trace in traces] + [band.high for band in bands]
-    high = max(float(np.nanmax(curve)) for curve in tops)
+    errors = [trace.error for trace in traces]
+    low = min(float(np.nanpercentile(x, 1.0)) for x in (*errors, *(b.low for b in bands)))
+    high = max(float(np.nanmax(x)) for x in (*errors, *(band.high for band in bands)))
     return 0.8 * max(low, 1e-4 * high), 1.5 * high
 
 
-def path_figure(trace: Trace, title: str = "") -> Any:
-    """Make a matplotlib Figure with `draw_path`."""
-    with house_style():
-        figure, axes = one_picture((5.0, 5.0), title)
-        draw_path(axes, trace)
-    return figure
-
-
-def height_figure(trace: Trace, title: str = "") -> Any:
-    """Make a matplotlib Figure with `draw_height`."""
-    with house_style():
-        figure, axes = one_picture((6.0, 3.4), title)
-        draw_height(axes, trace)
-    return figure
-
-
-def error_figure(
-    trace: Trace,
-    band: Band | None = None,
-    title: str = "",
-    *,
-    label: str = "one flight",
-    limits: tuple[float, float] | None = None,
+@house_style()
+def flight_figure(
+    draw: Callable[..., None], trace: Trace, *args: Any, title: str = "", **options: Any
 ) -> Any:
-    """Make a matplotlib Figure with `draw_error`."""
-    with house_style():
-        figure, axes = one_picture((6.0, 3.4), title)
-        draw_error(axes, trace, band, label=label, limits=limits)
+    """Make a matplotlib Figure with one drawing of a flight.
+
+    Args:
+        draw: `draw_path`, `draw_height` or `draw_error`.
+        trace: Flight.
+        *args: Further arguments of `draw`.
+        title: Title of the figure.
+        **options: Options of `draw`.
+    """
+    size = (5.0, 5.0) if draw is draw_path else (6.0, 3.4)
+    figure, ((axes,),) = panels(1, 1, size, title)
+    draw(axes, trace, *args, **options)
     return figure
 
 
+@house_style()
 def overview_figure(
     trace: Trace,
     errors: Mapping[str, tuple[Trace, Band | None]],
@@ -310,29 +271,24 @@ def overview_figure(
     Returns:
         matplotlib Figure.
     """
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
     pairs = list(errors.values())
     limits = error_limits([one for one, _ in pairs], [band for _, band in pairs if band])
-    with house_style():
-        from matplotlib.figure import Figure
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-        rows = 1 + len(errors)
-        layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06)
-        figure = Figure(figsize=(9.6, 1.75 * rows), layout=layout)
-        grid = figure.add_gridspec(rows, 2, width_ratios=(1.15, 1.0))
-        axes = figure.add_subplot(grid[:, 0])
-        draw_path(axes, trace)
-        axes.set_title(title)
-        axes = figure.add_subplot(grid[0, 1])
-        draw_height(axes, trace)
-        axes.set_title("Height")
-        for row, (name, (one, band)) in enumerate(errors.items(), start=1):
-            axes = figure.add_subplot(grid[row, 1])
-            draw_error(axes, one, band, label=label, limits=limits)
-            axes.set_title(name)
+    layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06)
+    figure = Figure(figsize=(9.6, 1.75 * (1 + len(errors))), layout=layout)
+    grid = figure.add_gridspec(1 + len(errors), 2, width_ratios=(1.15, 1.0))
+    path = figure.add_subplot(grid[:, 0], title=title)
+    draw_path(path, trace)
+    draw_height(figure.add_subplot(grid[0, 1], title="Height"), trace)
+    for row, (name, (one, band)) in enumerate(errors.items(), start=1):
+        axes = figure.add_subplot(grid[row, 1], title=name)
+        draw_error(axes, one, band, label=label, limits=limits)
     return figure
 
 
+@house_style()
 def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     """Write a figure as PNG and SVG; equal figures give bitwise identical files.
 
@@ -343,43 +299,14 @@ def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     Returns:
         Paths of the two files.
     """
-    files = [Path(f"{stem}.{ending}") for ending in ("png", "svg")]
-    with house_style():
-        for file in files:
-            metadata = {"Date": None} if file.suffix == ".svg" else {"Software": None}
-            figure.savefig(file, metadata=metadata)
-    return files
+    files = {Path(f"{stem}.png"): {"Software": None}, Path(f"{stem}.svg"): {"Date": None}}
+    for file, metadata in files.items():
+        figure.savefig(file, metadata=metadata)
+    return list(files)
 
 
-def plain_numbers(axis: Any) -> None:
-    """Label a logarithmic axis with numbers such as 0.1 instead of powers of ten."""
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def one_picture(size: tuple[float, float], title: str) -> tuple[Any, Any]:
-    """Make a matplotlib Figure with one Axes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_title(title)
-    return figure, axes
-
-
-def _line(label: str, color: str, *, width: float) -> Any:
-    return _sample(label, {"color": color, "linewidth": width})
-
-
-def _sample(label: str, style: dict[str, Any]) -> Any:
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], label=label, **style)
-
-
-def _patch(label: str, color: str) -> Any:
-    from matplotlib.patches import Patch
-
-    return Patch(facecolor=color, alpha=0.45, label=label)
+def logarithmic(axes: Any) -> None:
+    """Scale the ordinate logarithmically, labeled with numbers such as 0.1, not powers of ten."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("")

@@ -90,9 +90,7 @@ def record_flights(
     estimating = batch.source == Source.ESTIMATE
     flying = np.ones(count, bool)
     ending, ended_at = np.zeros(count, np.int64), np.full(count, np.nan)
-    tracking, estimation = RunningSummary(count, steps + 1), RunningSummary(count, steps + 1)
-    position, quaternion = np.empty((steps + 1, 3)), np.empty((steps + 1, 4))
-    error, percentiles = np.full(steps + 1, np.nan), np.full((2, steps + 1), np.nan)
+    tracer, tracking, estimation = Tracer(), *(RunningSummary(count, steps + 1) for _ in range(2))
     samples = np.unique(np.linspace(0, steps, nees_samples + 1).round().astype(int)[1:])
     nees_values = np.full((len(samples), count), np.nan)
 
@@ -105,60 +103,41 @@ def record_flights(
             over = flying & (batch.result("terminated") + batch.result("truncated") > 0.0)
             ending[over], ended_at[over] = batch.result("ending")[over], times[step]
             flying &= ~over
-        errors = batch.record("position_error")
-        tracking.add(errors, flying)
+        tracer.add(step, batch, flying)
+        tracking.add(batch.record("position_error"), flying)
         estimation.add(batch.record("estimation_error"), flying)
-        if flying.any():
-            percentiles[:, step] = np.percentile(errors[flying], (5.0, 95.0))
-        position[step], quaternion[step] = batch.record("r")[0], batch.record("q")[0]
-        error[step] = errors[0]
         row = int(np.searchsorted(samples, step))
         if estimating and samples[row] == step and flying.any():
             errors_hat, P = flight_errors(batch), batch.covariance()
             nees_values[row, flying] = nees(errors_hat[flying], P[flying])
 
-    alike = bool(np.allclose(percentiles[0], percentiles[1], equal_nan=True))
-    share = "all" if alike else "5 to 95 % of"
-    shown = slice(0, len(times) if flying[0] else int((times < ended_at[0]).sum()))
+    trace = tracer.trace()
+    low, _, high = tracer.percentiles[:, : len(trace.time)]
+    share = "all" if np.allclose(low, high, equal_nan=True) else "5 to 95 % of"
     return Recording(
         tracking=tracking.result(),
         estimation=estimation.result() if estimating else None,
         ending=ending,
         ended_at=ended_at,
-        trace=Trace(
-            time=times[shown],
-            position=position[shown],
-            heading=quaternion_to_dcm(quaternion[shown])[:, 0, :2],
-            reference=reference_of_flight(batch, 0, times[shown]),
-            error=error[shown],
-        ),
-        band=Band(
-            low=percentiles[0, shown],
-            high=percentiles[1, shown],
-            label=f"{share} {count:,} flights" if count > 1 else "the only flight",
-        ),
+        trace=trace,
+        band=Band(low, high, f"{share} {count:,} flights" if count > 1 else "the only flight"),
         nees_time=times[samples],
         nees=nees_values,
     )
 
 
 class Tracer:
-    """Recorder of episodes over time: the errors of all flights, and the paths of the first ones.
+    """Recorder of the errors of all episodes over time, and of the path of the first one.
 
     Pass its method `add` to `evaluation.roll_out` as `watch`. The environment must not use
-    same-step autoreset. Arrays have one entry per instant, beginning with the start.
-
-    Args:
-        paths: Number of flights whose paths are recorded.
+    same-step autoreset.
     """
 
-    def __init__(self, paths: int = 1) -> None:
-        self._paths = paths
-        self._errors: list[Floats] = []
-        self._positions: list[Floats] = []
-        self._headings: list[Floats] = []
-        self._references: Floats | None = None
-        self.control_rate = 0.0
+    def __init__(self) -> None:
+        self._percentiles: list[Floats] = []
+        self._path: list[tuple[Floats, Floats, Floats, Floats]] = []
+        self._gates: Floats | None = None
+        self._control_rate = 0.0
 
     def add(self, step: int, batch: FlightBatch, flying: NDArray[np.bool_]) -> None:
         """Record the present instant of episodes in progress.
@@ -168,61 +147,34 @@ class Tracer:
             batch: Flights.
             flying: True for episodes in progress, (n,).
         """
-        first = np.arange(min(self._paths, batch.count))
+        first, errors = np.zeros(1, np.intp), batch.record("position_error")
         if step == 0:
-            self.control_rate = batch.clocks.control_rate
-            times = np.arange(batch.max_steps + 1) / self.control_rate
-            gates = batch.record("gates", first)[:, : batch.task.gate_count]
-            course = batch.task.kind == "waypoints"
-            paths = [reference_of_flight(batch, int(i), times) for i in first]
-            self._references = gates if course else np.stack(paths)
-        here = flying[first, np.newaxis]
-        self._errors.append(np.where(flying, batch.record("position_error"), np.nan))
-        self._positions.append(np.where(here, batch.record("r", first), np.nan))
-        R_BI = quaternion_to_dcm(batch.record("q", first))
-        self._headings.append(np.where(here, R_BI[:, 0, :2], np.nan))
+            self._control_rate = batch.clocks.control_rate
+            if batch.task.kind == "waypoints":
+                self._gates = batch.record("gates", first)[0, : batch.task.gate_count]
+        shares = np.percentile(errors[flying], (5.0, 50.0, 95.0)) if flying.any() else [np.nan] * 3
+        self._percentiles.append(np.asarray(shares))
+        if flying[0]:
+            heading = quaternion_to_dcm(batch.record("q", first)[0])[0, :2]
+            place = batch.record("r", first)[0]
+            self._path.append(
+                (place, heading, batch.read("reference_position", first)[0], errors[0])
+            )
 
     @property
     def time(self) -> Floats:
         """Times since the start, (k,) [s]."""
-        return np.arange(len(self._errors)) / self.control_rate
-
-    @property
-    def errors(self) -> Floats:
-        """True position errors, (k, n) [m]; NaN after the end of an episode."""
-        return np.stack(self._errors)
+        return np.arange(len(self._percentiles)) / self._control_rate
 
     @property
     def percentiles(self) -> Floats:
         """5th, 50th and 95th percentile of the errors of episodes in progress, (3, k) [m]."""
-        errors = self.errors
-        found = np.full((3, len(errors)), np.nan)
-        flown = np.isfinite(errors).any(axis=1)
-        found[:, flown] = np.nanpercentile(errors[flown], (5.0, 50.0, 95.0), axis=1)
-        return found
+        return np.stack(self._percentiles, axis=1)
 
-    def trace(self, flight: int) -> Trace:
-        """Path of one of the first flights, up to its end."""
-        position = np.stack(self._positions)[:, flight]
-        shown = np.isfinite(position[:, 0])
-        assert self._references is not None
-        reference = self._references[flight]
-        return Trace(
-            time=self.time[shown],
-            position=position[shown],
-            heading=np.stack(self._headings)[shown, flight],
-            reference=reference[: len(shown)][shown] if len(reference) >= len(shown) else reference,
-            error=self.errors[shown, flight],
-        )
-
-
-def reference_of_flight(batch: FlightBatch, flight: int, times: Floats) -> Floats:
-    """Reference positions of a flight at given times [s], (n, 3) in I [m]."""
-    followed = batch.trajectory(flight)
-    if followed is not None:
-        trajectory, phase = followed
-        return trajectory(times + phase)
-    omega, center = batch.record("ref_omega")[flight], batch.record("ref_center")[flight]
-    cosines, sines = batch.record("ref_cos")[flight], batch.record("ref_sin")[flight]
-    angles = omega * np.outer(times, np.arange(1, len(cosines) + 1))
-    return np.asarray(center + np.cos(angles) @ cosines + np.sin(angles) @ sines)
+    def trace(self) -> Trace:
+        """Path of the first flight, up to its end."""
+        position, heading, reference, error = map(np.array, zip(*self._path, strict=True))
+        time = self.time[: len(position)]
+        if self._gates is not None:
+            reference = self._gates
+        return Trace(time, position, heading, reference, error)

@@ -11,15 +11,7 @@ Floats = NDArray[np.float64]
 
 
 def check_in_bounds(task: TaskParams, places: Floats) -> None:
-    """Refuse starts with which an episode would end in its first step.
-
-    Args:
-        task: The task, with its reference and its bounds.
-        places: Positions (n, 3) in I [m].
-
-    Raises:
-        ValueError: If one is farther than `out_of_bounds` from every beginning of a reference.
-    """
+    """Refuse starts (n, 3) in I [m] with which an episode would end in its first step."""
     distance = distance_from_reference(task, places)
     worst = int(distance.argmax())
     if distance[worst] > task.out_of_bounds:

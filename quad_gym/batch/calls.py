@@ -12,44 +12,33 @@ from numpy.typing import NDArray
 from quad_gym.kernels.batch import fly
 from quad_gym.records import Call, Room
 
+Word = int | NDArray[Any] | Sequence[NDArray[Any]]
+"""A number, an array of which the kernel gets the address, or an array for each thread."""
+
 
 class Calls:
     """The calls of all threads of a batch; they keep its memory alive, not the batch.
 
-    Args:
-        blocks: The flights.
-        room: The fields that they have.
-        shared: Arrays that all threads see.
-        numbers: Words that are not addresses.
-        own, believed, work, gathered: Arrays of each thread: true parameters, assumed parameters,
-            workspace, lanes of several blocks.
-        kept: Arrays whose addresses others hold.
+    `kept` are arrays whose addresses others hold.
     """
 
     def __init__(
         self,
         blocks: NDArray[Any],
         room: Room,
-        shared: Mapping[Call, NDArray[Any]],
-        numbers: Mapping[Call, int],
-        own: Sequence[NDArray[Any]],
-        believed: Sequence[NDArray[Any]],
-        work: Sequence[NDArray[Any]],
-        gathered: Sequence[NDArray[Any]],
-        kept: Sequence[NDArray[Any]] = (),
+        words: Mapping[Call, Word],
+        kept: Sequence[NDArray[Any]],
     ) -> None:
-        self._memory = (blocks, dict(shared), own, believed, work, gathered, kept)
-        self._words = np.zeros((len(own), len(Call)), np.int64)
+        self._memory = (blocks, dict(words), kept)
+        threads = next(len(arrays) for arrays in words.values() if isinstance(arrays, list))
+        self._words = np.zeros((threads, len(Call)), np.int64)
         self._words[:, Call.BLOCKS] = address_of(blocks) - room.skipped
         self._words[:, Call.PITCH] = room.dtype.itemsize
-        for word, array in shared.items():
-            self._words[:, word] = address_of(array)
-        for word, number in numbers.items():
-            self._words[:, word] = number
-        self._words[:, Call.OWN] = [address_of(array) for array in own]
-        self._words[:, Call.BELIEVED] = [address_of(array) for array in believed]
-        self._words[:, Call.WORK] = [address_of(array) for array in work]
-        self._words[:, Call.GATHERED] = [address_of(array) for array in gathered]
+        for word, value in words.items():
+            if isinstance(value, Sequence):
+                self._words[:, word] = [address_of(array) for array in value]
+            else:
+                self._words[:, word] = value if isinstance(value, int) else address_of(value)
         self._rows = list(self._words)
 
     @property

@@ -34,15 +34,7 @@ STEEP = 0.2
 
 
 def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
-    """Refuse tilts from which a filter cannot start, and warn of suites with too uncertain starts.
-
-    Args:
-        sensors: The sensors that the filter assumes.
-        draws: The draws of an episode.
-
-    Raises:
-        ValueError: If the draw of a tilt is too wide.
-    """
+    """Refuse tilts from which a filter cannot start, and warn of too uncertain starts."""
     magnetometer = sensors.magnetometer if sensors.heading_aid is not None else None
     slope = 0.0 if magnetometer is None else abs(math.tan(magnetometer.inclination))
     most = MAX_START_TILT / max(slope, 1.0)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.calls import Calls, address_of
+from quad_gym.batch.calls import Calls, Word, address_of
 from quad_gym.batch.cold_start import check_cold_start
 from quad_gym.batch.following import check_reference, followed
 from quad_gym.batch.innovations import innovations_of
@@ -218,7 +218,14 @@ class FlightBatch(FlightMemory):
 
     def _calls_of_threads(self) -> Calls:
         """Return the arguments with which the threads call the compiled code."""
-        shared = {
+        self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
+        words: dict[Call, Word] = {
+            Call.COUNT: self.count,
+            Call.GROUP: self._group,
+            Call.WORD_COUNT: len(self._words),
+            Call.WRITTEN_COUNT: self._written,
+            Call.SIZE: self._low.size,
+            Call.RESULT_PITCH: self._results.strides[0],
             Call.RESETS: self._resets,
             Call.WORLD: self._world,
             Call.MODEL: self._model,
@@ -231,18 +238,12 @@ class FlightBatch(FlightMemory):
             Call.OBSERVATIONS: self._observations,
             Call.FINAL_OBSERVATIONS: self.final_observations,
             Call.RESULTS: self._results,
+            Call.OWN: self._own,
+            Call.BELIEVED: self._believed,
+            Call.WORK: self._work,
+            Call.GATHERED: self._gathered,
         }
-        numbers = {
-            Call.COUNT: self.count,
-            Call.GROUP: self._group,
-            Call.WORD_COUNT: len(self._words),
-            Call.WRITTEN_COUNT: self._written,
-            Call.SIZE: self._low.size,
-            Call.RESULT_PITCH: self._results.strides[0],
-        }
-        self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
-        threads = (self._own, self._believed, self._work, self._gathered)
-        return Calls(self._blocks, self._room, shared, numbers, *threads, self._paths)
+        return Calls(self._blocks, self._room, words, self._paths)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the threads, which a copy starts again."""

@@ -27,17 +27,7 @@ LARGER, FASTER = 1.25, 0.8
 def check_reference(
     task: TaskParams, vehicle: VehicleParams, actions: ActionParams, control: Control
 ) -> None:
-    """Refuse trajectories, circles and lemniscates that the vehicle cannot fly.
-
-    Args:
-        task: Task with the reference, and the tilt at which episodes end.
-        vehicle: The vehicle that the controller assumes.
-        actions: Scales of the actions.
-        control: Meaning of an action.
-
-    Raises:
-        ValueError: If a reference needs more than the vehicle or the actions allow.
-    """
+    """Refuse references that need more than the assumed vehicle or the scales of actions allow."""
     limits: dict[str, Any] = {"max_tilt": task.max_tilt}
     if control in (Control.WRENCH, Control.CTBR, Control.ATTITUDE):
         limits["max_thrust"] = min(

@@ -38,11 +38,7 @@ _NO_CONFIGURATION = ("paths", "pieces", "max_steps")
 
 
 def configuration_digest(*records: NDArray[Any]) -> int:
-    """Return a digest of the settings and parameters of flights, as a word.
-
-    Args:
-        records: Records of settings, parameters and trajectories.
-    """
+    """Return a digest of records of settings, parameters and trajectories, as a word."""
     digest = hashlib.blake2b(digest_size=8)
     for record in records:
         for name in record.dtype.names or ():
@@ -62,13 +58,7 @@ class FlightMemory:
     _world: NDArray[Any]
 
     def _allocate(self, room: Room, undrawn: NDArray[np.float64], configuration: int) -> None:
-        """Allocate the records of flights that have never been reset.
-
-        Args:
-            room: The fields of the records.
-            undrawn: Values of the columns of "drawn" without draws.
-            configuration: Their `configuration_digest`.
-        """
+        """Allocate the records of flights that have never been reset."""
         self._room, self._undrawn, self._begun = room, undrawn, False
         self._blocks = aligned_zeros(-(-self.count // WIDTH), room.dtype)
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)

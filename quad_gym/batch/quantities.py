@@ -50,11 +50,7 @@ class Quantity(NamedTuple):
 
 
 def read(batch: "FlightBatch", name: str, flights: Flights) -> NDArray[Any]:
-    """A quantity of flights as a new array (n, ...); see `FlightBatch.read`.
-
-    Raises:
-        ValueError: If there is no such quantity, or no filter runs that would estimate it.
-    """
+    """A quantity of flights as a new array (n, ...); see `FlightBatch.read`."""
     quantity = QUANTITIES.get(name) if isinstance(name, str) else None
     if quantity is None:
         drawn = batch.randomization.names
@@ -160,8 +156,9 @@ def _gnss(field: str, block: int) -> Computed:
     """A vector that GNSS measures, turned from G to I."""
 
     def of(batch: "FlightBatch", flights: Flights) -> Floats:
-        measured = _measured(batch, flights)[:, block, np.newaxis]
-        return np.where(measured, batch.record(field, flights) @ batch.R_IG.T, np.nan)
+        x, y, z = batch.record(field, flights).T  # each sum in one order, in batches of any size
+        turned = [row[0] * x + row[1] * y + row[2] * z for row in batch.R_IG]
+        return np.where(_measured(batch, flights)[:, block], turned, np.nan).T
 
     return of
 

@@ -15,16 +15,8 @@ def check_standing(
 ) -> None:
     """Refuse ground on which the vehicle cannot stand, or where no episode of a task can begin.
 
-    Args:
-        task: Task with the reference, and the distance at which an episode ends.
-        vehicle: The true vehicle.
-        world: The world, with its ground if it has one.
-        draws: Draws around the start of the task.
-
-    Raises:
-        ValueError: If a foot is not below all rotor hubs, on which the vehicle would stand, which
-            is a crash; or if a start on the ground is farther from the reference than
-            `TaskParams.out_of_bounds`, so that the episode ends with its first step.
+    A foot has to be below all rotor hubs, as standing on these is a crash; a start on the ground
+    has to be within `TaskParams.out_of_bounds` of the reference.
     """
     if world.ground is None:
         return
@@ -52,11 +44,7 @@ def check_standing(
 
 
 def check_pad(task: TaskParams) -> None:
-    """Refuse a task whose launch pad, at height 0, is out of bounds wherever its reference begins.
-
-    Raises:
-        ValueError: If episodes that start there would end with their first step.
-    """
+    """Refuse a task whose launch pad, at height 0, is out of bounds wherever a reference begins."""
     if not task.may_start_on_ground:
         return
     distance = max(max(low, -high, 0.0) for low, high in _reference_heights(task))

@@ -59,19 +59,8 @@ def checked_start(
 ) -> NDArray[np.float64] | None:
     """Return initial values (count, 7), NaN where they are to be drawn; None if all are.
 
-    Args:
-        count: Number of flights.
-        position: (3,) or (count, 3) in I [m], or None.
-        velocity: (3,) or (count, 3) in I [m/s], or None.
-        yaw: Scalar or (count,) [rad], or None.
-        task: Task, for the largest distance of a start.
-        world: World with obstacles and geofence; None: without any.
-        chosen: (count,) flights that begin, whose positions have to be free; None: all.
-
-    Raises:
-        ValueError: If one has another shape, is not finite, or no flight can begin there: farther
-            from the origin than the task's bounds around any of its references, in an obstacle,
-            beyond the geofence, faster than MAX_SPEED, or turned by more than MAX_YAW.
+    Positions of `chosen` flights (count,) have to be free of the world's obstacles. Starts from
+    which no flight can begin are refused, as are speeds above MAX_SPEED and yaws above MAX_YAW.
     """
     if position is None and velocity is None and yaw is None:
         return None

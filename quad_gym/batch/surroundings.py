@@ -53,16 +53,10 @@ def _depths(obstacle: Obstacle, p: Floats) -> tuple[Floats, Floats]:
 def nearest_obstacle(
     obstacles: Sequence[Obstacle], centers: Floats, points: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the distance of points from the nearest surface of an obstacle.
+    """Return distances (n,) of points (n, 3) in I from the nearest obstacle's surface [m].
 
-    Args:
-        obstacles: At least one obstacle.
-        centers: (n, obstacles, 3) their centers in I [m].
-        points: (n, 3) in I [m].
-
-    Returns:
-        (n,) distances, negative inside [m]; (n, 3) vectors to the nearest point of the surface, in
-        I [m].
+    They are negative inside. The second array (n, 3) holds vectors to the nearest points, in I [m].
+    `centers` (n, obstacles, 3) are those of at least one obstacle, in I [m].
     """
     best, found = np.full(len(points), np.inf), np.zeros((len(points), 3))
     for k, obstacle in enumerate(obstacles):
@@ -88,13 +82,9 @@ def nearest_obstacle(
 def hidden_points(
     obstacles: Sequence[Obstacle], centers: Floats, eyes: Floats, points: Floats
 ) -> NDArray[np.bool_]:
-    """Return the mask (n, m) of points behind an obstacle, as seen from an eye.
+    """Return a mask (n, m) of points (m, 3) or (n, m, 3) behind an obstacle, seen from eyes (n, 3).
 
-    Args:
-        obstacles: Any number of obstacles.
-        centers: (n, obstacles, 3) their centers in I [m].
-        eyes: (n, 3) in I [m].
-        points: (m, 3) or (n, m, 3) in I [m].
+    All are in I [m], as are the centers (n, obstacles, 3) of the obstacles.
     """
     along_I = points - eyes[:, np.newaxis]
     end = 1.0 - AT_THE_END / np.maximum(_length(along_I), AT_THE_END)
@@ -135,16 +125,7 @@ def _disc(start: Floats, along: Floats, radius: float) -> tuple[Floats, Floats]:
 
 
 def require_room(name: str, points: Floats, world: WorldParams) -> None:
-    """Refuse places within a vehicle's radius of an obstacle, with any shift that may be drawn.
-
-    Args:
-        name: Name of the places in the message.
-        points: (n, 3) in I [m].
-        world: The world, with its obstacles and its geofence.
-
-    Raises:
-        ValueError: If a place is refused, or is beyond the geofence.
-    """
+    """Refuse places (n, 3) that an obstacle may reach by its shift, or beyond the geofence."""
     reach: list[Floats] = []
     for k, obstacle in enumerate(world.obstacles):
         shared = 0.0 if obstacle.follows is None else reach[obstacle.follows]

@@ -29,11 +29,7 @@ MAX_THREADS = 1024
 
 
 def resolve_threads(threads: int | None) -> int:
-    """Return `threads` checked, or the number of available cores for None.
-
-    Raises:
-        ValueError: If `threads` is not a whole number from 1 to MAX_THREADS.
-    """
+    """Return `threads`, from 1 to MAX_THREADS, or the number of available cores for None."""
     if threads is None:
         return available_cores()
     return check.whole("threads", threads, most=MAX_THREADS)
@@ -52,12 +48,6 @@ class Crew:
 
     A helper stays in compiled code while steps follow each other fast, and sleeps otherwise; see
     `kernels/board.py`. It ends with the crew. A single thread needs no crew, but has its board.
-
-    Args:
-        fly: Flies blocks, see `Fly`.
-        blocks: Number of blocks.
-        threads: Largest number of threads to fly them.
-        group: Blocks that a thread flies side by side.
     """
 
     def __init__(self, fly: Fly, blocks: int, threads: int, group: int = 1) -> None:
@@ -75,11 +65,7 @@ class Crew:
         weakref.finalize(self, _dismiss, self._board, self._alarms)
 
     def run(self, command: int) -> None:
-        """Fly all blocks.
-
-        Raises:
-            RuntimeError: If another thread is flying this batch at the same time.
-        """
+        """Fly all blocks; a batch can be flown by one thread at a time."""
         if self._flying:
             raise RuntimeError("a batch can be flown by one thread at a time")
         self._flying = True
@@ -115,10 +101,7 @@ class Crew:
 
 
 def board_of(blocks: int, parts: int, group: int = 1) -> NDArray[np.int64]:
-    """A board with the blocks cut into ranges, and nothing posted.
-
-    A chunk is a group of blocks, unless that is more than a quarter of a range.
-    """
+    """A board with the blocks cut into ranges and chunks, and nothing posted."""
     words = np.zeros(board.RANGES + parts * board.WORDS_OF_RANGE, np.int64)
     ranges = words[board.RANGES :].reshape(parts, board.WORDS_OF_RANGE)
     cuts = [blocks * part // parts for part in range(parts + 1)]

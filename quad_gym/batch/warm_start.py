@@ -40,13 +40,7 @@ Floats = NDArray[np.float64]
 
 
 def pack_warm_start(settings: Any, make: Callable[..., Any], c: FlightConfiguration) -> None:
-    """Fill the settings' fields of a warm start.
-
-    Args:
-        settings: One SETTINGS record.
-        make: Makes a batch of flights, called as `FlightBatch`.
-        c: Configuration of the flights that start warm.
-    """
+    """Fill the fields of a warm start in a SETTINGS record; `make` makes a `FlightBatch`."""
     P = converged_covariance(
         make, vehicle=c.vehicle, sensors=c.sensors, task=c.task, substeps=c.substeps
     )
@@ -68,22 +62,10 @@ def converged_covariance(
     task: TaskParams,
     substeps: int,
 ) -> Floats:
-    """Return the covariance that filters reach from a cold start in `WARM_UP` of hovering.
+    """Return the mean covariance that filters reach from a cold start in `WARM_UP` of hovering.
 
-    Args:
-        make: Makes a batch of flights, called as `FlightBatch`.
-        vehicle: The vehicle that the controller assumes.
-        sensors: The sensors that the filter assumes.
-        task: Task with the starts; on the ground the flights hover at height 0.
-        substeps: Runge-Kutta steps per tick.
-
-    Returns:
-        (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east;
-        larger if the filter estimates time-correlated sensor errors, which come last.
-
-    Raises:
-        ValueError: If a filter fails on the way, or has diverged at the end, for example because no
-            sensor observes the heading.
+    It is that of a vehicle that looks east, in the order r, v, e, b_a, b_g and then the slow errors
+    of sensors. Filters that fail or diverge on the way are refused, as without a known heading.
     """
     with warnings.catch_warnings():  # that the start is vague, as errors are drawn from P itself
         warnings.simplefilter("ignore", UserWarning)
@@ -173,15 +155,8 @@ def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
     Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals. Time-correlated
     errors of sensors are treated in the same way.
 
-    Args:
-        P: (n, n) covariance, n at least 15, whose blocks of biases and time-correlated errors are
-            not larger than S.
-        sensors: The sensors that the filter assumes, which define S.
-
-    Returns:
-        (n, WARM_DRAWS + 2 (n - 15)), with the columns of the biases after the first fifteen,
-        followed, in threes, by the columns of the time-correlated errors alone and of their true
-        values.
+    W is (n, WARM_DRAWS + 2 (n - 15)): the columns of the biases follow the first fifteen, and then,
+    in threes, the columns of the time-correlated errors alone and of their true values.
     """
     imu = sensors.imu
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)

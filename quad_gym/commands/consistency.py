@@ -46,7 +46,7 @@ from quad_gym.commands.options import (
 )
 from quad_gym.envs import IDS
 from quad_gym.experiments.consistency import matrix, recovery
-from quad_gym.experiments.consistency.cases import Case, CaseFlights, run_cases
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, run_cases, unexpected
 from quad_gym.experiments.consistency.single import run_single
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
@@ -237,4 +237,4 @@ def fly_table(args: ConsistencyArgs) -> None:
     files, duration = args.folder / name, {"duration": args.duration} if args.matrix else {}
     cases = matrix.cases_of(args.cells) if args.matrix else recovery.cases()
     found = run_cases(cases, files, args.flights, table.measure, table.table_of, **duration)
-    print(f"{len(found)} cells, {table.unexpected(found)} unexpected misses; see {files}.md.")
+    print(f"{len(found)} cells, {unexpected(found)} unexpected misses; see {files}.md.")

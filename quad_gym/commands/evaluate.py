@@ -8,29 +8,20 @@ writes episodes.csv (one row per episode), summary.json (all numbers and the con
 figures of paths and errors over time (PNG and SVG).
 """
 
+import itertools
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
+from tqdm import tqdm
 
-from baselines.policies import keywords_of_policy, load_policy, task_of
+from baselines.policies import keywords_of_policy, load_policy
 from baselines.seeds import first_seed
 from quad_gym import IDS
-from quad_gym.analysis import plots
-from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
-from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_interval
-from quad_gym.analysis.recording import Tracer
-from quad_gym.analysis.reports import (
-    require_writable,
-    short_name,
-    stacked,
-    text_table,
-    versions,
-    write_csv,
-    write_json,
-)
+from quad_gym.analysis.plots import require_matplotlib
+from quad_gym.analysis.reports import require_writable, short_name
 from quad_gym.commands.options import (
     EnvId,
     Keywords,
@@ -45,7 +36,9 @@ from quad_gym.commands.options import (
     with_full_id,
 )
 from quad_gym.envs.effects import with_effect
-from quad_gym.evaluation import Episodes, Policy, roll_out
+from quad_gym.evaluation import Policy
+from quad_gym.experiments.evaluated import evaluation_table, write_evaluation
+from quad_gym.experiments.flown import fly
 from quad_gym.params.suites import contents_of_suite_files
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 
@@ -97,17 +90,16 @@ def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Pa
             "--policy that was trained on measurements"
         )
     first_seed("test", args.seed, args.episodes)  # rejects seeds of trainings
-    plots.require_matplotlib()
+    require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     if args.output is None and not args.overwrite:
         folder = free_folder(folder, "summary.json")
     refuse_overwriting(folder / "summary.json", args.overwrite)
     policies = args.policy or default_policies(args)
     cases: dict[Pairing, tuple[Policy, Any]] = {}
-    for observation in args.observation:
-        for name in policies:
-            env = make_flights(args, observation, args.episodes, name)
-            cases[name, observation] = (load_policy(name, env), env)
+    for observation, name in itertools.product(args.observation, policies):
+        env = make_flights(args, observation, args.episodes, name)
+        cases[name, observation] = (load_policy(name, env), env)
     require_writable("--output", folder)
     if args.video != "none":
         checked_video_path(folder / f"video.{args.video}")
@@ -127,8 +119,7 @@ def default_policies(args: EvaluateArgs) -> tuple[str, ...]:
 
 def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) -> Any:
     """Make the environment with an observation, for a policy."""
-    names = ("observation", "sensors", "threads")
-    given = leave(args.env, {name: f"--{name}" for name in names})
+    given = leave(args.env, {name: f"--{name}" for name in ("observation", "sensors", "threads")})
     keywords = {
         **keywords_of_policy(policy, args.env_id),
         **given,
@@ -144,8 +135,6 @@ def write_videos(
     cases: dict[Pairing, tuple[Policy, Any]], args: EvaluateArgs, folder: Path
 ) -> list[Path]:
     """Write a video of the first episode of each case."""
-    from tqdm import tqdm
-
     files = []
     for name, observation in tqdm(cases, desc="filming", unit=" videos"):
         env = make_flights(args, observation, 1, name)
@@ -157,113 +146,23 @@ def write_videos(
     return files
 
 
-def table(results: dict[Pairing, Episodes], env: Any) -> str:
-    """Format a table of errors and endings of each case."""
-    gates = env.unwrapped.flights.task.gate_count
-    course = task_of(env) == "QuadGym/Waypoints-v0"
-    rows = []
-    for (name, observation), episodes in results.items():
-        found = episodes.summary()
-        row = [f"{short_name(name)} on {observation}"]
-        if course:
-            done = episodes.ending == "last_gate"
-            steps = episodes.lengths[done].sum() / max(int(done.sum()), 1)
-            seconds = steps / env.unwrapped.flights.control_rate
-            row += [
-                f"{found['gates_passed'] / gates:.1%}",
-                f"{seconds:.2f} s" if any(done) else "-",
-            ]
-        else:
-            late = f"{1e3 * found['late_error']:.1f}"
-            errors = episodes.mean_error
-            interval = mean_interval(errors) if len(errors) > 1 else None
-            row.append(in_brackets(errors.mean(), interval, ".1f", 1e3))
-            row.append("-" if late == "nan" else late)
-        rows.append(
-            [
-                *row,
-                f"{1e3 * found['estimation_error']:.1f}",
-                _rate(episodes.crashed),
-                f"{found['return']:.2f}",
-            ]
-        )
-    tracking = (
-        {"course": ["gates passed", "time"]}
-        if course
-        else {"tracking error [mm]": ["whole episode", "second half"]}
-    )
-    return text_table(
-        {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
-    )
-
-
-def _rate(happened: Any) -> str:
-    low, high = (100.0 * limit for limit in rate_interval(happened.sum(), len(happened)))
-    return f"{happened.mean():.1%} [{low:.1f}, {high:.1f}]"
-
-
-def write(
-    results: dict[Pairing, Episodes],
-    tracers: dict[Pairing, Tracer],
-    args: EvaluateArgs,
-    folder: Path,
-) -> list[Path]:
-    """Write numbers and figures; return the files."""
-    tables = (
-        {
-            "policy": [name] * args.episodes,
-            "observation": [observation] * args.episodes,
-            "seed": range(args.seed, args.seed + args.episodes),
-            **episodes._asdict(),
-        }
-        for (name, observation), episodes in results.items()
-    )
-    summary = {
-        "cases": [
-            {"policy": name, "observation": observation, **episodes.summary()}
-            for (name, observation), episodes in results.items()
-        ],
-        "units": {"errors": "m", "rates": "share of episodes"},
-        **contents_of_suite_files(args.sensors),
-        "arguments": replace(args, policy=tuple(dict.fromkeys(name for name, _ in results))),
-        "versions": versions("numpy", "numba", "torch", "stable_baselines3"),
-    }
-    written = [
-        write_csv(folder / "episodes.csv", stacked(tables)),
-        write_json(folder / "summary.json", summary),
-    ]
-    labels = {case: f"{short_name(case[0])} on {case[1]}" for case in results}
-    figures = {
-        "paths": paths_figure({labels[c]: t.trace(0) for c, t in tracers.items()}),
-        "errors": error_over_time_figure(
-            {labels[c]: (t.time, t.percentiles) for c, t in tracers.items()}
-        ),
-    }
-    for name, figure in figures.items():
-        written += plots.save_figure(figure, folder / name)
-    return written
-
-
 def main(args: EvaluateArgs) -> None:
     """Evaluate."""
-    from tqdm import tqdm
-
     with usage_errors():
         args = with_full_id(args)
         cases, folder = configure(args)
     began = time.perf_counter()
-    results, tracers = {}, {}
-    for case in tqdm(cases, desc="flying", unit=" cases"):
-        policy, env = cases[case]
-        tracers[case] = Tracer()
-        results[case] = roll_out(policy, env, seed=args.seed, watch=tracers[case].add)
+    bar = tqdm(cases.items(), desc="flying", unit=" cases")
+    results = {case: fly(policy, env, args.seed) for case, (policy, env) in bar}
     print(
         f"\n{args.env_id}, sensors {sensors_of(args.env_id, args.sensors)}; "
         f"{args.episodes:,} episodes in each case, from seed {args.seed}.\n"
     )
-    print(table(results, next(iter(cases.values()))[1]))
+    print(evaluation_table(results, next(iter(cases.values()))[1]))
     print("In brackets: 95 % interval over episodes, Student's t or Clopper and Pearson's.")
-    written = write(results, tracers, args, folder)
+    flown = tuple(dict.fromkeys(name for name, _ in results))
+    about = {**contents_of_suite_files(args.sensors), "arguments": replace(args, policy=flown)}
+    written = write_evaluation(results, args.seed, folder, about)
     if args.video != "none":
         written += write_videos(cases, args, folder)
     print(f"\nWrote {len(written)} files to {folder} after {time.perf_counter() - began:.1f} s.")

@@ -13,14 +13,16 @@ Keys in the window: C and G switch camera and GNSS off and on, F switches the --
 V changes the view, the space bar pauses, R begins the next episode, and Q or Escape quits.
 """
 
+import itertools
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import gymnasium
+from tqdm import tqdm
 from tyro.conf import arg
 
 from baselines.policies import keywords_of_policy, load_policy
@@ -41,6 +43,7 @@ from quad_gym.evaluation import Policy
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import PRESETS, faults_of
 from quad_gym.flights.rerun import load_rerun
+from quad_gym.params import checks as check
 from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path, fly_steps
@@ -104,58 +107,53 @@ class Switches:
     """State of sensors and faults as switched by keys."""
 
     def __init__(self) -> None:
-        self._off = {"gnss": False, "camera": False}
+        self._on = {"gnss": True, "camera": True}
         self._turn_faults = False
 
     def press(self, key: str) -> None:
         """Process a key."""
-        for letter, sensor in (("c", "camera"), ("g", "gnss")):
-            if key == letter:
-                self._off[sensor] = not self._off[sensor]
-        if key == "f":
-            self._turn_faults = True
+        if (sensor := {"c": "camera", "g": "gnss"}.get(key)) is not None:
+            self._on[sensor] = not self._on[sensor]
+        self._turn_faults |= key == "f"
 
     def apply(self, batch: FlightBatch) -> None:
         """Apply the switches to a batch."""
-        batch.switch_sensors(**{sensor: not off for sensor, off in self._off.items()})
+        batch.switch_sensors(**self._on)
         if self._turn_faults:
-            there = any(active.any() for active in batch.active_faults().values())
-            batch.switch_faults(not there)
+            active = any(flights.any() for flights in batch.active_faults().values())
+            batch.switch_faults(not active)
             self._turn_faults = False
 
 
 def check_options(args: FlyArgs) -> None:
     """Check the options before the flight."""
-    args = with_full_id(args)
     require_at_least(args, seed=0)
     for name in ("speed", "fps"):
-        value = getattr(args, name)
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"--{name} must be greater than 0, got {value:g}")
-    if args.replay is None:
-        suite_of(args)
+        check.positive(f"--{name}", getattr(args, name))
     if args.fault_time is not None:
         start, end = args.fault_time
         if not 0.0 <= start < end:
             raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
         if not args.faults:
             raise ValueError("--fault-time needs --faults")
+    if args.replay is None:
+        sensor_suite(sensors_of(args.env_id, args.sensors))  # before missing packages
+    ending = None if args.output is None else args.output.suffix.lower()
     if args.output is not None:
-        if args.output.suffix.lower() not in VIDEO_ENDINGS + OTHER_ENDINGS:
+        if ending not in VIDEO_ENDINGS + OTHER_ENDINGS:
             endings = ", ".join(VIDEO_ENDINGS + OTHER_ENDINGS)
             raise ValueError(f"--output must end in one of {endings}, got {args.output}")
-        if args.output.suffix.lower() in VIDEO_ENDINGS:
+        if ending in VIDEO_ENDINGS:
             checked_video_path(args.output)
-        if args.output.suffix.lower() == ".rrd":
+        if ending == ".rrd":
             load_rerun()
         require_writable("--output", args.output.parent)
-    if args.output is None or args.output.suffix.lower() in VIDEO_ENDINGS:
+    if ending is None or ending in VIDEO_ENDINGS:
         Renderer(args.view, args.size)
 
 
-def faults_of_args(args: FlyArgs) -> tuple[Fault, ...]:
+def faults_of_args(args: FlyArgs, sensors: SensorSuite) -> tuple[Fault, ...]:
     """Faults, at their default times or at `--fault-time`."""
-    sensors = sensor_suite(sensors_of(args.env_id, args.sensors))
     faults = faults_of(args.faults, sensors if args.camera else sensors.replace(camera=None))
     if args.fault_time is None:
         return faults
@@ -163,31 +161,25 @@ def faults_of_args(args: FlyArgs) -> tuple[Fault, ...]:
     return tuple(fault.replace(start=start, duration=end - start, rate=0.0) for fault in faults)
 
 
-def suite_of(args: FlyArgs) -> SensorSuite:
-    """Sensor suite with the rates selected by options."""
-    suite = sensor_suite(sensors_of(args.env_id, args.sensors))
-    return suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate)
-
-
 def make_env(args: FlyArgs) -> Any:
     """Make an environment with one flight."""
     args = with_full_id(args)
-    options = ("observation", "action", "sensors", "camera", "duration")
-    named = {name: f"--{name.replace('_', '-')}" for name in options}
-    given = leave(args.env, {**named, "faults": "--faults"})
-    keywords = {**keywords_of_policy(args.policy, args.env_id), **given}
+    names = ("observation", "action", "sensors", "camera", "duration", "faults")
+    given = leave(args.env, {name: f"--{name}" for name in names})
+    suite = sensor_suite(sensors_of(args.env_id, args.sensors))
+    keywords: dict[str, Any] = {**keywords_of_policy(args.policy, args.env_id), **given}
     if not args.camera:
         keywords["camera"] = False
     if args.action is not None:
         keywords["action"] = args.action
     if args.faults:
-        keywords["faults"] = faults_of_args(args)
+        keywords["faults"] = faults_of_args(args, suite)
     return gymnasium.make_vec(
         args.env_id,
         num_envs=1,
         autoreset_mode="Disabled",
         observation=args.observation,
-        sensors=suite_of(args),
+        sensors=suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate),
         duration=args.duration,
         **keywords,
     )
@@ -199,12 +191,6 @@ def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> 
     for flight, ending in steps:  # noqa: B007 - the last one is printed
         yield flight
     print(f"seed {seed}: {ending.replace('_', ' ')} after {in_words(flight)}")
-
-
-def replayed(flight: Flight) -> Iterator[Flight]:
-    """Yield a saved flight step by step."""
-    for time in flight["time"]:
-        yield flight.until(time)
 
 
 def in_words(flight: Flight) -> str:
@@ -245,23 +231,14 @@ def watch(flights: Iterator[Flight], args: FlyArgs, window: Window, switches: Sw
     return True
 
 
-def open_window(args: FlyArgs) -> Window:
-    """Open a window."""
-    try:
-        return Window(args.size, f"quad_gym: {IDS[args.env_id]}")
-    except RuntimeError as error:
-        raise OSError(f"{error}; without a display, --output writes a video instead") from None
-
-
 def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
     """Write the flight to a file, for videos together with its data; return the files."""
-    from tqdm import tqdm
-
-    if path.suffix.lower() == ".npz":
+    ending = path.suffix.lower()
+    if ending == ".npz":
         return [flight.save(path)]
-    if path.suffix.lower() == ".csv":
+    if ending == ".csv":
         return [flight.to_csv(path)]
-    if path.suffix.lower() == ".rrd":
+    if ending == ".rrd":
         path.parent.mkdir(parents=True, exist_ok=True)
         recording = flight.to_rerun()
         recording.save(path)
@@ -272,52 +249,44 @@ def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
         yield from tqdm(times, desc="drawing", unit=" pictures")
         print(f"encoding {path} ...", file=sys.stderr, flush=True)
 
-    video = save_video(
-        flight,
-        path,
-        view=args.view,
-        size=args.size,
-        fps=args.fps,
-        speed=args.speed,
-        progress=progress,
-    )
+    look: dict[str, Any] = {name: getattr(args, name) for name in ("view", "size", "fps", "speed")}
+    video = save_video(flight, path, progress=progress, **look)
     return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
+
+
+def flights_of(args: FlyArgs) -> Callable[[int, Switches], Iterator[Flight]]:
+    """Check the options; return a function that runs the episode of a seed, or the saved flight."""
+    check_options(args)
+    if args.replay is not None:
+        saved = Flight.load(args.replay)
+        return lambda seed, switches: (saved.until(time) for time in saved["time"])
+    env = make_env(args)
+    if args.output and not env.unwrapped.flights.batch.max_steps:
+        raise ValueError("--output needs a flight with a time limit: a --duration above 0")
+    policy, sensors = load_policy(args.policy, env), sensors_of(args.env_id, args.sensors)
+    about: dict[str, Any] = {"task": IDS[args.env_id], "policy": args.policy, "sensors": sensors}
+    about["faults"] = args.faults
+    return lambda seed, switches: fly(env, policy, seed, switches, about)
 
 
 def main(args: FlyArgs) -> None:
     """Fly or replay, and show or write."""
     with usage_errors():
         args = with_full_id(args)
-        check_options(args)
-        saved = Flight.load(args.replay) if args.replay else None
-        env = make_env(args) if saved is None else None
-        if env is not None and args.output and not env.unwrapped.flights.batch.max_steps:
-            raise ValueError("--output needs a flight with a time limit: a --duration above 0")
-        policy = None if env is None else load_policy(args.policy, env)
-    sensors = sensors_of(args.env_id, args.sensors)
-    about = {
-        "task": IDS[args.env_id],
-        "policy": args.policy,
-        "sensors": sensors,
-        "faults": args.faults,
-    }
-
-    def flights(seed: int, switches: Switches) -> Iterator[Flight]:
-        if saved is not None:
-            return replayed(saved)
-        assert policy is not None
-        return fly(env, policy, seed, switches, about)
-
+        flights = flights_of(args)
     if args.output:
         *_, flight = flights(args.seed, Switches())
         for file in write(flight, args.output, args):
             print(f"Wrote {file} ({file.stat().st_size / 1e6:.1f} MB).")
         return
     with usage_errors():
-        window = open_window(args)
-    seed, goes_on = args.seed, True
-    while goes_on:
+        try:
+            window = Window(args.size, f"quad_gym: {IDS[args.env_id]}")
+        except RuntimeError as error:
+            hint = "without a display, --output writes a video instead"
+            raise OSError(f"{error}; {hint}") from None
+    for seed in itertools.count(args.seed):
         switches = Switches()
-        goes_on = watch(flights(seed, switches), args, window, switches)
-        seed += 1
+        if not watch(flights(seed, switches), args, window, switches):
+            break
     window.close()

@@ -1,6 +1,7 @@
 """`quad-gym COMMAND`: subcommands of tyro, of which only the one that runs is imported."""
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, Union, get_type_hints
@@ -24,15 +25,15 @@ COMMANDS = {
     "ablation": "measure the effects of filter corrections and of model mismatch",
     "benchmark": "measure the speed of all parts",
     "export policy": "export a trained policy to an autopilot: C or ONNX",
-    "export filter": "export the parameters of a filter to an autopilot: C or JSON",
+    "export filter": "export a filter to an autopilot: a C library with the same estimates",
     "compile": "compile the kernels into the cache before their first use",
     "completion": "print a script for the completion of commands and options in a shell",
     "version": "print the version",
 }
 """Commands, of one or two words, and their descriptions."""
 
-INTERRUPTED = 130
-"""Exit code of a program that Ctrl-C has stopped."""
+INTERRUPTED, CLOSED_PIPE = 130, 141
+"""Exit codes of programs that Ctrl-C or a closed pipe has stopped."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,8 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        args = parse(subcommands(words), words, prog="quad-gym", description="")
-        return sys.modules[type(args).__module__].main(args) or 0
+        try:
+            args = parse(subcommands(words), words, prog="quad-gym", description="")
+            return sys.modules[type(args).__module__].main(args) or 0
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # the reader has gone, such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return CLOSED_PIPE
     except (KeyboardInterrupt, Exception) as error:
         if not _interrupted(error):
             raise

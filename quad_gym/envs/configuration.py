@@ -70,15 +70,7 @@ MAX_STEPS = 10**9
 def kind_and_task(
     task: "Task | type[Task] | str | None", base: str | None
 ) -> "tuple[str, Task | type[Task] | str | None]":
-    """Return the kind of task that is flown, and the user-defined task laid over it, if any.
-
-    Args:
-        task: Name of a kind, a user-defined task as `resolve_task` accepts it, or None.
-        base: Kind under that task; None: the one that `task` names, or the circle.
-
-    Raises:
-        ValueError: If there is no such kind, or both arguments name one.
-    """
+    """Return the kind of task that is flown, and the user-defined task laid over it, if any."""
     kinds = (*TASK_DEFAULTS, *BENCHMARKS)
     kind = "circle" if base is None else check.choice("base", base, kinds)
     if not isinstance(task, str) or ":" in task:
@@ -97,19 +89,7 @@ def kind_and_task(
 
 
 class Flights:
-    """The flights behind an environment, with its observation's table.
-
-    Args:
-        task: A kind of task, or a task of the user's own; see `QuadEnv`.
-        count: Number of flights.
-        autoreset: When a flight whose episode is over begins the next one.
-        base: The kind of task that the user's own is laid over; see `QuadEnv`.
-        keywords: The environment's keywords; see `QuadEnv`.
-
-    Raises:
-        TypeError: If a keyword is unknown; it is a ValueError, too.
-        ValueError: If a keyword is another task's, or its value is invalid.
-    """
+    """The flights behind an environment, with its observation's table; see `QuadEnv`."""
 
     def __init__(
         self,
@@ -155,14 +135,7 @@ class Flights:
     def _build(
         self, count: int, autoreset: Autoreset, asked: Collection[str], keywords: dict[str, Any]
     ) -> None:
-        """Make the flights and the table of their observation.
-
-        Args:
-            count: Number of flights.
-            autoreset: When a flight whose episode is over begins the next one.
-            asked: Names of the keywords that the user gave.
-            keywords: All keywords; `FlightBatch` gets its own.
-        """
+        """Make the flights and their observation's table; `asked`: keywords given by the user."""
         for name, known in (
             ("observation", OBSERVATIONS),
             ("action", ACTIONS),
@@ -212,11 +185,7 @@ class Flights:
         self.batch = make(count=count, autoreset=autoreset)
 
     def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
-        """The start values in the options of a reset, checked before anything changes.
-
-        Raises:
-            ValueError: If an option is unknown or invalid.
-        """
+        """The start values in the options of a reset, checked before anything changes."""
         chosen = start_options(options)
         position, velocity, yaw = (chosen.get(name) for name in ("position", "velocity", "yaw"))
         given = checked_start(
@@ -247,11 +216,7 @@ _NOT_OF_BATCH = (
 
 
 def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:
-    """Return the sensor suite that the keywords `sensors`, `camera` and `estimator` select.
-
-    Raises:
-        ValueError: If one is invalid.
-    """
+    """Return the sensor suite that the keywords `sensors`, `camera` and `estimator` select."""
     sensors, estimator = keywords["sensors"], keywords["estimator"]
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     if not isinstance(suite, SensorSuite):
@@ -267,11 +232,7 @@ def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:
 
 
 def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...]:
-    """Return the faults that can occur.
-
-    Raises:
-        ValueError: If one concerns sensors, and none runs.
-    """
+    """Return the faults that can occur; refuse those of sensors if none runs."""
     true = keywords["true_sensors"]
     if true is not None:
         check.instance("true_sensors", true, SensorSuite)
@@ -287,11 +248,7 @@ def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Actions as floats, clipped to [-1, 1].
-
-    Raises:
-        ValueError: If the shape is another or a number is not finite.
-    """
+    """Actions as finite floats of a shape, clipped to [-1, 1]."""
     if _in_order(actions, shape):
         return actions
     try:
@@ -318,22 +275,14 @@ def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
 
 
 def named_options(options: Any) -> dict[str, Any]:
-    """A copy of the options of a reset; none for None.
-
-    Raises:
-        ValueError: If they are not options by name.
-    """
+    """A copy of the options of a reset, which are by name; none for None."""
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"options must be values by name, or None, got {options!r}")
     return dict(options or {})
 
 
 def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
-    """The start values in the options of a reset.
-
-    Raises:
-        ValueError: If an option is unknown, or there are none by name.
-    """
+    """The start values in the options of a reset."""
     chosen = named_options(options)
     known = ("position", "velocity", "yaw")
     unknown = sorted(set(chosen) - set(known))

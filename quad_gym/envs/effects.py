@@ -25,17 +25,7 @@ KEYWORDS_WITHOUT_EFFECT = {
 
 
 def require_own_task(given: Collection[str], name: str, kind: str, *, own_reward: bool) -> None:
-    """Refuse keywords of other tasks.
-
-    Args:
-        given: Names of fields of `TaskParams` that were given.
-        name: Name of the task.
-        kind: Kind of its reference.
-        own_reward: True if its class defines a reward.
-
-    Raises:
-        ValueError: If there is one.
-    """
+    """Refuse fields of `TaskParams` that belong to other tasks, or have no effect."""
     if own_reward and "reward_params" in given:
         raise ValueError(
             f"reward_params has no effect on the task {name}, and must not be given: its class has "
@@ -52,11 +42,7 @@ def require_own_task(given: Collection[str], name: str, kind: str, *, own_reward
 
 
 def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
-    """Refuse keywords that were asked for and have no effect with the others.
-
-    Raises:
-        ValueError: If there is one.
-    """
+    """Refuse keywords that were asked for and have no effect with the others."""
     observation, action = keywords["observation"], keywords["action"]
     if "layout" in asked and observation == "measurements":
         raise ValueError(

@@ -34,12 +34,7 @@ def drawn_info(drawn: dict[str, NDArray[np.float64]]) -> Parts:
 
 
 def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
-    """Return the entries "faults" and "innovations" of `info` for all flights, if they have any.
-
-    Args:
-        batch: The flights.
-        bits: (n,) active faults, as in a flight's field "faults".
-    """
+    """Return the entries "faults", from their bits (n,), and "innovations" of `info`, if any."""
     found: Parts = {}
     if batch.faults:
         found["faults"] = named_faults(batch.faults, bits)
@@ -70,13 +65,7 @@ def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[n
 
 
 def final_parts(infos: dict[str, Any], batch: FlightBatch, over: NDArray[np.bool_]) -> Parts:
-    """Return faults and innovations at the end of episodes that are over, as in `final_info`.
-
-    Args:
-        infos: Infos of the step, with the faults at its end.
-        batch: The flights, in which new episodes have begun.
-        over: Whether the episode of each flight is over, (n,).
-    """
+    """Return the faults and innovations of episodes that are over, (n,)."""
     found: Parts = {}
     if "faults" in infos:
         faults = infos["faults"].items()

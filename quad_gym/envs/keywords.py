@@ -126,15 +126,7 @@ def types_of(keywords: type) -> dict[str, Any]:
 
 
 def checked(given: Mapping[str, Any], *others: str) -> dict[str, Any]:
-    """Return a copy of keywords of an environment.
-
-    Args:
-        given: The keywords.
-        others: Further names of the interface that an unknown keyword may be meant for.
-
-    Raises:
-        UnknownKeywordError: If a keyword is unknown.
-    """
+    """Return a copy of keywords; an unknown one may stand for one of `others`, too."""
     known = (*types_of(EnvKeywords), "task", "base", *others)
     for name in ("threads", "render_flights"):
         if name in given and name not in known:
@@ -150,11 +142,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def shows(keywords: type) -> Callable[[F], F]:
-    """Return a decorator that shows the keywords of a TypedDict in a signature, not `**keywords`.
-
-    Args:
-        keywords: `EnvKeywords`, or a class that extends it.
-    """
+    """Return a decorator that shows the keywords of a TypedDict in a signature."""
 
     def decorate(function: F) -> F:
         signature = inspect.signature(function)

@@ -21,17 +21,7 @@ def with_task(
     """Return the maker of flights with a user-defined task, and the table of their observation.
 
     The parts that `observe` returns are found by calling it once, with a flight made for the
-    purpose.
-
-    Args:
-        given: See `resolve_task`.
-        make: Makes the flights without the task.
-        table: Table of their observation.
-
-    Raises:
-        ValueError: If `given` is not a task, it cannot be flown with these sensors or in this
-            world, or a part of its observation has a built-in name.
-        TaskError: If its `reset` or `observe` fails.
+    purpose. Parts with names of built-in parts are refused.
     """
     task = resolve_task(given)
     task._require(make.keywords["sensors"], make.keywords["world"])

@@ -3,8 +3,12 @@
 Pygame is imported with the first picture: environments with a render mode can be made without it.
 """
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
 
 from quad_gym.envs.configuration import Flights
 from quad_gym.envs.keywords import RENDERING_KEYWORDS
@@ -24,25 +28,50 @@ def rendering_options(keywords: dict[str, Any]) -> dict[str, Any]:
     return {name: keywords.pop(name) for name in RENDERING_KEYWORDS if name in keywords}
 
 
-def rendering_of(
-    flights: Flights,
-    render_mode: str | None,
-    *,
-    render_view: str | None = None,
-    render_size: tuple[int, int] | None = None,
-    render_flights: Sequence[int] | None = None,
-) -> "Rendering | None":
-    """Return the renderer of an environment; None if it does not render.
+class Rendered:
+    """Flights with a renderer and Gymnasium's description, as the interfaces have them."""
 
-    Raises:
-        ValueError: If an argument is invalid.
-    """
-    given: dict[str, Any] = {"view": render_view, "size": render_size, "flights": render_flights}
-    given = {name: value for name, value in given.items() if value is not None}
-    if render_mode is None:
-        if given:
-            raise ValueError(f"render_{next(iter(given))} needs a render_mode, got None")
-        return None
-    from quad_gym.rendering.live import Rendering
+    flights: Flights
+    render_mode: str | None
+    rendering: "Rendering | None"
+    _spec: EnvSpec | None = None
+    _seeded = False
 
-    return Rendering(flights.batch, render_mode, **given)
+    def _open(self, flights: Flights, mode: str | None, keywords: Mapping[str, Any]) -> None:
+        """Set flights, and a renderer if there is a `render_mode`, which other keywords need."""
+        self.flights, self.render_mode, self.rendering = flights, mode, None
+        given = {name: value for name, value in keywords.items() if value is not None}
+        if mode is None and given:
+            raise ValueError(f"{next(iter(given))} needs a render_mode, got None")
+        if mode is not None:
+            from quad_gym.rendering.live import Rendering
+
+            options = {name.removeprefix("render_"): value for name, value in given.items()}
+            self.rendering = Rendering(flights.batch, mode, **options)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's description of the environment, with the time limit in steps."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        """Store a description with the time limit of the environment, not of a wrapper."""
+        self._spec = copy.copy(value)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.flights.batch.max_steps or None
+
+    def _open_rendering(self, make: str) -> "Rendering | None":
+        """Return the renderer of flights that have begun, or warn that there is none."""
+        if self.rendering is None:
+            gymnasium.logger.warn(
+                f"render() needs a render_mode: {make}(..., render_mode='rgb_array')"
+            )
+        elif not self._seeded:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        return self.rendering
+
+    def close(self) -> None:
+        """Close the window, if there is one; closing twice is fine."""
+        if self.rendering is not None:
+            self.rendering.close()

@@ -13,7 +13,7 @@ from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.configuration import Flights, checked_actions, start_options
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
-from quad_gym.envs.rendered import rendering_of, rendering_options
+from quad_gym.envs.rendered import Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Ending, Result
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from quad_gym.tasks import Task
 
 
-class QuadSB3VecEnv(VecEnv):
+class QuadSB3VecEnv(Rendered, VecEnv):
     """N flights for Stable-Baselines3, with the episode records of `Monitor` built in.
 
     The last `info` of an episode holds `terminal_observation`, `TimeLimit.truncated` and `episode`
@@ -60,16 +60,9 @@ class QuadSB3VecEnv(VecEnv):
             raise ValueError(f"render_mode must be human or rgb_array, got {render_mode!r}")
         given = checked(keywords, "threads", "render_mode", "render_flights")
         look = rendering_options(given)
-        self.flights = Flights(
-            task, num_envs, Autoreset.SAME_STEP, base=base, threads=threads, **given
-        )
-        self.render_mode = render_mode
-        self.rendering = rendering_of(
-            self.flights, render_mode, render_flights=render_flights, **look
-        )
-        self.spec: Any = None
+        flights = Flights(task, num_envs, Autoreset.SAME_STEP, base=base, threads=threads, **given)
+        self._open(flights, render_mode, look | {"render_flights": render_flights})
         self._began = time.monotonic()
-        self._seeded = False
         self._pending: np.ndarray | None = None
         super().__init__(num_envs, self.flights.space, action_space())
         self.metadata: dict[str, Any] = {
@@ -170,11 +163,6 @@ class QuadSB3VecEnv(VecEnv):
         if seed is None:  # the base class would draw from NumPy's global generator
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         return super().seed(seed)
-
-    def close(self) -> None:
-        """Close the window, if there is one; closing twice is fine."""
-        if self.rendering is not None:
-            self.rendering.close()
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
         """Return a picture of all tiles with "rgb_array"; with "human", a window shows them."""

@@ -1,18 +1,17 @@
 """`QuadEnv`: one flight as a Gymnasium environment."""
 
-import copy
 import inspect
 from typing import TYPE_CHECKING, Any, Unpack
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec, make
+from gymnasium.envs.registration import make
 
 from quad_gym.batch.starts import stream_key
 from quad_gym.envs.configuration import Flights, checked_actions
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
-from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
+from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Ending, Result
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from quad_gym.tasks import Task
 
 
-class QuadEnv(gymnasium.Env[Any, np.ndarray]):
+class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     """A quadrotor that is controlled on estimated state.
 
     ## Description
@@ -210,24 +209,12 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         given = checked(keywords, "render_mode")
         look = rendering_options(given)
         given.setdefault("max_episode_steps", limit_asked_of_make())
-        self.flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **given)
-        self.render_mode = render_mode
-        self.rendering = rendering_of(self.flights, render_mode, **look)
+        flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **given)
+        self._open(flights, render_mode, look)
         self.metadata = self.metadata | {"render_fps": round(self.flights.control_rate)}
         self.observation_space = self.flights.space
         self.action_space = action_space()
-        self._seeded = self._over = False
-        self._spec: EnvSpec | None = None
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Gymnasium's description of the environment, with the time limit in steps."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        """Store a description with the time limit of the environment, not of a wrapper."""
-        self._spec = with_limit(value, self.flights)
+        self._over = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -313,30 +300,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset.
         """
-        if self.rendering is None:
-            gymnasium.logger.warn(
-                "render() needs a render_mode: make(..., render_mode='rgb_array')"
-            )
-            return None
-        if not self._seeded:
-            raise gymnasium.error.ResetNeeded("call reset() before render()")
-        if self.render_mode == "rgb_array_list":
-            return [frame for (frame,) in self.rendering.taken_frames()]
-        return self.rendering.frames()[0] if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Close the window, if there is one; closing twice is fine."""
-        if self.rendering is not None:
-            self.rendering.close()
-
-
-def with_limit(spec: EnvSpec | None, flights: Flights) -> EnvSpec | None:
-    """Return a copy of Gymnasium's description with the time limit of the flights."""
-    if spec is None:
-        return None
-    described = copy.copy(spec)
-    described.max_episode_steps = flights.batch.max_steps or None
-    return described
+        rendering = self._open_rendering("make")
+        if rendering is not None and self.render_mode == "rgb_array_list":
+            return [frame for (frame,) in rendering.taken_frames()]
+        return rendering.frames()[0] if rendering and self.render_mode == "rgb_array" else None
 
 
 ENTRY_POINT = "quad_gym.envs.single:QuadEnv"

@@ -241,11 +241,7 @@ def layout_of_suite(
 def layout_bounds(
     table: tuple[ObservationField, ...],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the bounds (low, high) of every number of an observation, (n,) each.
-
-    Raises:
-        ValueError: If there are more numbers than the kernels have room for.
-    """
+    """Return the bounds (low, high) of every number of an observation, (n,) each."""
     if table[-1].slice.stop > MAX_OBSERVATION:
         raise ValueError(
             f"an observation must have at most {MAX_OBSERVATION} numbers, got "

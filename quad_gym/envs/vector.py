@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -14,8 +13,7 @@ from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.configuration import Flights, checked_actions, named_options
 from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults, start_info
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
-from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
-from quad_gym.envs.single import with_limit
+from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Ending, Result
@@ -32,7 +30,7 @@ _OTHERS = ("num_envs", "autoreset_mode", "threads", "render_mode", "render_fligh
 _ENDINGS = np.array(list(Ending), object)
 
 
-class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
+class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
     """N flights in one compiled call; flight i equals a `QuadEnv` seeded with seed + i.
 
     Observations, actions, rewards, endings and keywords are as in `QuadEnv`. `info` holds arrays
@@ -70,12 +68,9 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         look = rendering_options(given)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         mode = _MODES[self.autoreset_mode]
-        self.flights = Flights(task, num_envs, mode, base=base, threads=threads, **given)
+        flights = Flights(task, num_envs, mode, base=base, threads=threads, **given)
+        self._open(flights, render_mode, look | {"render_flights": render_flights})
         self.num_envs = self.flights.batch.count
-        self.render_mode = render_mode
-        self.rendering = rendering_of(
-            self.flights, render_mode, render_flights=render_flights, **look
-        )
         self.metadata = RENDERING_METADATA | {
             "render_fps": round(self.flights.control_rate),
             "autoreset_mode": self.autoreset_mode,
@@ -84,21 +79,9 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._seeded = False
-        self._spec: EnvSpec | None = None
         self._over = np.zeros(self.num_envs, bool)
         self._everyone = np.ones(self.num_envs, bool)
         self._no_ending = np.full(self.num_envs, Ending.NONE, object)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Gymnasium's description of the environment, with the time limit in steps."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        """Store a description with the time limit of the environment, not of a wrapper."""
-        self._spec = with_limit(value, self.flights)
 
     def reset(
         self,
@@ -176,15 +159,12 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         flown_with = batch.drawn() if same_step else {}
         observations = batch.step(numbers)
         results = batch.results
-        terminated, truncated = (
-            results[:, Result.TERMINATED] > 0.0,
-            results[:, Result.TRUNCATED] > 0.0,
-        )
+        terminated = results[:, Result.TERMINATED] > 0.0
+        truncated = results[:, Result.TRUNCATED] > 0.0
         self._over = terminated | truncated
         if self.rendering is not None:
             self.rendering.observe()
-        infos = self._step_infos(results)
-        infos = _masked(infos, self._everyone)
+        infos = _masked(self._step_infos(results), self._everyone)
         if same_step and self._over.any():
             infos = self._with_finals(infos, flown_with)
         return (
@@ -207,21 +187,16 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset.
         """
-        if self.rendering is None:
-            gymnasium.logger.warn(
-                "render() needs a render_mode: make_vec(..., render_mode='rgb_array')"
-            )
-            return None
-        if not self._seeded:
-            raise gymnasium.error.ResetNeeded("call reset() before render()")
-        if self.render_mode == "rgb_array_list":
-            return self.rendering.taken_tiles()
-        return self.rendering.frames() if self.render_mode == "rgb_array" else None
+        rendering = self._open_rendering("make_vec")
+        if rendering is not None and self.render_mode == "rgb_array_list":
+            return rendering.taken_tiles()
+        return rendering.frames() if rendering and self.render_mode == "rgb_array" else None
+
+    close = gymnasium.vector.VectorEnv.close
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the window, if there is one; closing twice is fine."""
-        if self.rendering is not None:
-            self.rendering.close()
+        """Close the window, if there is one."""
+        Rendered.close(self)
 
     def _step_infos(self, results: NDArray[np.float64]) -> dict[str, Any]:
         """Return errors, endings and counters of the step."""
@@ -312,11 +287,7 @@ def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:
-    """Return one seed per flight: seed + i for a number, the list itself for a list.
-
-    Raises:
-        ValueError: If a seed is not an integer of at least 0, or a list has another length.
-    """
+    """Return one seed per flight: seed + i for a number, the list itself for a list."""
     if seed is None:
         return [None] * count
     if not isinstance(seed, (list, tuple, np.ndarray)):

@@ -119,7 +119,7 @@ class PathRecorder(Tracer):
 
     def arrays(self) -> dict[str, Floats]:
         """Recorded arrays; the path is in those named "path.FIELD", see `path_of`."""
-        path = {f"path.{name}": values for name, values in vars(self.trace(0)).items()}
+        path = {f"path.{name}": values for name, values in vars(self.trace()).items()}
         return {"time": self.time, "percentiles": self.percentiles, **path}
 
 

@@ -131,7 +131,7 @@ def _add_figures(report: Report, results: StudyResults) -> None:
     if curves:
         report.add_figure(
             "learning",
-            learning_figure(curves, levels, score="return of an episode", logarithmic=False),
+            learning_figure(curves, levels, score="return of an episode", linear=True),
             "Return of the evaluations during training, each arm on its own observations; "
             "thin lines are single seeds, bold ones their median.",
         )

@@ -1,6 +1,8 @@
 """Faults of aiding sensors."""
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
@@ -16,12 +18,8 @@ class SensorLoss(Fault):
     A magnetometer is also lost while an autopilot rejects it near iron.
     """
 
-    sensor: str
+    sensor: Annotated[str, partial(check.choice, choices=tuple(aid.name.lower() for aid in Aid))]
     """name of the lost sensor: "barometer", "magnetometer", "optical_flow" or "range_finder\""""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.choice, "sensor", choices=tuple(aid.name.lower() for aid in Aid))
 
     @property
     def kind(self) -> FaultKind:  # type: ignore[override]

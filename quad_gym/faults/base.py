@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import partial
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checks import Checked
 from quad_gym.params.portable import norm
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FaultKind
@@ -38,6 +39,15 @@ def span(name: str, value: Any, *, least: float = 0.0, open_end: bool = False) -
     return check.number(name, value, least=least, open_end=open_end)
 
 
+def _duration(name: str, value: Any) -> Span:
+    """Return `value` as a number above 0, which may be infinite, or as a range of such numbers."""
+    endless = isinstance(value, float) and value == math.inf
+    return value if endless else span(name, value, open_end=True)
+
+
+Size = Annotated[Span, partial(span, open_end=True)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Fault(Checked):
     """Schedule of a fault; its subclasses are the kinds of faults.
@@ -47,14 +57,14 @@ class Fault(Checked):
     kind, which may recur (`rate`).
     """
 
-    start: Span = 0.0
+    start: Annotated[Span, span] = 0.0
     """time of onset since the start of the episode [s]; a range: drawn uniformly"""
-    duration: Span = math.inf
+    duration: Annotated[Span, _duration] = math.inf
     """time from onset to end [s]; a range: drawn uniformly at each onset"""
-    rate: float = 0.0
+    rate: check.NonNegative = 0.0
     """rate of onset while inactive, in place of `start`: a Poisson process [1/s]; 0: a single onset
     at `start`"""
-    probability: float = 1.0
+    probability: check.UpToOne = 1.0
     """probability that the fault can occur in an episode"""
 
     kind: ClassVar[FaultKind]
@@ -64,11 +74,7 @@ class Fault(Checked):
     def __post_init__(self) -> None:
         if type(self) is Fault:
             raise ValueError("faults must be of a kind, such as GnssOutage, got a bare Fault")
-        self._check(span, "start")
-        if not (isinstance(self.duration, float) and self.duration == math.inf):
-            self._check(span, "duration", open_end=True)
-        self._check(check.number, "rate", least=0.0)
-        self._check(check.positive, "probability", most=1.0)
+        super().__post_init__()
         if self.rate > 0.0 and self.start != 0.0:
             raise ValueError(
                 f"{type(self).__name__} takes start or rate, not both, got start={self.start} and "
@@ -87,14 +93,10 @@ class Fault(Checked):
         "share", "size" (a Span) and "direction" have their own places for each kind; any other name
         is a field of the settings record.
         """
-        return {}
+        return {name: getattr(self, name) for name in ("share", "size") if hasattr(self, name)}
 
     def check_suite(self, sensors: SensorSuite) -> None:
-        """Refuse a sensor suite that lacks the sensor of the fault.
-
-        Raises:
-            ValueError: If the sensor is missing.
-        """
+        """Refuse a sensor suite that lacks the sensor of the fault."""
         if self.needs and getattr(sensors, self.needs) is None:
             what = _SENSORS.get(self.needs, f"a {self.needs}")
             raise ValueError(
@@ -107,27 +109,16 @@ class Fault(Checked):
 class DirectedFault(Fault):
     """A fault with a size and a direction, drawn uniformly from all directions by default."""
 
-    direction: Vector | None = None
+    direction: check.Vector3 | None = None
     """(3,) direction of the fault, of any length; None: drawn at each onset"""
-
-    size_field: ClassVar[str] = "size"
-    """name of the field that holds the size"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.direction is not None:
-            self._check(check.vector, "direction", length=3)
-            if not any(self.direction):
-                raise ValueError(f"{type(self).__name__}.direction must not be zero")
-        self._check(span, self.size_field, open_end=True)
+        if self.direction is not None and not any(self.direction):
+            raise ValueError(f"{type(self).__name__}.direction must not be zero")
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """Numbers that the kernels read of the fault."""
-        return {"size": getattr(self, self.size_field), "direction": self.unit}
-
-    @property
-    def unit(self) -> np.ndarray:
-        """Given direction (3,) as a unit vector; zeros: drawn."""
+        """Size, and direction (3,) as a unit vector; zeros: drawn."""
         given = np.zeros(3) if self.direction is None else np.array(self.direction)
-        return given / (norm(given) or 1.0)
+        return super().numbers | {"direction": given / (norm(given) or 1.0)}

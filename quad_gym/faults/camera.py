@@ -1,7 +1,7 @@
 """Faults of the camera."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
@@ -15,21 +15,12 @@ __all__ = ["CameraOcclusion", "WrongAssociations"]
 class CameraOcclusion(Fault):
     """Features that the camera does not see: something is in the way, or the image is dark."""
 
-    share: float = 1.0
+    share: check.UpToOne = 1.0
     """probability that a feature is hidden, drawn for each feature at each onset; 1: all
     features"""
 
     kind = FaultKind.CAMERA_OCCLUSION
     needs = "camera"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.positive, "share", most=1.0)
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """Numbers that the kernels read of the fault."""
-        return {"share": self.share}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,19 +31,14 @@ class WrongAssociations(Fault):
     see M. A. Fischler and R. C. Bolles, Communications of the ACM 24(6), 1981, for the reasons.
     """
 
-    share: float = 0.05
+    share: check.UpToOne = 0.05
     """probability that an image has a wrong association while the fault is active"""
-    how: str = "swap"
+    how: Literal["swap", "copy"] = "swap"
     """form of the error: "swap": two features, drawn among the visible ones, are swapped; "copy":
     one of them is reported in the direction of the other, which is reported in its own"""
 
     kind = FaultKind.WRONG_ASSOCIATIONS
     needs = "camera"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.positive, "share", most=1.0)
-        self._check(check.choice, "how", choices=("swap", "copy"))
 
     def check_suite(self, sensors: SensorSuite) -> None:
         """Refuse a suite without a camera, or with a single feature."""
@@ -65,5 +51,5 @@ class WrongAssociations(Fault):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """Numbers that the kernels read of the fault."""
-        return {"share": self.share, "fault_swaps": self.how == "swap"}
+        """Share of images, and the form of the error."""
+        return super().numbers | {"fault_swaps": self.how == "swap"}

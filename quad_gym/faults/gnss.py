@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from quad_gym.faults.base import DirectedFault, Fault, Span, span
+from quad_gym.faults.base import DirectedFault, Fault, Size
 from quad_gym.params import checks as check
 from quad_gym.records import FaultKind
 
@@ -33,23 +33,13 @@ class GnssOutliers(Fault):
     Solutions 22(1), 2018.
     """
 
-    share: float = 0.05
+    share: check.UpToOne = 0.05
     """probability that a position is an outlier while the fault is active"""
-    size: Span = (10.0, 100.0)
+    size: Size = (10.0, 100.0)
     """size of an outlier [standard deviations of a fix]"""
 
     kind = FaultKind.GNSS_OUTLIERS
     needs = "gnss"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.positive, "share", most=1.0)
-        self._check(span, "size", open_end=True)
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """Numbers that the kernels read of the fault."""
-        return {"share": self.share, "size": self.size}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,12 +51,16 @@ class GnssRamp(DirectedFault):
     innovations detects a ramp that is slow enough.
     """
 
-    speed: Span = (0.1, 0.5)
+    speed: Size = (0.1, 0.5)
     """rate of the ramp [m/s]"""
 
     kind = FaultKind.GNSS_RAMP
     needs = "gnss"
-    size_field = "speed"
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Speed as the size, and direction."""
+        return super().numbers | {"size": self.speed}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +70,7 @@ class GnssJump(DirectedFault):
     The offset is then a small multiple of the carrier's wavelength, 0.19 m on L1.
     """
 
-    size: Span = (0.19, 0.95)
+    size: Size = (0.19, 0.95)
     """length of the offset [m]; default: one to five wavelengths"""
 
     kind = FaultKind.GNSS_JUMP

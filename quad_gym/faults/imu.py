@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from quad_gym.faults.base import DirectedFault, Fault, Span
+from quad_gym.faults.base import DirectedFault, Fault, Size
 from quad_gym.params import checks as check
 from quad_gym.records import FaultKind
 
@@ -19,7 +19,7 @@ class AccelBiasStep(DirectedFault):
     of temperature moves them by a fraction of that; engineering judgment.
     """
 
-    size: Span = (0.05, 0.2)
+    size: Size = (0.05, 0.2)
     """length of the step [m/s^2]"""
 
     kind = FaultKind.ACCEL_BIAS_STEP
@@ -33,7 +33,7 @@ class GyroBiasStep(DirectedFault):
     tenths of that; engineering judgment.
     """
 
-    size: Span = (math.radians(0.2), math.radians(1.0))
+    size: Size = (math.radians(0.2), math.radians(1.0))
     """length of the step [rad/s]"""
 
     kind = FaultKind.GYRO_BIAS_STEP
@@ -47,18 +47,14 @@ class ImuSaturation(Fault):
     inner loops saturate, too.
     """
 
-    accel_range: float = 2.0 * 9.80665
+    accel_range: check.Positive = 2.0 * 9.80665
     """largest specific force along each axis, in either direction [m/s^2]"""
-    gyro_range: float = math.radians(250.0)
+    gyro_range: check.Positive = math.radians(250.0)
     """largest angular rate about each axis, in either direction [rad/s]"""
 
     kind = FaultKind.IMU_SATURATION
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.positive, "accel_range", "gyro_range")
-
     @property
     def numbers(self) -> dict[str, Any]:
-        """Numbers that the kernels read of the fault."""
+        """Both ranges."""
         return {"imu_range": (self.accel_range, self.gyro_range)}

@@ -61,16 +61,8 @@ ALL = "all"
 def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
     """Return the faults that the keyword `faults` selects, in the order of `FaultKind`.
 
-    Args:
-        given: See `FaultsGiven`; "all" stands for every preset that the suite can have.
-        sensors: The suite that the faults affect.
-
-    Returns:
-        At most one fault of each kind.
-
-    Raises:
-        ValueError: If a name is unknown, a kind is given twice, or the suite lacks the sensor of a
-            fault.
+    "all" stands for every preset that the suite can have. At most one fault of each kind is
+    accepted, and only faults of sensors in the suite.
     """
     if isinstance(given, (str, Fault)) or given is None:
         given = () if given is None else (given,)
@@ -99,11 +91,7 @@ def needs_sensors(fault: Fault) -> bool:
 
 
 def felt_without_sensors(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
-    """Return the faults that affect the vehicle itself, and thus also control on the truth.
-
-    For comparisons of control on the estimate, which all faults affect, with control on the truth,
-    which faults of sensors do not.
-    """
+    """Return the faults that affect the vehicle itself, and thus also control on the truth."""
     return tuple(fault for fault in faults_of(given, sensors) if not needs_sensors(fault))
 
 
@@ -127,11 +115,6 @@ def possible(faults: Any, sensors: SensorSuite) -> bool:
 
 
 def named_faults(faults: Iterable[Fault], bits: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
-    """Return the state of each fault, active or not, by name.
-
-    Args:
-        faults: The faults that can occur.
-        bits: (...,) sums of 2^FaultKind over the active ones, as in a flight's field "faults".
-    """
+    """Return which faults are active, by name, from sums (...,) of 2^FaultKind."""
     whole = bits.astype(np.int64)
     return {fault.name: (whole >> fault.kind) % 2 > 0 for fault in faults}

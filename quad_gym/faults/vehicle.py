@@ -1,9 +1,10 @@
 """Faults of the vehicle."""
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
-from quad_gym.faults.base import DirectedFault, Fault, Span, ends, span
+from quad_gym.faults.base import DirectedFault, Fault, Size, ends
 from quad_gym.params import checks as check
 from quad_gym.records import FaultKind
 
@@ -20,7 +21,7 @@ class PositionJump(DirectedFault):
     exceed the bounds of `Hover`, 1.6 m; use `out_of_bounds=3.0` with that environment.
     """
 
-    size: Span = (1.0, 2.0)
+    size: Size = (1.0, 2.0)
     """length of the displacement [m]"""
 
     kind = FaultKind.POSITION_JUMP
@@ -34,26 +35,23 @@ class RotorLoss(Fault):
     Visser and D. Scaramuzza, IEEE Robotics and Automation Letters 6(2), 2021.
     """
 
-    share: Span = (0.1, 0.3)
+    share: Size = (0.1, 0.3)
     """fraction of thrust and torque that is lost, at most 1 [-]; engineering judgment for chipped
     blades"""
-    rotor: int | None = None
+    rotor: Annotated[int, partial(check.whole, least=0)] | None = None
     """index of the rotor, 0 to 3; None: drawn at each onset"""
 
     kind = FaultKind.ROTOR_LOSS
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(span, "share", open_end=True)
         if ends(self.share)[1] > 1.0:
             raise ValueError(f"RotorLoss.share must be at most 1, got {self.share}")
-        if self.rotor is not None:
-            self._check(check.whole, "rotor", least=0)
-            if self.rotor > 3:
-                raise ValueError(f"RotorLoss.rotor must be 0, 1, 2 or 3, got {self.rotor}")
+        if self.rotor is not None and self.rotor > 3:
+            raise ValueError(f"RotorLoss.rotor must be 0, 1, 2 or 3, got {self.rotor}")
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """Numbers that the kernels read of the fault."""
+        """Lost fraction as the size, and the range from which the rotor is drawn."""
         pick = (0.0, 1.0) if self.rotor is None else ((self.rotor + 0.5) / 4.0, 0.0)
         return {"size": self.share, "fault_pick": pick}

@@ -12,7 +12,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.measurements import call_sensor, call_sensors
-from quad_gym.kernels.maths.linalg import load3, norm, sub
+from quad_gym.kernels.maths.linalg import load3, norm
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Act
@@ -118,5 +118,5 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     run(Stage.UPDATE, here)
     run(Stage.LOOK, here)
     r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
-    error = norm(sub(r_ref, load3(flight.r)))
+    error = norm(r_ref - load3(flight.r))
     flight.position_error = select(mask, error, flight.position_error)

@@ -11,22 +11,14 @@ import numpy as np
 from numba import types
 from numba.np.numpy_support import from_dtype
 
-from quad_gym.kernels.compiling import Stage, call_stage, entry
+from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.align import initialize
-from quad_gym.kernels.filter.innovations import forget_innovations
+from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
+from quad_gym.kernels.filter.still import start_still
 from quad_gym.kernels.filter.wahba import wahba
-from quad_gym.kernels.maths.linalg import (
-    add_outer,
-    load3,
-    load4,
-    load33,
-    scale,
-    scale33,
-    store3,
-    store33,
-)
+from quad_gym.kernels.maths.linalg import diagonal, load3, load4, load33, outer, store
 from quad_gym.kernels.sensors import camera
 from quad_gym.kernels.sensors.gnss import measure_gnss
 from quad_gym.kernels.sensors.gnss_position import drift_gnss
@@ -49,6 +41,7 @@ from quad_gym.records import (
     PARAMS,
     PARAMS_BLOCK,
     SETTINGS,
+    START,
     WORK_BLOCK,
     Sensor,
 )
@@ -60,20 +53,10 @@ FILTER_ENTRIES = (f"{__name__}:start_filter", "quad_gym.kernels.tape:run_tape")
 SENSORS_AND_VEHICLE = tuple(
     f"{__name__}:{name}"
     for name in (
-        "sense_features",
-        "sense_gnss",
-        "body_accelerations_in_air",
-        "integrate_flight",
-        "sense_imu_average",
-        "sense_imu",
-        "body_accelerations",
-        "wahba_of_vectors",
-        "step_biases",
-        "step_gnss_drift",
-        "draw_sensor_errors",
-        "disturb_imu",
-        "turn_gnss_baseline",
-        "limit_features",
+        *("sense_features", "sense_gnss", "body_accelerations_in_air", "integrate_flight"),
+        *("sense_imu_average", "sense_imu", "body_accelerations", "start_level"),
+        *("wahba_of_vectors", "step_biases", "step_gnss_drift", "draw_sensor_errors"),
+        *("disturb_imu", "turn_gnss_baseline", "limit_features"),
     )
 )
 """Names of the other entries of this module, the slowest to compile first."""
@@ -93,16 +76,28 @@ def _entry(*arguments, returns=types.none):
     return lambda function: entry(function, returns(*arguments))
 
 
+@kernel
+def begin_filter(block, params, settings, work, x_I):
+    """Start the filters of a block, see `start_filter`."""
+    flight, mask = lanes_of(block), lanes_of(work).mask > 0.0
+    forget_innovations(flight, settings.feature_count, mask)
+    initialize(flight, lanes_of(params), mask, x_I)
+    begin_slow(flight, lanes_of(params), settings, mask)
+
+
 @_entry(_BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
 def start_filter(blocks, params, settings, work, x_I):
     """Start the filters of blocks[0] from their first fixes, where `work.mask`.
 
     x_I: (3,) known direction of body x in I, or zeros if unknown.
     """
-    flight, mask = lanes_of(blocks[0]), lanes_of(work[0]).mask > 0.0
-    forget_innovations(flight, settings[0].feature_count, mask)
-    initialize(flight, lanes_of(params[0]), mask, load3(x_I))
-    begin_slow(flight, lanes_of(params[0]), settings[0], mask)
+    begin_filter(blocks[0], params[0], settings[0], work[0], load3(x_I))
+
+
+@_entry(from_dtype(START))
+def start_level(start):
+    """Compute the first estimate of a vehicle of known tilt, from a START record."""
+    start_still(start)
 
 
 @_entry(
@@ -111,15 +106,9 @@ def start_filter(blocks, params, settings, work, x_I):
     types.int64,
 )
 def run_stage(address, pitch, count, number, world, model, settings, work, table, flag):
-    """Run a stage of the table once for every block, where `work.mask`.
+    """Run a stage of the table, its number, once for every block, where `work.mask`.
 
-    Args:
-        address: Address of the first block, as in `Call`.
-        pitch: Bytes from one block to the next.
-        count: Number of blocks.
-        number: A `Stage`.
-        world, model, settings, work, table: As for `fly`.
-        flag: The stage's flag.
+    The first block is at `address`; each next one is `pitch` bytes further.
     """
     true, believed = lanes_of(world[0]), lanes_of(model[0])
     scratch = lanes_of(work[0])
@@ -201,45 +190,35 @@ def integrate_flight(flights, params, substeps):
 @_entry(_MATRIX, *[_VECTOR] * 4, _PARAMS, _VECTOR, _VECTOR)
 def body_accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, params, a_I, dw_B):
     """Write the acceleration in I and the angular acceleration in B."""
-    a, dw = accelerations(
-        load33(R_BI), load3(v_I), load3(w_B), load4(rotor_speeds), load3(d_I), params[0]
-    )
-    store3(a_I, a)
-    store3(dw_B, dw)
+    R, W = load33(R_BI), load4(rotor_speeds)
+    a, dw = accelerations(R, load3(v_I), load3(w_B), W, load3(d_I), params[0])
+    store(a_I, a)
+    store(dw_B, dw)
 
 
 @_entry(_VECTOR, _MATRIX, *[_VECTOR] * 4, _PARAMS, _SETTINGS, _VECTOR, _VECTOR)
 def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, settings, a_I, dw_B):
     """Write the acceleration in I and the angular acceleration in B in moving air."""
-    a, dw = accelerations_in_air(
-        load3(r_I),
-        load33(R_BI),
-        load3(v_I),
-        load3(w_B),
-        load4(rotor_speeds),
-        load3(d_I),
-        load3(params[0].wind_I),
-        params[0],
-        settings[0],
-    )
-    store3(a_I, a)
-    store3(dw_B, dw)
+    r, R, v, w, W = load3(r_I), load33(R_BI), load3(v_I), load3(w_B), load4(rotor_speeds)
+    p, d, wind = params[0], load3(d_I), load3(params[0].wind_I)
+    a, dw = accelerations_in_air(r, R, v, w, W, d, wind, p, settings[0])
+    store(a_I, a)
+    store(dw_B, dw)
 
 
 @_entry(_VECTOR, _MATRIX, _MATRIX, _MATRIX, returns=types.float64)
 def wahba_of_vectors(weights, v_I, v_B, R_BI):
     """Write the solution of Wahba's problem for (n, 3) vectors; return its uniqueness."""
-    zeros = (0.0, 0.0, 0.0)
-    profile = (zeros, zeros, zeros)
+    profile = diagonal((0.0, 0.0, 0.0))
     for i in range(len(weights)):
-        profile = add_outer(profile, scale(weights[i], load3(v_B[i])), load3(v_I[i]))
+        profile = profile + outer(weights[i] * load3(v_B[i]), load3(v_I[i]))
     # only ratios matter: scale the largest entry to one, to avoid under- and overflow
     largest = 0.0
     for i in range(3):
         for j in range(3):
             largest = max(largest, abs(profile[i][j]))
     if largest > 0.0:
-        profile = scale33(1.0 / largest, profile)
+        profile = (1.0 / largest) * profile
     rotation, uniqueness = wahba(profile)
-    store33(R_BI, rotation)
+    store(R_BI, rotation)
     return uniqueness

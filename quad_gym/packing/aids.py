@@ -96,12 +96,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
 
 
 def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
-    """Write the sensors of a suite and the slow errors that its filter estimates.
-
-    Args:
-        settings: One SETTINGS record.
-        sensors: The sensors that the filter assumes; the true ones measure the same quantities.
-    """
+    """Write the sensors that a filter assumes into a SETTINGS record, with their slow errors."""
     states = slow_states(sensors)
     assert len(states.errors) <= MAX_SLOW
     settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated

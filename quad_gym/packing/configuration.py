@@ -16,7 +16,7 @@ from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.draw_limits import check_draws
 from quad_gym.params.randomization import DrawingTable, Randomization
 from quad_gym.params.randomization import Given as Drawn
-from quad_gym.params.resolved import Resolved, default_of, preset_of
+from quad_gym.params.resolved import Resolved, resolving
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
@@ -49,18 +49,18 @@ class FlightConfiguration:
     """number of flights"""
     _: KW_ONLY
     vehicle: Resolved[VehicleParams | str, VehicleParams] = Resolved(
-        preset_of(VehicleParams, vehicle_params), "lab"
+        resolving(VehicleParams, vehicle_params), "lab"
     )
     """vehicle, or the name of a preset"""
     sensors: Resolved[SensorSuite | str, SensorSuite] = Resolved(
-        preset_of(SensorSuite, sensor_suite), "standard"
+        resolving(SensorSuite, sensor_suite), "standard"
     )
     """sensor suite, or the name of a preset"""
     gains: PDGains | str | None = None
     """gains of `Control.PD`, or the name of a preset; None: "lab\""""
     action_params: ActionParams | None = None
     """scales of the actions, and bandwidths of the inner loops"""
-    task: Resolved[TaskParams | None, TaskParams] = Resolved(default_of(TaskParams), None)
+    task: Resolved[TaskParams | None, TaskParams] = Resolved(resolving(TaskParams), None)
     """reference, start and termination"""
     source: Source = Source.ESTIMATE
     """source of the state that the controller observes"""
@@ -101,7 +101,7 @@ class FlightConfiguration:
     true_sensors: SensorSuite | None = None
     """true parameters of the sensors, if they differ from `sensors`, which the filter assumes"""
     world: Resolved[WorldParams | str, WorldParams] = Resolved(
-        preset_of(WorldParams, world_params), "calm"
+        resolving(WorldParams, world_params), "calm"
     )
     """wind, gusts, drag, ground, battery, obstacles and geofence, or the name of a preset"""
     randomization: Resolved[Randomization | Mapping[str, Drawn] | None, Randomization] = Resolved(

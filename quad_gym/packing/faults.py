@@ -9,13 +9,7 @@ from quad_gym.kernels.sensors.faults import NEVER
 
 
 def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
-    """Write faults into a settings record.
-
-    Args:
-        s: The settings.
-        faults: At most one fault of each kind.
-        dt: The tick [s].
-    """
+    """Write faults, at most one of each kind, into a settings record; `dt` is the tick [s]."""
     for fault in faults:
         k = fault.kind
         s["faults"], s["fault_on"][k] = True, True

@@ -53,10 +53,7 @@ def params_record(
     action_params: ActionParams | None = None,
     world: WorldParams | None = None,
 ) -> NDArray[Any]:
-    """Return a vehicle, its sensors, gains and world as one scalar record, shape (1,).
-
-    A field that is a parameter has its name; the other fields are derived.
-    """
+    """Return a vehicle, its sensors, gains and world as one scalar record, shape (1,)."""
     record = np.zeros(1, PARAMS)
     p = record[0]
     world = WorldParams() if world is None else world
@@ -115,12 +112,7 @@ def _pack_imu(p: Any, sensors: SensorSuite, vehicle: VehicleParams) -> None:
 
 
 def pack_tick(p: Any, sensors: SensorSuite) -> None:
-    """Write the numbers that depend on the duration of a tick.
-
-    Args:
-        p: One record of parameters; its gravity is already set.
-        sensors: Sensors that the filter assumes.
-    """
+    """Write the numbers that depend on the duration of a tick, after gravity."""
     imu, dt = sensors.imu, sensors.imu.dt
     p["dt"], p["accel_error_noise"] = dt, imu.accel_error_noise
     biases = slow_errors_of(sensors)
@@ -182,13 +174,7 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
 
 
 def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
-    """Return the options of a filter as flags for the kernels.
-
-    Args:
-        estimator: The filter.
-        innovations: True if it stores innovations.
-        lever_arm: Flags for the accelerometer's lever arm, see `lever_form`.
-    """
+    """Return the options of a filter as flags; it may store innovations, and model a lever arm."""
     form = FilterForm.INNOVATIONS if innovations else FilterForm(0)
     if estimator.kind == "ekf":
         form |= FilterForm.EKF
@@ -204,12 +190,7 @@ def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int =
 
 
 def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
-    """Return the flags with which a filter models the accelerometer's lever arm; 0: none.
-
-    Args:
-        imu: The IMU that the filter assumes.
-        drawn: True if each episode draws a lever arm, which is available to the filter.
-    """
+    """Return flags for the lever arm of the assumed accelerometer, known or drawn; 0: none."""
     if not (drawn or any(imu.lever_arm_B)):
         return FilterForm(0)
     averages = imu.samples == "average"

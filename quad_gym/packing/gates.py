@@ -2,12 +2,7 @@
 
 
 def gate_limit(freedoms: int, false_alarm: float) -> float:
-    """Return the NIS above which a measurement is rejected, a quantile of chi-square.
-
-    Args:
-        freedoms: Degrees of freedom of the measurement.
-        false_alarm: Probability that a correct measurement is rejected; 0: no gate.
-    """
+    """Return the NIS above which a measurement is rejected, a quantile of chi-square."""
     if false_alarm == 0.0:
         return float("inf")
     from scipy.special import chdtri  # takes 0.1 s, needed with gates only

@@ -36,11 +36,7 @@ _HARMONICS = {
 
 
 def settings_record(c: FlightConfiguration) -> NDArray[Any]:
-    """Return the settings of a batch as one scalar record, shape (1,).
-
-    Raises:
-        ValueError: If the latency of a sensor is too long for its rate.
-    """
+    """Return the settings of a batch as one scalar record, shape (1,)."""
     record = np.zeros(1, SETTINGS)
     s, task, assumed = record[0], c.task, c.sensors
     s["substeps"], s["ticks_per_step"] = c.clocks.substeps, c.clocks.ticks_between("control")

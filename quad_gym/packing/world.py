@@ -19,15 +19,7 @@ FALLEN_THROUGH = 0.5
 def pack_options(
     s: Any, world: WorldParams, draws: DrawingTable, *, known: bool, limited: bool
 ) -> None:
-    """Write the options of a world and its randomization into a settings record.
-
-    Args:
-        s: The settings.
-        world: The world without draws.
-        draws: The drawn parameters and their distributions.
-        known: True if filter and controller use the true parameters.
-        limited: True if the motors have a largest voltage that is unknown to the controller.
-    """
+    """Write the options of a world and its draws."""
 
     def present(name: str, *values: float) -> bool:
         return any(values) or bool(draws.kind[COLUMNS[name]].any())
@@ -53,12 +45,7 @@ def pack_options(
 
 
 def pack_start(s: Any, draws: DrawingTable) -> None:
-    """Write the variance of the velocity and the tilt at the start into a settings record.
-
-    Args:
-        s: The settings, with `start` already set.
-        draws: The drawn parameters, which are added to the start.
-    """
+    """Write the variance of velocity and tilt at the start; the field `start` is already set."""
     if s["start"] == Start.MOVING:  # uniform on [-most, most]
         s["start_velocity_variance"] = MAX_START_VELOCITY**2 / 3.0
     if "start_velocity_I" in draws.names:
@@ -72,14 +59,7 @@ def pack_start(s: Any, draws: DrawingTable) -> None:
 def pack_places(
     s: Any, draws: DrawingTable, true_sensors: SensorSuite, sensors: SensorSuite
 ) -> None:
-    """Write into a settings record if features are drawn, and their positions without draws.
-
-    Args:
-        s: The settings, with `known` already set.
-        draws: The drawn parameters.
-        true_sensors: The true sensors.
-        sensors: The sensors that the filter assumes, unless `known` is set.
-    """
+    """Write whether features are drawn, and their positions without draws, after `pack_options`."""
     s["features_drawn"] = bool(set(FEATURE_DRAWS) & set(draws.names))
     if s["features_drawn"]:
         believed = true_sensors if s["known"] else sensors

@@ -22,12 +22,12 @@ class SlowError(NamedTuple):
 class AidParams(Checked):
     """An aiding sensor other than IMU, GNSS and camera."""
 
-    rate: float = 50.0
+    rate: check.Positive = 50.0
     """measurement rate [Hz]; the IMU rate must be a whole multiple of it"""
-    phase: float | None = None
+    phase: check.Phase = None
     """time of the first measurement after the start as a fraction of the measurement period, in [0,
     1), rounded to whole ticks; None: drawn at random in each episode"""
-    latency: float = 0.0
+    latency: check.NonNegative = 0.0
     """delay from a measurement to its arrival at the filter, which receives it with its time stamp
     [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods"""
     noise_sigma: float
@@ -36,11 +36,6 @@ class AidParams(Checked):
     aid: ClassVar[Aid]
     raw: ClassVar[tuple[str, str, float]]
     """unit, frame and bound of the measurement in raw observations"""
-
-    def __post_init__(self) -> None:
-        self._check(check.positive, "rate")
-        self._check(check.phase, "phase")
-        self._check(check.number, "latency", least=0.0)
 
     @property
     def slow_vector(self) -> SlowError | None:

@@ -11,22 +11,18 @@ from quad_gym.records import Aid
 class BarometerParams(AidParams):
     """A barometer: height of the vehicle in I, with white noise and a time-correlated bias."""
 
-    noise_sigma: float = 0.1
+    noise_sigma: check.Positive = 0.1
     """standard deviation of the white noise [m]; dominated by the airflow of the rotors, as the
     sensor's own noise is some centimeters; engineering judgment"""
-    bias_sigma: float = 0.7
+    bias_sigma: check.Positive = 0.7
     """stationary standard deviation of the bias, a first-order Gauss-Markov process [m]; Bosch
     BMP388 data sheet: relative accuracy +-8 Pa, equivalent to +-0.66 m"""
-    bias_tau: float = 300.0
+    bias_tau: check.Positive = 300.0
     """correlation time of the bias [s]: weather and sensor temperature change within minutes;
     engineering judgment. The filter estimates the bias as an augmented state"""
 
     aid = Aid.BAROMETER
     raw = ("m", "I", 1000.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.positive, "noise_sigma", "bias_sigma", "bias_tau")
 
     @property
     def slow_scalar(self) -> SlowError:

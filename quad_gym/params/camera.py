@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -9,63 +11,58 @@ from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Matrix, Vector
 from quad_gym.records import MAX_FEATURES
 
+Positive2 = Annotated[Vector, partial(check.vector, length=2, least=0.0, open_end=True)]
+
+
+def _features(name: str, value: Any) -> Matrix:
+    """`value` as positions of at least one and at most MAX_FEATURES features."""
+    if np.size(value) == 0:
+        raise ValueError(f"{name} must hold at least one feature, got none")
+    found = check.matrix(name, value, rows=None, columns=3)
+    if len(found) > MAX_FEATURES:
+        raise ValueError(f"{name} must hold at most {MAX_FEATURES} features, got {len(found)}")
+    return found
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraParams(Checked):
     """A pinhole camera that measures the image coordinates of known features."""
 
-    rate: float = 200.0
+    rate: check.Positive = 200.0
     """frame rate [Hz]; the IMU rate must be a whole multiple of it; laboratory: an image at every
     tick"""
-    position_B: Vector = (0.1159, -0.0004, -0.0435)
+    position_B: check.Place = (0.1159, -0.0004, -0.0435)
     """(3,) projection center in B [m]; laboratory vehicle"""
-    attitude: Vector = (math.radians(120.0), 0.0, math.radians(90.0))
+    attitude: check.Vector3 = (math.radians(120.0), 0.0, math.radians(90.0))
     """(3,) Euler angles of R_CB (roll, pitch and yaw in the 3-1-2 sequence), with the camera's z
     axis along the optical axis [rad]; laboratory"""
-    focal_length: float = 1657.72
+    focal_length: check.Positive = 1657.72
     """focal length [pixels]; laboratory"""
-    image_size: Vector = (3840.0, 2160.0)
+    image_size: Positive2 = (
+        3840.0,
+        2160.0,
+    )
     """(2,) width and height of the image, with the origin of image coordinates at its center
     [pixels]; laboratory"""
-    pixel_sigma: float = 20.0
+    pixel_sigma: check.Positive = 20.0
     """standard deviation of each image coordinate of a feature [pixels]; laboratory"""
-    features_I: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.7))
+    features_I: Annotated[Matrix, _features] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.7))
     """(n, 3) positions of the known features in I, at most MAX_FEATURES of them [m]; laboratory"""
-    phase: float | None = 0.0
+    phase: check.Phase = 0.0
     """time of the first image after the start as a fraction of the frame period, in [0, 1), rounded
     to whole ticks; None: drawn at random in each episode"""
-    latency: float = 0.0
+    latency: check.NonNegative = 0.0
     """delay from an image to the arrival of its features at the filter, which receives them with
     the time stamp of the image [s]; rounded to whole ticks, at most MAX_UNDER_WAY frame periods"""
-    max_range: float = math.inf
+    max_range: Annotated[float, check.positive_or_infinite] = math.inf
     """distance beyond which a feature is too small to be detected [m]"""
-    exposure: float = 0.0
+    exposure: Annotated[float, check.between(0.0, 1.0)] = 0.0
     """exposure time of an image [s]: a body rate w smears a feature over `focal_length w exposure`
     pixels, and the measured position is uniformly distributed along the smear; the filter inflates
     the pixel noise in proportion to the measured body rate"""
     ground_hides: bool = False
     """True: the ground (`WorldParams.ground_height`) occludes features below it, and all features
     if the camera is below it"""
-
-    def __post_init__(self) -> None:
-        self._check(check.number, "latency", least=0.0)
-        self._check(check.number, "exposure", least=0.0, most=1.0)
-        self._check(check.flag, "ground_hides")
-        if not (isinstance(self.max_range, float) and self.max_range == math.inf):
-            self._check(check.positive, "max_range")
-        self._check(check.phase, "phase")
-        self._check(check.positive, "rate", "focal_length", "pixel_sigma")
-        self._check(check.place, "position_B")
-        self._check(check.vector, "attitude", length=3)
-        self._check(check.vector, "image_size", length=2, least=0.0, open_end=True)
-        if np.size(self.features_I) == 0:
-            raise ValueError("CameraParams.features_I must hold at least one feature, got none")
-        self._check(check.matrix, "features_I", rows=None, columns=3)
-        if len(self.features_I) > MAX_FEATURES:
-            raise ValueError(
-                f"CameraParams.features_I must hold at most {MAX_FEATURES} features, "
-                f"got {len(self.features_I)}"
-            )
 
     def simplified(self) -> "CameraParams":
         """Return a copy without latency, motion blur, and limits of range and ground."""

@@ -5,11 +5,17 @@ import difflib
 import importlib
 import inspect
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, Self
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+T = TypeVar("T")
+Vector = tuple[float, ...]
+Matrix = tuple[tuple[float, ...], ...]
 
 MOST_TICKS = 10**5
 """Largest number of ticks between two events of a clock; 500 s at 200 Hz."""
@@ -127,6 +133,11 @@ def positive(name: str, value: Any, *, least: float = SMALLEST, most: float = LA
     return result
 
 
+def positive_or_infinite(name: str, value: Any) -> float:
+    """`value` as a float above zero, which may be infinite."""
+    return value if isinstance(value, float) and value == math.inf else positive(name, value)
+
+
 def whole(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
     """`value` as an int that is at least `least` and at most `most`."""
     if isinstance(value, (bool, np.bool_)) or int(number(name, value)) != value:
@@ -173,10 +184,11 @@ def phase(name: str, value: Any) -> float | None:
     return share
 
 
-def instance(name: str, value: Any, kind: type) -> None:
-    """Refuse a `value` that is not a `kind`."""
+def instance(name: str, value: T, kind: type) -> T:
+    """`value`, if it is a `kind`."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be a {kind.__name__}, got {value!r}")
+    return value
 
 
 def choice(name: str, value: Any, choices: Sequence[str]) -> str:
@@ -269,8 +281,44 @@ def ticks(name: str, rate: float, tick_rate: float) -> int:
     return round(ratio)
 
 
-Vector = tuple[float, ...]
-Matrix = tuple[tuple[float, ...], ...]
+Positive = Annotated[float, positive]
+NonNegative = Annotated[float, partial(number, least=0.0)]
+UpToOne = Annotated[float, partial(positive, most=1.0)]
+Phase = Annotated[float | None, phase]
+Place = Annotated[Vector, place]
+Vector3 = Annotated[Vector, partial(vector, length=3)]
+NonNegative3 = Annotated[Vector, partial(vector, length=3, least=0.0)]
+Positive3 = Annotated[Vector, partial(vector, length=3, least=0.0, open_end=True)]
+Matrix33 = Annotated[Matrix, partial(matrix, rows=3, columns=3)]
+Matrix43 = Annotated[Matrix, partial(matrix, rows=4, columns=3)]
+
+Rule = Callable[[str, Any], Any]
+"""From the name of a field in messages, and its value, to the checked value."""
+
+
+def between(least: float, most: float) -> Rule:
+    """Return the rule of a finite float in [least, most]."""
+    return partial(number, least=least, most=most)
+
+
+def _rule_of(hint: Any) -> tuple[Any, Rule | None]:
+    """Split the type of a field into the plain type and the rule of its values, if it has one."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return inner[0], inner[1]
+    if origin is Literal:
+        return hint, partial(choice, choices=inner)
+    if origin in (Union, UnionType) and len(inner) == 2 and inner[1] is NoneType:
+        plain, rule = _rule_of(inner[0])
+        return plain | None, rule and partial(_unless_none, rule)
+    if dataclasses.is_dataclass(hint):
+        return hint, partial(instance, kind=hint)  # type: ignore[arg-type]
+    plain_rules: dict[Any, Rule] = {bool: flag, float: number}
+    return hint, plain_rules.get(hint)
+
+
+def _unless_none(rule: Rule, name: str, value: Any) -> Any:
+    return None if value is None else rule(name, value)
 
 
 class _Signature:
@@ -284,9 +332,25 @@ class _Signature:
 
 
 class Checked:
-    """A frozen dataclass whose fields are replaced by their checked form on creation."""
+    """A frozen dataclass whose fields are replaced by their checked form on creation.
+
+    The rule of a field is part of its type, as in `Annotated[float, rule]`, or follows from it.
+    """
 
     __signature__ = _Signature()
+    _rules: ClassVar[dict[str, Rule]] = {}
+
+    def __init_subclass__(cls) -> None:
+        """Move the rules out of the types of fields, which then are plain."""
+        super().__init_subclass__()
+        split = {name: _rule_of(hint) for name, hint in inspect.get_annotations(cls).items()}
+        cls.__annotations__ = {name: plain for name, (plain, _) in split.items()}
+        cls._rules = cls._rules | {name: rule for name, (_, rule) in split.items() if rule}
+
+    def __post_init__(self) -> None:
+        """Apply the rules of all fields."""
+        for name, rule in self._rules.items():
+            self._set(name, rule(f"{type(self).__name__}.{name}", getattr(self, name)))
 
     def __new__(cls, *_: Any, **given: Any) -> Self:
         """Refuse keywords that are no fields, and name the field that may be meant.

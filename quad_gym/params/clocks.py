@@ -1,6 +1,8 @@
 """Clocks: the rates of simulation, sensors and control."""
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
@@ -14,7 +16,7 @@ class Clocks(Checked):
     A tick is one IMU sample, and every period is a whole number of ticks.
     """
 
-    imu_rate: float = 200.0
+    imu_rate: Annotated[float, partial(check.positive, most=1e6)] = 200.0
     """rate of IMU samples, which sets the tick [Hz]"""
     control_rate: float = 200.0
     """rate of new actions [Hz]"""
@@ -22,14 +24,13 @@ class Clocks(Checked):
     """rate of GNSS measurements [Hz]"""
     camera_rate: float = 200.0
     """frame rate of the camera [Hz]"""
-    substeps: int = 1
+    substeps: Annotated[int, partial(check.whole, most=1000)] = 1
     """Runge-Kutta steps per tick"""
 
     def __post_init__(self) -> None:
-        self._check(check.positive, "imu_rate", most=1e6)
+        super().__post_init__()
         for name in ("control_rate", "gnss_rate", "camera_rate"):
             check.ticks(name, getattr(self, name), self.imu_rate)
-        self._check(check.whole, "substeps", most=1000)
 
     @classmethod
     def of(cls, sensors: SensorSuite, control_rate: float, substeps: int = 1) -> "Clocks":

@@ -4,54 +4,42 @@ import math
 from dataclasses import dataclass
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checks import Checked
 
 
 @dataclass(frozen=True, kw_only=True)
 class PDGains(Checked):
     """Gains of the PD controller of position and attitude."""
 
-    position: float = 5.0
+    position: check.NonNegative = 5.0
     """proportional gain k of the position loop [N/m]; laboratory"""
-    velocity: float = 3.1
+    velocity: check.NonNegative = 3.1
     """derivative gain kd of the position loop [N s/m]; laboratory"""
-    attitude: Vector = (1.0, 0.95, 0.21)
+    attitude: check.NonNegative3 = (1.0, 0.95, 0.21)
     """(3,) diagonal of the proportional gain K of the attitude loop [N m]; laboratory"""
-    body_rates: Vector = (0.25, 0.25, 0.12)
+    body_rates: check.NonNegative3 = (0.25, 0.25, 0.12)
     """(3,) diagonal of the derivative gain Kd of the attitude loop [N m s]; laboratory"""
-
-    def __post_init__(self) -> None:
-        self._check(check.number, "position", "velocity", least=0.0)
-        self._check(check.vector, "attitude", "body_rates", length=3, least=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ActionParams(Checked):
     """Scales of the actions, and bandwidths of the inner loops that track them at every tick."""
 
-    rate_scale: Vector = (6.0, 6.0, 3.0)
+    rate_scale: check.Positive3 = (6.0, 6.0, 3.0)
     """(3,) body rates at full action [rad/s]"""
-    tilt_scale: float = math.radians(45.0)
+    tilt_scale: check.Positive = math.radians(45.0)
     """roll and pitch angles at full action [rad]"""
-    velocity_scale: float = 5.0
+    velocity_scale: check.Positive = 5.0
     """velocity along each axis at full action [m/s]"""
-    rate_bandwidth: float = 14.0
+    rate_bandwidth: check.Positive = 14.0
     """bandwidth k_w of the body-rate loop [1/s]: torque J k_w (w* - w) + w x J w"""
-    attitude_bandwidth: float = 7.0
+    attitude_bandwidth: check.Positive = 7.0
     """bandwidth k_a of the attitude loop [1/s]: desired body rates k_a (e3 x z*)"""
-    velocity_bandwidth: float = 4.0
+    velocity_bandwidth: check.Positive = 4.0
     """bandwidth k_v of the velocity loop [1/s]: desired acceleration k_v (v* - v)"""
 
     def __post_init__(self) -> None:
-        self._check(
-            check.positive,
-            "tilt_scale",
-            "velocity_scale",
-            "rate_bandwidth",
-            "attitude_bandwidth",
-            "velocity_bandwidth",
-        )
-        self._check(check.vector, "rate_scale", length=3, least=0.0, open_end=True)
+        super().__post_init__()
         if self.tilt_scale >= math.pi / 2:
             raise ValueError(
                 f"ActionParams.tilt_scale must be less than pi/2, got {self.tilt_scale}"

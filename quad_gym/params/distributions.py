@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class Distribution(Checked):
     """True: the draw is added to the nominal value"""
 
     def __post_init__(self) -> None:
-        self._check(check.flag, "relative", "offset")
+        super().__post_init__()
         if self.relative and self.offset:
             raise ValueError(f"{type(self).__name__} must be relative or an offset, not both")
 
@@ -70,7 +70,6 @@ class Uniform(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(check.number, "low", "high")
         self._check_order(self.low, self.high)
 
     @property
@@ -87,12 +86,11 @@ class Uniform(Distribution):
 class LogUniform(Distribution):
     """Log-uniform distribution on [low, high], above 0: for scales that are known to a factor."""
 
-    low: float
-    high: float
+    low: check.Positive
+    high: check.Positive
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(check.positive, "low", "high")
         self._check_order(self.low, self.high)
         if self.offset:
             raise ValueError("LogUniform.offset must be False: log-uniform draws are factors")
@@ -107,24 +105,24 @@ class LogUniform(Distribution):
         return Affine(LOG_UNIFORM, factor * self.low, math.log(self.high / self.low))
 
 
+def _bound(name: str, value: Any) -> float:
+    """`value` as a float, which may be infinite."""
+    if not (isinstance(value, (int, float, np.number)) and not math.isnan(value)):
+        raise ValueError(f"{name} must be a number, got {value!r}")
+    return float(value)
+
+
 @dataclass(frozen=True)
 class Normal(Distribution):
     """Normal distribution with mean and standard deviation `sigma`, truncated to [low, high]."""
 
     mean: float
-    sigma: float
-    low: float = -math.inf
-    high: float = math.inf
+    sigma: check.Positive
+    low: Annotated[float, _bound] = -math.inf
+    high: Annotated[float, _bound] = math.inf
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(check.number, "mean")
-        self._check(check.positive, "sigma")
-        for name in ("low", "high"):
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float, np.number)) and not math.isnan(value)):
-                raise ValueError(f"Normal.{name} must be a number, got {value!r}")
-            self._set(name, float(value))
         self._check_order(self.low, self.high)
         if self._probabilities[1] < 1e-6:
             raise ValueError(

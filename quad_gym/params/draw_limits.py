@@ -1,14 +1,14 @@
 """Limits of draws: within the bounds of the parameters, able to hover, and stable."""
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params.clocks import Clocks
-from quad_gym.params.gnss import GnssParams, check_baseline
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.gnss import check_baseline
 from quad_gym.params.vehicle import (
     RK4_LIMIT,
     VehicleParams,
@@ -17,7 +17,7 @@ from quad_gym.params.vehicle import (
     check_moments,
 )
 from quad_gym.params.world import BatteryParams, WorldParams
-from quad_gym.records import COLUMNS
+from quad_gym.records import COLUMNS, Drawable
 
 if TYPE_CHECKING:
     from quad_gym.params.randomization import DrawingTable
@@ -25,58 +25,33 @@ if TYPE_CHECKING:
 FAST = 100.0
 """Speed that no vehicle reaches [m/s]."""
 
-_OF_PARTS = {"battery_charge": "charge", "battery_resistance": "resistance"}
-_OF_PARTS |= {"camera_position_B": "position_B"}
-"""Names of fields whose draws have other names."""
 
-
-def check_bounds(
-    table: "DrawingTable", vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams
-) -> None:
-    """Refuse draws that the parameters themselves refuse.
-
-    Args:
-        table: The draws.
-        vehicle: The vehicle without draws.
-        sensors: The sensors without draws.
-        world: The world without draws.
-
-    Raises:
-        ValueError: If the smallest or the largest draws of a parameter are beyond its bounds.
-    """
-    parts = (vehicle, world, world.battery, sensors.imu, sensors.gnss, sensors.camera)
-    present = [part for part in parts if part is not None]
-    for name in table.names:
-        field = _OF_PARTS.get(name, name)
-        owner = next((part for part in present if hasattr(part, field)), None)
-        for ends in (table.low[COLUMNS[name]], table.high[COLUMNS[name]]):
+def check_bounds(table: "DrawingTable", parts: Mapping[str, Any]) -> None:
+    """Refuse draws whose smallest or largest values the parameters themselves refuse."""
+    for drawable in table.drawables:
+        for ends in (table.low[drawable.columns], table.high[drawable.columns]):
             try:
-                if name == "inertia":
-                    check_gyration("inertia", ends, vehicle.mass, vehicle.rotor_positions_B)
-                elif name == "center_of_mass_B":
-                    _check_center(ends, vehicle)
-                elif name.startswith("wind_") and name != "wind_direction":
-                    world.replace(wind_I=_wind(name, float(ends[0]), world))
-                elif owner is not None:
-                    value: Any = float(ends[0]) if ends.size == 1 else tuple(ends.tolist())
-                    drawn = owner.replace(**{field: value})
-                    if name == "position_sigma_I" and isinstance(drawn, GnssParams):
-                        drawn.require_filter()
+                _check_values(drawable, ends, parts)
             except ValueError as error:
                 reached = ", ".join(f"{end:g}" for end in ends)
                 raise ValueError(
-                    f"randomization of {name!r} must stay within the bounds of the parameter, got "
-                    f"{reached}: {error}"
+                    f"randomization of {drawable.name!r} must stay within the bounds of the "
+                    f"parameter, got {reached}: {error}"
                 ) from None
     if "inertia" in table.names:
         _check_inertia(table)
     antennas = {"primary_antenna_B", "secondary_antenna_B"} & set(table.names)
-    if antennas and sensors.gnss is not None and sensors.gnss.has_baseline:
+    if antennas and parts["antennas"] is not None:
         _check_antennas(table)
 
 
-def _wind(name: str, value: float, world: WorldParams) -> tuple[float, float, float]:
-    """Return the wind in I with a draw of one component, or of the horizontal speed."""
+def _check_values(
+    drawable: Drawable, values: NDArray[np.float64], parts: Mapping[str, Any]
+) -> None:
+    """Refuse values that the parameter itself refuses."""
+    part: Any = parts.get(drawable.of)
+    vehicle, world = parts["vehicle"], parts["world"]
+    value: Any = float(values[0]) if values.size == 1 else tuple(values.tolist())
     east, north, up = world.wind_I
     winds = {
         "wind_east": (value, north, up),
@@ -84,7 +59,16 @@ def _wind(name: str, value: float, world: WorldParams) -> tuple[float, float, fl
         "wind_up": (east, north, value),
         "wind_speed": (value, 0.0, up),
     }
-    return winds[name]
+    if drawable.name == "inertia":
+        check_gyration("inertia", values, vehicle.mass, vehicle.rotor_positions_B)
+    elif drawable.name == "center_of_mass_B":
+        _check_center(values, vehicle)
+    elif drawable.name in winds:
+        world.replace(wind_I=winds[drawable.name])
+    elif hasattr(part, drawable.field):
+        drawn = part.replace(**{drawable.field: value})
+        if drawable.name == "position_sigma_I":
+            drawn.require_filter()
 
 
 def _check_center(place: NDArray[np.float64], vehicle: VehicleParams) -> None:
@@ -108,16 +92,7 @@ def _check_antennas(table: "DrawingTable") -> None:
 
 
 def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldParams) -> None:
-    """Refuse draws whose worst case lacks the thrust or the power to hover.
-
-    Args:
-        table: The draws.
-        vehicle: The vehicle without draws.
-        world: The world without draws.
-
-    Raises:
-        ValueError: If there are such draws.
-    """
+    """Refuse draws whose worst case lacks the thrust or the power to hover."""
     least, most = table.least, table.most
     mass = most("mass")
     full = least("max_voltage")
@@ -152,17 +127,7 @@ def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldPa
 def check_draws(
     table: "DrawingTable", vehicle: VehicleParams, world: WorldParams, clocks: Clocks
 ) -> None:
-    """Refuse rotors that are too fast, or drag that is too large, for the integration.
-
-    Args:
-        table: The draws.
-        vehicle: The vehicle without draws.
-        world: The world without draws.
-        clocks: Rates, for the duration of a Runge-Kutta step.
-
-    Raises:
-        ValueError: If the nominal values or any draw are refused.
-    """
+    """Refuse rotors that are too fast, or drag that is too large, for the integration."""
     _check_drag(table, vehicle, world, clocks)
     name = "motor_time_constant"
     if name in table.names:

@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checks import Checked
 
 LEAST_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so
@@ -21,15 +22,7 @@ LEAST_BASELINE = 1e-3
 
 
 def check_baseline(name: str, baseline: np.ndarray) -> None:
-    """Refuse antennas at one place.
-
-    Args:
-        name: Of both antennas.
-        baseline: (3,) from one to the other [m].
-
-    Raises:
-        ValueError: If they are.
-    """
+    """Refuse antennas at one place, with a baseline (3,) below LEAST_BASELINE [m]."""
     if np.linalg.norm(baseline) < LEAST_BASELINE:
         raise ValueError(f"{name} must be apart, by at least {LEAST_BASELINE:g} m")
 
@@ -42,54 +35,45 @@ class GnssParams(Checked):
     one, given by `InitialPoseParams`.
     """
 
-    rate: float = 200.0
+    rate: check.Positive = 200.0
     """measurement rate [Hz]; the IMU rate must be a whole multiple of it; laboratory: a measurement
     at every tick"""
-    primary_antenna_B: Vector = (0.1013, -0.0004, 0.0472)
+    primary_antenna_B: check.Place = (0.1013, -0.0004, 0.0472)
     """(3,) position of the primary antenna in B [m]; laboratory vehicle"""
-    secondary_antenna_B: Vector | None = (-0.0887, -0.0004, 0.0472)
+    secondary_antenna_B: check.Place | None = (-0.0887, -0.0004, 0.0472)
     """(3,) position of the secondary antenna in B [m]; laboratory vehicle. None: one antenna, and
     no baseline"""
-    reference_antenna_G: Vector = (-742080.456, -5462030.875, 3198338.956)
+    reference_antenna_G: check.Vector3 = (-742080.456, -5462030.875, 3198338.956)
     """(3,) position of the reference antenna, the origin of the east-north-up frame I, in ECEF [m];
     laboratory"""
-    position_sigma_I: Vector = (0.006, 0.006, 0.012)
+    position_sigma_I: check.Positive3 = (0.006, 0.006, 0.012)
     """(3,) standard deviation of the white position noise east, north, up [m]; laboratory (RTK)"""
-    baseline_sigma: float = 0.05
+    baseline_sigma: check.Positive = 0.05
     """standard deviation of the white noise of the baseline's direction [rad]; laboratory"""
-    heading_error_sigma: float = 0.0
+    heading_error_sigma: Annotated[float, check.between(0.0, 1.0)] = 0.0
     """standard deviation of the heading error that all baselines of an episode have in common, a
     rotation about the body z axis [rad]; causes are unequal antennas, their mounting or, for a
     compass, iron nearby"""
-    velocity_sigma: float | None = None
+    velocity_sigma: check.Positive | None = None
     """standard deviation of the velocity from Doppler shifts, per axis [m/s]; None: velocity is not
     measured (laboratory)"""
-    phase: float | None = 0.0
+    phase: check.Phase = 0.0
     """time of the first measurement after the start as a fraction of the measurement period, in [0,
     1), rounded to whole ticks; None: drawn at random in each episode"""
-    drift_sigma_I: Vector = (0.0, 0.0, 0.0)
+    drift_sigma_I: check.NonNegative3 = (0.0, 0.0, 0.0)
     """(3,) stationary standard deviation of the time-correlated position error (drift) east, north,
     up, in addition to the white noise [m]. The drift is a first-order Gauss-Markov process that is
     zero at the start of an episode, because positions are relative to the place of the start"""
-    drift_tau: float = 60.0
+    drift_tau: check.Positive = 60.0
     """correlation time of the position drift [s]; the filter estimates the drift in three augmented
     states"""
-    latency: float = 0.0
+    latency: check.NonNegative = 0.0
     """delay from a measurement to its arrival at the filter, which receives it with its time stamp
     [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods. Receivers take about 0.1
     s: the autopilot PX4 assumes 0.11 s (parameter EKF2_GPS_DELAY)"""
 
     def __post_init__(self) -> None:
-        self._check(check.number, "latency", least=0.0)
-        self._check(check.number, "heading_error_sigma", least=0.0, most=1.0)
-        self._check(check.positive, "rate", "baseline_sigma", "drift_tau")
-        self._check(check.phase, "phase")
-        if self.velocity_sigma is not None:
-            self._check(check.positive, "velocity_sigma")
-        self._check(check.vector, "drift_sigma_I", length=3, least=0.0)
-        self._check(check.place, *self._antennas)
-        self._check(check.vector, "reference_antenna_G", length=3)
-        self._check(check.vector, "position_sigma_I", length=3, least=0.0, open_end=True)
+        super().__post_init__()
         if self.has_baseline:
             check_baseline("GnssParams.secondary_antenna_B and primary_antenna_B", self.baseline_B)
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
@@ -111,11 +95,7 @@ class GnssParams(Checked):
         )
 
     def require_filter(self) -> None:
-        """Refuse positions with hardly any noise, by the square of which a filter divides.
-
-        Raises:
-            ValueError: If they have.
-        """
+        """Refuse positions with hardly any noise, by the square of which a filter divides."""
         if min(self.position_sigma_I) < 1e-9:
             raise ValueError(
                 "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "
@@ -126,11 +106,6 @@ class GnssParams(Checked):
     def has_baseline(self) -> bool:
         """True with two antennas."""
         return self.secondary_antenna_B is not None
-
-    @property
-    def _antennas(self) -> tuple[str, ...]:
-        names = ("primary_antenna_B", "secondary_antenna_B")
-        return names if self.has_baseline else names[:1]
 
     @property
     def baseline_B(self) -> np.ndarray:

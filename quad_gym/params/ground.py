@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Matrix
+from quad_gym.params.checks import Checked
 
 FARTHEST_FOOT = 10.0
 """Largest distance of a foot from the center of mass [m]."""
@@ -26,7 +28,7 @@ class GroundParams(Checked):
     Int. J. Numerical Methods in Engineering 39, 1996).
     """
 
-    feet_B: Matrix = (
+    feet_B: check.Matrix43 = (
         (0.15, -0.15, -0.1),
         (0.15, 0.15, -0.1),
         (-0.15, 0.15, -0.1),
@@ -35,18 +37,18 @@ class GroundParams(Checked):
     """(4, 3) positions of the soles of the feet relative to the center of mass, in B [m], in a
     level plane below all rotor hubs; default: legs 0.1 m long under the arms of the laboratory
     vehicle, whose hubs are 0.21 m from the center of mass along both axes"""
-    friction: float = 0.6
+    friction: Annotated[float, check.between(0.0, 100.0)] = 0.6
     """Coulomb friction coefficient, for sticking and sliding; rubber on concrete has 0.6 to 0.85;
     0: no friction"""
-    max_touchdown_speed: float = 1.5
+    max_touchdown_speed: Annotated[float, partial(check.positive, least=0.2)] = 1.5
     """speed of the center of mass toward the ground above which a touchdown is a crash [m/s]; a
     free fall from 0.11 m ends at the default"""
-    max_touchdown_tilt: float = math.radians(30.0)
+    max_touchdown_tilt: Annotated[float, partial(check.positive, most=math.pi)] = math.radians(30.0)
     """angle between the body z axis and the vertical above which touching the ground is a crash
     [rad]; touching it with a rotor always is"""
 
     def __post_init__(self) -> None:
-        self._check(check.matrix, "feet_B", rows=4, columns=3)
+        super().__post_init__()
         feet = np.array(self.feet_B)
         if np.abs(feet).max() > FARTHEST_FOOT:
             raise ValueError(
@@ -59,6 +61,3 @@ class GroundParams(Checked):
                 "GroundParams.feet_B must be four points of a level plane below the center of "
                 f"mass, not all on one line, got {self.feet_B}"
             )
-        self._check(check.number, "friction", least=0.0, most=100.0)
-        self._check(check.positive, "max_touchdown_speed", least=0.2)
-        self._check(check.positive, "max_touchdown_tilt", most=math.pi)

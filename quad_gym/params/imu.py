@@ -2,92 +2,77 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Literal
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checks import Checked
 
 MANEUVER = 0.5
 """Typical time for which a quadrotor accelerates in one direction [s]; engineering judgment,
 between a turn through a gate (some tenths of a second) and steady wind."""
+
+Error = Annotated[float, check.between(0.0, 0.1)]
+
+_ERRORS = tuple(
+    f"{sensor}_{error}_sigma" for sensor in ("accel", "gyro") for error in ("scale", "misalignment")
+)
+"""Errors of scale and alignment."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParams(Checked):
     """Accelerometer and gyro, with white noise and Gauss-Markov biases (report eqs. 4, 6, 7)."""
 
-    rate: float = 200.0
+    rate: Annotated[float, partial(check.positive, least=1.0, most=1e6)] = 200.0
     """sampling rate [Hz]; one sample is one tick of the simulation; report section 4"""
-    lever_arm_B: Vector = (0.0, 0.0, 0.0)
+    lever_arm_B: check.Place = (0.0, 0.0, 0.0)
     """(3,) position of the accelerometer in B [m]; report section 2.3"""
-    samples: str = "instant"
+    samples: Literal["instant", "average"] = "instant"
     """samples with which the filter predicts a tick: "instant", a sample of the motion at the start
     of the tick (report), or "average", the mean over the tick, as real IMUs provide by delta angles
     and delta velocities with coning and sculling corrections. In both cases the inner loops read
     the gyro at the present instant, with the noise of the last sample: a mean lags by half a tick,
     too much for a tight rate loop"""
-    accel_noise_density: float = 9.8e-3 * 0.1
+    accel_noise_density: check.Positive = 9.8e-3 * 0.1
     """noise density of the accelerometer [m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
-    gyro_noise_density: float = math.radians(0.05)
+    gyro_noise_density: check.Positive = math.radians(0.05)
     """noise density of the gyro [rad/s/sqrt(Hz)]; laboratory: 0.05 deg/s/sqrt(Hz)"""
-    accel_bias_sigma: float = 9.8e-3 * 100.0
+    accel_bias_sigma: check.Positive = 9.8e-3 * 100.0
     """stationary standard deviation of the accelerometer bias, per axis [m/s^2]; laboratory: 100
     milli-g"""
-    gyro_bias_sigma: float = math.radians(100.0) / 3600.0
+    gyro_bias_sigma: check.Positive = math.radians(100.0) / 3600.0
     """stationary standard deviation of the gyro bias, per axis [rad/s]; laboratory: 100 deg/h"""
-    accel_bias_tau: float = 100.0
+    accel_bias_tau: check.Positive = 100.0
     """correlation time of the accelerometer bias [s]; laboratory"""
-    gyro_bias_tau: float = 100.0
+    gyro_bias_tau: check.Positive = 100.0
     """correlation time of the gyro bias [s]; laboratory"""
-    accel_scale_sigma: float = 0.0
+    accel_scale_sigma: Error = 0.0
     """standard deviation of the accelerometer's scale factor error, per axis, constant in an
     episode [-]. Errors of scale and alignment act on the difference from rest on level ground,
     where biases are defined: `(I + D) (f - g e3)` for the accelerometer and `(I + D) w` for the
     gyro, with the scale factor errors on the diagonal of D"""
-    gyro_scale_sigma: float = 0.0
+    gyro_scale_sigma: Error = 0.0
     """standard deviation of the gyro's scale factor error, per axis, constant in an episode [-]"""
-    accel_misalignment_sigma: float = 0.0
+    accel_misalignment_sigma: Error = 0.0
     """standard deviation of each off-diagonal entry of the accelerometer's D, constant in an
     episode: non-orthogonal axes, and the rotation of the sensor in its housing [rad]"""
-    gyro_misalignment_sigma: float = 0.0
+    gyro_misalignment_sigma: Error = 0.0
     """standard deviation of each off-diagonal entry of the gyro's D, constant in an episode
     [rad]"""
-    accel_vibration: float = 0.0
+    accel_vibration: check.NonNegative = 0.0
     """standard deviation of the noise that rotor vibration adds to an accelerometer sample in
     hover, per axis, after the IMU's own filters [m/s^2]. The noise is white, and proportional to
     the square of the rotor speeds, as the forces of unbalanced masses are"""
-    gyro_vibration: float = 0.0
+    gyro_vibration: check.NonNegative = 0.0
     """standard deviation of the noise that rotor vibration adds to a gyro sample in hover, per
     axis, after the IMU's own filters [rad/s]. The noise is white, and proportional to the square of
     the rotor speeds"""
 
-    def __post_init__(self) -> None:
-        self._check(
-            check.number,
-            "accel_scale_sigma",
-            "gyro_scale_sigma",
-            "accel_misalignment_sigma",
-            "gyro_misalignment_sigma",
-            least=0.0,
-            most=0.1,
-        )
-        self._check(check.number, "accel_vibration", "gyro_vibration", least=0.0)
-        self._check(check.positive, "rate", least=1.0, most=1e6)
-        self._check(check.positive, "accel_bias_tau", "gyro_bias_tau")
-        self._check(check.positive, "accel_noise_density", "gyro_noise_density")
-        self._check(check.positive, "accel_bias_sigma", "gyro_bias_sigma")
-        self._check(check.place, "lever_arm_B")
-        self._check(check.choice, "samples", choices=("instant", "average"))
-
     def simplified(self) -> "ImuParams":
         """Return a copy without errors of scale and alignment, and without vibration."""
-        return self.replace(
-            accel_scale_sigma=0.0,
-            gyro_scale_sigma=0.0,
-            accel_misalignment_sigma=0.0,
-            gyro_misalignment_sigma=0.0,
-            accel_vibration=0.0,
-            gyro_vibration=0.0,
-        )
+        none = dict.fromkeys(_ERRORS, 0.0)
+        return self.replace(accel_vibration=0.0, gyro_vibration=0.0, **none)
 
     def scaled_noise(self, factor: float) -> "ImuParams":
         """Return a copy with the white noise multiplied by `factor`."""
@@ -104,14 +89,7 @@ class ImuParams(Checked):
     @property
     def errs(self) -> bool:
         """True if there are errors of scale or alignment."""
-        return any(
-            (
-                self.accel_scale_sigma,
-                self.gyro_scale_sigma,
-                self.accel_misalignment_sigma,
-                self.gyro_misalignment_sigma,
-            )
-        )
+        return any(getattr(self, name) for name in _ERRORS)
 
     @property
     def vibrates(self) -> bool:

@@ -1,9 +1,12 @@
 """Delays of the time stamps in logs."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
+
+Delay = Annotated[float, check.between(-2.0, 2.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,16 +17,11 @@ class LogDelays(Checked):
     simulated flights time stamps are exact.
     """
 
-    gnss: float = 0.0
+    gnss: Delay = 0.0
     """of GNSS, relative to the IMU [s]"""
-    camera: float = 0.0
+    camera: Delay = 0.0
     """of images [s]"""
-    magnetometer: float = 0.0
+    magnetometer: Delay = 0.0
     """of the magnetometer [s]"""
-    barometer: float = 0.0
+    barometer: Delay = 0.0
     """of the barometer [s]"""
-
-    def __post_init__(self) -> None:
-        self._check(
-            check.number, "gnss", "camera", "magnetometer", "barometer", least=-2.0, most=2.0
-        )

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams, SlowError
@@ -20,26 +21,26 @@ class MagnetometerParams(AidParams):
     Magnetic Model 2025 at the laboratory's reference antenna, 2026.0.
     """
 
-    noise_sigma: float = 0.5 * MICROTESLA
+    noise_sigma: check.UpToOne = 0.5 * MICROTESLA
     """standard deviation of the white noise, per axis [T]; dominated by the motor currents, as a
     digit of the AK09916 in the ICM-20948 is 0.15 microtesla (data sheet); engineering judgment"""
-    hard_iron_sigma: float = 1.0 * MICROTESLA
+    hard_iron_sigma: check.UpToOne = 1.0 * MICROTESLA
     """standard deviation of the vehicle's own field that calibration leaves, per axis, constant in
     a flight [T]; the default is 2.4 degrees of heading; engineering judgment. The filter estimates
     this field in three augmented states"""
-    hard_iron_tau: float = math.inf
+    hard_iron_tau: Annotated[float, check.positive_or_infinite] = math.inf
     """correlation time of this field [s]: currents of motors change with thrust and attitude, and
     their field with them; infinite: constant in a flight"""
-    soft_iron_sigma: float = 0.0
+    soft_iron_sigma: Annotated[float, check.between(0.0, 1.0)] = 0.0
     """standard deviation of each element of D, constant in a flight [-]; the filter does not
     estimate D, but assumes hard iron larger by its effect on the field"""
-    strength: float = 46.28 * MICROTESLA
+    strength: check.UpToOne = 46.28 * MICROTESLA
     """strength of the Earth's field [T]"""
-    declination: float = math.radians(3.13)
+    declination: Annotated[float, check.between(-math.pi, math.pi)] = math.radians(3.13)
     """declination of the Earth's field, from true north toward east [rad]"""
-    inclination: float = math.radians(58.67)
+    inclination: Annotated[float, check.between(-math.pi / 2, math.pi / 2)] = math.radians(58.67)
     """inclination of the Earth's field below the horizon [rad]"""
-    declination_sigma: float = math.radians(0.35)
+    declination_sigma: check.UpToOne = math.radians(0.35)
     """standard deviation of the error of the model's declination, constant in a flight [rad]; the
     World Magnetic Model's error model, hypot(0.26, 5417 nT / horizontal field) degrees. The filter
     estimates the error in an augmented state"""
@@ -49,19 +50,6 @@ class MagnetometerParams(AidParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(
-            check.positive,
-            "noise_sigma",
-            "hard_iron_sigma",
-            "strength",
-            "declination_sigma",
-            most=1.0,
-        )
-        if self.hard_iron_tau != math.inf:
-            self._check(check.positive, "hard_iron_tau")
-        self._check(check.number, "soft_iron_sigma", least=0.0, most=1.0)
-        self._check(check.number, "declination", least=-math.pi, most=math.pi)
-        self._check(check.number, "inclination", least=-math.pi / 2, most=math.pi / 2)
         if math.cos(self.inclination) < 0.01:
             raise ValueError(
                 "MagnetometerParams.inclination must leave a horizontal field, from which the "

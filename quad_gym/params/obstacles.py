@@ -6,6 +6,8 @@ to one than its radius collides with it, and the camera cannot see features behi
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
@@ -16,32 +18,27 @@ FARTHEST_OBSTACLE = 1e4
 LEAST_SIZE = 1e-3
 """Smallest length, thickness, height or radius [m]."""
 
+Size = Annotated[float, partial(check.positive, least=LEAST_SIZE, most=FARTHEST_OBSTACLE)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle(Checked):
     """Base of all obstacles: a place, which can be shifted at random in each episode."""
 
-    center_I: Vector = (0.0, 0.0, 0.0)
+    center_I: check.Vector3 = (0.0, 0.0, 0.0)
     """(3,) center of the obstacle in I [m]"""
-    shift_I: Vector = (0.0, 0.0, 0.0)
+    shift_I: check.NonNegative3 = (0.0, 0.0, 0.0)
     """(3,) largest shift along each axis of I, in either direction [m]; each episode draws a shift
     uniformly"""
-    follows: int | None = None
+    follows: Annotated[int, partial(check.whole, least=0)] | None = None
     """index of an earlier obstacle in `WorldParams.obstacles` whose shift is added to this
     obstacle's own shift, as for the two sides of a gap; None: its own shift only"""
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        self._check(check.vector, "center_I", length=3)
-        self._check(check.vector, "shift_I", length=3, least=0.0)
+        super().__post_init__()
         for field in ("center_I", "shift_I"):
-            check.number(
-                f"{name}.{field}",
-                max(abs(x) for x in getattr(self, field)),
-                most=FARTHEST_OBSTACLE,
-            )
-        if self.follows is not None:
-            self._set("follows", check.whole(f"{name}.follows", self.follows, least=0))
+            farthest = max(abs(x) for x in getattr(self, field))
+            check.number(f"{type(self).__name__}.{field}", farthest, most=FARTHEST_OBSTACLE)
 
     @property
     def half_size(self) -> Vector:
@@ -63,17 +60,15 @@ class Obstacle(Checked):
 class Wall(Obstacle):
     """An upright box: a wall, a pillar, a house."""
 
-    size: Vector = (4.0, 0.2, 3.0)
+    size: check.Vector3 = (4.0, 0.2, 3.0)
     """(3,) length, thickness and height [m]"""
-    yaw: float = 0.0
+    yaw: Annotated[float, check.between(-FARTHEST_OBSTACLE, FARTHEST_OBSTACLE)] = 0.0
     """direction of the length, from east toward north [rad]"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(check.vector, "size", length=3)
         for length in self.size:
             check.positive("Wall.size", length, least=LEAST_SIZE, most=FARTHEST_OBSTACLE)
-        self._check(check.number, "yaw", least=-FARTHEST_OBSTACLE, most=FARTHEST_OBSTACLE)
 
     @property
     def half_size(self) -> Vector:
@@ -96,14 +91,10 @@ class Wall(Obstacle):
 class Cylinder(Obstacle):
     """An upright cylinder: a pillar, a tree, a mast."""
 
-    radius: float = 0.2
+    radius: Size = 0.2
     """radius of the cylinder [m]"""
-    height: float = 3.0
+    height: Size = 3.0
     """height of the cylinder [m]"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.positive, "radius", "height", least=LEAST_SIZE, most=FARTHEST_OBSTACLE)
 
     @property
     def half_size(self) -> Vector:
@@ -117,15 +108,7 @@ class Cylinder(Obstacle):
 
 
 def check_obstacles(name: str, obstacles: tuple[Obstacle, ...]) -> None:
-    """Refuse anything that is not an obstacle, and obstacles that follow a later one.
-
-    Args:
-        name: Name of the argument in messages.
-        obstacles: All obstacles of a world.
-
-    Raises:
-        ValueError: If one is refused.
-    """
+    """Refuse anything that is not an obstacle, and obstacles that follow a later one."""
     for k, obstacle in enumerate(obstacles):
         if not isinstance(obstacle, Wall | Cylinder):
             raise ValueError(f"{name} must hold Wall and Cylinder, got {obstacle!r}")

@@ -18,20 +18,16 @@ class OpticalFlowParams(AidParams):
 
     rate: float = 100.0
     """measurement rate [Hz]; the Crazyflie firmware reads the PMW3901 every 10 ms"""
-    noise_sigma: float = 0.2
+    noise_sigma: check.Positive = 0.2
     """standard deviation of the white noise, per axis [rad/s]; PX4 assumes 0.15 (EKF2_OF_N_MIN) to
     0.5 over poor texture, the Crazyflie firmware 2 counts of 0.1 pixels in 10 ms, 0.41"""
-    min_height: float = 0.08
+    min_height: check.Positive = 0.08
     """least height above the ground [m]; PixArt PMW3901 data sheet: focus from 80 mm on"""
-    max_rate: float = 7.4
+    max_rate: check.Positive = 7.4
     """largest rate, per axis [rad/s]; PixArt PMW3901 data sheet"""
 
     aid = Aid.OPTICAL_FLOW
     raw = ("rad/s", "B", 20.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(check.positive, "noise_sigma", "min_height", "max_rate")
 
     @property
     def numbers(self) -> tuple[float, float, float]:

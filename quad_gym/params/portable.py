@@ -29,12 +29,15 @@ def _times(x: float, y: float) -> float:
     return x * y
 
 
-def inverse(matrix: ArrayLike) -> Floats:
-    """Inverse of a regular matrix (n, n), by elimination with partial pivoting.
+def turned(matrix: ArrayLike, vector: ArrayLike) -> Floats:
+    """Product of a matrix (n, 3) and a vector (3,), with plain sums, as C code computes it."""
+    x, y, z = np.asarray(vector, np.float64).tolist()
+    rows = np.asarray(matrix, np.float64).tolist()
+    return np.array([a * x + b * y + c * z for a, b, c in rows])
 
-    Raises:
-        ValueError: If the matrix is singular.
-    """
+
+def inverse(matrix: ArrayLike) -> Floats:
+    """Inverse of a regular matrix (n, n), by elimination with partial pivoting."""
     rows = np.asarray(matrix, np.float64).tolist()
     n = len(rows)
     rows = [row + [float(i == j) for j in range(n)] for i, row in enumerate(rows)]
@@ -54,9 +57,7 @@ def inverse(matrix: ArrayLike) -> Floats:
 def lower_root(matrix: ArrayLike, scale: ArrayLike) -> Floats:
     """Return the lower triangular L with L L^T = M, for a positive semidefinite M (n, n).
 
-    Args:
-        matrix: M.
-        scale: (n,) variances; a pivot below 1e-12 times its variance counts as zero.
+    A pivot below 1e-12 times its variance in `scale` (n,) counts as zero.
     """
     M, scales = np.asarray(matrix, np.float64).tolist(), np.asarray(scale, np.float64).tolist()
     n = len(M)

@@ -110,15 +110,8 @@ class Randomization:
 class DrawingTable:
     """A randomization in numbers: the distribution of each column of a flight's field `drawn`.
 
-    Args:
-        randomization: The distributions.
-        vehicle: The vehicle without draws.
-        sensors: The sensors without draws.
-        world: The world without draws.
-        action_delay: The delay of actions without draws [control steps].
-
-    Raises:
-        ValueError: If a range holds invalid values, such as a vehicle too heavy to hover.
+    Vehicle, sensors, world and delay of actions [control steps] are those without draws. Ranges
+    with invalid values are refused, such as a vehicle too heavy to hover.
     """
 
     def __init__(
@@ -130,21 +123,20 @@ class DrawingTable:
         action_delay: float = 0.0,
     ) -> None:
         self.names = randomization.names
+        self.drawables = [drawable for drawable in DRAWABLES if drawable.name in self.names]
         self.kind = np.zeros(DRAWN_SIZE, np.int64)
         self.a, self.b, self.c, self.d = np.zeros((4, DRAWN_SIZE))
         nominal = nominal_values(vehicle, sensors, world)
         nominal[COLUMNS["action_delay"]] = action_delay
         self.low, self.high = nominal.copy(), nominal.copy()
         self.center, self.spread = np.zeros(DRAWN_SIZE), np.ones(DRAWN_SIZE)
-        for drawable in DRAWABLES:
-            if drawable.name in self.names:
-                first = COLUMNS[drawable.name].start
-                parts = randomization.distributions(drawable.name)
-                if drawable.name == "feature_offsets_I" and sensors.camera is not None:
-                    parts = parts * len(sensors.camera.features_I)
-                for k, part in enumerate(parts):
-                    self._fill(drawable, first + k, part, nominal[first + k])
-        check_bounds(self, vehicle, sensors, world)
+        for drawable in self.drawables:
+            parts = randomization.distributions(drawable.name)
+            if drawable.name == "feature_offsets_I" and sensors.camera is not None:
+                parts = parts * len(sensors.camera.features_I)
+            for column, part in enumerate(parts, drawable.columns.start):
+                self._fill(drawable, column, part, nominal[column])
+        check_bounds(self, parts_of(vehicle, sensors, world))
         check_hovering(self, vehicle, world)
 
     def least(self, name: str) -> float:
@@ -177,7 +169,7 @@ class DrawingTable:
     ) -> None:
         name = drawable.name
         if np.isnan(nominal):
-            raise ValueError(f"randomization of {name!r} needs {_MISSING[name]}, got none")
+            raise ValueError(f"randomization of {name!r} needs {_MISSING[drawable.of]}, got none")
         if part is None:  # a component that stays among others that are drawn
             part = Uniform(nominal, nominal)
         if part.relative and nominal == 0.0:
@@ -212,27 +204,29 @@ def _range_in_words(drawable: Drawable) -> str:
     return f"{' and '.join(words)} {'' if drawable.unit == '-' else drawable.unit}".strip()
 
 
-_CAMERA = (
-    *("pixel_sigma", "camera_position_B", "camera_rotation", "focal_length"),
-    *FEATURE_DRAWS,
-)
-_GNSS = ("position_sigma_I", "primary_antenna_B")
-_BASELINE = ("baseline_sigma", "secondary_antenna_B")
-_MISSING = (
-    dict.fromkeys(_CAMERA, "a camera")
-    | dict.fromkeys(_GNSS, "GNSS")
-    | dict.fromkeys(_BASELINE, "GNSS with two antennas")
-    | dict.fromkeys(("battery_charge", "battery_resistance"), "a battery (WorldParams.battery)")
-)
+_MISSING = {
+    "camera": "a camera",
+    "gnss": "GNSS",
+    "antennas": "GNSS with two antennas",
+    "battery": "a battery (WorldParams.battery)",
+}
+"""Parts that a configuration may lack, in messages."""
+
+
+def parts_of(vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams) -> dict[str, Any]:
+    """Return the parts with nominal values of drawn parameters, by `Drawable.of`; None: missing."""
+    gnss = sensors.gnss
+    paired = gnss if gnss is not None and gnss.has_baseline else None
+    parts = {"vehicle": vehicle, "world": world, "battery": world.battery, "imu": sensors.imu}
+    return parts | {"gnss": gnss, "antennas": paired, "camera": sensors.camera}
 
 
 def nominal_values(
     vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams
 ) -> NDArray[np.float64]:
     """Return the columns (DRAWN_SIZE,) of `drawn` without draws; NaN: of a missing part."""
-    imu, gnss, camera, battery = sensors.imu, sensors.gnss, sensors.camera, world.battery
     east, north, up = world.wind_I
-    known: dict[str, Any] = {
+    derived: dict[str, Any] = {
         "inertia": np.diag(vehicle.inertia),
         "rotor_efficiency": 1.0,
         "wind_east": east,
@@ -240,24 +234,10 @@ def nominal_values(
         "wind_up": up,
         "wind_speed": math.hypot(east, north),
         "wind_direction": math.atan2(north, east),
-        "battery_charge": math.nan if battery is None else battery.charge,
-        "battery_resistance": math.nan if battery is None else battery.resistance,
-        "camera_position_B": math.nan if camera is None else camera.position_B,
-        "camera_rotation": math.nan if camera is None else 0.0,
-        "pixel_sigma": math.nan if camera is None else camera.pixel_sigma,
-        "focal_length": math.nan if camera is None else camera.focal_length,
-        **dict.fromkeys(FEATURE_DRAWS, math.nan if camera is None else 0.0),
-        **(dict.fromkeys(_GNSS, math.nan) if gnss is None else {}),
-        **(dict.fromkeys(_BASELINE, math.nan) if gnss is None or not gnss.has_baseline else {}),
     }
-    values = np.zeros(DRAWN_SIZE)
+    values, parts = np.zeros(DRAWN_SIZE), parts_of(vehicle, sensors, world)
     for drawable in DRAWABLES:
-        for part in (known, vehicle, world, imu, gnss):
-            if isinstance(part, dict):
-                found = part.get(drawable.name)
-            else:
-                found = getattr(part, drawable.name, None)
-            if found is not None:
-                values[COLUMNS[drawable.name]] = found
-                break
+        part = parts.get(drawable.of)
+        value = derived.get(drawable.name, getattr(part, drawable.field, 0.0))
+        values[drawable.columns] = math.nan if drawable.of and part is None else value
     return values

@@ -18,12 +18,12 @@ class RangeFinderParams(AidParams):
 
     rate: float = 25.0
     """measurement rate [Hz]; ST VL53L1X user manual: a timing budget of 33 ms, plus 4 ms"""
-    noise_sigma: float = 0.01
+    noise_sigma: check.Positive = 0.01
     """standard deviation of the white noise [m]; ST VL53L1X user manual: ranging error +-20 mm, two
     sigma"""
-    min_range: float = 0.04
+    min_range: check.Positive = 0.04
     """shortest distance [m]; ST VL53L1X user manual"""
-    max_range: float = 3.6
+    max_range: check.Positive = 3.6
     """longest distance [m]; ST VL53L1X user manual: in the dark, over a light floor"""
 
     aid = Aid.RANGE_FINDER
@@ -31,7 +31,6 @@ class RangeFinderParams(AidParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(check.positive, "noise_sigma", "min_range", "max_range")
         if self.max_range <= self.min_range:
             raise ValueError(
                 "RangeFinderParams.max_range must be more than min_range, got "

@@ -14,18 +14,12 @@ Owner = TypeVar("Owner")
 
 
 class Resolved(Generic[Given, Value]):
-    """Field of a dataclass that is given in one of several forms and read in one.
-
-    Args:
-        resolve: Returns the value from the field's name and from what is given.
-        default: Default of what is given.
-    """
+    """Field of a dataclass that is given in one of several forms; `resolve` takes its name, too."""
 
     def __init__(self, resolve: Callable[[str, Given], Value], default: Given) -> None:
         self._resolve, self._default = resolve, default
 
     def __set_name__(self, owner: type, name: str) -> None:
-        """Store the name of the field."""
         self._name = name
 
     @overload
@@ -35,32 +29,20 @@ class Resolved(Generic[Given, Value]):
     def __get__(self, instance: object, owner: type) -> Value: ...
 
     def __get__(self, instance: Any, owner: type) -> Any:
-        """Return the value, or from the class the default."""
         return self._default if instance is None else vars(instance)[self._name]
 
     def __set__(self, instance: Any, given: Given) -> None:
-        """Store the value, checked."""
         vars(instance)[self._name] = self._resolve(self._name, given)
 
 
-def preset_of(kind: type[Value], named: Callable[[str], Value]) -> Callable[[str, Any], Value]:
-    """Return a function that resolves the name of a preset and checks the type of the value."""
+def resolving(
+    kind: type[Value], named: Callable[[str], Value] | None = None
+) -> Callable[[str, Any], Value]:
+    """Return a function that resolves None to defaults, and names of presets if there are any."""
 
     def resolve(name: str, given: Any) -> Value:
-        value = named(given) if isinstance(given, str) else given
-        check.instance(name, value, kind)
-        return value
-
-    return resolve
-
-
-def default_of(kind: type[Value]) -> Callable[[str, Any], Value]:
-    """Return a function that resolves None to the defaults of parameters."""
-
-    def resolve(name: str, given: Any) -> Value:
-        value = kind() if given is None else given
-        check.instance(name, value, kind)
-        return value
+        value = named(given) if named is not None and isinstance(given, str) else given
+        return check.instance(name, kind() if given is None and named is None else value, kind)
 
     return resolve
 
@@ -71,12 +53,7 @@ def taking(
     [Callable[[Owner, Value], None]],
     Callable[Concatenate[Owner, Arguments], None],
 ]:
-    """Return a decorator for a method of a dataclass, which then takes the fields as arguments.
-
-    Args:
-        kind: The dataclass, whose fields the signature shows.
-        name: Name of the method in messages.
-    """
+    """Return a decorator for a method of a dataclass, which then takes the fields as arguments."""
     make: Callable[..., Value] = kind
     fields = {
         name: parameter.replace(annotation=_given_type(parameter.annotation))

@@ -1,10 +1,13 @@
 """Weights of the built-in rewards."""
 
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 from quad_gym.records import RewardTerm
+
+Weight = Annotated[float, check.between(0.0, 1e9)]
 
 _COMMON = (RewardTerm.HEADING, RewardTerm.ACTION_RATE, RewardTerm.BODY_RATES)
 _TRACKING = (RewardTerm.NEAR, RewardTerm.FINE, *_COMMON)
@@ -19,28 +22,25 @@ class RewardParams(Checked):
     costs are small beside it unless actions jump.
     """
 
-    near: float = 1.0
+    near: Weight = 1.0
     """weight of exp(-near_decay e) of the position error e [-]"""
-    near_decay: float = 2.0
+    near_decay: Weight = 2.0
     """decay of that term with distance [1/m]; it still rewards coming closer at errors of a
     meter"""
-    fine: float = 0.5
+    fine: Weight = 0.5
     """weight of exp(-fine_decay e) [-]"""
-    fine_decay: float = 20.0
+    fine_decay: Weight = 20.0
     """decay of that term with distance [1/m]; it rewards errors of centimeters"""
-    progress: float = 1.0
+    progress: Weight = 1.0
     """weight of the speed toward the next gate of a course [s/m]"""
-    gate_passed: float = 1.0
+    gate_passed: Weight = 1.0
     """weight of 1 / control period in a step that passes a gate [s]"""
-    heading: float = 0.1
+    heading: Weight = 0.1
     """weight of the alignment of body x with the desired heading, from -1 to 1 [-]"""
-    action_rate: float = 0.02
+    action_rate: Weight = 0.02
     """cost of the squared change of the action since the last step [-]"""
-    body_rates: float = 0.002
+    body_rates: Weight = 0.002
     """cost of the squared body rates [s^2/rad^2]"""
-
-    def __post_init__(self) -> None:
-        self._check(check.number, *(field.name for field in fields(self)), least=0.0, most=1e9)
 
     @staticmethod
     def terms(kind: str) -> tuple[RewardTerm, ...]:
@@ -48,11 +48,7 @@ class RewardParams(Checked):
         return _COURSE if kind == "waypoints" else _TRACKING
 
     def require_effect(self, kind: str) -> None:
-        """Refuse changed weights of terms that the reward of a kind of task does not have.
-
-        Raises:
-            ValueError: If there is one.
-        """
+        """Refuse changed weights of terms that the reward of a kind of task does not have."""
         used = {term.name.lower() for term in self.terms(kind)}
         for field in fields(self):
             changed = getattr(self, field.name) != field.default

@@ -55,14 +55,11 @@ class InitialPoseParams(Checked):
     so that it hardly observes the heading, and with a single antenna and no magnetometer.
     """
 
-    position_sigma: float = 0.05
+    position_sigma: check.Positive = 0.05
     """standard deviation of the initial position, per axis [m]; a vehicle put on its mark by
     hand"""
-    heading_sigma: float = 0.05
+    heading_sigma: check.Positive = 0.05
     """standard deviation of the initial heading [rad]; a vehicle lined up by eye, some 3 degrees"""
-
-    def __post_init__(self) -> None:
-        self._check(check.positive, "position_sigma", "heading_sigma")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,25 +70,18 @@ class NoisyObservationParams(Checked):
     sensors; suites of other sensors have their own values.
     """
 
-    position: float = 0.0018
+    position: check.NonNegative = 0.0018
     """standard deviation of the position, per axis [m]; measured on the laboratory's circle"""
-    velocity: float = 0.012
+    velocity: check.NonNegative = 0.012
     """standard deviation of the velocity, per axis [m/s]; measured on the laboratory's circle"""
-    attitude: float = 0.006
+    attitude: check.NonNegative = 0.006
     """standard deviation of the attitude, per axis [rad]; measured on the laboratory's circle"""
-    body_rates: float = 0.0123
+    body_rates: check.NonNegative = 0.0123
     """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
-
-    def __post_init__(self) -> None:
-        self._check(check.number, "position", "velocity", "attitude", "body_rates", least=0.0)
 
 
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
-    """Return a latency [s] in ticks.
-
-    Raises:
-        ValueError: If more than MAX_UNDER_WAY measurements would be in transit at a time.
-    """
+    """Return a latency [s] in ticks, with at most MAX_UNDER_WAY measurements in transit."""
     ticks, longest = round(latency * imu_rate), MAX_UNDER_WAY * check.ticks(name, rate, imu_rate)
     if ticks > longest:
         raise ValueError(
@@ -129,21 +119,11 @@ class SensorSuite(Checked):
     """delays of time stamps in this vehicle's logs, which a replay subtracts"""
 
     def __post_init__(self) -> None:
-        for name, kind in (
-            ("imu", ImuParams),
-            ("initial_pose", InitialPoseParams),
-            ("estimator", FilterParams),
-            ("noisy", NoisyObservationParams),
-            ("log_delays", LogDelays),
-        ):
-            check.instance(f"SensorSuite.{name}", getattr(self, name), kind)
-        for name, params in SENSOR_PARAMS.items():
-            sensor = getattr(self, name)
-            if sensor is not None:
-                check.instance(f"SensorSuite.{name}", sensor, params)
-                check.ticks(f"{params.__name__}.rate", sensor.rate, self.imu.rate)
-                label = f"{params.__name__}.latency"
-                delay_ticks(label, sensor.latency, sensor.rate, self.imu.rate)
+        super().__post_init__()
+        for sensor in self.sensors.values():
+            label = type(sensor).__name__
+            check.ticks(f"{label}.rate", sensor.rate, self.imu.rate)
+            delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, self.imu.rate)
 
     def save(self, file: str | Path) -> Path:
         """Write the suite to a file, to edit it, and to read it with `quad_gym.sensor_suite`.

@@ -369,11 +369,7 @@ def suite_label(name: str) -> str:
 
 
 def contents_of_suite_files(*names: Any) -> dict[str, Any]:
-    """Suites in files, as an entry of a record of results: a file may change later.
-
-    Args:
-        names: Values of the keyword `sensors`; those that are no files have no entry.
-    """
+    """Suites in files among the names, as an entry of a record of results: files may change."""
     found = {str(name): sensor_suite(name) for name in names if is_suite_file(name)}
     return {"suite_files": found} if found else {}
 

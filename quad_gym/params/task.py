@@ -4,8 +4,9 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
@@ -25,23 +26,25 @@ FARTHEST = 1000.0
 MIN_PERIOD = 0.01
 """Period of the fastest reference [s]; no vehicle can follow a faster one."""
 
+Size = Annotated[float, partial(check.positive, most=FARTHEST)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class TaskParams(Checked):
     """Reference, start, reward scale and termination of a task."""
 
-    kind: str = "circle"
+    kind: Annotated[str, partial(check.choice, choices=TASKS)] = "circle"
     """kind of task, one of TASKS"""
-    radius: float = 4.0
+    radius: Size = 4.0
     """size of the reference, at most 1000 [m]; report section 4.2. Radius of the circle; distance
     of the hover point from the vertical through the origin; half the length of the lemniscate;
     bound of a random trajectory's distance from its center, and of the gates' distance from the
     vertical through the origin"""
-    period: float = 10.0
+    period: Annotated[float, partial(check.number, least=MIN_PERIOD)] = 10.0
     """period of the reference, at least 0.01 [s]; report section 4.2"""
-    height: float = 1.0
+    height: Size = 1.0
     """height of the reference, at most 1000 [m]; report section 4.2"""
-    start: str = "ground"
+    start: Annotated[str, partial(check.choice, choices=STARTS)] = "ground"
     """start of an episode. "ground": at rest below the reference at height 0, with stopped rotors
     (report section 4.2); "hover": hovering at rest within some decimeters of the reference;
     "mixed": one of these two, each with probability 0.5; "moving": as "hover", with uniformly drawn
@@ -51,7 +54,7 @@ class TaskParams(Checked):
     """True: a launch pad supports a vehicle that starts on the ground until its thrust lifts it;
     False: it sinks while its rotors spin up, as in the report. Ground that supports vehicles
     (`WorldParams.ground`) makes the pad unnecessary"""
-    reward_per: str = "step"
+    reward_per: Literal["step", "second"] = "step"
     """unit of the reward. "step": of order one in each step, as learning algorithms expect;
     "second": the reward per step times the control period"""
     reward_params: RewardParams = field(default_factory=RewardParams)
@@ -61,10 +64,10 @@ class TaskParams(Checked):
     radius, period and sense of circle and lemniscate; the heading of a random trajectory and of a
     course of gates. A user-defined trajectory is rotated about the vertical through the origin, and
     a closed one begins anywhere"""
-    duration: float = 10.0
+    duration: Annotated[float, check.between(0.0, 1e9)] = 10.0
     """time limit of an episode [s], at least half a control period; 0: no limit; report section
     4.2"""
-    out_of_bounds: float = 3.0
+    out_of_bounds: check.Positive = 3.0
     """distance from the reference above which an episode ends [m]"""
     min_height: float = -0.5
     """height below which an episode ends [m]; negative, as a vehicle without a launch pad sinks
@@ -74,15 +77,15 @@ class TaskParams(Checked):
     """True: truncate an episode when the filter's consistency monitor flags divergence"""
     max_tilt: float = math.radians(100.0)
     """angle between the body z axis and the vertical above which an episode ends [rad]"""
-    max_speed: float = 2.5
+    max_speed: check.Positive = 2.5
     """bound of the speed of a random trajectory [m/s]"""
-    max_acceleration: float = 3.0
+    max_acceleration: check.Positive = 3.0
     """bound of the acceleration of a random trajectory [m/s^2]"""
-    gate_count: int = 5
+    gate_count: Annotated[int, partial(check.whole, most=MAX_GATES)] = 5
     """number of gates of a course, at most MAX_GATES"""
-    gate_radius: float = 0.3
+    gate_radius: check.Positive = 0.3
     """distance from the center of a gate below which the gate is passed [m]"""
-    preview: Vector = (0.2, 0.4)
+    preview: Annotated[Vector, partial(check.vector, length=2, least=0.0)] = (0.2, 0.4)
     """(2,) times ahead of the present at which observations include the reference [s]"""
     trajectory: Trajectory | str | Path | Sequence[Trajectory | str | Path] | None = None
     """reference of the task: a `quad_gym.Trajectory`, the path of a table for
@@ -90,28 +93,10 @@ class TaskParams(Checked):
     of eight through five points"""
 
     def __post_init__(self) -> None:
-        self._check(check.choice, "kind", choices=TASKS)
-        self._check(check.choice, "start", choices=STARTS)
-        self._check(check.choice, "reward_per", choices=("step", "second"))
-        self._check(check.flag, "pad")
-        self._check(
-            check.positive,
-            "out_of_bounds",
-            "max_speed",
-            "max_acceleration",
-            "gate_radius",
-        )
-        self._check(check.positive, "radius", "height", most=FARTHEST)
-        self._check(check.number, "period", least=MIN_PERIOD)
-        self._check(check.number, "duration", least=0.0, most=1e9)
-        self._check(check.number, "min_height")
-        self._check(check.flag, "randomize_reference", "truncate_when_diverged")
-        self._check(check.vector, "preview", length=2, least=0.0)
+        super().__post_init__()
         self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
-        self._check(check.whole, "gate_count", most=MAX_GATES)
-        check.instance("TaskParams.reward_params", self.reward_params, RewardParams)
         self.reward_params.require_effect(self.kind)
-        if not 0.0 < check.number("TaskParams.max_tilt", self.max_tilt) <= math.pi:
+        if not 0.0 < self.max_tilt <= math.pi:
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
 
     @property
@@ -136,12 +121,7 @@ def figure_of_eight() -> Trajectory:
 
 
 def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None:
-    """Return the trajectories of a task as a tuple, or None.
-
-    Raises:
-        ValueError: If an element is not a trajectory or leads too far away, or the task follows
-            none.
-    """
+    """Return the trajectories of a task as a tuple, or None; files are read."""
     if given is None:
         return None
     if kind != "trajectory":
@@ -174,16 +154,7 @@ def _read(file: str | Path) -> Trajectory:
 
 
 def check_limit(task: TaskParams, rate: float, name: str) -> None:
-    """Refuse a time limit of less than a step, which would be rounded to no limit.
-
-    Args:
-        task: The task with the limit.
-        rate: Rate of the steps [Hz].
-        name: Name of that rate in messages.
-
-    Raises:
-        ValueError: If the limit is refused.
-    """
+    """Refuse a time limit of less than a step, which would be rounded to no limit."""
     if task.duration > 0.0 and round(task.duration * rate) == 0:
         raise ValueError(
             f"duration must be 0 (no limit) or at least one step, {1.0 / rate:g} s at {name}="

@@ -7,12 +7,14 @@ Texas at Austin) whose third laboratory report this package implements.
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.checks import Checked, Vector
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.gravity import GRAVITY
 
@@ -45,11 +47,15 @@ its solution grows: the root of |1 - z + z^2/2 - z^3/6 + z^4/24| = 1 is 2.785.""
 class VehicleParams(Checked):
     """A quadrotor: rigid body, four rotors with first-order speed response, disc drag."""
 
-    mass: float = 0.78
+    mass: Annotated[float, partial(check.positive, least=1e-3)] = 0.78
     """mass [kg]; laboratory vehicle"""
-    inertia: Matrix = ((1.7565e-3, 0.0, 0.0), (0.0, 3.5723e-3, 0.0), (0.0, 0.0, 4.7134e-3))
+    inertia: check.Matrix33 = (
+        (1.7565e-3, 0.0, 0.0),
+        (0.0, 3.5723e-3, 0.0),
+        (0.0, 0.0, 4.7134e-3),
+    )
     """(3, 3) inertia about the center of mass, in B [kg m^2]; laboratory vehicle"""
-    rotor_positions_B: Matrix = (
+    rotor_positions_B: check.Matrix43 = (
         (0.21, -0.21, 0.0),
         (0.21, 0.21, 0.0),
         (-0.21, 0.21, 0.0),
@@ -57,44 +63,31 @@ class VehicleParams(Checked):
     )
     """(4, 3) positions of the rotor hubs relative to the center of mass, in B [m]; laboratory
     vehicle"""
-    rotor_spins: Vector = (1.0, -1.0, 1.0, -1.0)
+    rotor_spins: Annotated[Vector, partial(check.vector, length=4)] = (1.0, -1.0, 1.0, -1.0)
     """(4,) sense of rotation of each rotor about body z, +1 or -1, opposite to its reaction torque;
     laboratory vehicle"""
-    thrust_coefficient: float = 6.11e-8 / 0.104719755**2
+    thrust_coefficient: check.Positive = 6.11e-8 / 0.104719755**2
     """kF in the thrust of a rotor, F = kF W^2 [N/(rad/s)^2]; laboratory vehicle, there per rpm^2"""
-    torque_coefficient: float = 1.5e-9 / 0.104719755**2
+    torque_coefficient: check.Positive = 1.5e-9 / 0.104719755**2
     """kN in the reaction torque of a rotor, N = kN W^2 [N m/(rad/s)^2]; laboratory vehicle, there
     per rpm^2"""
-    motor_time_constant: float = 0.05
+    motor_time_constant: Annotated[float, partial(check.positive, most=SLOWEST_ROTORS)] = 0.05
     """time constant of the rotor speed's response to the voltage [s]; laboratory vehicle"""
-    motor_speed_per_volt: float = 200.0
+    motor_speed_per_volt: check.Positive = 200.0
     """steady rotor speed per volt [rad/s/V]; laboratory vehicle"""
-    max_voltage: float = 12.0
+    max_voltage: check.Positive = 12.0
     """largest motor voltage [V]; laboratory vehicle"""
-    disc_area: float = 0.01
+    disc_area: check.NonNegative = 0.01
     """area of the drag disc [m^2]; laboratory vehicle"""
-    drag_coefficient: float = 0.3
+    drag_coefficient: check.NonNegative = 0.3
     """drag coefficient of the drag disc [-]; laboratory vehicle"""
-    air_density: float = 1.225
+    air_density: check.NonNegative = 1.225
     """density of the air [kg/m^3]; standard atmosphere at sea level"""
-    gravity: float = GRAVITY
+    gravity: check.Positive = GRAVITY
     """gravitational acceleration [m/s^2]; laboratory"""
 
     def __post_init__(self) -> None:
-        self._check(
-            check.positive,
-            "thrust_coefficient",
-            "torque_coefficient",
-            "motor_speed_per_volt",
-            "max_voltage",
-            "gravity",
-        )
-        self._check(check.positive, "motor_time_constant", most=SLOWEST_ROTORS)
-        self._check(check.positive, "mass", least=1e-3)
-        self._check(check.number, "disc_area", "drag_coefficient", "air_density", least=0.0)
-        self._check(check.matrix, "inertia", rows=3, columns=3)
-        self._check(check.matrix, "rotor_positions_B", rows=4, columns=3)
-        self._check(check.vector, "rotor_spins", length=4)
+        super().__post_init__()
         inertia = np.array(self.inertia)
         if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
             raise ValueError("VehicleParams.inertia must be symmetric")
@@ -159,15 +152,7 @@ class VehicleParams(Checked):
 
 
 def check_moments(name: str, moments: ArrayLike) -> None:
-    """Refuse moments of inertia that no body has: each is at most the sum of the other two.
-
-    Args:
-        name: Name of the argument in messages.
-        moments: (3,) about the principal axes, or about any three orthogonal ones [kg m^2].
-
-    Raises:
-        ValueError: If one is larger, by more than rounding.
-    """
+    """Refuse moments of inertia (3,) that no body has: each is at most the sum of the other two."""
     values = np.asarray(moments, np.float64)
     if 2.0 * values.max() > values.sum() * (1.0 + 1e-9):
         raise ValueError(
@@ -177,18 +162,7 @@ def check_moments(name: str, moments: ArrayLike) -> None:
 
 
 def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike) -> None:
-    """Refuse moments of inertia that are too small or too large for the vehicle's mass and size.
-
-    Args:
-        name: Name of the argument in messages.
-        moments: (3,) about three orthogonal axes [kg m^2].
-        mass: Mass of the vehicle [kg].
-        rotors: (4, 3) rotor hubs relative to the center of mass [m].
-
-    Raises:
-        ValueError: If a radius of gyration over the distance of the rotors is less than
-            LEAST_GYRATION, or more than MOST_GYRATION.
-    """
+    """Refuse moments of inertia (3,) too small or too large for mass and rotor hubs (4, 3) [SI]."""
     reach = float(np.linalg.norm(rotors, axis=1).max())
     smallest = max(LEAST_MOMENT, mass * (LEAST_GYRATION * reach) ** 2)
     largest = mass * (MOST_GYRATION * reach) ** 2
@@ -204,16 +178,7 @@ def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike
 
 
 def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
-    """Refuse rotors that are too fast for the integration.
-
-    Args:
-        name: Name of the time constant in messages.
-        time_constant: Time constant of the rotor speeds [s].
-        clocks: Rates, for the duration of a Runge-Kutta step.
-
-    Raises:
-        ValueError: If the step is too long, so that the computed rotor speeds would diverge.
-    """
+    """Refuse rotors that are too fast for the integration, so that their speeds would diverge."""
     step = 1.0 / (clocks.imu_rate * clocks.substeps)
     if step > RK4_LIMIT * time_constant:
         raise ValueError(

@@ -6,11 +6,13 @@ laboratory's model.
 """
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.checks import Checked, Matrix
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
 from quad_gym.records import MAX_OBSTACLES
@@ -33,27 +35,18 @@ class BatteryParams(Checked):
     is refused.
     """
 
-    energy: float = 88e3
+    energy: check.Positive = 88e3
     """energy of a full battery [J]; three lithium-polymer cells of 2.2 A h: 3 x 3.7 V x 2.2 A h"""
-    charge: float = 1.0
+    charge: check.UpToOne = 1.0
     """charge at the start of an episode as a fraction of a full battery, in (0, 1]"""
-    empty_voltage: float = 0.83
+    empty_voltage: check.UpToOne = 0.83
     """open-circuit voltage of an empty battery divided by the voltage of a full one; 3.5 V / 4.2 V
     per cell"""
-    resistance: float = 0.03
+    resistance: check.NonNegative = 0.03
     """internal resistance of the battery and its leads [ohm]; some 10 milliohm per cell"""
-    motor_efficiency: float = 0.75
+    motor_efficiency: check.UpToOne = 0.75
     """mechanical power of the rotors divided by electrical power; typical of small brushless
     motors"""
-
-    def __post_init__(self) -> None:
-        self._check(check.positive, "energy", "charge", "empty_voltage", "motor_efficiency")
-        self._check(check.number, "resistance", least=0.0)
-        for name in ("charge", "empty_voltage", "motor_efficiency"):
-            if getattr(self, name) > 1.0:
-                raise ValueError(
-                    f"BatteryParams.{name} must be at most 1, got {getattr(self, name)}"
-                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,16 +57,16 @@ class WorldParams(Checked):
     Neither the filter nor the controller models this world.
     """
 
-    wind_I: Vector = (0.0, 0.0, 0.0)
+    wind_I: check.Vector3 = (0.0, 0.0, 0.0)
     """(3,) steady wind, the velocity of the air east, north, up in I [m/s]"""
-    gust_wind_speed: float = 0.0
+    gust_wind_speed: Annotated[float, check.between(0.0, MAX_WIND)] = 0.0
     """W20, the wind speed at 20 feet above ground, which sets the intensity of the Dryden gusts
     [m/s]; 0: no gusts. MIL-F-8785C, 3.7.3.4: 7.7 is light, 15.4 moderate, 23.2 severe turbulence"""
-    linear_drag_B: Vector = (0.0, 0.0, 0.0)
+    linear_drag_B: check.NonNegative3 = (0.0, 0.0, 0.0)
     """(3,) drag force along each body axis per air velocity along that axis, opposing it [N s/m];
     M. Faessler, A. Franchi, D. Scaramuzza, "Differential flatness of quadrotor dynamics subject to
     rotor drag", RA-L 2018: mass times (0.544, 0.386, 0) 1/s for their vehicle"""
-    rotor_drag_B: Vector = (0.0, 0.0, 0.0)
+    rotor_drag_B: check.NonNegative3 = (0.0, 0.0, 0.0)
     """(3,) drag force along each body axis per air velocity along that axis and per rad/s of the
     sum of the rotor speeds, opposing the velocity [N s/m per rad/s]; J. Svacha, K. Mohta, V. Kumar,
     "Improving quadrotor trajectory tracking by compensating for aerodynamic effects", ICUAS 2017"""
@@ -83,7 +76,7 @@ class WorldParams(Checked):
     forward flight", ARC R&M 3021, 1955. Heights below half a radius count as half a radius, so
     thrust increases by at most a third; for a tilted vehicle the increase is multiplied by the
     cosine of the tilt"""
-    rotor_radius: float = 0.127
+    rotor_radius: check.Positive = 0.127
     """radius of the rotors, for the ground effect [m]; ten-inch propellers"""
     ground_height: float = -0.1
     """height of the ground in I, for contact, ground effect and gusts [m]; the center of mass of a
@@ -97,33 +90,20 @@ class WorldParams(Checked):
     obstacles: tuple[Obstacle, ...] = ()
     """walls and cylinders, at most MAX_OBSTACLES of them: touching one is a collision and ends the
     episode, and the camera sees nothing behind one"""
-    vehicle_radius: float = 0.42
+    vehicle_radius: Annotated[float, partial(check.positive, most=100.0)] = 0.42
     """distance between center of mass and obstacle below which the vehicle touches the obstacle
     [m]; the laboratory's rotor hubs are 0.30 m from the center of mass, and its propellers reach
     0.13 m beyond"""
-    geofence: Matrix | None = None
+    geofence: Annotated[Matrix, partial(check.matrix, rows=2, columns=3)] | None = None
     """(2, 3) lowest and highest corner in I of a box [m]; an episode ends when the center of mass
     leaves the box; None: no geofence"""
 
     def __post_init__(self) -> None:
-        self._check(check.vector, "wind_I", length=3)
-        self._check(check.vector, "linear_drag_B", "rotor_drag_B", length=3, least=0.0)
-        self._check(check.number, "gust_wind_speed", least=0.0, most=MAX_WIND)
+        super().__post_init__()
         if np.linalg.norm(self.wind_I) > MAX_WIND:
             raise ValueError(
                 f"WorldParams.wind_I must be at most {MAX_WIND:g} m/s, got {self.wind_I}"
             )
-        self._check(check.flag, "ground_effect")
-        self._check(check.positive, "rotor_radius")
-        self._check(check.number, "ground_height")
-        if self.ground is not None:
-            check.instance("WorldParams.ground", self.ground, GroundParams)
-        if self.battery is not None:
-            check.instance("WorldParams.battery", self.battery, BatteryParams)
-        self._check_room()
-
-    def _check_room(self) -> None:
-        """Check obstacles and geofence."""
         if not isinstance(self.obstacles, (tuple, list)):
             raise ValueError(
                 "WorldParams.obstacles must be a tuple of Wall and Cylinder, got "
@@ -135,9 +115,7 @@ class WorldParams(Checked):
             raise ValueError(
                 f"WorldParams.obstacles must be at most {MAX_OBSTACLES}, got {len(self.obstacles)}"
             )
-        self._check(check.positive, "vehicle_radius", most=100.0)
         if self.geofence is not None:
-            self._check(check.matrix, "geofence", rows=2, columns=3)
             low, high = self.geofence
             if not all(a < b for a, b in zip(low, high, strict=True)):
                 raise ValueError(

@@ -32,12 +32,8 @@ _NOT_WRITTEN = {
 def words_of_update(settings: Any, used: frozenset[str]) -> tuple[NDArray[np.uint64], int]:
     """Return the words of an update as offsets of their first lane in a block.
 
-    Args:
-        settings: A SETTINGS record.
-        used: Names of the parts of a flight's record that are in use.
-
-    Returns:
-        Offsets, first of the words that an update writes, and the number of words it writes.
+    Words that an update writes come first; the second value is their number. `used` names the parts
+    of a flight's record that are in use.
     """
     written: list[NDArray[np.int64]] = []
     read: list[NDArray[np.int64]] = []

@@ -57,9 +57,6 @@ def room_of(used: frozenset[str]) -> Room:
     Kernels address the fields of the full record. A block in memory is a window of it: its address
     minus the skipped bytes is the address of the full record, and kernels access no field outside
     the window.
-
-    Args:
-        used: Names of the parts in use, see `PARTS`.
     """
     chosen = [i for i, (name, _) in enumerate(PARTS) if name in used | {"core"}]
     fields = [field for _, part in PARTS[chosen[0] : chosen[-1] + 1] for field in part]

@@ -34,11 +34,7 @@ DRAW_RANGES: list[DrawRange] = []
 
 
 def _claim(quantity: str, first: int, count: int) -> int:
-    """Reserve a range of draws for a quantity; return the first.
-
-    Raises:
-        ValueError: If the range overlaps another quantity's.
-    """
+    """Reserve a range of draws that no other quantity has; return the first."""
     for other in DRAW_RANGES:
         if first < other.first + other.draws and other.first < first + count:
             raise ValueError(f"draws of {quantity!r} overlap those of {other.quantity!r}")

@@ -2,16 +2,12 @@
 
 import os
 
-WIDTHS = (2, 4, 8)
-"""Supported numbers of lanes."""
+WIDTHS = (1, 2, 4, 8)
+"""Supported numbers of lanes; 1 is for filters on other processors."""
 
 
 def lanes_of_machine() -> int:
-    """Return the number of lanes: 8 with AVX-512, 4 with AVX2, else 2; QUAD_GYM_LANES overrides it.
-
-    Raises:
-        ValueError: If QUAD_GYM_LANES is not one of WIDTHS.
-    """
+    """Return QUAD_GYM_LANES, or 8 lanes with AVX-512, 4 with AVX2, else 2."""
     wanted = os.environ.get("QUAD_GYM_LANES")
     if wanted:
         if wanted not in map(str, WIDTHS):

@@ -20,11 +20,7 @@ LONE = "observed"
 
 
 def ask(task: Task, method: str, *arguments: Any) -> Any:
-    """Call a task's method.
-
-    Raises:
-        TaskError: If the method raises an exception, which becomes the cause.
-    """
+    """Call a task's method; an exception that it raises becomes the cause of a TaskError."""
     try:
         return getattr(task, method)(*arguments)
     except Exception as error:
@@ -48,11 +44,7 @@ def _meant(error: Exception) -> str:
 
 
 def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]:
-    """Convert a return value to an array of numbers.
-
-    Raises:
-        TaskError: If it is not an array of numbers.
-    """
+    """Convert a return value to an array of numbers."""
     try:
         found = np.asarray(value)
     except (TypeError, ValueError):
@@ -65,11 +57,7 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
 
 
 def reward_terms(task: Task, view: View) -> dict[str, Floats]:
-    """Terms of a task's reward, (n,) each, which may still be NaN or infinite.
-
-    Raises:
-        TaskError: If the method fails, or returns another shape or type.
-    """
+    """Terms of a task's reward, (n,) each, which may still be NaN or infinite."""
     value = ask(task, "reward", view)
     if not isinstance(value, Mapping):
         return {"reward": _reward(task, value, view.count)}
@@ -90,11 +78,7 @@ def _reward(task: Task, value: Any, count: int, name: str = "") -> Floats:
 
 
 def truths(task: Task, method: str, view: View) -> Truths:
-    """Boolean values that a method returns, (n,).
-
-    Raises:
-        TaskError: If the method fails, or returns another shape or type.
-    """
+    """Boolean values that a method returns, (n,)."""
     found = numbers(task, method, ask(task, method, view))
     if found.dtype.kind != "b" or found.shape != (view.count,):
         raise TaskError(
@@ -105,11 +89,7 @@ def truths(task: Task, method: str, view: View) -> Truths:
 
 
 def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
-    """Convert the return value of `observe` to (n, k) arrays by name, in its order.
-
-    Raises:
-        TaskError: If an array has another shape or type.
-    """
+    """Convert the return value of `observe` to (n, k) arrays by name, in its order."""
     named = value if isinstance(value, Mapping) else {LONE: value}
     found = {}
     for name, part in named.items():
@@ -124,18 +104,7 @@ def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
 
 
 def require(sound: Truths, task: Task, method: str, values: NDArray[Any], required: str) -> None:
-    """Reject invalid values.
-
-    Args:
-        sound: True for flights whose values are valid, (n,).
-        task: Task that returned them.
-        method: Method that returned them.
-        values: Values, (n, ...), for the message.
-        required: Description of valid values, for the message.
-
-    Raises:
-        TaskError: If a value is invalid.
-    """
+    """Reject values (n, ...) of flights that are not sound, (n,)."""
     wrong = np.flatnonzero(~sound)
     if wrong.size:
         raise TaskError(

@@ -36,17 +36,8 @@ class TaskBatch(ReadableBatch):
     of the results. Episodes begin in the kernel with next-step autoreset, and by masked resets
     otherwise, so that the flights' random streams continue as without a task.
 
-    Args:
-        count: Number of flights.
-        own_task: User-defined task.
-        parts: Arrays that its `observe` returns, by name; None: `observe` is not called.
-        split: Index in the built-in observation at which these are inserted.
-        kept: Indices of the built-in observation that are kept; None: all.
-        autoreset: Mode that determines when the next episode begins after one has ended.
-        keywords: Keywords of `FlightBatch`.
-
-    Raises:
-        ValueError: If an argument is invalid.
+    `parts` are the arrays that `observe` returns, inserted at index `split` of the built-in
+    observation, of which the indices `kept` are kept (None: all).
     """
 
     def __init__(
@@ -70,13 +61,14 @@ class TaskBatch(ReadableBatch):
         if parts is not None and "observe" in self.methods:
             self._joiner = Joiner(self.count, parts, self._low.size, split, kept)
         self._state = State(self.count, own_task.state)
-        self._failed: Truths | None = None  # None: no flight has failed
+        self._failed: Truths = np.zeros(self.count, bool)
         self._terms: Mapping[str, Floats] = {}
         self._rewarded: Truths = np.zeros(self.count, bool)
         self._all, self._returns = np.arange(self.count), np.zeros(self.count)
         self._block, self._lane = np.divmod(self._all, WIDTH)
         size = self._joiner.size if self._joiner else self._low.size
-        self._finals = np.zeros((self.count, size), np.float32)
+        # the kernels do not write it: they begin episodes only at the start of a step
+        self.final_observations = np.zeros((self.count, size), np.float32)
         self._begun_again = False
         self._view: View | None = None
 
@@ -101,13 +93,10 @@ class TaskBatch(ReadableBatch):
         given: Start = {"position": position, "velocity": velocity, "yaw": yaw}
         chosen = checked_mask(self.count, mask)
         builtin = super().reset(seeds=seeds, keys=keys, mask=mask, **given)
-        others = ~chosen & (False if self._failed is None else self._failed)
-        self._note_failed(others)
-        try:
-            return self._observed(self._begin(chosen, given, builtin))
-        except BaseException:
-            self._note_failed(others | chosen)
-            raise
+        self._failed |= chosen
+        observations = self._observed(self._begin(chosen, given, builtin))
+        self._failed &= ~chosen
+        return observations
 
     def step(self, actions: NDArray[Any] | None = None) -> Singles:
         """Fly one control period; see `FlightBatch.step`.
@@ -117,22 +106,17 @@ class TaskBatch(ReadableBatch):
             TaskError: If a method of the task fails. The vehicles have moved, but the step has no
                 results; all flights must be reset.
         """
-        if self._failed is not None:
+        if self._failed.any():
             raise check.NotResetError(
                 f"call reset() before step(): a method of {label(self.own_task)} has failed for "
                 f"{answers.flights_named(np.flatnonzero(self._failed))}"
             )
         self.view.forget()
         builtin = super().step(actions)
-        try:
-            return self._after_step(builtin)
-        except BaseException:
-            self._note_failed(np.ones(self.count, bool))
-            raise
-
-    def _note_failed(self, flights: Truths) -> None:
-        """Mark flights for which a method has failed; they need a reset before the next step."""
-        self._failed = flights if flights.any() else None
+        self._failed[:] = True
+        observations = self._after_step(builtin)
+        self._failed[:] = False
+        return observations
 
     def _after_step(self, builtin: Singles) -> Singles:
         """Call the task's methods after a step; return the observations."""
@@ -155,7 +139,7 @@ class TaskBatch(ReadableBatch):
         self._write_remaining()
         if self._same_step and over.any():
             self._keep_innovations()
-            self._finals[over] = observations[over]
+            self.final_observations[over] = observations[over]
             builtin = self._begin(over, {}, super().reset(mask=over))
             observations[over] = self._observed(builtin)[over]
         return observations
@@ -199,11 +183,7 @@ class TaskBatch(ReadableBatch):
         return answers.truths(self.own_task, method, self.view)
 
     def _write_rewards(self, terms: Mapping[str, Floats]) -> None:
-        """Write rewards; flights that begin, or whose state is not finite, have none.
-
-        Raises:
-            TaskError: If another reward is not finite; nothing is written then.
-        """
+        """Write rewards; flights that begin, or whose state is not finite, have none."""
         rewards = reduce(np.add, terms.values())
         sound = np.abs(rewards) <= LARGEST_REWARD  # NaN is not
         if not sound.all():
@@ -266,7 +246,7 @@ class TaskBatch(ReadableBatch):
 
     def _write_remaining(self) -> None:
         """Write gates passed, and the starts of episodes that `reset` has changed."""
-        if "gates_passed" in self._state:
+        if "gates_passed" in self._state.names:
             passed = np.where(self.began, 0.0, self._state.gates_passed)
             self._results[Result.GATES_PASSED, : self.count] = passed
             self._write(slice(None), gate_next=passed)
@@ -276,15 +256,6 @@ class TaskBatch(ReadableBatch):
                 row[self.began] = self.record(name)[self.began]
 
     # ---- observing ----------------------------------------------------------------------------
-
-    @property
-    def final_observations(self) -> Singles:
-        """Last observations of episodes that ended in this step, (count, n_observation) float32."""
-        return self._finals
-
-    @final_observations.setter
-    def final_observations(self, value: Singles) -> None:
-        """Ignore the kernels' array: they begin episodes only at the start of a step."""
 
     def ask_parts(self) -> dict[str, NDArray[Any]]:
         """Arrays that `observe` returns at the present instant, (count, k) each."""
@@ -316,33 +287,31 @@ class TaskBatch(ReadableBatch):
     def snapshot(self) -> NDArray[Any]:
         """Copy all flights and the task's state, for `restore`."""
         flights = super().snapshot()
-        if not len(self._state):
+        if not self._state.names:
             return flights
-        kept = np.zeros(len(flights), [("flights", flights.dtype), ("state", self._state.dtype())])
+        kept, rows = np.zeros(len(flights), self._kind_of_snapshot), self._state.rows()
         kept["flights"] = flights
-        self._state.write_to(kept["state"])
+        kept["state"][self._block, self._lane] = rows
         return kept
 
-    def restore(self, snapshot: NDArray[Any]) -> None:
-        """Restore all flights from a snapshot of this batch, or of another one of equal size.
+    @property
+    def _kind_of_snapshot(self) -> np.dtype[Any]:
+        """Data type of a snapshot with the task's state."""
+        rows = (self._state.rows().dtype, (WIDTH,))
+        return np.dtype([("flights", self._blocks.dtype), ("state", *rows)])
 
-        Raises:
-            ValueError: If the snapshot has another size, kind or task.
-        """
-        flights = snapshot
-        if len(self._state):
-            kind = getattr(snapshot, "dtype", None)
-            if getattr(kind, "names", None) != ("flights", "state") or (
-                snapshot["state"].dtype != self._state.dtype()
-            ):
-                raise ValueError(f"snapshot must be one of a batch with {label(self.own_task)}")
-            flights = snapshot["flights"]
-        super().restore(flights)
-        if len(self._state):
-            self._state.read_from(snapshot["state"])
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Restore all flights from a snapshot of this batch, or of another one of equal size."""
+        if not self._state.names:
+            super().restore(snapshot)
+        elif getattr(snapshot, "dtype", None) != self._kind_of_snapshot:
+            raise ValueError(f"snapshot must be one of a batch with {label(self.own_task)}")
+        else:
+            super().restore(snapshot["flights"])
+            self._state.put(snapshot["state"][self._block, self._lane], np.ones(self.count, bool))
         self._returns = self.record("episode_return")
         self.began = self.record("tick") == 0.0
-        self._failed = None
+        self._failed[:] = False
         self.view.forget()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -354,11 +323,9 @@ class TaskBatch(ReadableBatch):
     @contextmanager
     def _writing(self, chosen: Truths, draws: int) -> Iterator[FlightRandom]:
         """Allow a method to change the task's state, but only of chosen flights."""
-        kept = {} if np.count_nonzero(chosen) == self.count else self._state.copies()
+        kept = self._state.rows()
         self._state.lock(False)
         try:
             yield FlightRandom(self.record("key"), self.record("instant"), draws)
         finally:
-            self._state.lock(True)
-            if kept:
-                self._state.bring_back(kept, ~chosen)
+            self._state.put(kept[~chosen], ~chosen)

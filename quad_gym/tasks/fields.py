@@ -15,15 +15,10 @@ T = TypeVar("T")
 
 
 class GroupField(Generic[T]):
-    """Read-only value of a `Group`, stored until the next step.
+    """Read-only value of a `Group`, computed from it by `read` and stored until the next step.
 
-    Args:
-        read: Function that computes it from the group.
-        shape: Shape. n: flights, m: features of the camera, o: obstacles, k: values of an
-            observation.
-        unit: Unit.
-        frame: Frame. I: inertial (east, north, up), B: body, C: image; "-": none.
-        meaning: Description.
+    Shapes: n: flights, m: features of the camera, o: obstacles, k: values of an observation.
+    Frames: I: inertial (east, north, up), B: body, C: image; "-": none.
     """
 
     def __init__(
@@ -61,12 +56,7 @@ _LETTERS = {"features": "m", "obstacles": "o"}
 
 
 def quantity(name: str, shown: str | None = None) -> GroupField[NDArray[Any]]:
-    """Make a field of one of `quad_gym.batch.quantities.QUANTITIES`.
-
-    Args:
-        name: Name of the quantity.
-        shown: Field of `quad_gym.records.SHOWN` with its values; None: the records.
-    """
+    """Make a field of one of QUANTITIES, from the field `shown` of SHOWN or from the records."""
     q = QUANTITIES[name]
     kind: type[np.generic] = {bool: np.bool_, int: np.int64}.get(q.kind, np.float64)
 
@@ -102,11 +92,7 @@ def frozen(value: Any) -> Any:
 
 
 class Group:
-    """Group of fields of a view.
-
-    Args:
-        flights: Flights that it describes.
-    """
+    """Group of fields of a view."""
 
     __slots__ = ("__dict__", "_flights")
 

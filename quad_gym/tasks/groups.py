@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
-from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK
 from quad_gym.tasks.fields import Group, GroupField, field, quantity, record, shown
 from quad_gym.tasks.memory import ReadableBatch
 
@@ -188,47 +187,21 @@ class MeasuredView(Group):
                 "or include_std=True or innovations=True"
             )
 
-    gyro = quantity("gyro")
-    accel = quantity("accel")
-
-    @field("(n, 3)", "m", "I", "position of the primary antenna")
-    def gnss_position(self) -> Floats:
-        return self._in_I("gnss_position", self.gnss_valid)
-
-    @field("(n, 3)", "m", "I", "baseline from the primary to the secondary antenna")
-    def gnss_baseline(self) -> Floats:
-        return self._in_I("gnss_baseline", self.baseline_valid)
-
-    @field("(n, 3)", "m/s", "I", "velocity of the primary antenna, if the receiver measures it")
-    def gnss_velocity(self) -> Floats:
-        gnss = self._flights.sensors.gnss
-        gives = gnss is not None and gnss.velocity_sigma is not None
-        return self._in_I("gnss_velocity", self.gnss_valid & gives)
-
-    def _in_I(self, name: str, valid: Truths) -> Floats:
-        """Vector in G rotated to I; NaN where it was not measured."""
-        x, y, z = self._flights.rows(name).T
-        turned = [row[0] * x + row[1] * y + row[2] * z for row in self._flights.nominal()["R_IG"]]
-        return np.where(valid, turned, np.nan).T
-
-    @field("(n, m, 2)", "pixels", "C", "image coordinates of the features, relative to the image center")
-    def pixels(self) -> Floats:
-        seen = self.features_seen
-        pixels = self._flights.rows("pixels")[:, : seen.shape[1]]
-        return np.where(seen[:, :, np.newaxis], pixels, np.nan)
+    gyro, accel = quantity("gyro"), quantity("accel")
+    gnss_position, gnss_baseline = quantity("gnss_position"), quantity("gnss_baseline")
+    gnss_velocity, pixels = quantity("gnss_velocity"), quantity("pixels")
 
     @field("(n,) bool", "-", "-", "True where a position was measured in this step")
     def gnss_valid(self) -> Truths:
-        return self._flights.rows("block_fresh", np.bool_)[:, POSITION_BLOCK]
+        return np.isfinite(self.gnss_position[:, 0])
 
     @field("(n,) bool", "-", "-", "True where a baseline was measured in this step")
     def baseline_valid(self) -> Truths:
-        return self._flights.rows("block_fresh", np.bool_)[:, BASELINE_BLOCK]
+        return np.isfinite(self.gnss_baseline[:, 0])
 
     @field("(n, m) bool", "-", "-", "True for features in an image of this step")
     def features_seen(self) -> Truths:
-        count = self._flights.feature_places().shape[1]
-        return self._flights.rows("block_fresh", np.bool_)[:, FEATURE_SLICE][:, :count]
+        return np.isfinite(self.pixels[:, :, 0])
 
 
 class BuiltinView(Group):

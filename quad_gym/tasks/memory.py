@@ -19,15 +19,7 @@ _JUDGED = slice(int(Result.REWARD), int(Result.ENDING) + 1)
 
 
 class ReadableBatch(FlightBatch):
-    """`FlightBatch` with quantities that only views of a task need.
-
-    All methods return new arrays.
-
-    Args:
-        count: Number of flights.
-        split: Size of the observation without its privileged part.
-        keywords: Keywords of `FlightBatch`.
-    """
+    """`FlightBatch` with quantities that only views of a task need; methods return new arrays."""
 
     def __init__(self, count: int, split: int, **keywords: Any) -> None:
         super().__init__(count, **keywords)
@@ -67,11 +59,7 @@ class ReadableBatch(FlightBatch):
         return observations
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Restore all flights from a snapshot.
-
-        Raises:
-            ValueError: If the snapshot has another size or kind.
-        """
+        """Restore all flights from a snapshot."""
         super().restore(snapshot)
         self._resets[:] = 0
         self._run(Command.RESET)  # resets no flight, but computes `shown` and the observations

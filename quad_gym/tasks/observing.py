@@ -24,12 +24,8 @@ class Part(NamedTuple):
 class Joiner:
     """Assembly of observations: built-in values that are kept, the task's, and privileged ones.
 
-    Args:
-        count: Number of flights.
-        parts: Arrays that `observe` returns, by name.
-        builtin: Size of the built-in observation.
-        split: Index in the built-in observation at which the task's values are inserted.
-        kept: Indices before `split` that are kept; None: all.
+    The task's values are inserted at index `split` of the built-in observation, of whose indices
+    before it the `kept` remain (None: all).
     """
 
     def __init__(
@@ -55,18 +51,10 @@ class Joiner:
         """Size of an observation."""
 
     def join(self, flights: ReadableBatch, task: Task, value: Any, builtin: Singles) -> Singles:
-        """Assemble the observations of the environment.
+        """Assemble observations from the return value of `observe` and the built-in ones, (n, k).
 
-        Args:
-            flights: Flights of the task.
-            task: Task.
-            value: Return value of its `observe`.
-            builtin: Built-in observations, (n, k).
-
-        Raises:
-            TaskError: If the return value has another size than at first, or is not finite although
-                the state of the flight is. For flights whose state is not finite, it is replaced by
-                finite numbers.
+        Sizes must be those of the first call, and values finite, except for flights whose state is
+        not finite: finite numbers replace theirs.
         """
         parts = answers.parts(task, value, self._count)
         sizes = {name: part.shape[1] for name, part in parts.items()}

@@ -26,21 +26,9 @@ def starts(
     params: TaskParams,
     world: WorldParams,
 ) -> Start:
-    """Combine the start values returned by `reset` of a task with those given by the caller.
+    """Combine start values that `reset` of a task returns with `given` ones, which take precedence.
 
-    Args:
-        task: Task that returned them.
-        returned: Return value of its `reset`.
-        chosen: True for flights that begin an episode, (n,); rows of the others are ignored.
-        given: Start values of the caller, which take precedence; None: not given.
-        params: Parameters of the built-in task.
-        world: World with its obstacles, in which the vehicles start.
-
-    Returns:
-        "position", "velocity" and "yaw" for `FlightBatch.reset`.
-
-    Raises:
-        TaskError: If the start values are invalid.
+    Rows of flights that are not `chosen` (n,) to begin an episode are ignored.
     """
     if not isinstance(returned, Mapping) or not set(returned) <= set(_SHAPES):
         raise TaskError(

@@ -203,11 +203,7 @@ def resolve_task(given: Any) -> Task:
 
 
 def _named(name: str) -> Any:
-    """Object specified by "module:name".
-
-    Raises:
-        ValueError: If the module or the name in it does not exist.
-    """
+    """Object specified by "module:name"."""
     module, colon, attribute = name.partition(":")
     if not (colon and module and attribute):
         raise ValueError(f'task must be "module:name" of a quad_gym.Task, got {name!r}')

@@ -1,6 +1,6 @@
 """`View`: the fields that methods of a task read, and a table of them."""
 
-from typing import Any, NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,25 +19,15 @@ class HiddenTruthError(RuntimeError):
     """Error raised when `observe` of a task that is not privileged reads the true state."""
 
 
-class Short:
-    """Field of `view.truth` as an attribute of the view."""
+class Short(property):
+    """Field of `view.truth` as an attribute of the view, unless the truth is hidden."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        """Store the name of the field."""
-        self._name = name
+    def __init__(self, name: str) -> None:
+        def read(view: "View") -> Floats:
+            view._require_open(name)
+            return getattr(view._truth, name)
 
-    @overload
-    def __get__(self, view: None, owner: type) -> "Short": ...
-
-    @overload
-    def __get__(self, view: "View", owner: type) -> Floats: ...
-
-    def __get__(self, view: "View | None", owner: type) -> Any:
-        """Return the field, unless the truth is hidden."""
-        if view is None:
-            return self
-        view._require_open(self._name)
-        return getattr(view._truth, self._name)
+        super().__init__(read)
 
 
 # fmt: off
@@ -96,9 +86,11 @@ class View(Group):
         self._require_open("builtin")
         return self._builtin
 
-    position, velocity, R_BI, quaternion, body_rates = Short(), Short(), Short(), Short(), Short()
-    rotor_speeds, accel_bias, gyro_bias = Short(), Short(), Short()
-    position_error, estimation_error, obstacle_distance = Short(), Short(), Short()
+    position, velocity, R_BI = Short("position"), Short("velocity"), Short("R_BI")
+    quaternion, body_rates = Short("quaternion"), Short("body_rates")
+    rotor_speeds, accel_bias = Short("rotor_speeds"), Short("accel_bias")
+    gyro_bias, position_error = Short("gyro_bias"), Short("position_error")
+    estimation_error, obstacle_distance = Short("estimation_error"), Short("obstacle_distance")
 
     # ---- never hidden -------------------------------------------------------------------------
 
@@ -110,9 +102,7 @@ class View(Group):
     def period(self) -> float:
         return self._flights.period
 
-    time = quantity("time")
-
-    step = quantity("step")
+    time, step = quantity("time"), quantity("step")
 
     @field("(n,) bool", "-", "-", "True where an episode has just begun and no step of it has been flown")
     def is_first(self) -> Truths:
@@ -126,9 +116,7 @@ class View(Group):
     reference_heading = quantity("reference_heading", "x_ref")
     preview = shown("preview", "(n, 2, 3)", "m", "I", "reference after each of the two times `preview`; on a course, the two gates after the next")
 
-    gates = quantity("gates")
-
-    gates_passed = quantity("gates_passed")
+    gates, gates_passed = quantity("gates"), quantity("gates_passed")
 
     @field("(n,) bool", "-", "-", "True where this step passed a gate")
     def gate_passed(self) -> Truths:

@@ -24,57 +24,53 @@ def run(folder, *options):
     return json.loads((folder / "benchmark.json").read_text())
 
 
-def test_the_filter_section_compares_all_filters(tmp_path, capsys):
-    found = run(tmp_path / "new", "--only", "filter", "--batch", "16")
-    assert set(found) == {"sections", "configuration", "processor", "versions"}
-    assert list(found["sections"]) == ["filter"]
-    rows = found["sections"]["filter"]
+def test_filter_section_compares_all_filters(tmp_path, capsys):
+    rows = run(tmp_path / "new", "--only", "filter", "--batch", "16")["sections"]["filter"]
     kinds = {(row["kind"], row["measurements"]) for row in rows}
     expected = ("lanes", "UnscentedKalmanFilter", "plain NumPy")
     assert {(kind, n) for kind in expected for n in (6, 12)} <= kinds
     for row in rows:
-        more = {"kind", "measurements", "suite", "times_lanes"}
-        assert set(row) == {"name", "seconds", "spread"} | more
-        assert row["suite"] == "lab"
         assert row["seconds"] > 0.0
-        assert row["spread"] >= 0.0
-        assert row["times_lanes"] > 0.0
         assert (row["times_lanes"] == 1.0) == (row["kind"] == "lanes")
-    assert found["configuration"]["batch"] == 16
-    assert found["versions"]["numba"]
-    printed = capsys.readouterr()
-    assert "plain NumPy, 12 measurements" in printed.out
-    assert "plain NumPy, 12 measurements" in printed.err
+    assert "plain NumPy, 12 measurements" in capsys.readouterr().out
 
 
-def test_the_tick_section_names_every_stage_that_the_suites_fly_through(tmp_path):
+def test_tick_section_names_every_stage_of_a_suite(tmp_path):
     rows = run(tmp_path, "--only", "tick", "--batch", "16", "--n-envs", "16")["sections"]["tick"]
-    speeds = {row["suite"]: row["speed"] for row in rows if row["kind"] == "suite"}
-    assert set(speeds) == set(SUITES)
-    assert speeds["standard"] == 1.0
-    rows = [row for row in rows if row["kind"] != "suite"]
+    assert {row["suite"] for row in rows if row["kind"] == "suite"} == set(SUITES)
     for suite in ("standard", "lab"):
-        mine = {row["part"]: row for row in rows if row["suite"] == suite}
+        mine = {
+            row["part"]: row for row in rows if row["kind"] != "suite" and row["suite"] == suite
+        }
         batch = quad_gym.FlightBatch(1, sensors=suite, task=TASK_DEFAULTS["hover"])
         stages = {stage.name.lower() for stage in needed_stages(batch._settings[0])}
-        assert stages < set(mine)
-        assert set(mine) - stages == {"whole tick", "filter", "sum of the tick's stages"}
-        assert {n for n, row in mine.items() if row["kind"] == "start"} == {"begin", "align"}
+        assert set(mine) == stages | {"whole tick", "filter", "sum of the tick's stages"}
         ticks = [row["seconds"] for row in mine.values() if row["kind"] == "tick"]
         assert mine["sum of the tick's stages"]["seconds"] == pytest.approx(sum(ticks))
-        both = mine["predict"]["seconds"] + mine["update"]["seconds"]
-        assert mine["filter"]["seconds"] == pytest.approx(both)
         for row in mine.values():
-            assert row["seconds"] > 0.0
             assert row["share"] == pytest.approx(row["seconds"] / mine["whole tick"]["seconds"])
-    parts = {row["part"] for row in rows if row["suite"] == "standard"}
-    assert parts - {row["part"] for row in rows if row["suite"] == "lab"} == {
-        "average_imu",
-        "keep_start",
-    }
 
 
-def test_blocks_over_a_period_measure_as_often_as_the_sensors_do():
+def test_options_section_compares_each_with_everything_off(tmp_path):
+    found = run(tmp_path, "--only", "options", "--batch", "16")
+    rows = {row["name"]: row for row in found["sections"]["options"]}
+    assert {"gate", "gusts", "suite rtk", "extended Kalman filter"} < set(rows)
+    for row in rows.values():
+        off = rows["everything off"]["seconds"]
+        assert row["times_off"] == pytest.approx(row["seconds"] / off)
+
+
+def test_learning_section_finds_when_the_policy_beats_pd(tmp_path, capsys):
+    rows = run(tmp_path, "--only", "learning", "--seeds", "2")["sections"]["learning"]
+    assert [(row["seed"], row["steps_to_pd"]) for row in rows] == [(0, None)]  # quick
+    assert "0 of 1 below tuned PD" in capsys.readouterr().out
+    names = ("steps", "training_seconds", "mean_error", "crash_rate")
+    flown = [(0, 0.0, 0.05, 0.5), (10, 1.0, 0.08, 0.0), (20, 2.0, 0.06, 0.0), (30, 3.0, 0.05, 0.0)]
+    found = learning.summary([dict(zip(names, row, strict=True)) for row in flown], pd=0.07)
+    assert (found["steps_to_pd"], found["seconds_to_pd"], found["error"]) == (20, 2.0, 0.05)
+
+
+def test_blocks_over_a_period_measure_as_often_as_sensors():
     """GNSS at 10 Hz and a camera at 25 Hz measure in 1 of 20 and 1 of 8 ticks of 5 ms."""
     batch = stages.hovering(40 * WIDTH, sensors="rtk")
     blocks = stages.over_a_period(batch)
@@ -90,34 +86,6 @@ def test_what_takes_turns_is_timed_by_turns():
     timings = by_turns(jobs, 3)
     assert order == ["slow", "fast"] * 3
     assert timings == [Timing(2.0, 0.5), Timing(1.0, 0.0)]
-
-
-def test_the_options_section_compares_each_with_everything_off(tmp_path):
-    found = run(tmp_path, "--only", "options", "--batch", "16")
-    rows = {row["name"]: row for row in found["sections"]["options"]}
-    assert next(iter(rows)) == "everything off"
-    assert {"gate", "gusts", "suite rtk", "extended Kalman filter"} < set(rows)
-    off = rows["everything off"]
-    assert off["suite"] == rows["gate"]["suite"] == "lab"
-    assert rows["suite rtk"]["suite"] == "rtk"
-    for row in rows.values():
-        assert row["times_off"] == pytest.approx(row["seconds"] / off["seconds"])
-        assert row["seconds"] > 0.0
-
-
-def test_the_learning_section_says_when_the_policy_was_better_than_pd(tmp_path, capsys):
-    rows = run(tmp_path, "--only", "learning", "--seeds", "2")["sections"]["learning"]
-    assert [row["seed"] for row in rows] == [0]  # quick
-    assert rows[0]["steps"] == 16_384
-    assert rows[0]["steps_to_pd"] is None
-    assert rows[0]["error"] > rows[0]["pd_error"] > 0.0
-    assert "0 of 1 below tuned PD" in capsys.readouterr().out
-    names = ("steps", "training_seconds", "mean_error", "crash_rate")
-    flown = [(0, 0.0, 0.05, 0.5), (10, 1.0, 0.08, 0.0), (20, 2.0, 0.06, 0.0), (30, 3.0, 0.05, 0.0)]
-    found = learning.summary([dict(zip(names, row, strict=True)) for row in flown], pd=0.07)
-    assert (found["steps_to_pd"], found["seconds_to_pd"], found["error"]) == (20, 2.0, 0.05)
-    better = {**rows[0], **found}
-    assert "1 of 2 below tuned PD, the last after 2.0 s" in learning.SECTION.table([*rows, better])
 
 
 def test_update_of_repeated_flights_shrinks_each_covariance():

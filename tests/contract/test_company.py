@@ -4,19 +4,16 @@ import functools
 import os
 import pickle
 import select
-import shutil
 import signal
 import subprocess
 import sys
-import threading
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-import quad_gym
 from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.kernels.compiling import cores
@@ -80,23 +77,12 @@ def test_stable_baselines3s_processes_fly_the_same(start_method):
         env.close()
 
 
-def test_two_environments_may_be_stepped_from_two_threads_at_once():
-    runs, errors = {}, []
-
-    def run(seed):
-        try:
-            runs[seed] = expected_run(200, "SameStep", seed=seed, batch_threads=2)
-        except BaseException as error:
-            errors.append(error)
-
-    workers = [threading.Thread(target=run, args=(seed,)) for seed in (1, 2, 3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join(PATIENCE)
-    assert not errors
-    for seed in (1, 2, 3):
-        assert_same(runs[seed], expected_run(200, "SameStep", seed=seed))
+def test_environments_may_be_stepped_from_several_threads():
+    run = functools.partial(expected_run, 200, "SameStep", batch_threads=2)
+    with ThreadPoolExecutor(3) as pool:
+        runs = [pool.submit(run, seed=seed) for seed in (1, 2, 3)]
+        for seed, flown in zip((1, 2, 3), runs, strict=True):
+            assert_same(flown.result(PATIENCE), run(seed=seed))
 
 
 def in_a_fork(work):
@@ -153,113 +139,17 @@ def test_an_environment_travels_to_a_worker_in_mid_episode():
     assert_same(pickle.loads(done.stdout), further(env))
 
 
-# ---- the cache of compiled kernels ---------------------------------------------------------------
-
-SMALL = (
-    "import numpy as np; from quad_gym.estimation import solve_wahba;"
-    "R = solve_wahba(np.ones(3), np.eye(3), np.eye(3)[[1, 2, 0]]);"
-    "print(np.abs(R @ np.eye(3).T - np.eye(3)[[1, 2, 0]].T).max() < 1e-12)"
-)
-"""A program that compiles one small kernel."""
-
-
-def start(cache, **environment):
-    return subprocess.Popen(
-        [sys.executable, "-c", SMALL],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "NUMBA_CACHE_DIR": str(cache), **environment},
-    )
-
-
-def outcome(process):
-    """Whether it compiled rather than loaded; fails if it did not compute the right thing."""
-    output, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, errors
-    assert output.strip() == "True"
-    return "compiling" in errors
-
-
-@pytest.mark.slow  # nine processes; which edits count is in tests/unit/compiling/test_digest.py
-def test_changed_kernel_is_compiled_again(tmp_path):
-    copy = tmp_path / "quad_gym"
-    source = Path(quad_gym.__file__).parent
-    shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    anew = functools.partial(start, tmp_path / "cache", PYTHONPATH=str(tmp_path))
-    where = subprocess.run(
-        [sys.executable, "-c", "import quad_gym; print(quad_gym.__file__)"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    if not where.stdout.startswith(str(tmp_path)):
-        pytest.skip("the installed package comes before PYTHONPATH")
-    assert run_in(tmp_path, anew)
-    assert not run_in(tmp_path, anew)
-    for room, change, stale in (
-        ("maths/rotation.py", "# a comment", False),
-        ("task/reference.py", "_CHANGED = True", False),
-        ("maths/rotation.py", "_CHANGED = True", True),
-    ):
-        with (copy / "kernels" / room).open("a") as file:
-            file.write(f"\n{change}\n")
-        assert run_in(tmp_path, anew) == stale
-        assert not run_in(tmp_path, anew)
-
-
-def run_in(folder, begin):
-    """`outcome(begin())` with another working folder, where another copy of the package lies."""
-    here = Path.cwd()
-    os.chdir(folder)
-    try:
-        return outcome(begin())
-    finally:
-        os.chdir(here)
-
-
 # ---- cores and imports ---------------------------------------------------------------------------
 
 
-def cores_in_a_process(code, **environment):
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            f"{code}; from quad_gym.batch.threads import *; print(available_cores())",
-        ],
-        env={**{k: v for k, v in os.environ.items() if k != "NUMBA_NUM_THREADS"}, **environment},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return int(done.stdout)
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no affinity on this system")
-def test_cores_are_limited_by_affinity_and_by_numbas_variable():
-    one = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
-    assert cores_in_a_process(one) == 1
-    assert cores_in_a_process("pass", NUMBA_NUM_THREADS="1") == 1
-
-
-def test_cores_are_limited_by_a_containers_quota(monkeypatch):
+def test_cores_are_limited_by_quota_affinity_and_variable(monkeypatch):
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
     for quota, expected in ((None, 16), (4, 4), (64, 16)):
         monkeypatch.setattr(cores, "_cgroup_cores", lambda quota=quota: quota)
         assert cores.available_cores() == expected
-    for limit, expected in (
-        ("3", 3),
-        ("999", 16),
-        ("", 16),
-        ("0", 16),
-        ("-2", 16),
-        ("many", 16),
-    ):
-        monkeypatch.setattr(cores, "_cgroup_cores", lambda: None)
+    monkeypatch.setattr(cores, "_cgroup_cores", lambda: None)
+    for limit, expected in (("3", 3), ("999", 16), ("", 16), ("0", 16), ("-2", 16), ("many", 16)):
         monkeypatch.setenv("NUMBA_NUM_THREADS", limit)
         assert cores.available_cores() == expected
 

@@ -32,7 +32,7 @@ def test_the_numbers_of_the_action_are_the_default_ones():
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
-def test_its_c_observes_as_the_environment(tmp_path):
+def test_c_of_the_page_observes_as_the_environment(tmp_path):
     """On the state and the reference of the absolute layout, which the same flights show."""
     (tmp_path / "it.c").write_text(re.search(r"```c\n(.*?)```", PAGE, re.DOTALL)[1])
     flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]

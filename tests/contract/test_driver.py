@@ -1,7 +1,6 @@
 """Driver of trainings: restarts, failures, stops, locks; the same tables after any death."""
 
 import contextlib
-import importlib.util
 import json
 import os
 import signal
@@ -12,7 +11,7 @@ import pytest
 
 from baselines.locks import BusyError, holder, is_locked, locked
 from quad_gym.experiments.driver import Driver
-from quad_gym.experiments.executors import Ended, make_executor, work
+from quad_gym.experiments.executors import Ended, work
 from quad_gym.experiments.sweep_plan import expand, read
 from quad_gym.experiments.sweep_table import FILES
 from tests import console_commands
@@ -68,7 +67,8 @@ class ScriptedJob:
 
 
 def test_died_trainings_restart_and_failed_ones_do_not(tmp_path):
-    trainings = expand({"seeds": 6, "env": TRUTH}, {}, tmp_path)
+    *trainings, finished = expand({"seeds": 7, "env": TRUTH}, {}, tmp_path)
+    pretend(finished, 0.1)
     fine, died = Ended("finished"), Ended("died", "signal 9")
     ends = [
         [fine],
@@ -80,10 +80,11 @@ def test_died_trainings_restart_and_failed_ones_do_not(tmp_path):
     ]
     executor = Scripted({t.name: end for t, end in zip(trainings, ends, strict=True)})
     bar = Bar()
-    driver = Driver(trainings, executor, 2, 2, bar)
+    driver = Driver([*trainings, finished], executor, 2, 2, bar)
     driver.run()
     assert not driver.stopped
     assert [executor.started.count(t.name) for t in trainings] == [1, 3, 3, 1, 5, 1]
+    assert finished.name not in executor.started
     assert executor.most == 2
     assert driver.failed == {
         trainings[2]: "died 3 times, lastly: signal 9",
@@ -93,16 +94,6 @@ def test_died_trainings_restart_and_failed_ones_do_not(tmp_path):
     name = trainings[1].name
     assert f"{name}: died (signal 9); restarts from its checkpoint (1 of 2)" in bar.lines
     assert driver.exit_code() == 1
-
-
-def test_finished_trainings_are_not_started(tmp_path):
-    trainings = expand({"seeds": 2, "env": TRUTH}, {}, tmp_path)
-    pretend(trainings[0], 0.1)
-    executor = Scripted({trainings[1].name: [Ended("finished")]})
-    driver = Driver(trainings, executor, None, 0, Bar())
-    driver.run()
-    assert executor.started == [trainings[1].name]
-    assert driver.exit_code() == 0
 
 
 def test_signals_stop_all_trainings_and_start_no_others(tmp_path):
@@ -213,9 +204,8 @@ def executor(request, monkeypatch):
 
 
 @pytest.mark.slow  # processes
-def test_tables_are_the_same_after_killed_workers_and_a_killed_sweep(
-    tmp_path, undisturbed, executor
-):
+def test_tables_are_the_same_after_kills(tmp_path, undisturbed, executor):
+    """A worker is killed, and then the sweep itself."""
     runs = tmp_path / "out/runs"
     process = start(tmp_path, *executor, "--jobs", "1")
     os.kill(worker_at(process, runs / GROUP.format(0.97) / "seed_0"), signal.SIGKILL)
@@ -231,7 +221,7 @@ def test_tables_are_the_same_after_killed_workers_and_a_killed_sweep(
 
 
 @pytest.mark.slow  # processes
-def test_sweep_that_is_terminated_leaves_checkpoints_and_continues(tmp_path, undisturbed, executor):
+def test_terminated_sweep_leaves_checkpoints_and_continues(tmp_path, undisturbed, executor):
     process = start(tmp_path, *executor, "--jobs", "1")
     first = tmp_path / "out/runs" / GROUP.format(0.97) / "seed_0"
     worker_at(process, first)
@@ -261,28 +251,3 @@ def test_full_disk_fails_one_training_only(tmp_path, undisturbed):
     (full / "evaluations.csv.part").unlink()
     end(start(tmp_path))
     assert tables(tmp_path) == undisturbed
-
-
-@pytest.mark.slow  # needs Ray
-def test_tables_are_the_same_after_the_loss_of_a_node(tmp_path, undisturbed, monkeypatch):
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    second = cluster.add_node(num_cpus=1)
-    options = ["--executor", "ray", "--options", f"address={cluster.address}"]
-    process = start(tmp_path, *options)
-    worker_at(process, tmp_path / "out/runs" / GROUP.format(0.8) / "seed_0")
-    cluster.remove_node(second, allow_graceful=False)
-    end(process)
-    cluster.shutdown()
-    assert tables(tmp_path) == undisturbed
-
-
-@pytest.mark.slow  # needs submitit
-@pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="needs submitit")
-@pytest.mark.parametrize("options", [{"cluster": "local", "cores": 3}, {"cluster": "moon"}])
-def test_unknown_options_of_submitit_are_rejected(tmp_path, options):
-    with pytest.raises(ValueError, match="--options do not fit submitit"):
-        make_executor("slurm", tmp_path, 1, options)

@@ -1,13 +1,7 @@
 """`info` of environments with faults and innovations."""
 
 import numpy as np
-import pytest
 
-import quad_gym
-from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.single import QuadEnv
-from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.faults import GnssOutage
 from quad_gym.records import FEATURE_BLOCKS, Aid, FaultKind, GateDecision
 from tests.builders import SHORT, actions_for, vec_env
 from tests.contract.configurations import FAULTY
@@ -42,23 +36,3 @@ def test_info_has_the_innovations_and_decisions_of_the_gate():
         rejected += (has[:, 0] & (info["gate"][:, 0] == GateDecision.REJECTED)).sum()
     assert info["rejections"][:, 0].sum() == rejected
     assert 0 < rejected < measured / 5
-
-
-def test_info_without_faults_has_no_entry():
-    assert not {"faults", "innovations"} & set(QuadEnv("hover").reset(seed=1)[1])
-    assert not {"faults", "innovations"} & set(QuadVectorEnv(2, "hover").reset(seed=1)[1])
-
-
-def test_invalid_faults_are_refused():
-    for make in (
-        lambda **k: QuadEnv("hover", **k),
-        lambda **k: QuadVectorEnv(2, "hover", **k),
-        lambda **k: quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 2, **k),
-        lambda **k: FlightBatch(2, **k),
-    ):
-        with pytest.raises(ValueError, match="faults must be one of none, gnss_outage"):
-            make(faults="storm")
-        with pytest.raises(ValueError, match="faults must be faults or names of presets"):
-            make(faults=3.0)
-        with pytest.raises(ValueError, match="needs GNSS, which this sensor suite does not have"):
-            make(sensors="indoor", faults=GnssOutage())

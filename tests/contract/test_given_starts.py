@@ -8,16 +8,10 @@ import quad_gym
 from quad_gym.envs.vector import QuadVectorEnv
 from tests.contract.comparing import state_of
 
+DRAWN = {"randomize_reference": True}
 REFERENCES = [
-    ("Hover", {}),
-    ("Hover", {"randomize_reference": True}),
-    ("Circle", {}),
-    ("Circle", {"randomize_reference": True}),
-    ("Lemniscate", {"randomize_reference": True}),
-    ("RandomTrajectory", {}),
-    ("Waypoints", {}),
-    ("Trajectory", {}),
-    ("Trajectory", {"randomize_reference": True}),
+    *((name, {}) for name in ("Hover", "Circle", "RandomTrajectory", "Waypoints", "Trajectory")),
+    *((name, DRAWN) for name in ("Hover", "Circle", "Lemniscate", "Trajectory")),
 ]
 
 

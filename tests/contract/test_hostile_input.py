@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import BarometerParams, FlightBatch, TaskParams
+from quad_gym import BarometerParams, FlightBatch, TaskParams, WorldParams
 from quad_gym import faults as fault_kinds
 from quad_gym.faults.base import DirectedFault
 from quad_gym.records import Autoreset, Control
+from tests.builders import flat
 
 RTK, INDOOR = quad_gym.sensor_suite("rtk"), quad_gym.sensor_suite("indoor")
 NUMBERS = [np.nan, np.inf, -np.inf, -1.0, 0.0, 10**400]
@@ -69,44 +70,25 @@ def environment_keywords():
     )
 
 
-def flat(observation):
-    parts = observation.values() if isinstance(observation, dict) else [observation]
-    return [np.asarray(part) for part in parts]
+INTERFACES = {
+    "make": lambda name, **keywords: gymnasium.make(name, disable_env_checker=True, **keywords),
+    "make_vec": lambda name, **keywords: gymnasium.make_vec(name, num_envs=2, **keywords),
+    "make_sb3_vec_env": lambda name, **keywords: quad_gym.make_sb3_vec_env(name, 2, 1, **keywords),
+}
 
 
-def fly_make(task, **keywords):
-    env = gymnasium.make(f"QuadGym/{task}-v0", disable_env_checker=True, **keywords)
-    seen = flat(env.reset(seed=1)[0])
+def fly(interface, task, **keywords):
+    """Observations and rewards of a few steps."""
+    env = INTERFACES[interface](f"QuadGym/{task}-v0", **keywords)
+    start = env.reset() if interface == "make_sb3_vec_env" else env.reset(seed=1)[0]
+    seen, action = [np.asarray(flat(start))], np.full(4 if interface == "make" else (2, 4), 0.3)
     for _ in range(4):
-        observation, reward, terminated, truncated, _ = env.step(np.full(4, 0.3))
-        seen += [*flat(observation), np.array(reward)]
-        if terminated or truncated:
+        observation, reward, *others = env.step(action)
+        seen += [np.asarray(flat(observation)), np.array(reward)]
+        if interface == "make" and (others[0] or others[1]):
             break
     env.close()
     return seen
-
-
-def fly_make_vec(task, **keywords):
-    env = gymnasium.make_vec(f"QuadGym/{task}-v0", num_envs=2, **keywords)
-    seen = flat(env.reset(seed=1)[0])
-    for _ in range(4):
-        observation, reward, *_ = env.step(np.full((2, 4), 0.3))
-        seen += [*flat(observation), reward]
-    env.close()
-    return seen
-
-
-def fly_sb3(task, **keywords):
-    env = quad_gym.make_sb3_vec_env(f"QuadGym/{task}-v0", 2, seed=1, **keywords)
-    seen = flat(env.reset())
-    for _ in range(4):
-        observation, reward, *_ = env.step(np.full((2, 4), 0.3))
-        seen += [*flat(observation), reward]
-    env.close()
-    return seen
-
-
-INTERFACES = {"make": fly_make, "make_vec": fly_make_vec, "make_sb3_vec_env": fly_sb3}
 
 
 @pytest.mark.parametrize("name", [*environment_keywords(), "threads"])
@@ -118,7 +100,7 @@ def test_keywords_of_environments(interface, name):
         pytest.skip("another keyword's business")
     task = ONE_TASK.get(name, "Circle")
     for value in [*NUMBERS[:: 1 + (interface != "make")], *OTHERS]:
-        assert_refused_or_flown(lambda v: INTERFACES[interface](task, **{name: v}), name, value)
+        assert_refused_or_flown(lambda v: fly(interface, task, **{name: v}), name, value)
 
 
 @pytest.mark.parametrize("name", ["position", "velocity", "yaw", "seed", "options", "colour"])
@@ -128,7 +110,7 @@ def test_arguments_of_reset(name):
 
     def reset(value):
         given = {name: value} if name in ("seed", "options") else {"options": {name: value}}
-        return [*flat(env.reset(**given)[0]), env.step(np.zeros(4))[0]]
+        return [env.reset(**given)[0], env.step(np.zeros(4))[0]]
 
     for value in [*NUMBERS, *OTHERS, *vectors(3), None]:
         if isinstance(value, dict) and name == "options":
@@ -165,9 +147,8 @@ def test_arguments_of_flights(name):
             assert_refused_or_flown(lambda v: [FlightBatch(v).results], name, value)
         elif name in enumerations and isinstance(value, np.ndarray):
             continue  # Python's own message
-        elif name in ("run_filter", "include_std", "privileged") and not isinstance(value, str):
-            continue  # anything is true or false to them
-        else:
+        elif name not in ("run_filter", "include_std", "privileged") or isinstance(value, str):
+            # anything is true or false to those
             assert_refused_or_flown(lambda v: fly_batch(**{name: v}), names, value)
 
 
@@ -198,46 +179,38 @@ def imu_suite(imu):
     return suite_of(imu=imu, estimator=integration)
 
 
-PARAMETERS = {
-    "VehicleParams": (quad_gym.VehicleParams(), lambda p: {"vehicle": p}),
-    "PDGains": (quad_gym.PDGains(), lambda p: {"gains": p}),
-    "ActionParams": (quad_gym.ActionParams(), lambda p: {"action_params": p}),
-    "TaskParams": (TaskParams(), lambda p: {"task": p}),
-    "RewardParams": (
-        quad_gym.RewardParams(),
-        lambda p: {"task": TaskParams(start="hover", reward_params=p)},
-    ),
-    "WorldParams": (quad_gym.WorldParams(), lambda p: {"world": p}),
-    "BatteryParams": (
-        quad_gym.BatteryParams(),
-        lambda p: {"world": quad_gym.WorldParams(battery=p)},
-    ),
-    "GroundParams": (
-        quad_gym.GroundParams(),
-        lambda p: {"world": quad_gym.WorldParams(ground=p)},
-    ),
-    "ImuParams": (RTK.imu, imu_suite),
-    "GnssParams": (RTK.gnss, lambda p: suite_of(gnss=p)),
-    "CameraParams": (RTK.camera, lambda p: suite_of(camera=p)),
-    "FilterParams": (RTK.estimator, lambda p: suite_of(estimator=p)),
-    "NoisyObservationParams": (RTK.noisy, lambda p: suite_of(noisy=p)),
-    "LogDelays": (RTK.log_delays, lambda p: suite_of(log_delays=p)),
-    "InitialPoseParams": (
-        INDOOR.initial_pose,
-        lambda p: {"sensors": INDOOR.replace(initial_pose=p)},
-    ),
-    "SensorSuite": (RTK, lambda p: {"sensors": p}),
-}
+PARAMETERS = [
+    (quad_gym.VehicleParams(), lambda p: {"vehicle": p}),
+    (quad_gym.PDGains(), lambda p: {"gains": p}),
+    (quad_gym.ActionParams(), lambda p: {"action_params": p}),
+    (TaskParams(), lambda p: {"task": p}),
+    (quad_gym.RewardParams(), lambda p: {"task": TaskParams(start="hover", reward_params=p)}),
+    (WorldParams(), lambda p: {"world": p}),
+    (quad_gym.BatteryParams(), lambda p: {"world": WorldParams(battery=p)}),
+    (quad_gym.GroundParams(), lambda p: {"world": WorldParams(ground=p)}),
+    (RTK.imu, imu_suite),
+    (RTK.gnss, lambda p: suite_of(gnss=p)),
+    (RTK.camera, lambda p: suite_of(camera=p)),
+    (RTK.estimator, lambda p: suite_of(estimator=p)),
+    (RTK.noisy, lambda p: suite_of(noisy=p)),
+    (RTK.log_delays, lambda p: suite_of(log_delays=p)),
+    (INDOOR.initial_pose, lambda p: {"sensors": INDOOR.replace(initial_pose=p)}),
+    (RTK, lambda p: {"sensors": p}),
+]
+FIELDS_OF_PARAMETERS = [
+    pytest.param(nominal, use, name, id=f"{type(nominal).__name__}-{name}")
+    for nominal, use in PARAMETERS
+    for name in names_of(nominal)
+]
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), [(kind, name) for kind, (p, _) in PARAMETERS.items() for name in names_of(p)]
-)
-def test_fields_of_parameters(kind, name):
-    nominal, use = PARAMETERS[kind]
-    both = (Control.PD, Control.VELOCITY)
-    moved = {"VehicleParams": both, "TaskParams": both, "ActionParams": (Control.VELOCITY,)}
-    controls = moved.get(kind, (Control.PD,))
+@pytest.mark.parametrize(("nominal", "use", "name"), FIELDS_OF_PARAMETERS)
+def test_fields_of_parameters(nominal, use, name):
+    controls = {
+        quad_gym.VehicleParams: (Control.PD, Control.VELOCITY),
+        TaskParams: (Control.PD, Control.VELOCITY),
+        quad_gym.ActionParams: (Control.VELOCITY,),
+    }.get(type(nominal), (Control.PD,))
     present = getattr(nominal, name)
     values = [*NUMBERS, *OTHERS]
     if isinstance(present, tuple):
@@ -250,7 +223,7 @@ def test_fields_of_parameters(kind, name):
 
 @pytest.mark.parametrize("drawable", quad_gym.params.randomization.DRAWABLES, ids=lambda d: d.name)
 def test_ranges_of_draws(drawable):
-    keywords = {"sensors": RTK, "world": quad_gym.WorldParams(battery=quad_gym.BatteryParams())}
+    keywords = {"sensors": RTK, "world": WorldParams(battery=quad_gym.BatteryParams())}
 
     def drawn(span):
         part = {drawable.name: quad_gym.Uniform(*span)}
@@ -297,18 +270,10 @@ def test_fields_of_faults(kind, name):
 @pytest.mark.parametrize(
     ("method", "name"),
     [
-        ("initialize", "gnss_position_G"),
-        ("initialize", "gnss_baseline_G"),
-        ("initialize", "heading"),
-        ("set_state", "position"),
-        ("set_state", "R_BI"),
-        ("set_state", "covariance"),
-        ("update", "gnss_position_G"),
-        ("update", "gnss_baseline_G"),
-        ("update", "pixels"),
-        ("update", "gnss_velocity_G"),
-        ("predict", "gyro"),
-        ("predict", "accel"),
+        *(("initialize", name) for name in ("gnss_position_G", "gnss_baseline_G", "heading")),
+        *(("set_state", name) for name in ("position", "R_BI", "covariance")),
+        *(("update", f"gnss_{name}_G") for name in ("position", "baseline", "velocity")),
+        *(("update", "pixels"), ("predict", "gyro"), ("predict", "accel")),
     ],
 )
 def test_arguments_of_filters(kind, method, name):

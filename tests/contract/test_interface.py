@@ -187,13 +187,9 @@ def test_a_comparison_gives_the_filters_keywords_where_a_filter_runs(tmp_path):
     for observation in ("truth", "noisy", "estimate"):
         evaluate.make_flights(args, observation, 1, "pd").close()
     given = {**args.env, "sensors": "rtk"}
-    assert with_effect({**given, "observation": "truth"}) == {
-        **{"observation": "truth", "sensors": "rtk"}
-    }
-    assert with_effect({**given, "observation": "estimate"}) == {
-        **{"observation": "estimate"},
-        **given,
-    }
+    truth, estimate = ({"observation": name} for name in ("truth", "estimate"))
+    assert with_effect(given | truth) == truth | {"sensors": "rtk"}
+    assert with_effect(given | estimate) == estimate | given
 
 
 @pytest.mark.parametrize(

@@ -41,23 +41,6 @@ def test_hitting_a_wall_is_a_crash_and_info_says_so():
     assert Crash()(view)[0] == 1.0
 
 
-def test_leaving_the_geofence_is_a_crash_too():
-    fenced = OBSTACLES.replace(obstacles=())
-    nearest = quad_gym.Task.of(
-        observe=lambda view: {"wall_distance": view.observed.obstacle_distance}
-    )
-    env = QuadEnv(base="hover", world=fenced, observation="truth", task=nearest)
-    with pytest.raises(quad_gym.TaskError, match=r"finite 'wall_distance', got array\(\[inf\]\)"):
-        env.reset(seed=0)
-    env = single_env(seed=0, world=fenced, observation="truth", out_of_bounds=50.0)
-    for _ in range(400):
-        *_, terminated, truncated, info = env.step(EASTWARD)
-        if terminated or truncated:
-            break
-    assert terminated
-    assert info["ending"] == Ending.LEFT_GEOFENCE
-
-
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
     env = gymnasium.make_vec(
@@ -105,26 +88,6 @@ def test_the_true_distance_is_hidden_from_the_controller():
         QuadEnv(base="hover", world=OBSTACLES, task=Peeking)
 
 
-def test_starts_within_obstacles_are_refused():
-    env = hovering(2)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="position must be farther than vehicle_radius"):
-        env.reset(options={"position": (2.0, 0.5, 1.0)})
-
-
-class InTheWall(quad_gym.Task):
-    def reset(self, view, rng):
-        return {"position": (5.5, 0.0, 1.0)}
-
-
-def test_starts_that_a_task_puts_into_obstacles_are_refused():
-    env = hovering(2, task=InTheWall)
-    with pytest.raises(
-        quad_gym.TaskError, match=r"InTheWall\.reset returned an invalid start: position"
-    ):
-        env.reset(seed=0)
-
-
 # ---- records and pictures -----------------------------------------------------------------------
 
 
@@ -137,17 +100,6 @@ def test_a_flight_keeps_its_obstacles(tmp_path):
     again = Flight.load(flight.save(tmp_path / "flight.npz")).scene
     np.testing.assert_array_equal(again.obstacles, flight.scene.obstacles)
     np.testing.assert_array_equal(again.geofence_I, OBSTACLES.geofence)
-
-
-def test_files_from_before_there_were_obstacles_can_be_read(tmp_path):
-    flight = recorded_flight("hover", 3, world=OBSTACLES)[1]
-    path = flight.save(tmp_path / "flight.npz")
-    with np.load(path) as file:
-        kept = {n: file[n] for n in file.files if "obstacles" not in n and "geofence" not in n}
-    np.savez(path, **kept)
-    scene = Flight.load(path).scene
-    assert scene.obstacles.shape == (0, 9)
-    assert scene.geofence_I.shape == (0, 3)
 
 
 @pytest.mark.parametrize("view", ["fixed", "chase"])

@@ -24,23 +24,9 @@ REFUSED = [
     ("completion fish", "invalid choice 'fish'"),
     ("version extra", "extra"),
     ("ablation --output text.toml", "cannot write to --output text.toml: File exists"),
-    ("compile --stages most", "--stages"),
-    ("compile --stages", "--stages"),
-    ("compile --jobs 0", "--jobs"),
-    ("benchmark --batch 9", "--batch"),
-    ("benchmark --batch 0", "--batch"),
-    ("benchmark --n-envs 0", "--n-envs"),
-    ("benchmark --repeats 0", "--repeats"),
-    ("benchmark --seeds 0", "--seeds"),
-    ("benchmark --seconds 0", "--seconds"),
-    ("benchmark --seconds nan", "--seconds"),
-    ("benchmark --threads 0", "--threads"),
-    ("benchmark --only speed", "--only"),
     # ---- training
-    ("train --steps abc", "--steps"),
     ("train --stepz 4", "Unrecognized options: --stepz"),
     ("train --algorithm pp", "invalid choice 'pp' for argument '--algorithm'"),
-    ("train --output", "--output"),
     ("train --output /dev/null/run", "cannot write to --output"),
     ("train --steps 0", "--steps must be at least 1, got 0"),
     ("train --evaluations 0", "evaluations must be at least 1"),
@@ -51,7 +37,6 @@ REFUSED = [
     ("train --env radius=-1", "radius must be greater than 0"),
     ("train --env height=4", "out_of_bounds must be at least 4 m"),  # half start on the pad
     ("train --env colour=red", "colour is not a keyword"),
-    ("train --set gama=0.9", "gama is not a keyword of PPO"),
     ("train --set gama=0.9", "did you mean gamma?"),
     ("train --set gamma=abc", "gamma must be a number, got 'abc'"),
     ("train --set gamma=1.1", "gamma must be at most 1, got 1.1"),
@@ -60,24 +45,15 @@ REFUSED = [
     ("train --engine compiled --algorithm sac", "must be one of ppo"),
     ("train --engine compiled --set target_kl=0.1", "is not a keyword of the compiled PPO"),
     ("tune --env-ids QuadGym/Waypoints-v0", "--env-ids must be one of"),
-    ("tune --candidates 0", "--candidates must be at least 1"),
     ("tune --env sensors=rtk", "must not contain sensors: use --sensors instead"),
     ("tune --sensors sonar", "sensors must be one of"),
     ("tune --env action=velocity", 'layout="absolute"'),
-    ("tune --output /dev/null/x", "cannot write to --output"),
     ("sweep folder", "folder: Is a directory"),
     ("sweep nowhere.toml", "nowhere.toml does not exist"),
-    ("sweep --engine compiled --jobs 0", "--jobs must be at least 1"),
-    ("sweep --engine compiled --retries -1", "--retries must be at least 0"),
-    ("sweep --engine compiled --threads 0", "threads must be at least 1"),
     ("sweep --engine compiled --options mem_gb=4", "--options are of slurm and ray"),
     # ---- flights
-    ("circle --attitude-gain 1 2", "--attitude-gain"),
     ("circle --seed -1", "--seed must be at least 0, got -1"),
-    ("circle --episodes 0", "--episodes must be at least 1"),
-    ("circle --threads 0", "--threads must be at least 1"),
     ("circle --gnss-rate 33", "gnss_rate must divide the IMU rate of 200 Hz"),
-    ("circle --camera-rate 400", "camera_rate must divide the IMU rate"),
     ("circle --camera-rate 50 --no-camera", "has no effect with --no-camera"),
     ("circle --imu-rate -1", "imu_rate must be greater than 0"),
     ("circle --duration 0.001", "--duration must be at least 0.01 s"),
@@ -85,13 +61,9 @@ REFUSED = [
     ("circle --radius -4", "radius must be greater than 0"),
     ("circle --period inf", "period must be finite"),
     ("circle --position-gain -1", "position must be at least 0"),
-    ("circle --output text.toml", "cannot write to --output"),
-    ("fly --seed -1 --output it.npz", "--seed must be at least 0, got -1"),
     ("fly --faults --output it.npz", "--faults must have at least one value, got none"),
     ("fly --output it.avi", "--output must end in"),
-    ("fly --output it.npz --speed 0", "--speed"),
     ("fly --output it.npz --faults gnss_outage --fault-time 3 2", "--fault-time"),
-    ("fly --output it.npz --fault-time 2 3", "--fault-time"),
     ("fly --output it.npz --faults gremlins", "gremlins"),
     ("fly --output it.npz --faults gnss_outtage", "did you mean gnss_outage?"),
     ("fly --output it.npz --faults camera_occlusion --no-camera", "CameraOcclusion"),
@@ -103,22 +75,14 @@ REFUSED = [
     ("fly circel --output it.npz", "did you mean circle?"),
     ("fly --output it.npz --env worl=calm", "did you mean world?"),
     ("fly --output it.npz --env world=clam", "did you mean calm?"),
-    ("fly --output it.npz --gnss-rate 77", "gnss_rate"),
-    ("fly --output it.npz --duration 0", "--duration"),
     # ---- evaluations
     ("evaluate QuadGym/Square-v0", "ENV_ID must be one of"),
     ("evaluate --policy nobody", "policy must be pd"),
     ("evaluate --policy", "--policy must have at least one value"),
     ("evaluate --policy missing.zip", "there is no policy"),
     ("evaluate trajectory --policy pretrained", "no policy is included for QuadGym/Trajectory-v0"),
-    (
-        "evaluate trajectory --policy pd pretrained",
-        "no policy is included for QuadGym/Trajectory-v0",
-    ),
     ("evaluate --observation measurements", "select a --policy that was trained on measurements"),
-    ("evaluate --observation estimat", "observation must be one of"),
     ("evaluate --observation estimat", "did you mean estimate?"),
-    ("evaluate --observation", "--observation must have at least one value"),
     (
         "evaluate --policy pretrained --env include_std=true",
         "trained with observations of 9 fields, but the environment returns 14 (it adds "
@@ -132,52 +96,60 @@ REFUSED = [
     ("evaluate --policy pretrained --env action=motor", "trained with action ctbr"),
     ("evaluate hover --policy pretrained --env wings=2", "wings is not"),
     ("evaluate --env acton=motor", "did you mean action?"),
-    ("evaluate --episodes 0", "--episodes must be at least 1"),
-    ("evaluate --output /dev/null/x", "cannot write to --output"),
     ("compare QuadGym/Waypoints-v0", "ENV_ID must be one of QuadGym/Hover-v0"),
     ("compare --sensors sonar", "sensors must be one of"),
-    ("compare --seeds 0", "--seeds must be at least 1"),
     ("compare --env observation=truth", "must not contain observation: use --train-on"),
     ("compare --engine compiled --algorithm sac", "engine"),
-    ("consistency --seed -1", "--seed must be at least 0, got -1"),
-    ("consistency --episodes 1", "--episodes must be at least 2, got 1"),
-    ("consistency --settle 5 --duration 1", "--settle"),
-    ("consistency --sensors none", "sensors"),
-    ("consistency --cells suites", "--cells"),
-    ("consistency --matrix --recovery", "--recovery"),
     ("study --arms", "--arms must have at least one value, got none"),
     ("study --arms nobody", "--arms must be one of"),
-    ("study --arms-file nowhere.py", "--arms-file must be a Python file"),
     ("study --arms-file text.toml", "--arms-file must be a Python file, got text.toml"),
-    ("study --seeds 0", "--seeds must be at least 1"),
-    ("study --episodes 1", "--episodes must be at least 2"),
-    ("study --success-within -1", "--success-within must be"),
     ("study stale_race --success-within 1", "--success-within belongs to LookAround"),
     ("study stale_race --arms truth_delay_compensated", "--arms must name truth, whose policies"),
     ("study QuadGym/Circle-v0", "ENV_ID must be one of QuadGym/LookAround-v0"),
     ("study --env observation=truth", "must not contain observation: use --arms instead"),
-    ("study --set gammma=0.9", "gammma"),
     ("study --arms recurrent --set clip=0.1", "clip is not a keyword of RecurrentPPO"),
     ("study --arms truth --set critic_only=3", "critic_only must be the number of values"),
-    ("study --video webp --arms pd_features truth", "needs the arm truth and another trained one"),
     ("study --video webp --arms std estimate", "needs the arm truth and another trained one"),
-    ("study --video avi", "--video"),
     # ---- exports
     ("export", "{policy, filter}"),
     ("export filters", "policy, filter"),
     ("export policy", "POLICY"),
     ("export policy pretrained", "needs an ENV_ID"),
-    ("export policy nothing.npz", "there is no policy"),
     ("export policy pd QuadGym/Hover-v0", "must be a trained network"),
-    ("export policy pretrained QuadGym/Hover-v1", "must be one of"),
-    ("export policy pretrained QuadGym/Hover-v0 --to json", "invalid choice 'json'"),
     ("export policy pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
     ("export policy pretrained QuadGym/Hover-v0 --output /dev/null/it.c", "cannot write"),
-    ("export policy pretrained QuadGym/Hover-v0 --sensors rtk", "Unrecognized options"),
     ("export policy pretrained hover --env action=motor", "trained with action ctbr"),
-    ("export filter --to c", "invalid choice 'c'"),
-    ("export filter QuadGym/Hover-v0 --to json", "QuadGym/Hover-v0"),
     ("export filter --sensors gps --to json", "sensors must be one of"),
+]
+NAMED = {
+    "benchmark": (
+        *("--batch 9", "--n-envs 0", "--repeats 0", "--seeds 0", "--seconds nan", "--threads 0"),
+        "--only speed",
+    ),
+    "circle": ("--attitude-gain 1 2", "--episodes 0", "--threads 0", "--output text.toml"),
+    "compare": ("--seeds 0",),
+    "compile": ("--stages most", "--stages", "--jobs 0"),
+    "consistency": (
+        *("--seed -1", "--episodes 1", "--settle 5 --duration 1", "--sensors none"),
+        *("--cells suites", "--recovery --matrix"),
+    ),
+    "evaluate": ("--episodes 0", "--output /dev/null/x", "--observation"),
+    "export filter": ("--to c",),
+    "export policy": ("--to json pretrained QuadGym/Hover-v0",),
+    "fly": (
+        *("--seed -1 --output it.npz", "--speed 0 --output it.npz", "--duration 0 --output it.npz"),
+        *("--fault-time 2 3 --output it.npz", "--gnss-rate 77 --output it.npz"),
+    ),
+    "study": ("--seeds 0", "--episodes 1", "--success-within -1", "--video avi"),
+    "sweep": ("--jobs 0 --engine compiled", "--retries -1 --engine compiled"),
+    "train": ("--steps abc", "--output"),
+    "tune": ("--candidates 0", "--output /dev/null/x"),
+}
+"""Options whose error must name the first of them."""
+REFUSED += [
+    (f"{command} {options}", options.split()[0].removeprefix("--"))
+    for command, lines in NAMED.items()
+    for options in lines
 ]
 
 
@@ -194,7 +166,7 @@ def test_wrong_option_ends_with_exit_code_2_and_names_it(line, message, tmp_path
     pytest.importorskip(NEEDS.get(line.split()[0], "numpy"))
     done = console_commands.run(*line.split())
     assert done.returncode == 2
-    assert message in plain(done.stderr)
+    assert message.replace("_", "-") in plain(done.stderr).replace("_", "-")
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
     assert sorted(p.name for p in tmp_path.iterdir()) == ["binary.npz", "folder", "text.toml"]
@@ -251,6 +223,14 @@ def test_other_errors_are_raised(monkeypatch):
     monkeypatch.setattr(circle, "main", fail)
     with pytest.raises(RuntimeError, match="a bug"):
         main(["circle"])
+
+
+def test_a_closed_pipe_ends_a_command_quietly():
+    line = [sys.executable, "-m", "quad_gym", "circle", "--help"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
 
 
 @pytest.mark.skipif(shutil.which("sh") is None, reason="signals as of Unix")

@@ -17,7 +17,7 @@ def test_pages_hold_the_texts_of_the_ledger(entries):
     assert list(pages.wrong(ledger.texts(entries))) == []
 
 
-def test_changed_golden_flights_and_changed_options_make_a_result_stale(tmp_path, monkeypatch):
+def test_result_of_changed_flights_or_options_is_stale(tmp_path, monkeypatch):
     result = Result(name="one", commands=["circle"], flights=("C*",), texts=lambda *_: {})
     golden = tmp_path / "flights.json"
     monkeypatch.setattr(ledger, "GOLDEN", golden)
@@ -30,9 +30,3 @@ def test_changed_golden_flights_and_changed_options_make_a_result_stale(tmp_path
     assert ledger.stale(result, entries)
     entries["one"] = {"commands": ["circle --seeds 2"], "flights": ledger.digest(result)}
     assert ledger.stale(result, entries)
-
-
-def test_texts_replace_those_between_their_marks_and_no_others():
-    page = "a <!-- =one -->1 %<!-- / --> b\n<!-- =two -->\n| old |\n<!-- / -->\n"
-    assert pages.renewed(page, {"two": "\n| new |\n"}) == page.replace("old", "new")
-    assert pages.renewed(page, {}) == page

@@ -29,7 +29,7 @@ def assert_disjoint(sets):
         assert not first & second
 
 
-def test_no_stream_is_shared_between_training_validation_and_test():
+def test_training_validation_and_test_share_no_stream():
     keys = {
         (purpose, seed): keys_of(flight_seeds(purpose, seed, COUNT))
         for purpose in PURPOSES
@@ -70,7 +70,7 @@ def test_refuses_seeds_out_of_their_block(purpose, seed, count, message):
         flight_seeds(purpose, seed, count)
 
 
-def test_trainings_fly_their_own_flights_and_are_judged_on_others():
+def test_trainings_are_judged_on_flights_of_their_own_block():
     """The algorithm seeds its environment too, which must not bring other flights in."""
     pytest.importorskip("stable_baselines3")
     from baselines.checkpoints import Keeper
@@ -108,7 +108,7 @@ START = ("r", "v", "q", "w", "b_a", "b_g", "ref_cos", "ref_sin", "key")
 
 
 def starts_of(rng, episodes, count=11):
-    """What each episode began with; flights do what they like, for as long as they like."""
+    """Starts of episodes with random actions and lengths."""
     task = TaskParams(
         kind="random_trajectory", start="hover", randomize_reference=True, duration=0.0
     )

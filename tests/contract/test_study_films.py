@@ -90,7 +90,7 @@ def curves(*tops):
     return [(steps, np.array([0.0, top, -1.0])) for top in tops]
 
 
-def test_pace_shows_best_validated_trainings_and_the_first_crash_on_truth(tmp_path):
+def test_pace_shows_best_trainings_and_first_crash_on_truth(tmp_path):
     study = study_of("stale_race", ("truth", "std"), tmp_path)
     speed = {"speed": np.ones((2, 4))}
     crashes = [[True] * 4, [True] * 4, [False, False, True, True]]

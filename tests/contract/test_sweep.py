@@ -29,7 +29,7 @@ n_envs = 16
 # ---- expansion -----------------------------------------------------------------------------------
 
 
-def test_every_combination_has_a_folder_and_first_seeds_are_first(tmp_path):
+def test_every_combination_has_a_folder_first_seeds_first(tmp_path):
     given = {
         "env_ids": ["QuadGym/Hover-v0", "QuadGym/Circle-v0"],
         "seeds": [3, 1],
@@ -47,13 +47,8 @@ def test_every_combination_has_a_folder_and_first_seeds_are_first(tmp_path):
     assert first.plan.recipe.parameters["gamma"] == 0.9
     assert first.plan.recipe.parameters["n_epochs"] == 5  # the recipe's
     assert (first.plan.engine, first.plan.threads) == ("sb3", 2)
-
-
-def test_further_values_do_not_change_folders(tmp_path):
-    def folders(**more):
-        return {t.folder for t in expand({"seeds": 1, **more}, {}, tmp_path)}
-
-    assert folders(set={"gamma": [0.9]}) < folders(set={"gamma": [0.9, 0.99]}, seeds=2)
+    fewer = expand({**given, "set": {"gamma": [0.9]}, "seeds": [3]}, {}, tmp_path)
+    assert {t.folder for t in fewer} < {t.folder for t in found}
 
 
 def test_arms_define_observation_and_reward_of_trainings(tmp_path):
@@ -73,15 +68,8 @@ def test_arms_define_observation_and_reward_of_trainings(tmp_path):
 
 def test_options_override_the_file(tmp_path):
     (tmp_path / "mine.toml").write_text(SMALL)
-    options = [
-        "mine.toml",
-        "--dry-run",
-        "--set",
-        "gamma=0.9,0.95,0.99",
-        "--env",
-        "camera=true,false",
-    ]
-    done = console_commands.run("sweep", *options, "--seeds", "1", where=tmp_path)
+    line = "mine.toml --dry-run --set gamma=0.9,0.95,0.99 --env camera=true,false --seeds 1"
+    done = console_commands.run("sweep", *line.split(), where=tmp_path)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     want = "results/sweep/mine/runs/circle,compiled_ppo,camera=true,gamma=0.9/seed_0"
@@ -96,22 +84,14 @@ def test_options_override_the_file(tmp_path):
         ("seeds = [", "is no valid TOML"),
         ("sedes = 3", "must be one of env_ids, arms"),
         ("env = 3", "env in bad.toml must be a table, got 3"),
-        ("seeds = 0", "seeds must be at least 1, got 0"),
-        ("seeds = []", "seeds must be different numbers, at least one, got []"),
         ("seeds = [1, 1]", "seeds must be different numbers, at least one, got [1, 1]"),
         ("set = {gamma = [0.9, 0.9]}", "every value of a sweep must be given once"),
         ('env_ids = "QuadGym/Hover-v0"', "env_ids must be a list of names"),
-        ('env_ids = ["QuadGym/Howver-v0"]', "env_ids must be one of QuadGym/"),
         ('arms = ["nobody"]', "--arms must be one of"),
-        ('engine = "torch"', "engine must be one of sb3, compiled"),
         ('algorithm = ["alphago"]', "algorithm must be one of ppo"),
         ("episodes = 1.5", "episodes must be a whole number"),
         ("set = {gamma = []}", "set.gamma must have at least one value"),
-        ("recipe = {parameters = {gamma = 1}}", "recipe must not hold parameters: use set instead"),
         ("recipe = {steps = 1000}", "recipe must not hold steps: use steps instead"),
-        ("recipe = {policy = {}}", "recipe must be one of learning_rate"),
-        ("steps = 0", "Recipe.steps must be at least 1, got 0"),
-        ("n_envs = []", "n_envs must have at least one value"),
         ('engine = "compiled"\nset = {gama = 0.9}', "circle,compiled_ppo: "),
         ('engine = "compiled"\nenv = {radius = -1}', "radius must be greater than 0"),
         ("env = {threads = 1}", "--env must not contain threads: use --threads instead"),

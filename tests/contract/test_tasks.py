@@ -2,7 +2,6 @@
 
 import math
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -151,30 +150,11 @@ def test_the_reward_of_waypoints_is_the_documented_formula(weights):
     assert set(info["ending"][terminated]) == {Ending.LAST_GATE}
 
 
-@pytest.mark.parametrize("action", ["ctbr", "wrench", "attitude", "velocity", "motor"])
-def test_nobody_earns_more_than_the_perfect_flight(action):
-    env = vec_env("circle", 64, seed=5, action=action, start="hover", autoreset_mode="SameStep")
-    for k in range(50):
-        _, reward, *_ = env.step(0.2 * np.stack([actions_of(64 * k + i, 1)[0] for i in range(64)]))
-        assert (reward <= 1.6).all()
-
-
-def test_resting_on_the_reference_earns_nearly_the_perfect_flight():
+def test_rest_on_the_reference_has_nearly_the_largest_reward():
     env = QuadEnv("hover", observation="truth", action="velocity")
     env.reset(seed=1, options={"position": [4, 0, 1], "velocity": [0, 0, 0], "yaw": np.pi})
     _, reward, *_ = env.step(np.zeros(4))
     assert 1.5 < reward <= 1.6
-
-
-def test_a_good_circle_earns_most_of_what_a_perfect_one_does():
-    env = QuadVectorEnv(32, "circle", start="hover", autoreset_mode="Disabled")
-    policy, total = PDPolicy(env), 0.0
-    observation, _ = env.reset(seed=5)
-    for _ in range(500):
-        observation, reward, *_ = env.step(policy.predict(observation)[0])
-        total += reward
-    assert (total <= 800.0).all()
-    assert total.mean() > 450.0
 
 
 # ---- endings -------------------------------------------------------------------------------------
@@ -266,7 +246,7 @@ def test_the_last_gate_terminates():
 
 
 @pytest.mark.parametrize("privileged", [False, True])
-def test_a_failed_filter_truncates_and_leaves_finite_observations(privileged):
+def test_failed_filter_truncates_with_finite_observations(privileged):
     env = single_env(seed=1, privileged=privileged, include_std=True)
     batch = env.flights.batch
     instant = batch.snapshot()
@@ -313,17 +293,6 @@ def test_the_circle_starts_on_the_ground_or_hovering():
     assert (batch.record("rotor_speeds")[~grounded] > 0.0).all()
     off = np.linalg.norm(batch.record("r")[~grounded] - [4.0, 0.0, 1.0], axis=1)
     assert off.max() < 0.3 * 6.0
-
-
-def test_a_start_on_the_ground_is_the_reports():
-    env = vec_env("circle", 50, seed=1, start="ground")
-    batch = env.flights.batch
-    np.testing.assert_allclose(batch.record("r"), np.tile([4.0, 0.0, 0.0], (50, 1)), atol=1e-12)
-    for name in ("v", "w", "rotor_speeds"):
-        assert not batch.record(name).any()
-    axes = body_axes(batch.record("q"))
-    np.testing.assert_allclose(axes[:, 0], np.tile([-1.0, 0.0, 0.0], (50, 1)), atol=1e-9)
-    assert batch.record("b_a").std() == pytest.approx(0.98, rel=0.25)
 
 
 @pytest.mark.parametrize("task", ["circle", "lemniscate", "hover"])
@@ -375,8 +344,3 @@ def test_gates_lie_within_the_radius_and_apart():
     assert gates[..., 2].min() > 0.5
     assert np.linalg.norm(np.diff(gates, axis=1), axis=2).min() > 1.0
     assert (gates[0] != gates[1]).all()
-
-
-def test_the_registered_names_are_the_tasks():
-    for env_id, task in (("QuadGym/Circle-v0", "circle"), ("QuadGym/Waypoints-v0", "waypoints")):
-        assert gymnasium.make(env_id).unwrapped.flights.name == task

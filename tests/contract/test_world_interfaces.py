@@ -1,19 +1,11 @@
 """Draws and wind in `info` and in the privileged observation."""
 
 import numpy as np
-import pytest
 
 import quad_gym
-from quad_gym import Uniform
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from tests.contract.configurations import DRAWN
-
-
-def test_info_without_draws_has_no_entry():
-    assert "drawn" not in QuadEnv("hover").reset(seed=1)[1]
-    assert "drawn" not in QuadVectorEnv(2, "hover", world="breeze").reset(seed=1)[1]
 
 
 def test_the_privileged_truth_ends_with_wind_and_draws():
@@ -43,20 +35,3 @@ def test_privileged_truth_of_a_calm_world_has_no_wind():
     calm, windy = (QuadEnv("hover", privileged=True, world=world) for world in ("calm", "breeze"))
     assert calm.observation_space["privileged"].shape == (25,)
     assert windy.observation_space["privileged"].shape == (28,)
-
-
-def test_invalid_worlds_and_draws_are_refused():
-    for make in (
-        lambda **k: QuadEnv("hover", **k),
-        lambda **k: QuadVectorEnv(2, "hover", **k),
-        lambda **k: quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 2, **k),
-        lambda **k: FlightBatch(2, **k),
-    ):
-        with pytest.raises(ValueError, match="world must be"):
-            make(world="storm")
-        with pytest.raises(ValueError, match="world must be"):
-            make(world={"wind_I": (1.0, 0.0, 0.0)})
-        with pytest.raises(ValueError, match="'colour' is unknown"):
-            make(randomization={"colour": Uniform(0.0, 1.0)})
-        with pytest.raises(ValueError, match="light enough to hover"):
-            make(randomization={"mass": Uniform(1.0, 30.0)})

@@ -14,12 +14,7 @@ def measured_errors(suite):
     """Root mean square errors per axis of what control on the estimate sees, on the circle."""
     task = TaskParams(kind="circle", start="hover", duration=0.0, out_of_bounds=100.0)
     batch = FlightBatch(
-        FLIGHTS,
-        sensors=suite,
-        task=task,
-        source=Source.ESTIMATE,
-        control_rate=RATE,
-        gains="tuned",
+        FLIGHTS, sensors=suite, task=task, source=Source.ESTIMATE, control_rate=RATE, gains="tuned"
     )
     batch.reset(seeds=range(91_000, 91_000 + FLIGHTS))
     squares = []

@@ -16,8 +16,8 @@ from tests.builders import part
 ID = "QuadGym/LookAround-v0"
 
 
-def make(name, count=6, env_id=ID, **keywords):
-    own = f"baselines.arm_tasks:{name}"
+def make(name, count=6, env_id=ID, module="arm_tasks", **keywords):
+    own = f"baselines.{module}:{name}"
     env = gymnasium.make_vec(
         env_id, num_envs=count, autoreset_mode="Disabled", task=own, **keywords
     )
@@ -45,19 +45,28 @@ def test_log_sigma_without_a_filter_is_the_lowest(observation):
     np.testing.assert_array_equal(part(env, observations, "log_sigma"), -1.0)
 
 
-def test_history_has_every_tenth_observation_newest_first():
-    env, observations = make("WithStdHistory")
-    names = ("position_error", "velocity_error", "up", "heading", "body_rates")
-    seen = []
+RACE_ID, DASH_ID = "QuadGym/StaleRace-v0", "QuadGym/OutageDash-v0"
+STATE = ("position_error", "velocity_error", "up", "body_rates")
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id", "every", "names"),
+    [
+        ("WithStdHistory", ID, 10, (*STATE[:3], "heading", "body_rates", "features_direction")),
+        ("RaceWithHistory", RACE_ID, 5, STATE),
+    ],
+)
+def test_history_has_past_observations_newest_first(name, env_id, every, names):
+    env, observations = make(name, env_id=env_id)
+    seen, width = [], 3 * len(names)
     np.testing.assert_array_equal(part(env, observations, "past"), 0.0)
     for step in range(1, 35):
         observations, *_ = env.step(np.full((6, 4), 0.01, np.float32))
-        if step % 10 == 0:
-            now = [part(env, observations, name) for name in (*names, "features_direction")]
-            seen.insert(0, np.concatenate(now, axis=1))
-        past = part(env, observations, "past").reshape(6, 4, 18)
+        if step % every == 0:
+            seen.insert(0, np.hstack([part(env, observations, name) for name in names]))
+        past = part(env, observations, "past").reshape(6, 4, width)
         for k in range(4):
-            expected = seen[k] if k < len(seen) else np.zeros((6, 18))
+            expected = seen[k] if k < len(seen) else np.zeros((6, width))
             np.testing.assert_allclose(past[:, k], expected, atol=1e-5)
 
 
@@ -85,28 +94,12 @@ def test_masked_std_of_a_race_is_constant():
         (shown, *_), (observed, *_), (partly, *_) = (e.step(actions) for e in (plain, told, some))
 
 
-def test_history_of_a_race_has_every_fifth_observation():
-    env, observations = make("RaceWithHistory", env_id="QuadGym/StaleRace-v0")
-    names, seen = ("position_error", "velocity_error", "up", "body_rates"), []
-    for step in range(1, 27):
-        observations, *_ = env.step(np.full((6, 4), 0.01, np.float32))
-        if step % 5 == 0:
-            now = [part(env, observations, name) for name in names]
-            seen.insert(0, np.concatenate(now, axis=1))
-        past = part(env, observations, "past").reshape(6, 4, 12)
-        for k in range(4):
-            expected = seen[k] if k < len(seen) else np.zeros((6, 12))
-            np.testing.assert_allclose(past[:, k], expected, atol=1e-5)
-
-
 def test_observed_race_equals_the_builtin_observation():
     (plain, a), (own, b) = (
         make(name, env_id="QuadGym/StaleRace-v0") for name in ("RaceWithHistory", "ObservedRace")
     )
     for _ in range(20):
-        for name in ("position_error", "velocity_error", "up", "heading", "body_rates"):
-            np.testing.assert_allclose(part(own, b, name), part(plain, a, name), atol=1e-5)
-        for name in ("preview_1", "preview_2", "last_action"):
+        for name in (*STATE, "heading", "preview_1", "preview_2", "last_action"):
             np.testing.assert_allclose(part(own, b, name), part(plain, a, name), atol=1e-5)
         action = np.full((6, 4), 0.05, np.float32)
         a, b = plain.step(action)[0], own.step(action)[0]
@@ -160,12 +153,7 @@ def test_constant_crash_cost_is_the_same_everywhere():
 
 
 def test_starts_are_before_the_first_wall_or_between_two():
-    env = gymnasium.make_vec(
-        "QuadGym/OutageDash-v0",
-        num_envs=300,
-        task="baselines.arm_tasks:ConstantCrashCost",
-    )
-    env.reset(seed=0)
+    env, _ = make("ConstantCrashCost", 300, DASH_ID)
     x = env.unwrapped.flights.batch.record("r")[:, 0]
     found, count = np.unique(np.round(x, 6), return_counts=True)
     np.testing.assert_allclose(found, [*np.arange(-54.0, 43.0, 12.0), 60.0])
@@ -239,41 +227,26 @@ def true_state(env, target):
 
 
 def test_critic_of_look_around_observes_the_truth():
-    task = "baselines.arm_tasks:WithStdCertaintyReward"
-    plain = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", task=task)
+    plain, _ = make("WithStdCertaintyReward")
     shipped = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", privileged=True)
-    both = [env.reset(seed=3)[0] for env in (plain, shipped)]
-    env = gymnasium.make_vec(
-        ID,
-        num_envs=6,
-        autoreset_mode="Disabled",
-        task="baselines.arm_critics:WithStdCertaintyRewardForCritic",
-    )
-    observations, _ = env.reset(seed=3)
+    shipped.reset(seed=3)
+    env, _ = make("WithStdCertaintyRewardForCritic", module="arm_critics")
     for _ in range(20):
         actions = np.full((6, 4), 0.1, np.float32)
-        steps = [e.step(actions) for e in (plain, shipped)]
-        both = [step[0] for step in steps]
         observations, reward, *_ = env.step(actions)
-        np.testing.assert_array_equal(observations[:, :-15], both[0])
-        np.testing.assert_allclose(observations[:, -15:], both[1]["privileged"][:, :15], atol=1e-5)
-        np.testing.assert_array_equal(reward, steps[0][1])
+        shown, same, *_ = plain.step(actions)
+        truth = shipped.step(actions)[0]["privileged"]
+        np.testing.assert_array_equal(observations[:, :-15], shown)
+        np.testing.assert_allclose(observations[:, -15:], truth[:, :15], atol=1e-5)
+        np.testing.assert_array_equal(reward, same)
     seen = part(env, observations, "position_error")
     assert abs(part(env, observations, "actual_position_error") - seen).max() > 0.01
 
 
 def test_critic_of_outage_dash_observes_gap_and_outage():
-    task = "QuadGym/OutageDash-v0"
-    name = "baselines.arm_critics:ConstantCrashCostWithUncertaintyForCritic"
-    env = gymnasium.make_vec(task, num_envs=20, autoreset_mode="Disabled", task=name)
-    plain = gymnasium.make_vec(
-        task,
-        num_envs=20,
-        autoreset_mode="Disabled",
-        task="baselines.arm_tasks:ConstantCrashCostWithUncertainty",
-    )
-    env.reset(seed=3)
-    plain.reset(seed=3)
+    name = "ConstantCrashCostWithUncertainty"
+    env, _ = make(f"{name}ForCritic", 20, DASH_ID, "arm_critics")
+    plain, _ = make(name, 20, DASH_ID)
     batch = env.unwrapped.flights.batch
     kinds = set()
     for _ in range(80):
@@ -294,15 +267,13 @@ def test_critic_of_outage_dash_observes_gap_and_outage():
             north, south = middle[walls[0], 1] - half[0], middle[walls[0] + 1, 1] + half[1]
             gap[i] = middle[walls[0], 0], 0.5 * (north + south), 4.0
         true = true_state(env, gap)
-        want = {
+        for part_name, value in {
             "actual_position_error_scaled": true["position_error"] / 6.0,
             "actual_velocity_error_scaled": true["velocity_error"] / 4.0,
+            "actual_body_rates_scaled": true["body_rates"] / 2.0,
             "actual_up": true["up"],
-        }
-        for part_name, value in want.items():
+        }.items():
             np.testing.assert_allclose(part(env, observations, part_name), value, atol=1e-4)
-        rates = part(env, observations, "actual_body_rates_scaled")
-        np.testing.assert_allclose(rates, true["body_rates"] / 2.0, atol=1e-5)
     assert kinds == {0.0, 1.0}
 
 

@@ -25,13 +25,11 @@ def at(flights, value):
 WRONG = {
     "reward": [
         (lambda v: np.ones(3), r"reward must return shape \(9,\).*got \(3,\)"),
-        (lambda v: np.ones((FLIGHTS, 1)), r"reward must return shape \(9,\).*got \(9, 1\)"),
         (lambda v: 1.0, r"reward must return shape \(9,\)"),
         (lambda v: None, "reward must return numbers, got None"),
         (lambda v: ["a"] * FLIGHTS, "reward must return numbers"),
         (lambda v: np.ones(FLIGHTS) * 1j, "reward must return numbers"),
         (lambda v: at([2, 5], np.nan), "reward must return finite rewards.*nan.*flights 2, 5"),
-        (lambda v: at([8], -np.inf), "finite rewards.*inf.*flight 8"),
         (lambda v: at([8], 1e40), "finite rewards.*flight 8"),
         (lambda v: at(range(8), np.nan), "flights 0, 1, 2, 3, 4 and 3 more"),
         (lambda v: 1 / 0, "reward failed, for all flights: ZeroDivisionError"),
@@ -58,18 +56,12 @@ WRONG = {
     "update": [(lambda v, rng: rng.normal(size=3), "update failed.*size must begin")],
     "observe": [
         (lambda v: np.ones((FLIGHTS, 3)), "must always return the same sizes"),
-        (
-            lambda v: {"observed": np.ones(FLIGHTS), "more": np.ones(FLIGHTS)},
-            "always return the same sizes",
-        ),
+        (lambda v: dict.fromkeys("ab", np.ones(FLIGHTS)), "always return the same sizes"),
         (lambda v: np.ones(3), r"observe must return shape \(9,\) or \(9, k\)"),
         (lambda v: np.ones((FLIGHTS, 1, 1)), "observe must return shape"),
-        (lambda v: at([3], np.nan), "observe must return finite 'observed'.*flight 3"),
         (lambda v: at([3], np.inf), "observe must return finite 'observed'.*flight 3"),
-        (lambda v: {"observed": "a"}, "observe must return numbers"),
         (lambda v: {"observed": np.ones((FLIGHTS, 1)) * 1j}, "observe must return numbers"),
         (lambda v: {"observed": np.full((FLIGHTS, 1), None)}, "observe must return numbers"),
-        (lambda v: {"observed": np.ones((1, FLIGHTS))}, "observe must return shape"),
         (lambda v: v.position, r"cannot read the truth \(view.position\).*view.observed"),
         (lambda v: v.truth.position, r"cannot read the truth \(view.truth\)"),
         (lambda v: v.builtin.reward, r"cannot read the truth \(view.builtin\)"),
@@ -263,12 +255,6 @@ def test_flight_with_a_state_that_is_not_finite_ends():
 def test_invalid_declarations_are_refused(attributes, message):
     with pytest.raises(ValueError, match=message):
         gymnasium.make("QuadGym/Hover-v0", task=quad_gym.Task.of(**attributes))
-
-
-def test_environment_with_an_invalid_observe_is_refused():
-    task = quad_gym.Task.of(observe=lambda view: view.position)
-    with pytest.raises(TaskError, match=r"observe failed.*cannot read the truth"):
-        gymnasium.make("QuadGym/Hover-v0", task=task)
 
 
 def test_misspelled_method_is_warned_of():

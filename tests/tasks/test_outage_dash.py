@@ -1,5 +1,7 @@
 """`OutageDash`: course, reward and observation recomputed, and what fixed rules reach."""
 
+import itertools
+
 import gymnasium
 import numpy as np
 import pytest
@@ -15,10 +17,6 @@ from tests.builders import part
 
 ID = "QuadGym/OutageDash-v0"
 FAST = {"action": "ctbr", "control_rate": 50.0}
-SHOWN = {
-    **{"position_error": 3, "velocity_error": 3, "up": 3, "heading": 3, "body_rates": 3},
-    **{"gap_width": 1, "next_gap": 3, "next_width": 1, "course_share": 1},
-}
 
 
 def make(count=20, **keywords):
@@ -36,16 +34,33 @@ def edges(batch):
     return walls[:, ::2, 0], walls[:, ::2, 1] - 15.0, walls[:, 1::2, 1] + 15.0
 
 
-def test_defaults_are_those_of_the_description():
-    flights = make(1).unwrapped.flights
-    assert flights.name == "outage_dash"
-    assert flights.batch.max_steps == 450
-    assert flights.action == "velocity"
-    assert flights.control_rate == 10.0
-    assert flights.batch.sensors == quad_gym.sensor_suite("consumer")
-    assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
-    assert [f.name for f in flights.table] == ["last_action", *SHOWN]
-    assert flights.space.shape == (25,)
+def test_invalid_worlds_and_weights_are_refused():
+    cylinders = quad_gym.WorldParams(obstacles=(quad_gym.Cylinder(center_I=(0.0, 0.0, 1.0)),) * 2)
+    for world in ("calm", cylinders):
+        with pytest.raises(ValueError, match="world must have pairs of walls for OutageDash"):
+            make(1, world=world)
+    for name, bad in itertools.product(("progress_weight", "crash_cost"), (-1.0, np.inf, "much")):
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            OutageDash(**{name: bad})
+
+
+def test_task_that_replaces_the_observation_keeps_named_parts():
+    def height(view):
+        return {"height": view.observed.position[:, 2]}
+
+    keeps = ("up", "body_rates", "nothing of the kind")
+    task = quad_gym.Task.of(replaces_observation=True, keeps=keeps, observe=height)
+    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, task=task, privileged=True)
+    plain = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, privileged=True)
+    assert [f.name for f in env.unwrapped.flights.table][:3] == ["up", "body_rates", "height"]
+    ours, shipped = env.reset(seed=0)[0], plain.reset(seed=0)[0]
+    kept = shipped["policy"][:, [6, 7, 8, 12, 13, 14]]
+    np.testing.assert_array_equal(ours["policy"][:, :-1], kept)
+    np.testing.assert_array_equal(ours["privileged"], shipped["privileged"])
+    wrong = quad_gym.Task.of(replaces_observation=True, observe=height)
+    wrong.keeps = "up"
+    with pytest.raises(ValueError, match="keeps of Task must hold names, got 'up'"):
+        gymnasium.make("QuadGym/Circle-v0", task=wrong)
 
 
 def test_gaps_have_the_specified_distribution():
@@ -99,16 +114,12 @@ def test_observation_is_computed_from_the_observed_state(observation):
             behind = int((r[i, 0] < x[i] - 0.7).sum())
             middle = np.stack([x[i], 0.5 * (north[i] + south[i]), np.full(10, 4.0)], axis=1)
             passed.add(behind)
-            np.testing.assert_allclose(
-                part(env, observed, "position_error")[i],
-                turn[i].apply(middle[behind] - r[i]),
-                atol=1e-5,
-            )
-            np.testing.assert_allclose(
-                part(env, observed, "next_gap")[i],
-                turn[i].apply(middle[behind + 1] - middle[behind]),
-                atol=1e-5,
-            )
+            for name, gap in (
+                ("position_error", middle[behind] - r[i]),
+                ("next_gap", middle[behind + 1] - middle[behind]),
+            ):
+                found = part(env, observed, name)[i]
+                np.testing.assert_allclose(found, turn[i].apply(gap), atol=1e-5)
             widths = [part(env, observed, name)[i, 0] for name in ("gap_width", "next_width")]
             np.testing.assert_allclose(widths, (north - south)[i, behind : behind + 2], atol=1e-5)
         velocity = turn.apply(batch.record("v_seen"))
@@ -170,12 +181,8 @@ def test_standard_deviations_grow_during_the_outage():
         observed, *_ = env.step(policy.predict(observed)[0])
         gone.append(batch.active_faults()["gnss_outage"])
         sigma.append(part(env, observed, "position_sigma")[:, :2].max(axis=1))
-        factor = batch.record("L")
-        np.testing.assert_allclose(
-            part(env, observed, "position_sigma"),
-            np.sqrt((factor[:, :3] ** 2).sum(axis=2)),
-            rtol=1e-5,
-        )
+        expected = np.sqrt((batch.record("L")[:, :3] ** 2).sum(axis=2))
+        np.testing.assert_allclose(part(env, observed, "position_sigma"), expected, rtol=1e-5)
     gone, sigma = np.array(gone), np.array(sigma)
     lasted = np.cumsum(gone, axis=0) * gone * 0.02
     assert sigma[~gone & (np.cumsum(gone, axis=0) == 0)].max() < 0.3
@@ -232,38 +239,3 @@ def test_rules_without_their_observations_are_refused():
         PDPolicy(circle, pace="waiting")
     with pytest.raises(ValueError, match="pace must be one of steady, waiting"):
         PDPolicy(circle, pace="hasty")
-
-
-def test_worlds_without_gaps_and_invalid_weights_are_refused():
-    cylinders = quad_gym.WorldParams(obstacles=(quad_gym.Cylinder(center_I=(0.0, 0.0, 1.0)),) * 2)
-    for world in ("calm", cylinders):
-        with pytest.raises(ValueError, match="world must have pairs of walls for OutageDash"):
-            make(1, world=world)
-    for bad in (-1.0, np.inf, "much"):
-        with pytest.raises(ValueError, match="progress_weight must be"):
-            OutageDash(progress_weight=bad)
-        with pytest.raises(ValueError, match="crash_cost must be"):
-            OutageDash(crash_cost=bad)
-
-
-class KeepsSome(quad_gym.Task):
-    replaces_observation = True
-    keeps = ("up", "body_rates", "nothing of the kind")
-
-    def observe(self, view):
-        return {"height": view.observed.position[:, 2]}
-
-
-def test_task_that_replaces_the_observation_keeps_named_parts():
-    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, task=KeepsSome, privileged=True)
-    plain = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, privileged=True)
-    assert [f.name for f in env.unwrapped.flights.table][:3] == ["up", "body_rates", "height"]
-    ours, shipped = env.reset(seed=0)[0], plain.reset(seed=0)[0]
-    assert ours["policy"].shape == (3, 7)
-    np.testing.assert_array_equal(ours["policy"][:, :3], shipped["policy"][:, 6:9])
-    np.testing.assert_array_equal(ours["policy"][:, 3:6], shipped["policy"][:, 12:15])
-    np.testing.assert_array_equal(ours["privileged"], shipped["privileged"])
-    wrong = quad_gym.Task.of(replaces_observation=True, observe=KeepsSome.observe)
-    wrong.keeps = "up"
-    with pytest.raises(ValueError, match="keeps of Task must hold names, got 'up'"):
-        gymnasium.make("QuadGym/Circle-v0", task=wrong)

@@ -100,7 +100,7 @@ def test_options_of_reset_precede_the_start_of_the_task():
 def test_masked_reset_keeps_the_state_of_other_flights():
     env = vec_env(count=4, seed=1, autoreset_mode="Disabled", task=Chase())
     state, mask = env.flights.batch.view.state, np.array([True, False, True, False])
-    before = state.copies()
+    before = state.rows()
     env.reset(options={"reset_mask": mask})
     for name in ("target", "velocity"):
         changed = (getattr(state, name) != before[name]).any(axis=1)

@@ -43,12 +43,7 @@ def expected_endings(said, plain):
 
 @pytest.mark.parametrize(
     "methods",
-    [
-        ("reward",),
-        ("terminated",),
-        ("truncated", "reward"),
-        ("reward", "terminated", "truncated"),
-    ],
+    [("reward",), ("terminated",), ("truncated", "reward"), ("reward", "terminated", "truncated")],
 )
 @pytest.mark.parametrize("per", ["step", "second"])
 def test_results_and_records_have_the_judgment_of_the_task(methods, per):
@@ -103,13 +98,9 @@ def test_returns_after_a_restore_continue():
     ("task", "sensors", "faults"), [("hover", "rtk", "all"), ("waypoints", "standard", "gnss_jump")]
 )
 def test_task_with_builtin_judgment_changes_no_ending(task, sensors, faults, mode):
-    keywords = {
-        "sensors": sensors,
-        "faults": faults,
-        "truncate_when_diverged": True,
-        "reward_per": "step",
-    }
-    keywords |= {"autoreset_mode": mode, "max_episode_steps": 90, "max_tilt": 0.25}
+    keywords = {"sensors": sensors, "faults": faults, "truncate_when_diverged": True}
+    keywords |= {"reward_per": "step", "autoreset_mode": mode}
+    keywords |= {"max_episode_steps": 90, "max_tilt": 0.25}
     plain, same = (vec_env(task, FLIGHTS, task=own, **keywords) for own in (None, Same()))
     rng, seen = np.random.default_rng(3), set()
     assert_same(plain.reset(seed=3), same.reset(seed=3))

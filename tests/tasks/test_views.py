@@ -1,6 +1,5 @@
 """Fields of a view, against closed forms and the records of the flights."""
 
-import copy
 import re
 
 import numpy as np
@@ -94,14 +93,6 @@ def test_estimate_equals_the_state_of_the_filter():
     error[:, 12:] = batch.record("b_g") - batch.record("b_g_hat")
     expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
     np.testing.assert_allclose(view.truth.nees, expected, rtol=0.02)
-
-
-def test_status_after_a_filter_failure_is_an_integer():
-    batch, view = view_of()
-    batch._blocks["filter_status"][0, 3] = 4
-    batch.step(np.zeros((FLIGHTS, 4)))
-    assert list(view.estimate.status) == [0, 0, 0, 4, 0]
-    assert list(view.step) == [21] * FLIGHTS
 
 
 def test_reference_of_a_circle_is_its_closed_form():
@@ -200,29 +191,6 @@ def test_gates_and_progress_of_a_course_match_the_positions():
     assert passed.any()
 
 
-def test_faults_when_active_are_true_by_name():
-    batch, view = view_of(sensors="rtk", faults="gnss_outage")
-    batch.switch_faults(True)
-    batch.step(np.zeros((FLIGHTS, 4)))
-    view = batch.view
-    assert list(view.truth.faults) == list(batch.active_faults())
-    assert all(active.all() for active in view.truth.faults.values())
-
-
-def test_misspelled_field_raises_an_error_with_its_group():
-    _, view = view_of(steps=1)
-    for group, misspelt, meant in (
-        (view, "positon", "position"),
-        (view, "reference_postion", "reference_position"),
-        (view.observed, "velocty", "velocity"),
-        (view.estimate, "covarance", "covariance"),
-    ):
-        with pytest.raises(AttributeError) as caught:
-            getattr(group, misspelt)
-        assert (caught.value.name, caught.value.obj) == (misspelt, group)
-        assert meant in dir(group)
-
-
 def test_estimate_without_a_filter_is_refused():
     _, view = view_of(observation="truth")
     with pytest.raises(ValueError, match=r"view.estimate needs a filter"):
@@ -246,40 +214,6 @@ def test_view_at_an_autoreset_shows_the_episode_of_the_step():
         rewards = [float(env.step(np.zeros((1, 4)))[1][0]) for _ in range(5)]
         assert sum(b.sum() for _, b in said) == began
         assert rewards == ([1.0, 2.0, 3.0, 1.0, 2.0] if not began else [1.0, 2.0, 3.0, 0.0, 1.0])
-
-
-@pytest.mark.parametrize(
-    "part",
-    [
-        lambda view: view.position,
-        lambda view: view.time[3:],
-        lambda view: view.observed.preview[:2, 1],
-        lambda view: view.R_BI,
-        lambda view: view.step,
-        lambda view: view.reference_velocity[1:],
-        lambda view: memoryview(view.velocity),
-    ],
-)
-def test_arrays_kept_by_a_task_do_not_change(part):
-    env = begun()
-    view, kept = env.flights.batch.view, []
-    for _ in range(4):
-        env.step(np.full((FLIGHTS, 4), 0.1))
-        kept.append((part(view), np.array(part(view))))
-    for array, before in kept:
-        np.testing.assert_array_equal(array, before)
-    assert len({array.tobytes() for array, _ in kept}) == 4
-
-
-def test_arrays_kept_from_a_copy_do_not_change():
-    env = begun()
-    other = copy.deepcopy(env)
-    for one in (other, env):
-        kept = one.flights.batch.view.position
-        before = kept.copy()
-        one.step(np.full((FLIGHTS, 4), 0.1))
-        np.testing.assert_array_equal(kept, before)
-        assert (one.flights.batch.view.position != before).any()
 
 
 def test_progress_after_a_restore_repeats():

@@ -6,9 +6,10 @@ import pytest
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.params.task import TaskParams
 from quad_gym.records import Autoreset, Control, Source
+from tests.builders import batch as flights_of
+from tests.contract.configurations import LATE
 
 TRUTH = ("r", "v", "q", "w", "rotor_speeds")
 ESTIMATE = (*TRUTH, "r_hat", "v_hat", "R_hat", "L")
@@ -16,26 +17,9 @@ HOVER = TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e6)
 COUNT, STEPS = 3, 14
 
 
-def late_rtk():
-    suite = quad_gym.sensor_suite("rtk")
-    return suite.replace(
-        gnss=suite.gnss.replace(latency=0.1), camera=suite.camera.replace(latency=0.04)
-    )
-
-
-def batch(source=Source.TRUTH, control=Control.CTBR, rate=50.0, task=HOVER, **keywords):
-    made = FlightBatch(
-        COUNT,
-        task=task,
-        source=source,
-        control=control,
-        control_rate=rate,
-        autoreset=Autoreset.DISABLED,
-        threads=1,
-        **keywords,
-    )
-    made.reset(seeds=range(COUNT))
-    return made
+def batch(source=Source.TRUTH, control=Control.CTBR, **keywords):
+    made = {"task": HOVER, "control_rate": 50.0, "autoreset": Autoreset.DISABLED, "threads": 1}
+    return flights_of(COUNT, source=source, control=control, **made | keywords)
 
 
 def commands(seed=1, steps=STEPS):
@@ -76,15 +60,14 @@ def test_a_delay_of_parts_of_a_step_shifts_them_by_ticks(ticks):
     actions = commands()
     every_tick = np.repeat(actions, 4, axis=0)
     every_tick = np.concatenate([np.zeros((ticks, COUNT, 4)), every_tick])[: 4 * STEPS]
-    at_every_tick = fly(batch(rate=200.0), every_tick)
+    at_every_tick = fly(batch(control_rate=200.0), every_tick)
     assert equal(fly(batch(action_delay=ticks / 4), actions), at_every_tick[3::4])
 
 
-@pytest.mark.parametrize("latency", [False, True], ids=["prompt", "late measurements"])
-def test_delays_are_the_same_on_the_estimate(latency):
+@pytest.mark.parametrize("options", [{}, {"sensors": LATE}], ids=["prompt", "late measurements"])
+def test_delays_are_the_same_on_the_estimate(options):
     actions = commands()
     shifted = np.concatenate([np.zeros((2, COUNT, 4)), actions])[:STEPS]
-    options = {"sensors": late_rtk()} if latency else {}
     delayed = batch(Source.ESTIMATE, Control.ATTITUDE, action_delay=2, **options)
     prompt = batch(Source.ESTIMATE, Control.ATTITUDE, **options)
     assert equal(fly(delayed, actions, ESTIMATE), fly(prompt, shifted, ESTIMATE))
@@ -108,17 +91,7 @@ def test_each_episode_draws_its_own_delay():
 
 def test_a_new_episode_forgets_the_actions_before_it():
     short = HOVER.replace(duration=0.1)
-    flights = FlightBatch(
-        COUNT,
-        task=short,
-        source=Source.TRUTH,
-        control=Control.CTBR,
-        control_rate=50.0,
-        action_delay=3,
-        autoreset=Autoreset.SAME_STEP,
-        threads=1,
-    )
-    flights.reset(seeds=range(COUNT))
+    flights = batch(task=short, action_delay=3, autoreset=Autoreset.SAME_STEP)
     fly(flights, np.ones((5, COUNT, 4)))
     assert (flights.record("episode") == 2.0).all()
     assert not flights.record("past_actions")[:, :4].any()
@@ -126,8 +99,17 @@ def test_a_new_episode_forgets_the_actions_before_it():
     assert not flights.record("delayed_action").any()
 
 
-def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
-    """While the delay lasts nothing but the cost of changes, 0.02 |da|^2 a step, differs."""
+def test_draws_and_flights_without_actions_are_limited():
+    for randomization in ({"action_delay": Uniform(0.0, 11.0)}, {"action_delay": Uniform(-1, 1)}):
+        with pytest.raises(ValueError, match="action_delay"):
+            batch(randomization=randomization)
+    for delayed in ({"action_delay": 1}, {"randomization": {"action_delay": Uniform(0, 1)}}):
+        with pytest.raises(ValueError, match="action_delay needs actions"):
+            batch(control=Control.PD, **delayed)
+
+
+def test_observation_has_the_commanded_action():
+    """While the delay lasts only the cost of changes, 0.02 |da|^2 a step, differs."""
     last = quad_gym.observation_layout("truth")[-1]
     assert last.name == "last_action"
     keywords = {"observation": "truth", "start": "hover"}
@@ -147,22 +129,3 @@ def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
     observation, *_ = late.step(zeros)  # carries out the first action
     other, *_ = idle.step(zeros)
     assert not np.array_equal(observation[: last.slice.start], other[: last.slice.start])
-
-
-@pytest.mark.parametrize("delay", [-0.1, 10.5, np.nan, "1", None])
-def test_a_delay_that_cannot_be_is_refused(delay):
-    with pytest.raises(ValueError, match="action_delay must be"):
-        batch(action_delay=delay)
-
-
-def test_a_draw_beyond_the_longest_delay_is_refused():
-    with pytest.raises(ValueError, match="action_delay"):
-        batch(randomization={"action_delay": Uniform(0.0, 11.0)})
-
-
-@pytest.mark.parametrize(
-    "delayed", [{"action_delay": 1}, {"randomization": {"action_delay": Uniform(0, 1)}}]
-)
-def test_a_flight_without_actions_takes_no_delay(delayed):
-    with pytest.raises(ValueError, match="action_delay needs actions"):
-        batch(control=Control.PD, **delayed)

@@ -9,7 +9,7 @@ from baselines.compiled_ppo import CompiledPPO
 from tests.unit.sliders import sliders, small_recipe
 
 
-def test_what_is_for_the_critic_alone_changes_values_and_no_action():
+def test_input_of_the_critic_alone_changes_no_action():
     model = CompiledPPO(sliders(), small_recipe(parameters={"critic_only": 1}), seed=0)
     model.learn(1000)
     draw = np.random.default_rng(0)

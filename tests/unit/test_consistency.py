@@ -1,13 +1,10 @@
 """Statistics of consistency, on errors whose distribution is known."""
 
-import re
-
 import numpy as np
 import pytest
 from scipy import stats
 
-import quad_gym
-from quad_gym import FilterParams, sensor_suite
+from quad_gym import sensor_suite
 from quad_gym.analysis.consistency import (
     InnovationRecorder,
     MeanSquare,
@@ -51,14 +48,14 @@ def drawn(factor, instants=400, flights=500):
     return MeanSquare("state", 15, np.arange(instants) * 0.05, mean, low, high)
 
 
-def test_a_consistent_filter_is_called_consistent_and_others_by_how_much_they_err():
+def test_verdict_is_consistent_or_the_ratio_of_errors():
     consistent = drawn(1.0)
     assert consistent.consistent
-    assert re.fullmatch(
-        r"state: mean 1[45]\.\d\d, expected 15, within 3\.2 % of it at 9\d % of the instants: "
-        r"consistent\.",
-        verdict(consistent),
-    )
+    assert verdict(consistent).endswith("consistent.")
+    part = consistent.since(10.0)
+    assert part.mean.shape == part.low.shape == part.high.shape == part.time.shape == (200,)
+    with pytest.raises(ValueError, match=r"^start must be before the last instant"):
+        part.since(1e9)
     for factor, words in (
         (1.1, "overconfident, errors are 10"),
         (0.9, "too cautious, errors are 10"),
@@ -68,14 +65,6 @@ def test_a_consistent_filter_is_called_consistent_and_others_by_how_much_they_er
         assert not part.consistent
         assert part.share_inside < 0.05
         assert words in verdict(part)
-
-
-def test_what_comes_before_an_instant_can_be_left_out():
-    part = drawn(1.0).since(10.0)
-    assert part.time[0] == 10.0
-    assert part.mean.shape == part.low.shape == part.high.shape == part.time.shape == (200,)
-    with pytest.raises(ValueError, match=r"^start must be before the last instant"):
-        part.since(1e9)
 
 
 def test_a_recorder_sees_the_errors_of_a_batch():
@@ -94,7 +83,7 @@ def test_a_recorder_sees_the_errors_of_a_batch():
     np.testing.assert_allclose(sigmas[0, :3] ** 2, np.diagonal(P, axis1=1, axis2=2).mean(axis=0))
 
 
-def test_a_matched_start_has_errors_as_claimed_and_leaves_the_flights_alone():
+def test_matched_start_has_errors_as_claimed():
     batch = FlightBatch(4000, sensors=sensor_suite("lab").replace(camera=None))
     batch.reset(seeds=range(4000))
     before = batch.snapshot()
@@ -108,11 +97,6 @@ def test_a_matched_start_has_errors_as_claimed_and_leaves_the_flights_alone():
     }
     assert changed <= {"r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat"}
     assert {"r_hat", "R_hat"} <= changed
-
-
-def test_the_defaults_are_the_reports_form():
-    report = FilterParams()
-    assert (report.kind, report.integration, report.attitude_reset) == ("ukf", "euler", False)
 
 
 class Measured:
@@ -152,7 +136,7 @@ def recorded(memory, factor=1.0, instants=200):
     return recorder
 
 
-def test_white_innovations_are_called_white_and_their_nis_consistent():
+def test_white_innovations_are_white_and_have_a_consistent_nis():
     recorder = recorded(0.0)
     assert set(recorder.nis()) == set(recorder.whiteness()) == {"position"}
     white = recorder.whiteness()["position"]
@@ -165,14 +149,14 @@ def test_white_innovations_are_called_white_and_their_nis_consistent():
     assert nis.consistent
 
 
-def test_innovations_with_memory_are_not_white_by_as_much_as_they_remember():
+def test_correlated_innovations_are_not_white():
     white = recorded(0.3).whiteness()["position"]
     assert not white.white
     np.testing.assert_allclose(white.correlation, 0.3 ** np.arange(1, 6), atol=0.02)
     assert white.largest == white.correlation[0]
 
 
-def test_innovations_larger_than_expected_show_in_the_nis_and_not_in_the_correlation():
+def test_large_innovations_are_white_and_have_a_large_nis():
     recorder = recorded(0.0, factor=1.2)
     assert recorder.nis()["position"].overall == pytest.approx(1.44 * 3.0, rel=0.02)
     assert not recorder.nis()["position"].consistent
@@ -189,16 +173,3 @@ def test_of_an_image_the_first_feature_seen_counts():
     nis = recorder.nis()["feature"]
     assert nis.dimension == 2
     assert nis.overall == FEATURE_BLOCKS + 2
-
-
-def test_a_batch_hands_its_innovations_to_a_recorder():
-    suite = quad_gym.sensor_suite("rtk").simplified()
-    batch = FlightBatch(64, sensors=suite, innovations=True)
-    batch.reset(seeds=range(64))
-    recorder = InnovationRecorder(batch, [0.0, 0.5, 1.0])
-    for tick in range(1, 201):
-        batch.step()
-        recorder.add(batch, tick / 200)
-    assert set(recorder.nis()) == {"position", "baseline", "velocity", "feature"}
-    for part in recorder.nis().values():
-        assert 0.5 * part.dimension < part.overall < 2.0 * part.dimension

@@ -27,7 +27,7 @@ def condition_of(case):
     return case.name.split(", ", 3)[-1]
 
 
-def test_it_has_every_suite_on_every_task_and_names_no_cell_twice():
+def test_matrix_has_every_suite_on_every_task_once():
     cells = matrix.cases_of("all")
     names = [cell.name for cell in cells]
     assert len(set(names)) == len(names)
@@ -38,7 +38,7 @@ def test_it_has_every_suite_on_every_task_and_names_no_cell_twice():
     assert "gnss_outage" not in {condition_of(c) for c in cells if c.name.startswith("indoor")}
 
 
-def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
+def test_cells_are_consistent_but_for_the_reports_filter(tmp_path):
     cells = chosen("rtk, hover, warm, nominal", "lab, circle, cold, nominal")
     done = run(cells, tmp_path)
     sound, report = (done[f"{name}, nominal"] for name in ("rtk, hover, warm", "lab, circle, cold"))
@@ -51,7 +51,7 @@ def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
     assert written["cells"][cells[0].name]["sensors"]["imu"]["rate"] == 200.0
 
 
-def test_a_run_goes_on_where_it_was_and_begins_anew_with_other_flights(tmp_path, monkeypatch):
+def test_run_continues_and_repeats_with_other_flights(tmp_path, monkeypatch):
     flown = []
 
     def measured(cell, flights):
@@ -89,7 +89,7 @@ def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
 @pytest.mark.slow
 @pytest.mark.parametrize("start", matrix.STARTS)
 @pytest.mark.parametrize("fault", ["gnss_outage", "gnss_outage+camera_occlusion", "baseline_loss"])
-def test_the_default_filter_stays_consistent_while_sensors_are_silent(fault, start):
+def test_default_filter_is_consistent_without_sensors(fault, start):
     """Of 400 flights none may take a feature near a position that is uncertain for a fix."""
     cell = matrix.case_of("standard", "random_trajectory", start, faults=fault)
     found = matrix.measure(cell, CaseFlights(400))

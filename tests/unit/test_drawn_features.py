@@ -56,7 +56,7 @@ def test_draws_are_those_of_their_distributions():
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_a_flight_that_draws_features_is_the_flight_that_has_them(known):
+def test_flight_with_drawn_features_equals_the_one_that_has_them(known):
     flights = batch(3, randomization=Randomization(FEATURES, known=known))
     for _ in range(100):
         flights.step()
@@ -74,6 +74,9 @@ def test_a_flight_that_draws_features_is_the_flight_that_has_them(known):
 def test_each_episode_draws_its_own_and_seeds_repeat_them():
     flights = batch()
     first = flights.feature_places()
+    recorder = FlightRecorder(flights, 2)
+    recorder.keep()
+    np.testing.assert_array_equal(recorder.flight.scene.features_I, first[2])
     flights.reset()
     assert (flights.feature_places() != first).any(axis=(1, 2)).all()
     flights.reset(mask=[True, False, False, True])
@@ -148,13 +151,6 @@ def test_obstacles_hide_features_where_they_are():
         hid, saw = hid + int(hidden.sum()), saw + int(seen.sum())
     assert hid > 100
     assert saw > 100
-
-
-def test_a_record_has_the_features_of_its_episode():
-    flights = batch(3)
-    recorder = FlightRecorder(flights, 2)
-    recorder.keep()
-    np.testing.assert_array_equal(recorder.flight.scene.features_I, flights.feature_places()[2])
 
 
 @pytest.mark.parametrize(

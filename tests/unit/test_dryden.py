@@ -144,12 +144,12 @@ def history():
 
 
 @pytest.mark.parametrize("tick", [0, 1, 4000])
-def test_gusts_are_normal_with_the_intensities_of_the_specification(history, tick):
+def test_gusts_are_normal_with_the_specified_intensities(history, tick):
     assert_normal(history[tick], np.zeros(3), np.eye(3))
 
 
 @pytest.mark.parametrize("tick", [1, 40, 400])
-def test_gusts_are_correlated_over_time_as_the_spectra_say(history, tick):
+def test_correlation_of_gusts_over_time_is_that_of_the_spectra(history, tick):
     _, _, L_u, L_w = military_scales(HEIGHT, WIND)
     x, z = np.array([L_u, L_u, L_w]), WIND * tick * 0.005
     first_order_decay = np.exp(-z / x)

@@ -35,29 +35,6 @@ def assert_same(before, after):
         np.testing.assert_array_equal(was, now, err_msg=name)
 
 
-def test_a_refused_measurement_has_no_later_effect():
-    calm, upset = running_filter(), running_filter()
-    for call in (
-        lambda: upset.update(RECORDING.gnss_position[7], RECORDING.gnss_baseline[7], [[0, np.inf]]),
-        lambda: upset.predict((9.0, 9.0, 9.0), (0.0, 0.0, np.nan)),
-        lambda: upset.update(gnss_baseline_G=(0.0, 0.0, 0.0)),
-    ):
-        with pytest.raises(ValueError, match="must"):
-            call()
-    for ukf in (calm, upset):
-        ukf.update(RECORDING.gnss_position[5])
-        ukf.predict(RECORDING.gyro[5], RECORDING.accel[5])
-    assert_same(estimate(calm), estimate(upset))
-
-
-def test_a_baseline_of_no_length_raises():
-    ukf = UnscentedKalmanFilter(LAB)
-    with pytest.raises(ValueError, match="gnss_baseline_G"):
-        ukf.initialize((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    with pytest.raises(RuntimeError, match="initialize"):
-        _ = ukf.position
-
-
 @pytest.mark.parametrize("partly", [(np.nan, np.nan), (np.nan, 3.0), (3.0, np.nan)])
 def test_a_nan_pixel_is_a_feature_not_seen(partly):
     first, second = running_filter(), running_filter()
@@ -81,18 +58,20 @@ def test_an_update_without_measurements_changes_nothing():
     assert ukf.status == FilterStatus(0)
 
 
-def test_a_filter_without_a_camera_takes_no_pixels():
+def test_pixels_without_a_camera_are_refused():
     ukf = UnscentedKalmanFilter(LAB.replace(camera=None))
     ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
-    before = estimate(ukf)
     ukf.update(pixels=np.zeros((0, 2)))
-    assert_same(before, estimate(ukf))
     with pytest.raises(ValueError, match="pixels"):
         ukf.update(pixels=np.zeros((2, 2)))
 
 
 def test_calls_before_the_start_raise():
+    with pytest.raises(ValueError, match="sensors"):
+        UnscentedKalmanFilter(sensors="lab")
     ukf = UnscentedKalmanFilter(LAB)
+    with pytest.raises(ValueError, match="gnss_baseline_G"):
+        ukf.initialize((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     with pytest.raises(RuntimeError, match="initialize"):
         ukf.update(RECORDING.gnss_position[0])
     with pytest.raises(RuntimeError, match="initialize"):
@@ -100,12 +79,6 @@ def test_calls_before_the_start_raise():
     for name in PROPERTIES:
         with pytest.raises(RuntimeError, match="initialize"):
             getattr(ukf, name)
-
-
-@pytest.mark.parametrize("sensors", ["lab", None, 3, quad_gym.ImuParams()], ids=repr)
-def test_sensors_must_be_a_suite(sensors):
-    with pytest.raises(ValueError, match="sensors"):
-        UnscentedKalmanFilter(sensors=sensors)
 
 
 def test_what_the_properties_return_is_the_callers_own():
@@ -120,7 +93,7 @@ def test_what_the_properties_return_is_the_callers_own():
 
 
 @pytest.mark.parametrize("yaw", np.linspace(-3.0, 3.0, 7))
-def test_an_exact_fix_of_a_level_vehicle_gives_its_position_and_attitude(yaw):
+def test_exact_fix_gives_position_and_attitude(yaw):
     gnss, ukf = LAB.gnss, UnscentedKalmanFilter(LAB)
     r, R_BI = np.array([1.0, -2.0, 3.0]), rotation_312(np.array([0.0, 0.0, yaw]))
     antenna = r + R_BI.T @ gnss.primary_antenna_B
@@ -141,7 +114,7 @@ def test_the_first_covariance_is_the_laboratorys():
     np.testing.assert_allclose(ukf.covariance, np.diag(variances), rtol=1e-14, atol=0.0)
 
 
-def test_a_tilted_baseline_splits_its_angle_between_baseline_and_vertical():
+def test_tilt_is_split_between_baseline_and_vertical():
     """Two directions of equal weight that disagree by 2d: each is turned by d."""
     ukf, tilt = UnscentedKalmanFilter(LAB), 0.3
     baseline_I = 0.19 * np.array([-np.cos(tilt), 0.0, np.sin(tilt)])
@@ -245,42 +218,26 @@ EXTREMES = [1e300, -1e300, 1e160, 1e100, -1e30, 1e17]
 
 
 @pytest.mark.parametrize("value", EXTREMES)
-@pytest.mark.parametrize("name", ["gyro", "accel"])
-def test_an_enormous_imu_sample_warns_or_is_followed_but_never_makes_nan(name, value):
-    ukf = running_filter()
-    before = estimate(ukf)
-    sample = {"gyro": (0.0, 0.0, 0.1), "accel": (0.0, 0.0, 9.8), name: (0.1 * value, value, value)}
+@pytest.mark.parametrize("name", ["gyro", "accel", "gnss_position_G", "pixels"])
+def test_enormous_values_warn_or_are_used_but_make_no_nan(name, value):
+    ukf, shape = running_filter(), (2, 2) if name == "pixels" else (3,)
+    before, of_imu = estimate(ukf), name in ("gyro", "accel")
+    given = {"gyro": (0.0, 0.0, 0.1), "accel": (0.0, 0.0, 9.8)} if of_imu else {}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        ukf.predict(**sample)
-    assert (ukf.status == FilterStatus.PREDICTION_FAILED) == bool(caught)
+        (ukf.predict if of_imu else ukf.update)(**{**given, name: np.full(shape, value)})
+    failed = FilterStatus.PREDICTION_FAILED if of_imu else FilterStatus.UPDATE_FAILED
+    assert (ukf.status == failed) == bool(caught)
     if caught:
-        assert "PREDICTION_FAILED" in str(caught[0].message)
+        assert failed.name in str(caught[0].message)
         assert_same(before, estimate(ukf))
-    assert all(np.isfinite(value).all() for value in estimate(ukf))
+    assert all(np.isfinite(part).all() for part in estimate(ukf))
     np.testing.assert_allclose(ukf.R_BI @ ukf.R_BI.T, np.eye(3), atol=1e-12)
-    if abs(value) >= 1e160:
-        assert caught
-
-
-@pytest.mark.parametrize("value", EXTREMES)
-@pytest.mark.parametrize("name", ["gnss_position_G", "pixels"])
-def test_an_enormous_measurement_warns_or_is_followed_but_never_makes_nan(name, value):
-    ukf = running_filter()
-    before = estimate(ukf)
-    shape = (2, 2) if name == "pixels" else (3,)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        ukf.update(**{name: np.full(shape, value)})
-    assert (ukf.status == FilterStatus.UPDATE_FAILED) == bool(caught)
-    if caught:
-        assert_same(before, estimate(ukf))
-    assert all(np.isfinite(value).all() for value in estimate(ukf))
-    np.testing.assert_allclose(ukf.R_BI @ ukf.R_BI.T, np.eye(3), atol=1e-12)
+    assert caught or abs(value) < 1e160 or not of_imu
 
 
 @pytest.mark.parametrize("length", [1e300, 1e160, 1e100, 1e-8])
-def test_a_baseline_of_any_length_is_refused_or_counts_by_its_direction(length):
+def test_baseline_counts_by_its_direction_or_is_refused(length):
     wild, tame = running_filter(), running_filter()
     before, direction = estimate(wild), RECORDING.gnss_baseline[5] / 0.19
     try:

@@ -27,19 +27,15 @@ FIELD = LAB.replace(
         integration="midpoint",
         attitude_reset=True,
         false_alarm_probability=1e-4,
-    ),
+    )
 )
 RECORDING = record_circle(LAB.replace(estimator=FIELD.estimator), 60, 3)
 TICK = int(np.flatnonzero(np.isfinite(RECORDING.pixels).all(axis=(1, 2)))[0])
 BAD = 2
 """The flight whose measurement fails."""
 KEPT = (*STATE, "nis", "nis_dimension")
-VALUES = {
-    "position": "gnss_position",
-    "baseline": "gnss_baseline",
-    "velocity": "gnss_velocity",
-    "features": "pixels",
-}
+VALUES = {name: f"gnss_{name}" for name in ("position", "baseline", "velocity")}
+VALUES |= {"features": "pixels"}
 BLOCKS = {
     "position": [POSITION_BLOCK],
     "baseline": [BASELINE_BLOCK],

@@ -1,6 +1,5 @@
 """Faults by name, and what is refused."""
 
-import numpy as np
 import pytest
 
 import quad_gym
@@ -9,8 +8,6 @@ from quad_gym.faults import (
     Fault,
     GnssJump,
     GnssOutage,
-    GnssOutliers,
-    ImuSaturation,
     RotorLoss,
     WrongAssociations,
 )
@@ -24,24 +21,19 @@ AIDED = RTK.replace(
     optical_flow=quad_gym.OpticalFlowParams(),
     range_finder=quad_gym.RangeFinderParams(),
 )
-BLIND = LAB.replace(camera=None)
+ONE_FEATURE = LAB.replace(camera=LAB.camera.replace(features_I=((0.0, 0.0, 0.0),)))
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: GnssOutage(start=-1.0), "GnssOutage.start must be at least 0"),
         (lambda: GnssOutage(start=(3.0, 1.0)), r"GnssOutage.start must be \(low, high\)"),
         (lambda: GnssOutage(start=(1.0, 2.0, 3.0)), r"must be a number or \(low, high\)"),
         (lambda: GnssOutage(duration=0.0), "GnssOutage.duration must be greater than 0"),
-        (lambda: GnssOutage(duration=np.nan), "GnssOutage.duration must be finite"),
         (lambda: GnssOutage(start=1.0, rate=0.1), "start or rate, not both"),
         (lambda: GnssOutage(probability=1.5), "GnssOutage.probability must be at most 1"),
-        (lambda: GnssOutliers(share=0.0), "GnssOutliers.share must be greater than 0"),
-        (lambda: GnssOutliers(size="large"), "GnssOutliers.size must be a number"),
         (lambda: GnssJump(direction=(0.0, 0.0, 0.0)), "GnssJump.direction must not be zero"),
         (lambda: WrongAssociations(how="mix"), "WrongAssociations.how must be one of swap, copy"),
-        (lambda: ImuSaturation(gyro_range=0.0), "ImuSaturation.gyro_range must be greater"),
         (lambda: RotorLoss(share=1.2), "RotorLoss.share must be at most 1"),
         (lambda: RotorLoss(rotor=4), "RotorLoss.rotor must be 0, 1, 2 or 3"),
         (lambda: Fault(), "of a kind"),
@@ -49,18 +41,9 @@ BLIND = LAB.replace(camera=None)
         (lambda: faults_of(3, LAB), "faults must be faults or names of presets, got 3"),
         (lambda: faults_of([3], LAB), "faults must be faults or names of presets, got 3"),
         (lambda: faults_of([GnssOutage(), "gnss_outage"], LAB), "one of each kind, got two Gnss"),
-        (
-            lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor").simplified()),
-            "needs GNSS",
-        ),
-        (lambda: faults_of(CameraOcclusion(), BLIND), "needs a camera"),
-        (
-            lambda: faults_of(
-                WrongAssociations(),
-                LAB.replace(camera=LAB.camera.replace(features_I=((0.0, 0.0, 0.0),))),
-            ),
-            "two features",
-        ),
+        (lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor")), "needs GNSS"),
+        (lambda: faults_of(CameraOcclusion(), LAB.replace(camera=None)), "needs a camera"),
+        (lambda: faults_of(WrongAssociations(), ONE_FEATURE), "two features"),
     ],
 )
 def test_invalid_faults_are_refused(make, words):

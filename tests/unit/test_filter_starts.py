@@ -107,7 +107,7 @@ def test_the_magnetic_heading_hangs_on_tilt_and_iron():
 
 
 @pytest.mark.parametrize("suite", [ONE_ANTENNA, quad_gym.sensor_suite("consumer")])
-def test_flights_and_filters_alone_take_the_same_heading_from_a_field(suite):
+def test_flights_and_filters_take_the_same_heading_from_a_field(suite):
     """Kernels start a flight's filter, NumPy one alone: same attitude, position and covariance."""
     batch, kf = fly(suite, 4, task="hover", seed=3), UnscentedKalmanFilter(suite)
     read = {
@@ -198,20 +198,6 @@ def test_late_measurements_resolve_the_heading_as_those_in_time():
     np.testing.assert_array_equal(in_time.position, late.position)
 
 
-def test_no_result_depends_on_the_lanes_that_hold_the_headings():
-    """Fields of lanes go there and back."""
-    kf = UnscentedKalmanFilter(MAGNETIC)
-    kf.initialize(np.zeros(3))
-    engine = kf._engine
-    assert engine.lanes == 48
-    for name in ("L", "r_hat", "R_hat", "slow_hat"):
-        before = engine.read(name)
-        engine.write(name, before)
-        np.testing.assert_array_equal(engine.read(name), before)
-    headings = np.arctan2(engine.read("R_hat")[:, 0, 1], engine.read("R_hat")[:, 0, 0])
-    np.testing.assert_allclose(np.diff(np.sort(headings)), 2.0 * math.pi / 48)
-
-
 def test_a_baseline_takes_velocity_and_noise_too():
     kf = UnscentedKalmanFilter(MAGNETIC)
     kf.initialize(
@@ -230,23 +216,18 @@ FIX, SPEED = np.zeros(3), np.array([1.0, 0.0, 0.0])
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"heading": math.nan}, "heading must be finite"),
         ({"heading": 0.1, "magnetometer": [1e-5, 1e-5, 0.0]}, "only one of heading"),
         ({"heading": 0.1, "heading_sigma": 0.0}, "heading_sigma"),
         ({"heading_sigma": 0.1}, "heading_sigma must come with"),
         ({"magnetometer": [0.0, 0.0, 4e-5]}, "level part of the field"),
-        ({"magnetometer": [1e-5, 1e-5]}, "magnetometer must have shape"),
         ({"magnetometer_sigma": 1e-6}, "magnetometer_sigma must come with"),
         ({"course": True}, "course must come with gnss_velocity_G"),
         ({"course": True, "gnss_velocity_G": [0.01, 0.0, 0.0]}, "course must belong to a moving"),
-        ({"course": 1}, "course must be True or False"),
         ({"velocity_sigma": 0.1}, "velocity_sigma must come with"),
         ({"tilt_sigma": -0.1}, "tilt_sigma"),
-        ({"gnss_sigma": [1.0, 0.0, 1.0]}, "gnss_sigma"),
         ({"time": math.inf}, "time"),
         ({"gnss_baseline_G": SPEED, "tilt_sigma": 0.1}, "tilt_sigma must not be given with"),
         ({"gnss_baseline_G": SPEED, "magnetometer": SPEED}, "magnetometer must not be given with"),
-        ({"gnss_baseline_G": SPEED, "course": True}, "course must not be given with"),
         ({"gnss_baseline_G": SPEED, "gnss_sigma": np.eye(3) + 0.1}, "covariance as gnss_sigma"),
     ],
 )

@@ -50,7 +50,7 @@ def test_rows_are_control_steps_from_the_start():
     assert len(flight.until(-1.0)) == 1
 
 
-def test_estimate_and_reference_are_those_that_the_controller_observed():
+def test_estimate_and_reference_are_those_of_the_observation():
     _, flight, observed = recorded_flight(layout="absolute")
     part = {f.name: f.slice for f in quad_gym.observation_layout(layout="absolute")}
     for name, column in (
@@ -95,7 +95,7 @@ def test_nees_is_that_of_the_error_and_the_covariance():
     assert (np.linalg.eigvalsh(P) > 0.0).all()
 
 
-def test_fixes_are_kept_in_the_inertial_frame_and_only_when_they_come():
+def test_fixes_are_kept_in_the_inertial_frame():
     keywords = {"sensors": at_rates(gnss=5.0), "control_rate": 50.0, "out_of_bounds": 50.0}
     env, flight, _ = recorded_flight("hover", steps=100, **keywords)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
@@ -113,6 +113,9 @@ def test_what_the_gate_made_of_measurements_is_kept():
     faults = {"faults": GnssOutliers(share=0.5, size=(50.0, 100.0))}
     env, flight, _ = recorded_flight("hover", steps=100, sensors="rtk", **faults)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
+    np.testing.assert_array_equal(measured, np.isfinite(flight["gnss_velocity"]).all(axis=1))
+    miss = (flight["gnss_velocity"] - flight["velocity"])[measured]
+    assert np.abs(miss).max() < 6 * 0.05 + 0.3  # the antenna turns, and the row ends later
     np.testing.assert_array_equal(np.isfinite(flight["gnss_decision"][:, 0]), measured)
     antenna_B = env.flights.batch.sensors.gnss.primary_antenna_B
     antenna = flight["position"] + antenna_B @ quaternion_to_dcm(flight["quaternion"])
@@ -128,15 +131,6 @@ def test_what_the_gate_made_of_measurements_is_kept():
     lab = recorded_flight("hover")[1]
     assert (lab["gnss_decision"][:, 0] == GateDecision.NONE).all()
     assert np.isnan(lab["gnss_decision"][:, 2]).all()  # its receiver gives no velocity
-
-
-def test_velocities_are_kept_where_the_receiver_gives_them():
-    _, flight, _ = recorded_flight("hover", steps=100, sensors="rtk")
-    measured = np.isfinite(flight["gnss_velocity"]).all(axis=1)
-    np.testing.assert_array_equal(measured, np.isfinite(flight["gnss_position"]).all(axis=1))
-    miss = (flight["gnss_velocity"] - flight["velocity"])[measured]
-    assert np.abs(miss).max() < 6 * 0.05 + 0.3  # the antenna turns, and the row ends later
-    assert np.isnan(recorded_flight("hover")[1]["gnss_velocity"]).all()
 
 
 def test_wind_and_faults_are_kept():
@@ -171,15 +165,7 @@ def test_a_new_episode_is_a_new_flight_and_the_old_one_lives_on():
     np.testing.assert_array_equal(recorder.flight["position"], first["position"][:1])
 
 
-def test_long_flights_have_room():
-    _, flight, _ = recorded_flight(
-        "hover", steps=600, duration=0.0, out_of_bounds=1e6, min_height=-1e6, max_tilt=np.pi
-    )
-    assert len(flight) == 601
-    assert (np.diff(flight["time"]) > 0.0).all()
-
-
-def test_rows_are_the_same_whether_they_are_asked_for_at_once_or_at_the_end():
+def test_rows_do_not_depend_on_when_they_are_read():
     """An episode ends on the way, so that the copies of another one are dropped."""
     env = QuadVectorEnv(11, "circle", autoreset_mode="SameStep", max_episode_steps=9)
     at_once, at_the_end = (FlightRecorder(env.flights.batch, 10) for _ in range(2))
@@ -193,7 +179,7 @@ def test_rows_are_the_same_whether_they_are_asked_for_at_once_or_at_the_end():
     assert_same_flights(at_once.flight, at_the_end.flight)
 
 
-def test_nothing_is_drawn_or_computed_for_pictures_that_nobody_asks_for(monkeypatch):
+def test_nothing_is_computed_for_frames_that_are_not_rendered(monkeypatch):
     """Stable-Baselines3 asks for "rgb_array" in training, and never renders."""
     monkeypatch.setattr("quad_gym.flights.record._fill", None)
     monkeypatch.setattr("quad_gym.rendering.live.Renderer", None)
@@ -253,23 +239,6 @@ def test_a_saved_flight_loads_bit_for_bit(tmp_path, keywords):
     assert_same_flights(Flight.load(file), flight)
 
 
-def test_a_file_can_be_read_with_numpy_alone(tmp_path):
-    _, flight, _ = recorded_flight()
-    with np.load(flight.save(tmp_path / "flight.npz")) as archive:
-        header = json.loads(str(archive["header"]))
-        assert (header["format"], header["version"]) == ("quad_gym flight", 1)
-        np.testing.assert_array_equal(archive["columns/position"], flight["position"])
-
-
-def changed_file(flight, path, change):
-    """The file of a flight after a change of its entries."""
-    with np.load(flight.save(path)) as archive:
-        entries = {name: archive[name] for name in archive.files}
-    change(entries)
-    np.savez_compressed(path, **entries)
-    return path
-
-
 def with_header(**changes):
     def change(entries):
         entries["header"] = np.array(json.dumps(json.loads(str(entries["header"])) | changes))
@@ -281,7 +250,6 @@ def with_header(**changes):
     ("change", "message"),
     [
         (with_header(version=2), "version 2"),
-        (with_header(version=None), "version None"),
         (with_header(format="other"), "not a flight"),
         (lambda e: e.pop("header"), "not a flight"),
         (lambda e: e.pop("columns/position"), "columns/position"),
@@ -291,38 +259,25 @@ def with_header(**changes):
         (lambda e: e.update({"columns/position": np.zeros((13, 3), "f4")}), "float64"),
     ],
 )
-def test_files_of_another_kind_are_clear_errors(tmp_path, change, message):
-    file = changed_file(recorded_flight()[1], tmp_path / "flight.npz", change)
-    with pytest.raises(ValueError, match=message) as caught:
-        Flight.load(file)
-    assert "flight.npz" in str(caught.value)
+def test_files_of_another_kind_are_refused(tmp_path, change, message):
+    path = recorded_flight()[1].save(tmp_path / "flight.npz")
+    with np.load(path) as archive:  # by NumPy alone
+        entries = {name: archive[name] for name in archive.files}
+    change(entries)
+    np.savez_compressed(path, **entries)
+    with pytest.raises(ValueError, match=rf"flight\.npz.*{message}"):
+        Flight.load(path)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_truncated_files_are_clear_errors(tmp_path, share):
+def test_damaged_files_are_refused(tmp_path):
     file = recorded_flight()[1].save(tmp_path / "flight.npz")
     whole = file.read_bytes()
-    file.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ValueError, match=r"flight\.npz"):
-        Flight.load(file)
-
-
-def test_damaged_bytes_are_noticed(tmp_path):
-    file = recorded_flight()[1].save(tmp_path / "flight.npz")
-    whole = bytearray(file.read_bytes())
-    whole[len(whole) // 2] ^= 0xFF
-    file.write_bytes(bytes(whole))
-    with pytest.raises(ValueError, match=r"flight\.npz"):
-        Flight.load(file)
-
-
-def test_other_files_are_clear_errors(tmp_path):
-    np.save(tmp_path / "array.npz.npy", np.zeros(3))
-    (tmp_path / "array.npz.npy").rename(tmp_path / "array.npz")
-    (tmp_path / "text.npz").write_text("hello")
-    for name in ("array", "text"):
-        with pytest.raises(ValueError, match=rf"{name}\.npz"):
-            Flight.load(tmp_path / f"{name}.npz")
+    middle = len(whole) // 2
+    flipped = whole[:middle] + bytes([whole[middle] ^ 0xFF]) + whole[middle + 1 :]
+    for content in (b"", b"hello", whole[:middle], whole[:-1], flipped):
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match=r"flight\.npz"):
+            Flight.load(file)
     with pytest.raises(FileNotFoundError):
         Flight.load(tmp_path / "nowhere.npz")
 

@@ -98,17 +98,15 @@ def test_what_cannot_be_flown_is_refused_with_its_place_and_size():
     k = int(motion.thrust.argmax())
     excess = round(100 * (motion.thrust[k] / 8.5 - 1.0))
     assert excess > 1
-    with pytest.raises(
-        ValueError, match=f"thrust of {motion.thrust[k]:.4g} N {where(k)}, {excess} %"
-    ):
+    message = f"thrust of {motion.thrust[k]:.4g} N {where(k)}, {excess} %"
+    with pytest.raises(ValueError, match=message):
         path.check(VEHICLE, max_thrust=8.5)
     k = int(motion.tilt.argmax())
     with pytest.raises(ValueError, match=f"a tilt of .* degrees {where(k)}, .* 20 degrees"):
         path.check(VEHICLE, max_tilt=math.radians(20.0))
     k = int(rates[:, 0].argmax())
-    with pytest.raises(
-        ValueError, match=f"body rate about x of {rates[k, 0]:.4g} rad/s {where(k)}"
-    ):
+    message = f"body rate about x of {rates[k, 0]:.4g} rad/s {where(k)}"
+    with pytest.raises(ValueError, match=message):
         path.check(VEHICLE, max_body_rates=(0.1, 6.0, 6.0))
     with pytest.raises(ValueError, match=r"a speed of .* m/s"):
         path.check(VEHICLE, max_speed=1.0)

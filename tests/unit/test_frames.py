@@ -30,9 +30,7 @@ def test_up_is_the_normal_of_the_ellipsoid(latitude, longitude, height):
 
 
 @given(reduced_latitudes, longitudes, heights)
-def test_the_axes_are_a_right_handed_frame_with_east_along_the_parallel(
-    latitude, longitude, height
-):
+def test_axes_are_right_handed_with_east_along_the_parallel(latitude, longitude, height):
     r_G, _ = place(latitude, longitude, height)
     R_IG = ecef_to_enu(r_G)
     np.testing.assert_allclose(R_IG @ R_IG.T, np.eye(3), rtol=0.0, atol=1e-15)
@@ -64,13 +62,6 @@ def test_a_published_pair_of_coordinates():
     assert height == pytest.approx(73.0, abs=2e-3)
 
 
-def test_the_laboratory_stands_in_austin():
-    lat, lon, height = ecef_to_geodetic([-742080.456, -5462030.875, 3198338.956])
-    assert np.degrees(lat) == pytest.approx(30.29, abs=0.02)
-    assert np.degrees(lon) == pytest.approx(-97.74, abs=0.02)
-    assert 0.0 < height < 400.0
-
-
 @pytest.mark.parametrize(
     ("r_G", "axes"),
     [
@@ -91,9 +82,5 @@ def test_the_axes_at_the_equator_and_the_poles(r_G, axes):
 def test_what_is_no_place_is_refused_by_name(bad):
     with pytest.raises(ValueError, match=r"^r_G must"):
         ecef_to_geodetic(bad)
-
-
-@pytest.mark.parametrize("bad", [[1.0, 2.0], "Austin", [np.inf, 0.0, EQUATOR], [0.0, 0.0, 5e5]])
-def test_the_frame_of_no_place_is_refused_by_the_name_of_its_argument(bad):
     with pytest.raises(ValueError, match=r"^r0_G must"):
         ecef_to_enu(bad)

@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.records import FLIGHT_BLOCK, WIDTH, Autoreset, offset_of, words_of_update
+from quad_gym.records import WIDTH, Autoreset
 from tests.builders import flown_batch
 from tests.golden.flights import AIDED
 
@@ -40,22 +40,7 @@ def test_flights_of_a_batch_equal_flights_alone(name):
             np.testing.assert_array_equal(mine, its, err_msg=f"{field}, flight {seed}")
 
 
-def test_blocks_with_equal_phases_or_parameters_of_their_own_are_not_gathered():
+def test_equal_phases_or_own_parameters_are_not_gathered():
     assert flown("standard", [0])._group == 1
     drawn = {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
     assert flown("rtk", [0], randomization=drawn)._group == 1
-
-
-def test_words_of_an_update_are_those_of_the_sensors_in_use():
-    batch = flown("indoor", [0])
-    words, written = words_of_update(batch._settings[0], frozenset({"filter", "watch", "late"}))
-    assert len(set(words.tolist())) == len(words)
-    assert 0 < written < len(words)
-
-    def first(name):
-        return offset_of(FLIGHT_BLOCK, name) // 8
-
-    assert first("L") in words[:written]
-    assert first("L") + WIDTH not in words  # above the diagonal
-    assert first("pixels") in words[written:]
-    assert first("slow_hat") not in words

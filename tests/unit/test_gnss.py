@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.frames import ecef_to_enu
-from quad_gym.kernels.maths.linalg import load3, store3
+from quad_gym.kernels.maths.linalg import load3, store
 from quad_gym.kernels.sensors.gnss_baseline import noisy_baseline
 from quad_gym.sensors import GnssReceiver
 from tests.unit.alarms import assert_normal
@@ -27,7 +27,7 @@ directions = (
 
 
 def measure_baseline(f, option):
-    store3(f.measured, noisy_baseline(load3(f.r_b), load3(f.normals), f.sigma_b, f.floor, f.length))
+    store(f.measured, noisy_baseline(load3(f.r_b), load3(f.normals), f.sigma_b, f.floor, f.length))
 
 
 kernels = Compiled(
@@ -50,7 +50,7 @@ def noise_map(r_b, sigma_b, floor):
 
 
 @given(directions, st.floats(0.05, 5.0), st.floats(0.005, 0.2))
-def test_the_noise_of_any_baseline_has_the_reports_covariance_of_rank_two(u, length, sigma_b):
+def test_noise_of_a_baseline_has_a_covariance_of_rank_two(u, length, sigma_b):
     R_bG = noise_map(length * u, sigma_b, 0.0)
     R_bG = R_bG @ R_bG.T
     unit = (length * sigma_b) ** 2
@@ -79,7 +79,7 @@ def test_the_measured_baseline_has_its_known_length(u, normals, length):
 
 
 @given(directions, st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.floats(0.1, 0.5))
-def test_large_noise_is_drawn_by_the_root_of_the_covariance_before_scaling(u, normals, sigma_b):
+def test_large_noise_is_drawn_before_scaling(u, normals, sigma_b):
     length, floor = 0.19, 1e-4
     R_bG = (length * sigma_b) ** 2 * (np.eye(3) - np.outer(u, u)) + floor * np.eye(3)
     values, vectors = np.linalg.eigh(R_bG)
@@ -134,15 +134,6 @@ def test_position_and_baseline_noise_are_independent(flight):
     assert np.abs(serial).max() < 5.5 / np.sqrt(SAMPLES)
 
 
-def test_at_the_laboratorys_noise_the_direction_is_off_by_the_laboratorys_angle():
-    # the tangent of the angle is Rayleigh, up to the noise of 1e-4 m along the baseline of 0.19 m
-    _, baselines = measurements(LAB, np.zeros(3), np.eye(3), 5_000)
-    along = ecef_to_enu(LAB.reference_antenna_G).T @ LAB.baseline_B
-    tangent2 = np.linalg.norm(np.cross(baselines, along), axis=1) ** 2 / (baselines @ along) ** 2
-    expected = 2.0 * (LAB.baseline_sigma**2 + FLOOR / 0.19**2)
-    assert tangent2.mean() == pytest.approx(expected, rel=5.0 / np.sqrt(5_000))
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_without_noise_the_geometry_is_exact(seed):
     rng = np.random.default_rng(seed)
@@ -162,15 +153,6 @@ def test_without_noise_the_geometry_is_exact(seed):
     np.testing.assert_allclose(R_IG @ r_bG, R_BI.T @ params.baseline_B, rtol=0.0, atol=1e-3)
 
 
-def test_a_receiver_is_reproducible_and_two_are_independent():
-    first, again, other = (
-        GnssReceiver(LAB, np.random.default_rng(seed)).measure(np.zeros(3), np.eye(3))[0]
-        for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).all()
-
-
 @pytest.mark.parametrize(
     ("name", "position", "R_BI"),
     [
@@ -185,7 +167,12 @@ def test_bad_input_is_refused_by_name(name, position, R_BI):
         GnssReceiver(LAB, np.random.default_rng(1)).measure(position, R_BI)
 
 
-@pytest.mark.parametrize("rng", [1, None, np.random.RandomState(1)])
-def test_a_sensor_wants_a_generator(rng):
+def test_equal_generators_give_equal_measurements():
+    first, again, other = (
+        GnssReceiver(LAB, np.random.default_rng(seed)).measure(np.zeros(3), np.eye(3))[0]
+        for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).all()
     with pytest.raises(ValueError, match=r"^rng must"):
-        GnssReceiver(LAB, rng)
+        GnssReceiver(LAB, 1)

@@ -3,7 +3,6 @@
 import decimal
 from decimal import Decimal
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -14,7 +13,7 @@ from quad_gym.records import POSITION_BLOCK
 from tests.circle_flight import record_circle
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.reference_late import Rewinding
-from tests.reference_ukf import PlainEKF, PlainUKF, array_of, east_north_up
+from tests.reference_ukf import PlainEKF, PlainUKF, array_of
 
 CONSUMER, LAB = quad_gym.sensor_suite("consumer").simplified(), quad_gym.sensor_suite("lab")
 DRIFTING = LAB.replace(gnss=LAB.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=20.0))
@@ -40,7 +39,7 @@ def with_filter(suite, **choices):
     ],
     ids=["with camera", "GNSS alone", "field filter", "Euler and turn"],
 )
-def test_the_filter_equals_a_plain_one_with_the_slow_error_in_its_state(suite, kinds):
+def test_filter_equals_a_plain_one_with_the_drift_in_its_state(suite, kinds):
     """The plain one computes in 45 digits; measurements come and go."""
     ours_class, plain_class = kinds
     ticks, seed = 14, 3
@@ -130,15 +129,6 @@ def test_the_position_is_about_as_good_as_theory_allows():
     assert square.sum() < 1.32 * best.sum()
 
 
-@pytest.mark.slow  # a minute of flight
-def test_after_a_minute_the_position_is_much_better_than_a_fix():
-    """At most 0.6 of a first fix's error, which has no slow part; by chance 0.55 varies by 0.01."""
-    batch = fly(CONSUMER, 400, task="hover")
-    steps(batch, 60.0)
-    found = np.sqrt(np.square(state_errors(batch)[:, :3]).sum(axis=1).mean())
-    assert found < 0.6 * np.linalg.norm(CONSUMER.gnss.position_sigma_I)
-
-
 def test_the_slow_error_is_estimated_as_well_as_claimed():
     batch = fly(CONSUMER, 300)
     steps(batch, 10.0)
@@ -168,7 +158,7 @@ def test_the_filter_is_consistent(kind, start, latency):
     assert not batch.record("filter_status").any()
 
 
-def test_a_warm_start_draws_the_slow_error_of_a_receiver_that_has_run():
+def test_warm_start_draws_the_drift_of_a_running_receiver():
     """It has its variance after ten seconds, and goes with the errors as the filter claims."""
     batch = fly(CONSUMER, 4000, task="hover", filter_start="warm")
     true, error = (
@@ -253,7 +243,7 @@ def test_a_gross_outlier_is_rejected():
     assert rms[0] < 1.2 * rms[1]
 
 
-def test_a_jump_of_the_fixes_shows_in_the_innovations_and_moves_the_slow_error():
+def test_jump_of_the_fixes_moves_the_estimated_drift():
     batch = fly(CONSUMER, 100, task="hover", faults=GnssJump(start=3.0, size=5.0, duration=1e3))
     steps(batch, 3.2)
     assert (batch.record("block_nis")[:, 0] > 100.0).mean() > 0.9
@@ -262,19 +252,3 @@ def test_a_jump_of_the_fixes_shows_in_the_innovations_and_moves_the_slow_error()
     assert (batch.record("alarm_tick") > 3.0 * CONSUMER.imu.rate).all()
     assert (batch.record("gate")[:, 0] == 1.0).all()
     assert nees(batch, slice(0, 3)).mean() < 30.0
-
-
-def test_the_estimate_follows_the_fixes_in_an_environment():
-    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=8, sensors="consumer")
-    env.reset(seed=1)
-    batch = env.unwrapped.flights.batch
-    R_IG = east_north_up(CONSUMER.gnss.reference_antenna_G)
-    for _ in range(50):
-        env.step(np.zeros((8, 4), np.float32))
-    fix = (
-        batch.record("gnss_position") @ R_IG.T
-        - batch.record("r_hat")
-        - batch.record("gnss_drift_hat")
-    )
-    assert np.abs(fix - [0.0, 0.0, 0.0472]).max() < 5 * 0.4
-    env.close()

@@ -1,19 +1,10 @@
 """Where vehicles begin in a world whose ground carries them, and what ground is refused."""
 
-import math
-
 import numpy as np
 import pytest
 
-from quad_gym import (
-    FlightBatch,
-    GroundParams,
-    TaskParams,
-    Trajectory,
-    Uniform,
-    WorldParams,
-    vehicle_params,
-)
+from quad_gym import GroundParams, TaskParams, Trajectory, Uniform, WorldParams, vehicle_params
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import COLUMNS, Control, Source
 
 LEGS, HUBS = 0.1, vehicle_params("lab").rotor_positions_B
@@ -78,19 +69,15 @@ def test_where_a_reference_begins_decides():
             batch(height=50.0, task={"kind": kind})
 
 
-def test_the_ground_of_a_task_without_ground_that_carries_stays():
-    flights = FlightBatch(1, task=TaskParams(min_height=0.3), world=WorldParams(ground_height=-5.0))
-    assert flights._settings["min_height"][0] == 0.3
-    assert batch(task={"min_height": -7.0})._settings["min_height"][0] == -7.0
-    assert math.isclose(
-        batch(height=-3.0, task={"out_of_bounds": 9.0})._settings["min_height"][0], -3.5
-    )
+SMALL = Uniform(-1e-3, 1e-3)
+DRAWS = [{}, *({name: SMALL} for name in ("start_velocity_I", "start_body_rates", "start_yaw"))]
+DRAWS += [{"start_position_I": (None, None, Uniform(-0.5, -0.1))}]  # lifted onto it
+DRAWS += [{"center_of_mass_B": (SMALL, SMALL, None)}]
 
 
 @pytest.mark.parametrize("pad", [True, False])
-@pytest.mark.parametrize("moving", [{}, {"start_velocity_I"}, {"start_body_rates"}, {"start_yaw"}])
-def test_starts_on_the_ground_are_on_it_with_any_draws(pad, moving):
-    draws = {name: Uniform(-1e-3, 1e-3) for name in moving}
+@pytest.mark.parametrize("draws", DRAWS, ids=str)
+def test_starts_on_the_ground_are_on_it_with_any_draws(pad, draws):
     task = {"pad": pad, "out_of_bounds": 10.0}
     flights = batch(16, height=-2.0, task=task, randomization=draws)
     flights.reset(seeds=range(16))
@@ -117,13 +104,6 @@ def test_a_drawn_height_is_on_top_of_the_ground(pad, start):
     assert (flights.record("footing") == 0.0).all()
     flights.reset(seeds=range(64), position=[0.0, 0.0, -1.0])
     assert (flights.record("r")[:, 2] == -1.0).all()
-
-
-def test_a_drawn_height_below_the_ground_is_lifted_onto_it():
-    draws = {"start_position_I": (None, None, Uniform(-0.5, -0.1))}
-    flights = batch(height=-2.0, task={"out_of_bounds": 10.0}, randomization=draws)
-    flights.reset(seeds=range(4))
-    np.testing.assert_allclose(flights.record("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
 
 
 def test_only_flights_that_begin_are_put_onto_the_ground():

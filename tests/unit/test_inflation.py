@@ -7,10 +7,8 @@ import pytest
 
 import quad_gym
 import quad_gym.frames
-from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.records import FEATURE_BLOCKS, POSITION_BLOCK
-from tests.field_flights import steps
+from tests.field_flights import fly, steps
 from tests.filter_states import set_at_rest
 
 MOST = np.repeat([100.0, 20.0, math.nan, 2.0, 0.1], 3)  # of attitude: tilt 0.2, heading pi/sqrt 3
@@ -93,7 +91,7 @@ def test_an_alarm_inflates_each_deviation_up_to_its_bound(deviations):
     )
 
 
-def test_alarms_that_repeat_leave_what_nothing_measures_bounded():
+def test_repeated_alarms_leave_unmeasured_states_bounded():
     """Only velocities are measured: nothing tells the position or the heading for 25 alarms."""
     ukf = started(np.repeat([0.1, 0.05, 0.05, 0.05, 0.005], 3))
     for _ in range(25):
@@ -116,15 +114,7 @@ def test_a_sensor_that_no_longer_measures_raises_no_more_alarms():
 
     The filter stays lost for as long as biases may err, but from the last fix on.
     """
-    batch = FlightBatch(
-        8,
-        sensors="standard",
-        task=TASK_DEFAULTS["hover"],
-        gains="tuned",
-        filter_start="warm",
-        innovations=True,
-    )
-    batch.reset(seeds=range(8))
+    batch = fly("standard", 8, task="hover", filter_start="warm")
     steps(batch, 1.0)
     assert not batch.record("diverged").any()
     flights = batch.snapshot()

@@ -101,23 +101,17 @@ def test_a_rejected_block_is_as_good_as_not_measured(wrong):
     without = warm(CONSISTENT, k)
     gated = UnscentedKalmanFilter(GATED)
     set_like(gated, without)
-    value = {
-        "gnss_position_G": RECORDING.gnss_position[k] + 0.5,
-        "gnss_baseline_G": RECORDING.gnss_baseline[k] @ np.diag([-1.0, -1.0, 1.0]),
-        "pixels": RECORDING.pixels[k] + np.array([[600.0, 0.0], [0.0, 0.0]]),
-    }[wrong]
-    lacking = {
-        "gnss_position_G": None,
-        "gnss_baseline_G": None,
-        "pixels": np.where([[True], [False]], np.nan, RECORDING.pixels[k]),
+    baseline, pixels = RECORDING.gnss_baseline[k], RECORDING.pixels[k]
+    block, value, lacking = {
+        "gnss_position_G": (POSITION_BLOCK, RECORDING.gnss_position[k] + 0.5, None),
+        "gnss_baseline_G": (BASELINE_BLOCK, baseline @ np.diag([-1.0, -1.0, 1.0]), None),
+        "pixels": (
+            *(FEATURE_BLOCKS, pixels + np.array([[600.0, 0.0], [0.0, 0.0]])),
+            np.where([[True], [False]], np.nan, pixels),
+        ),
     }[wrong]
     cycle(gated, k, **{wrong: value})
     cycle(without, k, **{wrong: lacking})
-    block = {
-        "gnss_position_G": POSITION_BLOCK,
-        "gnss_baseline_G": BASELINE_BLOCK,
-        "pixels": FEATURE_BLOCKS,
-    }[wrong]
     assert gated.gate_decisions[block] == GateDecision.REJECTED
     assert (gated.gate_decisions == GateDecision.REJECTED).sum() == 1
     assert gated.status == FilterStatus(0)
@@ -149,9 +143,6 @@ def test_a_lane_gates_for_itself():
     for name in STATE:
         np.testing.assert_array_equal(filters.get(name)[others], free.get(name)[others])
     np.testing.assert_array_equal(filters.get("gate")[:, POSITION_BLOCK], [1, 1, 1, 2, 1, 1, 1, 1])
-
-
-# ---- measurements that fail ------------------------------------------------------------------
 
 
 # ---- many flights ----------------------------------------------------------------------------

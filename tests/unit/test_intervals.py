@@ -30,7 +30,7 @@ def estimate_of(sample):
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 10, 20, 100, 1000])
-def test_the_interval_of_a_mean_covers_95_percent_of_normal_values(count):
+def test_interval_of_a_mean_covers_95_percent_of_normal_values(count):
     samples = np.random.default_rng(count).normal(3.0, 2.0, (DRAWS, count))
     assert 0.93 < np.mean([mean_interval(x).holds(3.0) for x in samples]) < 0.97
 
@@ -38,7 +38,7 @@ def test_the_interval_of_a_mean_covers_95_percent_of_normal_values(count):
 @pytest.mark.parametrize(
     ("count", "stated"), [(2, 0.89), (5, 0.82), (10, 0.84), (100, 0.92), (1000, 0.95)]
 )
-def test_the_interval_of_a_mean_covers_of_lognormal_values_what_the_docstring_says(count, stated):
+def test_interval_of_a_mean_covers_lognormal_values_as_stated(count, stated):
     samples = np.random.default_rng(count).lognormal(size=(DRAWS, count))
     covered = np.mean([mean_interval(x).holds(np.exp(0.5)) for x in samples])
     assert covered == pytest.approx(stated, abs=0.03)
@@ -46,7 +46,7 @@ def test_the_interval_of_a_mean_covers_of_lognormal_values_what_the_docstring_sa
 
 @pytest.mark.parametrize("rate", [0.002, 0.05, 0.3, 0.5, 0.98])
 @pytest.mark.parametrize("episodes", [5, 20, 100])
-def test_the_interval_of_a_rate_covers_at_least_95_percent(rate, episodes):
+def test_interval_of_a_rate_covers_at_least_95_percent(rate, episodes):
     counts = np.arange(episodes + 1)
     held = [rate_interval(k, episodes).holds(rate) for k in counts]
     assert binom.pmf(counts, episodes, rate)[held].sum() >= 0.95
@@ -57,9 +57,7 @@ def test_the_interval_of_a_rate_covers_at_least_95_percent(rate, episodes):
     ("of_seeds", "of_episodes", "highest"),
     [(1.0, 0.0, 0.97), (1.0, 1.0, 0.98), (0.2, 1.0, 1.0), (0.0, 0.0, 1.0)],
 )
-def test_the_interval_over_trainings_covers_at_least_95_percent(
-    seeds, of_seeds, of_episodes, highest
-):
+def test_interval_over_trainings_covers_95_percent(seeds, of_seeds, of_episodes, highest):
     rng = np.random.default_rng(seeds)
     held = []
     for _ in range(DRAWS):
@@ -71,7 +69,7 @@ def test_the_interval_over_trainings_covers_at_least_95_percent(
 
 @pytest.mark.parametrize("seeds", [2, 3, 5])
 @pytest.mark.parametrize(("rate", "alike"), [(0.05, 20.0), (0.5, 4.0), (0.9, 10.0), (0.5, 1e6)])
-def test_the_interval_of_a_rate_over_trainings_covers_at_least_95_percent(seeds, rate, alike):
+def test_rate_over_trainings_covers_at_least_95_percent(seeds, rate, alike):
     rng = np.random.default_rng(seeds)
     own = rng.beta(alike * rate, alike * (1.0 - rate), (DRAWS, seeds))  # of each training
     found = [rate_over_trainings(rates, 100) for rates in rng.binomial(100, own) / 100]
@@ -87,7 +85,7 @@ def test_equal_arms_differ_as_seldom_as_the_docstring_says(seeds, alarms):
 
 @pytest.mark.parametrize("seeds", [3, 5, 10])
 @pytest.mark.parametrize("apart", [0.0, 1.0, 2.0])
-def test_the_interval_of_the_probability_of_improvement_covers_90_percent(seeds, apart):
+def test_probability_of_improvement_covers_90_percent(seeds, apart):
     pairs = np.random.default_rng(seeds).normal(size=(300, 2, seeds))
     exact = norm.cdf(apart / np.sqrt(2.0))
     held = [probability_of_improvement(apart + a, b).holds(exact) for a, b in pairs]
@@ -97,94 +95,63 @@ def test_the_interval_of_the_probability_of_improvement_covers_90_percent(seeds,
 # ---- closed forms -------------------------------------------------------------------------------
 
 
-def test_the_interval_of_a_mean_is_student_s():
-    x = np.random.default_rng(6).normal(size=5)
-    expected = ttest_1samp(x, 0.0).confidence_interval()
-    np.testing.assert_allclose(mean_interval(x), [expected.low, expected.high], rtol=1e-12)
-
-
-def test_the_interval_of_a_mean_of_equal_numbers_is_a_point():
-    assert mean_interval([0.1, 0.1, 0.1]) == (0.1, 0.1)
-
-
-@pytest.mark.parametrize("values", [[], [1.0], [1.0, np.nan]])
-def test_the_interval_of_a_mean_refuses_too_few_or_unknown_values(values):
-    with pytest.raises(ValueError, match="at least two finite numbers"):
-        mean_interval(values)
-
-
-@pytest.mark.parametrize(("count", "trials"), [(0, 20), (1, 20), (20, 20), (13, 40), (0, 1)])
-def test_the_interval_of_a_rate_is_clopper_and_pearson_s(count, trials):
-    expected = binomtest(count, trials).proportion_ci(method="exact")
-    np.testing.assert_allclose(
-        rate_interval(count, trials), [expected.low, expected.high], rtol=1e-9
-    )
-
-
-def test_no_crash_in_twenty_episodes_may_be_one_in_six():
-    low, high = rate_interval(0, 20)
-    assert low == 0.0
-    assert high == pytest.approx(1.0 - 0.025 ** (1 / 20))
-
-
-@pytest.mark.parametrize(("count", "trials"), [(-1, 20), (21, 20), (0, 0), (np.nan, 5)])
-def test_the_interval_of_a_rate_refuses_what_is_none(count, trials):
-    with pytest.raises(ValueError, match="must be"):
-        rate_interval(count, trials)
-
-
-def test_the_interval_of_a_fixed_rule_is_student_s_over_episodes():
-    values = np.random.default_rng(2).normal(3.0, 2.0, 400)
-    found = mean_over_trainings([values])
-    np.testing.assert_allclose(found, [values.mean(), *mean_interval(values)])
-
-
-def test_the_interval_of_trainings_that_fly_alike_in_all_episodes_is_student_s_over_trainings():
-    scores = np.array([0.0, 1.0, 2.0, 3.0, 8.0])
-    found = mean_over_trainings(np.repeat(scores[:, np.newaxis], 50, axis=1))
-    np.testing.assert_allclose(found, [2.8, *mean_interval(scores)])
-
-
-def test_the_jackknife_of_a_mean_is_its_variance():
-    values = np.random.default_rng(3).normal(size=(3, 40))
-    other = mean_over_trainings(values, lambda x: x.mean(axis=-1))
-    np.testing.assert_allclose(other, mean_over_trainings(values))
-
-
-def test_the_interval_of_the_worst_tenth_of_a_fixed_rule_covers_95_percent():
+def test_worst_tenth_of_a_fixed_rule_covers_95_percent():
     exact = -norm.pdf(norm.ppf(0.1)) / 0.1
     samples = np.random.default_rng(1).normal(size=(200, 1, 200))
     held = [mean_over_trainings(x, worst_tenth).holds(exact) for x in samples]
     assert 0.86 < np.mean(held) < 0.99
 
 
-def test_the_worst_tenth_is_the_mean_of_the_lowest_numbers():
-    assert worst_tenth(np.arange(20.0)[::-1]) == 0.5
-    assert worst_tenth(np.array([3.0, 1.0])) == 1.0
-    np.testing.assert_array_equal(worst_tenth(np.arange(40.0).reshape(2, 20)), [0.5, 20.5])
+def test_interval_of_a_mean_is_student_s():
+    x = np.random.default_rng(6).normal(size=5)
+    expected = ttest_1samp(x, 0.0).confidence_interval()
+    np.testing.assert_allclose(mean_interval(x), [expected.low, expected.high], rtol=1e-12)
+    assert mean_interval([0.1, 0.1, 0.1]) == (0.1, 0.1)
 
 
-@pytest.mark.parametrize(
-    "bad", [[], [[]], [[1.0]], [[1.0, np.nan]], [[np.inf]], np.ones((2, 2, 2))]
-)
-def test_values_that_are_not_of_trainings_and_episodes_are_refused(bad):
-    with pytest.raises(ValueError, match="values must be finite numbers"):
-        mean_over_trainings(bad)
+@pytest.mark.parametrize(("count", "trials"), [(0, 20), (1, 20), (20, 20), (13, 40), (0, 1)])
+def test_interval_of_a_rate_is_clopper_and_pearson_s(count, trials):
+    expected = binomtest(count, trials).proportion_ci(method="exact")
+    found = rate_interval(count, trials)
+    np.testing.assert_allclose(found, [expected.low, expected.high], rtol=1e-9)
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.1, 1.0])
-def test_the_rate_of_a_fixed_rule_has_the_interval_of_its_episodes(rate):
-    assert rate_over_trainings([rate], 20) == (rate, *rate_interval(20 * rate, 20))
-
-
-def test_no_crash_of_five_trainings_has_the_interval_of_no_crash_of_one():
+def test_interval_over_trainings_is_student_s_where_one_part_varies():
+    rng = np.random.default_rng(2)
+    episodes, trainings = rng.normal(3.0, 2.0, 400), rng.normal(size=5)
+    of_rule = mean_over_trainings([episodes])
+    np.testing.assert_allclose(of_rule, [episodes.mean(), *mean_interval(episodes)])
+    equal = mean_over_trainings(np.repeat(trainings[:, np.newaxis], 50, axis=1))
+    np.testing.assert_allclose(equal, [trainings.mean(), *mean_interval(trainings)])
+    values = rng.normal(size=(3, 40))  # the jackknife of a mean is its variance
+    other = mean_over_trainings(values, lambda x: x.mean(axis=-1))
+    np.testing.assert_allclose(other, mean_over_trainings(values))
+    for rate in (0.0, 0.1, 1.0):
+        assert rate_over_trainings([rate], 20) == (rate, *rate_interval(20 * rate, 20))
     assert rate_over_trainings(np.zeros(5), 20) == rate_over_trainings([0.0], 20)
 
 
-@pytest.mark.parametrize("bad", [[], [1.1], [-0.1], [np.nan]])
-def test_rates_beyond_0_and_1_are_refused(bad):
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        rate_over_trainings(bad, 20)
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        *((mean_interval, (bad,), "two finite numbers") for bad in ([], [1.0], [1.0, np.nan])),
+        *((rate_interval, bad, "must be") for bad in ((-1, 20), (21, 20), (0, 0), (np.nan, 5))),
+        *((mean_over_trainings, (bad,), "values must be finite") for bad in ([], [[]], [[np.inf]])),
+        (mean_over_trainings, (np.ones((2, 2, 2)),), "values must be finite numbers"),
+        *((rate_over_trainings, (bad, 20), "between 0 and 1") for bad in ([], [1.1], [np.nan])),
+        (probability_of_improvement, ([1.0], [np.nan]), "scores must be finite numbers"),
+        (paired_difference, ([1.0, 2.0], [1.0]), "first and second must have shape"),
+    ],
+)
+def test_invalid_samples_are_refused(function, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        function(*arguments)
+
+
+def test_worst_tenth_is_the_mean_of_the_lowest_numbers():
+    assert worst_tenth(np.arange(20.0)[::-1]) == 0.5
+    assert worst_tenth(np.array([3.0, 1.0])) == 1.0
+    np.testing.assert_array_equal(worst_tenth(np.arange(40.0).reshape(2, 20)), [0.5, 20.5])
 
 
 def test_the_difference_of_rates_is_newcombe_s():
@@ -193,7 +160,7 @@ def test_the_difference_of_rates_is_newcombe_s():
     np.testing.assert_allclose(found, [0.2, 0.0526, 0.3341], atol=1e-3)
 
 
-def test_the_probability_of_improvement_is_the_statistic_of_mann_and_whitney():
+def test_probability_of_improvement_is_that_of_mann_and_whitney():
     rng = np.random.default_rng(6)
     a, b = rng.normal(1.0, 1.0, 7), rng.normal(0.0, 1.0, 9)
     found = probability_of_improvement(a, b)
@@ -209,12 +176,6 @@ def test_the_probability_of_improvement_at_its_limits():
     assert probability_of_improvement([1.0, 1.0], [1.0]).value == 0.5
 
 
-@pytest.mark.parametrize("bad", [[], [np.nan]])
-def test_scores_that_are_no_numbers_are_refused(bad):
-    with pytest.raises(ValueError, match="scores must be finite numbers"):
-        probability_of_improvement([1.0], bad)
-
-
 # ---- pairs --------------------------------------------------------------------------------------
 
 
@@ -226,25 +187,9 @@ def test_pairs_show_what_seeds_hide():
     assert found.significant
     assert found.interval.holds(0.5)
     assert found.spread.mean == pytest.approx(0.5, abs=0.05)
-
-
-def test_pairs_of_equal_numbers_are_not_significant():
-    found = paired_difference([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
-    assert not found.significant
-    assert found.interval == (0.0, 0.0)
-
-
-def test_pairs_leave_out_unknown_seeds():
-    found = paired_difference([1.0, np.nan, 3.0], [0.0, 1.0, 2.0])
-    assert (found.spread.count, found.spread.mean) == (2, 1.0)
-
-
-def test_pairs_of_one_seed_have_no_interval():
-    found = paired_difference([1.0], [2.0])
-    assert found.interval is None
-    assert not found.significant
-
-
-def test_pairs_of_different_numbers_of_seeds_are_refused():
-    with pytest.raises(ValueError, match="first and second must have shape"):
-        paired_difference([1.0, 2.0], [1.0])
+    equal = paired_difference([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+    assert (equal.significant, equal.interval) == (False, (0.0, 0.0))
+    unknown = paired_difference([1.0, np.nan, 3.0], [0.0, 1.0, 2.0])
+    assert (unknown.spread.count, unknown.spread.mean) == (2, 1.0)
+    one = paired_difference([1.0], [2.0])
+    assert (one.significant, one.interval) == (False, None)

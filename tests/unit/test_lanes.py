@@ -42,22 +42,11 @@ def arithmetic(f, option):
 
 
 def truth_of_arithmetic(x, y, option):
+    chosen = [np.where(x < y, x, y), np.where(x > y, x, y)]
     return [
-        x + y,
-        x - y,
-        x * y,
-        x / y,
-        -x,
-        np.abs(x),
-        np.sqrt(np.abs(x)),
-        2.0 * x,
-        x / 3,
-        1 - x,
-        option + x,
-        np.rint(x),
-        np.where(x < y, x, y),
-        np.where(x > y, x, y),
-        np.minimum(np.where(x > -1.0, x, -1.0), 1.0),
+        *(x + y, x - y, x * y, x / y, -x, np.abs(x), np.sqrt(np.abs(x))),
+        *(2.0 * x, x / 3, 1 - x, option + x, np.rint(x)),
+        *(*chosen, np.minimum(np.where(x > -1.0, x, -1.0), 1.0)),
     ]
 
 
@@ -93,20 +82,9 @@ def asking(f, option):
 def truth_of_asking(x, y, option):
     less, one = x < y, option == 1
     masks = [
-        less,
-        x <= y,
-        x > y,
-        x >= y,
-        x == y,
-        x < 1,
-        x <= 0.5,
-        less & (x > 0.0),
-        less | (y < 0.0),
-        ~less,
-        np.isfinite(x),
-        one & (y <= x),
-        one | (y <= x),
-        np.where(less, x == 0.0, y == 0.0),
+        *(less, x <= y, x > y, x >= y, x == y, x < 1, x <= 0.5),
+        *(less & (x > 0.0), less | (y < 0.0), ~less, np.isfinite(x)),
+        *(one & (y <= x), one | (y <= x), np.where(less, x == 0.0, y == 0.0)),
     ]
     chosen = [np.where(less, a, b) for a, b in ((x, y), (1.0, y), (x, math.nan), (3.0, 4.0))]
     return [m.astype(float) for m in masks] + chosen
@@ -188,30 +166,19 @@ def test_words_are_added_and_turned_modulo_two_to_the_sixty_four(instance):
     got = getattr(bits_on, instance)(word_a=a, word_b=b)
     pairs = [(int(i), int(j)) for i, j in zip(a, b, strict=True)]
     wrap = 2**64
-    expected = np.array(
+    expected = [
         [
-            [
-                (i + j) % wrap,
-                i ^ j,
-                i & j,
-                i | j,
-                (i + int(MANY)) % wrap,
-                i ^ int(MANY),
-                (i << 13 | i >> 51) % wrap,
-                (i << 63 | i >> 1) % wrap,
-                i if i == j else (j + 1) % wrap,
-            ]
-            for i, j in pairs
-        ],
-        np.uint64,
-    )
-    np.testing.assert_array_equal(got["word_out"], expected)
+            *((i + j) % wrap, i ^ j, i & j, i | j, (i + int(MANY)) % wrap, i ^ int(MANY)),
+            *((i << 13 | i >> 51) % wrap, (i << 63 | i >> 1) % wrap),
+            i if i == j else (j + 1) % wrap,
+        ]
+        for i, j in pairs
+    ]
+    np.testing.assert_array_equal(got["word_out"], np.array(expected, np.uint64))
     np.testing.assert_array_equal(got["x"], [1.0 + (i >> 12) / 2**52 for i, _ in pairs])
 
 
-@given(
-    st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_size=1, max_size=20),
-)
+@given(st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_size=1, max_size=20))
 def test_floats_and_lanes_agree_to_the_last_bits(pairs):
     x, y = np.array(pairs).T
     with np.errstate(all="ignore"):

@@ -44,12 +44,11 @@ def test_a_lever_arm_and_late_measurements(latencies):
     assert np.abs(found - 15.0).max() < BAND, found
 
 
-def test_a_center_of_mass_that_each_episode_draws_and_the_filter_knows():
+def test_known_drawn_center_of_mass_leaves_the_filter_consistent():
     drawn = {"center_of_mass_B": quad_gym.Uniform(-0.03, 0.03)}
-    known = quad_gym.Randomization(drawn, known=True)
-    found = means(
-        fly(quad_gym.sensor_suite("rtk").simplified(), FLIGHTS, start="hover", randomization=known)
-    )
+    known = {"randomization": quad_gym.Randomization(drawn, known=True)}
+    suite = quad_gym.sensor_suite("rtk").simplified()
+    found = means(fly(suite, FLIGHTS, start="hover", **known))
     assert np.abs(found - 15.0).max() < BAND, found
 
 

@@ -61,19 +61,6 @@ def test_true_sensors_may_err_and_sit_and_wait_otherwise():
     assert np.isfinite(batch.record("r_hat")).all()
 
 
-# ---- numbers that are none -----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("good", [3, 3.0, np.float32(3.0), np.int64(3), np.array(3.0)])
-def test_numbers_of_every_make_are_taken(good):
-    assert TaskParams(radius=good).radius == 3.0
-
-
-@pytest.mark.parametrize("bad", [np.array(["lab"]), ["circle"], 1, None])
-def test_choices_are_text(bad):
-    refused("TaskParams.start must be one of", TaskParams, start=bad)
-
-
 # ---- limits, at the limit ------------------------------------------------------------------------
 
 
@@ -83,11 +70,12 @@ def test_a_duration_that_rounds_to_no_limit_is_refused():
     refused("duration must be 0", FlightBatch, 1, task=TaskParams(duration=0.001))
     assert QuadEnv("hover", duration=0.0101).flights.batch.max_steps == 1
     assert QuadEnv("hover", duration=0.0).flights.batch.max_steps == 0
-
-
-def test_too_many_threads_are_refused():
-    refused("threads must be at most 1024", QuadVectorEnv, 8, "hover", threads=10**6)
+    env = gymnasium.make("QuadGym/Hover-v0", duration=0.0, max_episode_steps=-1)
+    assert (env.unwrapped.flights.batch.max_steps, env.spec.max_episode_steps) == (0, None)
     refused("threads must be at most 1024", FlightBatch, 8, threads=1025)
+    refused("radius must be at most 1000", QuadEnv, "circle", radius=1e9)
+    for good in (np.float32(3.0), np.int64(3), np.array(3.0)):
+        assert TaskParams(radius=good).radius == 3.0
 
 
 def amplification(z):
@@ -127,7 +115,7 @@ def test_moments_of_inertia_of_no_body_are_refused():
         refused("VehicleParams.inertia must belong to a body", quad_gym.VehicleParams, inertia=bad)
 
 
-def test_randomized_moments_that_are_never_those_of_a_body_are_refused():
+def test_drawn_moments_of_no_body_are_refused():
     def drawn(*moments):
         return {"inertia": [Uniform(low, high) for low, high in moments]}
 
@@ -138,19 +126,13 @@ def test_randomized_moments_that_are_never_those_of_a_body_are_refused():
     FlightBatch(1, randomization={"inertia": Uniform(0.8, 1.2, relative=True)})
 
 
-def test_means_over_a_tick_are_not_for_the_prediction_of_an_instant():
+def test_averaged_samples_need_midpoint_integration():
     suite = LAB.replace(imu=LAB.imu.replace(samples="average"))
     message = "integration='midpoint'"
     refused(message, FlightBatch, 1, sensors=suite)
     refused(message, QuadEnv, "hover", sensors=suite)
     refused(message, UnscentedKalmanFilter, suite)
     FlightBatch(1, sensors=suite, source=Source.TRUTH)  # no filter runs
-
-
-@pytest.mark.parametrize("name", ["radius", "height"])
-def test_references_beyond_what_is_observed_are_refused(name):
-    refused(f"{name} must be at most 1000", QuadEnv, "circle", **{name: 1e9})
-    assert getattr(TaskParams(**{name: 1000.0}), name) == 1000.0
 
 
 @pytest.mark.parametrize(
@@ -163,16 +145,15 @@ def test_references_beyond_what_is_observed_are_refused(name):
     ],
 )
 def test_periods_that_no_thrust_allows_are_refused(task, least, options):
-    refused(
-        "period must be one that the vehicle can fly", QuadEnv, task, period=0.99 * least, **options
-    )
+    message = "period must be one that the vehicle can fly"
+    refused(message, QuadEnv, task, period=0.99 * least, **options)
     QuadEnv(task, period=1.01 * least, **options)
 
 
 # ---- starts and seeds ----------------------------------------------------------------------------
 
 
-def test_a_start_that_is_out_of_all_bounds_is_refused_and_changes_nothing():
+def test_starts_out_of_all_bounds_change_nothing():
     env, vector = QuadEnv("hover"), QuadVectorEnv(2, "hover")
     for one in (env, vector):
         one.reset(seed=1)
@@ -201,11 +182,8 @@ def test_seeds_that_are_none_are_refused(seed):
     refused("seed must be", quad_gym.make_sb3_vec_env, "QuadGym/Hover-v0", seed=seed)
     refused("seeds must be", FlightBatch(2).reset, seeds=[seed, 1])
     refused("seeds must hold 2", FlightBatch(2).reset, seeds=seed)
-
-
-def test_seeds_of_numpy_are_those_of_python():
-    env = QuadEnv("hover")
-    np.testing.assert_array_equal(env.reset(seed=np.int64(7))[0], env.reset(seed=7)[0])
+    first = QuadEnv("hover").reset(seed=np.int64(7))[0]
+    np.testing.assert_array_equal(first, QuadEnv("hover").reset(seed=7)[0])
 
 
 def test_flights_that_never_began_are_not_flown():
@@ -234,17 +212,12 @@ def test_an_absolute_position_does_not_start_a_filter():
 
 
 @pytest.mark.parametrize("maker", MAKERS)
-def test_keywords_that_do_not_belong_there_are_refused(maker):
+def test_misplaced_keywords_are_refused_with_a_suggestion(maker):
     make = MAKERS[maker]
-    for kind in (TypeError, ValueError):
-        message = "contrl_rate is not a keyword .* did you mean control_rate?"
-        refused(message, make, kind=kind, contrl_rate=1)
-        refused("observations .* did you mean observation?", make, kind=kind, observations="truth")
-        refused("xyzzy is not a keyword .* it takes observation", make, kind=kind, xyzzy=1)
+    refused("contrl_rate is not a keyword .* did you mean control_rate?", make, contrl_rate=1)
     refused("gate_count belongs to the task waypoints", make, gate_count=3)
-    refused("max_speed belongs to the task random_trajectory", make, max_speed=1.0)
     refused("camera must not be True", make, camera=True, sensors="consumer")
-    refused("control_rate must be at least 1, got 0.02", make, control_rate=0.02)
+    refused("num_envs is n_envs here", quad_gym.make_sb3_vec_env, "QuadGym/Hover-v0", num_envs=2)
     make(camera=False, sensors="consumer")
     make(camera=True, sensors="rtk")
 
@@ -259,10 +232,6 @@ def test_faults_of_sensors_need_sensors(maker, observation):
     make(observation=observation, faults=(RotorLoss(), PositionJump()))
     make(observation=observation, faults="gnss_outage", innovations=True)
     make(observation="measurements", faults="gnss_outage")
-
-
-def test_the_number_of_stable_baselines_environments_has_another_name():
-    refused("num_envs is n_envs here", quad_gym.make_sb3_vec_env, "QuadGym/Hover-v0", num_envs=2)
 
 
 # ---- policies ------------------------------------------------------------------------------------
@@ -294,22 +263,12 @@ def test_pd_control_is_not_shown_other_observations():
         PDPolicy(plain)
 
 
-def test_pd_control_knows_the_length_of_its_observations():
-    policy = PDPolicy(QuadEnv("hover"))
-    wide = QuadEnv("hover", include_std=True)
-    refused(r"observation must be \(\.\.\., 28\)", policy.predict, wide.reset(seed=1)[0])
-    privileged = PDPolicy(QuadEnv("hover", privileged=True))
-    assert privileged.predict({"policy": np.zeros(28)})[0].shape == (4,)
-
-
 # ---- time limits ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("given", "steps"),
     [
-        ({"max_episode_steps": 1000}, 1000),
-        ({"max_episode_steps": 20}, 20),
         ({"max_episode_steps": 1000, "control_rate": 100.0}, 1000),
         ({"max_episode_steps": 30, "duration": 0.4}, 20),
         ({"max_episode_steps": 10, "duration": 0.4}, 10),
@@ -317,7 +276,7 @@ def test_pd_control_knows_the_length_of_its_observations():
         ({}, 500),
     ],
 )
-def test_a_limit_in_steps_holds_in_every_interface_and_its_description(given, steps):
+def test_limit_in_steps_holds_in_every_interface(given, steps):
     still = {"observation": "truth", "action": "velocity", **given}
     single = gymnasium.make("QuadGym/Hover-v0", **still)
     vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **still)
@@ -333,20 +292,3 @@ def test_a_limit_in_steps_holds_in_every_interface_and_its_description(given, st
         assert not terminated
         assert truncated == (k == steps)
     assert info["ending"] == Ending.TIME_LIMIT
-
-
-def test_without_any_limit_the_description_has_none():
-    env = gymnasium.make("QuadGym/Hover-v0", duration=0.0, max_episode_steps=-1)
-    assert env.unwrapped.flights.batch.max_steps == 0
-    assert env.spec.max_episode_steps is None
-
-
-def test_an_environment_within_another_keeps_its_own_limit():
-    class Outer(gymnasium.Env):
-        def __init__(self):
-            self.inner = QuadEnv("hover")
-
-    gymnasium.register("OuterForLimits-v0", entry_point=Outer, max_episode_steps=7)
-    outer = gymnasium.make("OuterForLimits-v0", disable_env_checker=True)
-    assert outer.unwrapped.inner.flights.batch.max_steps == 500
-    del gymnasium.registry["OuterForLimits-v0"]

@@ -91,19 +91,8 @@ def write_bin(file, recorded):
     for (_, received, values), place in zip(recorded.gnss, geodetic(recorded), strict=True):
         e, n, u = values["gnss_velocity"]
         course = np.degrees(np.arctan2(e, n)) % 360.0
-        add(
-            "GPS",
-            received,
-            0,
-            3,
-            round(1e3 * received),
-            2300,
-            *place,
-            np.hypot(e, n),
-            course,
-            -u,
-            0.0,
-        )
+        speed = (np.hypot(e, n), course, -u, 0.0)
+        add("GPS", received, 0, 3, round(1e3 * received), 2300, *place, *speed)
         add("GPA", received, 0, 0.3, 0.6, 0.1)
     for time, _, value in recorded.aids[0]:
         add("BARO", time, 0, value[0])
@@ -131,11 +120,15 @@ def test_a_log_of_ardupilot_is_the_log_that_was_flown(recorded, table, tmp_path)
     assert len(replay(log, sensors=PX4, start={"heading": 0.0})) > 100
 
 
-def test_files_that_are_no_logs_of_ardupilot_are_refused(tmp_path):
-    pytest.importorskip("pymavlink")
-    (tmp_path / "some.bin").write_bytes(bytes(1000))
-    with pytest.raises(ValueError, match=r"some.bin must be a log of ArduPilot"):
-        read_log(tmp_path / "some.bin")
+@pytest.mark.parametrize(
+    ("name", "kind", "library"),
+    [("some.bin", "a log of ArduPilot", "pymavlink"), ("some.bag", "a bag of ROS", "rosbags")],
+)
+def test_files_of_another_kind_are_refused(tmp_path, name, kind, library):
+    pytest.importorskip(library)
+    (tmp_path / name).write_bytes(bytes(1000))
+    with pytest.raises(ValueError, match=f"{name} must be {kind}"):
+        read_log(tmp_path / name)
     with pytest.raises(FileNotFoundError, match=r"none.bin"):
         read_log(tmp_path / "none.bin")
 
@@ -213,13 +206,6 @@ def test_a_bag_of_ros_is_the_log_that_was_flown(recorded, table, tmp_path, versi
         np.testing.assert_allclose(found.time - BOOT, expected.time, atol=2e-6)
         np.testing.assert_allclose(found.received - BOOT, expected.received, atol=2e-6)
     assert len(replay(log, sensors=PX4, start={"heading": 0.0})) > 100
-
-
-def test_files_that_are_no_bags_are_refused(tmp_path):
-    pytest.importorskip("rosbags")
-    (tmp_path / "some.bag").write_bytes(bytes(1000))
-    with pytest.raises(ValueError, match=r"some.bag must be a bag of ROS"):
-        read_log(tmp_path / "some.bag")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from scipy import stats
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.params.task import TaskParams
 from tests.field_flights import fly, nees, steps
 
 FLIGHTS = 20_000
@@ -90,7 +89,7 @@ def test_draws_come_on_top_of_the_motion(moving):
     assert (on_top.min() >= 2.0 - 1e-12) & (on_top.max() <= 3.0 + 1e-12)
 
 
-def test_a_velocity_that_a_reset_gives_replaces_that_of_the_start(moving):
+def test_velocity_of_a_reset_replaces_that_of_the_start(moving):
     batch = begun(16, options={"velocity": (0.5, 0.0, 0.0)})
     np.testing.assert_array_equal(batch.record("v"), np.tile((0.5, 0.0, 0.0), (16, 1)))
     np.testing.assert_array_equal(batch.record("v_hat"), batch.record("v"))
@@ -113,14 +112,9 @@ def test_a_pad_for_a_start_in_the_air_is_refused(start, pad):
         gymnasium.make("QuadGym/Circle-v0", pad=pad, start=start)
 
 
-def test_a_warm_filter_is_as_close_to_a_moving_start_as_to_a_hovering_one():
+def test_warm_filter_is_as_close_to_a_moving_start():
     errors = [
         np.abs(batch.record("v_hat") - batch.record("v")).mean()
         for batch in (begun(2000, start, filter_start="warm") for start in ("moving", "hover"))
     ]
     assert errors[0] == pytest.approx(errors[1], rel=0.1)
-
-
-def test_which_starts_may_be_on_the_ground():
-    found = [s for s in quad_gym.params.task.STARTS if TaskParams(start=s).may_start_on_ground]
-    assert found == ["ground", "mixed"]

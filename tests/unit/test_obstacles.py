@@ -6,9 +6,9 @@ from scipy.spatial import cKDTree
 
 import quad_gym
 from quad_gym import Cylinder, Wall, WorldParams
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle, require_room
 from quad_gym.records import FEATURE_SLICE, MAX_OBSTACLES, Ending, Source
+from tests.builders import batch as batch_of
 
 WALL = Wall(center_I=(0.5, -0.2, 1.0), size=(3.0, 0.6, 2.0), yaw=0.7)
 MAST = Cylinder(center_I=(-0.4, 0.3, 0.8), radius=0.5, height=1.8)
@@ -121,7 +121,7 @@ def test_lines_of_sight_are_those_that_samples_of_the_line_say(obstacle):
     assert 200 < hidden.sum() < 2800
 
 
-def test_what_hangs_on_a_wall_is_seen_from_before_it_and_not_from_behind():
+def test_marks_on_a_wall_are_hidden_from_behind():
     wall = Wall(center_I=(0.0, 0.0, 1.0), size=(6.0, 0.2, 4.0), yaw=0.3)
     along, across = axes(wall)[0], axes(wall)[1]
     marks = wall.center_I + np.linspace(-2.9, 2.9, 7)[:, np.newaxis] * along + 0.1 * across
@@ -134,20 +134,13 @@ def test_what_hangs_on_a_wall_is_seen_from_before_it_and_not_from_behind():
 # ---- in the kernels -----------------------------------------------------------------------------
 
 
+TRUTH = {"source": Source.TRUTH, "threads": 1}
+
+
 def circling(world, **options):
     """Flights on the truth around the origin, through whatever stands there."""
-    batch = FlightBatch(
-        8,
-        source=Source.TRUTH,
-        world=world,
-        threads=1,
-        task=quad_gym.TaskParams(
-            kind="circle", start="hover", randomize_reference=True, duration=0.0
-        ),
-        **options,
-    )
-    batch.reset(seeds=range(8))
-    return batch
+    task = quad_gym.TaskParams(start="hover", randomize_reference=True, duration=0.0)
+    return batch_of(8, world=world, task=task, **{**TRUTH, **options})
 
 
 def test_the_kernels_find_the_same_distances_inside_and_outside():
@@ -163,7 +156,7 @@ def test_the_kernels_find_the_same_distances_inside_and_outside():
     assert inside > 20
 
 
-def test_a_collision_is_found_at_its_tick_and_judged_at_the_end_of_its_step():
+def test_collision_in_a_step_ends_the_episode_after_it():
     barred = (Wall(center_I=(x, 0.0, 1.0), size=(4.0, 0.2, 4.0)) for x in (-3.5, 3.5))
     world = WorldParams(obstacles=tuple(barred))
     ticks, steps = circling(world), circling(world, control_rate=25.0)
@@ -189,8 +182,7 @@ def test_contact_is_contact_to_the_last_bit(gap, touches):
     # at rest on its pad, at (4, 0, 0); the wall's face is at x = 4.5
     wall = Wall(center_I=(4.75, 0.0, 0.0), size=(0.5, 2.0, 2.0))
     world = WorldParams(obstacles=(wall,), vehicle_radius=0.5 - gap)
-    batch = FlightBatch(1, source=Source.TRUTH, world=world, threads=1)
-    batch.reset(seeds=[0])
+    batch = batch_of(1, world=world, **TRUTH)
     assert batch.record("obstacle_distance")[0] == 0.5
     assert bool(batch.record("collided")[0]) is touches
 
@@ -264,9 +256,8 @@ SHIFTED = WorldParams(
 )
 
 
-def test_shifts_are_uniform_within_their_reach_and_shared_by_those_that_follow():
-    batch = FlightBatch(2000, source=Source.TRUTH, world=SHIFTED, threads=1)
-    batch.reset(seeds=range(2000))
+def test_shifts_are_uniform_and_shared_by_followers():
+    batch = batch_of(2000, world=SHIFTED, **TRUTH)
     nominal = np.array([o.center_I for o in SHIFTED.obstacles])
     shift = batch.record("obstacle_center")[:, :3] - nominal
     own = shift[:, 1] - shift[:, 0]
@@ -282,16 +273,14 @@ def test_shifts_are_uniform_within_their_reach_and_shared_by_those_that_follow()
         assert abs(np.mean(values**2) * 3.0 / reach**2 - 1.0) < 8.0 * np.sqrt(0.8 / 2000)
     np.testing.assert_allclose(own[:, [0, 2]], 0.0, atol=1e-12)
     assert (shift[:, 2, :2] == 0.0).all()
-    again = FlightBatch(3, source=Source.TRUTH, world=SHIFTED, threads=1)
-    again.reset(seeds=range(3))
+    again = batch_of(3, world=SHIFTED, **TRUTH)
     np.testing.assert_array_equal(
         again.record("obstacle_center"), batch.record("obstacle_center", np.arange(3))
     )
 
 
 def test_a_new_episode_has_new_places_and_has_touched_nothing():
-    batch = FlightBatch(4, source=Source.TRUTH, world=SHIFTED, threads=1)
-    batch.reset(seeds=range(4))
+    batch = batch_of(4, world=SHIFTED, **TRUTH)
     before = batch.record("obstacle_center")
     batch._blocks["collided"] = 1.0
     batch.reset(mask=np.array([True, False, True, False]))
@@ -305,41 +294,21 @@ def test_a_new_episode_has_new_places_and_has_touched_nothing():
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("obstacles", "message"),
     [
-        (lambda: Wall(size=(1.0, -0.1, 2.0)), r"Wall.size must be greater than 0, got -0.1"),
-        (lambda: Wall(size=(1.0, 2.0)), r"Wall.size must have shape \(3\)"),
-        (lambda: Wall(yaw=np.nan), "Wall.yaw must be finite"),
-        (lambda: Wall(center_I=(0.0, np.inf, 0.0)), "Wall.center_I must be finite"),
-        (lambda: Wall(center_I=(0.0, 1e5, 0.0)), "Wall.center_I must be at most 10000"),
-        (lambda: Cylinder(radius=0.0), "Cylinder.radius must be greater than 0"),
-        (lambda: Cylinder(height=-1.0), "Cylinder.height must be greater than 0"),
-        (lambda: Cylinder(shift_I=(-1.0, 0.0, 0.0)), "Cylinder.shift_I must be at least 0"),
-        (lambda: Wall(follows=-1), "Wall.follows must be at least 0"),
-        (lambda: WorldParams(obstacles=(Wall(follows=0),)), r"obstacles\[0\].follows must be"),
-        (lambda: WorldParams(obstacles=Wall()), "WorldParams.obstacles must be a tuple"),
-        (lambda: WorldParams(obstacles=("wall",)), "must hold Wall and Cylinder, got 'wall'"),
-        (
-            lambda: WorldParams(obstacles=(Wall(),) * (MAX_OBSTACLES + 1)),
-            f"must be at most {MAX_OBSTACLES}, got {MAX_OBSTACLES + 1}",
-        ),
-        (lambda: WorldParams(vehicle_radius=0.0), "WorldParams.vehicle_radius must be greater"),
-        (
-            lambda: WorldParams(geofence=((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))),
-            "geofence must be a lower and an upper corner",
-        ),
-        (lambda: WorldParams(geofence=(0.0, 1.0)), "WorldParams.geofence must have shape"),
+        ((Wall(follows=0),), r"obstacles\[0\].follows must be"),
+        (("wall",), "must hold Wall and Cylinder, got 'wall'"),
+        ((Wall(),) * (MAX_OBSTACLES + 1), f"at most {MAX_OBSTACLES}, got {MAX_OBSTACLES + 1}"),
     ],
 )
-def test_wrong_obstacles_are_refused(make, message):
+def test_invalid_obstacles_are_refused(obstacles, message):
     with pytest.raises(ValueError, match=message):
-        make()
+        WorldParams(obstacles=obstacles)
 
 
 def test_starts_in_the_way_are_refused_before_anything_changes():
     world = WorldParams(obstacles=(WALL, MAST), geofence=((-5.0, -5.0, -1.0), (5.0, 5.0, 4.0)))
-    batch = FlightBatch(2, source=Source.TRUTH, world=world, threads=1)
-    batch.reset(seeds=[0, 1])
+    batch = batch_of(2, world=world, **TRUTH)
     before = batch.snapshot()
     with pytest.raises(ValueError, match=r"farther than vehicle_radius=0\.42 m from all obstacles"):
         batch.reset(position=[WALL.center_I, (0.0, 3.0, 1.0)])

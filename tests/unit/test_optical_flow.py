@@ -25,7 +25,7 @@ def expected(r, v, R_BI, w):
     return np.array([x - w[1], y + w[0], distance, cosine])
 
 
-def test_measurements_have_the_closed_form_and_the_noise_of_the_parameters():
+def test_measurements_have_the_closed_form_and_their_noise():
     suite = CRAZYFLIE.replace(
         optical_flow=CRAZYFLIE.optical_flow.replace(rate=200.0),
         range_finder=CRAZYFLIE.range_finder.replace(rate=200.0),

@@ -24,90 +24,48 @@ def circle(n=201, duration=10.0, gap=0.1):
     )
 
 
-def band(trace, low=0.5, high=2.0):
-    return plots.Band(low=low * trace.error, high=high * trace.error, label="range")
-
-
 def axes_of(figure):
     (axes,) = figure.axes
     return axes
 
 
-class TestHeadingTicks:
-    def test_begin_on_the_path_and_point_along_the_heading(self):
-        trace = circle()
-        ticks = plots.heading_ticks(
-            trace.time, trace.position, 7.0 * trace.heading, every=2.5, length=0.5
-        )
-        want = [[4, 0], [0, 4], [-4, 0], [0, -4], [4, 0]]
-        np.testing.assert_allclose(ticks[:, 0], want, atol=1e-12)
-        np.testing.assert_allclose(ticks[:, 1], 3.5 / 4.0 * np.array(want), atol=1e-12)
-
-    @pytest.mark.parametrize("dt", [0.005, 0.1, 1.0 / 3.0])
-    def test_rounding_loses_no_tick(self, dt):
-        time = dt * np.arange(round(10.0 / dt) + 1)
-        position = np.stack([time, 0.0 * time], axis=1)
-        ticks = plots.heading_ticks(time, position, position + 1.0, every=1.0, length=1.0)
-        np.testing.assert_allclose(ticks[:, 0, 0], np.arange(11), atol=dt / 2 + 1e-9)
-
-
-class TestPath:
-    def test_shows_path_reference_and_start_to_scale(self):
-        trace = circle()
-        axes = axes_of(plots.path_figure(trace, "Title"))
-        assert axes.get_aspect() == 1.0
-        assert axes.get_title(loc="left") == "Title"
-        assert "[m]" in axes.get_xlabel()
-        assert "[m]" in axes.get_ylabel()
-        flown, reference, start = axes.lines
-        np.testing.assert_array_equal(flown.get_xydata(), trace.position[:, :2])
-        np.testing.assert_array_equal(reference.get_xydata(), trace.reference[:, :2])
-        np.testing.assert_array_equal(start.get_xydata(), trace.position[:1, :2])
+def test_figures_show_the_flight_and_its_reference():
+    trace = circle()
+    axes = axes_of(plots.flight_figure(plots.draw_path, trace, title="Title"))
+    assert (axes.get_aspect(), axes.get_title(loc="left")) == (1.0, "Title")
+    flown, reference, start = axes.lines
+    np.testing.assert_array_equal(flown.get_xydata(), trace.position[:, :2])
+    np.testing.assert_array_equal(reference.get_xydata(), trace.reference[:, :2])
+    np.testing.assert_array_equal(start.get_xydata(), trace.position[:1, :2])
+    axes = axes_of(plots.flight_figure(plots.draw_height, trace))
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), trace.position[:, 2])
+    np.testing.assert_array_equal(axes.lines[1].get_ydata(), trace.reference[:, 2])
+    band = plots.Band(low=0.5 * trace.error, high=2.0 * trace.error, label="range")
+    axes = axes_of(plots.flight_figure(plots.draw_error, trace, band, label="seed 7"))
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["seed 7", "range"]
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), trace.error)
+    assert len(axes.collections) == 1
 
 
-class TestHeight:
-    def test_shows_height_and_reference(self):
-        trace = circle()
-        axes = axes_of(plots.height_figure(trace))
-        flown, reference, _ = axes.lines
-        np.testing.assert_array_equal(flown.get_ydata(), trace.position[:, 2])
-        np.testing.assert_array_equal(reference.get_ydata(), trace.reference[:, 2])
-        assert axes.get_xlabel() == "time [s]"
-        assert axes.get_ylabel() == "height z [m]"
-
-
-class TestError:
-    def labels(self, axes):
-        return [text.get_text() for text in axes.get_legend().get_texts()]
-
-    def test_shows_flight_and_band(self):
-        trace = circle()
-        axes = axes_of(plots.error_figure(trace, band(trace), label="seed 7"))
-        assert self.labels(axes) == ["seed 7", "range"]
-        np.testing.assert_array_equal(axes.lines[-1].get_ydata(), trace.error)
-        assert len(axes.collections) == 1
-        assert axes.get_yscale() == "log"
+def figure():
+    return plots.flight_figure(plots.draw_height, circle())
 
 
 def test_saves_png_and_svg_with_the_same_bytes_each_time(tmp_path):
-    first = plots.save_figure(plots.height_figure(circle()), tmp_path / "first")
-    second = plots.save_figure(plots.height_figure(circle()), tmp_path / "second")
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    first = plots.save_figure(figure(), tmp_path / "first")
+    second = plots.save_figure(figure(), tmp_path / "second")
     assert [file.name for file in first] == ["first.png", "first.svg"]
     assert first[0].read_bytes()[:4] == b"\x89PNG"
     assert b"<svg" in first[1].read_bytes()
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes()
-
-
-def test_leaves_the_users_matplotlib_settings_alone(tmp_path):
-    import matplotlib
-
-    before = dict(matplotlib.rcParams)
-    plots.save_figure(plots.path_figure(circle()), tmp_path / "path")
     assert dict(matplotlib.rcParams) == before
 
 
 def test_missing_matplotlib_is_explained(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r'pip install "quad-gym\[plot\]"'):
-        plots.path_figure(circle())
+        plots.flight_figure(plots.draw_path, circle())

@@ -88,7 +88,7 @@ def test_the_reference_is_the_one_that_tasks_are_shown(task):
     np.testing.assert_array_equal(batch.read("time"), view.time)
 
 
-def test_measurements_are_those_of_a_view_and_nan_where_there_was_none():
+def test_measurements_are_those_of_a_view_or_nan():
     suite = AIDED.with_rates(gnss=10.0, camera=20.0)
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=quad_gym.Task(), sensors=suite)
     env.reset(seed=2)
@@ -104,8 +104,10 @@ def test_measurements_are_those_of_a_view_and_nan_where_there_was_none():
     assert 0 < fixes < 20
 
 
-def test_an_unknown_quantity_is_refused_with_the_one_that_may_be_meant():
-    batch = FlightBatch(1)
+def test_unknown_quantities_are_refused_and_drawn_ones_are_read():
+    batch = builders.batch(4, randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
+    np.testing.assert_array_equal(batch.read("mass"), batch.drawn()["mass"])
+    np.testing.assert_array_equal(batch.read("mass", np.array([2])), batch.drawn()["mass"][2:3])
     with pytest.raises(ValueError, match=r"must be a quantity.* did you mean position"):
         batch.read("positon")
     for wrong in ("r", "v_hat", None, 3):
@@ -125,10 +127,3 @@ def test_estimates_without_a_filter_are_refused():
         else:
             batch.read(name)
     assert not batch.read("filter_diverged").any()
-
-
-def test_a_drawn_parameter_is_read_by_its_name():
-    batch = FlightBatch(4, randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
-    batch.reset(seeds=range(4))
-    np.testing.assert_array_equal(batch.read("mass"), batch.drawn()["mass"])
-    np.testing.assert_array_equal(batch.read("mass", np.array([2])), batch.drawn()["mass"][2:3])

@@ -45,7 +45,7 @@ def assert_uncorrelated(a, b):
 
 
 @pytest.mark.parametrize("instance", INSTANCES)
-def test_threefry_gives_the_published_answers_for_thirteen_rounds(instance):
+def test_threefry_of_13_rounds_has_the_published_answers(instance):
     # known answers of the Random123 library, threefry2x64 with 13 rounds
     ones = 2**64 - 1
     pi = (0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 0x082EFA98EC4E6C89)

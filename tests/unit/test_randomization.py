@@ -10,22 +10,12 @@ from scipy import special, stats
 
 import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.task.draws import normal_quantile
 from quad_gym.packing.flight import params_record
-from quad_gym.params.distributions import Distribution
 from quad_gym.params.randomization import nominal_values
-from quad_gym.records import (
-    COLUMNS,
-    DRAWABLES,
-    DRAWN_SIZE,
-    FEATURE_SLICE,
-    PARAMETERS_DRAWN,
-    Control,
-    Source,
-)
+from quad_gym.records import COLUMNS, DRAWABLES, FEATURE_SLICE, PARAMETERS_DRAWN, Control, Source
 from quad_gym.rotations import euler_to_dcm
-from tests.builders import flown_batch
+from tests.builders import batch, flown_batch
 from tests.unit.alarms import ALARM, alarm_score
 from tests.unit.compiled import Compiled
 
@@ -57,10 +47,7 @@ def test_the_normal_quantile_is_that_of_scipy(p):
 
 DRAWS = {
     "mass": (Uniform(0.8, 1.2, relative=True), stats.uniform(0.8 * 0.78, 0.4 * 0.78)),
-    "motor_time_constant": (
-        LogUniform(0.5, 2.0, relative=True),
-        stats.loguniform(0.025, 0.1),
-    ),
+    "motor_time_constant": (LogUniform(0.5, 2.0, relative=True), stats.loguniform(0.025, 0.1)),
     "wind_north": (Normal(1.0, 2.0), stats.norm(1.0, 2.0)),
     "wind_east": (
         Normal(0.0, 1.0, low=-0.5, high=2.0, offset=True),
@@ -77,17 +64,11 @@ DRAWS = {
 
 @pytest.fixture(scope="module")
 def drawn():
-    count = 20_000
-    batch = FlightBatch(
-        count,
-        source=Source.TRUTH,
-        world=WORLD,
-        randomization={name: given for name, (given, _) in DRAWS.items()},
-    )
-    batch.reset(seeds=range(count))
-    first = batch.drawn()
-    batch.reset()
-    return first, batch.drawn()
+    randomization = {name: given for name, (given, _) in DRAWS.items()}
+    flights = batch(20_000, source=Source.TRUTH, world=WORLD, randomization=randomization)
+    first = flights.drawn()
+    flights.reset()
+    return first, flights.drawn()
 
 
 @pytest.mark.parametrize("name", DRAWS)
@@ -101,18 +82,15 @@ def test_draws_have_their_distribution(drawn, name):
         assert low <= component.min() < component.max() <= high
 
 
-def test_draws_of_parameters_components_flights_and_episodes_are_independent(drawn):
-    columns = [
-        np.reshape(episode[name], (20_000, -1)).T for episode in drawn for name in sorted(DRAWS)
-    ]
+def test_all_draws_are_independent(drawn):
+    """Of parameters, components, flights and episodes."""
+    columns = [np.reshape(part[name], (20_000, -1)).T for part in drawn for name in sorted(DRAWS)]
     ranks = stats.rankdata(np.concatenate(columns), axis=1)
     scores = np.corrcoef(ranks)[np.triu_indices(len(ranks), 1)] * math.sqrt(20_000)
     assert np.abs(scores).max() < alarm_score(scores.size)
     centered = ranks - ranks.mean(axis=1, keepdims=True)
-    along = (
-        (centered[:, 1:] * centered[:, :-1]).mean(axis=1) / centered.var(axis=1) * math.sqrt(19_999)
-    )
-    assert np.abs(along).max() < alarm_score(along.size)
+    along = (centered[:, 1:] * centered[:, :-1]).mean(axis=1) / centered.var(axis=1)
+    assert np.abs(along).max() < alarm_score(along.size) / math.sqrt(19_999)
 
 
 @given(st.floats(-5.0, 5.0), st.floats(0.0, 3.0), st.floats(0.1, 4.0), st.integers(0, 3))
@@ -125,35 +103,21 @@ def test_bounds_hold_to_the_last_bit(low, width, sigma, kind):
         given = Normal(low + 0.3 * width, sigma, low, high + 1e-3)
     elif kind == 3:
         given = Uniform(low, high, offset=True)
-    batch = FlightBatch(16, source=Source.TRUTH, randomization={"start_yaw": given}, threads=1)
-    batch.reset(seeds=range(16))
-    values = batch.read("start_yaw")
+    drawing = {"randomization": {"start_yaw": given}, "threads": 1}
+    values = batch(16, source=Source.TRUTH, **drawing).read("start_yaw")
     assert (given.support[0] <= values).all()
     assert (values <= given.support[1]).all()
 
 
 def test_a_parameter_does_not_depend_on_which_others_are_drawn():
+    mass, inertia = Uniform(0.5, 1.0), (None, LogUniform(0.5, 2.0, relative=True), None)
     few, many = (
-        FlightBatch(12, source=Source.TRUTH, randomization=randomization)
-        for randomization in (
-            {"mass": Uniform(0.5, 1.0)},
-            {"mass": Uniform(0.5, 1.0), "inertia": LogUniform(0.5, 2.0, relative=True)},
-        )
+        batch(12, source=Source.TRUTH, randomization=randomization)
+        for randomization in ({"mass": mass}, {"mass": mass, "inertia": inertia})
     )
-    few.reset(seeds=range(12))
-    many.reset(seeds=range(12))
     np.testing.assert_array_equal(few.read("mass"), many.read("mass"))
-    assert len(np.unique(many.read("inertia"))) == 36
-
-
-def test_a_component_without_a_distribution_stays():
-    batch = FlightBatch(
-        5, source=Source.TRUTH, randomization={"lever_arm_B": (None, Uniform(0.1, 0.2), None)}
-    )
-    batch.reset(seeds=range(5))
-    lever_arm = batch.read("lever_arm_B")
-    np.testing.assert_array_equal(lever_arm[:, [0, 2]], 0.0)
-    assert len(np.unique(lever_arm[:, 1])) == 5
+    drawn = many.read("inertia")  # whose other components stay
+    assert [len(np.unique(column)) for column in drawn.T] == [1, 12, 1]
 
 
 # ---- drawn flights are flights with these parameters ---------------------------------------------
@@ -235,18 +199,18 @@ TOLD = [d.name for d in DRAWABLES if d.name not in OTHERS and not d.name.startsw
 
 
 @pytest.mark.parametrize("name", TOLD)
-def test_a_flight_that_draws_a_parameter_is_the_flight_that_has_it(name):
-    batch = flown(seeds=(2, 3), world=WORLD, randomization={name: some_distribution(name)})
-    value = np.atleast_1d(batch.read(name)[1])
+def test_flight_that_draws_a_parameter_is_the_one_that_has_it(name):
+    drawing = flown(seeds=(2, 3), world=WORLD, randomization={name: some_distribution(name)})
+    value = np.atleast_1d(drawing.read(name)[1])
     nominal = nominal_values(LAB, SUITE, WORLD)[COLUMNS[name]]
     assert (value != nominal).any()
     vehicle, sensors, world = told(name, value)
     told_so = flown(true_vehicle=vehicle, true_sensors=sensors, world=world)
-    assert_alike(batch, told_so, flight=1)
+    assert_alike(drawing, told_so, flight=1)
     if name in ("max_voltage", "battery_resistance"):
         return  # limits that this vehicle does not reach: see the next test
     unaware = flown(world=WORLD)
-    changed = [n for n in SEEN if (batch.record(n)[1] != unaware.record(n)[0]).any()]
+    changed = [n for n in SEEN if (drawing.record(n)[1] != unaware.record(n)[0]).any()]
     assert changed, "the draw changes nothing"
 
 
@@ -255,11 +219,9 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
     task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e3)
     heavy = {"vehicle": LAB.replace(mass=2.5), "control": Control.MOTOR, "task": task}
     given = Uniform(0.01, 0.03) if name == "battery_resistance" else some_distribution(name)
-    drawing = FlightBatch(2, **heavy, world=WORLD, randomization={name: given})
-    drawing.reset(seeds=(2, 3))
+    drawing = batch(2, 2, **heavy, world=WORLD, randomization={name: given})
     vehicle, _, world = told(name, np.atleast_1d(drawing.read(name)[1]))
-    telling = FlightBatch(1, **heavy, world=world, true_vehicle=vehicle.replace(mass=2.5))
-    telling.reset(seeds=[3])
+    telling = batch(1, 3, **heavy, world=world, true_vehicle=vehicle.replace(mass=2.5))
     for _ in range(100):
         drawing.step(np.ones((2, 4)))
         telling.step(np.ones((1, 4)))
@@ -274,26 +236,20 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
 )  # fmt: skip
 def test_what_is_known_is_what_filter_and_controller_believe(name):
     given = Randomization({name: some_distribution(name)}, known=True)
-    batch = flown(seeds=(2, 3), world=WORLD, randomization=given)
-    vehicle, sensors, world = told(name, np.atleast_1d(batch.read(name)[1]))
-    assert_alike(batch, flown(vehicle=vehicle, sensors=sensors, world=world), flight=1)
+    drawing = flown(seeds=(2, 3), world=WORLD, randomization=given)
+    vehicle, sensors, world = told(name, np.atleast_1d(drawing.read(name)[1]))
+    assert_alike(drawing, flown(vehicle=vehicle, sensors=sensors, world=world), flight=1)
 
 
 def test_each_rotor_has_its_efficiency():
     """After a tick the body turns and climbs as these forces say."""
-    still = {
-        "source": Source.TRUTH,
-        "control": Control.MOTOR,
-        "task": quad_gym.TaskParams(kind="hover", start="hover", duration=0.0),
-    }
-    plain = FlightBatch(1, **still)
-    batch = FlightBatch(1, **still, randomization={"rotor_efficiency": Uniform(0.8, 1.0)})
-    plain.reset(seeds=[1])
-    batch.reset(seeds=[1])
-    start_v = plain.record("v")[0]
-    efficiency, W = batch.read("rotor_efficiency")[0], batch.record("rotor_speeds")[0]
-    batch.step(np.zeros((1, 4)))
-    v, w, R = batch.record("v")[0], batch.record("w")[0], batch.record("R_seen")[0]
+    task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0)
+    still = {"source": Source.TRUTH, "control": Control.MOTOR, "task": task}
+    start_v = batch(1, 1, **still).record("v")[0]
+    weak = batch(1, 1, **still, randomization={"rotor_efficiency": Uniform(0.8, 1.0)})
+    efficiency, W = weak.read("rotor_efficiency")[0], weak.record("rotor_speeds")[0]
+    weak.step(np.zeros((1, 4)))
+    v, w, R = weak.record("v")[0], weak.record("w")[0], weak.record("R_seen")[0]
     forces = efficiency * LAB.thrust_coefficient * W**2
     torque = LAB.effectiveness[1:] @ forces
     np.testing.assert_allclose(w, 0.005 * np.linalg.solve(np.array(LAB.inertia), torque), rtol=2e-3)
@@ -301,19 +257,16 @@ def test_each_rotor_has_its_efficiency():
     np.testing.assert_allclose(R @ pull, [0.0, 0.0, forces.sum() / LAB.mass], atol=0.1)
 
 
-def test_a_camera_turned_in_its_mount_sees_what_a_turned_camera_sees():
-    batch = flown(ticks=0, randomization={"camera_rotation": Uniform(-0.1, 0.1),
-                                          "pixel_sigma": Uniform(1e-9, 1e-9)})  # fmt: skip
-    turn = euler_to_dcm(batch.read("camera_rotation")[0])
-    camera = SUITE.camera
-    R_BI = quad_gym.rotations.quaternion_to_dcm(batch.record("q"))[0]
-    for i, X in enumerate(camera.features_I):
-        if batch.record("block_valid")[:, FEATURE_SLICE][0, i] == 0.0:
-            continue
-        in_B = R_BI @ (np.array(X) - batch.record("r")[0]) - camera.position_B
+def test_image_of_a_drawn_camera_rotation_is_that_of_a_turned_camera():
+    draws = {"camera_rotation": Uniform(-0.1, 0.1), "pixel_sigma": Uniform(1e-9, 1e-9)}
+    flight, camera = flown(ticks=0, randomization=draws), SUITE.camera
+    turn = euler_to_dcm(flight.read("camera_rotation")[0])
+    R_BI = quad_gym.rotations.quaternion_to_dcm(flight.record("q"))[0]
+    for i in np.flatnonzero(flight.record("block_valid")[0, FEATURE_SLICE]):
+        in_B = R_BI @ (np.array(camera.features_I[i]) - flight.record("r")[0]) - camera.position_B
         in_C = turn @ euler_to_dcm(camera.attitude) @ in_B
         expected = camera.focal_length * in_C[:2] / in_C[2]
-        np.testing.assert_allclose(batch.record("pixels")[0, i], expected, atol=1e-6)
+        np.testing.assert_allclose(flight.record("pixels")[0, i], expected, atol=1e-6)
 
 
 def test_the_start_is_spread_as_told():
@@ -327,12 +280,9 @@ def test_the_start_is_spread_as_told():
     }
     plain, spread = flown(0, range(20)), flown(0, range(20), randomization=given)
     drawn = spread.drawn()
-    np.testing.assert_allclose(
-        spread.record("r"), plain.record("r") + drawn["start_position_I"], atol=1e-12
-    )
-    np.testing.assert_allclose(
-        spread.record("v"), plain.record("v") + drawn["start_velocity_I"], atol=1e-12
-    )
+    for name, draw in (("r", "start_position_I"), ("v", "start_velocity_I")):
+        expected = plain.record(name) + drawn[draw]
+        np.testing.assert_allclose(spread.record(name), expected, atol=1e-12)
     np.testing.assert_array_equal(spread.record("w"), drawn["start_body_rates"])
     eulers = [
         quad_gym.rotations.dcm_to_euler(quad_gym.rotations.quaternion_to_dcm(b.record("q")))
@@ -341,12 +291,8 @@ def test_the_start_is_spread_as_told():
     change = np.stack([drawn[f"start_{n}"] for n in ("roll", "pitch", "yaw")], axis=1)
     turned = (eulers[1] - eulers[0] - change + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(turned, 0.0, atol=1e-9)
-
-
-def test_a_start_that_the_caller_gives_stays():
-    batch = FlightBatch(3, randomization={"start_position_I": Uniform(1.0, 2.0)})
-    batch.reset(seeds=range(3), position=(0.5, 0.6, 0.7))
-    np.testing.assert_array_equal(batch.record("r"), [[0.5, 0.6, 0.7]] * 3)
+    spread.reset(seeds=range(20), position=(0.5, 0.6, 0.7))  # what a caller gives stays
+    np.testing.assert_array_equal(spread.record("r"), [[0.5, 0.6, 0.7]] * 20)
 
 
 def test_parameter_record_begins_with_the_columns_of_draws():
@@ -362,9 +308,3 @@ def test_parameter_record_begins_with_the_columns_of_draws():
             np.testing.assert_array_equal(
                 np.ravel(record[drawable.name]), columns[COLUMNS[drawable.name]]
             )
-
-
-def test_the_table_has_a_column_for_every_number():
-    assert sum(d.size for d in DRAWABLES) == DRAWN_SIZE == len(nominal_values(LAB, SUITE, WORLD))
-    assert len(COLUMNS) == len(DRAWABLES)
-    assert isinstance(Uniform(0.0, 1.0), Distribution)

@@ -23,11 +23,7 @@ SUITE = quad_gym.sensor_suite("lab")
         ({"inertia": (Uniform(1, 2), 3.0, None)}, "'inertia' must hold distributions"),
         ({"mass": Uniform(0.0, 1.0)}, "'mass' .* bounds .* got 0: .*mass must be greater than 0"),
         ({"mass": Uniform(-0.5, 0.5, relative=True)}, "'mass' .*mass must be greater than 0"),
-        (
-            {"mass": Normal(0.8, 0.1)},
-            "'mass' .* bounds .* got -0.03: .*mass must be greater than 0",
-        ),
-        ({"mass": Uniform(0.5, 20.0)}, "'mass' .*light enough to hover"),
+        ({"mass": Normal(0.8, 0.1)}, "'mass' .* got -0.03: .*mass must be greater than 0"),
         ({"mass": Uniform(1.0, 20.0, relative=True)}, "'mass' .*light enough to hover"),
         ({"max_voltage": Uniform(1.0, 12.0)}, "'max_voltage' .*light enough to hover"),
         ({"max_voltage": Uniform(4, 12), "mass": Uniform(1, 2)}, "must leave .* able to hover"),
@@ -37,6 +33,13 @@ SUITE = quad_gym.sensor_suite("lab")
         ({"wind_speed": Normal(3.0, 1.0)}, "'wind_speed' must stay at least 0"),
         ({"wind_speed": Uniform(0, 1), "wind_east": Uniform(0, 1)}, "not by both"),
         ([("mass", Uniform(0.5, 1.0))], "must be distributions by name"),
+        ({"position_sigma_I": Uniform(1e-12, 1e-3)}, "'position_sigma_I'.* at least 1e-9 m for"),
+        ({"inertia": Uniform(1e-7, 1e-6)}, "'inertia' .* inertia must be at least"),
+        ({"inertia": LogUniform(0.03, 1.0, relative=True)}, "'inertia' .* with a mass of 0.78 kg"),
+        ({"center_of_mass_B": Uniform(-5.0, 5.0)}, "'center_of_mass_B' .* between the rotors"),
+        ({"center_of_mass_B": (Uniform(0.0, 0.21), None, None)}, "between the rotors"),
+        ({"gust_wind_speed": Uniform(0.0, 201.0)}, "WorldParams.gust_wind_speed must be at most"),
+        ({"wind_up": Uniform(0.0, 201.0)}, "WorldParams.wind_I must be at most 200 m/s"),
     ],
     ids=str,
 )  # fmt: skip
@@ -45,19 +48,25 @@ def test_a_randomization_that_is_invalid_is_refused(given, message):
         FlightBatch(1, randomization=given)
 
 
-def test_gnss_that_is_not_there_cannot_be_drawn():
-    for name in ("position_sigma_I", "baseline_sigma", "primary_antenna_B", "secondary_antenna_B"):
-        with pytest.raises(ValueError, match=f"'{name}' needs GNSS"):
-            FlightBatch(1, sensors="indoor", randomization={name: Uniform(0.1, 0.2)})
-    FlightBatch(1, sensors="indoor", randomization={"pixel_sigma": Uniform(1.0, 2.0)})
-
-
-def test_a_camera_that_is_not_there_cannot_be_drawn():
-    for name in ("pixel_sigma", "camera_rotation", "camera_position_B", "focal_length"):
-        with pytest.raises(ValueError, match=f"'{name}' needs a camera"):
-            FlightBatch(
-                1, sensors=SUITE.replace(camera=None), randomization={name: Uniform(1.0, 2.0)}
-            )
+@pytest.mark.parametrize(
+    ("suite", "names", "needed"),
+    [
+        (
+            quad_gym.sensor_suite("indoor"),
+            ("position_sigma_I", "baseline_sigma", "primary_antenna_B", "secondary_antenna_B"),
+            "GNSS",
+        ),
+        (
+            SUITE.replace(camera=None),
+            ("pixel_sigma", "camera_rotation", "camera_position_B", "focal_length"),
+            "a camera",
+        ),
+    ],
+)
+def test_numbers_of_absent_sensors_cannot_be_drawn(suite, names, needed):
+    for name in names:
+        with pytest.raises(ValueError, match=f"'{name}' needs {needed}"):
+            FlightBatch(1, sensors=suite, randomization={name: Uniform(0.1, 0.2)})
 
 
 @pytest.mark.parametrize(
@@ -82,26 +91,15 @@ def test_a_distribution_that_is_invalid_is_refused(make, message):
         make()
 
 
-def test_what_is_not_drawn_cannot_be_read():
-    batch = FlightBatch(1, randomization={"mass": Uniform(0.6, 0.9)})
-    with pytest.raises(ValueError, match=r"got 'inertia': one of .*, mass$"):
-        batch.read("inertia")
-
-
 SIGMAS = ("accel_noise_density", "gyro_noise_density", "accel_bias_sigma", "gyro_bias_sigma")
 SIGMAS = (*SIGMAS, "position_sigma_I", "baseline_sigma", "pixel_sigma")
 
 
 @pytest.mark.parametrize("name", SIGMAS)
-def test_a_drawn_deviation_of_zero_is_refused_as_the_parameter_refuses_it(name):
+def test_drawn_deviation_of_zero_is_refused(name):
     with pytest.raises(ValueError, match=rf"randomization of '{name}'.*Params.{name} must be"):
         FlightBatch(1, randomization={name: Uniform(0.0, 0.0)})
     FlightBatch(1, randomization={name: Uniform(1e-6, 1e-6)})
-
-
-def test_drawn_positions_with_hardly_any_noise_are_refused_as_a_filter_refuses_them():
-    with pytest.raises(ValueError, match=r"'position_sigma_I'.* at least 1e-9 m for a filter"):
-        FlightBatch(1, randomization={"position_sigma_I": Uniform(1e-12, 1e-3)})
 
 
 @pytest.mark.parametrize(
@@ -113,7 +111,7 @@ def test_drawn_positions_with_hardly_any_noise_are_refused_as_a_filter_refuses_t
         ("camera_position_B", "CameraParams.position_B"),
     ],
 )
-def test_a_drawn_place_off_the_vehicle_is_refused_as_the_parameter_refuses_it(name, parameter):
+def test_drawn_place_off_the_vehicle_is_refused(name, parameter):
     for far in (Uniform(0.0, 101.0), (None, Uniform(-1e15, 0.0), None), Normal(0.0, 20.0)):
         with pytest.raises(ValueError, match=rf"{parameter} must be on the vehicle, within 100 m"):
             FlightBatch(1, randomization={name: far})
@@ -130,27 +128,3 @@ def test_antennas_whose_draws_may_come_together_are_refused():
         with pytest.raises(ValueError, match=r"secondary_antenna_B.* must be apart"):
             FlightBatch(1, randomization=draws)
     FlightBatch(1, randomization={"primary_antenna_B": near})
-
-
-@pytest.mark.parametrize(
-    ("draws", "message"),
-    [
-        ({"inertia": Uniform(1e-7, 1e-6)}, "'inertia' .* inertia must be at least"),
-        ({"inertia": LogUniform(0.03, 1.0, relative=True)}, "'inertia' .* with a mass of 0.78 kg"),
-        ({"center_of_mass_B": Uniform(-5.0, 5.0)}, "'center_of_mass_B' .* between the rotors"),
-        ({"center_of_mass_B": (Uniform(0.0, 0.21), None, None)}, "between the rotors"),
-        ({"gust_wind_speed": Uniform(0.0, 201.0)}, "WorldParams.gust_wind_speed must be at most"),
-        ({"wind_up": Uniform(0.0, 201.0)}, "WorldParams.wind_I must be at most 200 m/s"),
-    ],
-    ids=str,
-)  # fmt: skip
-def test_draws_that_no_vehicle_flies_with_are_refused(draws, message):
-    with pytest.raises(ValueError, match=message):
-        FlightBatch(1, randomization=draws)
-
-
-def test_a_vehicle_whose_mass_is_all_in_its_middle_is_refused():
-    with pytest.raises(
-        ValueError, match=r"VehicleParams.inertia must be at least 7.64e-05 kg m\^2"
-    ):
-        quad_gym.VehicleParams(inertia=((1e-6, 0, 0), (0, 1e-6, 0), (0, 0, 2e-6)))

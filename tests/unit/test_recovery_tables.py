@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery, longest
+from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery
 from quad_gym.experiments.consistency import recovery
 from quad_gym.experiments.consistency.cases import CaseFlights, run_cases
 from quad_gym.faults import GyroBiasStep
@@ -19,16 +19,8 @@ def flights_of(consistent, flagged, large_error, every=0.5):
     return Recovery(time, *(np.array(flags, bool) for flags in (consistent, flagged, large_error)))
 
 
-def test_runs_are_the_longest_ones():
-    flags = np.array([[1, 0], [1, 1], [0, 1], [1, 1], [1, 0], [1, 0]], bool)
-    assert longest(flags).tolist() == [3, 3]
-    assert longest(flags[:, :0]).shape == (0,)
-
-
-def test_alarms_are_missed_after_two_seconds_of_large_errors_without_a_flag():
-    large_error = [[1, 1, 1]] * 4 + [
-        [0, 0, 1]
-    ]  # 2 s, 2 s, and 2.5 s of which one instant is flagged
+def test_long_large_errors_without_a_flag_are_missed_alarms():
+    large_error = [[1, 1, 1]] * 4 + [[0, 0, 1]]  # for 2 s, 2 s and 2.5 s
     flagged = [[0, 0, 0]] * 3 + [[0, 1, 0]] + [[0, 0, 0]]
     found = flights_of(np.zeros((5, 3)), flagged, large_error)
     assert found.long_large_error().tolist() == [True, True, True]
@@ -39,11 +31,7 @@ def test_alarms_are_missed_after_two_seconds_of_large_errors_without_a_flag():
 
 def test_the_time_to_recover_is_until_nearly_all_are_consistent():
     consistent = np.ones((8, 100), bool)
-    consistent[:3], consistent[4, 0], consistent[5, :2] = (
-        False,
-        False,
-        False,
-    )  # one in a hundred is allowed
+    consistent[:3] = consistent[4, 0] = consistent[5, :2] = False  # 1 in 100 is allowed
     found = flights_of(consistent, np.zeros_like(consistent), ~consistent)
     assert found.time_to(found.consistent, 1.0) == pytest.approx(1.0)
     assert found.time_to(found.consistent, 2.5) == pytest.approx(1.0)
@@ -78,20 +66,18 @@ def test_consistent_flights_and_flags_equal_a_plain_computation():
 def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     chosen = [t for t in recovery.cases() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
     chosen = [t for t in chosen if t.keywords]  # hovering takes a minute
-    cells = run_cases(
-        chosen, tmp_path / "recovery", CaseFlights(32), recovery.measure, recovery.table_of
-    )
+    how = (recovery.measure, recovery.table_of)
+    cells = run_cases(chosen, tmp_path / "recovery", CaseFlights(32), *how)
     values = cells["rtk, camera_occlusion"]["values"]
     assert values["consistent"] >= 90.0
     assert set(values) == set(recovery.COLUMNS)
     assert "| rtk, camera_occlusion | " in (tmp_path / "recovery.md").read_text()
-    calm = {"values": {"alarms_per_hour": 0.25, "flagged": 0.01, "hours": 6.0}, "miss": False}
-    calm |= {"expected": "", "filters_failed": 0}
-    lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "miss": True, "expected": ""}
-    lost |= {"filters_failed": 1}
-    text = recovery.table_of(
-        {"a": lost, "b": lost | {"expected": "why"}, "c": calm}, CaseFlights(32)
-    )
+    calm = {"values": {"alarms_per_hour": 0.25, "flagged": 0.01, "hours": 6.0}, "misses": []}
+    calm |= {"expected": {}, "filters_failed": 0}
+    lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "misses": ["undetected"]}
+    lost |= {"expected": {}, "filters_failed": 1}
+    rows = {"a": lost, "b": lost | {"expected": {"": "why"}}, "c": calm}
+    text = recovery.table_of(rows, CaseFlights(32))
     assert "| **5.0** |" in text.splitlines()[4]
     assert "**1 filters failed**" in text
     assert "| *5.0* |" in text

@@ -33,7 +33,7 @@ def color_near(frame, at, radius, color):
     return bool((abs(part.astype(int) - color) < 40).all(axis=-1).any())
 
 
-def test_features_and_reference_are_drawn_where_the_view_projects_them(flight):
+def test_features_and_reference_are_drawn_where_they_project(flight):
     frame = Renderer("fixed", (640, 480)).draw(flight)
     view = fixed_view(flight, 640, round(0.765 * 480))
     for feature in flight.scene.features_I:
@@ -71,10 +71,8 @@ def test_what_the_gate_rejects_is_gray():
     flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
     view = fixed_view(flight, 640, round(0.765 * 480))
     measured = np.flatnonzero(np.isfinite(flight["gnss_position"][:, 0]))
-    assert flight["gnss_decision"][measured[[2, -1]], 0].tolist() == [
-        GateDecision.ACCEPTED,
-        GateDecision.REJECTED,
-    ]
+    decisions = flight["gnss_decision"][measured[[2, -1]], 0].tolist()
+    assert decisions == [GateDecision.ACCEPTED, GateDecision.REJECTED]
     for k, is_purple in ((measured[2], True), (measured[-1], False)):
         frame = Renderer("fixed", (640, 480)).draw(flight.until(flight["time"][k]))
         at = view.project(flight["gnss_position"][k])[0]
@@ -86,13 +84,8 @@ def test_a_replay_shows_what_was_seen_live(flight):
     import gymnasium
 
     for view in ("fixed", "chase"):
-        env = gymnasium.make_vec(
-            "QuadGym/Hover-v0",
-            num_envs=1,
-            render_mode="rgb_array",
-            render_view=view,
-            max_episode_steps=30,
-        )
+        made = {"render_mode": "rgb_array", "render_view": view, "max_episode_steps": 30}
+        env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=1, **made)
         env.reset(seed=1)
         replayed = Renderer(view)
         for k in range(30):

@@ -9,7 +9,7 @@ import pytest
 
 import quad_gym
 from quad_gym.analysis.replay_plots import replay_figure
-from quad_gym.estimation import LOG_COLUMNS, Log, Stream, read_log, replay
+from quad_gym.estimation import LOG_COLUMNS, Stream, read_log, replay
 from quad_gym.estimation.player import Player
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
 from tests.console_commands import run
@@ -95,7 +95,7 @@ def test_a_log_of_px4_replays_to_the_errors_of_the_flight(tmp_path):
 
 
 @pytest.mark.slow  # three flights of 5 s, each replayed
-def test_what_a_log_of_px4_lacks_of_the_attitude_is_the_second_antenna(tmp_path):
+def test_baselines_added_to_a_px4_log_give_the_attitude_of_the_flight(tmp_path):
     """With the baselines that its messages cannot hold, attitude errors are within 10 %, too.
 
     From 1 s on, over all flights together; 6 % were seen. Without baselines it is 20 to 50 %.
@@ -153,7 +153,15 @@ def test_a_regular_log_replays_as_it_was_flown(flight):
     assert gap.max() < 0.1 * sizes(errors_in_flight(recorded, k)[late])[0]
 
 
-def test_the_memory_of_corrections_is_of_seconds_whatever_the_stamps_are(flight):
+def test_measurements_that_come_too_late_or_without_a_sensor_are_counted(table):
+    result = replay(table, sensors=RTK, window=0.12)
+    assert 0 < result.too_late < 70
+    assert np.isfinite(result.position).all()
+    result = replay(small(barometer=np.ones(4)), sensors=RTK, start={"heading": 0.0})
+    assert result.unused == ("barometer",)
+
+
+def test_memory_of_corrections_does_not_depend_on_stamps(flight):
     """Fixes 0.1 ms after a sample split the next one: the filter ends with as many corrections."""
     recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, most_ticks=1)
     found = []
@@ -167,12 +175,6 @@ def test_the_memory_of_corrections_is_of_seconds_whatever_the_stamps_are(flight)
         found.append(engine.read("corrected_variance")[0])
         assert engine.read("tick")[0] * RTK.imu.dt == pytest.approx(SECONDS, abs=0.02)
     np.testing.assert_allclose(found[1], found[0], rtol=0.05)
-
-
-def test_what_has_come_too_late_is_left_out_and_counted(table):
-    result = replay(table, sensors=RTK, window=0.12)
-    assert 0 < result.too_late < 70
-    assert np.isfinite(result.position).all()
 
 
 # ---- ways to give a log --------------------------------------------------------------------------
@@ -228,14 +230,6 @@ def test_a_log_from_elsewhere_has_its_origin_at_the_first_fix(table):
     assert np.abs(result.position[:20]).max() < 0.2
 
 
-def test_geodetic_coordinates_go_there_and_back():
-    for lat, lon, height in ((0.5, -1.7, 169.0), (-1.2, 3.0, -40.0), (math.pi / 2, 0.0, 10.0)):
-        place = geodetic_to_ecef(lat, lon, height)
-        np.testing.assert_allclose(ecef_to_geodetic(place), (lat, lon, height), atol=2e-8)
-    with pytest.raises(ValueError, match="latitude"):
-        geodetic_to_ecef(1.6, 0.0, 0.0)
-
-
 def test_reported_noise_counts_unless_it_is_told_not_to(table):
     short = {name: column[:900] for name, column in table.items() if "pixel" not in name}
     suite = RTK.replace(camera=None)
@@ -289,7 +283,6 @@ def small(**changes):
         ({"time": None}, "must have a column time"),
         ({"gyro": None}, "must have a column gyro_x"),
         ({"time": np.array([0.0, 0.02, 0.01, 0.03])}, r"must increase, got 0\.010000 s after"),
-        ({"time": np.array([0.0, 0.01, 0.01, 0.03])}, "must increase"),
         ({"time": np.zeros(3)}, "equal lengths"),
         ({"time": np.array(["a", "b", "c", "d"])}, "column time must hold numbers"),
         ({"gyro": np.zeros((4, 2))}, "gyro must have shape"),
@@ -302,7 +295,6 @@ def small(**changes):
         ({"pixel_0_u": np.zeros(4), "pixel_0_v": np.zeros(4)}, "12 features of the suite, got 1"),
         ({"time": np.array([0.0, 0.01, 1.5, 1.51])}, "at most 1 s apart, got none from 0.010 s"),
         ({"time": np.array([0.0, np.nan, 0.02, 0.03])}, "must increase|must be finite"),
-        ({"gnss_enu": None, **latitude(200.0)}, r"^gnss_lat \[deg\] must be at most 90, got 200"),
         ({"gnss_enu": None, **latitude(-90.5)}, r"^gnss_lat \[deg\] must be at least -90, got"),
     ],
 )  # fmt: skip
@@ -314,24 +306,15 @@ def test_bad_logs_raise_by_name(changes, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"sensors": "nothing"}, "sensors must be one of"),
         ({"sensors": 3}, "sensors must be a SensorSuite"),
         ({"estimator": "kf"}, "estimator must be one of"),
         ({"body": "ned"}, "body must be one of"),
         ({"window": -1.0}, "window"),
         ({"reported_noise": 1}, "reported_noise"),
-        ({"start": {"nose": 1.0}}, "^nose is not a keyword of start"),
         ({"start": {"headings": 1.0}}, "^headings is not a keyword of start.*did you mean heading"),
         ({"start": "x"}, "^start must be values by name, or None, got 'x'"),
-        ({"start": 1.0}, "^start must be values by name"),
-        (
-            {"start": {"course": True}, "sensors": "lab"},
-            "sensors take none: GnssParams.velocity_si",
-        ),
-        (
-            {"start": {"course": True}},
-            "must have a GNSS velocity, but the first fix of the log has",
-        ),
+        ({"start": {"course": True}, "sensors": "lab"}, "sensors take none: GnssParams.velocity_s"),
+        ({"start": {"course": True}}, "must have a GNSS velocity, but the first fix of the log"),
     ],
 )
 def test_bad_options_raise_by_name(options, message):
@@ -362,16 +345,10 @@ def test_files_that_are_none_are_refused(tmp_path):
         replay(tmp_path / "broken.ulg", sensors=RTK)
 
 
-def test_measurements_without_a_sensor_in_the_suite_are_named():
-    result = replay(small(barometer=np.ones(4)), sensors=RTK, start={"heading": 0.0})
-    assert result.unused == ("barometer",)
-    assert isinstance(read_log(small()), Log)
-
-
 # ---- the command ---------------------------------------------------------------------------------
 
 
-def test_the_command_writes_estimates_innovations_and_configuration(recorded, tmp_path):
+def test_command_writes_estimates_and_innovations(recorded, tmp_path):
     pytest.importorskip("matplotlib")
     recorded.write_csv(tmp_path / "flight.csv")
     options = ("flight.csv", "--sensors", "rtk", "--output", "out")

@@ -21,18 +21,12 @@ def test_json_of_everything(tmp_path):
     file = write_json(tmp_path / "a.json", value)
     want = {"1": {"x": None, "where": "a/b"}, "array": [0, 1], "flag": True}
     assert json.loads(file.read_text()) == want
-
-
-def test_json_knows_no_infinity():
     assert as_json((1.5, np.float64("inf"))) == [1.5, None]
 
 
 def test_csv_leaves_unknown_cells_empty(tmp_path):
     columns = {"a": np.array([1.0, np.nan]), "b": ["x", None]}
     assert write_csv(tmp_path / "a.csv", columns).read_text() == "a,b\n1.0,x\n,\n"
-
-
-def test_csv_refuses_columns_of_different_length(tmp_path):
     with pytest.raises(ValueError, match="shorter"):
         write_csv(tmp_path / "a.csv", {"a": [1, 2], "b": [1]})
 

@@ -36,7 +36,7 @@ def test_a_fit_finds_the_model_that_has_drawn_its_data(tmp_path):
     np.testing.assert_array_equal(ResidualModel.load(tmp_path / "model.json").A, found.A)
 
 
-def test_errors_that_would_grow_without_end_and_too_few_are_refused():
+def test_growing_or_too_few_errors_are_refused():
     rng = np.random.default_rng(0)
     errors = 0.01 * rng.standard_normal((400, 20, SIZE)) + 1.01 ** np.arange(400)[:, None, None]
     with pytest.raises(ValueError, match="stationary"):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from quad_gym import rotations
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.linalg import load3, store3, store4, store33
+from quad_gym.kernels.maths.linalg import load3, store
 from quad_gym.kernels.maths.rotation import (
     dcm_to_quaternion,
     euler_to_dcm,
@@ -23,31 +23,31 @@ from tests.unit.compiled import Compiled
 
 @kernel
 def store_rows(array, matrix):
-    """Like `store33` for a matrix some of whose entries are plain zeros."""
-    store3(array[0], matrix[0])
-    store3(array[1], matrix[1])
-    store3(array[2], matrix[2])
+    """Like `store` for a matrix some of whose entries are plain zeros."""
+    store(array[0], matrix[0])
+    store(array[1], matrix[1])
+    store(array[2], matrix[2])
 
 
 def attitude(f, option):
     e = load3(f.e)
     R_BI = euler_to_dcm(e)
-    store33(f.R, R_BI)
+    store(f.R, R_BI)
     q = dcm_to_quaternion(R_BI)
-    store4(f.q, q)
-    store33(f.R_again, quaternion_to_dcm(q))
-    store4(f.q_rate, quaternion_rate(q, load3(f.w)))
+    store(f.q, q)
+    store(f.R_again, quaternion_to_dcm(q))
+    store(f.q_rate, quaternion_rate(q, load3(f.w)))
     even, odd, parts = split_rotation(e)
     store_rows(f.even, even)
     store_rows(f.odd, odd)
-    store4(f.parts, parts)
+    store(f.parts, parts)
     x, d = load3(f.x), load3(f.d)
     there = turn_pair(even, odd, x, d)
-    store3(f.pair[0], there[0])
-    store3(f.pair[1], there[1])
+    store(f.pair[0], there[0])
+    store(f.pair[1], there[1])
     back = turn_pair_back(even, odd, x, d)
-    store3(f.pair_back[0], back[0])
-    store3(f.pair_back[1], back[1])
+    store(f.pair_back[0], back[0])
+    store(f.pair_back[1], back[1])
 
 
 FIELDS = {"e": (3,), "w": (3,), "q": (4,), "q_rate": (4,), "parts": (4,), "x": (3,), "d": (3,)}
@@ -140,30 +140,16 @@ def test_a_quaternion_survives_the_way_through_a_rotation(q):
 @given(unit_quaternions)
 def test_quaternions_are_hamiltons_from_body_to_inertial(q):
     R_IB = Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix()
-    np.testing.assert_allclose(rotations.quaternion_to_dcm(q), R_IB.T, rtol=0.0, atol=1e-15)
+    stacked = rotations.quaternion_to_dcm([[q, 1e-3 * q]])  # which need not be normalized
+    np.testing.assert_allclose(stacked, np.tile(R_IB.T, (1, 2, 1, 1)), rtol=0.0, atol=1e-15)
+    assert rotations.dcm_to_euler(stacked).shape == (1, 2, 3)
+    assert rotations.dcm_to_quaternion(stacked).shape == (1, 2, 4)
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (-1, 1, 1)])
 def test_half_turns_have_well_conditioned_quaternions(axis):
     R = Rotation.from_rotvec(np.pi * np.array(axis) / np.linalg.norm(axis)).as_matrix().T
     q = rotations.dcm_to_quaternion(R)
-    np.testing.assert_allclose(rotations.quaternion_to_dcm(q), R, rtol=0.0, atol=1e-15)
-
-
-def test_a_quaternion_is_normalized_first():
-    q = np.array([0.1, -0.2, 0.3, 0.4])
-    R = rotations.quaternion_to_dcm(q / np.linalg.norm(q))
-    np.testing.assert_allclose(rotations.quaternion_to_dcm(1e-3 * q), R, rtol=0.0, atol=1e-15)
-
-
-def test_leading_axes_are_kept():
-    e = random_eulers(2, 24).reshape(2, 3, 4, 3)
-    R = rotations.euler_to_dcm(e)
-    assert R.shape == (2, 3, 4, 3, 3)
-    q = rotations.dcm_to_quaternion(R)
-    assert q.shape == (2, 3, 4, 4)
-    assert rotations.dcm_to_euler(R).shape == e.shape
-    np.testing.assert_allclose(R[1, 2, 3], rotations.euler_to_dcm(e[1, 2, 3]), rtol=0, atol=0)
     np.testing.assert_allclose(rotations.quaternion_to_dcm(q), R, rtol=0.0, atol=1e-15)
 
 
@@ -195,7 +181,7 @@ def test_a_pair_of_turned_vectors_is_that_of_the_rotations(instance, size):
 
 
 @pytest.mark.parametrize("instance", INSTANCES)
-def test_the_even_part_of_a_small_rotation_keeps_its_relative_accuracy(instance):
+def test_even_part_of_a_small_rotation_keeps_its_accuracy(instance):
     # to second order: -1/2 [e x]^2 with the order of the rotations, here about one axis at a time
     for axis, (i, j) in enumerate([(1, 2), (0, 2), (0, 1)]):
         e = np.zeros((1, 3))
@@ -238,20 +224,9 @@ def test_floats_and_lanes_give_the_same_attitude(e, w):
     ],
 )
 def test_bad_input_is_refused_by_name(function, name, good_shape):
-    for bad in (
-        np.zeros((*good_shape[:-1], 5)),
-        0.0,
-        [],
-        "north",
-        [[1.0], [1.0, 2.0]],
-        None,
-        np.full(good_shape, np.nan),
-        np.full(good_shape, np.inf),
-    ):
+    arrays = (np.zeros((*good_shape[:-1], 5)), *(np.full(good_shape, x) for x in (np.nan, np.inf)))
+    for bad in (0.0, [], "north", [[1.0], [1.0, 2.0]], None, *arrays):
         with pytest.raises(ValueError, match=rf"^{name} must"):
             function(bad)
-
-
-def test_the_zero_quaternion_is_no_rotation():
     with pytest.raises(ValueError, match=r"^q must not be zero"):
         rotations.quaternion_to_dcm([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])

@@ -7,13 +7,13 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.estimation import UnscentedKalmanFilter
 from quad_gym.faults import GnssJump, GyroBiasStep, PositionJump
 from quad_gym.frames import ecef_to_enu
 from quad_gym.records import AID_GROUPS, POSITION_BLOCK, Aid, Source
+from tests.builders import batch as flights_of
 from tests.field_flights import fly, nees, steps
 from tests.unit.test_inflation import R_BI, R_IG, SUITE, started
 
@@ -26,9 +26,7 @@ RIGHT = stats.chi2.ppf(0.9973, 9)
 def hovering(**keywords):
     if keywords.get("source") is not Source.TRUTH:
         keywords["filter_start"] = "warm"
-    batch = FlightBatch(16, task=TASK_DEFAULTS["hover"], gains="tuned", **keywords)
-    batch.reset(seeds=range(16))
-    return batch
+    return flights_of(16, **{"task": TASK_DEFAULTS["hover"], "gains": "tuned", **keywords})
 
 
 def silent(batch):
@@ -48,7 +46,7 @@ def share_silent(batch, times, every):
 # ---- who watches -------------------------------------------------------------------------------
 
 
-def test_flights_of_the_default_suite_that_meet_faults_say_that_they_are_lost():
+def test_flights_of_the_default_suite_with_faults_are_lost():
     env = QuadVectorEnv(16, "hover", faults=STEP, start="hover", filter_start="warm")
     _, info = env.reset(seed=0)
     assert not info["filter_diverged"].any()
@@ -69,27 +67,18 @@ def test_watching_changes_no_bit_of_a_flight(suite):
         np.testing.assert_array_equal(plain.record(name), watching.record(name))
     assert np.isnan(plain.record("block_nis")).all()
     assert np.isfinite(watching.record("block_nis")[:, 0]).all()
-
-
-def test_flights_that_end_when_lost_watch():
-    task = TASK_DEFAULTS["hover"].replace(truncate_when_diverged=True)
-    batch = FlightBatch(2, task=task)
-    batch.reset(seeds=[0, 1])
-    steps(batch, 0.1)
-    assert np.isfinite(batch.record("block_nis")[:, 0]).all()
-
-
-def test_flights_on_the_truth_have_no_filter_that_watches():
-    batch = hovering(source=Source.TRUTH, faults="rotor_loss")
-    steps(batch, 0.1)
-    assert np.isnan(batch.record("block_nis")).all()
+    ends = hovering(task=TASK_DEFAULTS["hover"].replace(truncate_when_diverged=True))
+    on_truth = hovering(source=Source.TRUTH, faults="rotor_loss")
+    for batch, watches in ((ends, True), (on_truth, False)):
+        steps(batch, 0.1)
+        assert (np.isfinite(batch.record("block_nis")[:, 0]) == watches).all()
 
 
 # ---- without a gate ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("tau", [100.0, 1e6])
-def test_a_filter_that_mends_nothing_is_lost_for_about_as_long_as_it_is_wrong(tau):
+def test_filter_is_lost_about_as_long_as_it_is_wrong(tau):
     """Of biases that hardly change, the filter becomes surer and surer, and its errors last."""
     suite = quad_gym.sensor_suite("standard")
     imu = suite.imu.replace(accel_bias_tau=tau, gyro_bias_tau=tau)
@@ -107,7 +96,7 @@ def test_a_filter_that_mends_nothing_is_lost_for_about_as_long_as_it_is_wrong(ta
     assert np.mean(lost[65:]) <= 0.02 + 2.0 * np.mean(wrong[30:])
 
 
-def test_flights_without_a_gate_are_not_wrong_in_silence_after_a_jump_of_gnss():
+def test_jump_of_gnss_does_not_go_undetected_without_a_gate():
     fault = GnssJump(start=1.0, duration=2.0, size=0.5)
     batch = fly(quad_gym.sensor_suite("standard"), 128, filter_start="warm", faults=fault)
     steps(batch, 5.0)
@@ -117,7 +106,7 @@ def test_flights_without_a_gate_are_not_wrong_in_silence_after_a_jump_of_gnss():
 # ---- a drift that is none ------------------------------------------------------------------------
 
 
-def test_corrections_of_the_drift_have_the_variance_that_they_are_given():
+def test_corrections_of_the_drift_have_their_variance():
     """Their sums over a second in deviations, 3 x 256 of them, are standard normal."""
     batch = fly(quad_gym.sensor_suite("consumer"), 256, start="hover", filter_start="warm")
     steps(batch, 5.0)
@@ -138,7 +127,7 @@ def test_a_jump_of_the_vehicle_is_not_taken_for_drift_of_gnss(size):
     assert share_silent(batch, times=5, every=2.0) <= 0.1
 
 
-def test_few_flights_are_silent_long_after_jumps_of_the_vehicle_in_any_direction():
+def test_few_jumps_of_the_vehicle_go_undetected():
     """Some six of a hundred were, as their doubts fell short of the jump; 0.75 % are.
 
     Of 320 flights more than eight are so with a probability of 1e-3 then.
@@ -192,7 +181,7 @@ def test_a_wrong_position_is_mended_however_far_off_it_is():
     assert np.sqrt(flight.ukf.covariance[0, 0]) < 20.0
 
 
-def test_an_outlier_of_a_fix_is_no_jump_while_another_sensor_is_doubted():
+def test_outlier_of_a_fix_is_no_jump_after_rejected_fields():
     flight = AtRest()
     for _ in range(20):
         flight.measure()

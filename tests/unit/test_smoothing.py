@@ -27,12 +27,9 @@ LINEAR = RTK.replace(
     camera=None,
     gnss=RTK.gnss.replace(primary_antenna_B=(0.0, 0.0, 0.0), secondary_antenna_B=None),
     imu=RTK.imu.replace(
-        accel_vibration=0.0,
-        gyro_vibration=0.0,
-        accel_scale_sigma=0.0,
-        accel_misalignment_sigma=0.0,
-        accel_bias_tau=2.0,
-        gyro_bias_tau=3.0,
+        **dict.fromkeys(("accel_vibration", "gyro_vibration"), 0.0),
+        **dict.fromkeys(("accel_scale_sigma", "accel_misalignment_sigma"), 0.0),
+        **{"accel_bias_tau": 2.0, "gyro_bias_tau": 3.0},
     ),
     estimator=RTK.estimator.replace(false_alarm_probability=0.0, recursive_update_threshold=None),
 )
@@ -111,7 +108,7 @@ def least_squares(table):
 
 
 @pytest.mark.parametrize("estimator", ["ukf", "ekf"])
-def test_a_linear_case_equals_least_squares_over_the_whole_trajectory(estimator):
+def test_linear_case_equals_least_squares(estimator):
     """Means within 0.2 % of their standard deviations, covariances within 0.2 %."""
     table = log_at_rest()
     start = at_rest(covariance=P0, time=0.0)
@@ -171,14 +168,14 @@ def test_smoothed_errors_are_consistent(flights):
     assert low < np.mean(nees) < high
 
 
-def test_covariances_are_positive_and_smaller_than_the_filters(flights):
+def test_covariances_are_positive(flights):
     for _, _, result in flights:
         units = result.sigma[:, :, np.newaxis] * result.sigma[:, np.newaxis]
         assert np.linalg.eigvalsh(result.covariance / units).min() > 0.0
         assert np.isfinite(result.difference).mean() > 0.95
 
 
-def test_covariances_are_positive_where_the_first_updates_turn_the_attitude():
+def test_covariances_are_positive_after_first_turns():
     """Drift of GNSS begins without variance, and the first magnetic headings are far off."""
     suite = CONSUMER.replace(barometer=PX4.barometer, magnetometer=PX4.magnetometer)
     result = smooth(Recorded(flown(suite, 2.0, seed=42), suite, seed=42).table(), sensors=suite)
@@ -186,7 +183,7 @@ def test_covariances_are_positive_where_the_first_updates_turn_the_attitude():
     assert np.linalg.eigvalsh(result.covariance / units).min() > 0.0
 
 
-def test_differences_of_filter_and_smoother_are_consistent_for_the_right_suite_only(flights):
+def test_differences_are_consistent_for_the_right_suite_only(flights):
     shares = np.mean([list(result.consistency().values()) for *_, result in flights], axis=0)
     assert shares.max() < 0.05
     recorded = Recorded(flown(PX4, 8.0, seed=20), PX4, seed=20)
@@ -196,7 +193,7 @@ def test_differences_of_filter_and_smoother_are_consistent_for_the_right_suite_o
     assert min(list(wrong.values())[:6]) > 0.2
 
 
-def test_the_command_writes_the_smoothed_trajectory(tmp_path):
+def test_command_writes_the_smoothed_trajectory(tmp_path):
     recorded = Recorded(flown(RTK, 3.0), RTK)
     recorded.write_csv(tmp_path / "flight.csv")
     options = ("--sensors", "rtk", "--smooth", "--no-figure", "--output", "out")

@@ -5,16 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quad_gym.kernels.maths.linalg import (
-    load3,
-    load4,
-    load33,
-    load44,
-    store3,
-    store4,
-    store33,
-    store_column3,
-)
+from quad_gym.kernels.maths.linalg import load3, load4, load33, load44, store
+from quad_gym.kernels.maths.matrices import store_column3
 from quad_gym.kernels.maths.vectors import outer, rounded, vector
 from tests.unit.compiled import Compiled
 
@@ -23,34 +15,34 @@ INSTANCES = ("on_floats", "on_lanes")
 
 def combine(f, option):
     u, v, m = load3(f.u), load3(f.v), load33(f.m)
-    store3(f.vectors[0], 2 * u - v * f.s)
-    store3(f.vectors[1], m @ u)
-    store3(f.vectors[2], -(m.T @ u))
-    store3(f.vectors[3], (1.0, 2.0, f.s) - u)
-    store3(f.vectors[4], vector(f.s, 0.0, 1.0) + vector(0.0, f.s, 0.0))
+    store(f.vectors[0], 2 * u - v * f.s)
+    store(f.vectors[1], m @ u)
+    store(f.vectors[2], -(m.T @ u))
+    store(f.vectors[3], (1.0, 2.0, f.s) - u)
+    store(f.vectors[4], vector(f.s, 0.0, 1.0) + vector(0.0, f.s, 0.0))
     for axis in (u, v):  # as other tuples, vectors are iterated over, indexed and unpacked
         x, y, z = axis
-        store3(f.vectors[5], load3(f.vectors[5]) + vector(x, y, axis[2] + 0.0 * z))
-    store33(f.matrices[0], m @ m.T - f.s * m)
+        store(f.vectors[5], load3(f.vectors[5]) + vector(x, y, axis[2] + 0.0 * z))
+    store(f.matrices[0], m @ m.T - f.s * m)
     rows = (u, v, (0.0, 1.0, f.s))
-    store33(f.matrices[1], outer(u, v) + rows)
-    store33(f.matrices[2], -m)
+    store(f.matrices[1], outer(u, v) + rows)
+    store(f.matrices[2], -m)
     store_column3(f.matrices[2], 0, option, u)
     q, w = load4(f.q), load44(f.w)
-    store4(f.fours[0], w @ q + f.s * q)
-    store4(f.fours[1], (w @ w.T) @ q)
+    store(f.fours[0], w @ q + f.s * q)
+    store(f.fours[1], (w @ w.T) @ q)
 
 
 def add_products(f, option):
     a, b, s = load3(f.a), load3(f.b), f.s
     m = (a, b, a)
-    store3(f.sums[0], a + s * b)
-    store3(f.sums[1], a - s * b)
-    store3(f.sums[2], s * b + a)
-    store3(f.sums[3], a + rounded(s * b))
-    store3(f.sums[4], s * a - s * b)
-    store33(f.outers[0], m + outer(a, b))
-    store33(f.outers[1], outer(a, b) + m)
+    store(f.sums[0], a + s * b)
+    store(f.sums[1], a - s * b)
+    store(f.sums[2], s * b + a)
+    store(f.sums[3], a + rounded(s * b))
+    store(f.sums[4], s * a - s * b)
+    store(f.outers[0], m + outer(a, b))
+    store(f.outers[1], outer(a, b) + m)
 
 
 threes = {"u": (3,), "v": (3,), "vectors": (6, 3), "m": (3, 3), "matrices": (3, 3, 3)}

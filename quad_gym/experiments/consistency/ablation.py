@@ -2,12 +2,11 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import Findings
@@ -78,20 +77,19 @@ def _sensors(suite: SensorSuite) -> dict[str, SensorSuite]:
 
 def _scaled(params: Any, factor: float, *names: str) -> Any:
     """Parameters of a sensor with some multiplied by a factor, as far as they are given."""
-    return _changed(params, lambda value: factor * np.array(value), names)
+    given = {k: getattr(params, k) for k in names if getattr(params, k) is not None}
+    return params.replace(
+        **{
+            k: tuple((factor * np.array(v)).tolist()) if np.ndim(v) else factor * v
+            for k, v in given.items()
+        }
+    )
 
 
 def _moved(params: Any, by: Vector, *names: str) -> Any:
     """Parameters of a sensor with a vector added to some, as far as they are given."""
-    return _changed(params, lambda value: np.add(value, by), names)
-
-
-def _changed(params: Any, change: Callable[[Any], NDArray[Any]], names: Sequence[str]) -> Any:
-    given = {name: getattr(params, name) for name in names}
-    changed = {k: change(value).tolist() for k, value in given.items() if value is not None}
-    return params.replace(
-        **{k: tuple(value) if isinstance(value, list) else value for k, value in changed.items()}
-    )
+    given = {k: getattr(params, k) for k in names if getattr(params, k) is not None}
+    return params.replace(**{k: tuple(np.add(v, by).tolist()) for k, v in given.items()})
 
 
 def _filters(suite: SensorSuite) -> Iterator[Fields]:

@@ -87,13 +87,11 @@ def run_cases(
         cases: Cases of the table.
         files: Output path without extension: numbers in .json and the table in .md. Both are
             written again after each case.
-        flights: CaseFlights of each case.
-        measure: Function that computes the results of a case, including "sensors".
+        flights: Flights of each case.
+        measure: Function that computes the results of a case: "values" by column, "misses",
+            "expected", "filters_failed" and "sensors".
         table: Function that formats the results of all cases.
         **head: Further parameters that an earlier run must have in common with this one.
-
-    Returns:
-        CaseResults of these cases.
     """
     file, chosen = files.with_suffix(".json"), list(cases)
     before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
@@ -109,13 +107,44 @@ def run_cases(
     return {case.name: done[case.name] for case in chosen}
 
 
-def markdown(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table in Markdown, with texts in its first and last column."""
-    head, *body = (f"| {' | '.join(row)} |" for row in rows)
-    return [head, "|---|" + "---:|" * (len(rows[0]) - 2) + "---|", *body]
+def case_table(
+    first: str,
+    columns: Mapping[str, str],
+    cells: CaseResults,
+    text: Callable[[float], str],
+    *head: Sequence[str],
+) -> list[str]:
+    """Lines of a table in Markdown: misses bold, or in italics if there is a reason.
+
+    Args:
+        first: Heading of the first column.
+        columns: Headings by name of the column.
+        cells: Results of the cases.
+        text: Format of a value.
+        *head: Rows above the cases.
+    """
+    rows = [[first, *columns.values(), "remarks"], *head]
+    for label, cell in cells.items():
+        texts = []
+        for name in columns:
+            value = cell["values"].get(name)
+            words = "" if value is None else text(value)
+            mark = "*" if {"", name} & cell["expected"].keys() else "**"
+            texts.append(f"{mark}{words}{mark}" if name in cell["misses"] else words)
+        remarks = [
+            f"{k.removeprefix('nis_')}: {v}" if k else v for k, v in cell["expected"].items()
+        ]
+        if cell["filters_failed"]:
+            remarks.append(f"**{cell['filters_failed']} filters failed**")
+        rows.append([label, *texts, "; ".join(remarks)])
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return [lines[0], "|---|" + "---:|" * len(columns) + "---|", *lines[1:]]
 
 
-def remark(reasons: Iterable[str], filters_failed: int) -> str:
-    """Reasons for misses, and the number of filters with a numerical failure."""
-    failed = [f"**{filters_failed} filters failed**"] if filters_failed else []
-    return "; ".join([*reasons, *failed])
+def unexpected(cells: CaseResults) -> int:
+    """Number of misses without a known reason."""
+    return sum(
+        not {"", name} & cell["expected"].keys()
+        for cell in cells.values()
+        for name in cell["misses"]
+    )

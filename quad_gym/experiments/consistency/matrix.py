@@ -8,7 +8,7 @@ over instants varies less. Misses are expected if the filter's model differs fro
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, Literal
 
 from quad_gym.analysis.consistency import PARTS, SENSOR_BLOCKS
@@ -18,27 +18,20 @@ from quad_gym.experiments.consistency.cases import (
     Case,
     CaseFlights,
     CaseResults,
+    case_table,
     fly,
-    markdown,
-    remark,
 )
 from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.distributions import Uniform
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import SUITES, sensor_suite
+from quad_gym.records import FREEDOMS
 
 STARTS: tuple[Literal["cold", "warm"], ...] = ("cold", "warm")
 CONDITIONS_TASK = "random_trajectory"
-FREEDOMS = {name: part.stop - part.start for name, part in PARTS.items()} | {
-    "nis_position": 3,
-    "nis_baseline": 2,
-    "nis_velocity": 3,
-    "nis_feature": 2,
-    "nis_barometer": 1,
-    "nis_magnetometer": 3,
-    "nis_optical_flow": 2,
-    "nis_range_finder": 1,
+COLUMN_FREEDOMS = {name: part.stop - part.start for name, part in PARTS.items()} | {
+    f"nis_{name}": FREEDOMS[blocks[0]] for name, blocks in SENSOR_BLOCKS.items()
 }
 """Degrees of freedom, by column: the means of a consistent filter."""
 
@@ -161,8 +154,11 @@ def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:
     found = fly(batch, flights, every=0.1)
     values = {name: part.overall for name, part in found.nees.items()}
     values |= {f"nis_{name}": part.overall for name, part in found.nis.items()}
-    bands = {name: chi_square_band(FREEDOMS[name], flights.count) for name in values}
-    misses = [name for name, value in values.items() if not bands[name].holds(value)]
+    misses = [
+        name
+        for name, value in values.items()
+        if not chi_square_band(COLUMN_FREEDOMS[name], flights.count).holds(value)
+    ]
     return {
         "values": values,
         "misses": misses,
@@ -179,46 +175,19 @@ def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:
 
 def table_of(cells: CaseResults, flights: CaseFlights) -> str:
     """Format the matrix in Markdown: misses bold, or in italics if they are expected."""
-    names = [*PARTS, *(f"nis_{name}" for name in SENSOR_BLOCKS)]
-    bands = [chi_square_band(FREEDOMS[name], flights.count) for name in names]
-    rows = [
-        [
-            "suite, task, start, condition",
-            *(name.removeprefix("nis_") for name in names),
-            "expected misses",
-        ],
-        ["95 % band", *(f"{low:.2f} to {high:.2f}" for low, high in bands), ""],
-    ]
-    for label, cell in cells.items():
-        expected = cell["expected"]
-        reasons = [f"{k.removeprefix('nis_')}: {v}" if k else v for k, v in expected.items()]
-        texts = [_text(name, cell) for name in names]
-        rows.append([label, *texts, remark(reasons, cell["filters_failed"])])
+    bands = [chi_square_band(n, flights.count) for n in COLUMN_FREEDOMS.values()]
+    band = ["95 % band", *(f"{low:.2f} to {high:.2f}" for low, high in bands), ""]
+    columns = {name: name.removeprefix("nis_") for name in COLUMN_FREEDOMS}
+    first = "suite, task, start, condition"
     lines = [
         f"Mean of NEES, then NIS, over {flights.count} flights. In a consistent filter:",
         "",
-        *markdown(rows),
+        *case_table(first, columns, cells, _text, band),
         "",
         "**Bold**: a miss. *Italics*: a miss that is expected, for the reason given.",
     ]
     return "\n".join(lines) + "\n"
 
 
-def _text(name: str, cell: Mapping[str, Any]) -> str:
-    """Format the value of a column, with the mark of a miss."""
-    value = cell["values"].get(name)
-    if value is None:
-        return ""
-    text = f"{value:.3g}" if value >= 100 else f"{value:.2f}"
-    if name not in cell["misses"]:
-        return text
-    return f"*{text}*" if {"", name} & cell["expected"].keys() else f"**{text}**"
-
-
-def unexpected(cells: CaseResults) -> int:
-    """Number of misses without a known reason."""
-    return sum(
-        not {"", name} & cell["expected"].keys()
-        for cell in cells.values()
-        for name in cell["misses"]
-    )
+def _text(value: float) -> str:
+    return f"{value:.3g}" if value >= 100 else f"{value:.2f}"

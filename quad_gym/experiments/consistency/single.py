@@ -1,9 +1,10 @@
 """Consistency of a filter in one configuration: report, figures and numbers."""
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSquare
 from quad_gym.analysis.consistency_flights import Findings
@@ -12,7 +13,7 @@ from quad_gym.analysis.consistency_plots import (
     mean_square_figure,
     whiteness_figure,
 )
-from quad_gym.analysis.plots import house_style, save_figure
+from quad_gym.analysis.plots import save_figure
 from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.experiments.consistency.cases import Case, CaseFlights, fly
 
@@ -27,28 +28,15 @@ def run_single(
     matched: bool,
     configuration: Any,
 ) -> None:
-    """Fly a case, print the report, and write figures and numbers.
+    """Fly a case, print the report, and write figures and numbers; see `measure_consistency`.
 
-    Args:
-        case: The configuration; its name is the title of the figures.
-        flights: Number, seeds and length of the flights.
-        output: Folder.
-        every: Time between two evaluations of the errors [s].
-        settle: Time at the start that is left out of the means [s].
-        matched: True to start the filters with errors drawn from their own covariance.
-        configuration: Options of the experiment, for the file.
+    The name of the case is the title of the figures; `configuration` is stored in the file.
     """
     began, batch = time.monotonic(), case.batch(flights.count, flights.threads)
     print(f"{case.name}; {flights.count:,} flights of {flights.duration:g} s, {case.task}.\n")
-    shown = began
-
-    def progress(flown: float) -> None:
-        nonlocal shown
-        if time.monotonic() > shown + 2.0:
-            shown = time.monotonic()
-            print(f"  {flown:.1f} of {flights.duration:g} s flown", file=sys.stderr, flush=True)
-
-    whole = fly(batch, flights, every=every, settle=settle, matched=matched, progress=progress)
+    options: dict[str, Any] = {"every": every, "settle": settle, "matched": matched}
+    with tqdm(total=flights.duration, desc="flying", unit=" s", mininterval=2.0) as bar:
+        whole = fly(batch, flights, progress=lambda flown: bar.update(flown - bar.n), **options)
     findings = whole.since(settle)
     print(report_of(findings))
     files = _draw(case.name, whole, findings, settle, output)
@@ -84,19 +72,16 @@ def _draw(
     title: str, whole: Findings, findings: Findings, settle: float, output: Path
 ) -> list[Path]:
     """Draw and save the figures; return their files."""
-    files: list[Path] = []
-    with house_style():
-        figures = {
-            "nees": mean_square_figure("NEES", whole.nees, title, settle),
-            "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
-        }
-        if whole.nis:
-            figures["nis"] = mean_square_figure("NIS", whole.nis, title, settle)
-        if findings.whiteness:
-            figures["whiteness"] = whiteness_figure(findings.whiteness, title)
-        for name, figure in figures.items():
-            files += save_figure(figure, output / name)
-    return files
+    figures = {
+        "nees": mean_square_figure("NEES", whole.nees, title, settle),
+        "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
+    }
+    if whole.nis:
+        figures["nis"] = mean_square_figure("NIS", whole.nis, title, settle)
+    if findings.whiteness:
+        figures["whiteness"] = whiteness_figure(findings.whiteness, title)
+    saved = (save_figure(figure, output / name) for name, figure in figures.items())
+    return [file for pair in saved for file in pair]
 
 
 def _table(quantity: str, parts: dict[str, MeanSquare]) -> str:
@@ -120,12 +105,11 @@ def report_of(findings: Findings) -> str:
     tables = [_table("NEES", findings.nees)]
     if findings.nis:
         tables.append(_table("NIS", findings.nis))
+    verdict = "consistent" if findings.consistent else "not consistent in everything"
     lines = [
-        "The filter is consistent:"
-        if findings.consistent
-        else "The filter is not consistent in everything:",
+        f"The filter is {verdict}:",
         *(f"  {text}" for text in findings.sentences().values()),
-        f"  Filters with a numerical failure: {findings.failed}. CaseFlights lost: "
+        f"  Filters with a numerical failure: {findings.failed}. Flights lost: "
         f"{findings.astray.sum()}.",
         f"Criterion: means within the tolerance, the 95 % band of a mean over at most "
         f"{BAND_FLIGHTS:,} values, at {100 * CONSISTENT_SHARE:.0f} % of the instants or more; "

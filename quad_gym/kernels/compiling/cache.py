@@ -55,11 +55,8 @@ def where_cached(*folders: Path | None) -> str:
 def locked(path: Path | None, waiting: str = "") -> Iterator[None]:
     """Hold a lock between processes; a process that dies releases it.
 
-    Where the system or the folder supports no locks, two processes may do the same work.
-
-    Args:
-        path: The file that represents the lock; None: no lock.
-        waiting: Message on standard error if another process holds it.
+    Where the system or the folder supports no locks (path: None), two processes may do the same
+    work. `waiting`: message on standard error if another process holds the lock.
     """
     from filelock import FileLock, Timeout  # here, as only compiling needs it
 

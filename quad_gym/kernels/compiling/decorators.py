@@ -71,11 +71,8 @@ class EntryDispatcher(CPUDispatcher):  # type: ignore[misc]
 def entry(function: Callable[..., Any] | None = None, signature: Any = None) -> Any:
     """Compile `function` for calls from Python: cached on disk, running without the GIL.
 
-    As a decorator: `@entry`, or `@entry(signature=...)`.
-
-    Args:
-        function: The function to compile.
-        signature: The Numba types of its arguments, so that it can be compiled ahead of a call.
+    As a decorator: `@entry`, or `@entry(signature=...)` with the Numba types of its arguments, so
+    that it can be compiled ahead of a call.
     """
     if function is None:
         return functools.partial(entry, signature=signature)

@@ -27,9 +27,6 @@ _NO_CODE = {f"{__package__}.{name}" for name in ("cache", "cores", "digest", "wo
 """Modules that determine when code is compiled, but do not change the code."""
 
 
-# ---- modules ---------------------------------------------------------------------------------
-
-
 def digest_of(module: str) -> str:
     """Digest of an imported module and of all modules that it imports, directly or not.
 
@@ -84,10 +81,11 @@ def _parsed(content: bytes, package: str) -> tuple[str, list[str]]:
     known = _known_sources()
     key = hashlib.sha256(package.encode() + b"\n" + content).hexdigest()
     if key not in known:
-        tree = ast.parse(content)
-        imported = {name for node in ast.walk(tree) for name in _imports(node, package)}
+        tree, imported = ast.parse(content), set[str]()
         for node in ast.walk(tree):
-            _drop_docstring(node)
+            imported.update(_imports(node, package))
+            if isinstance(body := getattr(node, "body", None), list):  # drop strings: docstrings
+                node.body = [part for part in body if not _is_string(part)]  # type: ignore[attr-defined]
         known[key] = hashlib.sha256(ast.dump(tree).encode()).hexdigest(), sorted(imported)
     return known[key]
 
@@ -102,17 +100,9 @@ def _imports(node: ast.AST, package: str) -> Iterable[str]:
     return [module, *(f"{module}.{alias.name}" for alias in node.names)]
 
 
-def _drop_docstring(node: ast.AST) -> None:
-    """Remove the strings that are statements: docstrings, also of attributes."""
-    body = getattr(node, "body", None)
-    if isinstance(body, list):
-        kept = [statement for statement in body if not _is_docstring(statement)]
-        node.body = kept  # type: ignore[attr-defined]
-
-
-def _is_docstring(node: ast.AST) -> bool:
-    expression = node.value if isinstance(node, ast.Expr) else None
-    return isinstance(expression, ast.Constant) and isinstance(expression.value, str)
+def _is_string(statement: ast.AST) -> bool:
+    value = statement.value if isinstance(statement, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
 
 
 @functools.cache
@@ -136,9 +126,6 @@ def _known_sources() -> dict[str, tuple[str, list[str]]]:
                 temporary.replace(file)
 
     return known
-
-
-# ---- functions -------------------------------------------------------------------------------
 
 
 def digest_of_function(function: Callable[..., Any]) -> str:

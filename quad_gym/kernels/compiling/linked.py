@@ -17,12 +17,7 @@ _lock = threading.Lock()
 
 
 def names_of(needed: Collection[str], entries: Sequence[str] = (FLY,)) -> list[str]:
-    """The compiled functions of stages and of the entries that call them, the longest first.
-
-    Args:
-        needed: Names of the stages' functions.
-        entries: Names of the entries, the longest to compile first.
-    """
+    """The compiled functions of stages and of the entries that call them, the longest first."""
     ordered = [name for name in dict.fromkeys(s.name for s in SOURCES) if name in needed]
     return [*ordered[:2], *entries[:1], *ordered[2:], *entries[1:]]
 
@@ -31,11 +26,8 @@ def linked_table(needed: Mapping[Stage, str], entries: Sequence[str] = (FLY,)) -
     """Table of addresses, (1,) STAGE_TABLE, of only the stages that are needed.
 
     A batch has memory only for the parts that these stages use, see `used_parts`: other slots stay
-    empty, even if another batch has linked their stages.
-
-    Args:
-        needed: The stages, and the names of their functions.
-        entries: Names of the entries that call them, compiled with them.
+    empty, even if another batch has linked their stages. The entries that call them are compiled
+    with them.
     """
     with _lock:
         missing = set(needed.values()) - _addresses.keys()
@@ -50,9 +42,7 @@ def linked_table(needed: Mapping[Stage, str], entries: Sequence[str] = (FLY,)) -
 
 def _address(name: str) -> int:
     """Address of the machine code of a stage."""
-    dispatcher = dispatcher_of(name)
-    arguments = tuple(SIGNATURE.args)
-    compiled = dispatcher.overloads[arguments]
+    compiled = dispatcher_of(name).overloads[tuple(SIGNATURE.args)]
     address = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
     if not address:
         raise RuntimeError(f"{name} has no machine code")

@@ -25,6 +25,7 @@ from numba.extending import intrinsic
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling.decorators import entry, kernel
+from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.records import (
     FIRST_AID,
     FLIGHT_BLOCK,
@@ -105,7 +106,7 @@ class Kernel(NamedTuple):
     function: str
     """its module in `quad_gym.kernels`, and its name without `_stage`"""
     needed: Callable[[Any], bool]
-    parts: tuple[str, ...] = ()
+    parts: tuple[str, ...]
     """parts of a flight's record that it uses in addition to the core, see `records.PARTS`"""
 
     @property
@@ -114,130 +115,109 @@ class Kernel(NamedTuple):
         return f"quad_gym.kernels.{self.function}_stage"
 
 
+def _stage(function: str, needed: Callable[[Any], bool], *parts: str) -> Kernel:
+    """A function for the slot of its name."""
+    slot = function.partition(":")[2].removesuffix("_with_slow")
+    return Kernel(Stage[slot.upper()], function, needed, parts)
+
+
 def _with(*names: str) -> Callable[[Any], bool]:
     """Make a test of settings: all of these are set."""
     return lambda settings: all(settings[name] > 0 for name in names)
 
 
+def _filter_and(needed: Callable[[Any], Any]) -> Callable[[Any], bool]:
+    """Make a test of settings: there is a filter, and `needed`."""
+    return lambda settings: bool(settings["run_filter"] and needed(settings))
+
+
 _always, _filter, _faults = _with(), _with("run_filter"), _with("faults")
 _corrupts, _air = _with("run_filter", "faults"), _with("air")
 _late, _slow = _with("run_filter", "late"), _with("run_filter", "slow_states")
+_REWINDS = ("run_filter", "late", "rewinds")
 _grounded, _contacts, _drawn = _with("grounded"), _with("contacts"), _with("randomized")
-
-
-def _pad(s: Any) -> bool:
-    return bool(s["pad"]) and not _grounded(s)
-
-
-def _keeps_start(s: Any) -> bool:
-    return bool(_pad(s) or _grounded(s) or (_filter(s) and s["imu_averages"]))
-
-
-def _imu_disturbed(s: Any) -> bool:
-    return _filter(s) and bool(s["imu_errs"] or s["imu_vibrates"])
-
-
-def _has_constant_errors(s: Any) -> bool:
-    return _filter(s) and bool(s["imu_errs"] or s["heading_errs"])
-
-
-def _watches(s: Any) -> bool:
-    return _filter(s) and bool(int(s["form"]) & (FilterForm.GATE | FilterForm.INNOVATIONS))
-
-
-def _observes_measurements(s: Any) -> bool:
-    return _filter(s) and bool(s["layout"] == Layout.MEASUREMENTS)
-
-
-def _hides(s: Any) -> bool:
-    return _sensor(Sensor.CAMERA)(s) and bool(s["obstacle_count"])
+_MONITORED = FilterForm.GATE | FilterForm.INNOVATIONS
 
 
 def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
-    return lambda s: _filter(s) and bool(s["sensor_blocks"][sensor])
+    return _filter_and(lambda s: s["sensor_blocks"][sensor])
+
+
+_camera = _sensor(Sensor.CAMERA)
+
+
+def _keeps_start(s: Any) -> bool:
+    return bool(s["pad"] or s["grounded"] or (s["run_filter"] and s["imu_averages"]))
 
 
 def _sensor_source(sensor: Sensor) -> Kernel:
     name, parts = sensor.name.lower(), () if sensor < FIRST_AID else ("aids",)
-    return Kernel(Stage[sensor.name], f"sensors.{name}:{name}", _sensor(sensor), parts)
+    return _stage(f"sensors.{name}:{name}", _sensor(sensor), *parts)
 
 
 SOURCES = (
-    Kernel(Stage.UPDATE, "filter.update:update_with_slow", _slow, ("filter", "slow")),
-    Kernel(Stage.UPDATE, "filter.update:update", _filter, ("filter",)),
-    Kernel(Stage.PREDICT, "filter.predict:predict_with_slow", _slow, ("filter", "slow")),
-    Kernel(Stage.PREDICT, "filter.predict:predict", _filter, ("filter",)),
-    Kernel(
-        Stage.LATE_UPDATE,
-        "filter.delayed:late_update_with_slow",
-        _with("run_filter", "slow_states", "late", "rewinds"),
-        ("late",),
-    ),
-    Kernel(
-        Stage.LATE_UPDATE,
-        "filter.delayed:late_update",
-        _with("run_filter", "late", "rewinds"),
-        ("late",),
-    ),
+    _stage("filter.update:update_with_slow", _slow, "filter", "slow"),
+    _stage("filter.update:update", _filter, "filter"),
+    _stage("filter.predict:predict_with_slow", _slow, "filter", "slow"),
+    _stage("filter.predict:predict", _filter, "filter"),
+    _stage("filter.delayed:late_update_with_slow", _with(*_REWINDS, "slow_states"), "late"),
+    _stage("filter.delayed:late_update", _with(*_REWINDS), "late"),
     *map(_sensor_source, Sensor),
-    Kernel(Stage.SAMPLE, "sensors.imu:sample", _filter, ("filter",)),
-    Kernel(Stage.DRAW, "task.draws:draw", _drawn, ("draws",)),
-    Kernel(Stage.IMPOSE, "task.draws:impose", _drawn, ("draws",)),
-    Kernel(
-        Stage.PLACE_FEATURES, "task.places:place_features", _with("features_drawn"), ("places",)
-    ),
-    Kernel(Stage.BEGIN, "task.episode:begin", _always),
-    Kernel(Stage.MOVE, "vehicle.air:move_in_air", _air),
-    Kernel(Stage.ALIGN, "filter.align:align", _filter, ("filter",)),
-    Kernel(Stage.OBSERVE, "task.observation:observe", _always),
-    Kernel(Stage.SHOW, "task.show:show", _with("shown")),
-    Kernel(Stage.ADVANCE_FAULTS, "sensors.faults:advance_faults", _faults, ("faults",)),
-    Kernel(Stage.BEGIN_FAULTS, "sensors.faults:begin_faults", _faults, ("faults",)),
-    Kernel(Stage.CONTROL, "vehicle.control:control", _always),
-    Kernel(Stage.MOVE, "vehicle.dynamics:move", _always),
-    Kernel(Stage.BEGIN_IN_AIR, "vehicle.air:begin_in_air", _air),
-    Kernel(Stage.WARM, "filter.warm:warm_with_slow", _with("run_filter", "slow_states", "warm")),
-    Kernel(Stage.WARM, "filter.warm:warm", _with("run_filter", "warm")),
-    Kernel(Stage.AVERAGE_IMU, "sensors.imu:average_imu", _with("run_filter", "imu_averages")),
-    Kernel(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features", _corrupts),
-    Kernel(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss", _corrupts),
-    Kernel(Stage.INCREMENT, "filter.preintegration:increment", _late, ("late",)),
-    Kernel(Stage.LOOK, "task.look:look", _always),
-    Kernel(Stage.JUDGE, "task.reward_and_endings:judge", _always),
-    Kernel(Stage.DRIFT_BIASES, "sensors.imu:drift_biases", _filter),
-    Kernel(
-        Stage.FOLLOW, "task.follow:follow", lambda s: bool(s["harmonics"] == FOLLOWED), ("path",)
-    ),
-    Kernel(Stage.REST_ON_PAD, "vehicle.pad:rest_on_pad", _pad),
-    Kernel(Stage.KEEP_START, "vehicle.pad:keep_start", _keeps_start),
-    Kernel(Stage.SUPPLY, "vehicle.air:supply", lambda s: s["supply"] != Supply.NOMINAL),
-    Kernel(Stage.BEGIN_LATE, "filter.preintegration:begin_late", _late, ("late",)),
-    Kernel(
-        Stage.BEGIN_IMPERFECT,
+    _stage("sensors.imu:sample", _filter, "filter"),
+    _stage("task.draws:draw", _drawn, "draws"),
+    _stage("task.draws:impose", _drawn, "draws"),
+    _stage("task.places:place_features", _with("features_drawn"), "places"),
+    _stage("task.episode:begin", _always),
+    Kernel(Stage.MOVE, "vehicle.air:move_in_air", _air, ()),
+    _stage("filter.align:align", _filter, "filter"),
+    _stage("task.observation:observe", _always),
+    _stage("task.show:show", _with("shown")),
+    _stage("sensors.faults:advance_faults", _faults, "faults"),
+    _stage("sensors.faults:begin_faults", _faults, "faults"),
+    _stage("vehicle.control:control", _always),
+    _stage("vehicle.dynamics:move", _always),
+    _stage("vehicle.air:begin_in_air", _air),
+    _stage("filter.warm:warm_with_slow", _with("run_filter", "slow_states", "warm")),
+    _stage("filter.warm:warm", _with("run_filter", "warm")),
+    _stage("sensors.imu:average_imu", _with("run_filter", "imu_averages")),
+    _stage("sensors.faults:corrupt_features", _corrupts),
+    _stage("sensors.faults:corrupt_gnss", _corrupts),
+    _stage("filter.preintegration:increment", _late, "late"),
+    _stage("task.look:look", _always),
+    _stage("task.reward_and_endings:judge", _always),
+    _stage("sensors.imu:drift_biases", _filter),
+    _stage("task.follow:follow", lambda s: bool(s["harmonics"] == FOLLOWED), "path"),
+    _stage("vehicle.pad:rest_on_pad", lambda s: bool(s["pad"] and not s["grounded"])),
+    _stage("vehicle.pad:keep_start", _keeps_start),
+    _stage("vehicle.air:supply", lambda s: s["supply"] != Supply.NOMINAL),
+    _stage("filter.preintegration:begin_late", _late, "late"),
+    _stage(
         "sensors.imperfect:begin_imperfect",
-        _has_constant_errors,
-        ("errors",),
+        _filter_and(lambda s: s["imu_errs"] or s["heading_errs"]),
+        "errors",
     ),
-    Kernel(Stage.DISTURB_IMU, "sensors.imperfect:disturb_imu", _imu_disturbed),
-    Kernel(
-        Stage.TURN_BASELINE, "sensors.imperfect:turn_baseline", _with("run_filter", "heading_errs")
+    _stage(
+        "sensors.imperfect:disturb_imu", _filter_and(lambda s: s["imu_errs"] or s["imu_vibrates"])
     ),
-    Kernel(
-        Stage.LIMIT_CAMERA, "sensors.imperfect:limit_camera", _with("run_filter", "camera_limited")
+    _stage("sensors.imperfect:turn_baseline", _with("run_filter", "heading_errs")),
+    _stage("sensors.imperfect:limit_camera", _with("run_filter", "camera_limited")),
+    _stage("vehicle.delay:delay_action", _with("action_delays"), "actions"),
+    _stage("obstacles.sight:hide_features", lambda s: _camera(s) and bool(s["obstacle_count"])),
+    _stage("obstacles.contact:begin_contacts", _contacts),
+    _stage("obstacles.contact:touch", _contacts, "contacts"),
+    _stage("obstacles.contact:judge_contacts", _contacts),
+    _stage("vehicle.ground:begin_ground", _grounded),
+    _stage("vehicle.ground:stand", _grounded, "ground"),
+    _stage("vehicle.ground:feel_ground", _with("run_filter", "grounded")),
+    _stage("vehicle.ground:judge_landing", _grounded),
+    _stage("sensors.faults:saturate_imu", _corrupts),
+    _stage("sensors.faults:meet_rotors", _faults),
+    _stage("sensors.imu:sum_imu", _filter_and(lambda s: s["layout"] == Layout.MEASUREMENTS), "raw"),
+    _stage(
+        "filter.align:forget_innovations",
+        _filter_and(lambda s: int(s["form"]) & _MONITORED),
+        "watch",
     ),
-    Kernel(Stage.DELAY_ACTION, "vehicle.delay:delay_action", _with("action_delays"), ("actions",)),
-    Kernel(Stage.HIDE_FEATURES, "obstacles.sight:hide_features", _hides),
-    Kernel(Stage.BEGIN_CONTACTS, "obstacles.contact:begin_contacts", _contacts),
-    Kernel(Stage.TOUCH, "obstacles.contact:touch", _contacts, ("contacts",)),
-    Kernel(Stage.JUDGE_CONTACTS, "obstacles.contact:judge_contacts", _contacts),
-    Kernel(Stage.BEGIN_GROUND, "vehicle.ground:begin_ground", _grounded),
-    Kernel(Stage.STAND, "vehicle.ground:stand", _grounded, ("ground",)),
-    Kernel(Stage.FEEL_GROUND, "vehicle.ground:feel_ground", _with("run_filter", "grounded")),
-    Kernel(Stage.JUDGE_LANDING, "vehicle.ground:judge_landing", _grounded),
-    Kernel(Stage.SATURATE_IMU, "sensors.faults:saturate_imu", _corrupts),
-    Kernel(Stage.MEET_ROTORS, "sensors.faults:meet_rotors", _faults),
-    Kernel(Stage.SUM_IMU, "sensors.imu:sum_imu", _observes_measurements, ("raw",)),
-    Kernel(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations", _watches, ("watch",)),
 )
 """Every function of a stage, the longest to compile first. A slot with several functions gets the
 first one that is needed."""
@@ -274,10 +254,18 @@ def stage(function: Callable[..., Any]) -> Any:
     """Compile `function` as a stage.
 
     Its arguments are a block of flights, the true parameters and the assumed ones, the settings,
-    the workspace, the table of stages, and a number whose meaning depends on the stage. `work.mask`
-    holds the lanes to work on.
+    the workspace, the table of stages, and a number whose meaning depends on the stage. Blocks
+    come as lanes; `work.mask` holds those to work on.
     """
-    return entry(function, SIGNATURE)
+    body = kernel(function)
+
+    def call(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
+        world, model, work = lanes_of(world), lanes_of(model), lanes_of(work)
+        body(lanes_of(flight), world, model, settings, work, stages, flag)
+
+    call.__name__, call.__module__ = function.__name__, function.__module__
+    call.__qualname__ = function.__qualname__
+    return entry(call, SIGNATURE)
 
 
 @intrinsic

@@ -9,70 +9,48 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
-from quad_gym.kernels.filter.innovations import forget_innovations
+from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.elementary import maximum, minimum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky33, lower33, solve_right33
-from quad_gym.kernels.maths.linalg import (
-    add33,
-    apply,
-    apply_transposed,
-    dot,
-    keep3,
-    keep33,
-    keep_block,
-    load3,
-    load4,
-    load33,
-    load_block,
-    multiply,
-    outer,
-    scale,
-    scale33,
-    select3,
-    select33,
-    sub,
-    transpose,
-    unit_or,
-)
+from quad_gym.kernels.maths.linalg import dot, keep, load3, load4, load33, outer, rounded, unit_or
+from quad_gym.kernels.maths.matrices import load_block
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_MARK
 
-NOTHING = (0.0, 0.0, 0.0)
+_NOTHING = (0.0, 0.0, 0.0)
 _NO_HEADING = math.pi / math.sqrt(3.0)  # standard deviation of an unknown angle
 _STEEP = 0.2  # level share of a baseline 12 degrees from the vertical: too small for a heading
 
 
 @kernel
-def _tie_position_to_attitude(L, R_BI, lever_B, mask):
-    """Add to L the dependence of the start's position on its attitude, in the lanes `mask`.
-
-    The antenna was measured, and r = antenna - R^T l: with R = R(e) R_hat the error of the position
-    is the error of the fix plus J e, with J = R_hat^T [l x].
-    """
-    zero = 0.0 * lever_B[0]
-    x, y, z = lever_B
-    J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
-    root_r, root_e = load_block(L, R, R), load_block(L, E, E)  # diagonal
-    tied = multiply(J, root_e)
-    factor, diagonal, _ = cholesky33(
-        add33(multiply(root_r, root_r), multiply(tied, transpose(tied)))
-    )
-    L_er = solve_right33(multiply(root_e, transpose(tied)), factor)
-    keep_block(L, R, R, mask, lower33(factor, diagonal))
-    keep_block(L, E, R, mask, L_er)
-    rest = scale33(-1.0, multiply(L_er, transpose(L_er)))
-    factor, diagonal, _ = cholesky33(add33(multiply(root_e, root_e), rest))
-    keep_block(L, E, E, mask, lower33(factor, diagonal))
+def lever_of_attitude(R_BI, l_B):
+    """J = R_hat^T [l x]: with R = R(e) R_hat, the error of r = antenna - R^T l grows by J e."""
+    zero = 0.0 * l_B[0]
+    x, y, z = l_B
+    return R_BI.T @ ((zero, -z, y), (z, zero, -x), (-y, x, zero))
 
 
 @kernel
-def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_variance=NOTHING):
+def _tie_position_to_attitude(L, R_BI, l_B, mask):
+    """Add to L the dependence of the start's position on its attitude, in the lanes `mask`."""
+    root_r, root_e = load_block(L, R, R), load_block(L, E, E)  # diagonal
+    tied = lever_of_attitude(R_BI, l_B) @ root_e
+    factor, diagonal_r, _ = cholesky33(root_r @ root_r + tied @ tied.T)
+    L_er = solve_right33(root_e @ tied.T, factor)
+    keep(L[R : R + 3, R : R + 3], mask, lower33(factor, diagonal_r))
+    keep(L[E : E + 3, R : R + 3], mask, L_er)
+    factor, diagonal_e, _ = cholesky33(root_e @ root_e - L_er @ L_er.T)
+    keep(L[E : E + 3, E : E + 3], mask, lower33(factor, diagonal_e))
+
+
+@kernel
+def initialize(flight, p, mask, x_I, v_I=_NOTHING, v_variance=_NOTHING, tilt_variance=_NOTHING):
     """Start the filter from the first fix, in the lanes `mask`.
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
@@ -84,9 +62,7 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
     heading.
 
     Args:
-        flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
-        p: Parameters assumed by the filter.
-        mask: Lanes to work on.
+        flight, p, mask: Record, parameters assumed by the filter, lanes to work on.
         x_I: Level direction in I of the body x axis, if the place of the start determines it; else
             zero.
         v_I: Known velocity of the start, in I [m/s].
@@ -95,33 +71,30 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
     """
     inflation = math.sqrt(p.initial_covariance_scale)
     attitude = inflation * p.first_baseline_sigma
-    baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
+    baseline_B = (1.0 / p.baseline_length) * load3(p.baseline)
     level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])
     heading = minimum(attitude / maximum(level_share, 1e-9), _NO_HEADING)
     placed = (level_share < _STEEP) & (dot(x_I, x_I) > 0.0)
     heading = select(placed, inflation * p.heading_sigma, heading)
 
     R_IG = load33(p.R_IG)
-    baseline_I = unit_or(apply(R_IG, load3(flight.gnss_baseline)), (0.0, 0.0, 1.0))
-    nothing = scale(0.0, x_I)
+    baseline_I = unit_or(R_IG @ load3(flight.gnss_baseline), (0.0, 0.0, 1.0))
+    nothing = 0.0 * x_I
     x_B = (nothing[0] + 1.0, nothing[1], nothing[2])
-    profile = add33(outer(baseline_B, baseline_I), outer(x_B, select3(placed, x_I, nothing)))
+    ahead = outer(x_B, select(placed, x_I, nothing))
+    profile = outer(baseline_B, baseline_I) + rounded(ahead)
     profile = (profile[0], profile[1], (profile[2][0], profile[2][1], profile[2][2] + 1.0))
     R_BI, _ = wahba(profile)
     level = p.initial_tilt_sigma > 0.0
-    ahead_B, ahead_I = select3(placed, x_B, baseline_B), select3(placed, x_I, baseline_I)
-    R_BI = select33(level, level_attitude(ahead_B, ahead_I), R_BI)
-    antenna_I = apply(R_IG, load3(flight.gnss_position))
-    keep33(flight.R_hat, mask, R_BI)
-    keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
-    keep3(flight.v_hat, mask, v_I)
-    keep3(flight.b_a_hat, mask, (0.0, 0.0, 0.0))
-    keep3(flight.b_g_hat, mask, (0.0, 0.0, 0.0))
+    ahead_B, ahead_I = select(placed, x_B, baseline_B), select(placed, x_I, baseline_I)
+    R_BI = select(level, level_attitude(ahead_B, ahead_I), R_BI)
+    antenna_I = R_IG @ load3(flight.gnss_position)
+    keep(flight.R_hat, mask, R_BI)
+    keep(flight.r_hat, mask, antenna_I - R_BI.T @ load3(p.antenna))
+    keep(flight.v_hat, mask, v_I)
     flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
-    flight.prediction_failures = select(mask, 0.0, flight.prediction_failures)
-    flight.update_failures = select(mask, 0.0, flight.update_failures)
-    flight.nis = select(mask, 0.0, flight.nis)
-    flight.nis_dimension = select(mask, 0.0, flight.nis_dimension)
+    reset(flight, mask, 0.0, "b_a_hat b_g_hat prediction_failures update_failures")
+    reset(flight, mask, 0.0, "nis nis_dimension")
     begin_recovery(flight, mask)
 
     L = flight.L
@@ -146,21 +119,22 @@ def known_velocity(flight, settings):
 
     A velocity given by the caller of a reset is known; its variance is zero.
     """
-    given = (flight.start_given[3], flight.start_given[4], flight.start_given[5])
+    known, zero = load3(flight.start_given[3:]), 0.0 * flight.tick
     drawn = load3(settings.start_velocity_variance)
-    zero = 0.0 * flight.tick
-    known = (given[0] == given[0], given[1] == given[1], given[2] == given[2])
-    v_I = (
-        select(known[0], given[0], zero),
-        select(known[1], given[1], zero),
-        select(known[2], given[2], zero),
+    return (
+        (_or(known[0], zero), _or(known[1], zero), _or(known[2], zero)),
+        (
+            select(known[0] == known[0], zero, drawn[0]),
+            select(known[1] == known[1], zero, drawn[1]),
+            select(known[2] == known[2], zero, drawn[2]),
+        ),
     )
-    variance = (
-        select(known[0], zero, drawn[0]),
-        select(known[1], zero, drawn[1]),
-        select(known[2], zero, drawn[2]),
-    )
-    return v_I, variance
+
+
+@kernel
+def _or(given, other):
+    """A number, or another where it is NaN."""
+    return select(given == given, given, other)
 
 
 @kernel
@@ -177,17 +151,17 @@ def look_along_mark(flight, p):
 @stage
 def align_stage(flight, world, model, settings, work, stages, flag):
     """Start the filter from its first fix."""
-    flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
+    mask = work.mask > 0.0
     if settings.slow_states > 0:
-        begin_slow(flying, lanes_of(model), settings, mask)
+        begin_slow(flight, model, settings, mask)
     call_stage(stages, Stage.FORGET_INNOVATIONS, flight, world, model, settings, work, 0)
-    x_I = look_along_mark(flying, lanes_of(world))
-    v_I, v_variance = known_velocity(flying, settings)
+    v_I, v_variance = known_velocity(flight, settings)
     tilt_variance = load3(settings.start_tilt_variance)
-    initialize(flying, lanes_of(model), mask, x_I, v_I, v_variance, tilt_variance)
+    x_I = look_along_mark(flight, world)
+    initialize(flight, model, mask, x_I, v_I, v_variance, tilt_variance)
 
 
 @stage
 def forget_innovations_stage(flight, world, model, settings, work, stages, flag):
     """Forget the innovations of the previous episode."""
-    forget_innovations(lanes_of(flight), settings.feature_count, lanes_of(work).mask > 0.0)
+    forget_innovations(flight, settings.feature_count, work.mask > 0.0)

@@ -22,12 +22,7 @@ from quad_gym.kernels.filter.measurements import (
     restore_valid,
     store_valid,
 )
-from quad_gym.kernels.filter.preintegration import (
-    NOISE,
-    put_noise,
-    take_columns,
-    take_mean,
-)
+from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_columns, take_mean
 from quad_gym.kernels.filter.recovery import forget_corrections
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
@@ -38,21 +33,8 @@ from quad_gym.kernels.filter.slow import (
     shift_carried_slow,
 )
 from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import (
-    add_outer,
-    keep3,
-    keep33,
-    load3,
-    load33,
-    load_column3,
-    multiply,
-    scale,
-    store3,
-    store33,
-    store_block,
-    sub,
-    sum_of_outers,
-)
+from quad_gym.kernels.maths.linalg import keep, load3, load33, outer, store
+from quad_gym.kernels.maths.matrices import load_column3, store_block, sum_of_outers
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import SENSORS, FilterForm, FilterStatus
@@ -64,12 +46,12 @@ _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 @kernel
 def _keep_estimate(flight, work, slow):
     """Copy the estimate, for lanes in which nothing arrives or an update fails."""
-    store3(work.kept_r, load3(flight.r_hat))
-    store3(work.kept_v, load3(flight.v_hat))
-    store33(work.kept_R, load33(flight.R_hat))
-    store3(work.kept_b_a, load3(flight.b_a_hat))
-    store3(work.kept_b_g, load3(flight.b_g_hat))
-    store3(work.kept_rates, load3(flight.w_meas))
+    store(work.kept_r, load3(flight.r_hat))
+    store(work.kept_v, load3(flight.v_hat))
+    store(work.kept_R, load33(flight.R_hat))
+    store(work.kept_b_a, load3(flight.b_a_hat))
+    store(work.kept_b_g, load3(flight.b_g_hat))
+    store(work.kept_rates, load3(flight.w_meas))
     work.kept_failures = flight.update_failures
     for i in range(15):
         for j in range(i + 1):
@@ -93,24 +75,23 @@ def _find_stamp(flight, p, work, sensor, delay, under_way, arrived):
 
     Where a measurement arrives, w_meas becomes the rates at that instant, for lever arms.
     """
-    store33(work.since_turn, load33(flight.imu_turn))
-    store33(work.since_bias_gain, load33(flight.imu_bias_gain))
-    store3(work.since_velocity, load3(flight.imu_velocity))
-    store3(work.since_position, load3(flight.imu_position))
+    store(work.since_turn, load33(flight.imu_turn))
+    store(work.since_bias_gain, load33(flight.imu_bias_gain))
+    store(work.since_velocity, load3(flight.imu_velocity))
+    store(work.since_position, load3(flight.imu_position))
     stamps = flight.stamps[sensor]
     for slot in range(under_way + 1):
         row, here = stamps[slot], arrived & (stamps[slot, 0] == flight.tick - delay)
-        keep33(work.since_turn, here, _matrix_of(row, 1))
-        keep33(work.since_bias_gain, here, _matrix_of(row, 16))
-        keep3(work.since_velocity, here, (row[10], row[11], row[12]))
-        keep3(work.since_position, here, (row[13], row[14], row[15]))
-        keep3(flight.w_meas, here, (row[25], row[26], row[27]))
+        keep(work.since_turn, here, _matrix_of(row, 1))
+        keep(work.since_bias_gain, here, _matrix_of(row, 16))
+        keep(work.since_velocity, here, (row[10], row[11], row[12]))
+        keep(work.since_position, here, (row[13], row[14], row[15]))
+        keep(flight.w_meas, here, (row[25], row[26], row[27]))
     work.since_time = select(arrived, delay * p.dt, 0.0)
     work.since_noise = select(arrived, 1.0, 0.0)
     C_s, B_s = load33(work.since_turn), load33(work.since_bias_gain)
     B = load33(flight.imu_bias_gain)
-    gain = (sub(B[0], B_s[0]), sub(B[1], B_s[1]), sub(B[2], B_s[2]))
-    store33(work.since_bias_gain, multiply(C_s, gain))
+    store(work.since_bias_gain, C_s @ (B - B_s))
 
 
 @kernel
@@ -121,7 +102,7 @@ def _factor_columns(flight, p, work, noise, slow, back):
         for j in range(0, i + 3, 3):
             block = sum_of_outers(M, i, M, j, 15)
             for k in range(NOISE, NOISE + 6):
-                block = add_outer(block, scale(noise, load_column3(M, i, k)), load_column3(M, j, k))
+                block = block + outer(noise * load_column3(M, i, k), load_column3(M, j, k))
             store_block(P, i, j, block)
     states = 15
     if slow is not None:
@@ -188,17 +169,17 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     Where it failed, the sums of corrections are reset, as the last correction is undone.
     """
     old = logical_not(arrived & good)
-    keep3(flight.r_hat, old, load3(work.kept_r))
-    keep3(flight.v_hat, old, load3(work.kept_v))
-    keep33(flight.R_hat, old, load33(work.kept_R))
-    keep3(flight.b_a_hat, old, load3(work.kept_b_a))
-    keep3(flight.b_g_hat, old, load3(work.kept_b_g))
+    keep(flight.r_hat, old, load3(work.kept_r))
+    keep(flight.v_hat, old, load3(work.kept_v))
+    keep(flight.R_hat, old, load33(work.kept_R))
+    keep(flight.b_a_hat, old, load3(work.kept_b_a))
+    keep(flight.b_g_hat, old, load3(work.kept_b_g))
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(old, work.kept_L[i, j], flight.L[i, j])
     if slow is not None:
         restore_slow(flight, slow, work, old)
-    store3(flight.w_meas, load3(work.kept_rates))
+    store(flight.w_meas, load3(work.kept_rates))
     failed = arrived & old
     if (settings.form & _WATCH) != 0 and any_of(failed):
         forget_corrections(flight, failed)

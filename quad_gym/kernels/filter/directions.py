@@ -3,9 +3,19 @@
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.linalg import add_to_diagonal, dot
-from quad_gym.kernels.maths.vectors import outer
+from quad_gym.kernels.maths.linalg import add_to_diagonal, dot, outer
+from quad_gym.kernels.maths.vectors import polynomial
 from quad_gym.kernels.simd.lanes import any_of, select
+
+_SERIES = (
+    -1.0 / 2.0,
+    3.0 / 8.0,
+    -5.0 / 16.0,
+    35.0 / 128.0,
+    -63.0 / 256.0,
+    231.0 / 1024.0,
+    -429.0 / 2048.0,
+)
 
 
 @kernel
@@ -17,19 +27,7 @@ def direction_noise(direction, variance, floor):
 @kernel
 def _inverse_root_minus_one(d):
     """(1 + d)^(-1/2) - 1 by its binomial series, exact to float64 for |d| < 0.01."""
-    return d * (
-        -1.0 / 2.0
-        + d
-        * (
-            3.0 / 8.0
-            + d
-            * (
-                -5.0 / 16.0
-                + d
-                * (35.0 / 128.0 + d * (-63.0 / 256.0 + d * (231.0 / 1024.0 - d * (429.0 / 2048.0))))
-            )
-        )
-    )
+    return d * polynomial(d, _SERIES)
 
 
 @kernel

@@ -13,13 +13,14 @@ The derivatives of measurements are in the files of these, in `kernels/sensors/`
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BG, E
-from quad_gym.kernels.maths.linalg import add_scaled, apply_transposed, cross, load_column3, sub
+from quad_gym.kernels.maths.linalg import cross
+from quad_gym.kernels.maths.matrices import load_column3
 
 
 @kernel
 def acceleration_column(L, j, R_BI, f_B, df_B):
     """Derivative of the acceleration in I along column j, whose share of biases in f is df_B."""
-    return apply_transposed(R_BI, sub(cross(load_column3(L, E, j), f_B), df_B))
+    return R_BI.T @ (cross(load_column3(L, E, j), f_B) - df_B)
 
 
 @kernel
@@ -27,4 +28,4 @@ def angle_column(L, j, w_B, dt):
     """Derivative of the Euler step e + dt S(e) (w - b_g) along column j."""
     d, dg = load_column3(L, E, j), load_column3(L, BG, j)
     rate = (d[1] * w_B[2] - dg[0], -d[0] * w_B[2] - dg[1], -d[1] * w_B[0] - dg[2])
-    return add_scaled(d, dt, rate)
+    return d + dt * rate

@@ -16,7 +16,13 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import load_block, load_column3, store_block, store_column3
+from quad_gym.kernels.maths.matrices import (
+    load_block,
+    load_column3,
+    store_block,
+    store_column3,
+    sum_of_outers,
+)
 
 R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
 """First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
@@ -37,6 +43,14 @@ def reset_matrix(m):
 
 
 @kernel
+def put_covariance(P, L, factor):
+    """P <- factor L L^T, in the lower triangle by blocks of three."""
+    for i in range(0, D, 3):
+        for j in range(0, i + 3, 3):
+            store_block(P, i, j, factor * sum_of_outers(L, i, L, j, j + 3))
+
+
+@kernel
 def turn_covariance(P, T):
     """P <- diag(I, I, T, I, I) P diag(...)^T in the lower triangle of P, by blocks of three."""
     store_block(P, E, R, T @ load_block(P, E, R))
@@ -50,13 +64,9 @@ def turn_covariance(P, T):
 def turn_factor(L9, T, rows, columns):
     """Transform the factor of a covariance as well, and make it lower triangular again.
 
-    Args:
-        L9: (rows, columns) the factor's first columns, last first; its rows of e are multiplied by
-            T, which fills the three places above the diagonal that Givens rotations of columns
-            clear.
-        T: From `reset_matrix`.
-        rows: Number of states.
-        columns: At least the nine up to the error angles.
+    L9 has `columns` of the factor, last first, at least the nine up to the error angles. Its rows
+    of e are multiplied by T, which fills the three places above the diagonal that Givens rotations
+    of columns clear.
     """
     first = columns - 9
     for j in range(first, columns):

@@ -1,10 +1,13 @@
 """The gate: the innovation of one block of the measurement, and its acceptance.
 
-With the columns A and E of `update.py` and the block's measurement noise R, the innovation has the
-covariance `S = A A^T + E E^T + (beta - alpha^2) mu mu^T + R` (3 x 3). A direction has two degrees
-of freedom: its innovation is taken across the predicted direction, as the length of a unit vector
-carries no information. A block whose normalized innovation squared (NIS), chi-square in a
+With the columns A and E of `update.py` and the block's measurement noise R, the innovation nu has
+the covariance `P_zz = A A^T + E E^T + (beta - alpha^2) mu mu^T + R` (3 x 3). A direction has two
+degrees of freedom: its innovation is taken across the predicted direction, as the length of a unit
+vector carries no information. A block whose normalized innovation squared (NIS), chi-square in a
 consistent filter, lies beyond the gate is masked as if it had not been measured.
+
+Where a group of measurements has been rejected `max_rejections` times in a row, the filter is more
+likely wrong than the sensor, see `recovery.py`.
 
 Source: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
 Navigation, 2001, section 5.4.
@@ -15,47 +18,34 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.recovery import follow_drift
+from quad_gym.kernels.filter.measurements import call_measured
+from quad_gym.kernels.filter.recovery import follow_drift, follow_ratio, forget_corrections
 from quad_gym.kernels.filter.rows import columns_of
-from quad_gym.kernels.maths.linalg import (
-    add33,
-    add_outer,
-    apply,
-    cross,
-    dot,
-    load_block,
-    scale,
-    sum_of_outers_of_rows,
-    unit_or,
-)
+from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or
+from quad_gym.kernels.maths.matrices import load_block, sum_of_outers_of_rows
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import logical_not, select
-from quad_gym.records import FilterForm, GateDecision
-
-_GATE = int(FilterForm.GATE)
-_REJECTED, _ACCEPTED = float(GateDecision.REJECTED), float(GateDecision.ACCEPTED)
-_UNSURE = float(GateDecision.UNSURE)
+from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, Act, FilterForm, GateDecision
 
 
 @kernel
-def _covariance(p, work, k, columns):
-    """S of the block that begins at row k of the stacked measurement."""
-    S = add33(
-        sum_of_outers_of_rows(work.A, work.A, k, k, columns),
-        sum_of_outers_of_rows(work.E, work.E, k, k, 9),
-    )
-    mu = (work.mu[k], work.mu[k + 1], work.mu[k + 2])
+def _covariance(p, work, settings, k):
+    """P_zz of the block that begins at row k of the stacked measurement."""
+    A, E, mu = work.A, work.E, load3(work.mu[k : k + 3])
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
-    return add33(add_outer(S, scale(excess, mu), mu), load_block(work.Rz, k, k))
+    P_zz = sum_of_outers_of_rows(A, A, k, k, columns_of(settings))
+    P_zz = P_zz + sum_of_outers_of_rows(E, E, k, k, 9) + outer(excess * mu, mu)
+    return P_zz + load_block(work.Rz, k, k)
 
 
 @kernel
-def _nis_of_triple(S, nu):
-    """nu^T S^-1 nu by the Cholesky factor of S."""
-    l00 = math.sqrt(S[0][0])
-    l10, l20 = S[1][0] / l00, S[2][0] / l00
-    l11 = math.sqrt(S[1][1] - l10 * l10)
-    l21 = (S[2][1] - l20 * l10) / l11
-    l22 = math.sqrt(S[2][2] - l20 * l20 - l21 * l21)
+def _nis_of_triple(P_zz, nu):
+    """The NIS nu^T P_zz^-1 nu, by the Cholesky factor of P_zz."""
+    l00 = math.sqrt(P_zz[0][0])
+    l10, l20 = P_zz[1][0] / l00, P_zz[2][0] / l00
+    l11 = math.sqrt(P_zz[1][1] - l10 * l10)
+    l21 = (P_zz[2][1] - l20 * l10) / l11
+    l22 = math.sqrt(P_zz[2][2] - l20 * l20 - l21 * l21)
     y0 = nu[0] / l00
     y1 = (nu[1] - l10 * y0) / l11
     y2 = (nu[2] - l20 * y0 - l21 * y1) / l22
@@ -63,42 +53,42 @@ def _nis_of_triple(S, nu):
 
 
 @kernel
-def _across(u, S, nu):
-    """Innovation and covariance of a direction, across u: (side, up), (S_ss, S_us, S_uu)."""
+def _across(u, P_zz, nu):
+    """Innovation and covariance of a direction, across u: (side, up), (P_ss, P_us, P_uu)."""
     side = unit_or((-u[1], u[0], 0.0 * u[0]), (1.0, 0.0, 0.0))  # vertical x u
     up = cross(u, side)
-    S_side, S_up = apply(S, side), apply(S, up)
-    return (dot(side, nu), dot(up, nu)), (dot(side, S_side), dot(up, S_side), dot(up, S_up))
+    P_side, P_up = P_zz @ side, P_zz @ up
+    return (dot(side, nu), dot(up, nu)), (dot(side, P_side), dot(up, P_side), dot(up, P_up))
 
 
 @kernel
-def _nis_of_direction(S, nu):
-    """nu^T S^-1 nu of two numbers."""
-    l00 = math.sqrt(S[0])
-    l10 = S[1] / l00
+def _nis_of_direction(P_zz, nu):
+    """The NIS of two numbers."""
+    l00 = math.sqrt(P_zz[0])
+    l10 = P_zz[1] / l00
     y0 = nu[0] / l00
-    y1 = (nu[1] - l10 * y0) / math.sqrt(S[2] - l10 * l10)
+    y1 = (nu[1] - l10 * y0) / math.sqrt(P_zz[2] - l10 * l10)
     return y0 * y0 + y1 * y1
 
 
 @kernel
-def _store_block(flight, s, first, nu, sigma, nis, rejected, unsure):
+def _store_innovation(flight, s, first, nu, sigma, nis, rejected, unsure):
     """Store the innovation of block s and the decision on it, in the lanes `first`."""
-    for i in range(3):
-        flight.innovation[s, i] = select(first, nu[i], flight.innovation[s, i])
-        flight.innovation_sigma[s, i] = select(first, sigma[i], flight.innovation_sigma[s, i])
+    keep(flight.innovation[s], first, nu)
+    keep(flight.innovation_sigma[s], first, sigma)
     flight.block_nis[s] = select(first, nis, flight.block_nis[s])
-    decision = select(unsure, _UNSURE, select(rejected, _REJECTED, _ACCEPTED))
+    decision = select(rejected, GateDecision.REJECTED, GateDecision.ACCEPTED)
+    decision = select(unsure, GateDecision.UNSURE, decision)
     flight.gate[s] = select(first, decision, flight.gate[s])
     rejections = flight.rejections[s]
     flight.rejections[s] = select(first & rejected, rejections + 1.0, rejections)
 
 
 @kernel
-def mask_block(work, k, rejected, columns):
+def mask_block(work, settings, k, rejected):
     """Mask the block at row k in the lanes `rejected`."""
     for i in range(k, k + 3):
-        for j in range(columns):
+        for j in range(columns_of(settings)):
             work.A[j, i] = select(rejected, 0.0, work.A[j, i])
         for j in range(9):
             work.E[j, i] = select(rejected, 0.0, work.E[j, i])
@@ -118,7 +108,7 @@ def count_rejections(flight, group, first, rejected):
 
 @kernel
 def accept_group(flight, group, accepted):
-    """Note the time of a group's last accepted measurement."""
+    """Store the time of a group's last accepted measurement."""
     before = flight.accepted_tick[group]
     flight.accepted_tick[group] = select(accepted, flight.tick, before)
 
@@ -137,80 +127,93 @@ def add_nis(work, counted, nis, freedoms):
 
 
 @kernel
-def gate_numbers(flight, p, work, settings, k, s, group, valid, limit, numbers):
-    """Store the innovation of block s; return the lanes in which it is rejected, and its NIS.
+def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers, excused):
+    """Store the innovation of block s, at row k, and mask it where its NIS exceeds `limit`.
 
-    A block of one number has two masked rows behind it, which add nothing to its NIS.
-
-    Args:
-        flight: Record.
-        p: Parameters assumed by the filter.
-        work: Workspace.
-        settings: The filter's form.
-        k: First row in the stacked measurement.
-        s: Number of the block.
-        group: Its group.
-        valid: Lanes that have measured it, among those to be updated.
-        limit: Largest accepted NIS.
-        numbers: 1.0 or 3.0.
+    A block with fewer `numbers` than three has masked rows behind them, which add nothing to its
+    NIS. Rejections in the lanes `excused` do not count against the filter.
     """
-    gating, again = (settings.form & _GATE) != 0, work.again > 0.0
-    S = _covariance(p, work, k, columns_of(settings))
-    nu = (work.nu[k], work.nu[k + 1], work.nu[k + 2])
-    nis = _nis_of_triple(S, nu)
-    rejected = _decide(flight, s, valid, (nis > limit) & gating, again, _REJECTED)
-    sigma = (math.sqrt(S[0][0]), math.sqrt(S[1][1]), math.sqrt(S[2][2]))
+    gating, again = (settings.form & FilterForm.GATE.value) != 0, work.again > 0.0
+    valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
+    P_zz, nu = _covariance(p, work, settings, k), load3(work.nu[k : k + 3])
+    nis = _nis_of_triple(P_zz, nu)
+    rejected = _decide(flight, s, valid, (nis > limit) & gating, again, GateDecision.REJECTED)
+    sigma = (math.sqrt(P_zz[0][0]), math.sqrt(P_zz[1][1]), math.sqrt(P_zz[2][2]))
     scaled = (nu[0] / sigma[0], nu[1] / sigma[1], nu[2] / sigma[2])
     if numbers < 3.0:
         none = np.nan + 0.0 * nis
         nu, sigma = (nu[0], none, none), (sigma[0], none, none)
         scaled = (scaled[0], 0.0 * nis, 0.0 * nis)
-    nowhere, first = rejected & logical_not(rejected), valid & logical_not(again)
-    _store_block(flight, s, first, nu, sigma, nis, rejected, nowhere)
-    follow_drift(flight, group, first, scaled[0], scaled[1], scaled[2])
-    return rejected, nis
+    first = valid & logical_not(again)
+    _store_innovation(flight, s, first, nu, sigma, nis, rejected, nis < nis)
+    follow_drift(flight, group, first, scaled)
+    add_nis(work, first & logical_not(rejected & excused), nis, numbers)
+    mask_rejected(flight, work, settings, k, group, valid, rejected, numbers)
 
 
 @kernel
 def gate_direction(flight, p, work, settings, k, s, valid, limit):
-    """Store the innovation of a direction, block s.
-
-    Args:
-        flight: Record.
-        p: Parameters assumed by the filter.
-        work: Workspace.
-        settings: The filter's form.
-        k: First row in the stacked measurement.
-        s: Number of the block.
-        valid: Lanes that have measured it, among those to be updated.
-        limit: Largest sum of its predicted variances; beyond, it is too uncertain.
+    """Store the innovation of a direction, block s, in the lanes `valid`.
 
     Returns:
-        Lanes in which it is rejected, lanes in which it is too uncertain, its innovation in
-        standard deviations, and its NIS.
+        Lanes in which it is rejected; lanes in which it is too uncertain, where the sum of its
+        predicted variances exceeds `limit`; its innovation in standard deviations; its NIS.
     """
-    gating, again = (settings.form & _GATE) != 0, work.again > 0.0
-    S = _covariance(p, work, k, columns_of(settings))
-    u = (work.z_hat[k], work.z_hat[k + 1], work.z_hat[k + 2])
-    nu, S2 = _across(u, S, (work.nu[k], work.nu[k + 1], work.nu[k + 2]))
-    nis = _nis_of_direction(S2, nu)
-    unsure = _decide(flight, s, valid, (S2[0] + S2[2] > limit) & gating, again, _UNSURE)
+    gating, again = (settings.form & FilterForm.GATE.value) != 0, work.again > 0.0
+    u, nu = load3(work.z_hat[k : k + 3]), load3(work.nu[k : k + 3])
+    nu, P_zz = _across(u, _covariance(p, work, settings, k), nu)
+    nis = _nis_of_direction(P_zz, nu)
+    vague = (P_zz[0] + P_zz[2] > limit) & gating
+    unsure = _decide(flight, s, valid, vague, again, GateDecision.UNSURE)
     beyond = (nis > p.gate_direction) & gating & logical_not(unsure)
-    rejected = _decide(flight, s, valid, beyond, again, _REJECTED)
+    rejected = _decide(flight, s, valid, beyond, again, GateDecision.REJECTED)
     none = np.nan + 0.0 * nis
-    sigma = (math.sqrt(S2[0]), math.sqrt(S2[2]), none)
+    sigma = (math.sqrt(P_zz[0]), math.sqrt(P_zz[2]), none)
     first = valid & logical_not(again)
-    _store_block(flight, s, first, (nu[0], nu[1], none), sigma, nis, rejected, unsure)
+    _store_innovation(flight, s, first, (nu[0], nu[1], none), sigma, nis, rejected, unsure)
     return rejected, unsure, (nu[0] / sigma[0], nu[1] / sigma[1]), nis
 
 
 @kernel
 def mask_rejected(flight, work, settings, k, group, valid, rejected, numbers):
     """Mask the block at row k in the lanes `rejected`, and count consecutive rejections."""
-    first = valid & logical_not(work.again > 0.0)
-    if (settings.form & _GATE) != 0:
-        mask_block(work, k, rejected, columns_of(settings))
-        count_rejections(flight, group, first, rejected)
+    if (settings.form & FilterForm.GATE.value) != 0:
+        mask_block(work, settings, k, rejected)
+        count_rejections(flight, group, valid & logical_not(work.again > 0.0), rejected)
         work.left_out = work.left_out + select(rejected, numbers, 0.0)
     else:
         accept_group(flight, group, valid)
+
+
+MONITORED = int(FilterForm.GATE | FilterForm.INNOVATIONS)
+"""Bits of a `FilterForm` with which innovations are stored, and the filter is monitored."""
+
+
+@kernel
+def gate_innovations(flight, p, work, settings, stages, mask, again):
+    """Store the innovations of the present measurements and mask those beyond the gate.
+
+    Where measurements are processed in steps, the first step decides for all: `again` are the lanes
+    in a later step. On return, work.left_out counts the masked numbers of each lane.
+    """
+    zero = 0.0 * p.sigma_beta
+    work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
+    work.judged_nis, work.judged_freedoms, work.left_out = zero, zero, zero
+    call_measured(flight, p, work, settings, stages, Act.GATE)
+    first = mask & (work.measured > 0.0) & logical_not(again)
+    follow_ratio(flight, p, work.judged_nis, work.judged_freedoms, first)
+
+
+@kernel
+def forget_innovations(flight, feature_count, mask):
+    """Reset the innovations at the start of an episode, in the lanes `mask`."""
+    blocks, none = FEATURE_BLOCKS + feature_count, (np.nan, np.nan, np.nan)
+    for k in range(blocks + AIDS):
+        s = k if k < blocks else k - blocks + AID_BLOCKS
+        flight.block_nis[s] = select(mask, np.nan, flight.block_nis[s])
+        flight.gate[s] = select(mask, 0.0, flight.gate[s])
+        flight.rejections[s] = select(mask, 0.0, flight.rejections[s])
+        keep(flight.innovation[s], mask, none)
+        keep(flight.innovation_sigma[s], mask, none)
+    forget_corrections(flight, mask)
+    reset(flight, mask, 0.0, "rejected_in_row reopened")

@@ -28,16 +28,14 @@ Source: ours.
 
 import math
 
-import numpy as np
-
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covariance
 from quad_gym.kernels.filter.jumps import (
     drifts_suddenly,
     forget_drift_corrections,
     inflate_position_and_drift,
 )
-from quad_gym.kernels.filter.measurements import call_sensors
+from quad_gym.kernels.filter.measurements import call_sensors, flag_failure
 from quad_gym.kernels.filter.recovery import (
     MOST_ACCEL_BIAS,
     MOST_ANGLE,
@@ -50,23 +48,15 @@ from quad_gym.kernels.filter.recovery import (
     forget_corrections,
     one_way,
     raise_alarm,
+    raise_variance,
     variance_of,
 )
-from quad_gym.kernels.filter.slow import fill_slow, keep_slow_factor
+from quad_gym.kernels.filter.slow import fill_slow, keep_factor
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import (
-    add_outer,
-    apply,
-    dot,
-    load33,
-    load_block,
-    multiply,
-    scale,
-    scale33,
-    store_block,
-    sum_of_outers,
-)
+from quad_gym.kernels.maths.linalg import diagonal, dot, load33, outer
+from quad_gym.kernels.maths.matrices import load_block, store_block
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import (
     AID_GROUPS,
@@ -78,14 +68,10 @@ from quad_gym.records import (
     SENSORS,
     Act,
     Aid,
-    FilterStatus,
 )
 
-_INFLATE = int(Act.INFLATE)
-_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _FACTOR, _BIAS_FACTOR = 16.0, 240.0
 """Factor on the covariance, and the share of the biases' variances that is added, after a drift."""
-_BAROMETER_GROUP = AID_GROUPS + int(Aid.BAROMETER)
 
 
 @kernel
@@ -114,20 +100,10 @@ def _share(variance, most, inflated):
 def _shrink_block(P, row, M, states):
     """Multiply the three rows and the three columns from `row` on by a symmetric M."""
     for j in range(0, row, 3):
-        store_block(P, row, j, multiply(M, load_block(P, row, j)))
-    store_block(P, row, row, multiply(multiply(M, load_block(P, row, row)), M))
+        store_block(P, row, j, M @ load_block(P, row, j))
+    store_block(P, row, row, M @ load_block(P, row, row) @ M)
     for i in range(row + 3, states, 3):
-        store_block(P, i, row, multiply(load_block(P, i, row), M))
-
-
-@kernel
-def _shrink_axes(P, row, most, inflated, states):
-    """Bound the inflation of three states, each separately."""
-    a = _share(P[row, row], most, inflated)
-    b = _share(P[row + 1, row + 1], most, inflated)
-    c = _share(P[row + 2, row + 2], most, inflated)
-    zero = 0.0 * a
-    _shrink_block(P, row, ((a, zero, zero), (zero, b, zero), (zero, zero, c)), states)
+        store_block(P, i, row, load_block(P, i, row) @ M)
 
 
 @kernel
@@ -141,36 +117,30 @@ def _inflate_drift(p, P, inflated):
     for i in range(3):
         a, s = p.slow_decay[i], p.slow_drive[i]
         most = s * s / ((1.0 - a) * (1.0 + a))
-        wanted = select(inflated, minimum(_FACTOR * P[D + i, D + i], most), 0.0)
-        P[D + i, D + i] = maximum(P[D + i, D + i], wanted)
+        raise_variance(P, D + i, inflated, minimum(_FACTOR * P[D + i, D + i], most))
 
 
 @kernel
 def bound_inflation(flight, P, inflated, states):
     """Reduce P where inflation by `_FACTOR` has exceeded the largest standard deviations.
 
-    Args:
-        flight: Record; reads R_hat, for the vertical.
-        P: The inflated covariance, its lower triangle by blocks.
-        inflated: Lanes in which P was inflated.
-        states: Number of states, slow errors included.
+    P is the inflated covariance of all `states`, its lower triangle by blocks; `inflated` are the
+    lanes in which it was inflated.
     """
     R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
-    k = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-    heading = dot(k, apply(P_ee, k))
+    k = R_BI.T[2]
+    heading = dot(k, P_ee @ k)
     both = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)
     tilted = _share(both, MOST_TILT, inflated)
     turned = _share(heading, MOST_ANGLE, inflated) - tilted
-    zero = 0.0 * tilted
-    M = ((tilted, zero, zero), (zero, tilted, zero), (zero, zero, tilted))
-    _shrink_block(P, E, add_outer(M, scale(turned, k), k), states)
-    for row, most in (
-        (R, MOST_POSITION),
-        (V, MOST_VELOCITY),
-        (BA, MOST_ACCEL_BIAS),
-        (BG, MOST_GYRO_BIAS),
-    ):
-        _shrink_axes(P, row, most, inflated, states)
+    M = diagonal((tilted, tilted, tilted)) + outer(turned * k, k)
+    _shrink_block(P, E, M, states)
+    bounds = ((R, MOST_POSITION), (V, MOST_VELOCITY), (BA, MOST_ACCEL_BIAS), (BG, MOST_GYRO_BIAS))
+    for row, most in bounds:
+        x = _share(P[row, row], most, inflated)
+        y = _share(P[row + 1, row + 1], most, inflated)
+        z = _share(P[row + 2, row + 2], most, inflated)
+        _shrink_block(P, row, diagonal((x, y, z)), states)
 
 
 @kernel
@@ -194,17 +164,7 @@ def _raise_alarms(flight, p, work, settings, mask):
 
 @kernel
 def inflate(flight, p, work, settings, mask, slow, stages):
-    """Raise alarms and inflate the covariance of states that may be wrong, in the lanes `mask`.
-
-    Args:
-        flight: Record; reads innovations, rejections and drifts, changes the covariance.
-        p: Parameters assumed by the filter.
-        work: Workspace.
-        settings: Configuration of the batch.
-        mask: Lanes to work on.
-        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
-        stages: Table of stages.
-    """
+    """Raise alarms and inflate the covariance of states that may be wrong, in the lanes `mask`."""
     _raise_alarms(flight, p, work, settings, mask)
     accel, corrected_a = one_way(flight, 0)
     gyro, corrected_g = one_way(flight, 3)
@@ -213,7 +173,9 @@ def inflate(flight, p, work, settings, mask, slow, stages):
     moved = mask & (flight.tick < 0.0)  # all false
     if slow is not None:
         if slow.estimates_drift:
-            moved = mask & (drifts_suddenly(flight) | (work.alarm[_BAROMETER_GROUP] > 0.0))
+            moved = mask & (
+                drifts_suddenly(flight) | (work.alarm[AID_GROUPS + Aid.BAROMETER] > 0.0)
+            )
             moved = moved & logical_not(camera_fits(flight, p))
     alarmed = inflated | moved
     for group in range(SENSOR_GROUPS):
@@ -221,10 +183,8 @@ def inflate(flight, p, work, settings, mask, slow, stages):
     if not any_of(alarmed):
         return
 
-    L, P, factor = flight.L, work.P, select(inflated, _FACTOR, 1.0)
-    for i in range(0, 15, 3):
-        for j in range(0, i + 3, 3):
-            store_block(P, i, j, scale33(factor, sum_of_outers(L, i, L, j, j + 3)))
+    P = work.P
+    put_covariance(P, flight.L, select(inflated, _FACTOR, 1.0))
     states = 15
     if slow is not None:
         states = 15 + slow.slow_states
@@ -234,28 +194,22 @@ def inflate(flight, p, work, settings, mask, slow, stages):
     bound_inflation(flight, P, inflated, states)
     _inflate_biases(flight, P, BA, drifting, accel, corrected_a, MOST_ACCEL_BIAS)
     _inflate_biases(flight, P, BG, drifting, gyro, corrected_g, MOST_GYRO_BIAS)
-    call_sensors(flight, p, p, settings, work, stages, _INFLATE, 0)
+    call_sensors(flight, p, p, settings, work, stages, Act.INFLATE, 0)
     if slow is not None:
         if slow.estimates_drift:
             inflate_position_and_drift(flight, P, moved)
 
     ok = alarmed & (cholesky(P, states, work.inverse_diagonal) > 0.0)
-    for i in range(15):
-        for j in range(i + 1):
-            L[i, j] = select(ok, P[i, j], L[i, j])
-    if slow is not None:
-        keep_slow_factor(flight, slow, work, ok)
-    failed, status = alarmed & logical_not(ok), flight.filter_status
-    flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
+    keep_factor(flight, slow, work, ok)
+    failed = alarmed & logical_not(ok)
+    flag_failure(flight, failed)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
     flight.alarm_tick = select(alarmed, flight.tick, flight.alarm_tick)
     for group in range(SENSOR_GROUPS):
         flight.reopened[group] = flight.reopened[group] + work.alarm[group]
         row = flight.rejected_in_row[group]
         flight.rejected_in_row[group] = select(work.alarm[group] > 0.0, 0.0, row)
-        for i in range(3):
-            mean = flight.innovation_drift[group, i]
-            flight.innovation_drift[group, i] = select(alarmed, 0.0, mean)
+    reset(flight, alarmed, 0.0, "innovation_drift")
     forget_corrections(flight, alarmed)
     if slow is not None:
         if slow.estimates_drift:

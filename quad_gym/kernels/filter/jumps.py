@@ -13,8 +13,15 @@ Source: ours.
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.recovery import MOST_POSITION, enlarge, variance_of
+from quad_gym.kernels.filter.recovery import (
+    MOST_POSITION,
+    add_correction,
+    enlarge,
+    raise_variance,
+    variance_of,
+)
 from quad_gym.kernels.maths.elementary import maximum
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
 
 _TIME = 1.5
@@ -29,27 +36,18 @@ the vertical part of the jump."""
 
 @kernel
 def follow_drift_corrections(flight, p, L9, dx, columns, ok):
-    """Add up an update's corrections of the drift, and their variances, where `ok`.
+    """Add up an update's corrections dx of the drift, and their variances, where `ok`.
 
-    Args:
-        flight: Record, with the factor before the update.
-        p: Parameters assumed by the filter.
-        L9: The updated factor, last column first.
-        dx: The correction of the state.
-        columns: Number of columns.
-        ok: Lanes to work on.
+    L9 is the updated factor, last column first; the record still has the factor before.
     """
     kept = maximum(1.0 - (flight.tick - flight.corrected_tick) * p.dt / _TIME, 0.0)
+    sums, variances = flight.drift_corrected, flight.drift_corrected_variance
     for i in range(3):
-        variance = 0.0 * kept
+        removed = 0.0 * kept
         for j in range(columns):
             before, after = flight.L_slow[i, j], L9[D + i, j]
-            variance = variance + before * before - after * after
-        before, total = flight.drift_corrected[i], kept * flight.drift_corrected[i] + dx[D + i]
-        flight.drift_corrected[i] = select(ok, total, before)
-        before = flight.drift_corrected_variance[i]
-        variance = kept * kept * before + maximum(variance, 0.0)
-        flight.drift_corrected_variance[i] = select(ok, variance, before)
+            removed = removed + before * before - after * after
+        add_correction(sums, variances, i, ok, kept, dx[D + i], maximum(removed, 0.0))
 
 
 @kernel
@@ -78,15 +76,11 @@ def inflate_position_and_drift(flight, P, moved):
     for i in range(3):
         total = flight.drift_corrected[i]
         square = maximum(total * total, mean)
-        wanted = select(moved, enlarge(square, MOST_POSITION), 0.0)
-        P[R + i, R + i] = maximum(P[R + i, R + i], wanted)
-        P[D + i, D + i] = maximum(P[D + i, D + i], wanted)
+        raise_variance(P, R + i, moved, enlarge(square, MOST_POSITION))
+        raise_variance(P, D + i, moved, enlarge(square, MOST_POSITION))
 
 
 @kernel
 def forget_drift_corrections(flight, mask):
     """Reset the sum of corrections of the drift, in the lanes `mask`."""
-    for i in range(3):
-        flight.drift_corrected[i] = select(mask, 0.0, flight.drift_corrected[i])
-        before = flight.drift_corrected_variance[i]
-        flight.drift_corrected_variance[i] = select(mask, 0.0, before)
+    reset(flight, mask, 0.0, "drift_corrected drift_corrected_variance")

@@ -14,8 +14,7 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.linalg import cross, load3
 from quad_gym.records import FilterForm
 
-_OF_AVERAGES, _OF_SAMPLES = int(FilterForm.LEVER_AVERAGES), int(FilterForm.LEVER_SAMPLES)
-LEVER_ARM = _OF_AVERAGES | _OF_SAMPLES
+LEVER_ARM = int(FilterForm.LEVER_AVERAGES | FilterForm.LEVER_SAMPLES)
 """Bits of a `FilterForm` with which there is a lever arm."""
 
 
@@ -24,17 +23,12 @@ def lever_force(flight, p, form, half):
     """Specific force that the lever arm adds to the tick's sample, in B.
 
     A sample that is the mean over the tick contains the change of R^T (w x l), in the body frame
-    halfway. For a sample of the tick's start, dw comes from the sample before.
-
-    Args:
-        flight: Record; reads w_meas and w_before.
-        p: Parameters that the filter assumes.
-        form: A `FilterForm`.
-        half: Rotation from the attitude at the tick's start to the attitude halfway, for means.
+    halfway: `half` rotates from the attitude at the tick's start to it. For a sample of the tick's
+    start, dw comes from the sample before.
     """
     l_B, b_g, rate = load3(p.imu_lever_arm), load3(flight.b_g_hat), 1.0 / p.dt
     w, w_before = load3(flight.w_meas) - b_g, load3(flight.w_before) - b_g
-    if (form & _OF_AVERAGES) != 0:
+    if (form & FilterForm.LEVER_AVERAGES.value) != 0:
         return rate * (half.T @ cross(w, l_B) - half @ cross(w_before, l_B))
     dw = rate * (w - w_before)
     return cross(dw, l_B) + cross(w, cross(w, l_B))

@@ -5,27 +5,27 @@ The stacked measurement has three rows for each block that any lane has measured
 with an `Act` and an argument. The filter accesses sensors by these calls only.
 """
 
+import numpy as np
+
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import (
     BLOCK_NUMBERS,
     FIRST_BLOCK,
+    MAX_BLOCKS,
     SENSORS,
     Act,
+    FilterStatus,
     GateDecision,
     Sensor,
 )
 
 ACTS = len(Act)
-_FIRST = int(Stage[Sensor(0).name])
-_FAILED = float(GateDecision.FAILED)
+_FIRST = Stage[Sensor(0).name].value
 _NUMBERS = tuple(map(float, BLOCK_NUMBERS))
 
 for _sensor in Sensor:  # their stages are in the same order
     assert Stage[_sensor.name] == _FIRST + _sensor
-
-
-# ---- calls -----------------------------------------------------------------------------------
 
 
 @kernel
@@ -57,9 +57,6 @@ def call_measured(flight, p, work, settings, stages, act):
             k += rows
 
 
-# ---- validity --------------------------------------------------------------------------------
-
-
 @kernel
 def _rows_of(flight, settings, sensor):
     """Count the rows of a sensor in the stacked measurement."""
@@ -88,10 +85,8 @@ def count_measured(flight, work, settings):
 @kernel
 def store_valid(flight, work, settings):
     """Store the validity of all blocks, to update with one delayed sensor after the other."""
-    for sensor in range(SENSORS):
-        first = FIRST_BLOCK[sensor]
-        for block in range(first, first + settings.sensor_blocks[sensor]):
-            work.kept_valid[block] = flight.block_valid[block]
+    for block in range(MAX_BLOCKS):
+        work.kept_valid[block] = flight.block_valid[block]
 
 
 @kernel
@@ -116,17 +111,21 @@ def choose_valid(flight, work, settings, turn):
 @kernel
 def restore_valid(flight, work, settings):
     """Restore the stored validity of all blocks."""
-    for sensor in range(SENSORS):
-        first = FIRST_BLOCK[sensor]
-        for block in range(first, first + settings.sensor_blocks[sensor]):
-            flight.block_valid[block] = work.kept_valid[block]
+    for block in range(MAX_BLOCKS):
+        flight.block_valid[block] = work.kept_valid[block]
 
 
 @kernel
-def mark_failed(flight, settings, failed):
+def mark_failed(flight, failed):
     """Mark the valid blocks of an update that failed."""
-    for sensor in range(SENSORS):
-        first = FIRST_BLOCK[sensor]
-        for block in range(first, first + settings.sensor_blocks[sensor]):
-            lost = failed & (flight.block_valid[block] > 0.0)
-            flight.gate[block] = select(lost, _FAILED, flight.gate[block])
+    for block in range(MAX_BLOCKS):
+        lost = failed & (flight.block_valid[block] > 0.0)
+        flight.gate[block] = select(lost, GateDecision.FAILED, flight.gate[block])
+
+
+@kernel
+def flag_failure(flight, failed):
+    """Flag an update that failed."""
+    status = flight.filter_status
+    failure = np.uint64(FilterStatus.UPDATE_FAILED.value)
+    flight.filter_status = select(failed, status | failure, status)

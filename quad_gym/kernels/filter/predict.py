@@ -30,16 +30,19 @@ from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.filter.preintegration import accel_variance, gyro_sigma
-from quad_gym.kernels.filter.slow import decay_slow, keep_slow_factor, predict_slow, turn_slow
+from quad_gym.kernels.filter.slow import decay_slow, keep_factor, predict_slow, turn_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add_to_diagonal,
     cross,
-    keep3,
-    keep33,
+    diagonal,
+    keep,
     load3,
     load33,
+    outer,
+)
+from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
     store_block,
@@ -53,13 +56,8 @@ from quad_gym.kernels.maths.rotation import (
     turn_pair_back,
     vector_to_dcm,
 )
-from quad_gym.kernels.maths.vectors import outer
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm, FilterStatus
-
-_EKF, _MIDPOINT, _TURN = int(FilterForm.EKF), int(FilterForm.MIDPOINT), int(FilterForm.TURN)
-_PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
 
 
 @kernel
@@ -100,19 +98,16 @@ def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
 
 @kernel
 def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
-    """Fill work.F and work.S with the propagated pairs.
+    """Fill work.F and work.S with the propagated pairs; return the means minus the center's.
 
-    Position and velocity share the half-sums of the acceleration: S has these and the half-sums of
-    the error angles.
-
-    Returns:
-        Mean acceleration and mean error angles of the sigma points, minus the center's.
+    Position and velocity share the half-sums of the acceleration: S and the means have these and
+    the half-sums of the error angles.
     """
     L, F, S = flight.L, work.F, work.S
     R_BI = load33(flight.R_hat)
     dt = p.dt
     half_dt, half_dt2 = 0.5 * dt, 0.5 * dt * dt
-    midpoint, extended = (form & _MIDPOINT) != 0, (form & _EKF) != 0
+    midpoint, extended = (form & FilterForm.MIDPOINT.value) != 0, (form & FilterForm.EKF.value) != 0
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
     inverse_c = 1.0 / c
     zero = 0.0 * c
@@ -173,9 +168,7 @@ def _turned_angles(L, j, full, half, dt):
 def _add_gyro_noise(P, p, R_BI, f_B, half):
     """Add the gyro's white noise to P; half of its angle error rotates the force."""
     dt, sigma = p.dt, gyro_sigma(p, f_B)
-    zero = 0.0 * dt
-    axes = ((sigma, zero, zero), (zero, sigma, zero), (zero, zero, sigma))
-    for axis in axes:
+    for axis in diagonal((sigma, sigma, sigma)):
         dv = 0.5 * dt * dt * (R_BI.T @ (half.T @ cross(f_B, axis)))
         dr, de = 0.5 * dt * dv, -dt * (half @ axis)
         store_block(P, R, R, load_block(P, R, R) + outer(dr, dr))
@@ -219,7 +212,7 @@ def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
     half_dt2 = 0.5 * dt * dt
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
     variance = accel_variance(p, f_B)
-    extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
+    extended, midpoint = (form & FilterForm.EKF.value) != 0, (form & FilterForm.MIDPOINT.value) != 0
     angle = 0.0 * dt if midpoint else dt * gyro_sigma(p, f_B)
     gyro_variance = angle * angle
 
@@ -239,19 +232,15 @@ def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
     for j in range(0, 9, 3):
         store_block(P, BA, j, decay_a * sum_of_outers(L, BA, F, j, 12))
         store_block(P, BG, j, decay_g * sum_of_outers(L, BG, F, j, 15))
-    aa, ga, gg = (
-        sum_of_squares(L, BA, 12),
-        sum_of_outers(L, BG, L, BA, 12),
-        sum_of_squares(L, BG, 15),
-    )
+    aa, gg = sum_of_squares(L, BA, 12), sum_of_squares(L, BG, 15)
     drive_a, drive_g = p.accel_bias_drive, p.gyro_bias_drive
     store_block(P, BA, BA, add_to_diagonal(decay_a * decay_a * aa, drive_a * drive_a))
-    store_block(P, BG, BA, decay_g * decay_a * ga)
+    store_block(P, BG, BA, decay_g * decay_a * sum_of_outers(L, BG, L, BA, 12))
     store_block(P, BG, BG, add_to_diagonal(decay_g * decay_g * gg, drive_g * drive_g))
 
 
 @kernel
-def predict(flight, p, work, form=0, slow=None):
+def predict(flight, p, work, form, slow):
     """Predict over one tick with its IMU sample.
 
     In the report's form, the sample is taken at the tick's start:
@@ -267,17 +256,11 @@ def predict(flight, p, work, form=0, slow=None):
     derivatives replace sigma points, see `ekf.py`.
 
     A lane whose predicted covariance is not positive definite keeps its state, sets
-    PREDICTION_FAILED, and counts the failure.
-
-    Args:
-        flight: Record; reads gyro and accel, changes the estimate.
-        p: Parameters that the filter assumes.
-        work: Workspace.
-        form: A `FilterForm`.
-        slow: The settings if sensors have slow errors (`slow.py`), else None.
+    PREDICTION_FAILED, and counts the failure. `slow`: the settings if sensors have slow errors
+    (`slow.py`), else None.
     """
     dt = p.dt
-    midpoint = (form & _MIDPOINT) != 0
+    midpoint = (form & FilterForm.MIDPOINT.value) != 0
     w_B = load3(flight.gyro) - load3(flight.b_g_hat)
     f_B = load3(flight.accel) - load3(flight.b_a_hat)
     R_BI = load33(flight.R_hat)
@@ -299,7 +282,7 @@ def predict(flight, p, work, form=0, slow=None):
         R_pred, f_B = half @ (half @ R_BI), half.T @ f_B
     else:
         R_pred = euler_to_dcm(turn) @ R_BI
-        if (form & _TURN) != 0:
+        if (form & FilterForm.TURN.value) != 0:
             turn_covariance(work.P, reset_matrix(turn))
             if slow is not None:
                 turn_slow(slow, work.P, reset_matrix(turn))
@@ -311,30 +294,26 @@ def predict(flight, p, work, form=0, slow=None):
     v_pred = v + dt * a_I
     ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
 
-    keep3(flight.r_hat, ok, r_pred)
-    keep3(flight.v_hat, ok, v_pred)
-    keep33(flight.R_hat, ok, R_pred)
-    keep3(flight.b_a_hat, ok, p.accel_bias_decay * load3(flight.b_a_hat))
-    keep3(flight.b_g_hat, ok, p.gyro_bias_decay * load3(flight.b_g_hat))
-    for i in range(15):
-        for j in range(i + 1):
-            flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    keep(flight.r_hat, ok, r_pred)
+    keep(flight.v_hat, ok, v_pred)
+    keep(flight.R_hat, ok, R_pred)
+    keep(flight.b_a_hat, ok, p.accel_bias_decay * load3(flight.b_a_hat))
+    keep(flight.b_g_hat, ok, p.gyro_bias_decay * load3(flight.b_g_hat))
+    keep_factor(flight, slow, work, ok)
     if slow is not None:
         decay_slow(flight, slow, p, ok)
-        keep_slow_factor(flight, slow, work, ok)
-    flight.filter_status = select(
-        ok, flight.filter_status, flight.filter_status | _PREDICTION_FAILED
-    )
+    status, failure = flight.filter_status, np.uint64(FilterStatus.PREDICTION_FAILED.value)
+    flight.filter_status = select(ok, status, status | failure)
     flight.prediction_failures = flight.prediction_failures + select(ok, 0.0, 1.0)
 
 
 @stage
 def predict_stage(flight, world, model, settings, work, stages, flag):
     """Predict over a tick."""
-    predict(lanes_of(flight), lanes_of(model), lanes_of(work), settings.form)
+    predict(flight, model, work, settings.form, None)
 
 
 @stage
 def predict_with_slow_stage(flight, world, model, settings, work, stages, flag):
     """Predict over a tick with slow errors of sensors in the state."""
-    predict(lanes_of(flight), lanes_of(model), lanes_of(work), settings.form, settings)
+    predict(flight, model, work, settings.form, settings)

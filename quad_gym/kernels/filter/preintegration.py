@@ -28,59 +28,46 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import (
-    cross,
-    dot,
-    keep3,
-    keep33,
-    load3,
-    load33,
-    load_column3,
-    store3,
-    store33,
-    store_column3,
-)
+from quad_gym.kernels.maths.linalg import cross, diagonal, dot, keep, load3, load33, rounded, store
+from quad_gym.kernels.maths.matrices import load_column3, store_column3
 from quad_gym.kernels.maths.rotation import euler_to_dcm, vector_to_dcm
-from quad_gym.kernels.maths.vectors import rounded
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm
 
-_MIDPOINT = int(FilterForm.MIDPOINT)
 NOISE = 15
 """First of the six columns of white noise, after the fifteen of the covariance's factor."""
 
 
-@kernel
-def begin_increments(flight, mask):
-    """Reset the sums, where `mask`."""
-    nothing = (0.0, 0.0, 0.0)
-    keep33(flight.imu_turn, mask, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-    keep3(flight.imu_velocity, mask, nothing)
-    keep3(flight.imu_position, mask, nothing)
-    keep33(flight.imu_bias_gain, mask, (nothing, nothing, nothing))
+@stage
+def begin_late_stage(flight, world, model, settings, work, stages, flag):
+    """Reset the sums of the IMU at the start of an episode."""
+    mask = work.mask > 0.0
+    keep(flight.imu_turn, mask, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    reset(flight, mask, 0.0, "imu_velocity imu_position imu_bias_gain")
 
 
-@kernel
-def add_increment(flight, p, form):
-    """Add the tick's IMU sample, in the form that the prediction uses."""
+@stage
+def increment_stage(flight, world, model, settings, work, stages, flag):
+    """Add the tick's IMU sample to the sums, in the form that the prediction uses."""
+    p, form = model, settings.form
     dt, C = p.dt, load33(flight.imu_turn)
     turn, half = dt * load3(flight.gyro), C
     force = load3(flight.accel)
-    if (form & _MIDPOINT) != 0:
+    if (form & FilterForm.MIDPOINT.value) != 0:
         half = vector_to_dcm(0.5 * turn)
     if (form & LEVER_ARM) != 0:
         force = force - lever_force(flight, p, form, half)
-    if (form & _MIDPOINT) != 0:
+    if (form & FilterForm.MIDPOINT.value) != 0:
         C = half @ C
-        store33(flight.imu_turn, half @ C)
+        store(flight.imu_turn, half @ C)
     else:
-        store33(flight.imu_turn, euler_to_dcm(turn) @ C)
+        store(flight.imu_turn, euler_to_dcm(turn) @ C)
     dv, v = rounded(dt * (C.T @ force)), load3(flight.imu_velocity)
-    store3(flight.imu_velocity, v + dv)
+    store(flight.imu_velocity, v + dv)
     moved = dt * v + rounded(0.5 * dt * dv)
-    store3(flight.imu_position, load3(flight.imu_position) + moved)
-    store33(flight.imu_bias_gain, dt * C.T + load33(flight.imu_bias_gain))
+    store(flight.imu_position, load3(flight.imu_position) + moved)
+    store(flight.imu_bias_gain, dt * C.T + load33(flight.imu_bias_gain))
 
 
 @kernel
@@ -107,11 +94,7 @@ def increments(flight, work):
 
 @kernel
 def take_mean(flight, p, work, back):
-    """Propagate the mean over the time since the saved instant, back to it or forward from it.
-
-    Returns:
-        R_s, dR, dv, dr.
-    """
+    """Propagate the mean over the time since the saved instant; return (R_s, dR, dv, dr)."""
     dR, dv, dr = increments(flight, work)
     T = work.since_time
     fall = (0.0, 0.0, p.gravity * T)
@@ -128,9 +111,9 @@ def take_mean(flight, p, work, back):
     else:
         r = T * v + r + moved
         v = v + gained
-    store33(flight.R_hat, R_end)
-    store3(flight.r_hat, r)
-    store3(flight.v_hat, v)
+    store(flight.R_hat, R_end)
+    store(flight.r_hat, r)
+    store(flight.v_hat, v)
     return R_s, dR, dv, dr
 
 
@@ -176,7 +159,7 @@ def put_noise(p, work, R_s, dR, dv):
     for k in range(3):
         M[V + k, NOISE + k] = a
         M[R + k, NOISE + k] = 0.5 * T * a
-    axes = ((g, zero, zero), (zero, g, zero), (zero, zero, g))
+    axes = diagonal((g, g, g))
     for k in range(3):
         force = R_s.T @ cross(axes[k], dv)
         store_column3(M, R, NOISE + 3 + k, -T / 6.0 * force)
@@ -208,18 +191,3 @@ def take_columns(work, R_s, dR, dv, dr, back):
         store_column3(M, R, j, r)
         store_column3(M, V, j, v)
         store_column3(M, E, j, e)
-
-
-# ---- stages ----------------------------------------------------------------------------------
-
-
-@stage
-def begin_late_stage(flight, world, model, settings, work, stages, flag):
-    """Reset the sums of the IMU at the start of an episode."""
-    begin_increments(lanes_of(flight), lanes_of(work).mask > 0.0)
-
-
-@stage
-def increment_stage(flight, world, model, settings, work, stages, flag):
-    """Add the tick's IMU sample to the sums with which delayed measurements are retrodicted."""
-    add_increment(lanes_of(flight), lanes_of(model), settings.form)

@@ -24,7 +24,9 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import add_outer, apply, dot, load_block, scale, store_block
+from quad_gym.kernels.maths.linalg import dot, outer
+from quad_gym.kernels.maths.matrices import load_block, store_block
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import SENSOR_GROUPS
 
@@ -70,11 +72,10 @@ MOST_ANGLE = math.pi / math.sqrt(3.0)
 
 
 @kernel
-def follow_drift(flight, group, valid, first, second, third):
+def follow_drift(flight, group, valid, nu):
     """Average the innovation of a group, in standard deviations, in the lanes `valid`."""
-    values = (first, second, third)
     for i in range(3):
-        value = clip(values[i], -LARGEST, LARGEST)
+        value = clip(nu[i], -LARGEST, LARGEST)
         mean = flight.innovation_drift[group, i]
         mean = mean + _MEMORY * (value - mean)
         flight.innovation_drift[group, i] = select(valid, mean, flight.innovation_drift[group, i])
@@ -82,35 +83,31 @@ def follow_drift(flight, group, valid, first, second, third):
 
 @kernel
 def follow_corrections(flight, p, L, L9, dx, columns, ok):
-    """Add up an update's corrections of the biases, and their variances, where `ok`.
+    """Add up an update's corrections dx of the biases, and their variances, where `ok`.
 
-    Args:
-        flight: Record.
-        p: Parameters assumed by the filter.
-        L: The factor before the update.
-        L9: The columns of the factor that the update has changed.
-        dx: The correction of the state.
-        columns: Number of these columns.
-        ok: Lanes to work on.
+    L is the factor before the update, L9 has the `columns` that the update has changed.
     """
     passed = (flight.tick - flight.corrected_tick) * p.dt
     kept = maximum(1.0 - passed / _CORRECTION_TIME, 0.0)
     kept_long = maximum(1.0 - passed / _LONG_TIME, 0.0)
     for i in range(6):
-        variance = 0.0 * kept
+        removed = 0.0 * kept
         for j in range(columns):
             if j < 15:
-                variance = variance + L[BA + i, j] * L[BA + i, j]
-            variance = variance - L9[BA + i, j] * L9[BA + i, j]
-        variance = maximum(variance, 0.0)
-        before, spread = flight.corrected[i], flight.corrected_variance[i]
-        flight.corrected[i] = select(ok, kept * before + dx[BA + i], before)
-        flight.corrected_variance[i] = select(ok, kept * kept * spread + variance, spread)
-        before, spread = flight.corrected_long[i], flight.corrected_long_variance[i]
-        flight.corrected_long[i] = select(ok, kept_long * before + dx[BA + i], before)
-        total = kept_long * kept_long * spread + variance
-        flight.corrected_long_variance[i] = select(ok, total, spread)
+                removed = removed + L[BA + i, j] * L[BA + i, j]
+            removed = removed - L9[BA + i, j] * L9[BA + i, j]
+        removed, shift = maximum(removed, 0.0), dx[BA + i]
+        add_correction(flight.corrected, flight.corrected_variance, i, ok, kept, shift, removed)
+        sums, variances = flight.corrected_long, flight.corrected_long_variance
+        add_correction(sums, variances, i, ok, kept_long, shift, removed)
     flight.corrected_tick = select(ok, flight.tick, flight.corrected_tick)
+
+
+@kernel
+def add_correction(sums, variances, i, ok, kept, shift, variance):
+    """Add a correction and its variance to sums of which a share is `kept`, where `ok`."""
+    sums[i] = select(ok, kept * sums[i] + shift, sums[i])
+    variances[i] = select(ok, kept * kept * variances[i] + variance, variances[i])
 
 
 @kernel
@@ -165,27 +162,17 @@ def camera_fits(flight, p):
 @kernel
 def forget_corrections(flight, mask):
     """Reset the sums of corrections, in the lanes `mask`."""
-    for i in range(6):
-        flight.corrected[i] = select(mask, 0.0, flight.corrected[i])
-        flight.corrected_variance[i] = select(mask, 0.0, flight.corrected_variance[i])
-        flight.corrected_long[i] = select(mask, 0.0, flight.corrected_long[i])
-        long = flight.corrected_long_variance[i]
-        flight.corrected_long_variance[i] = select(mask, 0.0, long)
+    names = "corrected corrected_variance corrected_long corrected_long_variance"
+    reset(flight, mask, 0.0, names)
     flight.corrected_tick = select(mask, flight.tick, flight.corrected_tick)
 
 
 @kernel
 def begin_recovery(flight, mask):
     """Reset the monitoring at the start of an episode, in the lanes `mask`."""
-    for group in range(SENSOR_GROUPS):
-        flight.accepted_tick[group] = select(mask, 0.0, flight.accepted_tick[group])
-        for i in range(3):
-            drift = flight.innovation_drift[group, i]
-            flight.innovation_drift[group, i] = select(mask, 0.0, drift)
+    reset(flight, mask, 0.0, "accepted_tick innovation_drift diverged")
+    reset(flight, mask, -1e9, "alarm_tick fit_tick")
     flight.nis_ratio = select(mask, 1.0, flight.nis_ratio)
-    flight.diverged = select(mask, 0.0, flight.diverged)
-    flight.alarm_tick = select(mask, -1e9, flight.alarm_tick)
-    flight.fit_tick = select(mask, -1e9, flight.fit_tick)
 
 
 @kernel
@@ -218,36 +205,42 @@ def enlarge(square, most):
 
 
 @kernel
-def raise_diagonal(P, first, least):
-    """Raise three variances of P from the row `first` on to at least `least`."""
+def raise_variance(P, i, alarm, least):
+    """Raise a variance of P to at least `least` in the lanes `alarm`."""
+    P[i, i] = maximum(P[i, i], select(alarm, least, 0.0))
+
+
+@kernel
+def raise_variances(P, first, alarm, least):
+    """Raise three variances of P from the row `first` on to at least `least`, where `alarm`."""
     for i in range(first, first + 3):
-        P[i, i] = maximum(P[i, i], least)
+        raise_variance(P, i, alarm, least)
 
 
 @kernel
 def inflate_accel_bias(p, P, acceleration, alarm):
     """Raise the standard deviations of accelerometer biases, and of the tilt in proportion."""
     bounded = minimum(acceleration, MOST_ACCEL_BIAS)
-    raise_diagonal(P, BA, select(alarm > 0.0, bounded * bounded, 0.0))
+    raise_variances(P, BA, alarm, bounded * bounded)
     tilt = minimum(acceleration / p.gravity, MOST_TILT)
-    raise_diagonal(P, E, select(alarm > 0.0, tilt * tilt, 0.0))
+    raise_variances(P, E, alarm, tilt * tilt)
 
 
 @kernel
 def inflate_gyro_bias(P, rate, alarm):
     """Raise the standard deviations of gyro biases."""
     bounded = minimum(rate, MOST_GYRO_BIAS)
-    raise_diagonal(P, BG, select(alarm > 0.0, bounded * bounded, 0.0))
+    raise_variances(P, BG, alarm, bounded * bounded)
 
 
 @kernel
-def inflate_heading(P, vertical, square, alarm):
-    """Raise the variance of the heading, the angle about the `vertical` in B."""
-    P_ee = load_block(P, E, E)
-    heading = dot(vertical, apply(P_ee, vertical))
+def inflate_heading(P, R_BI, square, alarm):
+    """Raise the variance of the heading, the angle about the vertical."""
+    P_ee, vertical = load_block(P, E, E), R_BI.T[2]
+    heading = dot(vertical, P_ee @ vertical)
     wanted = select(alarm, minimum(square, MOST_ANGLE * MOST_ANGLE), 0.0)
     more = maximum(wanted - heading, 0.0)
-    store_block(P, E, E, add_outer(P_ee, scale(more, vertical), vertical))
+    store_block(P, E, E, P_ee + outer(more * vertical, vertical))
 
 
 @kernel

@@ -4,8 +4,11 @@ Column j of the factor L is row `last - j` of work.A, and row 8 - j of work.E.
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import D
+from quad_gym.kernels.filter.error_state import D, E
+from quad_gym.kernels.maths.linalg import cross, load33
+from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import FilterForm
 
 
 @kernel
@@ -25,16 +28,30 @@ def put_three(row, k, valid, values):
 
 
 @kernel
-def put_noise(work, k, valid, R):
-    """Write the noise covariance of a block, in the lanes `valid`."""
+def put_block(work, settings, k, valid, z, z_hat, noise):
+    """Write measurement, prediction and noise, in the lanes `valid`; slow errors add nothing."""
+    put_three(work.z, k, valid, z)
+    put_three(work.z_hat, k, valid, z_hat)
     for i in range(3):
         for j in range(3):
-            work.Rz[k + i, k + j] = select(valid, R[i][j], 1.0 if i == j else 0.0)
-
-
-@kernel
-def clear_slow_columns(work, k, settings):
-    """Set the columns of slow errors to zero."""
+            work.Rz[k + i, k + j] = select(valid, noise[i][j], 1.0 if i == j else 0.0)
     for row in range(columns_of(settings) - 9):
         for i in range(3):
             work.A[row, k + i] = 0.0 * work.spread
+
+
+@kernel
+def put_column(work, settings, k, j, valid, a, s):
+    """Write half-difference and half-sum of column j < 9, both over c, in the lanes `valid`."""
+    put_three(work.A[columns_of(settings) - 1 - j], k, valid, a)
+    put_three(work.E[8 - j], k, valid, s)
+
+
+@kernel
+def lever_column(flight, work, settings, j, R_BI, l_B):
+    """Half-difference and half-sum of R^T l along column j, or derivative and zero in an EKF."""
+    if (settings.form & FilterForm.EKF.value) != 0:
+        a = R_BI.T @ cross(load_column3(flight.L, E, j), l_B)
+        return a, 0.0 * a
+    odd, even, inverse_c = load33(work.odd[j]), load33(work.even[j]), work.inverse_spread
+    return R_BI.T @ (inverse_c * (odd.T @ l_B)), R_BI.T @ (inverse_c * (even.T @ l_B))

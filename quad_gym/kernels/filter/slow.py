@@ -26,10 +26,8 @@ fifteen states, as without d, and their prediction does not depend on d. Kernels
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
-from quad_gym.kernels.maths.linalg import (
-    cross,
-    load3,
-    load33,
+from quad_gym.kernels.maths.linalg import add_diagonal, cross, load3, load33, outer
+from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
     store_block,
@@ -40,8 +38,6 @@ from quad_gym.kernels.maths.linalg import (
 from quad_gym.kernels.maths.rotation import euler_to_dcm
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import Aid
-
-_MAGNETOMETER = int(Aid.MAGNETOMETER)
 
 
 @kernel
@@ -56,16 +52,6 @@ def begin_slow(flight, p, slow, mask):
 
 
 @kernel
-def add_diagonal(m, d):
-    """M + diag(d)."""
-    return (
-        (m[0][0] + d[0], m[0][1], m[0][2]),
-        (m[1][0], m[1][1] + d[1], m[1][2]),
-        (m[2][0], m[2][1], m[2][2] + d[2]),
-    )
-
-
-@kernel
 def _scale_rows(a, m):
     """Diag(a) M."""
     return (a[0] * m[0], a[1] * m[1], a[2] * m[2])
@@ -74,11 +60,18 @@ def _scale_rows(a, m):
 @kernel
 def _scale_both(a, b, m):
     """Diag(a) M diag(b)."""
-    return (
-        (a[0] * b[0] * m[0][0], a[0] * b[1] * m[0][1], a[0] * b[2] * m[0][2]),
-        (a[1] * b[0] * m[1][0], a[1] * b[1] * m[1][1], a[1] * b[2] * m[1][2]),
-        (a[2] * b[0] * m[2][0], a[2] * b[1] * m[2][1], a[2] * b[2] * m[2][2]),
-    )
+    return _times(outer(a, b), m)
+
+
+@kernel
+def _times(a, b):
+    """The products of corresponding numbers of two matrices."""
+    return (_product(a[0], b[0]), _product(a[1], b[1]), _product(a[2], b[2]))
+
+
+@kernel
+def _product(a, b):
+    return (a[0] * b[0], a[1] * b[1], a[2] * b[2])
 
 
 @kernel
@@ -89,7 +82,14 @@ def keep_slow_factor(flight, slow, work, ok):
             flight.L_slow[i, j] = select(ok, work.P[D + i, j], flight.L_slow[i, j])
 
 
-# ---- prediction ------------------------------------------------------------------------------
+@kernel
+def keep_factor(flight, slow, work, ok):
+    """Store the factor in work.P, where `ok`."""
+    for i in range(15):
+        for j in range(i + 1):
+            flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    if slow is not None:
+        keep_slow_factor(flight, slow, work, ok)
 
 
 @kernel
@@ -108,7 +108,7 @@ def predict_slow(flight, slow, p, work):
             other = sum_of_outers(M, i, M, j, D + j + 3)
             store_block(P, D + i, D + j, _scale_both(a, b, other))
         own = _scale_both(a, a, sum_of_squares(M, i, D + i + 3))
-        store_block(P, D + i, D + i, add_diagonal(own, (s[0] * s[0], s[1] * s[1], s[2] * s[2])))
+        store_block(P, D + i, D + i, add_diagonal(own, _product(s, s)))
 
 
 @kernel
@@ -124,9 +124,6 @@ def turn_slow(slow, P, T):
     """Transform the correlation of d with the error angles, as `turn_covariance` the other ones."""
     for i in range(0, slow.slow_states, 3):
         store_block(P, D + i, E, load_block(P, D + i, E) @ T.T)
-
-
-# ---- update ----------------------------------------------------------------------------------
 
 
 @kernel
@@ -156,18 +153,12 @@ def turn_iron(flight, slow, p, L9, T, correction, columns):
     deviation of hard iron, if much smaller than the field's noise, grows by up to |f x m| times the
     standard deviation of the attitude, where m is the rotation.
 
-    Args:
-        flight: Record; R_hat is the attitude before the update.
-        slow: The settings.
-        p: Parameters that the filter assumes.
-        L9: The factor after the update, last column first.
-        T: Transformation of the attitude errors, from `reset_matrix`.
-        correction: Correction of the attitude, as error angles.
-        columns: Number of columns.
+    L9 is the factor after the update, last column first; R_hat is the attitude before it, T the
+    transformation of the attitude errors by `reset_matrix`.
     """
-    first = slow.aid_vector[_MAGNETOMETER]
+    first = slow.aid_vector[Aid.MAGNETOMETER]
     if first >= 0:
-        m, delta = load3(p.aid_numbers[_MAGNETOMETER]), slow.aid_scalar[_MAGNETOMETER]
+        m, delta = load3(p.aid_numbers[Aid.MAGNETOMETER]), slow.aid_scalar[Aid.MAGNETOMETER]
         turned = (m[1], -m[0], 0.0 * m[2])
         field_I = flight.slow_hat[delta] * turned + m
         before = load33(flight.R_hat) @ field_I
@@ -180,24 +171,13 @@ def turn_iron(flight, slow, p, L9, T, correction, columns):
 
 @kernel
 def shift_slow(flight, slow, columns, ok, shift):
-    """Store d and its rows after an update, where `ok`.
-
-    Args:
-        flight: Record.
-        slow: The settings.
-        columns: The factor, last column first.
-        ok: Mask of lanes.
-        shift: Correction of all states.
-    """
+    """Store d and its rows after an update, where `ok`, from the factor, last column first."""
     last = D + slow.slow_states - 1
     for i in range(slow.slow_states):
         d = flight.slow_hat[i]
         flight.slow_hat[i] = select(ok, d + shift[D + i], d)
         for j in range(D + i + 1):
             flight.L_slow[i, j] = select(ok, columns[D + i, last - j], flight.L_slow[i, j])
-
-
-# ---- inflation -------------------------------------------------------------------------------
 
 
 @kernel
@@ -210,9 +190,6 @@ def fill_slow(flight, slow, P):
         for j in range(0, i, 3):
             store_block(P, D + i, D + j, sum_of_outers(M, i, M, j, D + j + 3))
         store_block(P, D + i, D + i, sum_of_squares(M, i, D + i + 3))
-
-
-# ---- delayed measurements --------------------------------------------------------------------
 
 
 @kernel
@@ -228,23 +205,15 @@ def begin_to_carry_slow(slow, p, work, ticks):
 @kernel
 def _gained(p, work, i, noise):
     """Variances that three slow errors have gained over the time, times `noise`."""
-    decay, one = load3(work.slow_decay[i : i + 3]), load3(p.slow_decay[i : i + 3])
-    s = load3(p.slow_drive[i : i + 3])
-    fall = (
-        (1.0 - one[0]) * (1.0 + one[0]),
-        (1.0 - one[1]) * (1.0 + one[1]),
-        (1.0 - one[2]) * (1.0 + one[2]),
-    )
-    share = (
-        noise * ((1.0 - decay[0]) * (1.0 + decay[0]) / fall[0]),
-        noise * ((1.0 - decay[1]) * (1.0 + decay[1]) / fall[1]),
-        noise * ((1.0 - decay[2]) * (1.0 + decay[2]) / fall[2]),
-    )
-    return (  # a constant gains nothing
-        select(fall[0] > 0.0, share[0] * s[0] * s[0], 0.0),
-        select(fall[1] > 0.0, share[1] * s[1] * s[1], 0.0),
-        select(fall[2] > 0.0, share[2] * s[2] * s[2], 0.0),
-    )
+    return (_gain(p, work, i, noise), _gain(p, work, i + 1, noise), _gain(p, work, i + 2, noise))
+
+
+@kernel
+def _gain(p, work, i, noise):
+    decay, one, s = work.slow_decay[i], p.slow_decay[i], p.slow_drive[i]
+    fall = (1.0 - one) * (1.0 + one)
+    share = noise * ((1.0 - decay) * (1.0 + decay) / fall)
+    return select(fall > 0.0, share * s * s, 0.0)  # a constant gains nothing
 
 
 @kernel
@@ -260,15 +229,9 @@ def _factors(work, i, back):
 def carry_slow(flight, slow, p, work, noise, back):
     """Propagate the rows of d in work.P back in time by work.slow_decay, or forward.
 
-    The variance that d has gained since then is multiplied by `noise`, as the noise of the IMU is.
-
-    Args:
-        flight: Record.
-        slow: The settings.
-        p: Parameters that the filter assumes.
-        work: Workspace; work.columns has the fifteen propagated columns of the other states.
-        noise: -1 or 0 when propagating back, 1 or 0 when propagating forward.
-        back: Whether to propagate back.
+    The variance that d has gained since then is multiplied by `noise`, as the noise of the IMU is:
+    -1 or 0 on the way back, 1 or 0 on the way forward. work.columns has the fifteen propagated
+    columns of the other states.
     """
     M, P, rows = work.columns, work.P, flight.L_slow
     for i in range(0, slow.slow_states, 3):

@@ -16,64 +16,50 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
+from quad_gym.kernels.filter.gate import MONITORED, gate_innovations
 from quad_gym.kernels.filter.inflation import inflate
-from quad_gym.kernels.filter.innovations import gate_innovations
 from quad_gym.kernels.filter.jumps import follow_drift_corrections
-from quad_gym.kernels.filter.measurements import call_measured, count_measured, mark_failed
+from quad_gym.kernels.filter.measurements import (
+    call_measured,
+    count_measured,
+    flag_failure,
+    mark_failed,
+)
 from quad_gym.kernels.filter.recovery import flag_drifts, follow_corrections
 from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.filter.slow import load_slow, shift_slow, turn_iron
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
-    add,
-    add_outer,
     add_to_diagonal,
     dot,
-    keep3,
-    keep33,
+    keep,
     load3,
     load33,
+    outer,
+    store,
+    vector,
+)
+from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
-    multiply,
-    scale,
-    scale33,
-    store3,
     store_block,
-    sub,
     sum_of_outers,
     sum_of_outers_of_rows,
     sum_of_squares,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import FEATURE_BLOCKS, Act, FilterForm, FilterStatus, GateDecision
-
-_EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
-_GATE, _WATCH = int(FilterForm.GATE), int(FilterForm.GATE | FilterForm.INNOVATIONS)
-_GRADUAL = int(FilterForm.GRADUAL)
-_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
-_UNSURE = float(GateDecision.UNSURE)
-_EXPECT = int(Act.EXPECT)
-
-
-@kernel
-def _store_rows(a, m):
-    """Write a matrix with constant elements."""
-    store3(a[0], m[0])
-    store3(a[1], m[1])
-    store3(a[2], m[2])
+from quad_gym.records import FEATURE_BLOCKS, Act, FilterForm, GateDecision
 
 
 @kernel
 def _split_turns(flight, work, c):
     """Fill work.odd and work.even with the rotations of the sigma points."""
     for j in range(9):
-        even, odd, _ = split_rotation(scale(c, load_column3(flight.L, E, j)))
-        _store_rows(work.odd[j], odd)
-        _store_rows(work.even[j], even)
+        even, odd, _ = split_rotation(c * load_column3(flight.L, E, j))
+        store(work.odd[j], odd)
+        store(work.even[j], even)
 
 
 @kernel
@@ -94,13 +80,12 @@ def _sum_noise(p, work, n, factor):
     S, mu = work.E, work.mu
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     for i in range(0, n, 3):
-        mu_i = scale(excess, (mu[i], mu[i + 1], mu[i + 2]))
+        mu_i = excess * vector(mu[i], mu[i + 1], mu[i + 2])
         for j in range(0, i + 3, 3):
-            block = sum_of_outers_of_rows(S, S, i, j, 9)
-            block = add_outer(block, mu_i, (mu[j], mu[j + 1], mu[j + 2]))
+            mu_j = vector(mu[j], mu[j + 1], mu[j + 2])
+            block = sum_of_outers_of_rows(S, S, i, j, 9) + outer(mu_i, mu_j)
             if i == j:
-                noise = scale33(factor, load_block(work.Rz, i, i))
-                block = (add(block[0], noise[0]), add(block[1], noise[1]), add(block[2], noise[2]))
+                block = factor * load_block(work.Rz, i, i) + block
             store_block(work.Rz, i, j, block)
 
 
@@ -114,8 +99,8 @@ _VAGUE = 0.2
 
 
 @kernel
-def update(flight, p, work, settings, stages, mask, slow=None):
-    """Update the estimate with the valid measurements of the present instant, in the lanes `mask`.
+def update(flight, p, work, settings, stages, slow):
+    """Update the estimate with the valid measurements of the present instant, where `work.mask`.
 
     A lane whose result is not finite keeps its state bit for bit, sets UPDATE_FAILED and counts it.
     The gate masks after the spread c of the sigma points was chosen for all measurements; c enters
@@ -127,24 +112,16 @@ def update(flight, p, work, settings, stages, mask, slow=None):
     measurements' own, so a linear model gives the same result as one step; the derivatives of this
     nonlinear one are taken where they matter. (R. Zanetti, "Recursive Update Filtering for
     Nonlinear Estimation", IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
-
-    Args:
-        flight: Record; reads the measurements and their validity, changes the estimate.
-        p: Parameters assumed by the filter.
-        work: Workspace.
-        settings: The filter's form and its sensors.
-        stages: Table of stages, with the sensors' stages.
-        mask: Lanes to work on.
-        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
-    loose, first, form = mask & (p.sigma_spread < 0.0), _LAST, settings.form  # all false
+    mask, first, form = work.mask > 0.0, _LAST, settings.form
+    loose = mask & (p.sigma_spread < 0.0)  # all false
     hidden, vague = loose, loose
-    if (form & _GRADUAL) != 0 and settings.feature_count > 0:
+    if (form & FilterForm.GRADUAL.value) != 0 and settings.feature_count > 0:
         loose, vague = _are_loose(flight, p, work, settings.feature_count)
         loose, vague = mask & loose, mask & vague
         if any_of(loose):
             first = 0 if any_of(vague) else _FEW
-            if (form & _GATE) == 0:  # a gate leaves them out by itself
+            if (form & FilterForm.GATE.value) == 0:  # a gate leaves them out by itself
                 hidden = _hide_unsure(flight, work, settings.feature_count, loose)
     failures = flight.update_failures
     for part in range(first, _LAST + 1):
@@ -156,7 +133,7 @@ def update(flight, p, work, settings, stages, mask, slow=None):
         _update_by(flight, p, work, settings, stages, taking, factor, again, slow)
     if any_of(hidden):
         _show_hidden(flight, work, settings, hidden)
-    if (form & _GRADUAL) != 0:
+    if (form & FilterForm.GRADUAL.value) != 0:
         flight.nis = select(loose, np.nan, flight.nis)
 
 
@@ -176,7 +153,7 @@ def _are_loose(flight, p, work, feature_count):
     loose = attitude < 0.0  # all false
     vague = loose
     for i in range(feature_count):
-        offset = sub(load3(p.features[i]), r)
+        offset = load3(p.features[i]) - r
         square, seen = dot(offset, offset), flight.block_valid[FEATURE_BLOCKS + i] > 0.0
         loose = loose | (seen & (position > (too_much - attitude) * square))
         unsure = seen & (position > (p.gate_uncertainty - attitude) * square)
@@ -208,23 +185,21 @@ def _show_hidden(flight, work, settings, mask):
     for i in range(settings.feature_count):
         hidden, block = mask & (work.hidden[i] > 0.0), FEATURE_BLOCKS + i
         flight.block_valid[block] = select(hidden, 1.0, flight.block_valid[block])
-        if (settings.form & _WATCH) != 0:
-            flight.gate[block] = select(hidden, _UNSURE, flight.gate[block])
+        if (settings.form & MONITORED) != 0:
+            flight.gate[block] = select(hidden, GateDecision.UNSURE, flight.gate[block])
             flight.block_nis[block] = select(hidden, np.nan, flight.block_nis[block])
-            for axis in range(3):
-                nu, sigma = flight.innovation[block, axis], flight.innovation_sigma[block, axis]
-                flight.innovation[block, axis] = select(hidden, np.nan, nu)
-                flight.innovation_sigma[block, axis] = select(hidden, np.nan, sigma)
+            keep(flight.innovation[block], hidden, (np.nan, np.nan, np.nan))
+            keep(flight.innovation_sigma[block], hidden, (np.nan, np.nan, np.nan))
 
 
 @kernel
 def _whiten(work, n, columns):
     """Solve the update; return the NIS, and the lanes in which the noise is positive definite.
 
-    On return, work.M is the factor K of I + C C^T = K K^T with C = A^T Rz^(-T/2), and work.t is
+    On return, work.K is the factor K of I + C C^T = K K^T with C = A^T Rz^(-T/2), and work.y is
     K^-1 C Rz^(-1/2) nu.
     """
-    A, nu, M, t = work.A, work.nu, work.M, work.t
+    A, nu, K, y = work.A, work.nu, work.K, work.y
     pivot = cholesky(work.Rz, n, work.inverse_diagonal)
     solve_right(A, columns, work.Rz, n, work.inverse_diagonal, 0)  # rows of C
     solve_left_vector(work.Rz, nu, n, work.inverse_diagonal)
@@ -235,17 +210,17 @@ def _whiten(work, n, columns):
         total = A[j, 0] * nu[0]
         for k in range(1, n):
             total = total + A[j, k] * nu[k]
-        t[j] = total
+        y[j] = total
     for i in range(0, columns, 3):
         for j in range(0, i + 3, 3):
             if i == j:
-                store_block(M, i, i, add_to_diagonal(sum_of_squares(A, i, n), 1.0))
+                store_block(K, i, i, add_to_diagonal(sum_of_squares(A, i, n), 1.0))
             else:
-                store_block(M, i, j, sum_of_outers(A, i, A, j, n))
-    cholesky(M, columns, work.inverse_diagonal)
-    solve_left_vector(M, t, columns, work.inverse_diagonal)
+                store_block(K, i, j, sum_of_outers(A, i, A, j, n))
+    cholesky(K, columns, work.inverse_diagonal)
+    solve_left_vector(K, y, columns, work.inverse_diagonal)
     for j in range(columns):
-        nis = nis - t[j] * t[j]
+        nis = nis - y[j] * y[j]
     return nis, pivot > 0.0
 
 
@@ -255,18 +230,18 @@ def _correct(flight, work, states, columns, slow):
 
     With the columns last first, L9 K^-T is the updated factor's, last first again.
     """
-    L, L9, t, dx, last = flight.L, work.L9, work.t, work.dx, columns - 1
+    L, L9, y, dx, last = flight.L, work.L9, work.y, work.dx, columns - 1
     for i in range(15):
         for j in range(min(columns, 15)):
             L9[i, last - j] = L[i, j]
     if slow is not None:
         load_slow(flight, slow, L9)
-    solve_right(L9, states, work.M, columns, work.inverse_diagonal, columns - 3)
+    solve_right(L9, states, work.K, columns, work.inverse_diagonal, columns - 3)
     total = 0.0 * work.spread
     for i in range(states):
-        shift = L9[i, 0] * t[0]
+        shift = L9[i, 0] * y[0]
         for j in range(1, columns):
-            shift = shift + L9[i, j] * t[j]
+            shift = shift + L9[i, j] * y[j]
         dx[i] = shift
         total = total + shift
     return total
@@ -276,17 +251,16 @@ def _correct(flight, work, states, columns, slow):
 def _keep(flight, p, work, form, columns, ok, slow):
     """Keep the updated estimate and factor, in the lanes `ok`."""
     L, L9, dx, last = flight.L, work.L9, work.dx, columns - 1
-    keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))
-    keep3(flight.v_hat, ok, add(load3(flight.v_hat), (dx[V], dx[V + 1], dx[V + 2])))
-    if (form & _WATCH) != 0:
+    keep(flight.r_hat, ok, load3(flight.r_hat) + load3(dx[R:]))
+    keep(flight.v_hat, ok, load3(flight.v_hat) + load3(dx[V:]))
+    if (form & MONITORED) != 0:
         if slow is not None:
             if slow.estimates_drift:
                 follow_drift_corrections(flight, p, L9, dx, columns, ok)
         follow_corrections(flight, p, L, L9, dx, columns, ok)
-    R_BI = multiply(euler_to_dcm((dx[E], dx[E + 1], dx[E + 2])), load33(flight.R_hat))
-    keep33(flight.R_hat, ok, R_BI)
-    keep3(flight.b_a_hat, ok, add(load3(flight.b_a_hat), (dx[BA], dx[BA + 1], dx[BA + 2])))
-    keep3(flight.b_g_hat, ok, add(load3(flight.b_g_hat), (dx[BG], dx[BG + 1], dx[BG + 2])))
+    keep(flight.R_hat, ok, euler_to_dcm(load3(dx[E:])) @ load33(flight.R_hat))
+    keep(flight.b_a_hat, ok, load3(flight.b_a_hat) + load3(dx[BA:]))
+    keep(flight.b_g_hat, ok, load3(flight.b_g_hat) + load3(dx[BG:]))
     for i in range(15):
         for j in range(min(i + 1, columns)):
             L[i, j] = select(ok, L9[i, last - j], L[i, j])
@@ -310,18 +284,18 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     measured = work.measured
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
     work.spread, work.inverse_spread = c, 1.0 / c
-    if (form & _EKF) == 0:
+    if (form & FilterForm.EKF.value) == 0:
         _split_turns(flight, work, c)
-    call_measured(flight, p, work, settings, stages, _EXPECT)
+    call_measured(flight, p, work, settings, stages, Act.EXPECT)
     _innovate(work, n, c)
-    if (form & _WATCH) != 0:
+    if (form & MONITORED) != 0:
         gate_innovations(flight, p, work, settings, stages, mask, again)
         measured = measured - work.left_out
     _sum_noise(p, work, n, factor)
     nis, definite = _whiten(work, n, columns)
     total = _correct(flight, work, states, columns, slow)
-    if (form & _TURN) != 0:
-        correction = (work.dx[E], work.dx[E + 1], work.dx[E + 2])
+    if (form & FilterForm.TURN.value) != 0:
+        correction = load3(work.dx[E:])
         T = reset_matrix(correction)
         if slow is not None:
             turn_iron(flight, slow, p, work.L9, T, correction, columns)
@@ -331,29 +305,25 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     _keep(flight, p, work, form, columns, ok, slow)
     flight.nis = select(ok, nis, flight.nis)
     flight.nis_dimension = select(ok, measured, flight.nis_dimension)
-    failed, status = wanted & logical_not(ok), flight.filter_status
-    flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
+    failed = wanted & logical_not(ok)
+    flag_failure(flight, failed)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
-    if (form & _WATCH) != 0 and any_of(failed):
-        mark_failed(flight, settings, failed)
+    if (form & MONITORED) != 0 and any_of(failed):
+        mark_failed(flight, failed)
     updated = mask & (work.measured > 0.0)
-    if (form & _GATE) != 0:
+    if (form & FilterForm.GATE.value) != 0:
         inflate(flight, p, work, settings, updated & logical_not(failed), slow, stages)
-    elif (form & _WATCH) != 0:
+    elif (form & MONITORED) != 0:
         flag_drifts(flight, p, updated)
 
 
 @stage
 def update_stage(flight, world, model, settings, work, stages, flag):
     """Update the estimate with the valid measurements."""
-    scratch = lanes_of(work)
-    mask = scratch.mask > 0.0
-    update(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask)
+    update(flight, model, work, settings, stages, None)
 
 
 @stage
 def update_with_slow_stage(flight, world, model, settings, work, stages, flag):
     """Update the estimate of a filter with slow errors of sensors among its states."""
-    scratch = lanes_of(work)
-    mask = scratch.mask > 0.0
-    update(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask, settings)
+    update(flight, model, work, settings, stages, settings)

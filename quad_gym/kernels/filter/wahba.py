@@ -9,8 +9,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import cross, dot, select3, unit_or
-from quad_gym.kernels.maths.vectors import outer, rounded
+from quad_gym.kernels.maths.linalg import cross, dot, outer, rounded, unit_or
 from quad_gym.kernels.simd.lanes import select
 
 _SWEEPS = 10
@@ -35,9 +34,16 @@ def _rotate_pair(a, b, v, w):
 
 
 @kernel
+def _sorted(a, b, v, w):
+    """Swap columns a and b of B, and v and w of V with them, where b is longer."""
+    larger = dot(b, b) > dot(a, a)
+    return select(larger, b, a), select(larger, a, b), select(larger, w, v), select(larger, v, w)
+
+
+@kernel
 def _perpendicular(a):
     """A vector perpendicular to the unit vector a, with a length well above zero."""
-    return select3(abs(a[0]) < 0.6, cross(a, (1.0, 0.0, 0.0)), cross(a, (0.0, 1.0, 0.0)))
+    return select(abs(a[0]) < 0.6, cross(a, (1.0, 0.0, 0.0)), cross(a, (0.0, 1.0, 0.0)))
 
 
 @kernel
@@ -52,8 +58,7 @@ def _perpendicular_unit(candidate, a):
 def wahba(B):
     """The rotation R_BI that maximizes tr(R_BI^T B), by one-sided Jacobi rotations.
 
-    Args:
-        B: Attitude profile matrix, sum of a_i v_B,i v_I,i^T.
+    B is the attitude profile matrix, sum of a_i v_B,i v_I,i^T.
 
     Returns:
         (R_BI, uniqueness): the second is (s_2 + d s_3) / s_1 for singular values s and d = det U
@@ -69,15 +74,9 @@ def wahba(B):
         a1, a2, v1, v2 = _rotate_pair(a1, a2, v1, v2)
 
     # largest singular value first, smallest last
-    larger = dot(a1, a1) > dot(a0, a0)
-    a0, a1 = select3(larger, a1, a0), select3(larger, a0, a1)
-    v0, v1 = select3(larger, v1, v0), select3(larger, v0, v1)
-    larger = dot(a2, a2) > dot(a1, a1)
-    a1, a2 = select3(larger, a2, a1), select3(larger, a1, a2)
-    v1, v2 = select3(larger, v2, v1), select3(larger, v1, v2)
-    larger = dot(a1, a1) > dot(a0, a0)
-    a0, a1 = select3(larger, a1, a0), select3(larger, a0, a1)
-    v0, v1 = select3(larger, v1, v0), select3(larger, v0, v1)
+    a0, a1, v0, v1 = _sorted(a0, a1, v0, v1)
+    a1, a2, v1, v2 = _sorted(a1, a2, v1, v2)
+    a0, a1, v0, v1 = _sorted(a0, a1, v0, v1)
 
     u0 = unit_or(a0, (1.0, 0.0, 0.0))
     u1 = _perpendicular_unit(a1, u0)

@@ -9,26 +9,12 @@ sensors are correlated with the true ones in the same way.
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
-from quad_gym.kernels.filter.slow import keep_slow_factor
+from quad_gym.kernels.filter.slow import keep_factor
 from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import (
-    apply,
-    apply_transposed,
-    keep3,
-    keep33,
-    load3,
-    load4,
-    load_block,
-    multiply,
-    store3,
-    store_block,
-    sub,
-    transpose,
-    unit_or,
-)
+from quad_gym.kernels.maths.linalg import diagonal, keep, load3, load4, store, unit_or
+from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of
 from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import (
     AIDS,
@@ -69,7 +55,7 @@ def _draw_errors(settings, stream, work, slow, T):
         for s in range(AIDS):
             k = WARM_DRAWS + 2 * slow.aid_vector[s] + 3
             if slow.aid_vector[s] >= 0:  # as seen from I, as its errors are
-                store3(u[k : k + 3], apply(T, load3(u[k : k + 3])))
+                store(u[k : k + 3], T @ load3(u[k : k + 3]))
         if slow.estimates_drift:
             n_own, n_d = six_normals(stream, DRAW_WARM_DRIFT)
             for i in range(3):
@@ -94,7 +80,7 @@ def _turn_of_slow(slow, i, T, other):
         turn = T
     for s in range(AIDS):
         if slow.aid_vector[s] >= 0 and i == D + slow.aid_vector[s]:
-            turn = transpose(T)
+            turn = T.T
     return turn
 
 
@@ -104,9 +90,8 @@ def _start_aids(flight, slow, T, d, mask):
     for s in range(AIDS):
         k = slow.aid_vector[s]
         if k >= 0:
-            error = apply_transposed(T, load3(d[D + k : D + k + 3]))
-            estimate = sub(load3(flight.aid_vector[s]), error)
-            keep3(flight.slow_hat[k : k + 3], mask, estimate)
+            error = T.T @ load3(d[D + k : D + k + 3])
+            keep(flight.slow_hat[k : k + 3], mask, load3(flight.aid_vector[s]) - error)
         k = slow.aid_scalar[s]
         if k >= 0:
             estimate = flight.aid_scalar[s] - d[D + k]
@@ -114,34 +99,25 @@ def _start_aids(flight, slow, T, d, mask):
 
 
 @kernel
-def start_warm(flight, settings, stream, work, mask, slow=None):
-    """Start a converged filter, where `mask`.
+def _start_warm(flight, settings, work, slow):
+    """Start a converged filter, where `work.mask`; `slow`: the settings or None, see `slow.py`.
 
-    Args:
-        flight: Record with the true state and biases; the estimate is set.
-        settings: Has the covariance P of a vehicle that faces east, and its root W.
-        stream: The random stream at the episode's first instant.
-        work: Workspace.
-        mask: Lanes to work on.
-        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
+    The settings have the covariance P of a vehicle that faces east, and its root W.
     """
-    states = 15
+    states, mask, P, d = 15, work.mask > 0.0, work.P, work.dx
     if slow is not None:
         states = 15 + slow.slow_states
     R_BI = quaternion_to_dcm(load4(flight.q))
     T = _heading(R_BI)
-    n_d = _draw_errors(settings, stream, work, slow, T)
-    d = work.dx
-    keep3(flight.r_hat, mask, sub(load3(flight.r), apply(T, load3(d[R : R + 3]))))
-    keep3(flight.v_hat, mask, sub(load3(flight.v), apply(T, load3(d[V : V + 3]))))
-    R_error = euler_to_dcm(load3(d[E : E + 3]))
-    keep33(flight.R_hat, mask, multiply(transpose(R_error), R_BI))
-    keep3(flight.b_a_hat, mask, sub(load3(flight.b_a), load3(d[BA : BA + 3])))
-    keep3(flight.b_g_hat, mask, sub(load3(flight.b_g), load3(d[BG : BG + 3])))
+    n_d = _draw_errors(settings, stream_of(flight), work, slow, T)
+    keep(flight.r_hat, mask, load3(flight.r) - T @ load3(d[R : R + 3]))
+    keep(flight.v_hat, mask, load3(flight.v) - T @ load3(d[V : V + 3]))
+    keep(flight.R_hat, mask, euler_to_dcm(load3(d[E : E + 3])).T @ R_BI)
+    keep(flight.b_a_hat, mask, load3(flight.b_a) - load3(d[BA : BA + 3]))
+    keep(flight.b_g_hat, mask, load3(flight.b_g) - load3(d[BG : BG + 3]))
 
-    zero = 0.0 * T[0][0]
-    one = zero + 1.0
-    eye = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
+    one = 1.0 + 0.0 * T[0][0]
+    eye = diagonal((one, one, one))
     for i in range(0, states, 3):
         left = T if i < E else eye  # the rest is in B
         if slow is not None:
@@ -150,31 +126,25 @@ def start_warm(flight, settings, stream, work, mask, slow=None):
             right = T if j < E else eye
             if slow is not None:
                 right = _turn_of_slow(slow, j, T, right)
-            block = multiply(left, load_block(settings.warm_covariance, i, j))
-            store_block(work.P, i, j, multiply(block, transpose(right)))
-    cholesky(work.P, states, work.inverse_diagonal)  # P is known to be positive definite
-    for i in range(15):
-        for j in range(i + 1):
-            flight.L[i, j] = select(mask, work.P[i, j], flight.L[i, j])
+            store_block(P, i, j, left @ load_block(settings.warm_covariance, i, j) @ right.T)
+    cholesky(P, states, work.inverse_diagonal)  # P is known to be positive definite
+    keep_factor(flight, slow, work, mask)
     if slow is not None:
-        keep_slow_factor(flight, slow, work, mask)
         if slow.estimates_drift:
             s = load3(settings.warm_drift_sigma)
-            true = apply(T, (s[0] * n_d[0], s[1] * n_d[1], s[2] * n_d[2]))
-            keep3(flight.gnss_drift, mask, true)
-            keep3(flight.slow_hat, mask, sub(true, apply(T, load3(d[D : D + 3]))))
+            true = T @ (s[0] * n_d[0], s[1] * n_d[1], s[2] * n_d[2])
+            keep(flight.gnss_drift, mask, true)
+            keep(flight.slow_hat, mask, true - T @ load3(d[D : D + 3]))
         _start_aids(flight, slow, T, d, mask)
 
 
 @stage
 def warm_stage(flight, world, model, settings, work, stages, flag):
     """Start a converged filter."""
-    flying, scratch = lanes_of(flight), lanes_of(work)
-    start_warm(flying, settings, stream_of(flying), scratch, scratch.mask > 0.0)
+    _start_warm(flight, settings, work, None)
 
 
 @stage
 def warm_with_slow_stage(flight, world, model, settings, work, stages, flag):
     """Start a converged filter that estimates slow errors of sensors."""
-    flying, scratch = lanes_of(flight), lanes_of(work)
-    start_warm(flying, settings, stream_of(flying), scratch, scratch.mask > 0.0, settings)
+    _start_warm(flight, settings, work, settings)

@@ -7,6 +7,7 @@ libraries; here they have no branches, so that all lanes evaluate them together.
 import math
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.vectors import polynomial
 from quad_gym.kernels.simd.bits import (
     exponent_of,
     fused_multiply_add,
@@ -19,15 +20,28 @@ from quad_gym.kernels.simd.bits import (
 from quad_gym.kernels.simd.lanes import any_of, select
 
 # pi/2 in three parts of 33 bits and a rest: k * part is exact for |k| < 2^20 (Cody and Waite)
-_PIO2_1, _PIO2_2, _PIO2_3 = (
-    1.57079632673412561417e00,
-    6.07710050630396597660e-11,
-    2.02226624871116645580e-21,
-)
+_PIO2_1, _PIO2_2 = 1.57079632673412561417e00, 6.07710050630396597660e-11
+_PIO2_3 = 2.02226624871116645580e-21
 _PIO2_REST = 8.47842766036889956997e-32
 _REDUCIBLE = 1e6
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _SMALL_ANGLE = 0.05
+
+# fmt: off
+_SIN = (-1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04,
+        2.75573137070700676789e-06, -2.50507602534068634195e-08, 1.58969099521155010221e-10)
+_COS = (4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767294178e-05,
+        -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.13596475577881948265e-11)
+_EXP = (1.66666666666666019037e-01, -2.77777777770155933842e-03, 6.61375632143793436117e-05,
+        -1.65339022054652515390e-06, 4.13813679705723846039e-08)
+_LOG = (6.666666666666735130e-01, 3.999999999940941908e-01, 2.857142874366239149e-01,
+        2.222219843214978396e-01, 1.818357216161805012e-01, 1.531383769920937332e-01,
+        1.479819860511658591e-01)
+_ATAN = (3.33333333333329318027e-01, -1.99999999998764832476e-01, 1.42857142725034663711e-01,
+         -1.11111104054623557880e-01, 9.09088713343650656196e-02, -7.69187620504482999495e-02,
+         6.66107313738753120669e-02, -5.83357013379057348645e-02, 4.97687799461593236017e-02,
+         -3.65315727442169155270e-02, 1.62858201153657823623e-02)
+# fmt: on
 
 
 @kernel
@@ -55,47 +69,11 @@ def is_finite(x):
 
 
 @kernel
-def sin_near_zero(x):
-    """Sin x for |x| <= pi/4."""
+def near_zero(x):
+    """(sin x, cos x) for |x| <= pi/4."""
     z = x * x
-    return x + x * z * (
-        -1.66666666666666324348e-01
-        + z
-        * (
-            8.33333333332248946124e-03
-            + z
-            * (
-                -1.98412698298579493134e-04
-                + z
-                * (
-                    2.75573137070700676789e-06
-                    + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)
-                )
-            )
-        )
-    )
-
-
-@kernel
-def cos_near_zero_minus_one(x):
-    """Cos x - 1 for |x| <= pi/4."""
-    z = x * x
-    return -0.5 * z + z * z * (
-        4.16666666666666019037e-02
-        + z
-        * (
-            -1.38888888888741095749e-03
-            + z
-            * (
-                2.48015872894767294178e-05
-                + z
-                * (
-                    -2.75573143513906633035e-07
-                    + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)
-                )
-            )
-        )
-    )
+    cosine = 1.0 + (-0.5 * z + z * z * polynomial(z, _COS))
+    return x + x * z * polynomial(z, _SIN), cosine
 
 
 @kernel
@@ -118,9 +96,8 @@ def sin_cos(x):
     reduced = fused_multiply_add(-turns, _PIO2_3, reduced)
     reduced = fused_multiply_add(-turns, _PIO2_REST, reduced)
     quadrant = turns - 4.0 * round_to_even(0.25 * turns - 0.375)
-    sine, cosine = quarter_turns(
-        sin_near_zero(reduced), 1.0 + cos_near_zero_minus_one(reduced), quadrant
-    )
+    sine, cosine = near_zero(reduced)
+    sine, cosine = quarter_turns(sine, cosine, quadrant)
     small_enough = abs(x) < _REDUCIBLE
     if any_of(abs(x) >= _REDUCIBLE):
         sine = select(small_enough, sine, library_sin(x))
@@ -129,13 +106,11 @@ def sin_cos(x):
 
 
 @kernel
-def _near_zero(x):
+def _tiny(x):
     """(sin x, cos x - 1) for |x| < 0.05 rad."""
     z = x * x
-    return (
-        x + x * z * (-1.0 / 6.0 + z * (1.0 / 120.0 - z * (1.0 / 5040.0))),
-        z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z * (1.0 / 40320.0)))),
-    )
+    sine = polynomial(z, (-1.0 / 6.0, 1.0 / 120.0, -1.0 / 5040.0))
+    return x + x * z * sine, z * polynomial(z, (-0.5, 1.0 / 24.0, -1.0 / 720.0, 1.0 / 40320.0))
 
 
 @kernel
@@ -154,7 +129,7 @@ def sin_cos_minus_one(angles):
     Sigma points have such angles. One branch for all three lets the processor go ahead.
     """
     x, y, z = angles
-    of_x, of_y, of_z = _near_zero(x), _near_zero(y), _near_zero(z)
+    of_x, of_y, of_z = _tiny(x), _tiny(y), _tiny(z)
     large = (abs(x) >= _SMALL_ANGLE) | (abs(y) >= _SMALL_ANGLE) | (abs(z) >= _SMALL_ANGLE)
     if any_of(large):
         of_x, of_y, of_z = _where_large(x, of_x), _where_large(y, of_y), _where_large(z, of_z)
@@ -169,18 +144,7 @@ def exp(x):
     low = k * _LN2_LOW
     r = high - low
     z = r * r
-    c = r - z * (
-        1.66666666666666019037e-01
-        + z
-        * (
-            -2.77777777770155933842e-03
-            + z
-            * (
-                6.61375632143793436117e-05
-                + z * (-1.65339022054652515390e-06 + z * 4.13813679705723846039e-08)
-            )
-        )
-    )
+    c = r - z * polynomial(z, _EXP)
     mantissa = 1.0 - ((low - (r * c) / (2.0 - c)) - high)
     # two factors, as 2**k alone overflows at k = 1024
     half = round_to_even(0.5 * k)
@@ -198,26 +162,7 @@ def log(x):
     f = m - 1.0
     s = f / (2.0 + f)
     z = s * s
-    r = z * (
-        6.666666666666735130e-01
-        + z
-        * (
-            3.999999999940941908e-01
-            + z
-            * (
-                2.857142874366239149e-01
-                + z
-                * (
-                    2.222219843214978396e-01
-                    + z
-                    * (
-                        1.818357216161805012e-01
-                        + z * (1.531383769920937332e-01 + z * 1.479819860511658591e-01)
-                    )
-                )
-            )
-        )
-    )
+    r = z * polynomial(z, _LOG)
     half_square = 0.5 * f * f
     value = k * _LN2_HIGH - ((half_square - (s * (half_square + r) + k * _LN2_LOW)) - f)
     value = select(x > 0.0, value, select(x == 0.0, -math.inf, math.nan))
@@ -227,46 +172,7 @@ def log(x):
 @kernel
 def _atan_polynomial(x):
     z = x * x
-    return x - x * z * (
-        3.33333333333329318027e-01
-        + z
-        * (
-            -1.99999999998764832476e-01
-            + z
-            * (
-                1.42857142725034663711e-01
-                + z
-                * (
-                    -1.11111104054623557880e-01
-                    + z
-                    * (
-                        9.09088713343650656196e-02
-                        + z
-                        * (
-                            -7.69187620504482999495e-02
-                            + z
-                            * (
-                                6.66107313738753120669e-02
-                                + z
-                                * (
-                                    -5.83357013379057348645e-02
-                                    + z
-                                    * (
-                                        4.97687799461593236017e-02
-                                        + z
-                                        * (
-                                            -3.65315727442169155270e-02
-                                            + z * 1.62858201153657823623e-02
-                                        )
-                                    )
-                                )
-                            )
-                        )
-                    )
-                )
-            )
-        )
-    )
+    return x - x * z * polynomial(z, _ATAN)
 
 
 @kernel

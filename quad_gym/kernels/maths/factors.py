@@ -4,7 +4,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import load_block, load_column3, store_block
+from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block
 from quad_gym.kernels.maths.vectors import outer
 from quad_gym.kernels.simd.lanes import select
 
@@ -60,15 +60,10 @@ def solve_right33(m, d):
 
 @kernel
 def cholesky(a, n, inverse_diagonal):
-    """Replace the lower triangle of a by its Cholesky factor.
+    """Replace the lower triangle of a by its Cholesky factor; return the least pivot.
 
-    Args:
-        a: Symmetric positive definite, (n, n); only its lower triangle is read and written.
-        n: Its size, a multiple of three.
-        inverse_diagonal: (n,), receives the inverses of the factor's diagonal.
-
-    Returns:
-        The least pivot: not positive, or NaN, where `a` is not positive definite.
+    The pivot is not positive, or NaN, where the matrix a (n, n) is not positive definite; n is a
+    multiple of three. `inverse_diagonal` (n,) receives the inverses of the factor's diagonal.
     """
     least = a[0, 0]
     for j in range(0, n, 3):
@@ -97,14 +92,10 @@ def cholesky(a, n, inverse_diagonal):
 
 @kernel
 def solve_right(x, rows, factor, n, inverse_diagonal, staircase):
-    """Replace x by the solution y of y L^T = x, for the factor L of `cholesky`.
+    """Replace x (rows, n) by the solution y of y L^T = x, for the factor L of `cholesky`.
 
-    Args:
-        x: (rows, n).
-        rows: A multiple of three.
-        factor, n, inverse_diagonal: As left by `cholesky`.
-        staircase: Rows 0 to 2 of x and y are zero before this column, rows 3 to 5 before the column
-            three less, and so on; 0: x is full.
+    Rows 0 to 2 of x and y are zero before the column `staircase`, rows 3 to 5 before the column
+    three less, and so on; 0: x is full. `rows` is a multiple of three.
     """
     for j in range(0, n, 3):
         d = (

@@ -11,12 +11,7 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.elementary import (
-    cos_near_zero_minus_one,
-    log,
-    quarter_turns,
-    sin_near_zero,
-)
+from quad_gym.kernels.maths.elementary import log, near_zero, quarter_turns
 from quad_gym.kernels.simd.bits import one_to_two, rotate_left, round_to_even
 
 _PARITY = np.uint64(0x1BD11BDAA9FC1A22)
@@ -49,38 +44,26 @@ def threefry(key0, key1, counter0, counter1):
     a, b = _mix(a, b, 12)
     a, b = _mix(a, b, 31)
     a, b = a + key0, b + key1 + _THREE
-    a, b = _mix(a, b, 16)
-    return a, b
+    return _mix(a, b, 16)
 
 
 @kernel
 def uniform_pair(stream, draw):
-    """Two independent numbers, uniform on [0, 1).
-
-    Args:
-        stream: (key0, key1, instant), words.
-        draw: Which draw of this instant, a literal or a word.
-    """
+    """Two independent numbers, uniform on [0, 1), from a draw of a stream (key0, key1, instant)."""
     a, b = threefry(stream[0], stream[1], stream[2], np.uint64(draw))
     return one_to_two(a) - 1.0, one_to_two(b) - 1.0
 
 
 @kernel
 def normal_pair(stream, draw):
-    """Two independent standard normals (G. E. P. Box and M. E. Muller, 1958).
-
-    Args:
-        stream: (key0, key1, instant), words.
-        draw: Which draw of this instant.
-    """
+    """Two independent standard normals from a draw (G. E. P. Box and M. E. Muller, 1958)."""
     a, b = threefry(stream[0], stream[1], stream[2], np.uint64(draw))
     radius = math.sqrt(-2.0 * log(2.0 - one_to_two(a)))  # of a number in (0, 1]
     quarters = 4.0 * (one_to_two(b) - 1.0)
     quadrant = round_to_even(quarters)  # 0 to 4; 4 is a whole turn
     angle = 1.57079632679489661923 * (quarters - quadrant)
-    sine, cosine = quarter_turns(
-        sin_near_zero(angle), 1.0 + cos_near_zero_minus_one(angle), quadrant
-    )
+    sine, cosine = near_zero(angle)
+    sine, cosine = quarter_turns(sine, cosine, quadrant)
     return radius * cosine, radius * sine
 
 

@@ -29,10 +29,7 @@ def split_rotation(e):
     """R(e) = I + even(e) + odd(e), which keep and change sign with e, free of cancellation.
 
     A pair of sigma points is at +e and -e, so its sum and difference need one evaluation of these.
-
-    Returns:
-        (even, odd), and (s_phi, c_phi - 1, s_th, c_th - 1) of roll and pitch, which the Euler-rate
-        matrix needs, too.
+    The third result, (s_phi, c_phi - 1, s_th, c_th - 1) of roll and pitch, is for the Euler rates.
     """
     (s_phi, m_phi), (s_th, m_th), (s_psi, m_psi) = sin_cos_minus_one(e)
     c_phi, c_th, c_psi = 1.0 + m_phi, 1.0 + m_th, 1.0 + m_psi
@@ -128,38 +125,19 @@ def dcm_to_quaternion(R_BI):
     wx, wy, wz = r12 - r21, r20 - r02, r01 - r10
     xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
     # each candidate is 4 q_i q, for one i
-    best, w, x, y, z = square_w, square_w, wx, wy, wz
+    best, q = square_w, (square_w, wx, wy, wz)
     better = square_x > best
-    w, x, y, z = (
-        select(better, wx, w),
-        select(better, square_x, x),
-        select(better, xy, y),
-        select(better, xz, z),
-    )
-    best = select(better, square_x, best)
+    best, q = select(better, square_x, best), select(better, (wx, square_x, xy, xz), q)
     better = square_y > best
-    w, x, y, z = (
-        select(better, wy, w),
-        select(better, xy, x),
-        select(better, square_y, y),
-        select(better, yz, z),
-    )
-    best = select(better, square_y, best)
-    better = square_z > best
-    w, x, y, z = (
-        select(better, wz, w),
-        select(better, xz, x),
-        select(better, yz, y),
-        select(better, square_z, z),
-    )
-    return normalize_quaternion((w, x, y, z))
+    best, q = select(better, square_y, best), select(better, (wy, xy, square_y, yz), q)
+    return normalize_quaternion(select(square_z > best, (wz, xz, yz, square_z), q))
 
 
 @kernel
 def normalize_quaternion(q):
     """Q / |q|."""
     inverse = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return (inverse * q[0], inverse * q[1], inverse * q[2], inverse * q[3])
+    return inverse * q
 
 
 @kernel
@@ -167,9 +145,7 @@ def mean_quaternion(a, b):
     """The attitude halfway from a to b, two attitudes less than half a turn apart."""
     # b and -b are the same attitude; of the two rotations, halve the shorter one
     near = select(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0.0, -1.0, 1.0)
-    return normalize_quaternion(
-        (a[0] + near * b[0], a[1] + near * b[1], a[2] + near * b[2], a[3] + near * b[3])
-    )
+    return normalize_quaternion(a + near * b)
 
 
 @kernel

@@ -13,6 +13,9 @@ registers. One operand may mix lanes and floats: `inverse_mass * force_I - (0.0,
 multiply-add for each number, if the product is computed in the branch in which it is added. The
 product on the left of a sum is rounded first; `a + rounded(s * b)` rounds one on the right, too.
 
+`load3`, `load4`, `load33` and `load44` read an array's first numbers as a vector or matrix, `store`
+writes one into an array, and `keep` writes it in some lanes only.
+
 With lanes these are ordinary tuples. The instance of a kernel for floats has a separate type, as
 `+` concatenates tuples of floats: arithmetic returns it, and so do `vector` and all that loads from
 arrays, so that a sum needs one operand that comes from these. Nothing is fused there.
@@ -25,22 +28,23 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core.datamodel import models
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_global, signature
-from numba.extending import infer_getattr, intrinsic, lower_builtin, lower_getattr, register_model
+from numba.extending import infer_getattr, intrinsic, lower_builtin, lower_getattr
 
-from quad_gym.kernels.simd.lanes import ASKED_FIRST, Lanes, add_numbers, fuse, is_product, lanes
+from quad_gym.kernels.simd.lanes import (
+    ASKED_FIRST,
+    Floats,
+    Lanes,
+    add_numbers,
+    fuse,
+    is_product,
+    lanes,
+    splat,
+)
 
 # ---- types -----------------------------------------------------------------------------------
 
 _LENGTHS = (3, 4)
-
-
-class Floats(types.UniTuple):
-    """A vector of float64, or a matrix of such vectors."""
-
-
-register_model(Floats)(models.UniTupleModel)
 
 
 def _shape(kind: Any) -> tuple[int, ...] | None:
@@ -153,12 +157,9 @@ def _matrix_product(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
 
 
 def _operator(operation: Any, shape_of: Callable[..., Any], emit: Callable[..., Any]) -> None:
-    """Define `operation`.
+    """Define a function of `operator` by the shape and the value of its result.
 
-    Args:
-        operation: A function of `operator`.
-        shape_of: The result's shape, given the operands' shapes; None for undefined results.
-        emit: The result, given the operands' values.
+    `shape_of` gets the operands' shapes, and returns None for undefined results.
     """
 
     @infer_global(operation)
@@ -269,3 +270,89 @@ def rounded(typing_context, value):  # type: ignore[no-untyped-def]
         return _made_of(builder, [builder.extract_value(args[0], i) for i in range(count)])
 
     return value(value), lower
+
+
+@intrinsic
+def polynomial(typing_context, x, coefficients):  # type: ignore[no-untyped-def]
+    """The number c0 + x (c1 + x (c2 + ...)), by Horner's rule."""
+    number = _number_of(x)
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        add = ir.IRBuilder.fadd
+        *others, value = (builder.extract_value(args[1], i) for i in range(len(coefficients)))
+        if number == lanes:
+            add, value, others = _add, splat(builder, value), [splat(builder, c) for c in others]
+        for c in reversed(others):
+            value = add(builder, c, builder.fmul(args[0], value))
+        return value
+
+    return number(number, coefficients), lower
+
+
+# ---- arrays ----------------------------------------------------------------------------------
+
+
+def _access(context: Any, builder: Any, kind: Any, place: tuple[int, ...]) -> tuple[Any, ...]:
+    """Functions that read and write a number of an array, and the number's index."""
+    index = types.UniTuple(types.uintp, len(place)) if len(place) > 1 else types.uintp
+    read = context.get_function(operator.getitem, signature(kind.dtype, kind, index))
+    types_of_write = (types.none, kind, index, kind.dtype)
+    write = context.get_function(operator.setitem, signature(*types_of_write))
+    numbers = [context.get_constant(types.uintp, i) for i in place]
+    return read, write, _made_of(builder, numbers) if len(place) > 1 else numbers[0]
+
+
+def _loader(*shape: int) -> Any:
+    """Make a function that returns the first numbers of an array as a vector or matrix."""
+
+    @intrinsic
+    def load(typing_context, array):  # type: ignore[no-untyped-def]
+        if not isinstance(array, types.Array):
+            return None
+
+        def part(context, builder, values, place):  # type: ignore[no-untyped-def]
+            if len(place) < len(shape):
+                count = range(shape[len(place)])
+                return _made_of(
+                    builder, [part(context, builder, values, (*place, i)) for i in count]
+                )
+            read, _, index = _access(context, builder, array, place)
+            return read(builder, (values[0], index))
+
+        def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            return part(context, builder, args, ())
+
+        return _type(shape, array.dtype)(array), lower
+
+    return load
+
+
+load3, load4, load33, load44 = _loader(3), _loader(4), _loader(3, 3), _loader(4, 4)
+
+
+def _write(array: Any, value: Any, *mask: Any) -> Any:
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        for place in itertools.product(*map(range, _shape(value))):  # type: ignore[arg-type]
+            number, kind = args[-1], value
+            for i in place:
+                number, kind = builder.extract_value(number, i), kind.types[i]
+            number = context.cast(builder, number, kind, array.dtype)
+            read, write, index = _access(context, builder, array, place)
+            if mask:
+                number = builder.select(args[1], number, read(builder, (args[0], index)))
+            write(builder, (args[0], index, number))
+        return context.get_dummy_value()
+
+    return types.none(array, *mask, value), lower
+
+
+@intrinsic
+def store(typing_context, array, value):  # type: ignore[no-untyped-def]
+    """Write a vector or matrix into the first places of an array."""
+    return _write(array, value)
+
+
+@intrinsic
+def keep(typing_context, array, mask, value):  # type: ignore[no-untyped-def]
+    """Write a vector or matrix into the first places of an array where `mask` is set."""
+    return _write(array, value, mask)

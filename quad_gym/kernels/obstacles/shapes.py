@@ -8,7 +8,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import load3, norm, select3
+from quad_gym.kernels.maths.linalg import load3, norm
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import Shape
 
@@ -51,10 +51,10 @@ def _from_wall(p, half):
     )
     by_length, by_thickness = q[0] >= deepest, q[1] >= deepest
     upward = (zero, zero, _outward(p[2], -q[2]))
-    inside = select3(by_thickness, (zero, _outward(p[1], -q[1]), zero), upward)
-    inside = select3(by_length, (_outward(p[0], -q[0]), zero, zero), inside)
+    inside = select(by_thickness, (zero, _outward(p[1], -q[1]), zero), upward)
+    inside = select(by_length, (_outward(p[0], -q[0]), zero, zero), inside)
     is_outside = deepest > 0.0
-    return select(is_outside, norm(outside), deepest), select3(is_outside, outside, inside)
+    return select(is_outside, norm(outside), deepest), select(is_outside, outside, inside)
 
 
 @kernel
@@ -69,24 +69,14 @@ def _from_cylinder(p, half):
     deepest = maximum(q_r, q_z)
     back = -maximum(q_r, zero)
     outside = (back * x, back * y, clip(p[2], -half[2], half[2]) - p[2])
-    inside = select3(q_r >= q_z, (-q_r * x, -q_r * y, zero), (zero, zero, _outward(p[2], -q_z)))
+    inside = select(q_r >= q_z, (-q_r * x, -q_r * y, zero), (zero, zero, _outward(p[2], -q_z)))
     is_outside = deepest > 0.0
-    return select(is_outside, norm(outside), deepest), select3(is_outside, outside, inside)
+    return select(is_outside, norm(outside), deepest), select(is_outside, outside, inside)
 
 
 @kernel
 def distance_from(r_I, center_I, settings, k):
-    """Distance of a point from the surface of obstacle k, negative inside, and the vector to it.
-
-    Args:
-        r_I: The point in I [m].
-        center_I: Center of the obstacle in I [m].
-        settings: Shapes of obstacles.
-        k: Number of the obstacle.
-
-    Returns:
-        Distance [m]; vector in I to the surface's nearest point [m].
-    """
+    """Distance of a point from the surface of obstacle k, negative inside, and the vector to it."""
     p, half = to_obstacle(r_I - center_I, settings, k), load3(settings.obstacle_half[k])
     if settings.obstacle_shape[k] == Shape.CYLINDER:
         distance, vector = _from_cylinder(p, half)
@@ -130,13 +120,6 @@ def crosses(start_I, end_I, center_I, settings, k):
     """Check if the line from one point to another crosses obstacle k, before AT_THE_END.
 
     It does if it has entered all slabs before it leaves the first.
-
-    Args:
-        start_I: Start of the line in I [m].
-        end_I: End of the line in I [m].
-        center_I: Center of the obstacle in I [m].
-        settings: Shapes of obstacles.
-        k: Number of the obstacle.
     """
     along_I = end_I - start_I
     length = norm(along_I)

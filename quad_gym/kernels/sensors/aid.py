@@ -4,9 +4,11 @@ A sensor has one block of up to three numbers. It may have a slow error of three
 in an episode, a Gauss-Markov error of one number, and constant errors of scale and alignment.
 """
 
+from typing import Any
+
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.gate import add_nis, gate_numbers, mask_rejected
-from quad_gym.kernels.maths.linalg import keep3, keep33
+from quad_gym.kernels.filter.gate import gate_numbers
+from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
 from quad_gym.kernels.sensors.latency import (
@@ -16,9 +18,11 @@ from quad_gym.kernels.sensors.latency import (
     keep_arrived,
     stamp,
 )
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.sensors.stage import sensor_stage
+from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import (
     AID_BLOCKS,
+    AID_FREEDOMS,
     AID_GROUPS,
     DRAW_AID_DRIFT,
     DRAW_AID_MATRIX,
@@ -27,16 +31,18 @@ from quad_gym.records import (
     FIRST_AID,
     Aid,
     FaultKind,
+    Sensor,
 )
 
-_LOSS = int(FaultKind[f"{Aid(0).name}_LOSS"])
+AID_LOSS = FaultKind[f"{Aid(0).name}_LOSS"].value
+"""First of the faults that silence aiding sensors, which are in the same order."""
 
-for _aid in Aid:  # the faults that silence sensors are in the same order
-    assert FaultKind[f"{_aid.name}_LOSS"] == _LOSS + _aid
+for _aid in Aid:
+    assert FaultKind[f"{_aid.name}_LOSS"] == AID_LOSS + _aid
 
 
 @kernel
-def begin_aid(flight, p, settings, s, mask):
+def _begin(flight, p, settings, s, mask):
     """Begin an episode of sensor s of `Aid`, in the lanes `mask`: draw its errors, set its clock.
 
     A warm start uses the normals of slow errors, too, see `filter/warm.py`.
@@ -59,22 +65,17 @@ def begin_aid(flight, p, settings, s, mask):
 @kernel
 def draw_matrix(flight, p, s, mask):
     """Draw the errors of scale and alignment of sensor s, in the lanes `mask`."""
-    stream = stream_of(flight)
+    stream, z = stream_of(flight), p.aid_matrix_sigma[s]
     a, b = normal_pair(stream, DRAW_AID_MATRIX + 5 * s)
     c, d = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 1)
     e, f = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 2)
     g, h = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 3)
     i, _ = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 4)
-    z = p.aid_matrix_sigma[s]
-    keep33(
-        flight.aid_matrix[s],
-        mask,
-        ((z * a, z * b, z * c), (z * d, z * e, z * f), (z * g, z * h, z * i)),
-    )
+    keep(flight.aid_matrix[s], mask, z * ((a, b, c), (d, e, f), (g, h, i)))
 
 
 @kernel
-def aid_due(flight, p, settings, s, mask, starting):
+def _due(flight, p, settings, s, mask, starting):
     """Lanes in which sensor s measures now; advances its clock and its Gauss-Markov error."""
     due = tick_clock(flight, settings, FIRST_AID + s, mask)
     if not starting and any_of(due):
@@ -85,39 +86,74 @@ def aid_due(flight, p, settings, s, mask, starting):
 
 
 @kernel
-def deliver_first(flight, s, mask, values):
-    """Deliver the measurement of sensor s that initializes the filter, which uses it only once."""
-    keep3(flight.aid_measurement[s], mask, values)
-    block = AID_BLOCKS + s
-    flight.block_fresh[block] = select(mask, 1.0, flight.block_fresh[block])
-
-
-@kernel
-def deliver(flight, work, settings, s, mask, due, values):
+def _deliver(flight, work, settings, s, mask, due, values):
     """Deliver the measurement of sensor s in the lanes `due`, now or after its latency."""
     sensor, block, measurement = FIRST_AID + s, AID_BLOCKS + s, flight.aid_measurement[s]
     if settings.faults:
-        due = due & (flight.fault_active[_LOSS + s] <= 0.0)
+        due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
     arrives = find_arrivals(flight, work, settings, sensor, mask)
     flight.block_valid[block] = select(mask, select(due, 1.0, 0.0), flight.block_valid[block])
     if settings.sensor_delay[sensor] == 0:
-        keep3(measurement, due, values)
+        keep(measurement, due, values)
         flight.block_fresh[block] = select(due, 1.0, flight.block_fresh[block])
     elif any_of(due | arrives):
         keep_arrived(work, block, measurement, 3)
-        keep3(measurement, due, values)
+        keep(measurement, due, values)
         taken = stamp(flight, settings, sensor, mask)
         exchange(flight, work, block, measurement, 3, settings.under_way[sensor], mask, taken)
         deliver_arrived(work, block, measurement, 3, mask)
 
 
+def aid_stage(aid: Aid, measure: Any, expect: Any, inflate: Any, *others: Any) -> Any:
+    """Make the stage of an aiding sensor.
+
+    Args:
+        aid: The sensor.
+        measure: `(flight, p) -> numbers, within`: three numbers that it measures now, zero beyond
+            its own, and the lanes in which it can measure.
+        expect: `(flight, p, work, settings, k, valid)`: fill its rows from k on, in these lanes.
+        inflate: `(flight, p, work, settings, alarm, nu)`: inflate variances in the lanes `alarm`,
+            by the innovation nu.
+        others: `(flight, p, mask)`, draw further constant errors of an episode, and `align` of
+            `sensor_stage`; optional.
+    """
+    s, block, group = int(aid), AID_BLOCKS + aid, AID_GROUPS + aid
+    numbers, (draw, *align) = float(AID_FREEDOMS[aid]), others or (_draw_nothing,)
+
+    @kernel
+    def begin(flight, p, settings, mask):  # type: ignore[no-untyped-def]
+        _begin(flight, p, settings, s, mask)
+        draw(flight, p, mask)
+
+    @kernel
+    def sample(flight, p, settings, work, stages, mask, starting):  # type: ignore[no-untyped-def]
+        due = _due(flight, p, settings, s, mask, starting)
+        values, within = measure(flight, p)
+        if starting and settings.heading_sensor == FIRST_AID + s and settings.warm == 0:
+            # it initializes the filter, which uses it only once
+            keep(flight.aid_measurement[s], mask, values)
+            flight.block_fresh[block] = select(mask, 1.0, flight.block_fresh[block])
+        else:
+            _deliver(flight, work, settings, s, mask, due & within, values)
+
+    @kernel
+    def expect_valid(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
+        expect(flight, p, work, settings, k, flight.block_valid[block] > 0.0)
+
+    @kernel
+    def gate(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
+        limit, never = p.aid_gate[s], flight.tick < 0.0
+        gate_numbers(flight, p, work, settings, k, block, group, limit, numbers, never)
+
+    @kernel
+    def inflate_alarmed(flight, p, work, settings):  # type: ignore[no-untyped-def]
+        nu = load3(flight.innovation[block])
+        inflate(flight, p, work, settings, work.alarm[group] > 0.0, nu)
+
+    kernels = (begin, sample, expect_valid, gate, inflate_alarmed, *align)
+    return sensor_stage(Sensor[aid.name], *kernels)
+
+
 @kernel
-def gate_aid(flight, p, work, settings, s, k, numbers):
-    """Store the innovation of sensor s, whose rows begin at k, and mask it beyond the gate."""
-    block, group = AID_BLOCKS + s, AID_GROUPS + s
-    valid = (work.taking > 0.0) & (flight.block_valid[block] > 0.0)
-    rejected, nis = gate_numbers(
-        flight, p, work, settings, k, block, group, valid, p.aid_gate[s], numbers
-    )
-    add_nis(work, valid & logical_not(work.again > 0.0), nis, numbers)
-    mask_rejected(flight, work, settings, k, group, valid, rejected, numbers)
+def _draw_nothing(flight, p, mask):
+    """Placeholder for sensors without further constant errors."""

@@ -30,33 +30,13 @@ from quad_gym.kernels.filter.recovery import (
     MOST_ANGLE,
     follow_drift,
     inflate_gyro_bias,
-    raise_diagonal,
+    raise_variances,
     time_of,
 )
-from quad_gym.kernels.filter.rows import (
-    clear_slow_columns,
-    columns_of,
-    put_noise,
-    put_three,
-)
+from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import (
-    add_outer,
-    add_scaled,
-    apply,
-    apply_transposed,
-    cross,
-    dot,
-    load3,
-    load4,
-    load33,
-    load_column3,
-    norm,
-    scale,
-    select3,
-    store3,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
+from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm, turn_pair
 from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
@@ -71,17 +51,14 @@ from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import DRAW_FEATURE, DRAW_PHASE, FEATURE_BLOCKS, FilterForm, Sensor
 
-_CAMERA, _EKF, _GATE = int(Sensor.CAMERA), int(FilterForm.EKF), int(FilterForm.GATE)
-
+_CAMERA = int(Sensor.CAMERA)
 _PIXEL = 2e-6  # [m]; it cancels, so it is no parameter: the report writes rays in meters
-
-# ---- simulation ------------------------------------------------------------------------------
 
 
 @kernel
 def project(X_I, r_I, R_BI, p):
     """Pixel of a point, and the lanes in which it is in front of the camera and in the image."""
-    v_C = apply(load33(p.R_CB), sub(apply(R_BI, sub(X_I, r_I)), load3(p.camera)))
+    v_C = load33(p.R_CB) @ (R_BI @ (X_I - r_I) - load3(p.camera))
     in_front = v_C[2] > 1e-9
     per_depth = p.focal_length / select(in_front, v_C[2], 1.0)
     x, y = per_depth * v_C[0], per_depth * v_C[1]
@@ -112,114 +89,97 @@ def _begin(flight, p, settings, mask):
 
 
 @kernel
-def _corrupt(flight, p, settings, work, stages, due):
-    """Apply range, blur, ground, obstacles and faults to the image just taken."""
-    work.mask = select(due, 1.0, 0.0)
-    call_stage(stages, Stage.LIMIT_CAMERA, flight, p, p, settings, work, 0)
-    call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
-    call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
-
-
-@kernel
 def _sample(flight, p, settings, work, stages, mask, starting):
-    """Take an image when due."""
-    due, delayed = tick_clock(flight, settings, _CAMERA, mask), settings.sensor_delay[_CAMERA] > 0
+    """Take an image when due, with limits of range, blur, ground, obstacles, and faults."""
+    due = tick_clock(flight, settings, _CAMERA, mask)
+    delayed, count = settings.sensor_delay[_CAMERA] > 0, settings.feature_count
     arrives = find_arrivals(flight, work, settings, _CAMERA, mask)
-    for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + settings.feature_count):
+    for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + count):
         flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
     if not any_of(due | arrives):
         return
     if delayed:
-        for i in range(settings.feature_count):
+        for i in range(count):
             keep_arrived(work, FEATURE_BLOCKS + i, flight.pixels[i], 2)
     if any_of(due):
-        measure(flight, p, settings.feature_count, due)
-        _corrupt(flight, p, settings, work, stages, due)
+        measure(flight, p, count, due)
+        work.mask = select(due, 1.0, 0.0)
+        call_stage(stages, Stage.LIMIT_CAMERA, flight, p, p, settings, work, 0)
+        call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
+        call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
     if delayed:
-        taken, under_way = stamp(flight, settings, _CAMERA, mask), settings.under_way[_CAMERA]
-        for i in range(settings.feature_count):
+        taken = stamp(flight, settings, _CAMERA, mask)
+        under_way = settings.under_way[_CAMERA]
+        for i in range(count):
             block, pixels = FEATURE_BLOCKS + i, flight.pixels[i]
             exchange(flight, work, block, pixels, 2, under_way, mask, taken)
             deliver_arrived(work, block, pixels, 2, mask)
     else:
-        for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + settings.feature_count):
+        for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + count):
             seen = due & (flight.block_valid[block] > 0.0)
             flight.block_fresh[block] = select(seen, 1.0, flight.block_fresh[block])
 
 
-# ---- update ----------------------------------------------------------------------------------
-
-
 @kernel
-def _center(flight, p, work, settings, k):
-    """Fill the rows of predicted measurement, measurement and noise."""
-    R_BI, R_CB, r = load33(flight.R_hat), load33(p.R_CB), load3(flight.r_hat)
-    w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
-    pixel_sigma = math.sqrt(p.pixel_sigma * p.pixel_sigma + p.blur * p.blur * dot(w_B, w_B))
-    for i in range(settings.feature_count):
-        valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
-        if any_of(valid):
-            X_B = apply(R_BI, sub(load3(p.features[i]), r))
-            to_feature = sub(X_B, load3(p.camera))
-            store3(work.X_B[i], X_B)
-            work.inverse_distance[i] = 1.0 / norm(to_feature)
-            put_three(work.z_hat, k, valid, scale(work.inverse_distance[i], to_feature))
-            ray_C = (
-                _PIXEL * flight.pixels[i, 0],
-                _PIXEL * flight.pixels[i, 1],
-                _PIXEL * p.focal_length,
-            )
-            length = norm(ray_C)
-            u_B = apply_transposed(R_CB, scale(1.0 / length, ray_C))
-            put_three(work.z, k, valid, u_B)
-            sigma = pixel_sigma * _PIXEL / length
-            predicted = scale(work.inverse_distance[i], to_feature)
-            u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
-            noise = direction_noise(u_B, sigma * sigma, p.direction_floor)
-            # a pixel does not move along the optical axis c: minus c c^T, across u
-            across = add_scaled(R_CB[2], -dot(R_CB[2], u_B), u_B)
-            less = scale(-p.noise_pinhole * sigma * sigma, across)
-            put_noise(work, k, valid, add_outer(noise, less, across))
-            k += 3
+def _center(flight, p, work, settings, k, i, R_BI, pixel_sigma):
+    """Fill the rows of measurement, prediction and noise of feature i."""
+    R_CB = load33(p.R_CB)
+    X_B = R_BI @ (load3(p.features[i]) - load3(flight.r_hat))
+    to_feature = X_B - load3(p.camera)
+    per_distance = 1.0 / norm(to_feature)
+    store(work.X_B[i], X_B)
+    work.inverse_distance[i] = per_distance
+    x, y = flight.pixels[i, 0], flight.pixels[i, 1]
+    ray_C = (_PIXEL * x, _PIXEL * y, _PIXEL * p.focal_length)
+    length, z_hat = norm(ray_C), per_distance * to_feature
+    z = R_CB.T @ ((1.0 / length) * ray_C)
+    sigma = pixel_sigma * _PIXEL / length
+    u_B = select(p.noise_at_prediction > 0.0, z_hat, z)
+    noise = direction_noise(u_B, sigma * sigma, p.direction_floor)
+    # a pixel does not move along the optical axis c: minus c c^T, across u
+    across = R_CB[2] + -dot(R_CB[2], u_B) * u_B
+    noise = noise + outer(-p.noise_pinhole * sigma * sigma * across, across)
+    put_block(work, settings, k, flight.block_valid[FEATURE_BLOCKS + i] > 0.0, z, z_hat, noise)
 
 
 @kernel
 def _column(flight, p, work, settings, k, j, A, S, R_BI):
     """Fill the rows of all features in column j, with a derivative or a pair of sigma points."""
-    L, c, camera = flight.L, work.spread, load3(p.camera)
-    inverse_c, d, dr = work.inverse_spread, load_column3(L, E, j), load_column3(L, R, j)
-    by_derivative = (settings.form & _EKF) != 0
-    dr_B = apply(R_BI, dr) if by_derivative else apply(R_BI, scale(c, dr))
+    L, c, inverse_c, camera = flight.L, work.spread, work.inverse_spread, load3(p.camera)
+    d, dr_B = load_column3(L, E, j), load_column3(L, R, j)
+    by_derivative = (settings.form & FilterForm.EKF.value) != 0
+    dr_B = R_BI @ dr_B if by_derivative else R_BI @ (c * dr_B)
     odd, even = load33(work.odd[j]), load33(work.even[j])
     for i in range(settings.feature_count):
         valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
         if any_of(valid):
-            X_B = load3(work.X_B[i])
+            X_B, per_distance = load3(work.X_B[i]), work.inverse_distance[i]
             if by_derivative:
                 u_B = load3(work.z_hat[k : k + 3])
-                v = scale(work.inverse_distance[i], sub(cross(X_B, d), dr_B))
-                put_three(A, k, valid, add_scaled(v, -dot(u_B, v), u_B))
-                put_three(S, k, valid, scale(0.0, dr))
+                v = per_distance * (cross(X_B, d) - dr_B)
+                put_three(A, k, valid, v + -dot(u_B, v) * u_B)
+                put_three(S, k, valid, 0.0 * v)
             else:
                 # (I + even +- odd) (X_B -+ dr_B) - l_c
                 v_odd, v_even = turn_pair(even, odd, X_B, dr_B)
-                v = sub(X_B, camera)
-                a, s = direction_pair(v, work.inverse_distance[i], v_even, v_odd)
-                put_three(A, k, valid, scale(inverse_c, a))
-                put_three(S, k, valid, scale(inverse_c, s))
+                a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
+                put_three(A, k, valid, inverse_c * a)
+                put_three(S, k, valid, inverse_c * s)
             k += 3
-    return k
 
 
 @kernel
 def _expect(flight, p, work, settings, k):
     """Fill the rows from k on, three for each feature that any lane sees."""
-    R_BI, last, end = load33(flight.R_hat), columns_of(settings) - 1, k
-    _center(flight, p, work, settings, k)
+    R_BI, w_B, end = load33(flight.R_hat), load3(flight.w_meas) - load3(flight.b_g_hat), k
+    pixel_sigma = math.sqrt(p.pixel_sigma * p.pixel_sigma + p.blur * p.blur * dot(w_B, w_B))
+    for i in range(settings.feature_count):
+        if any_of(flight.block_valid[FEATURE_BLOCKS + i] > 0.0):
+            _center(flight, p, work, settings, end, i, R_BI, pixel_sigma)
+            end += 3
+    last = columns_of(settings) - 1
     for j in range(9):
-        end = _column(flight, p, work, settings, k, j, work.A[last - j], work.E[8 - j], R_BI)
-    for first in range(k, end, 3):
-        clear_slow_columns(work, first, settings)
+        _column(flight, p, work, settings, k, j, work.A[last - j], work.E[8 - j], R_BI)
 
 
 @kernel
@@ -230,7 +190,7 @@ def _gate(flight, p, work, settings, k):
     error of a direction is bounded, so it would pass any gate, and its update would be wrong and
     overconfident.
     """
-    gating, again = (settings.form & _GATE) != 0, work.again > 0.0
+    gating, again = (settings.form & FilterForm.GATE.value) != 0, work.again > 0.0
     zero = 0.0 * p.sigma_beta
     seen, refused, fresh, side, up = zero, zero, zero, zero, zero
     for i in range(settings.feature_count):
@@ -248,13 +208,13 @@ def _gate(flight, p, work, settings, k):
             up = up + counts * clip(scaled[1], -LARGEST, LARGEST)
             if gating:
                 out = rejected | unsure
-                mask_block(work, k, out, columns_of(settings))
+                mask_block(work, settings, k, out)
                 work.left_out = work.left_out + select(out, 3.0, 0.0)
                 seen = seen + select(valid & logical_not(unsure), 1.0, 0.0)
                 refused = refused + select(rejected, 1.0, 0.0)
             k += 3
     root = math.sqrt(maximum(fresh, 1.0))
-    follow_drift(flight, FEATURE_BLOCKS, fresh > 0.0, side / root, up / root, zero)
+    follow_drift(flight, FEATURE_BLOCKS, fresh > 0.0, (side / root, up / root, zero))
     if gating:
         first = (seen > 0.0) & logical_not(again)
         count_rejections(flight, FEATURE_BLOCKS, first, refused >= seen)
@@ -262,9 +222,6 @@ def _gate(flight, p, work, settings, k):
         flight.fit_tick = select(fits, flight.tick, flight.fit_tick)
     else:
         accept_group(flight, FEATURE_BLOCKS, fresh > 0.0)
-
-
-# ---- inflation -------------------------------------------------------------------------------
 
 
 @kernel
@@ -275,16 +232,16 @@ def _inflate(flight, p, work, settings):
     the feature's distance.
     """
     angle, offset, P = 0.0 * flight.tick, 0.0 * flight.tick, work.P
-    alarm, nu = work.alarm[FEATURE_BLOCKS], flight.innovation
+    alarm = work.alarm[FEATURE_BLOCKS] > 0.0
     for i in range(settings.feature_count):
-        s = FEATURE_BLOCKS + i
-        seen = (alarm > 0.0) & (flight.block_valid[s] > 0.0)
-        square = select(seen, nu[s, 0] * nu[s, 0] + nu[s, 1] * nu[s, 1], 0.0)
-        distance = norm(sub(load3(p.features[i]), load3(flight.r_hat)))
+        nu = flight.innovation[FEATURE_BLOCKS + i]
+        seen = alarm & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
+        square = select(seen, nu[0] * nu[0] + nu[1] * nu[1], 0.0)
+        distance = norm(load3(p.features[i]) - load3(flight.r_hat))
         angle = maximum(angle, square)
         offset = maximum(offset, square * distance * distance)
-    raise_diagonal(P, E, minimum(angle, MOST_ANGLE * MOST_ANGLE))
-    raise_diagonal(P, R, offset)
+    raise_variances(P, E, alarm, minimum(angle, MOST_ANGLE * MOST_ANGLE))
+    raise_variances(P, R, alarm, offset)
     inflate_gyro_bias(P, math.sqrt(angle) / time_of(flight, p, FEATURE_BLOCKS), alarm)
 
 

@@ -1,8 +1,10 @@
 """The GNSS receiver: one clock and latency for position, baseline and velocity."""
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.gate import gate_numbers
+from quad_gym.kernels.filter.recovery import camera_fits
 from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import keep3, load4
+from quad_gym.kernels.maths.linalg import keep, load3, load4
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors import gnss_baseline, gnss_position, gnss_velocity
@@ -27,15 +29,14 @@ from quad_gym.records import (
 )
 
 _GNSS = int(Sensor.GNSS)
-
-# ---- simulation ------------------------------------------------------------------------------
+_BLOCKS = (POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK)
 
 
 @kernel
 def _begin(flight, p, settings, mask):
     share, _ = uniform_pair(stream_of(flight), DRAW_PHASE)
     begin_clock(flight, settings, _GNSS, share, mask)
-    keep3(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
+    keep(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
 
 
 @kernel
@@ -61,6 +62,18 @@ def _measure(flight, p, settings, work, stages, mask, corrupted):
 
 
 @kernel
+def _measured(flight):
+    """The blocks, and the arrays of their numbers."""
+    position, baseline = flight.gnss_position, flight.gnss_baseline
+    velocity = flight.gnss_velocity
+    return (
+        (POSITION_BLOCK, position),
+        (BASELINE_BLOCK, baseline),
+        (VELOCITY_BLOCK, velocity),
+    )
+
+
+@kernel
 def _flag(flags, mask, position, baseline, settings):
     """Set the flags of the three blocks, in the lanes `mask`."""
     flags[POSITION_BLOCK] = select(mask, position, flags[POSITION_BLOCK])
@@ -72,18 +85,18 @@ def _flag(flags, mask, position, baseline, settings):
 @kernel
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Measure when due, and at the start for the initialization of the filter."""
-    due, delayed = tick_clock(flight, settings, _GNSS, mask), settings.sensor_delay[_GNSS] > 0
+    due = tick_clock(flight, settings, _GNSS, mask)
+    delayed, period = settings.sensor_delay[_GNSS] > 0, settings.sensor_ticks[_GNSS]
     arrives = find_arrivals(flight, work, settings, _GNSS, mask)
     if not starting and not any_of(due | arrives):
         nothing = 0.0 * flight.tick
         _flag(flight.block_valid, mask, nothing, nothing, settings)
         return
     if delayed:
-        keep_arrived(work, POSITION_BLOCK, flight.gnss_position, 3)
-        keep_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3)
-        keep_arrived(work, VELOCITY_BLOCK, flight.gnss_velocity, 3)
+        for block, values in _measured(flight):
+            keep_arrived(work, block, values, 3)
     if settings.gnss_drifts > 0 and not starting and any_of(due):
-        share = minimum(flight.tick / settings.sensor_ticks[_GNSS], 1.0)
+        share = minimum(flight.tick / period, 1.0)
         gnss_position.drift_gnss(flight, p, due, share)
     measured = mask if starting else due
     paired = measured
@@ -96,11 +109,11 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         paired = paired & logical_not(measured)
     unpaired = measured & logical_not(paired)
     if starting or not delayed:
-        fresh = measured & (settings.sensor_ticks[_GNSS] > 0)
+        fresh = measured & (period > 0)
         one = 1.0 + 0.0 * flight.tick
         _flag(flight.block_fresh, fresh, one, select(unpaired, 0.0, one), settings)
     if starting and settings.reuse_first_fix == 0 and not settings.warm:
-        due = due & (settings.sensor_ticks[_GNSS] < 0)  # none
+        due = due & (period < 0)  # none
     valid = select(due & measured, 1.0, 0.0)
     _flag(flight.block_valid, mask, valid, select(unpaired, 0.0, valid), settings)
     if delayed:
@@ -114,37 +127,54 @@ def _deliver_delayed(flight, work, settings, mask, starting):
     At the start of an episode the fix stays in the record, for the initialization of the filter.
     """
     taken, n = stamp(flight, settings, _GNSS, mask), settings.under_way[_GNSS]
-    exchange(flight, work, POSITION_BLOCK, flight.gnss_position, 3, n, mask, taken)
-    exchange(flight, work, BASELINE_BLOCK, flight.gnss_baseline, 3, n, mask, taken)
-    exchange(flight, work, VELOCITY_BLOCK, flight.gnss_velocity, 3, n, mask, taken)
-    if not starting:
-        deliver_arrived(work, POSITION_BLOCK, flight.gnss_position, 3, mask)
-        deliver_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3, mask)
-        deliver_arrived(work, VELOCITY_BLOCK, flight.gnss_velocity, 3, mask)
-
-
-# ---- update ----------------------------------------------------------------------------------
+    for block, values in _measured(flight):
+        exchange(flight, work, block, values, 3, n, mask, taken)
+        if not starting:
+            deliver_arrived(work, block, values, 3, mask)
 
 
 @kernel
 def _expect(flight, p, work, settings, k):
-    k = gnss_position.expect(flight, p, work, settings, k)
-    k = gnss_baseline.expect(flight, p, work, settings, k)
-    gnss_velocity.expect(flight, p, work, settings, k)
+    """Fill three rows for each block that any lane has, from k on."""
+    for block in _BLOCKS:
+        valid = flight.block_valid[block] > 0.0
+        if any_of(valid):
+            if block == POSITION_BLOCK:
+                gnss_position.expect(flight, p, work, settings, k, valid)
+            elif block == BASELINE_BLOCK:
+                gnss_baseline.expect(flight, p, work, settings, k, valid)
+            else:
+                gnss_velocity.expect(flight, p, work, settings, k, valid)
+            k += 3
 
 
 @kernel
 def _gate(flight, p, work, settings, k):
-    k = gnss_position.gate(flight, p, work, settings, k)
-    k = gnss_baseline.gate(flight, p, work, settings, k)
-    gnss_velocity.gate(flight, p, work, settings, k)
+    """Store the innovations in the rows from k on, and mask those beyond the gate.
+
+    A position that is rejected while the camera fits shows an error of GNSS, not of the filter.
+    """
+    limit = p.gate_position
+    for block in _BLOCKS:
+        if any_of(flight.block_valid[block] > 0.0):
+            if block == BASELINE_BLOCK:
+                gnss_baseline.gate(flight, p, work, settings, k)
+            else:
+                excused = (block == POSITION_BLOCK) & camera_fits(flight, p)
+                gate_numbers(flight, p, work, settings, k, block, block, limit, 3.0, excused)
+            k += 3
 
 
 @kernel
 def _inflate(flight, p, work, settings):
-    gnss_position.inflate(flight, p, work, settings)
-    gnss_baseline.inflate(flight, p, work, settings)
-    gnss_velocity.inflate(flight, p, work, settings)
+    for block in _BLOCKS:
+        nu, alarm = load3(flight.innovation[block]), work.alarm[block] > 0.0
+        if block == POSITION_BLOCK:
+            gnss_position.inflate(flight, p, work, settings, alarm, nu)
+        elif block == BASELINE_BLOCK:
+            gnss_baseline.inflate(flight, p, work, settings, alarm, nu)
+        else:
+            gnss_velocity.inflate(flight, p, work, settings, alarm, nu)
 
 
 gnss_stage = sensor_stage(Sensor.GNSS, _begin, _sample, _expect, _gate, _inflate)

@@ -8,39 +8,14 @@ linear: dz = dv.
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import E, V
-from quad_gym.kernels.filter.gate import add_nis, gate_numbers, mask_rejected
-from quad_gym.kernels.filter.recovery import inflate_accel_bias, time_of
-from quad_gym.kernels.filter.rows import (
-    clear_slow_columns,
-    columns_of,
-    put_noise,
-    put_three,
-)
-from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import (
-    add,
-    add_to_diagonal,
-    apply,
-    apply_transposed,
-    cross,
-    keep3,
-    load3,
-    load4,
-    load33,
-    load_column3,
-    norm,
-    scale,
-    sub,
-)
+from quad_gym.kernels.filter.error_state import V
+from quad_gym.kernels.filter.recovery import inflate_accel_bias, raise_variance, time_of
+from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
+from quad_gym.kernels.maths.linalg import cross, diagonal, keep, load3, load4, load33, norm
+from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK, FilterForm
-
-_EKF = int(FilterForm.EKF)
-
-# ---- simulation ------------------------------------------------------------------------------
+from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK
 
 
 @kernel
@@ -48,75 +23,29 @@ def measure(flight, p, mask):
     """Measure the antenna's velocity in G, in the lanes `mask`."""
     R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
     n, _ = six_normals(stream_of(flight), DRAW_VELOCITY)
-    lever_B = cross(load3(flight.w), load3(p.antenna))
-    v_I = add(load3(flight.v), apply_transposed(R_BI, lever_B))
-    keep3(flight.gnss_velocity, mask, apply_transposed(R_IG, add(v_I, scale(p.velocity_sigma, n))))
-
-
-# ---- update ----------------------------------------------------------------------------------
+    v_I = load3(flight.v) + R_BI.T @ cross(load3(flight.w), load3(p.antenna))
+    keep(flight.gnss_velocity, mask, R_IG.T @ (p.velocity_sigma * n + v_I))
 
 
 @kernel
-def _center(flight, p, work, k, valid):
-    """Fill the rows of predicted measurement, measurement and noise; return w x l_p."""
-    w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
-    lever_B = cross(w_B, load3(p.antenna))
-    lever_I = apply_transposed(load33(flight.R_hat), lever_B)
-    put_three(work.z_hat, k, valid, add(load3(flight.v_hat), lever_I))
-    put_three(work.z, k, valid, apply(load33(p.R_IG), load3(flight.gnss_velocity)))
-    variance = p.velocity_sigma * p.velocity_sigma
-    zero = 0.0 * variance
-    nothing = (zero, zero, zero)
-    put_noise(work, k, valid, add_to_diagonal((nothing, nothing, nothing), variance))
-    return lever_B
-
-
-@kernel
-def expect(flight, p, work, settings, k):
-    """Fill the rows from k on, if any lane has a velocity; return the next row."""
-    valid = flight.block_valid[VELOCITY_BLOCK] > 0.0
-    if not any_of(valid):
-        return k
-    L, last = flight.L, columns_of(settings) - 1
-    lever_B = _center(flight, p, work, k, valid)
-    clear_slow_columns(work, k, settings)
-    R_BI, inverse_c = load33(flight.R_hat), work.inverse_spread
+def expect(flight, p, work, settings, k, valid):
+    """Fill rows k to k + 2."""
+    R_BI, variance = load33(flight.R_hat), p.velocity_sigma * p.velocity_sigma
+    lever_B = cross(load3(flight.w_meas) - load3(flight.b_g_hat), load3(p.antenna))
+    z, z_hat = load33(p.R_IG) @ load3(flight.gnss_velocity), load3(flight.v_hat) + R_BI.T @ lever_B
+    put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
     for j in range(9):
-        dv = load_column3(L, V, j)
-        bent = scale(0.0, dv)
+        dv = load_column3(flight.L, V, j)
+        s = 0.0 * dv
         if settings.slow_states > 0:
-            if (settings.form & _EKF) != 0:
-                turned = cross(load_column3(L, E, j), lever_B)
-            else:
-                turned = scale(inverse_c, apply_transposed(load33(work.odd[j]), lever_B))
-                even = scale(inverse_c, apply_transposed(load33(work.even[j]), lever_B))
-                bent = apply_transposed(R_BI, even)
-            dv = add(dv, apply_transposed(R_BI, turned))
-        put_three(work.A[last - j], k, valid, dv)
-        put_three(work.E[8 - j], k, valid, bent)
-    return k + 3
+            a, s = lever_column(flight, work, settings, j, R_BI, lever_B)
+            dv = dv + a
+        put_column(work, settings, k, j, valid, dv, s)
 
 
 @kernel
-def gate(flight, p, work, settings, k):
-    """Store the innovation in the rows from k on, and mask it beyond the gate."""
-    if not any_of(flight.block_valid[VELOCITY_BLOCK] > 0.0):
-        return k
-    valid = (work.taking > 0.0) & (flight.block_valid[VELOCITY_BLOCK] > 0.0)
-    block, limit = VELOCITY_BLOCK, p.gate_position
-    rejected, nis = gate_numbers(flight, p, work, settings, k, block, block, valid, limit, 3.0)
-    add_nis(work, valid & logical_not(work.again > 0.0), nis, 3.0)
-    mask_rejected(flight, work, settings, k, VELOCITY_BLOCK, valid, rejected, 3.0)
-    return k + 3
-
-
-# ---- inflation -------------------------------------------------------------------------------
-
-
-@kernel
-def inflate(flight, p, work, settings):
+def inflate(flight, p, work, settings, alarm, nu):
     """Inflate the velocity, accelerometer biases and tilt."""
-    nu, alarm, P = load3(flight.innovation[VELOCITY_BLOCK]), work.alarm[VELOCITY_BLOCK], work.P
     for i in range(3):
-        P[V + i, V + i] = maximum(P[V + i, V + i], select(alarm > 0.0, nu[i] * nu[i], 0.0))
-    inflate_accel_bias(p, P, norm(nu) / time_of(flight, p, VELOCITY_BLOCK), alarm)
+        raise_variance(work.P, V + i, alarm, nu[i] * nu[i])
+    inflate_accel_bias(p, work.P, norm(nu) / time_of(flight, p, VELOCITY_BLOCK), alarm)

@@ -8,24 +8,9 @@ import math
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import (
-    add,
-    apply,
-    apply_transposed,
-    cross,
-    dot,
-    keep3,
-    keep33,
-    load3,
-    load4,
-    load33,
-    norm,
-    scale,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, load4, load33, norm, rounded
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import (
     DRAW_BLUR,
@@ -58,8 +43,8 @@ def draw_imu_errors(flight, p, mask):
     e, f = six_normals(stream, DRAW_IMU_ERRORS + 6)
     accel = _errors(p.accel_scale_sigma, p.accel_misalignment_sigma, a, b, c)
     gyro = _errors(p.gyro_scale_sigma, p.gyro_misalignment_sigma, d, e, f)
-    keep33(flight.accel_error, mask, accel)
-    keep33(flight.gyro_error, mask, gyro)
+    keep(flight.accel_error, mask, accel)
+    keep(flight.gyro_error, mask, gyro)
 
 
 @kernel
@@ -67,9 +52,9 @@ def err_imu(flight, p, mask):
     """Add D (f - g e3) and D w to the IMU's sample, where `mask`."""
     D_a, D_g = load33(flight.accel_error), load33(flight.gyro_error)
     f, w, w_now = load3(flight.accel), load3(flight.gyro), load3(flight.w_meas)
-    keep3(flight.accel, mask, add(f, apply(D_a, (f[0], f[1], f[2] - p.gravity))))
-    keep3(flight.gyro, mask, add(w, apply(D_g, w)))
-    keep3(flight.w_meas, mask, add(w_now, apply(D_g, w_now)))
+    keep(flight.accel, mask, f + D_a @ (f[0], f[1], f[2] - p.gravity))
+    keep(flight.gyro, mask, w + D_g @ w)
+    keep(flight.w_meas, mask, w_now + D_g @ w_now)
 
 
 @kernel
@@ -83,10 +68,10 @@ def vibrate_imu(flight, p, mask):
     a, b, c, d = W[0] * W[0], W[1] * W[1], W[2] * W[2], W[3] * W[3]
     size = 0.5 * math.sqrt(a * a + b * b + c * c + d * d)
     n_a, n_g = six_normals(stream_of(flight), DRAW_VIBRATION)
-    shake = scale(p.gyro_vibration * size, n_g)
-    keep3(flight.accel, mask, add(load3(flight.accel), scale(p.accel_vibration * size, n_a)))
-    keep3(flight.gyro, mask, add(load3(flight.gyro), shake))
-    keep3(flight.w_meas, mask, add(load3(flight.w_meas), shake))
+    n_a, n_g = p.accel_vibration * size * n_a, p.gyro_vibration * size * n_g
+    keep(flight.accel, mask, n_a + load3(flight.accel))
+    keep(flight.gyro, mask, n_g + load3(flight.gyro))
+    keep(flight.w_meas, mask, n_g + load3(flight.w_meas))
 
 
 @kernel
@@ -99,38 +84,26 @@ def draw_heading_error(flight, p, mask):
 @kernel
 def turn_baseline(flight, p, mask):
     """Turn a measured baseline about the body z axis by its constant error, where `mask`."""
-    z_G = apply_transposed(load33(p.R_IG), quaternion_to_dcm(load4(flight.q))[2])
+    z_G = load33(p.R_IG).T @ quaternion_to_dcm(load4(flight.q))[2]
     s, c = sin_cos(flight.heading_error)
     b = load3(flight.gnss_baseline)
-    along = scale((1.0 - c) * dot(z_G, b), z_G)
-    turned = add(add(scale(c, b), scale(s, cross(z_G, b))), along)
-    keep3(flight.gnss_baseline, mask, turned)
+    turned = c * b + rounded(s * cross(z_G, b))
+    keep(flight.gnss_baseline, mask, (1.0 - c) * dot(z_G, b) * z_G + turned)
 
 
 @kernel
 def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
-    """Blur the image just taken; drop features too far or behind the ground, where `mask`.
-
-    Args:
-        flight: Record, with the image.
-        p: True parameters.
-        blurs: True if images are blurred.
-        ground_hides: True if the ground hides features.
-        feature_count: Features in use.
-        mask: Lanes to work on.
-    """
-    stream = stream_of(flight)
-    camera_I = apply_transposed(quaternion_to_dcm(load4(flight.q)), load3(p.camera))
-    camera_I = add(load3(flight.r), camera_I)
+    """Blur the image just taken; drop features too far or behind the ground, where `mask`."""
+    stream, r_I = stream_of(flight), load3(flight.r)
+    camera_I = r_I + quaternion_to_dcm(load4(flight.q)).T @ load3(p.camera)
     # uniform over the smear in both directions: sqrt(3) standard deviations
     reach = 1.7320508075688772 * p.blur * norm(load3(flight.w))
-    above = camera_I[2] >= p.ground_height
     for i in range(feature_count):
-        X_I = load3(p.features[i])
-        lost = norm(sub(X_I, camera_I)) > p.max_range
+        X_I, valid = load3(p.features[i]), flight.block_valid[FEATURE_BLOCKS + i]
+        lost = norm(X_I - camera_I) > p.max_range
         if ground_hides:
-            lost = lost | logical_not(above) | (X_I[2] < p.ground_height - HIDDEN_BELOW)
-        valid = flight.block_valid[FEATURE_BLOCKS + i]
+            below = logical_not(camera_I[2] >= p.ground_height)
+            lost = lost | below | (X_I[2] < p.ground_height - HIDDEN_BELOW)
         kept = select(lost, 0.0, valid)
         flight.block_valid[FEATURE_BLOCKS + i] = select(mask, kept, valid)
         seen = mask & (kept > 0.0)
@@ -142,38 +115,32 @@ def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
                 flight.pixels[i, axis] = select(seen, pixel + shift, pixel)
 
 
-# ---- stages ----------------------------------------------------------------------------------
-
-
 @stage
 def begin_imperfect_stage(flight, world, model, settings, work, stages, flag):
     """Draw the errors that last an episode."""
-    flying, true, mask = lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0
     if settings.imu_errs:
-        draw_imu_errors(flying, true, mask)
+        draw_imu_errors(flight, world, work.mask > 0.0)
     if settings.heading_errs:
-        draw_heading_error(flying, true, mask)
+        draw_heading_error(flight, world, work.mask > 0.0)
 
 
 @stage
 def disturb_imu_stage(flight, world, model, settings, work, stages, flag):
     """Add the IMU's constant errors and vibration to its sample."""
-    flying, true, mask = lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0
     if settings.imu_errs:
-        err_imu(flying, true, mask)
+        err_imu(flight, world, work.mask > 0.0)
     if settings.imu_vibrates:
-        vibrate_imu(flying, true, mask)
+        vibrate_imu(flight, world, work.mask > 0.0)
 
 
 @stage
 def turn_baseline_stage(flight, world, model, settings, work, stages, flag):
     """Apply the constant error to the baseline just measured."""
-    turn_baseline(lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0)
+    turn_baseline(flight, world, work.mask > 0.0)
 
 
 @stage
 def limit_camera_stage(flight, world, model, settings, work, stages, flag):
     """Blur the image just taken; drop features too far or behind the ground."""
-    mask, count = lanes_of(work).mask > 0.0, settings.feature_count
-    blurs, hides = settings.camera_blurs, settings.ground_hides
-    limit_camera(lanes_of(flight), lanes_of(world), blurs, hides, count, mask)
+    count, mask = settings.feature_count, work.mask > 0.0
+    limit_camera(flight, world, settings.camera_blurs, settings.ground_hides, count, mask)

@@ -5,23 +5,12 @@ measurements.
 """
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
-from quad_gym.kernels.maths.linalg import (
-    add,
-    apply,
-    keep3,
-    load3,
-    load4,
-    load33,
-    scale,
-    select3,
-    store3,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import keep, load3, load4, store
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import mean_quaternion, quaternion_to_dcm, rotation_between
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.vehicle.dynamics import (
-    accelerations,
+    air_accelerations,
     body_point_velocity,
     imu_point_acceleration,
     load_start,
@@ -41,15 +30,11 @@ def drift_biases(flight, p):
 @kernel
 def specific_force(flight, p, R_BI):
     """f_B = R (a_I + g e3) at the accelerometer, without bias and noise (report equation 4)."""
-    w_B = load3(flight.w)
-    v_air_I = sub(load3(flight.v), load3(flight.wind))
-    d_I = add(load3(flight.disturbance), load3(flight.air_force))
-    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, load4(flight.rotor_speeds), d_I, p)
-    dw_B = add(dw_B, apply(load33(p.inertia_inverse), load3(flight.air_torque)))
+    a_I, dw_B = air_accelerations(flight, p, R_BI)
     rest, on_pad = (0.0, 0.0, 0.0), flight.on_pad > 0.0
-    a_I, dw_B = select3(on_pad, rest, a_I), select3(on_pad, rest, dw_B)
-    a_I = imu_point_acceleration(R_BI, a_I, w_B, dw_B, load3(p.imu_lever_arm))
-    return apply(R_BI, (a_I[0], a_I[1], a_I[2] + p.gravity))
+    a_I, dw_B = select(on_pad, rest, a_I), select(on_pad, rest, dw_B)
+    a_I = imu_point_acceleration(R_BI, a_I, load3(flight.w), dw_B, load3(p.imu_lever_arm))
+    return R_BI @ (a_I[0], a_I[1], a_I[2] + p.gravity)
 
 
 @kernel
@@ -59,12 +44,11 @@ def _sample_imu(flight, p, w_B, f_B, mask):
     Inner loops read the gyro at the present instant, with the same bias and noise.
     """
     n_a, n_g = six_normals(stream_of(flight), DRAW_IMU)
-    noise_g, b_g = scale(p.gyro_sigma, n_g), load3(flight.b_g)
-    f_B = add(f_B, load3(flight.b_a))
-    keep3(flight.accel, mask, add(f_B, scale(p.accel_sigma, n_a)))
-    keep3(flight.gyro, mask, add(add(w_B, b_g), noise_g))
-    keep3(flight.w_before, mask, load3(flight.w_meas))
-    keep3(flight.w_meas, mask, add(add(load3(flight.w), b_g), noise_g))
+    b_a, b_g = load3(flight.b_a), load3(flight.b_g)
+    keep(flight.accel, mask, p.accel_sigma * n_a + (f_B + b_a))
+    keep(flight.gyro, mask, p.gyro_sigma * n_g + (w_B + b_g))
+    keep(flight.w_before, mask, load3(flight.w_meas))
+    keep(flight.w_meas, mask, p.gyro_sigma * n_g + (load3(flight.w) + b_g))
 
 
 @kernel
@@ -82,25 +66,17 @@ def measure_imu_average(flight, p, start, mask):
     from the initial to the final body frame over dt (coning corrected), and the mean specific force
     is R_mid (dv_I + g dt e3) / dt with the change of the accelerometer's velocity and the attitude
     halfway (sculling corrected; P. G. Savage, J. Guidance, Control, and Dynamics 21, 1998). Density
-    over sqrt(dt) is the standard deviation of white noise in a mean over dt.
-
-    Args:
-        flight: Record, with the true state at the tick's end and the biases at its start.
-        p: True parameters.
-        start: True state at the tick's start, from `load_state`.
-        mask: Lanes to work on.
+    over sqrt(dt) is the standard deviation of white noise in a mean over dt. `start` is the true
+    state at the tick's start; biases are the ones at its start.
     """
     _, v_start, q_start, w_start, _ = start
     q_end, rate, lever = load4(flight.q), 1.0 / p.dt, load3(p.imu_lever_arm)
     v_before = body_point_velocity(quaternion_to_dcm(q_start), v_start, w_start, lever)
     v_after = body_point_velocity(quaternion_to_dcm(q_end), load3(flight.v), load3(flight.w), lever)
-    a_I = scale(rate, sub(v_after, v_before))
+    a_I = rate * (v_after - v_before)
     R_mid = quaternion_to_dcm(mean_quaternion(q_start, q_end))
-    f_B = apply(R_mid, (a_I[0], a_I[1], a_I[2] + p.gravity))
-    _sample_imu(flight, p, scale(rate, rotation_between(q_start, q_end)), f_B, mask)
-
-
-# ---- stages ----------------------------------------------------------------------------------
+    f_B = R_mid @ (a_I[0], a_I[1], a_I[2] + p.gravity)
+    _sample_imu(flight, p, rate * rotation_between(q_start, q_end), f_B, mask)
 
 
 @stage
@@ -108,27 +84,25 @@ def sample_stage(flight, world, model, settings, work, stages, flag):
     """Sample the IMU at the present instant; `flag`: 1 at the start of an episode."""
     if flag == 0 and settings.imu_averages:  # at the start, no tick to average over
         return
-    flying, scratch = lanes_of(flight), lanes_of(work)
-    mask = scratch.mask > 0.0
-    measure_imu(flying, lanes_of(world), mask)
+    mask = work.mask > 0.0
+    measure_imu(flight, world, mask)
     call_stage(stages, Stage.FEEL_GROUND, flight, world, world, settings, work, 0)
     call_stage(stages, Stage.DISTURB_IMU, flight, world, world, settings, work, 0)
     if flag > 0:
-        keep3(flying.w_before, mask, load3(flying.w_meas))
+        keep(flight.w_before, mask, load3(flight.w_meas))
     call_stage(stages, Stage.SATURATE_IMU, flight, world, world, settings, work, 0)
 
 
 @stage
 def drift_biases_stage(flight, world, model, settings, work, stages, flag):
     """Let the true IMU biases drift over a tick."""
-    drift_biases(lanes_of(flight), lanes_of(world))
+    drift_biases(flight, world)
 
 
 @stage
 def average_imu_stage(flight, world, model, settings, work, stages, flag):
     """Sample the means of the IMU over the tick that ends now."""
-    flying, scratch = lanes_of(flight), lanes_of(work)
-    measure_imu_average(flying, lanes_of(world), load_start(scratch), scratch.mask > 0.0)
+    measure_imu_average(flight, world, load_start(work), work.mask > 0.0)
     call_stage(stages, Stage.DISTURB_IMU, flight, world, model, settings, work, 0)
     call_stage(stages, Stage.SATURATE_IMU, flight, world, model, settings, work, 0)
 
@@ -136,6 +110,5 @@ def average_imu_stage(flight, world, model, settings, work, stages, flag):
 @stage
 def sum_imu_stage(flight, world, model, settings, work, stages, flag):
     """Add the newest IMU sample to the sum since the last step."""
-    here = lanes_of(flight)
-    store3(here.gyro_sum, add(load3(here.gyro_sum), load3(here.gyro)))
-    store3(here.accel_sum, add(load3(here.accel_sum), load3(here.accel)))
+    store(flight.gyro_sum, load3(flight.gyro_sum) + load3(flight.gyro))
+    store(flight.accel_sum, load3(flight.accel_sum) + load3(flight.accel))

@@ -24,87 +24,61 @@ along s, so that the derivative relates the heading's error to others:
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BA, D, E, R, V
+from quad_gym.kernels.filter.align import lever_of_attitude
+from quad_gym.kernels.filter.error_state import BA, D, E, R, V, put_covariance
 from quad_gym.kernels.filter.recovery import (
     MOST_ANGLE,
     drifts,
     inflate_gyro_bias,
     inflate_heading,
-    raise_diagonal,
+    raise_variance,
+    raise_variances,
 )
-from quad_gym.kernels.maths.elementary import maximum, minimum, sin_cos
+from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
+from quad_gym.kernels.maths.elementary import minimum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
-    add,
-    add33,
-    add_outer,
-    add_scaled,
-    apply,
-    apply_transposed,
     cross,
+    diagonal,
     dot,
-    keep3,
-    keep33,
+    keep,
     load3,
     load4,
     load33,
-    load_block,
-    load_column3,
-    multiply,
     outer,
-    scale,
-    select3,
-    store3,
-    store_block,
-    sub,
-    sum_of_outers,
-    transpose,
+    rounded,
+    store,
+    vector,
 )
+from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
-from quad_gym.kernels.sensors.aid import (
-    aid_due,
-    begin_aid,
-    deliver,
-    deliver_first,
-    draw_matrix,
-    gate_aid,
-)
-from quad_gym.kernels.sensors.stage import sensor_stage
+from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm, Sensor
+from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm
 
-_S, _SENSOR = int(Aid.MAGNETOMETER), int(Sensor.MAGNETOMETER)
-_BLOCK = AID_BLOCKS + _S
-_EKF = int(FilterForm.EKF)
+_S = Aid.MAGNETOMETER
 _DRIFT_TIME = 0.5
 """Time within which the magnetometer pulls the heading back [s]: shorter than it really is, so that
 the bias may be larger than a drift implies."""
 
 
 @kernel
-def _begin(flight, p, settings, mask):
-    begin_aid(flight, p, settings, _S, mask)
+def _draw(flight, p, mask):
     draw_matrix(flight, p, _S, mask)
 
 
 @kernel
-def _sample(flight, p, settings, work, stages, mask, starting):
-    """Measure when due."""
-    due = aid_due(flight, p, settings, _S, mask, starting)
+def _measure(flight, p):
+    """The field in B, with all errors."""
     stream = stream_of(flight)
     a, b = normal_pair(stream, DRAW_AID + 2 * _S)
     c, _ = normal_pair(stream, DRAW_AID + 2 * _S + 1)
     m, (s, t) = load3(p.aid_numbers[_S]), sin_cos(flight.aid_scalar[_S])
     field_I = (t * m[0] + s * m[1], t * m[1] - s * m[0], m[2])
-    field_B = apply(quaternion_to_dcm(load4(flight.q)), field_I)
-    field_B = add(field_B, apply(load33(flight.aid_matrix[_S]), field_B))
-    noise = scale(p.aid_sigma[_S], (a, b, c))
-    values = add(add(field_B, load3(flight.aid_vector[_S])), noise)
-    if starting and settings.heading_sensor == _SENSOR and settings.warm == 0:
-        deliver_first(flight, _S, mask, values)
-    else:
-        deliver(flight, work, settings, _S, mask, due, values)
+    field_B = quaternion_to_dcm(load4(flight.q)) @ field_I
+    field_B = field_B + load33(flight.aid_matrix[_S]) @ field_B + load3(flight.aid_vector[_S])
+    return p.aid_sigma[_S] * vector(a, b, c) + field_B, flight.tick >= 0.0
 
 
 @kernel
@@ -112,10 +86,8 @@ def _align(flight, p, work, settings, mask):
     """Initialize the heading with the direction of the field, and the covariance to match."""
     P, L, R_BI = work.P, flight.L, load33(flight.R_hat)
     m, z = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S])
-    R_BI = multiply(R_BI, level_attitude(apply_transposed(R_BI, z), m))
-    for i in range(0, D, 3):
-        for j in range(0, i + 3, 3):
-            store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
+    R_BI = R_BI @ level_attitude(R_BI.T @ z, m)
+    put_covariance(P, L, 1.0)
     for i in range(settings.slow_states):
         for j in range(D + i):
             P[D + i, j] = 0.0 * p.dt
@@ -133,9 +105,9 @@ def _align(flight, p, work, settings, mask):
         for j in range(D + i + 1):
             kept = flight.L_slow[i, j]
             flight.L_slow[i, j] = select(estimated, P[D + i, j], kept)
-    antenna_I = apply(load33(p.R_IG), load3(flight.gnss_position))
-    keep33(flight.R_hat, mask, R_BI)
-    keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
+    antenna_I = load33(p.R_IG) @ load3(flight.gnss_position)
+    keep(flight.R_hat, mask, R_BI)
+    keep(flight.r_hat, mask, antenna_I - R_BI.T @ load3(p.antenna))
 
 
 @kernel
@@ -143,116 +115,78 @@ def _tie_heading(p, P, m, R_BI, iron, delta):
     """Replace the error of the heading in P by the error of the field's heading, see above."""
     zero = 0.0 * p.dt
     level = math.sqrt(m[0] * m[0] + m[1] * m[1])
-    h, k = apply(R_BI, (m[0] / level, m[1] / level, zero)), apply(R_BI, (zero, zero, zero + 1.0))
+    h, k = R_BI @ (m[0] / level, m[1] / level, zero), R_BI @ (zero, zero, zero + 1.0)
     s, steep = cross(k, h), m[2] / level
-    F = outer(k, sub(scale(steep, h), k))  # e = F e + ..., where only the tilt counts
-    F = add33(((zero + 1.0, zero, zero), (zero, zero + 1.0, zero), (zero, zero, zero + 1.0)), F)
+    # e = F e + ..., where only the tilt counts
+    F = diagonal((zero + 1.0, zero + 1.0, zero + 1.0)) + rounded(outer(k, steep * h - k))
     P_bb, P_dd = P[iron, iron], P[delta, delta]
     white = p.initial_covariance_scale * p.aid_sigma[_S] * p.aid_sigma[_S]
     alone = P_dd + (white + P_bb) / (level * level)
-    P_ee = multiply(multiply(F, _full(P)), transpose(F))
-    store_block(P, E, E, add_outer(P_ee, scale(alone, k), k))
-    store_block(P, E, V, multiply(F, load_block(P, E, V)))
+    store_block(P, E, E, F @ _full(P) @ F.T + outer(alone * k, k))
+    store_block(P, E, V, F @ load_block(P, E, V))
     for i in range(BA, D, 3):
-        store_block(P, i, E, multiply(load_block(P, i, E), transpose(F)))
-    with_iron = scale(P_bb / level, s)
-    store3(P[iron, E : E + 3], scale(with_iron[0], k))
-    store3(P[iron + 1, E : E + 3], scale(with_iron[1], k))
-    store3(P[iron + 2, E : E + 3], scale(with_iron[2], k))
-    store3(P[delta, E : E + 3], scale(-P_dd, k))
+        store_block(P, i, E, load_block(P, i, E) @ F.T)
+    with_iron = P_bb / level * s
+    for i in range(3):
+        store(P[iron + i, E : E + 3], with_iron[i] * k)
+    store(P[delta, E : E + 3], -P_dd * k)
 
 
 @kernel
 def _tie_position(p, P, R_BI, iron, delta):
     """Correlate the position with the attitude in P, as an antenna was measured: see `align.py`."""
-    zero = 0.0 * p.dt
-    x, y, z = load3(p.antenna)
-    J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
-    J_t = transpose(J)
-    with_attitude, s, k = (
-        multiply(_full(P), J_t),
-        load3(p.position_sigma_I),
-        p.initial_covariance_scale,
-    )
-    white = (
-        (k * s[0] * s[0], zero, zero),
-        (zero, k * s[1] * s[1], zero),
-        (zero, zero, k * s[2] * s[2]),
-    )
-    store_block(P, R, R, add33(white, multiply(J, with_attitude)))
+    J, s = lever_of_attitude(R_BI, load3(p.antenna)), load3(p.position_sigma_I)
+    k, with_attitude = p.initial_covariance_scale, _full(P) @ J.T
+    white = diagonal((k * s[0] * s[0], k * s[1] * s[1], k * s[2] * s[2]))
+    store_block(P, R, R, white + J @ with_attitude)
     store_block(P, E, R, with_attitude)
-    store_block(P, V, R, multiply(transpose(load_block(P, E, V)), J_t))
+    store_block(P, V, R, load_block(P, E, V).T @ J.T)
     for i in range(BA, D, 3):
-        store_block(P, i, R, multiply(load_block(P, i, E), J_t))
+        store_block(P, i, R, load_block(P, i, E) @ J.T)
     for i in (iron, iron + 1, iron + 2, delta):
-        store3(P[i], apply(J, load3(P[i, E : E + 3])))
+        store(P[i], J @ load3(P[i, E : E + 3]))
 
 
 @kernel
 def _full(P):
     """Full covariance of the error angles, from the lower triangle in P."""
-    return (
-        (P[E, E], P[E + 1, E], P[E + 2, E]),
-        (P[E + 1, E], P[E + 1, E + 1], P[E + 2, E + 1]),
-        (P[E + 2, E], P[E + 2, E + 1], P[E + 2, E + 2]),
-    )
+    (a, _, _), (b, c, _), (d, e, f) = load_block(P, E, E)
+    return ((a, b, d), (b, c, e), (d, e, f))
 
 
 @kernel
 def _expected_field(flight, p, settings):
-    """R f and R g, see above."""
-    R_BI, m, delta = load33(flight.R_hat), load3(p.aid_numbers[_S]), settings.aid_scalar[_S]
+    """R_BI (m_I + delta m_I x e3) and R_BI (m_I x e3)."""
+    m, R_BI = load3(p.aid_numbers[_S]), load33(flight.R_hat)
     g = (m[1], -m[0], 0.0 * m[2])
-    return apply(R_BI, add(m, scale(flight.slow_hat[delta], g))), apply(R_BI, g)
+    return R_BI @ (flight.slow_hat[settings.aid_scalar[_S]] * g + m), R_BI @ g
 
 
 @kernel
-def _put_center(flight, p, work, settings, k, valid, f_B):
-    """Fill rows k to k + 2 of center, measured and noise."""
-    first = settings.aid_vector[_S]
-    center = add(f_B, load3(flight.slow_hat[first : first + 3]))
-    variance = p.aid_sigma[_S] * p.aid_sigma[_S]
-    for i in range(3):
-        work.z_hat[k + i] = select(valid, center[i], 0.0)
-        work.z[k + i] = select(valid, flight.aid_measurement[_S, i], 0.0)
-        for j in range(3):
-            work.Rz[k + i, k + j] = 0.0 * variance
-        work.Rz[k + i, k + i] = select(valid, variance, 1.0)
-
-
-@kernel
-def _expect(flight, p, work, settings, k):
+def _expect(flight, p, work, settings, k, valid):
     """Fill rows k to k + 2."""
-    L, M, inverse_c = flight.L, flight.L_slow, work.inverse_spread
-    valid, last = flight.block_valid[_BLOCK] > 0.0, D + settings.slow_states - 1
+    L, M, inverse_c, last = flight.L, flight.L_slow, work.inverse_spread, columns_of(settings) - 1
     first, delta = settings.aid_vector[_S], settings.aid_scalar[_S]
     f_B, g_B = _expected_field(flight, p, settings)
-    _put_center(flight, p, work, settings, k, valid, f_B)
-    zero = 0.0 * f_B[0]
-    nothing = (zero, zero, zero)
+    z, variance = load3(flight.aid_measurement[_S]), p.aid_sigma[_S] * p.aid_sigma[_S]
+    z_hat = f_B + load3(flight.slow_hat[first : first + 3])
+    put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
     for j in range(last + 1):
-        db, turned = load_column3(M, first, j), scale(M[delta, j], g_B)
-        straight = add(turned, db)
+        db, turned = load_column3(M, first, j), M[delta, j] * g_B
+        a, s = turned + db, 0.0 * db
         if j < 9:
-            half_sum = nothing
-            if (settings.form & _EKF) != 0:
-                straight = add(straight, cross(f_B, load_column3(L, E, j)))
+            if (settings.form & FilterForm.EKF.value) != 0:
+                a = a + cross(f_B, load_column3(L, E, j))
             else:
                 odd, even = load33(work.odd[j]), load33(work.even[j])
-                bent = add_scaled(apply(even, turned), inverse_c, apply(odd, f_B))
-                straight = add(straight, bent)
-                half_sum = add_scaled(apply(odd, turned), inverse_c, apply(even, f_B))
-            store3(work.E[8 - j][k : k + 3], select3(valid, half_sum, nothing))
-        store3(work.A[last - j][k : k + 3], select3(valid, straight, nothing))
+                a = a + (even @ turned + inverse_c * (odd @ f_B))
+                s = odd @ turned + inverse_c * (even @ f_B)
+            put_three(work.E[8 - j], k, valid, s)
+        put_three(work.A[last - j], k, valid, a)
 
 
 @kernel
-def _gate(flight, p, work, settings, k):
-    gate_aid(flight, p, work, settings, _S, k, 3.0)
-
-
-@kernel
-def _inflate(flight, p, work, settings):
+def _inflate(flight, p, work, settings, alarm, nu):
     """Inflate hard iron, attitude and gyro biases.
 
     The variances of hard iron and of the heading are raised to the square of a rejected innovation.
@@ -260,23 +194,21 @@ def _inflate(flight, p, work, settings):
     the variances of the attitude are raised to the square of the mean innovation, as an angle, and
     the variances of the gyro biases to the square of the rate that rotates as far in `_DRIFT_TIME`.
     """
-    alarm, mask = work.alarm[AID_GROUPS + _S] > 0.0, work.taking > 0.0
-    nu, k = load3(flight.innovation[_BLOCK]), D + settings.aid_vector[_S]
+    k, group = D + settings.aid_vector[_S], AID_GROUPS + _S
     m, R_BI, P = load3(p.aid_numbers[_S]), load33(flight.R_hat), work.P
-    square = nu[0] * nu[0] + nu[1] * nu[1] + nu[2] * nu[2]
-    vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-    inflate_heading(P, vertical, square / (m[0] * m[0] + m[1] * m[1]), alarm)
-    mean = load3(flight.innovation_drift[AID_GROUPS + _S])
-    sigma = load3(flight.innovation_sigma[_BLOCK])
+    level = m[0] * m[0] + m[1] * m[1]
+    inflate_heading(P, R_BI, dot(nu, nu) / level, alarm)
+    mean, sigma = (
+        load3(flight.innovation_drift[group]),
+        load3(flight.innovation_sigma[AID_BLOCKS + _S]),
+    )
     off = (mean[0] * sigma[0], mean[1] * sigma[1], mean[2] * sigma[2])
-    turned = dot(off, off) / (m[0] * m[0] + m[1] * m[1])
-    drifting = select(mask & drifts(flight, AID_GROUPS + _S), 1.0, 0.0)
-    raise_diagonal(P, E, drifting * minimum(turned, MOST_ANGLE * MOST_ANGLE))
+    turned = dot(off, off) / level
+    drifting = (work.taking > 0.0) & drifts(flight, group)
+    raise_variances(P, E, drifting, minimum(turned, MOST_ANGLE * MOST_ANGLE))
     inflate_gyro_bias(P, math.sqrt(turned) / _DRIFT_TIME, drifting)
     for i in range(3):
-        P[k + i, k + i] = maximum(P[k + i, k + i], select(alarm, nu[i] * nu[i], 0.0))
+        raise_variance(P, k + i, alarm, nu[i] * nu[i])
 
 
-magnetometer_stage = sensor_stage(
-    Sensor.MAGNETOMETER, _begin, _sample, _expect, _gate, _inflate, _align
-)
+magnetometer_stage = aid_stage(_S, _measure, _expect, _inflate, _draw, _align)

@@ -22,52 +22,33 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import E, R, V
-from quad_gym.kernels.filter.recovery import inflate_accel_bias, raise_diagonal, time_of
-from quad_gym.kernels.filter.rows import clear_slow_columns, columns_of, put_noise, put_three
+from quad_gym.kernels.filter.recovery import inflate_accel_bias, raise_variances, time_of
+from quad_gym.kernels.filter.rows import put_block, put_column
 from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import (
-    add,
-    apply,
-    cross,
-    load3,
-    load4,
-    load33,
-    load_column3,
-    scale,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33, vector
+from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.sensors.aid import aid_due, begin_aid, deliver, gate_aid
+from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.sensors.range_finder import LEAST_COSINE, ground_range
-from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm, Sensor
+from quad_gym.records import AID_GROUPS, DRAW_AID, Aid, FilterForm
 
-_S = int(Aid.OPTICAL_FLOW)
-_BLOCK, _EKF = AID_BLOCKS + _S, int(FilterForm.EKF)
-
-
-@kernel
-def _begin(flight, p, settings, mask):
-    begin_aid(flight, p, settings, _S, mask)
+_S = Aid.OPTICAL_FLOW
 
 
 @kernel
-def _sample(flight, p, settings, work, stages, mask, starting):
-    """Measure when due, and within the limits of height, tilt and rate."""
-    due = aid_due(flight, p, settings, _S, mask, starting)
+def _measure(flight, p):
+    """Two rates, within the limits of height, tilt and rate."""
     n_x, n_y = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
     R_BI, w = quaternion_to_dcm(load4(flight.q)), load3(flight.w)
     h, u = ground_range(p, flight.r, R_BI)
     within = (h >= p.aid_numbers[_S, 0]) & (u >= LEAST_COSINE)
-    g = u / select(within, h, 1.0)
-    v_B = apply(R_BI, load3(flight.v))
+    g, v_B = u / select(within, h, 1.0), R_BI @ load3(flight.v)
     x, y = g * v_B[0] - w[1], g * v_B[1] + w[0]
-    most = p.aid_numbers[_S, 1]
+    most, sigma = p.aid_numbers[_S, 1], p.aid_sigma[_S]
     within = within & (abs(x) <= most) & (abs(y) <= most)
-    values = (x + p.aid_sigma[_S] * n_x, y + p.aid_sigma[_S] * n_y, 0.0 * x)
-    deliver(flight, work, settings, _S, mask, due & within, values)
+    return (x + sigma * n_x, y + sigma * n_y, 0.0 * x), within
 
 
 @kernel
@@ -77,65 +58,52 @@ def _flow(g, v_B):
 
 
 @kernel
-def _put_center(flight, p, work, k, valid, G, W):
-    """Fill the rows of predicted measurement, measurement and noise."""
-    w = sub(load3(flight.w_meas), load3(flight.b_g_hat))
-    rotation = (-w[1], w[0], 0.0 * G)
-    put_three(work.z_hat, k, valid, add(_flow(G, W), rotation))
-    put_three(work.z, k, valid, load3(flight.aid_measurement[_S]))
+def _put_center(flight, p, work, settings, k, valid, G, W):
+    """Fill the rows of measurement, prediction and noise."""
+    w, zero = load3(flight.w_meas) - load3(flight.b_g_hat), 0.0 * G
+    z_hat = vector(-w[1], w[0], zero) + _flow(G, W)
     variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
-    zero, one = 0.0 * G, 1.0 + 0.0 * G
-    put_noise(work, k, valid, ((variance, zero, zero), (zero, variance, zero), (zero, zero, one)))
+    noise = diagonal((variance, variance, zero + 1.0))
+    put_block(work, settings, k, valid, load3(flight.aid_measurement[_S]), z_hat, noise)
 
 
 @kernel
-def _expect(flight, p, work, settings, k):
+def _expect(flight, p, work, settings, k, valid):
     """Fill rows k to k + 2: two rates, and a masked row."""
-    valid, last = flight.block_valid[_BLOCK] > 0.0, columns_of(settings) - 1
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
-    h, W = maximum(h, 0.5 * p.aid_numbers[_S, 0]), apply(R_BI, load3(flight.v_hat))
-    G, z_B, zero = u / h, (R_BI[0][2], R_BI[1][2], R_BI[2][2]), 0.0 * h
-    _put_center(flight, p, work, k, valid, G, W)
-    clear_slow_columns(work, k, settings)
+    h, W = maximum(h, 0.5 * p.aid_numbers[_S, 0]), R_BI @ load3(flight.v_hat)
+    G, z_B, zero = u / h, R_BI.T[2], 0.0 * h
+    _put_center(flight, p, work, settings, k, valid, G, W)
     for j in range(9):
-        dV, dh = apply(R_BI, load_column3(L, V, j)), L[R + 2, j] if j <= R + 2 else zero
-        if (settings.form & _EKF) != 0:
+        dV, dh = R_BI @ load_column3(L, V, j), L[R + 2, j] if j <= R + 2 else zero
+        if (settings.form & FilterForm.EKF.value) != 0:
             e = load_column3(L, E, j)
             du = cross(z_B, e)[2]
-            straight = _flow(G, add(dV, cross(W, e)))
-            straight = add(straight, _flow((du - G * dh) / h, W))
-            bent = (zero, zero, zero)
+            a = _flow(G, dV + cross(W, e)) + _flow((du - G * dh) / h, W)
+            s = (zero, zero, zero)
         else:
             odd, even = load33(work.odd[j]), load33(work.even[j])
-            dV, dh = scale(c, dV), c * dh
-            V_e = add(apply(even, W), apply(odd, dV))
-            V_o = add(add(apply(odd, W), dV), apply(even, dV))
-            odd_u, even_u = apply(odd, z_B)[2], apply(even, z_B)[2]
+            dV, dh = c * dV, c * dh
+            V_e = even @ W + odd @ dV
+            V_o = dV + odd @ W + even @ dV
+            odd_u, even_u = (odd @ z_B)[2], (even @ z_B)[2]
             divisor = 1.0 / (h * h - dh * dh)
             g_e = (even_u * h * h - odd_u * dh * h + u * dh * dh) * divisor / h
             g_o = (odd_u * h - (u + even_u) * dh) * divisor
-            straight = scale(inverse_c, add(_flow(G + g_e, V_o), _flow(g_o, add(W, V_e))))
-            bent = add(add(_flow(G + g_e, V_e), _flow(g_e, W)), _flow(g_o, V_o))
-            bent = scale(inverse_c, bent)
-        put_three(work.A[last - j], k, valid, straight)
-        put_three(work.E[8 - j], k, valid, bent)
+            a = inverse_c * (_flow(G + g_e, V_o) + _flow(g_o, W + V_e))
+            s = inverse_c * (_flow(G + g_e, V_e) + _flow(g_e, W) + _flow(g_o, V_o))
+        put_column(work, settings, k, j, valid, a, s)
 
 
 @kernel
-def _gate(flight, p, work, settings, k):
-    gate_aid(flight, p, work, settings, _S, k, 2.0)
-
-
-@kernel
-def _inflate(flight, p, work, settings):
+def _inflate(flight, p, work, settings, alarm, nu):
     """Inflate velocity, accelerometer biases and tilt by a rejected innovation."""
-    alarm, nu = work.alarm[AID_GROUPS + _S], flight.innovation[_BLOCK]
     h, _ = ground_range(p, flight.r_hat, load33(flight.R_hat))
     square = h * h * (nu[0] * nu[0] + nu[1] * nu[1])
-    raise_diagonal(work.P, V, select(alarm > 0.0, square, 0.0))
+    raise_variances(work.P, V, alarm, square)
     T = time_of(flight, p, AID_GROUPS + _S)
     inflate_accel_bias(p, work.P, math.sqrt(square) / T, alarm)
 
 
-optical_flow_stage = sensor_stage(Sensor.OPTICAL_FLOW, _begin, _sample, _expect, _gate, _inflate)
+optical_flow_stage = aid_stage(_S, _measure, _expect, _inflate)

@@ -11,18 +11,18 @@ U = u + even_u and D = U^2 - odd_u^2; the derivative along an offset is dh / u -
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.rows import clear_slow_columns, columns_of, put_noise, put_three
+from quad_gym.kernels.filter.recovery import raise_variance
+from quad_gym.kernels.filter.rows import put_block, put_column
 from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import apply, cross, load4, load33, load_column3
+from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33
+from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.sensors.aid import aid_due, begin_aid, deliver, gate_aid
-from quad_gym.kernels.sensors.stage import sensor_stage
+from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm, Sensor
+from quad_gym.records import DRAW_AID, Aid, FilterForm
 
-_S = int(Aid.RANGE_FINDER)
-_BLOCK, _EKF = AID_BLOCKS + _S, int(FilterForm.EKF)
+_S = Aid.RANGE_FINDER
 LEAST_COSINE = 0.5
 """Cosine of the tilt below which it does not measure: 60 degrees."""
 
@@ -34,70 +34,46 @@ def ground_range(p, r, R_BI):
 
 
 @kernel
-def _begin(flight, p, settings, mask):
-    begin_aid(flight, p, settings, _S, mask)
-
-
-@kernel
-def _sample(flight, p, settings, work, stages, mask, starting):
-    """Measure when due and within range."""
-    due = aid_due(flight, p, settings, _S, mask, starting)
+def _measure(flight, p):
+    """The distance, within range."""
     n, _ = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
     h, u = ground_range(p, flight.r, quaternion_to_dcm(load4(flight.q)))
     steep = u < LEAST_COSINE
     distance = h / select(steep, 1.0, u)
     within = (distance >= p.aid_numbers[_S, 0]) & (distance <= p.aid_numbers[_S, 1])
-    due = due & within & (u >= LEAST_COSINE)
     zero = 0.0 * distance
-    values = (distance + p.aid_sigma[_S] * n, zero, zero)
-    deliver(flight, work, settings, _S, mask, due, values)
+    return (distance + p.aid_sigma[_S] * n, zero, zero), within & (u >= LEAST_COSINE)
 
 
 @kernel
-def _expect(flight, p, work, settings, k):
+def _expect(flight, p, work, settings, k, valid):
     """Fill rows k to k + 2: the distance, and two masked ones."""
-    valid, last = flight.block_valid[_BLOCK] > 0.0, columns_of(settings) - 1
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
-    zero, one = 0.0 * u, 1.0 + 0.0 * u
+    zero, sigma = 0.0 * u, p.aid_sigma[_S]
     u = maximum(u, LEAST_COSINE)
-    put_three(work.z_hat, k, valid, (h / u, zero, zero))
-    put_three(work.z, k, valid, (flight.aid_measurement[_S, 0], zero, zero))
-    variance = p.aid_sigma[_S] * p.aid_sigma[_S]
-    put_noise(work, k, valid, ((variance, zero, zero), (zero, one, zero), (zero, zero, one)))
-    clear_slow_columns(work, k, settings)
-    z_B = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+    z, noise = load3(flight.aid_measurement[_S]), (sigma * sigma, zero + 1.0, zero + 1.0)
+    put_block(work, settings, k, valid, z, (h / u, zero, zero), diagonal(noise))
+    z_B = R_BI.T[2]
     for j in range(9):
         dh = L[R + 2, j] if j <= R + 2 else zero
-        if (settings.form & _EKF) != 0:
+        if (settings.form & FilterForm.EKF.value) != 0:
             du = cross(z_B, load_column3(L, E, j))[2]
-            straight, bent = (dh - h * du / u) / u, zero
+            a, s = (dh - h * du / u) / u, zero
         else:
-            dh, odd, even = (
-                c * dh,
-                apply(load33(work.odd[j]), z_B),
-                apply(load33(work.even[j]), z_B),
-            )
-            whole = u + even[2]
-            divisor = 1.0 / (whole * whole - odd[2] * odd[2])
-            straight = inverse_c * (dh * whole - h * odd[2]) * divisor
-            bent = h * (odd[2] * odd[2] - whole * even[2]) - u * dh * odd[2]
-            bent = inverse_c * bent * divisor / u
-        put_three(work.A[last - j], k, valid, (straight, zero, zero))
-        put_three(work.E[8 - j], k, valid, (bent, zero, zero))
+            dh, odd, even = c * dh, load33(work.odd[j]) @ z_B, load33(work.even[j]) @ z_B
+            U = u + even[2]
+            divisor = 1.0 / (U * U - odd[2] * odd[2])
+            a = inverse_c * (dh * U - h * odd[2]) * divisor
+            s = h * (odd[2] * odd[2] - U * even[2]) - u * dh * odd[2]
+            s = inverse_c * s * divisor / u
+        put_column(work, settings, k, j, valid, (a, zero, zero), (s, zero, zero))
 
 
 @kernel
-def _gate(flight, p, work, settings, k):
-    gate_aid(flight, p, work, settings, _S, k, 1.0)
-
-
-@kernel
-def _inflate(flight, p, work, settings):
+def _inflate(flight, p, work, settings, alarm, nu):
     """Inflate the height to the square of a rejected innovation."""
-    nu = flight.innovation[_BLOCK, 0]
-    square = select(work.alarm[AID_GROUPS + _S] > 0.0, nu * nu, 0.0)
-    work.P[R + 2, R + 2] = maximum(work.P[R + 2, R + 2], square)
+    raise_variance(work.P, R + 2, alarm, nu[0] * nu[0])
 
 
-range_finder_stage = sensor_stage(Sensor.RANGE_FINDER, _begin, _sample, _expect, _gate, _inflate)
+range_finder_stage = aid_stage(_S, _measure, _expect, _inflate)

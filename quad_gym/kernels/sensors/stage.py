@@ -4,12 +4,8 @@ from typing import Any
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.measurements import ACTS
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import Act, Sensor
-
-_BEGIN, _SAMPLE, _EXPECT = int(Act.BEGIN), int(Act.SAMPLE), int(Act.EXPECT)
-_GATE, _INFLATE = int(Act.GATE), int(Act.INFLATE)
 
 
 @kernel
@@ -41,21 +37,20 @@ def sensor_stage(
     """
 
     def call(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
-        flying, scratch, act, argument = lanes_of(flight), lanes_of(work), flag % ACTS, flag // ACTS
-        p, mask = lanes_of(model), scratch.mask > 0.0
-        if act == _BEGIN:
-            begin(flying, lanes_of(world), settings, mask)
-        elif act == _SAMPLE:
-            sample(flying, lanes_of(world), settings, scratch, stages, mask, argument > 0)
-            scratch.mask = select(mask, 1.0, 0.0)
-        elif act == _EXPECT:
-            expect(flying, p, scratch, settings, argument)
-        elif act == _GATE:
-            gate(flying, p, scratch, settings, argument)
-        elif act == _INFLATE:
-            inflate(flying, p, scratch, settings)
+        act, argument, mask = flag % ACTS, flag // ACTS, work.mask > 0.0
+        if act == Act.BEGIN:
+            begin(flight, world, settings, mask)
+        elif act == Act.SAMPLE:
+            sample(flight, world, settings, work, stages, mask, argument > 0)
+            work.mask = select(mask, 1.0, 0.0)
+        elif act == Act.EXPECT:
+            expect(flight, model, work, settings, argument)
+        elif act == Act.GATE:
+            gate(flight, model, work, settings, argument)
+        elif act == Act.INFLATE:
+            inflate(flight, model, work, settings)
         else:
-            align(flying, p, scratch, settings, mask)
+            align(flight, model, work, settings, mask)
 
     call.__name__ = call.__qualname__ = f"{sensor.name.lower()}_stage"  # for caches and messages
     return stage(call)

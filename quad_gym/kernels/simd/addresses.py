@@ -22,10 +22,7 @@ _INDEX = ir.IntType(32)
 _SINGLE = ir.FloatType()
 
 
-def record_at(dtype: np.dtype) -> Any:
-    """Return a function that returns the record of a type at an address."""
-    kind = from_dtype(dtype)
-
+def _pointer_at(kind: Any) -> Any:
     @intrinsic
     def at(typing_context, address):  # type: ignore[no-untyped-def]
         def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -36,18 +33,14 @@ def record_at(dtype: np.dtype) -> Any:
     return at
 
 
+def record_at(dtype: np.dtype) -> Any:
+    """Return a function that returns the record of a type at an address."""
+    return _pointer_at(from_dtype(dtype))
+
+
 def lanes_at(dtype: np.dtype) -> Any:
     """Return a function that returns the lanes of a block of a type at an address."""
-    kind = LaneRecord(from_dtype(dtype))
-
-    @intrinsic
-    def at(typing_context, address):  # type: ignore[no-untyped-def]
-        def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            return builder.inttoptr(args[0], _BYTES)
-
-        return kind(types.int64), lower
-
-    return at
+    return _pointer_at(LaneRecord(from_dtype(dtype)))
 
 
 def array_at(dtype: Any) -> Any:
@@ -142,13 +135,9 @@ def prefetch(typing_context, address):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def store_tile(typing_context, address, pitch, source, first):  # type: ignore[no-untyped-def]
-    """Write WIDTH elements of an array of lanes as float32, one row per lane.
+    """Write WIDTH elements of an array of lanes, from `first` on, as float32, one row per lane.
 
-    Args:
-        address: Address of the first lane's row.
-        pitch: Bytes from one lane's row to the next.
-        source: Array of lanes.
-        first: Index of the first element to write.
+    The first lane's row is at `address`; each next one is `pitch` bytes further.
     """
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]

@@ -3,6 +3,7 @@
 Each accepts a plain number or lanes, because LLVM's instructions do.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -21,7 +22,7 @@ def _like(value: ir.Value, scalar: ir.Type) -> ir.Type:
     return ir.VectorType(scalar, WIDTH) if isinstance(value.type, ir.VectorType) else scalar
 
 
-def _constant(builder: ir.IRBuilder, like: ir.Value, scalar: ir.Type, number: Any) -> ir.Value:
+def _constant(builder: ir.IRBuilder, like: ir.Value, number: Any, scalar: ir.Type = _INT) -> Any:
     constant = ir.Constant(scalar, number)
     return splat(builder, constant) if isinstance(like.type, ir.VectorType) else constant
 
@@ -34,12 +35,53 @@ def _is_word(numba_type: Any) -> bool:
     return bool(numba_type == words or numba_type == types.uint64)
 
 
-@intrinsic
-def round_to_even(typing_context, x):  # type: ignore[no-untyped-def]
-    """Return the nearest integer, ties to even, as a float."""
-    if not _is_float(x):
-        return None
-    return x(x), lambda context, builder, sig, args: call_llvm(builder, "llvm.rint", args[0])
+def _of_float(emit: Callable[[ir.IRBuilder, ir.Value], ir.Value]) -> Any:
+    """Make a function of one number, and with a number as its result."""
+
+    @intrinsic
+    def call(typing_context, x):  # type: ignore[no-untyped-def]
+        if not _is_float(x):
+            return None
+        return x(x), lambda context, builder, sig, args: emit(builder, args[0])
+
+    return call
+
+
+def _power_of_two(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    biased = builder.fadd(x, _constant(builder, x, 1023.0, _FLOAT))
+    shifted = builder.shl(builder.fptosi(biased, _like(x, _INT)), _constant(builder, x, 52))
+    return builder.bitcast(shifted, _like(x, _FLOAT))
+
+
+def _exponent_of(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    pattern = builder.bitcast(x, _like(x, _INT))
+    biased = builder.lshr(pattern, _constant(builder, x, 52))
+    return builder.sitofp(builder.sub(biased, _constant(builder, x, 1023)), _like(x, _FLOAT))
+
+
+def _with_exponent_zero(builder: ir.IRBuilder, mantissa: ir.Value) -> ir.Value:
+    """The number from 1 to 2 whose mantissa has these 52 bits."""
+    one = builder.or_(mantissa, _constant(builder, mantissa, 1023 << 52))
+    return builder.bitcast(one, _like(mantissa, _FLOAT))
+
+
+def _mantissa_of(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    pattern = builder.bitcast(x, _like(x, _INT))
+    return _with_exponent_zero(builder, builder.and_(pattern, _constant(builder, x, (1 << 52) - 1)))
+
+
+round_to_even = _of_float(lambda builder, x: call_llvm(builder, "llvm.rint", x))
+"""Nearest integer, ties to even, as a float."""
+library_sin = _of_float(lambda builder, x: call_llvm(builder, "llvm.sin", x))
+"""Sine from the C library, lane by lane: slow, for arguments too large to reduce."""
+library_cos = _of_float(lambda builder, x: call_llvm(builder, "llvm.cos", x))
+"""Cosine from the C library, lane by lane: slow, for arguments too large to reduce."""
+power_of_two = _of_float(_power_of_two)
+"""2 ** x, exact, for an integer-valued float in [-1022, 1023]."""
+exponent_of = _of_float(_exponent_of)
+"""The e of x = m 2**e with m in [1, 2), as a float, for positive normal x."""
+mantissa_of = _of_float(_mantissa_of)
+"""The m of x = m 2**e with m in [1, 2), for positive normal x."""
 
 
 @intrinsic
@@ -54,71 +96,6 @@ def fused_multiply_add(typing_context, a, b, c):  # type: ignore[no-untyped-def]
     return kind(a, b, c), lower
 
 
-def _library_call(name: str) -> Any:
-    @intrinsic
-    def call(typing_context, x):  # type: ignore[no-untyped-def]
-        if not _is_float(x):
-            return None
-        return x(x), lambda context, builder, sig, args: call_llvm(builder, name, args[0])
-
-    return call
-
-
-library_sin = _library_call("llvm.sin")
-"""Sine from the C library, lane by lane: slow, for arguments too large to reduce."""
-library_cos = _library_call("llvm.cos")
-"""Cosine from the C library, lane by lane: slow, for arguments too large to reduce."""
-
-
-@intrinsic
-def power_of_two(typing_context, exponent):  # type: ignore[no-untyped-def]
-    """Return 2 ** exponent, exact, for an integer-valued float in [-1022, 1023]."""
-    if not _is_float(exponent):
-        return None
-
-    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        value = args[0]
-        biased = builder.fptosi(
-            builder.fadd(value, _constant(builder, value, _FLOAT, 1023.0)), _like(value, _INT)
-        )
-        shifted = builder.shl(biased, _constant(builder, value, _INT, 52))
-        return builder.bitcast(shifted, _like(value, _FLOAT))
-
-    return exponent(exponent), lower
-
-
-@intrinsic
-def exponent_of(typing_context, x):  # type: ignore[no-untyped-def]
-    """Return e of x = m 2**e with m in [1, 2), as a float, for positive normal x."""
-    if not _is_float(x):
-        return None
-
-    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        value = args[0]
-        pattern = builder.bitcast(value, _like(value, _INT))
-        biased = builder.lshr(pattern, _constant(builder, value, _INT, 52))
-        unbiased = builder.sub(biased, _constant(builder, value, _INT, 1023))
-        return builder.sitofp(unbiased, _like(value, _FLOAT))
-
-    return x(x), lower
-
-
-@intrinsic
-def mantissa_of(typing_context, x):  # type: ignore[no-untyped-def]
-    """Return m of x = m 2**e with m in [1, 2), for positive normal x."""
-    if not _is_float(x):
-        return None
-
-    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        value = args[0]
-        pattern = builder.bitcast(value, _like(value, _INT))
-        kept = builder.and_(pattern, _constant(builder, value, _INT, (1 << 52) - 1))
-        one = builder.or_(kept, _constant(builder, value, _INT, 1023 << 52))
-        return builder.bitcast(one, _like(value, _FLOAT))
-
-    return x(x), lower
-
-
 @intrinsic
 def one_to_two(typing_context, word):  # type: ignore[no-untyped-def]
     """Return the top 52 bits of a word as a float in [1, 2)."""
@@ -126,10 +103,8 @@ def one_to_two(typing_context, word):  # type: ignore[no-untyped-def]
         return None
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        value = args[0]
-        kept = builder.lshr(value, _constant(builder, value, _INT, 12))
-        one = builder.or_(kept, _constant(builder, value, _INT, 1023 << 52))
-        return builder.bitcast(one, _like(value, _FLOAT))
+        kept = builder.lshr(args[0], _constant(builder, args[0], 12))
+        return _with_exponent_zero(builder, kept)
 
     return (lanes if word == words else types.float64)(word), lower
 
@@ -143,6 +118,6 @@ def rotate_left(typing_context, word, places):  # type: ignore[no-untyped-def]
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         value = args[0]
-        return call_llvm(builder, "llvm.fshl", value, value, _constant(builder, value, _INT, by))
+        return call_llvm(builder, "llvm.fshl", value, value, _constant(builder, value, by))
 
     return word(word, places), lower

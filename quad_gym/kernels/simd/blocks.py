@@ -58,6 +58,8 @@ class _LaneRecordModel(models.PrimitiveModel):
 @intrinsic
 def lanes_of(typing_context, record):  # type: ignore[no-untyped-def]
     """Return a block as lanes, without copying: every field is read WIDTH flights at a time."""
+    if isinstance(record, LaneRecord):
+        return record(record), lambda context, builder, sig, args: args[0]
     if not isinstance(record, types.Record):
         return None
 
@@ -152,3 +154,24 @@ def set_field(typing_context, block, name, value):  # type: ignore[no-untyped-de
         return context.get_dummy_value()
 
     return types.none(block, name, value), lower
+
+
+@intrinsic(prefer_literal=True)
+def reset(typing_context, block, chosen, value, names):  # type: ignore[no-untyped-def]
+    """Set fields of a block, all numbers of them, to `value` where `chosen`; names: "a b c"."""
+    if not isinstance(block, LaneRecord) or not isinstance(names, types.StringLiteral):
+        return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        for name in names.literal_value.split():
+            kind = block.field(name)
+            element = kind.dtype if isinstance(kind, types.Array) else kind
+            number = vector_of(context, builder, args[2], types.unliteral(value), element)
+            first = _field_pointer(builder, block, args[0], name, element)
+            for k in range(block.record.typeof(name).nitems // WIDTH):
+                pointer = builder.gep(first, [ir.Constant(ir.IntType(32), k)])
+                before = builder.load(pointer, align=8)
+                builder.store(builder.select(args[1], number, before), pointer, align=8)
+        return context.get_dummy_value()
+
+    return types.none(block, chosen, types.unliteral(value), names), lower

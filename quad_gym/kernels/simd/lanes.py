@@ -69,7 +69,12 @@ class Mask(_VectorType):
     llvm_type = _BITS
 
 
+class Floats(types.UniTuple):
+    """A vector of float64, or a matrix of such vectors, see `maths/vectors.py`."""
+
+
 lanes, words, mask = Lanes(), Words(), Mask()
+register_model(Floats)(models.UniTupleModel)
 
 
 @register_model(Lanes)
@@ -96,13 +101,19 @@ def vector_of(
     """Return `value` of Numba type `source` as the vector type `target`."""
     if source == target:
         return value
+    if isinstance(source, types.IntEnumMember):
+        source = source.dtype
     plain = {lanes: types.float64, words: types.uint64, mask: types.boolean}[target]
     return splat(builder, context.cast(builder, value, source, plain))
 
 
 # ---- conversions: a plain number has the same value in all lanes --------------------------------
 
-_PLAIN = {lanes: (types.Float, types.Integer), words: (types.Integer,), mask: (types.Boolean,)}
+_PLAIN = {
+    lanes: (types.Float, types.Integer, types.IntEnumMember),
+    words: (types.Integer,),
+    mask: (types.Boolean,),
+}
 
 
 @lower_cast(types.Float, lanes)
@@ -258,29 +269,48 @@ _unary(abs, lambda context, builder, value: call_llvm(builder, "llvm.fabs", valu
 # ---- selection and tests of masks ------------------------------------------------------------
 
 
-@intrinsic
-def select(typing_context, chosen, if_true, if_false):  # type: ignore[no-untyped-def]
-    """Return `if_true` where `chosen`, else `if_false`, lane by lane (or for plain numbers)."""
+def _selection(chosen: Any, if_true: Any, if_false: Any) -> Any:
+    """Return the type of a selection; None if it is undefined."""
+    if isinstance(if_true, types.BaseTuple):
+        parts = [_selection(chosen, a, b) for a, b in zip(if_true, if_false, strict=True)]
+        return (types.UniTuple if chosen == mask else Floats)(parts[0], len(parts))
     vectors = [t for t in (if_true, if_false) if isinstance(t, _VectorType)]
     if chosen == mask:
         plain = {types.Boolean: mask, types.Float: lanes, types.Integer: lanes}
-        kind = vectors[0] if vectors else plain.get(type(if_true), lanes)
-    elif isinstance(chosen, types.Boolean) and not vectors:
+        return vectors[0] if vectors else plain.get(type(if_true), lanes)
+    if isinstance(chosen, types.Boolean) and not vectors:
         kind = types.unliteral(if_true)
-        if kind not in (types.boolean, types.uint64):
-            kind = types.float64
-    else:
-        return None
+        return kind if kind in (types.boolean, types.uint64) else types.float64
+    return None
+
+
+@intrinsic
+def select(typing_context, chosen, if_true, if_false):  # type: ignore[no-untyped-def]
+    """Return `if_true` where `chosen`, else `if_false`: numbers, vectors or matrices."""
+
+    def choose(context, builder, chosen, kind, values, sources):  # type: ignore[no-untyped-def]
+        if isinstance(kind, types.BaseTuple):
+            parts = []
+            for i, part in enumerate(kind):
+                some = [builder.extract_value(value, i) for value in values]
+                parts.append(
+                    choose(context, builder, chosen, part, some, [s.types[i] for s in sources])
+                )
+            return context.make_tuple(builder, kind, parts)
+        for i, source in enumerate(sources):
+            cast = vector_of if isinstance(kind, _VectorType) else _cast
+            values[i] = cast(context, builder, values[i], source, kind)
+        return builder.select(chosen, *values)
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        def as_kind(value, source):  # type: ignore[no-untyped-def]
-            if isinstance(kind, _VectorType):
-                return vector_of(context, builder, value, source, kind)
-            return context.cast(builder, value, source, kind)
+        return choose(context, builder, args[0], sig.return_type, list(args[1:]), sig.args[1:])
 
-        return builder.select(args[0], as_kind(args[1], sig.args[1]), as_kind(args[2], sig.args[2]))
+    kind = _selection(chosen, if_true, if_false)
+    return kind and (kind(chosen, if_true, if_false), lower)
 
-    return kind(chosen, if_true, if_false), lower
+
+def _cast(context: Any, builder: ir.IRBuilder, value: Any, source: Any, target: Any) -> Any:
+    return context.cast(builder, value, source, target)
 
 
 @intrinsic

@@ -8,7 +8,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import exp, sin_cos
-from quad_gym.kernels.maths.linalg import load3, load33, multiply, norm, store33
+from quad_gym.kernels.maths.linalg import load3, load33, norm, store
 from quad_gym.kernels.maths.rotation import euler_to_dcm
 from quad_gym.records import COLUMNS, FIXED
 
@@ -40,7 +40,8 @@ def _derive_body(own, nominal, settings):
 
     kF, kN = own.thrust_coefficient, own.torque_coefficient
     turn = (kN / kF) / (nominal.torque_coefficient / nominal.thrust_coefficient)
-    x, y, z = load3(own.center_of_mass_B)
+    center = load3(own.center_of_mass_B)
+    x, y, _ = center
     for i in range(4):
         # E' = M E D and so A' = D^-1 A M^-1: D scales the rotors, M moves the center of mass
         e, E, A = own.rotor_efficiency[i], nominal.effectiveness, nominal.allocation
@@ -52,13 +53,9 @@ def _derive_body(own, nominal, settings):
         own.allocation[i, 1] = A[i, 1] / e
         own.allocation[i, 2] = A[i, 2] / e
         own.allocation[i, 3] = A[i, 3] / (turn * e)
-        own.rotor_positions_B[i, 0] = nominal.rotor_positions_B[i, 0] - x
-        own.rotor_positions_B[i, 1] = nominal.rotor_positions_B[i, 1] - y
-        own.rotor_positions_B[i, 2] = nominal.rotor_positions_B[i, 2] - z
+        store(own.rotor_positions_B[i], load3(nominal.rotor_positions_B[i]) - center)
         if settings.grounded:
-            own.feet_B[i, 0] = nominal.feet_B[i, 0] - x
-            own.feet_B[i, 1] = nominal.feet_B[i, 1] - y
-            own.feet_B[i, 2] = nominal.feet_B[i, 2] - z
+            store(own.feet_B[i], load3(nominal.feet_B[i]) - center)
 
     gain, full = own.motor_speed_per_volt, own.max_voltage
     own.max_rotor_force = kF * (gain * full) * (gain * full)
@@ -126,8 +123,7 @@ def _derive_sensors(own, nominal, settings):
     own.baseline_length = norm(load3(own.baseline))
     k, kinds = _CAMERA_ROTATION, settings.draw_kind
     if kinds[k] != FIXED or kinds[k + 1] != FIXED or kinds[k + 2] != FIXED:
-        turned = multiply(euler_to_dcm(load3(own.camera_rotation)), load33(nominal.R_CB))
-        store33(own.R_CB, turned)
+        store(own.R_CB, euler_to_dcm(load3(own.camera_rotation)) @ load33(nominal.R_CB))
     if kinds[_FOCAL_LENGTH] != FIXED:
         own.blur = nominal.blur * (own.focal_length / nominal.focal_length)
 
@@ -136,10 +132,7 @@ def _derive_sensors(own, nominal, settings):
 def derive(own, nominal, settings):
     """Derive the parameters of flights from the drawn ones.
 
-    Args:
-        own: Parameters that begin with the drawn ones; the others are initially equal to `nominal`.
-        nominal: Parameters without draws.
-        settings: Kinds of draws; FIXED where nothing is drawn.
+    `own` begins with the drawn ones; the others are initially equal to the ones in `nominal`.
     """
     _derive_body(own, nominal, settings)
     _derive_air(own, nominal, settings)

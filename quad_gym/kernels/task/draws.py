@@ -12,7 +12,7 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import clip, exp, log, minimum
 from quad_gym.kernels.maths.random import stream_of, uniform_pair
-from quad_gym.kernels.simd.blocks import lanes_of, numbers_of
+from quad_gym.kernels.simd.blocks import numbers_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.derive import derive
 from quad_gym.records import (
@@ -66,12 +66,13 @@ def normal_quantile(p):
     return select(abs(q) <= 0.425, middle, select(q < 0.0, -tail, tail))
 
 
-@kernel
-def draw_parameters(flight, settings, stream, mask):
-    """Draw the parameters of a new episode, where `mask`.
+@stage
+def draw_stage(flight, world, model, settings, work, stages, flag):
+    """Draw the parameters of a new episode.
 
     Each column has its own draw, so that a parameter does not depend on the other drawn ones.
     """
+    stream, mask = stream_of(flight), work.mask > 0.0
     for k in range(DRAWN_SIZE):
         kind = settings.draw_kind[k]
         if kind != FIXED:
@@ -89,24 +90,10 @@ def draw_parameters(flight, settings, stream, mask):
             flight.drawn[k] = select(mask, value, flight.drawn[k])
 
 
-@kernel
-def _overwrite(flight, nominal, own, settings):
-    """Overwrite the first numbers of `own` with draws, or with nominal values if not drawn."""
-    numbers, plain = numbers_of(own), numbers_of(nominal)
-    for k in range(PARAMETERS_DRAWN):
-        numbers[k] = flight.drawn[k] if settings.draw_kind[k] != FIXED else plain[k]
-
-
-@stage
-def draw_stage(flight, world, model, settings, work, stages, flag):
-    """Draw the parameters of a new episode."""
-    flying = lanes_of(flight)
-    draw_parameters(flying, settings, stream_of(flying), lanes_of(work).mask > 0.0)
-
-
 @stage
 def impose_stage(flight, world, model, settings, work, stages, flag):
     """Write the parameters of the current flights to `world`; `model`: the nominal ones."""
-    nominal, own = lanes_of(model), lanes_of(world)
-    _overwrite(lanes_of(flight), nominal, own, settings)
-    derive(own, nominal, settings)
+    own, nominal = numbers_of(world), numbers_of(model)
+    for k in range(PARAMETERS_DRAWN):
+        own[k] = flight.drawn[k] if settings.draw_kind[k] != FIXED else nominal[k]
+    derive(world, model, settings)

@@ -4,9 +4,9 @@ import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.maths.elementary import minimum, sin_cos
-from quad_gym.kernels.maths.linalg import keep3, load3
+from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.follow import draw_path
 from quad_gym.kernels.task.heights import GATE_SPREAD, LOWEST_GATE, RANDOM_RISE
@@ -25,19 +25,12 @@ from quad_gym.records import (
 
 
 @kernel
-def _keep(array, i, j, mask, value):
-    array[i, j] = select(mask, value, array[i, j])
-
-
-@kernel
 def _clear_reference(flight, mask, center, omega, rule, point):
-    keep3(flight.ref_center, mask, center)
-    keep3(flight.ref_heading_point, mask, point)
+    keep(flight.ref_center, mask, center)
+    keep(flight.ref_heading_point, mask, point)
     flight.ref_omega = select(mask, omega, flight.ref_omega)
     flight.ref_heading_rule = select(mask, rule, flight.ref_heading_rule)
-    for k in range(MAX_HARMONICS):
-        keep3(flight.ref_cos[k], mask, (0.0, 0.0, 0.0))
-        keep3(flight.ref_sin[k], mask, (0.0, 0.0, 0.0))
+    reset(flight, mask, 0.0, "ref_cos ref_sin")
 
 
 @kernel
@@ -55,8 +48,8 @@ def _draw_series(flight, settings, stream, mask):
         rate = (k + 1.0) * omega
         a = (fall * n_a[0], fall * n_a[1], RANDOM_RISE * fall * n_a[2])
         b = (fall * n_b[0], fall * n_b[1], RANDOM_RISE * fall * n_b[2])
-        keep3(flight.ref_cos[k], mask, a)
-        keep3(flight.ref_sin[k], mask, b)
+        keep(flight.ref_cos[k], mask, a)
+        keep(flight.ref_sin[k], mask, b)
         size = math.sqrt(
             a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
         )
@@ -66,9 +59,8 @@ def _draw_series(flight, settings, stream, mask):
     shrink = minimum(settings.max_speed / speed, settings.max_acceleration / acceleration)
     shrink = minimum(shrink, settings.radius / extent)
     for k in range(MAX_HARMONICS):
-        for i in range(3):
-            _keep(flight.ref_cos, k, i, mask, shrink * flight.ref_cos[k, i])
-            _keep(flight.ref_sin, k, i, mask, shrink * flight.ref_sin[k, i])
+        keep(flight.ref_cos[k], mask, shrink * load3(flight.ref_cos[k]))
+        keep(flight.ref_sin[k], mask, shrink * load3(flight.ref_sin[k]))
 
 
 @kernel
@@ -86,10 +78,10 @@ def _draw_gates(flight, settings, stream, mask):
         s, c = sin_cos(azimuth)
         # entries after the last gate repeat it, so that the preview ends there
         x, y, z = (distance * c, distance * s, height) if used else (x, y, z)
-        keep3(flight.gates[k], mask, (x, y, z))
+        keep(flight.gates[k], mask, (x, y, z))
         step = (1.0 / 3.0 + 2.0 / 3.0 * turn) * math.pi
         azimuth = azimuth + select(side < 0.5, -step, step)
-    keep3(flight.ref_center, mask, load3(flight.gates[0]))
+    keep(flight.ref_center, mask, load3(flight.gates[0]))
     flight.gate_next = select(mask, 0.0, flight.gate_next)
 
 
@@ -115,14 +107,14 @@ def draw_reference(flight, settings, stream, mask):
         _clear_reference(flight, mask, place, zero, HEADING_TOWARD, origin)
     elif settings.task == TaskKind.CIRCLE:
         _clear_reference(flight, mask, over_origin, omega, HEADING_TOWARD, origin)
-        keep3(flight.ref_cos[0], mask, (radius * c, radius * s, zero))
-        keep3(flight.ref_sin[0], mask, (-sense * radius * s, sense * radius * c, zero))
+        keep(flight.ref_cos[0], mask, (radius * c, radius * s, zero))
+        keep(flight.ref_sin[0], mask, (-sense * radius * s, sense * radius * c, zero))
     elif settings.task == TaskKind.LEMNISCATE:
         # r(t) = radius (sin wt, sin(2wt)/2) rotated by the phase
         _clear_reference(flight, mask, over_origin, omega, HEADING_VELOCITY, origin)
         half = 0.5 * sense * radius
-        keep3(flight.ref_sin[0], mask, (radius * c, radius * s, zero))
-        keep3(flight.ref_sin[1], mask, (-half * s, half * c, zero))
+        keep(flight.ref_sin[0], mask, (radius * c, radius * s, zero))
+        keep(flight.ref_sin[1], mask, (-half * s, half * c, zero))
     elif settings.task == TaskKind.RANDOM_TRAJECTORY:
         _clear_reference(flight, mask, over_origin, omega, HEADING_ALONG, ahead)
         flight.ref_omega = select(mask, 2.0 * math.pi / settings.period, flight.ref_omega)
@@ -136,28 +128,14 @@ def draw_reference(flight, settings, stream, mask):
         _draw_gates(flight, settings, stream, mask)
 
 
-@kernel
-def begin_counters(flight, mask):
-    """Reset the counters and sums of an episode's steps, rewards and errors, where `mask`."""
-    flight.step = select(mask, 0.0, flight.step)
-    flight.episode = select(mask, flight.episode + 1.0, flight.episode)
-    flight.gate_next = select(mask, 0.0, flight.gate_next)
-    flight.needs_reset = select(mask, 0.0, flight.needs_reset)
-    flight.reward = select(mask, 0.0, flight.reward)
-    flight.terminated = select(mask, 0.0, flight.terminated)
-    flight.truncated = select(mask, 0.0, flight.truncated)
-    flight.ending = select(mask, 0.0, flight.ending)
-    flight.episode_return = select(mask, 0.0, flight.episode_return)
-    flight.episode_error = select(mask, 0.0, flight.episode_error)
-
-
 @stage
 def begin_stage(flight, world, model, settings, work, stages, flag):
     """Set the reference, true state and counters at the start of an episode."""
-    flying, true, believed = lanes_of(flight), lanes_of(world), lanes_of(model)
-    stream, mask = stream_of(flying), lanes_of(work).mask > 0.0
-    draw_reference(flying, settings, stream, mask)
+    stream, mask = stream_of(flight), work.mask > 0.0
+    draw_reference(flight, settings, stream, mask)
     call_stage(stages, Stage.FOLLOW, flight, world, model, settings, work, 0)
-    draw_start(flying, true, believed, settings, lanes_of(work), stream, mask)
-    flying.charge = select(mask, true.battery_charge, flying.charge)
-    begin_counters(flying, mask)
+    draw_start(flight, world, model, settings, work, stream, mask)
+    flight.charge = select(mask, world.battery_charge, flight.charge)
+    flight.episode = select(mask, flight.episode + 1.0, flight.episode)
+    reset(flight, mask, 0.0, "step gate_next needs_reset reward terminated truncated ending")
+    reset(flight, mask, 0.0, "episode_return episode_error")

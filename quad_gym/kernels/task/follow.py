@@ -7,9 +7,10 @@ steps compute the lanes together.
 
 import math
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import entry, kernel
+from quad_gym.kernels.compiling.stages import SIGNATURE
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import select3, store3
+from quad_gym.kernels.maths.linalg import store
 from quad_gym.kernels.maths.random import uniform_pair
 from quad_gym.kernels.simd.addresses import record_at
 from quad_gym.kernels.simd.blocks import lanes_of
@@ -116,13 +117,13 @@ def _heading(flight, work, r, v):
     yaw, _, _ = _value(work, 3)
     s, c = sin_cos(yaw)
     toward = (work.path_point[0] - r[0], work.path_point[1] - r[1], zero)
-    along = select3(work.path_held > 0.0, (work.path_end[0], work.path_end[1], zero), v)
-    direction = select3(rule == HEADING_VELOCITY, along, toward)
-    x, y, _ = direction_of(select3(rule == HEADING_GIVEN, (c, s, zero), direction), zero)
+    along = select(work.path_held > 0.0, (work.path_end[0], work.path_end[1], zero), v)
+    direction = select(rule == HEADING_VELOCITY, along, toward)
+    x, y, _ = direction_of(select(rule == HEADING_GIVEN, (c, s, zero), direction), zero)
     return _turned(flight, x, y, zero)
 
 
-@stage
+@entry(signature=SIGNATURE)
 def follow_stage(flight, world, model, settings, work, stages, flag):
     """Set the reference of the present instant, and its preview.
 
@@ -135,19 +136,15 @@ def follow_stage(flight, world, model, settings, work, stages, flag):
     for i in range(2):
         room.path_time = time + settings.preview[i]
         _look_up(flight, work, settings)
-        x, _, _ = _value(room, 0)
-        y, _, _ = _value(room, 1)
-        z, _, _ = _value(room, 2)
-        store3(flying.path_ahead[i], _turned(flying, x, y, z))
+        (x, _, _), (y, _, _), (z, _, _) = _value(room, 0), _value(room, 1), _value(room, 2)
+        store(flying.path_ahead[i], _turned(flying, x, y, z))
     room.path_time = time
     _look_up(flight, work, settings)
-    x, vx, ax = _value(room, 0)
-    y, vy, ay = _value(room, 1)
-    z, vz, az = _value(room, 2)
+    (x, vx, ax), (y, vy, ay), (z, vz, az) = _value(room, 0), _value(room, 1), _value(room, 2)
     still, none = room.path_still > 0.0, (0.0 * x, 0.0 * x, 0.0 * x)
-    v = select3(still, none, (vx, vy, vz))
-    store3(flying.path_r, _turned(flying, x, y, z))
-    store3(flying.path_v, _turned(flying, v[0], v[1], v[2]))
-    ax, ay, az = select3(still, none, (ax, ay, az))
-    store3(flying.path_a, _turned(flying, ax, ay, az))
-    store3(flying.path_x, _heading(flying, room, (x, y, z), v))
+    v = select(still, none, (vx, vy, vz))
+    store(flying.path_r, _turned(flying, x, y, z))
+    store(flying.path_v, _turned(flying, v[0], v[1], v[2]))
+    ax, ay, az = select(still, none, (ax, ay, az))
+    store(flying.path_a, _turned(flying, ax, ay, az))
+    store(flying.path_x, _heading(flying, room, (x, y, z), v))

@@ -1,28 +1,15 @@
 """Observed state of the controller: the truth, the estimate, or the truth with noise."""
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import (
-    add,
-    keep3,
-    keep33,
-    load3,
-    load4,
-    load33,
-    multiply,
-    norm,
-    scale,
-    store3,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import keep, load3, load4, load33, norm, store
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_NOISY, Control, Source
 
 
 @kernel
-def look(flight, model, settings, mask):
+def _look(flight, model, settings, mask):
     """Set the state that the controller observes from its source, where `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     r, v, w_B = load3(flight.r), load3(flight.v), load3(flight.w)
@@ -30,43 +17,41 @@ def look(flight, model, settings, mask):
         r, v, R_BI = load3(flight.r_hat), load3(flight.v_hat), load33(flight.R_hat)
         w_B = load3(flight.w_meas)
         if settings.source == Source.ESTIMATE:
-            w_B = sub(w_B, load3(flight.b_g_hat))
+            w_B = w_B - load3(flight.b_g_hat)
     elif settings.source == Source.NOISY:
-        stream = stream_of(flight)
-        s = load4(model.noisy_sigma)
+        stream, s = stream_of(flight), load4(model.noisy_sigma)
         n_r, n_v = six_normals(stream, DRAW_NOISY)
         n_e, n_w = six_normals(stream, DRAW_NOISY + 3)
-        r, v = add(r, scale(s[0], n_r)), add(v, scale(s[1], n_v))
-        R_BI, w_B = multiply(euler_to_dcm(scale(s[2], n_e)), R_BI), add(w_B, scale(s[3], n_w))
-    keep3(flight.r_seen, mask, r)
-    keep3(flight.v_seen, mask, v)
-    keep33(flight.R_seen, mask, R_BI)
-    keep3(flight.w_seen, mask, w_B)
-    error = norm(sub(load3(flight.r_seen), load3(flight.r)))
+        r, v, w_B = s[0] * n_r + r, s[1] * n_v + v, s[3] * n_w + w_B
+        R_BI = euler_to_dcm(s[2] * n_e) @ R_BI
+    keep(flight.r_seen, mask, r)
+    keep(flight.v_seen, mask, v)
+    keep(flight.R_seen, mask, R_BI)
+    keep(flight.w_seen, mask, w_B)
+    error = norm(load3(flight.r_seen) - load3(flight.r))
     flight.estimation_error = select(mask, error, flight.estimation_error)
 
 
 @kernel
-def look_within(flight, model, settings):
+def _look_within(flight, model, settings):
     """Set the body rates that an inner loop reads, at an instant within a control period."""
     control, source = settings.control, settings.source
     if control != Control.MOTOR and control != Control.WRENCH:
         w_B = load3(flight.w)
         if source == Source.ESTIMATE:
-            w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
+            w_B = load3(flight.w_meas) - load3(flight.b_g_hat)
         elif source == Source.MEASUREMENTS:
             w_B = load3(flight.w_meas)
         elif source == Source.NOISY:
             _, n_w = six_normals(stream_of(flight), DRAW_NOISY + 3)
-            w_B = add(w_B, scale(model.noisy_sigma[3], n_w))
-        store3(flight.w_seen, w_B)
+            w_B = model.noisy_sigma[3] * n_w + w_B
+        store(flight.w_seen, w_B)
 
 
 @stage
 def look_stage(flight, world, model, settings, work, stages, flag):
     """Set the state that the controller observes; `flag`: 1 within a control period."""
-    flying, believed = lanes_of(flight), lanes_of(model)
     if flag and settings.control <= Control.CTBR:
-        look_within(flying, believed, settings)
+        _look_within(flight, model, settings)
     else:
-        look(flying, believed, settings, lanes_of(work).mask > 0.0)
+        _look(flight, model, settings, work.mask > 0.0)

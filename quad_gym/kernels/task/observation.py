@@ -3,9 +3,8 @@
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import apply, load3, load4, load33, scale, select3, sub
+from quad_gym.kernels.maths.linalg import load3, load4, load33
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
 from quad_gym.records import (
@@ -29,21 +28,17 @@ from quad_gym.records import (
 
 @kernel
 def _put3(row, k, v):
-    row[k] = v[0]
-    row[k + 1] = v[1]
-    row[k + 2] = v[2]
+    row[k], row[k + 1], row[k + 2] = v
     return k + 3
 
 
 @kernel
 def _upcoming_gate(flight, ahead):
     """Return the gate that is `ahead` gates after the present one; the last one is repeated."""
-    x, y, z = load3(flight.gates[MAX_GATES - 1])
+    gate = load3(flight.gates[MAX_GATES - 1])
     for k in range(MAX_GATES):
-        here = flight.gate_next + ahead == 1.0 * k
-        gate = flight.gates[k]
-        x, y, z = select(here, gate[0], x), select(here, gate[1], y), select(here, gate[2], z)
-    return (x, y, z)
+        gate = select(flight.gate_next + ahead == 1.0 * k, load3(flight.gates[k]), gate)
+    return gate
 
 
 @kernel
@@ -69,14 +64,14 @@ def reference_shown(flight, p, settings):
 def put_relative(reference, row, k, r, v, R_BI, w_B):
     """Write errors, directions and rates in B from index k on; return the next index."""
     r_ref, v_ref, a_ref, x_ref, first, second = reference
-    k = _put3(row, k, apply(R_BI, sub(r_ref, r)))
-    k = _put3(row, k, apply(R_BI, sub(v_ref, v)))
-    k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
-    k = _put3(row, k, apply(R_BI, x_ref))
+    k = _put3(row, k, R_BI @ (r_ref - r))
+    k = _put3(row, k, R_BI @ (v_ref - v))
+    k = _put3(row, k, R_BI.T[2])
+    k = _put3(row, k, R_BI @ x_ref)
     k = _put3(row, k, w_B)
-    k = _put3(row, k, apply(R_BI, a_ref))
-    k = _put3(row, k, apply(R_BI, sub(first, r_ref)))
-    return _put3(row, k, apply(R_BI, sub(second, r_ref)))
+    k = _put3(row, k, R_BI @ a_ref)
+    k = _put3(row, k, R_BI @ (first - r_ref))
+    return _put3(row, k, R_BI @ (second - r_ref))
 
 
 @kernel
@@ -93,14 +88,12 @@ def _put_absolute(flight, p, settings, row):
     k = _put3(row, 0, load3(flight.r_seen))
     k = _put3(row, k, load3(flight.v_seen))
     for i in range(3):
-        for j in range(3):
-            row[k + 3 * i + j] = flight.R_seen[i, j]
-    k += 9
+        k = _put3(row, k, load3(flight.R_seen[i]))
     b_a, b_g = load3(flight.b_a), load3(flight.b_g)
     if settings.source == Source.ESTIMATE:
         b_a, b_g = load3(flight.b_a_hat), load3(flight.b_g_hat)
     elif settings.source == Source.NOISY:
-        b_a, b_g = scale(0.0, b_a), scale(0.0, b_g)
+        b_a, b_g = 0.0 * b_a, 0.0 * b_g
     k = _put3(row, k, b_a)
     k = _put3(row, k, b_g)
     k = _put3(row, k, load3(flight.w_seen))
@@ -133,20 +126,19 @@ def _put_sensors(flight, p, settings, row):
     k = _put3(row, 0, gyro)
     k = _put3(row, k, accel)
     starts, share = flight.tick == 0.0, 1.0 / settings.ticks_per_step
-    k = _put3(row, k, select3(starts, gyro, scale(share, load3(flight.gyro_sum))))
-    k = _put3(row, k, select3(starts, accel, scale(share, load3(flight.accel_sum))))
+    k = _put3(row, k, select(starts, gyro, share * load3(flight.gyro_sum)))
+    k = _put3(row, k, select(starts, accel, share * load3(flight.accel_sum)))
     fresh = flight.block_fresh[POSITION_BLOCK]
-    k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_position))))
+    k = _put3(row, k, fresh * (R_IG @ load3(flight.gnss_position)))
     row[k] = fresh
-    baseline = apply(R_IG, load3(flight.gnss_baseline))
     measured = flight.block_fresh[BASELINE_BLOCK]
     fresh = measured / p.baseline_length
-    k = _put3(row, k + 1, scale(fresh, baseline))
+    k = _put3(row, k + 1, fresh * (R_IG @ load3(flight.gnss_baseline)))
     row[k] = measured
     k += 1
     if settings.gnss_velocity > 0:  # measured with every position
         fresh = flight.block_fresh[VELOCITY_BLOCK]
-        k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_velocity))))
+        k = _put3(row, k, fresh * (R_IG @ load3(flight.gnss_velocity)))
         row[k] = fresh
         k += 1
     for i in range(settings.feature_count):
@@ -164,10 +156,10 @@ def _put_privileged(flight, p, settings, row, k):
     """Write the truth, for critics: relative state, biases and rotor speeds."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     r_ref, v_ref, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
-    k = _put3(row, k, apply(R_BI, sub(r_ref, load3(flight.r))))
-    k = _put3(row, k, apply(R_BI, sub(v_ref, load3(flight.v))))
-    k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
-    k = _put3(row, k, apply(R_BI, x_ref))
+    k = _put3(row, k, R_BI @ (r_ref - load3(flight.r)))
+    k = _put3(row, k, R_BI @ (v_ref - load3(flight.v)))
+    k = _put3(row, k, R_BI.T[2])
+    k = _put3(row, k, R_BI @ x_ref)
     k = _put3(row, k, load3(flight.w))
     k = _put3(row, k, load3(flight.b_a))
     k = _put3(row, k, load3(flight.b_g))
@@ -180,7 +172,7 @@ def _put_privileged(flight, p, settings, row, k):
 @kernel
 def _put_world(flight, settings, row, k):
     """Write the air's velocity, and each draw minus its center, divided by its spread."""
-    k = _put3(row, k, apply(quaternion_to_dcm(load4(flight.q)), load3(flight.wind)))
+    k = _put3(row, k, quaternion_to_dcm(load4(flight.q)) @ load3(flight.wind))
     for column in range(DRAWN_SIZE):
         if settings.draw_kind[column] != FIXED:
             deviation = flight.drawn[column] - settings.draw_center[column]
@@ -188,16 +180,10 @@ def _put_world(flight, settings, row, k):
             k += 1
 
 
-@kernel
-def observe(flight, p, settings, row):
-    """Write the observation of the present instant.
-
-    Args:
-        flight: Record.
-        p: Nominal parameters.
-        settings: Settings of the batch.
-        row: (MAX_OBSERVATION,), receives the observation.
-    """
+@stage
+def observe_stage(flight, world, model, settings, work, stages, flag):
+    """Write the observation of the present instant to the workspace."""
+    p, row = model, work.observation
     if settings.layout == Layout.MEASUREMENTS:
         k = _put_sensors(flight, p, settings, row)
     elif settings.layout == Layout.ABSOLUTE:
@@ -220,9 +206,3 @@ def observe(flight, p, settings, row):
         k = _put_privileged(flight, p, settings, row, k)
         if settings.observe_world:
             _put_world(flight, settings, row, k)
-
-
-@stage
-def observe_stage(flight, world, model, settings, work, stages, flag):
-    """Write the observation of the present instant to the workspace."""
-    observe(lanes_of(flight), lanes_of(model), settings, lanes_of(work).observation)

@@ -7,7 +7,8 @@ trajectory is looked up by the stage of `follow.py`, and read here.
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import load3, select3, sub, unit_or
+from quad_gym.kernels.maths.linalg import load3, unit_or
+from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FOLLOWED, HEADING_ALONG, HEADING_VELOCITY, MAX_HARMONICS
 
 
@@ -36,22 +37,17 @@ def direction_of(v, zero):
 def heading(flight, r_ref, v_ref):
     """Return x*, the desired direction of the body x axis: a horizontal unit vector in I."""
     point = load3(flight.ref_heading_point)
-    toward = sub(point, r_ref)
     rule = flight.ref_heading_rule
-    along = select3(rule == HEADING_VELOCITY, v_ref, toward)
-    direction = select3(rule == HEADING_ALONG, point, along)
+    along = select(rule == HEADING_VELOCITY, v_ref, point - r_ref)
+    direction = select(rule == HEADING_ALONG, point, along)
     return direction_of(direction, 0.0 * r_ref[0])
 
 
 @kernel
 def _followed(flight):
     """Return (r*, v*, a*, x*) of a user's trajectory at the present instant."""
-    return (
-        load3(flight.path_r),
-        load3(flight.path_v),
-        load3(flight.path_a),
-        load3(flight.path_x),
-    )
+    r, v = load3(flight.path_r), load3(flight.path_v)
+    return r, v, load3(flight.path_a), load3(flight.path_x)
 
 
 @kernel

@@ -2,37 +2,27 @@
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import exp, is_finite
-from quad_gym.kernels.maths.linalg import dot, keep3, load3, load4, norm, sub
+from quad_gym.kernels.maths.linalg import dot, keep, load3, load4, norm
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import logical_not, select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import MAX_GATES, Ending, RewardTerm, TaskKind
 
-_NEAR, _FINE = RewardTerm.NEAR.value, RewardTerm.FINE.value
-_PROGRESS, _GATE_PASSED = RewardTerm.PROGRESS.value, RewardTerm.GATE_PASSED.value
-_HEADING, _TERMS = RewardTerm.HEADING.value, len(RewardTerm)
-_ACTION_RATE, _BODY_RATES = RewardTerm.ACTION_RATE.value, RewardTerm.BODY_RATES.value
-_FILTER_DIVERGED = float(Ending.FILTER_DIVERGED)
-_TIME_LIMIT, _FILTER_FAILED = float(Ending.TIME_LIMIT), float(Ending.FILTER_FAILED)
-_ON_THE_GROUND, _TIPPED_OVER = float(Ending.BELOW_MIN_HEIGHT), float(Ending.TIPPED_OVER)
-_OUT_OF_BOUNDS, _LAST_GATE = float(Ending.OUT_OF_BOUNDS), float(Ending.LAST_GATE)
+_TERMS = len(RewardTerm)
 
 
 @kernel
 def _pass_gate(flight, settings, active):
     """Advance to the next gate where the present one is reached; return (passed, progress)."""
     target = load3(flight.ref_center)
-    distance = norm(sub(target, load3(flight.r)))
+    distance = norm(target - load3(flight.r))
     progress = flight.position_error - distance
     passed = active & (distance < settings.gate_radius)
     flight.gate_next = select(passed, flight.gate_next + 1.0, flight.gate_next)
-    x, y, z = target
     for k in range(1, MAX_GATES):
-        gate = flight.gates[k]
         here = passed & (flight.gate_next == 1.0 * k) & (k < settings.gate_count)
-        x, y, z = select(here, gate[0], x), select(here, gate[1], y), select(here, gate[2], z)
-    keep3(flight.ref_center, passed, (x, y, z))
+        target = select(here, load3(flight.gates[k]), target)
+    keep(flight.ref_center, passed, target)
     return passed, progress
 
 
@@ -48,50 +38,46 @@ def _reward(flight, p, settings, work, active, R_BI, w_B):
     for i in range(4):
         gap = flight.action[i] - flight.last_action[i]
         change = change + gap * gap
-    costs = weight[_ACTION_RATE] * change + weight[_BODY_RATES] * spin
+    costs = weight[RewardTerm.ACTION_RATE] * change + weight[RewardTerm.BODY_RATES] * spin
     scale = settings.reward_scale
     finished = active & (change < 0.0)  # false in all lanes so far
     if settings.task == TaskKind.WAYPOINTS:
         passed, progress = _pass_gate(flight, settings, active)
         _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
-        facing, bonus = dot(R_BI[0], x_ref), select(passed, weight[_GATE_PASSED], 0.0)
-        reward = weight[_PROGRESS] * progress + bonus
-        reward = reward + seconds * (weight[_HEADING] * facing - costs)
+        facing, bonus = dot(R_BI[0], x_ref), select(passed, weight[RewardTerm.GATE_PASSED], 0.0)
+        reward = weight[RewardTerm.PROGRESS] * progress + bonus
+        reward = reward + seconds * (weight[RewardTerm.HEADING] * facing - costs)
         finished = active & (flight.gate_next >= settings.gate_count)
-        error = norm(sub(load3(flight.ref_center), load3(flight.r)))
-        term[_PROGRESS] = scale * weight[_PROGRESS] * progress
-        term[_GATE_PASSED] = scale * bonus
+        error = norm(load3(flight.ref_center) - load3(flight.r))
+        term[RewardTerm.PROGRESS] = scale * weight[RewardTerm.PROGRESS] * progress
+        term[RewardTerm.GATE_PASSED] = scale * bonus
     else:
         r_ref, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
-        facing, error = dot(R_BI[0], x_ref), norm(sub(r_ref, load3(flight.r)))
+        facing, error = dot(R_BI[0], x_ref), norm(r_ref - load3(flight.r))
         near, fine = exp(-settings.near_decay * error), exp(-settings.fine_decay * error)
-        closeness = weight[_NEAR] * near + weight[_FINE] * fine
-        reward = seconds * (closeness + weight[_HEADING] * facing - costs)
-        term[_NEAR] = scale * weight[_NEAR] * seconds * near
-        term[_FINE] = scale * weight[_FINE] * seconds * fine
-    term[_HEADING] = scale * weight[_HEADING] * seconds * facing
-    term[_ACTION_RATE] = -scale * weight[_ACTION_RATE] * seconds * change
-    term[_BODY_RATES] = -scale * weight[_BODY_RATES] * seconds * spin
+        closeness = weight[RewardTerm.NEAR] * near + weight[RewardTerm.FINE] * fine
+        reward = seconds * (closeness + weight[RewardTerm.HEADING] * facing - costs)
+        term[RewardTerm.NEAR] = scale * weight[RewardTerm.NEAR] * seconds * near
+        term[RewardTerm.FINE] = scale * weight[RewardTerm.FINE] * seconds * fine
+    term[RewardTerm.HEADING] = scale * weight[RewardTerm.HEADING] * seconds * facing
+    term[RewardTerm.ACTION_RATE] = -scale * weight[RewardTerm.ACTION_RATE] * seconds * change
+    term[RewardTerm.BODY_RATES] = -scale * weight[RewardTerm.BODY_RATES] * seconds * spin
     sound = is_finite(error + spin + R_BI[2][2])
     for k in range(_TERMS):
         term[k] = select(active & sound, term[k], 0.0)
     return select(sound, scale * reward, 0.0), error, finished, sound
 
 
-@kernel
-def judge(flight, p, settings, work, active):
-    """Set reward, errors and endings of the step that has just been flown, where `active`.
+@stage
+def judge_stage(flight, world, model, settings, work, stages, flag):
+    """Set reward, errors and endings of the step that has just been flown, where `work.mask`.
 
-    Args:
-        flight: Record.
-        p: Parameters, for the tick.
-        settings: TaskKind, weights of the reward, and bounds.
-        work: Workspace, for the terms of the reward.
-        active: Lanes that have flown a step, as opposed to lanes about to begin an episode.
+    Other lanes are about to begin an episode.
     """
+    active = work.mask > 0.0
     R_BI, w_B = quaternion_to_dcm(load4(flight.q)), load3(flight.w)
     flight.step = select(active, flight.step + 1.0, flight.step)
-    reward, error, finished, sound = _reward(flight, p, settings, work, active, R_BI, w_B)
+    reward, error, finished, sound = _reward(flight, model, settings, work, active, R_BI, w_B)
     lost = (error > settings.out_of_bounds) | logical_not(sound)
     tipped = R_BI[2][2] < settings.least_up
     grounded = flight.r[2] < settings.min_height
@@ -101,13 +87,13 @@ def judge(flight, p, settings, work, active):
     ended = (settings.truncate_when_diverged > 0.0) & (flight.diverged > 0.0)
     truncated = active & (over | failed | ended)
 
-    ending = select(over, _TIME_LIMIT, 0.0)
-    ending = select(ended, _FILTER_DIVERGED, ending)
-    ending = select(failed, _FILTER_FAILED, ending)
-    ending = select(grounded, _ON_THE_GROUND, ending)
-    ending = select(tipped, _TIPPED_OVER, ending)
-    ending = select(lost, _OUT_OF_BOUNDS, ending)
-    ending = select(finished, _LAST_GATE, ending)
+    ending = select(over, Ending.TIME_LIMIT, 0.0)
+    ending = select(ended, Ending.FILTER_DIVERGED, ending)
+    ending = select(failed, Ending.FILTER_FAILED, ending)
+    ending = select(grounded, Ending.BELOW_MIN_HEIGHT, ending)
+    ending = select(tipped, Ending.TIPPED_OVER, ending)
+    ending = select(lost, Ending.OUT_OF_BOUNDS, ending)
+    ending = select(finished, Ending.LAST_GATE, ending)
     error = select(sound, error, settings.out_of_bounds)
     flight.position_error = select(active, error, flight.position_error)
     flight.reward = select(active, reward, 0.0)
@@ -116,10 +102,3 @@ def judge(flight, p, settings, work, active):
     flight.ending = select(active, ending, 0.0)
     flight.episode_return = select(active, flight.episode_return + reward, flight.episode_return)
     flight.episode_error = select(active, flight.episode_error + error, flight.episode_error)
-
-
-@stage
-def judge_stage(flight, world, model, settings, work, stages, flag):
-    """Set reward, errors and endings of a step."""
-    working = lanes_of(work)
-    judge(lanes_of(flight), lanes_of(model), settings, working, working.mask > 0.0)

@@ -2,9 +2,10 @@
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import atan2, clip, maximum
-from quad_gym.kernels.maths.linalg import add, dot, keep3, load3, multiply, scale
+from quad_gym.kernels.maths.linalg import dot, keep, load3, vector
 from quad_gym.kernels.maths.random import normal_pair, six_normals, uniform_pair
 from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import (
@@ -68,7 +69,7 @@ def draw_start(flight, p, model, settings, work, stream, mask):
         x, y = select(on_ground, x, r_I[0]), select(on_ground, y, r_I[1])
         z = r_I[2]
         hovering = select(on_ground, 0.0, 1.0)
-        v_I = scale(hovering * START_VELOCITY_SIGMA, n_v)
+        v_I = hovering * START_VELOCITY_SIGMA * n_v
         roll = hovering * START_TILT_SIGMA * n_roll
         pitch = hovering * START_TILT_SIGMA * n_pitch
         yaw = yaw + hovering * START_YAW_SIGMA * n_yaw
@@ -78,14 +79,13 @@ def draw_start(flight, p, model, settings, work, stream, mask):
         a, b = _signed_pair(stream, DRAW_MOTION)
         c, d = _signed_pair(stream, DRAW_MOTION + 1)
         e, f = _signed_pair(stream, DRAW_MOTION + 2)
-        v_I = add(v_I, scale(MAX_START_VELOCITY, (a, b, c)))
-        w_B = scale(MAX_START_RATE, (d, e, f))
+        v_I = MAX_START_VELOCITY * (a, b, c) + v_I
+        w_B = MAX_START_RATE * (d, e, f)
     z = select(on_ground, 0.0, z)
     if settings.randomized:
         drawn = flight.drawn
-        x, y, z = x + drawn[_POSITION], y + drawn[_POSITION + 1], z + drawn[_POSITION + 2]
-        v_I = add(v_I, (drawn[_VELOCITY], drawn[_VELOCITY + 1], drawn[_VELOCITY + 2]))
-        w_B = add(w_B, (drawn[_RATES], drawn[_RATES + 1], drawn[_RATES + 2]))
+        x, y, z = vector(x, y, z) + load3(drawn[_POSITION:])
+        v_I, w_B = v_I + load3(drawn[_VELOCITY:]), w_B + load3(drawn[_RATES:])
         roll, pitch, yaw = roll + drawn[_ROLL], pitch + drawn[_PITCH], yaw + drawn[_YAW]
     given = flight.start_given
     x, y, z = _given_or(given[0], x), _given_or(given[1], y), _given_or(given[2], z)
@@ -95,21 +95,14 @@ def draw_start(flight, p, model, settings, work, stream, mask):
     work.on_ground = select(on_ground, 1.0, 0.0)
     on_pad = select(on_ground & still, 1.0 * settings.pad, 0.0)
     flight.on_pad = select(mask, on_pad, flight.on_pad)
-    keep3(flight.r, mask, (x, y, z))
-    keep3(flight.v, mask, v_I)
-    keep3(flight.w, mask, w_B)
-    keep3(flight.disturbance, mask, (zero, zero, zero))
-    q = dcm_to_quaternion(
-        multiply(euler_to_dcm((roll, pitch, zero)), euler_to_dcm((zero, zero, yaw)))
-    )
-    for i in range(4):
-        flight.q[i] = select(mask, q[i], flight.q[i])
-        flight.rotor_speeds[i] = select(mask, rotor_speed, flight.rotor_speeds[i])
-        flight.voltages[i] = select(mask, 0.0, flight.voltages[i])
-        flight.action[i] = select(mask, 0.0, flight.action[i])
-        flight.last_action[i] = select(mask, 0.0, flight.last_action[i])
+    keep(flight.r, mask, (x, y, z))
+    keep(flight.v, mask, v_I)
+    keep(flight.w, mask, w_B)
+    R_BI = euler_to_dcm((roll, pitch, zero)) @ euler_to_dcm((zero, zero, yaw))
+    keep(flight.q, mask, dcm_to_quaternion(R_BI))
+    keep(flight.rotor_speeds, mask, (rotor_speed, rotor_speed, rotor_speed, rotor_speed))
+    reset(flight, mask, 0.0, "disturbance voltages action last_action")
 
     n_a, n_g = six_normals(stream, DRAW_FIRST_BIASES)
-    for i in range(3):
-        flight.b_a[i] = select(mask, p.accel_bias_sigma * n_a[i], flight.b_a[i])
-        flight.b_g[i] = select(mask, p.gyro_bias_sigma * n_g[i], flight.b_g[i])
+    keep(flight.b_a, mask, p.accel_bias_sigma * n_a)
+    keep(flight.b_g, mask, p.gyro_bias_sigma * n_g)

@@ -7,10 +7,9 @@ import math
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import maximum, minimum
-from quad_gym.kernels.maths.linalg import dot, keep3, load3, load4, load33
+from quad_gym.kernels.maths.linalg import dot, keep, load3, load4, load33
 from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.vehicle.dynamics import (
     accelerations,
@@ -41,13 +40,7 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
     Linear drag `-(D + D_W sum W_i) v_air` along the body axes (Faessler et al. 2018; Svacha et al.
     2017), and each rotor's gain of thrust near the ground.
 
-    Args:
-        r_I: Position [m].
-        R_BI: Attitude.
-        v_air_I: Velocity relative to the air [m/s].
-        rotor_speeds: [rad/s].
-        p: True parameters.
-        settings: Whether there is linear drag, and a ground effect.
+    `v_air_I` is the velocity relative to the air [m/s].
     """
     W = rotor_speeds
     zero = 0.0 * r_I[0]
@@ -57,14 +50,13 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
         D = load3(p.linear_drag_B) + (W[0] + W[1] + W[2] + W[3]) * load3(p.rotor_drag_B)
         force_I = force_I - R_BI.T @ (D[0] * v_B[0], D[1] * v_B[1], D[2] * v_B[2])
     if settings.ground_effect:
-        up_B = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+        up_B = R_BI.T[2]
         level = maximum(up_B[2], 0.0)
         thrust, torque_x, torque_y = zero, zero, zero
         for i in range(4):
             height = r_I[2] - p.ground_height + dot(up_B, load3(p.rotor_positions_B[i]))
-            gained = (
-                level * ground_gain(height, p.rotor_radius) * (p.thrust_coefficient * W[i] * W[i])
-            )
+            force = p.thrust_coefficient * W[i] * W[i]
+            gained = level * ground_gain(height, p.rotor_radius) * force
             thrust = thrust + p.effectiveness[0, i] * gained
             torque_x = torque_x + p.effectiveness[1, i] * gained
             torque_y = torque_y + p.effectiveness[2, i] * gained
@@ -101,9 +93,8 @@ def integrate_in_air(flight, p, settings):
         end = advance(start, h / 6.0, k)
         for part in range(3):  # a loop, as four copies of the derivative take long to compile
             last = part == 2
-            k = _derivative(
-                advance(start, h if last else 0.5 * h, k), voltages, d_I, wind_I, p, settings
-            )
+            state = advance(start, h if last else 0.5 * h, k)
+            k = _derivative(state, voltages, d_I, wind_I, p, settings)
             end = advance(end, h / 6.0 if last else h / 3.0, k)
         r, v, q, w, W = end
         store_state(flight, (r, v, normalize_quaternion(q), w, W))
@@ -118,31 +109,11 @@ def set_air(flight, p, settings, mask):
     wind_I = load3(p.wind_I)
     if settings.gusts:
         wind_I = wind_I + gust_velocity(flight, p)
-    R_BI = quaternion_to_dcm(load4(flight.q))
-    v_air_I = load3(flight.v) - wind_I
-    force_I, torque_B = air_wrench(
-        load3(flight.r), R_BI, v_air_I, load4(flight.rotor_speeds), p, settings
-    )
-    keep3(flight.wind, mask, wind_I)
-    keep3(flight.air_force, mask, force_I)
-    keep3(flight.air_torque, mask, torque_B)
-
-
-@kernel
-def begin_in_air(flight, p, settings, stream, mask):
-    """Draw the gust and set the air at the start of an episode, where `mask`."""
-    if settings.gusts:
-        draw_gust(flight, stream, mask)
-    set_air(flight, p, settings, mask)
-
-
-@kernel
-def fly_through_air(flight, p, settings):
-    """Carry the true state and the gust over a tick, and set the air at its end."""
-    integrate_in_air(flight, p, settings)
-    if settings.gusts:
-        carry_gust(flight, p)
-    set_air(flight, p, settings, flight.tick >= 0.0)
+    r_I, v_I, q, _, W = load_state(flight)
+    force_I, torque_B = air_wrench(r_I, quaternion_to_dcm(q), v_I - wind_I, W, p, settings)
+    keep(flight.wind, mask, wind_I)
+    keep(flight.air_force, mask, force_I)
+    keep(flight.air_torque, mask, torque_B)
 
 
 @kernel
@@ -150,13 +121,8 @@ def battery_voltage(charge, power, current, p):
     """Largest voltage of the motors, and the power that the battery delivers.
 
     U = U0 - R P / U, and at most the V with V I = U0^2 / (4 R), the most that the battery can
-    deliver. An empty battery cuts off.
-
-    Args:
-        charge: State of charge; 1 is full.
-        power: P, electrical power of the rotors at their present speeds [W].
-        current: I, power over voltage of rotors at steady speeds [A].
-        p: True parameters.
+    deliver. P is the electrical power of the rotors at their present speeds [W], I the power over
+    voltage of rotors at steady speeds [A]. An empty battery cuts off.
     """
     U0 = p.max_voltage * (p.battery_empty_voltage + (1.0 - p.battery_empty_voltage) * charge)
     R = p.battery_resistance
@@ -166,10 +132,27 @@ def battery_voltage(charge, power, current, p):
     return select(charge > 0.0, loaded, 0.0), delivered
 
 
-@kernel
-def supply(flight, p, settings):
+@stage
+def begin_in_air_stage(flight, world, model, settings, work, stages, flag):
+    """Draw the gust and set the air at the start of an episode."""
+    if settings.gusts:
+        draw_gust(flight, stream_of(flight), work.mask > 0.0)
+    set_air(flight, world, settings, work.mask > 0.0)
+
+
+@stage
+def move_in_air_stage(flight, world, model, settings, work, stages, flag):
+    """Carry the true state and the gust over a tick, and set the air at its end."""
+    integrate_in_air(flight, world, settings)
+    if settings.gusts:
+        carry_gust(flight, world)
+    set_air(flight, world, settings, flight.tick >= 0.0)
+
+
+@stage
+def supply_stage(flight, world, model, settings, work, stages, flag):
     """Limit the motor voltages, and take a tick's energy from the battery."""
-    limit = p.max_voltage
+    p, limit = world, world.max_voltage
     if settings.supply == Supply.BATTERY:
         W = load4(flight.rotor_speeds)
         power, current = 0.0 * W[0], 0.0 * W[0]
@@ -182,22 +165,3 @@ def supply(flight, p, settings):
         flight.charge = maximum(flight.charge - p.dt * delivered / p.battery_energy, 0.0)
     for i in range(4):
         flight.voltages[i] = minimum(flight.voltages[i], limit)
-
-
-@stage
-def move_in_air_stage(flight, world, model, settings, work, stages, flag):
-    """Carry the true state over a tick in moving air."""
-    fly_through_air(lanes_of(flight), lanes_of(world), settings)
-
-
-@stage
-def begin_in_air_stage(flight, world, model, settings, work, stages, flag):
-    """Draw the gust and set the air at the start of an episode."""
-    flying = lanes_of(flight)
-    begin_in_air(flying, lanes_of(world), settings, stream_of(flying), lanes_of(work).mask > 0.0)
-
-
-@stage
-def supply_stage(flight, world, model, settings, work, stages, flag):
-    """Limit the motor voltages to the battery's."""
-    supply(lanes_of(flight), lanes_of(world), settings)

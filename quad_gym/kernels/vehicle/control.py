@@ -14,11 +14,10 @@ from quad_gym.kernels.maths.linalg import (
     load4,
     load33,
     load44,
-    store4,
+    rounded,
+    store,
     unit_or,
 )
-from quad_gym.kernels.maths.vectors import rounded
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Control
@@ -40,9 +39,8 @@ def allocate(thrust, torque, p):
     alpha = zero + 1.0
     for i in range(4):
         loaded = turn[i] > 0.0
-        alpha = select(
-            loaded, minimum(alpha, (limit - base[i]) / select(loaded, turn[i], 1.0)), alpha
-        )
+        share = (limit - base[i]) / select(loaded, turn[i], 1.0)
+        alpha = select(loaded, minimum(alpha, share), alpha)
     alpha = maximum(alpha, 0.0)
     f = base + alpha * turn
     return (_voltage(f[0], p), _voltage(f[1], p), _voltage(f[2], p), _voltage(f[3], p))
@@ -50,10 +48,8 @@ def allocate(thrust, torque, p):
 
 @kernel
 def _voltage(force, p):
-    return (
-        math.sqrt(clip(force, 0.0, p.max_rotor_force) / p.thrust_coefficient)
-        / p.motor_speed_per_volt
-    )
+    force = clip(force, 0.0, p.max_rotor_force)
+    return math.sqrt(force / p.thrust_coefficient) / p.motor_speed_per_volt
 
 
 @kernel
@@ -63,13 +59,7 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
     `F_I = k (r* - r) + kd (v* - v) + m (a* + g e3)`, `z* = F_I / |F_I|`, thrust `F_I . z_I`; with
     `b = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and `[e x] = R_E^T - R_E`,
     so that e is twice the vector of an antisymmetric part, `N = K e - Kd w + w x J w`.
-
-    Args:
-        r, v: Position [m] and velocity [m/s] in I.
-        R_BI: Attitude.
-        w_B: Body rates [rad/s].
-        reference: (r*, v*, a*, x*) in I.
-        p: Nominal parameters with the gains.
+    `reference` is (r*, v*, a*, x*) in I.
     """
     r_ref, v_ref, a_ref, x_ref = reference
     F_I = (
@@ -121,24 +111,15 @@ def tilt_rates(z_desired_I, R_BI, yaw_rate, p):
 def act(flight, a, p, mode, reference):
     """Set the motor voltages of the coming tick.
 
-    Args:
-        flight: Record; reads the observed state, sets voltages.
-        a: (4,) the action, in [-1, 1].
-        p: Nominal parameters.
-        mode: Meaning of the action, a `Control`.
-        reference: (r*, v*, a*, x*) in I, for `Control.PD`.
+    `mode` is the meaning of the action `a`, a `Control`; `reference` is read by `Control.PD`.
     """
     R_BI, w_B = load33(flight.R_seen), load3(flight.w_seen)
     weight = p.mass * p.gravity
     thrust = weight * (1.0 + a[0])
     if mode == Control.MOTOR:
         hover, limit = p.hover_voltage, p.max_voltage
-        voltages = (
-            minimum(hover * (1.0 + a[0]), limit),
-            minimum(hover * (1.0 + a[1]), limit),
-            minimum(hover * (1.0 + a[2]), limit),
-            minimum(hover * (1.0 + a[3]), limit),
-        )
+        for i in range(4):
+            flight.voltages[i] = minimum(hover * (1.0 + a[i]), limit)
     else:
         torque = (0.0 * thrust, 0.0 * thrust, 0.0 * thrust)
         if mode == Control.WRENCH:
@@ -169,22 +150,19 @@ def act(flight, a, p, mode, reference):
             w_desired = tilt_rates(unit_or(F_I, R_BI[2]), R_BI, p.rate_scale[2] * a[3], p)
             torque = rate_torque(w_desired, w_B, p)
         else:
-            thrust, torque = pd_wrench(
-                load3(flight.r_seen), load3(flight.v_seen), R_BI, w_B, reference, p
-            )
-        voltages = allocate(thrust, torque, p)
-    store4(flight.voltages, voltages)
+            r, v = load3(flight.r_seen), load3(flight.v_seen)
+            thrust, torque = pd_wrench(r, v, R_BI, w_B, reference, p)
+        store(flight.voltages, allocate(thrust, torque, p))
 
 
 @stage
 def control_stage(flight, world, model, settings, work, stages, flag):
     """Set the motor voltages of a tick."""
-    flying, believed = lanes_of(flight), lanes_of(model)
-    nothing = load3(flying.disturbance)
+    nothing = load3(flight.disturbance)
     reference = (nothing, nothing, nothing, nothing)
     if settings.control == Control.PD:
-        reference = evaluate_reference(flying, flying.tick * believed.dt, settings.harmonics)
-    action = load4(flying.action)
+        reference = evaluate_reference(flight, flight.tick * model.dt, settings.harmonics)
+    action = load4(flight.action)
     if settings.action_delays > 0:
-        action = load4(flying.delayed_action)
-    act(flying, action, believed, settings.control, reference)
+        action = load4(flight.delayed_action)
+    act(flight, action, model, settings.control, reference)

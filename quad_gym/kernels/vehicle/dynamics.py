@@ -4,9 +4,8 @@ A state is (r_I, v_I, q, w_B, rotor_speeds), a tuple of tuples; its derivative h
 """
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, load44, store3, store4
+from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, load44, store
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
-from quad_gym.kernels.simd.blocks import lanes_of
 
 
 @kernel
@@ -17,13 +16,8 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     `J dw/dt = N - w x J w` with `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`; where the air moves, v
     is the velocity relative to it.
     """
-    W = rotor_speeds
-    forces = (
-        p.thrust_coefficient * W[0] * W[0],
-        p.thrust_coefficient * W[1] * W[1],
-        p.thrust_coefficient * W[2] * W[2],
-        p.thrust_coefficient * W[3] * W[3],
-    )
+    W, kF = rotor_speeds, p.thrust_coefficient
+    forces = (kF * W[0] * W[0], kF * W[1] * W[1], kF * W[2] * W[2], kF * W[3] * W[3])
     thrust, torque_x, torque_y, torque_z = load44(p.effectiveness) @ forces
     z_I = R_BI[2]
     drag = p.half_drag * abs(dot(z_I, v_I))
@@ -52,20 +46,16 @@ def derivative(state, voltages, d_I, p):
 @kernel
 def advance(state, h, rate):
     """State + h rate."""
-    return (
-        state[0] + h * rate[0],
-        state[1] + h * rate[1],
-        state[2] + h * rate[2],
-        state[3] + h * rate[3],
-        state[4] + h * rate[4],
-    )
+    r, v, q, w, W = state
+    dr, dv, dq, dw, dW = rate
+    return r + h * dr, v + h * dv, q + h * dq, w + h * dw, W + h * dW
 
 
 @kernel
 def load_state(flight):
     """The true state of a flight."""
-    r, v, w = load3(flight.r), load3(flight.v), load3(flight.w)
-    return r, v, load4(flight.q), w, load4(flight.rotor_speeds)
+    r, v, q = load3(flight.r), load3(flight.v), load4(flight.q)
+    return r, v, q, load3(flight.w), load4(flight.rotor_speeds)
 
 
 @kernel
@@ -78,11 +68,12 @@ def load_start(work):
 @kernel
 def store_state(flight, state):
     """Write the true state of a flight."""
-    store3(flight.r, state[0])
-    store3(flight.v, state[1])
-    store4(flight.q, state[2])
-    store3(flight.w, state[3])
-    store4(flight.rotor_speeds, state[4])
+    r, v, q, w, W = state
+    store(flight.r, r)
+    store(flight.v, v)
+    store(flight.q, q)
+    store(flight.w, w)
+    store(flight.rotor_speeds, W)
 
 
 @kernel
@@ -107,6 +98,16 @@ def integrate(flight, p, substeps):
 
 
 @kernel
+def air_accelerations(flight, p, R_BI):
+    """Acceleration in I and angular acceleration in B of a flight in the air, without contact."""
+    v_air_I = load3(flight.v) - load3(flight.wind)
+    d_I = load3(flight.disturbance) + load3(flight.air_force)
+    W = load4(flight.rotor_speeds)
+    a_I, dw_B = accelerations(R_BI, v_air_I, load3(flight.w), W, d_I, p)
+    return a_I, dw_B + load33(p.inertia_inverse) @ load3(flight.air_torque)
+
+
+@kernel
 def body_point_velocity(R_BI, v_I, w_B, l_B):
     """Velocity of a body-fixed point in I: v_I + R^T (w x l)."""
     return v_I + R_BI.T @ cross(w_B, l_B)
@@ -121,4 +122,4 @@ def imu_point_acceleration(R_BI, a_I, w_B, dw_B, l_B):
 @stage
 def move_stage(flight, world, model, settings, work, stages, flag):
     """Carry the true state over a tick in calm air."""
-    integrate(lanes_of(flight), lanes_of(world), settings.substeps)
+    integrate(flight, world, settings.substeps)

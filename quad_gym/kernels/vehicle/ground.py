@@ -18,21 +18,10 @@ import math
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum, sin_cos
-from quad_gym.kernels.maths.linalg import (
-    cross,
-    dot,
-    keep3,
-    load3,
-    load4,
-    load33,
-    select3,
-    store3,
-)
+from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, load4, load33, rounded, store
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_to_dcm
-from quad_gym.kernels.maths.vectors import rounded
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.kernels.vehicle.dynamics import accelerations, load_start
+from quad_gym.kernels.vehicle.dynamics import air_accelerations, load_start
 from quad_gym.records import Ending
 
 SWEEPS = 24
@@ -43,17 +32,12 @@ STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
 Feet that an impact has left below the plane count as standing on it.
 """
 _FEET, _POINTS = 4, 8
-_ON_THE_GROUND = float(Ending.BELOW_MIN_HEIGHT)
 
 
 @kernel
-def _free_accelerations(flight, p, R_BI):
-    """Acceleration in I and angular acceleration in B without contact."""
-    v_air_I = load3(flight.v) - load3(flight.wind)
-    d_I = load3(flight.disturbance) + load3(flight.air_force)
-    W = load4(flight.rotor_speeds)
-    a_I, dw_B = accelerations(R_BI, v_air_I, load3(flight.w), W, d_I, p)
-    return a_I, dw_B + load33(p.inertia_inverse) @ load3(flight.air_torque)
+def _point(p, i):
+    """Foot or rotor hub i, relative to the center of mass in B [m]."""
+    return load3(p.feet_B[i]) if i < _FEET else load3(p.rotor_positions_B[i - _FEET])
 
 
 @kernel
@@ -65,27 +49,18 @@ def _effective_mass(arm, along, inverse_inertia_I, inverse_mass):
 
 @kernel
 def _prepare(work, p, R_BI, inverse_inertia_I, height):
-    """Set arms in I, effective masses and gaps of all points, and zero impulses.
-
-    Args:
-        work: Workspace.
-        p: True parameters.
-        R_BI: Attitude.
-        inverse_inertia_I: Inverse of the inertia, in I.
-        height: Of the center of mass above the plane [m].
-    """
+    """Set arms in I, effective masses and gaps of all points, and zero impulses."""
     zero, inverse_mass = 0.0 * height, 1.0 / p.mass
     one = zero + 1.0
     for i in range(_POINTS):
-        l_B = load3(p.feet_B[i]) if i < _FEET else load3(p.rotor_positions_B[i - _FEET])
-        arm = R_BI.T @ l_B
-        store3(work.ground_arm[i], arm)
+        arm = R_BI.T @ _point(p, i)
         x = _effective_mass(arm, (one, zero, zero), inverse_inertia_I, inverse_mass)
         y = _effective_mass(arm, (zero, one, zero), inverse_inertia_I, inverse_mass)
         z = _effective_mass(arm, (zero, zero, one), inverse_inertia_I, inverse_mass)
+        store(work.ground_arm[i], arm)
         # one for all level directions, so that friction opposes the sliding
-        store3(work.ground_mass[i], (minimum(x, y), minimum(x, y), z))
-        store3(work.ground_impulse[i], (zero, zero, zero))
+        store(work.ground_mass[i], (minimum(x, y), minimum(x, y), z))
+        store(work.ground_impulse[i], (zero, zero, zero))
         work.ground_gap[i] = height + arm[2]
 
 
@@ -105,9 +80,8 @@ def _sweep(work, v_I, w_I, inverse_inertia_I, inverse_mass, friction, rate):
         floor = -maximum(work.ground_gap[i], zero) * rate
         u = v_I + cross(w_I, arm)
         up = maximum(old[2] + mass[2] * (floor - u[2]), zero)
-        v_I, w_I = _pushed(
-            v_I, w_I, arm, (zero, zero, up - old[2]), inverse_inertia_I, inverse_mass
-        )
+        upward = (zero, zero, up - old[2])
+        v_I, w_I = _pushed(v_I, w_I, arm, upward, inverse_inertia_I, inverse_mass)
         u = v_I + cross(w_I, arm)
         x, y = old[0] - mass[0] * u[0], old[1] - mass[1] * u[1]
         size, most = math.sqrt(x * x + y * y), friction * up
@@ -115,7 +89,7 @@ def _sweep(work, v_I, w_I, inverse_inertia_I, inverse_mass, friction, rate):
         x, y = share * x, share * y
         aside = (x - old[0], y - old[1], zero)
         v_I, w_I = _pushed(v_I, w_I, arm, aside, inverse_inertia_I, inverse_mass)
-        store3(work.ground_impulse[i], (x, y, up))
+        store(work.ground_impulse[i], (x, y, up))
     return v_I, w_I
 
 
@@ -134,14 +108,10 @@ def _share_without_gain(start, before, after, ahead, p):
 
     Args:
         start: Velocity (I) at the tick's start.
-        before: Velocity (I) and body rates (B) at its end without impulses.
-        after: Velocity (I) and body rates (B) at its end with impulses.
+        before, after: Velocity (I) and body rates (B) at its end without and with impulses.
         ahead: Displacement in a tick at the final velocity, minus the displacement in free flight,
             in I [m].
         p: True parameters.
-
-    Returns:
-        The largest share in [0, 1] for which the energy is not positive.
     """
     J = load33(p.inertia)
     dv, dw = after[0] - before[0], after[1] - before[1]
@@ -190,12 +160,9 @@ def carry(p, settings, work, pose, rates, free, ahead):
     """Apply the ground's impulses over one tick.
 
     Args:
-        p: True parameters.
-        settings: Friction, and limits of a crash.
-        work: Workspace.
+        p, settings, work: As for a stage.
         pose: Position in I and attitude quaternion at the tick's start.
-        rates: Velocity in I and body rates in B at its start.
-        free: Velocity in I and body rates in B at its end without the ground.
+        rates, free: Velocity in I and body rates in B at its start, and at its end without ground.
         ahead: See `_share_without_gain`.
 
     Returns:
@@ -204,6 +171,7 @@ def carry(p, settings, work, pose, rates, free, ahead):
     """
     (r_I, q), (v_start, w_start), (v_free, w_free) = pose, rates, free
     R_BI, rate, J = quaternion_to_dcm(q), 1.0 / p.dt, load33(p.inertia)
+    friction = settings.friction
     inverse_inertia_I = R_BI.T @ (load33(p.inertia_inverse) @ R_BI)
     inverse_mass, zero = 1.0 / p.mass, 0.0 * r_I[0]
     w_I = R_BI.T @ w_free
@@ -222,13 +190,11 @@ def carry(p, settings, work, pose, rates, free, ahead):
     stays = meets & still & (dot(v_start, v_start) <= STILL_SPEED * STILL_SPEED)
     stays = stays & (dot(w_start, w_start) <= STILL_RATE * STILL_RATE)
     T_I = R_BI.T @ -(J @ w_free)
-    stays = stays & _can_hold(work, -p.mass * v_free, T_I, settings.friction)
+    stays = stays & _can_hold(work, -p.mass * v_free, T_I, friction)
     if any_of(meets & logical_not(stays)):
         v_I = v_free
         for _ in range(SWEEPS):
-            v_I, w_I = _sweep(
-                work, v_I, w_I, inverse_inertia_I, inverse_mass, settings.friction, rate
-            )
+            v_I, w_I = _sweep(work, v_I, w_I, inverse_inertia_I, inverse_mass, friction, rate)
         w_B = R_BI @ w_I
         share = _share_without_gain(v_start, free, (v_I, w_B), ahead, p)
         v = share * (v_I - v_free) + v_free
@@ -236,40 +202,46 @@ def carry(p, settings, work, pose, rates, free, ahead):
         for i in range(_FEET):
             feet = feet + select(work.ground_impulse[i, 2] > 0.0, 1.0, 0.0)
     nothing = (zero, zero, zero)
-    v, w = select3(stays, nothing, v), select3(stays, nothing, w)
+    v, w = select(stays, nothing, v), select(stays, nothing, w)
     feet = select(meets, select(stays, 4.0, feet), 0.0)
     return v, w, meets, stays, meets & hard, feet
 
 
 @kernel
 def _feel(flight, p, R_BI, gained, mask):
-    """Set the specific force at the accelerometer that the ground adds.
+    """Set the specific force that the ground adds at the accelerometer, in contact where `mask`.
 
-    Args:
-        flight: Record, at the end of the tick.
-        p: True parameters.
-        R_BI: Attitude there.
-        gained: Mean acceleration in I and angular acceleration in B over the tick.
-        mask: Lanes in contact; in others it is zero.
+    `gained`: mean acceleration in I and angular acceleration in B over the tick.
     """
-    a_I, dw_B = _free_accelerations(flight, p, R_BI)
+    a_I, dw_B = air_accelerations(flight, p, R_BI)
     push = R_BI @ (gained[0] - a_I) + cross(gained[1] - dw_B, load3(p.imu_lever_arm))
     zero = 0.0 * p.dt
-    store3(flight.ground_push, select3(mask, push, (zero, zero, zero)))
+    store(flight.ground_push, select(mask, push, (zero, zero, zero)))
 
 
 @kernel
-def stand(flight, p, settings, work, start):
-    """Apply the ground's contact forces to the tick that has just been flown.
+def _turned(q, w_B, dt):
+    """The attitude q exp(w dt), a quaternion."""
+    half = 0.5 * dt * math.sqrt(dot(w_B, w_B))
+    sine, cosine = sin_cos(half)
+    turns = half > 1e-100
+    per = select(turns, 0.5 * dt * sine / select(turns, half, 1.0), 0.5 * dt)
+    (a, x, y, z), d = q, per * w_B
+    return normalize_quaternion(
+        (
+            a * cosine - x * d[0] - y * d[1] - z * d[2],
+            x * cosine + a * d[0] + y * d[2] - z * d[1],
+            y * cosine + a * d[1] + z * d[0] - x * d[2],
+            z * cosine + a * d[2] + x * d[1] - y * d[0],
+        )
+    )
 
-    Args:
-        flight: Record, after the tick's free motion.
-        p: True parameters.
-        settings: Friction, and limits of a crash.
-        work: Workspace.
-        start: The true state at the tick's start, from `load_start`.
-    """
-    r_I, v_I, q, w_B, _ = start
+
+@stage
+def stand_stage(flight, world, model, settings, work, stages, flag):
+    """Apply the ground's contact forces to the tick that has just been flown freely."""
+    p = world
+    r_I, v_I, q, w_B, _ = load_start(work)
     free = load3(flight.v), load3(flight.w)
     ahead = p.dt * free[0] + r_I - load3(flight.r)
     pose = (r_I, q)
@@ -277,41 +249,26 @@ def stand(flight, p, settings, work, start):
     flight.footing = feet
     flight.crashed = select(crashes, 1.0, flight.crashed)
     if any_of(meets):
-        half = 0.5 * p.dt * math.sqrt(dot(w, w))
-        sine, cosine = sin_cos(half)
-        turns = half > 1e-100
-        per = select(turns, 0.5 * p.dt * sine / select(turns, half, 1.0), 0.5 * p.dt)
-        a, (x, y, z) = q[0], (q[1], q[2], q[3])
-        d = per * w
-        turned = normalize_quaternion(
-            (
-                a * cosine - x * d[0] - y * d[1] - z * d[2],
-                x * cosine + a * d[0] + y * d[2] - z * d[1],
-                y * cosine + a * d[1] + z * d[0] - x * d[2],
-                z * cosine + a * d[2] + x * d[1] - y * d[0],
-            )
-        )
-        keep3(flight.r, meets, select3(stays, r_I, p.dt * v + r_I))
-        keep3(flight.v, meets, v)
-        keep3(flight.w, meets, w)
-        for i in range(4):
-            flight.q[i] = select(meets, select(stays, q[i], turned[i]), flight.q[i])
+        keep(flight.r, meets, select(stays, r_I, p.dt * v + r_I))
+        keep(flight.v, meets, v)
+        keep(flight.w, meets, w)
+        keep(flight.q, meets, select(stays, q, _turned(q, w, p.dt)))
         rate = 1.0 / p.dt
         gained = rate * (v - v_I), rate * (w - w_B)
         _feel(flight, p, quaternion_to_dcm(load4(flight.q)), gained, meets)
     else:
         zero = 0.0 * p.dt
-        store3(flight.ground_push, (zero, zero, zero))
+        store(flight.ground_push, (zero, zero, zero))
 
 
-@kernel
-def begin_on_ground(flight, p, settings, work, mask):
-    """Place a vehicle that starts on the ground, and lift one that is below it, where `mask`."""
+@stage
+def begin_ground_stage(flight, world, model, settings, work, stages, flag):
+    """Place a vehicle that starts on the ground, and lift one that is below it."""
+    p, mask = world, work.mask > 0.0
     R_BI, height = quaternion_to_dcm(load4(flight.q)), flight.r[2] - p.ground_height
     lowest = height + math.inf
     for i in range(_POINTS):
-        l_B = load3(p.feet_B[i]) if i < _FEET else load3(p.rotor_positions_B[i - _FEET])
-        lowest = minimum(lowest, height + (R_BI.T @ l_B)[2])
+        lowest = minimum(lowest, height + (R_BI.T @ _point(p, i))[2])
     given = flight.start_given[2]
     placed = (work.on_ground > 0.0) & logical_not(given == given)
     z = flight.r[2]
@@ -322,7 +279,7 @@ def begin_on_ground(flight, p, settings, work, mask):
     flight.on_pad = select(mask, 0.0, flight.on_pad)
     flight.crashed = select(mask, 0.0, flight.crashed)
     v_I, w_B, h = load3(flight.v), load3(flight.w), p.dt
-    a_I, dw_B = _free_accelerations(flight, p, R_BI)
+    a_I, dw_B = air_accelerations(flight, p, R_BI)
     free = h * a_I + v_I, h * dw_B + w_B
     pose = load3(flight.r), load4(flight.q)
     ahead = 0.5 * h * (free[0] - v_I)
@@ -330,41 +287,20 @@ def begin_on_ground(flight, p, settings, work, mask):
     before = load3(flight.ground_push)
     gained = (1.0 / h) * (v - v_I), (1.0 / h) * (w - w_B)
     _feel(flight, p, R_BI, gained, meets)
-    keep3(flight.ground_push, logical_not(mask), before)
+    keep(flight.ground_push, logical_not(mask), before)
     flight.footing = select(mask, feet, flight.footing)
-
-
-@kernel
-def judge_landing(flight, active):
-    """Terminate the episodes of vehicles that have crashed into the ground, where `active`."""
-    over, flying = active & (flight.crashed > 0.0), logical_not(flight.terminated > 0.0)
-    flight.ending = select(over & flying, _ON_THE_GROUND, flight.ending)
-    flight.terminated = select(over, 1.0, flight.terminated)
-
-
-@stage
-def stand_stage(flight, world, model, settings, work, stages, flag):
-    """Apply the ground's contact forces to the tick that has just been flown."""
-    scratch = lanes_of(work)
-    stand(lanes_of(flight), lanes_of(world), settings, scratch, load_start(scratch))
-
-
-@stage
-def begin_ground_stage(flight, world, model, settings, work, stages, flag):
-    """Place vehicles that start on the ground."""
-    scratch = lanes_of(work)
-    mask = scratch.mask > 0.0
-    begin_on_ground(lanes_of(flight), lanes_of(world), settings, scratch, mask)
 
 
 @stage
 def feel_ground_stage(flight, world, model, settings, work, stages, flag):
     """Add the ground's contact force to the accelerometer's sample."""
-    flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
-    keep3(flying.accel, mask, load3(flying.accel) + load3(flying.ground_push))
+    push = load3(flight.ground_push)
+    keep(flight.accel, work.mask > 0.0, load3(flight.accel) + push)
 
 
 @stage
 def judge_landing_stage(flight, world, model, settings, work, stages, flag):
     """Terminate the episodes of vehicles that have crashed into the ground."""
-    judge_landing(lanes_of(flight), lanes_of(work).mask > 0.0)
+    over, flying = (work.mask > 0.0) & (flight.crashed > 0.0), flight.terminated <= 0.0
+    flight.ending = select(over & flying, Ending.BELOW_MIN_HEIGHT, flight.ending)
+    flight.terminated = select(over, 1.0, flight.terminated)

@@ -29,10 +29,8 @@ def gust_scales(height, wind_speed):
 
     `sigma_w = 0.1 W20`, `sigma_u = sigma_w / k^0.4`, `L_w = h`, `L_u = h / k^1.2` with `k = 0.177 +
     0.000823 h` and h in feet.
-
-    Args:
-        height: Above ground [m]; limited to between 10 and 1,000 feet.
-        wind_speed: W20, 20 feet above ground [m/s].
+    `height` above ground [m] counts as between 10 and 1,000 feet; `wind_speed` is W20, 20 feet
+    above ground [m/s].
     """
     h = clip(height / _FOOT, _LOWEST, _HIGHEST)
     log_k = log(0.177 + 0.000823 * h)
@@ -63,11 +61,8 @@ def second_order(x, y, h, n, m):
 
     With e = exp(-h), the added noise has the covariance [[e sinh h, c], [c, d]], where c = e (sinh
     h - h e) / 2, and d gives it the determinant e^2 (sinh^2 h - h^2) / 4.
-
-    Args:
-        x, y: The states, of stationary covariance [[1/2, 1/4], [1/4, 1/4]].
-        h: Time, in units of the filter's time constant.
-        n, m: Standard normals.
+    h is in units of the filter's time constant, n and m are standard normals, and the stationary
+    covariance of (x, y) is [[1/2, 1/4], [1/4, 1/4]].
     """
     e, excess = exp(-h), sinh_less_argument(h)
     sinh = h + excess

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.trajectories.headings import heading_choice
+from quad_gym.params.trajectories.splines import polynomials
 
 if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory
@@ -87,36 +88,42 @@ def fit(
     def joint(t: float) -> Any:
         if not callable(angles):
             return function(t)
-        row = np.append(np.asarray(function(t), np.float64), angles(t))
-        row[-1] -= turns * t
-        return row
+        return np.append(np.asarray(function(t), np.float64), angles(t) - turns * t)
 
     size = 4 if callable(angles) else 3
-    count = FEWEST
-    known: dict[float, Floats] = {}
-    while True:
-        times = np.linspace(0.0, span, count + 1)
-        spline = _spline(times, _values(joint, times, size, known), closed)
-        miss = _misses(spline, joint, times, size, known, given)
-        if miss <= limit:
-            break
-        count *= 2
-        if count > MOST:
-            raise ValueError(
-                f"function must be smooth: splines of {MOST} segments still miss it by "
-                f"{miss:.3g} m, tolerance={limit:g} m"
-            )
-    terms = np.zeros((8, count, 4))
-    factorial = 1.0
-    for k in range(8):
-        factorial *= max(k, 1)
-        terms[7 - k, :, :size] = np.asarray(spline(times[:-1], k)) / factorial
+    times, found = _fitted(joint, span, size, limit, closed, given)
+    terms = np.zeros((8, len(times) - 1, 4))
+    terms[..., :size] = found
     if callable(angles):
         terms[7, :, 3] += turns * times[:-1]
         terms[6, :, 3] += turns
     else:
         terms[7, :, 3] = angles
     return cls(times=times, coefficients=terms, closed=closed, heading=rule, point=point)
+
+
+def _fitted(
+    joint: Function,
+    span: float,
+    size: int,
+    limit: float,
+    closed: bool,
+    given: dict[str, Function | None],
+) -> tuple[Floats, Floats]:
+    """Return times (m + 1,) and coefficients (8, m, size) of the coarsest spline within a limit."""
+    count, known = FEWEST, dict[float, Floats]()
+    while True:
+        times = np.linspace(0.0, span, count + 1)
+        spline = _spline(times, _values(joint, times, size, known), closed)
+        miss = _misses(spline, joint, times, size, known, given)
+        if miss <= limit:
+            return times, polynomials(spline, times, 7)
+        count *= 2
+        if count > MOST:
+            raise ValueError(
+                f"function must be smooth: splines of {MOST} segments still miss it by "
+                f"{miss:.3g} m, tolerance={limit:g} m"
+            )
 
 
 def _called(name: str, function: Function, times: Any, size: int) -> Floats:

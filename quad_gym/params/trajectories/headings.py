@@ -1,6 +1,6 @@
 """Heading of a trajectory: from the arguments of users to polynomials, and its angles."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,23 +11,17 @@ if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+HeadingRule = Literal["given", "along", "toward"]
 
 LEAST_SPEED = 1e-3
 """Horizontal speed below which a heading along the path is held [m/s]."""
 
 
-def heading_choice(yaw: Any, look_at: Any) -> tuple[str, tuple[float, float], Any]:
-    """Return the rule that a heading follows.
+def heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, float], Any]:
+    """Return the rule that a heading follows, `Trajectory.heading`, and its point (2,).
 
-    Args:
-        yaw: None, an angle, "along", a function, or an array of angles.
-        look_at: None, or a point.
-
-    Returns:
-        One of HEADINGS, the point (2,), and the source of the angles: a number, or `yaw` itself.
-
-    Raises:
-        ValueError: If both are given, or one is invalid.
+    The third value is the source of the angles: a number, or `yaw` itself if it is a function or an
+    array.
     """
     if look_at is not None:
         if yaw is not None:

@@ -101,17 +101,15 @@ def through(
     def rough(when: Floats) -> Floats:
         return _unrolled(when, places, order) if closed else path(when)
 
-    if times is not None:
-        if max_speed is not None or max_acceleration is not None:
-            name = "max_speed" if max_speed is not None else "max_acceleration"
-            raise ValueError(f"{name} must not be given with times, which it would choose")
-        when = _given_times(times, len(places), closed)
-    else:
+    bounds = {"max_speed": max_speed, "max_acceleration": max_acceleration}
+    if times is None:
         _refuse_equal_neighbors(places, closed)
-        speed = MAX_SPEED if max_speed is None else check.positive("max_speed", max_speed)
-        most = MAX_ACCELERATION if max_acceleration is None else max_acceleration
-        most = check.positive("max_acceleration", most)
-        when = choose_times(path, rough, places, speed, most)
+        when = choose_times(path, rough, places, *_bounds(bounds))
+    else:
+        for name, bound in bounds.items():
+            if bound is not None:
+                raise ValueError(f"{name} must not be given with times, which it would choose")
+        when = _given_times(times, len(places), closed)
     terms = np.zeros((8, len(when) - 1, 4))
     terms[..., :3] = path(when)
     if np.ndim(angles) > 0:
@@ -119,6 +117,12 @@ def through(
     else:
         terms[-1, :, 3] = angles
     return cls(times=when, coefficients=terms, closed=closed, heading=rule, point=point)
+
+
+def _bounds(given: dict[str, float | None]) -> list[float]:
+    """Return the bounds of speed and acceleration, or their defaults."""
+    defaults = zip(given.items(), (MAX_SPEED, MAX_ACCELERATION), strict=True)
+    return [check.positive(name, usual if x is None else x) for (name, x), usual in defaults]
 
 
 def _given_times(times: Any, count: int, closed: bool) -> Floats:
@@ -153,7 +157,7 @@ def _refuse_equal_neighbors(places: Floats, closed: bool) -> None:
 def coefficients(
     times: Floats, values: Floats, order: int, *, closed: bool = False, at_rest: bool = True
 ) -> Floats:
-    """Polynomials of the least integral of a squared derivative through values at times.
+    """Polynomials of the least integral of a squared derivative through values (m + 1, n) at times.
 
     Args:
         times: (m + 1,) increasing.
@@ -174,15 +178,22 @@ def coefficients(
     else:
         ends = [(k, np.zeros(values.shape[1])) for k in known]
         spline = make_interp_spline(times, values, k=degree, bc_type=(ends, ends))
-    terms = np.zeros((8, len(times) - 1, values.shape[1]))
-    factorial = 1.0
-    for k in range(degree + 1):
-        factorial *= max(k, 1)
-        terms[7 - k] = np.asarray(spline(times[:-1], k)) / factorial
+    terms = polynomials(spline, times, degree)
     terms[7] = values[:-1]  # what they are, without the rounding of the solution
     if not closed:
         for k in known:
             terms[7 - k, 0] = 0.0
+    return terms
+
+
+def polynomials(spline: Any, times: Floats, degree: int) -> Floats:
+    """Return the coefficients (8, m, n) of a spline in the segments between times (m + 1,)."""
+    values = np.array([spline(times[:-1], k) for k in range(degree + 1)])
+    terms = np.zeros((8, *values.shape[1:]))
+    factorial = 1.0
+    for k, value in enumerate(values):
+        factorial *= max(k, 1)
+        terms[7 - k] = value / factorial
     return terms
 
 

@@ -31,21 +31,12 @@ def choose_times(
     max_speed: float,
     max_acceleration: float,
 ) -> Floats:
-    """Return the time at which each point is passed.
+    """Return the times (m + 1,) at which points (m + 1, 3) are passed, from 0 on [s].
 
     The shares of the segments are powers of their lengths, then improved by a search for the
     shortest flight. Velocities scale with 1/s and accelerations with 1/s^2 when all times do with
     s: the whole is scaled so that the largest speed, or the largest acceleration, is its bound.
-
-    Args:
-        path: Polynomials (8, m, 3) for times (m + 1,).
-        rough: The same, sooner had and less exact, for the search.
-        places: (m + 1, 3) points [m].
-        max_speed: Bound [m/s].
-        max_acceleration: Bound [m/s^2].
-
-    Returns:
-        (m + 1,) from 0 on [s].
+    `path` makes polynomials (8, m, 3) for times; `rough` approximates it faster, for the search.
     """
     from scipy.optimize import minimize
 
@@ -100,13 +91,7 @@ def derivative(terms: Floats, order: int) -> Floats:
 
 
 def peak(times: Floats, terms: Floats, order: int) -> float:
-    """The largest size that a derivative has at any time: exactly, by roots of polynomials.
-
-    Args:
-        times: (m + 1,) of the segments.
-        terms: (8, m, n) coefficients.
-        order: Of the derivative.
-    """
+    """The largest size that a derivative has at any time: exactly, by roots of polynomials."""
     sampled, lengths = _sampled(times, terms, order).max(axis=0), np.diff(times)
     rows, largest = derivative(terms, order), float(sampled.max())
     for j in np.flatnonzero(sampled > 0.8 * largest):

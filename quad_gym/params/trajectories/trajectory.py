@@ -1,10 +1,10 @@
 """Trajectories: references as piecewise polynomials in time."""
 
 import dataclasses
-import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ from quad_gym.params import portable
 from quad_gym.params.checks import Checked, Vector
 from quad_gym.params.trajectories.feasibility import check_trajectory
 from quad_gym.params.trajectories.fitting import fit
-from quad_gym.params.trajectories.headings import yaw_angles
+from quad_gym.params.trajectories.headings import HeadingRule, yaw_angles
 from quad_gym.params.trajectories.reading import from_csv
 from quad_gym.params.trajectories.splines import through
 
@@ -25,9 +25,6 @@ Floats = NDArray[np.float64]
 
 TERMS = 8
 """Coefficients of a polynomial of degree 7, as minimum snap requires."""
-
-HEADINGS = ("given", "along", "toward")
-"""Rules of the heading: given by a polynomial, along the horizontal velocity, toward a point."""
 
 EARLY = 1e-3
 """Fraction of a trajectory after which a start from rest has a direction."""
@@ -45,26 +42,22 @@ class Trajectory(Checked):
     Trajectories compare by their numbers, and can be pickled.
     """
 
-    times: Floats
+    times: Annotated[Floats, partial(check.array, shape=(None,))]
     """(m + 1,) times at which segments begin, the first at 0, and the end of the last segment
     [s]"""
-    coefficients: Floats
+    coefficients: Annotated[Floats, partial(check.array, shape=(TERMS, None, 4))]
     """(8, m, 4) coefficients of x, y, z in I [m] and yaw [rad], the highest power first, as in
     SciPy's `PPoly`"""
     closed: bool = False
     """True: the trajectory repeats, its end joining its start"""
-    heading: str = "given"
+    heading: HeadingRule = "given"
     """direction of body x: "given": by the yaw polynomial; "along": along the horizontal velocity;
     "toward": toward a point"""
-    point: Vector = (0.0, 0.0)
+    point: Annotated[Vector, partial(check.vector, length=2)] = (0.0, 0.0)
     """(2,) point in I that body x faces with `heading="toward"` [m]"""
 
     def __post_init__(self) -> None:
-        self._check(check.array, "times", shape=(None,))
-        self._check(check.array, "coefficients", shape=(TERMS, None, 4))
-        self._check(check.flag, "closed")
-        self._check(check.choice, "heading", choices=HEADINGS)
-        self._check(check.vector, "point", length=2)
+        super().__post_init__()
         if len(self.times) < 2 or self.times[0] != 0.0 or not (np.diff(self.times) > 0.0).all():
             raise ValueError(
                 "Trajectory.times must begin with 0 and increase, with at least two of them, got "
@@ -136,7 +129,7 @@ class Trajectory(Checked):
         x, y = self.point
         return self.replace(coefficients=terms, point=(c * x - s * y, s * x + c * y))
 
-    @functools.cached_property
+    @cached_property
     def reach(self) -> float:
         """Largest distance from the origin, among a hundred instants of each segment [m]."""
         return float(np.linalg.norm(self(self.instants(100)), axis=1).max())
@@ -147,7 +140,7 @@ class Trajectory(Checked):
         inner = self.times[:-1, np.newaxis] + np.diff(self.times)[:, np.newaxis] * steps
         return np.append(inner.ravel(), self.times[-1])
 
-    @functools.cached_property
+    @cached_property
     def end_headings(self) -> Floats:
         """Horizontal directions (2, 2) of the velocity at the start and the end, even at rest.
 
@@ -200,4 +193,4 @@ class Trajectory(Checked):
     def __reduce__(self) -> Any:
         """Copy with new arrays, which are as immutable."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return functools.partial(type(self), **values), ()
+        return partial(type(self), **values), ()

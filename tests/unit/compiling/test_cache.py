@@ -11,8 +11,6 @@ from quad_gym.kernels import single
 from quad_gym.kernels.compiling import cache as caches
 from quad_gym.kernels.compiling import entry, kernel, routine
 from quad_gym.kernels.maths.linalg import cross
-from quad_gym.records import WIDTH
-from tests.unit.compiled import Compiled
 from tests.unit.compiling.parts import PREPARE, RIGHT, Parts
 
 FULL_DISK = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))\n" + PREPARE
@@ -63,18 +61,6 @@ def test_an_entry_is_called_and_found_in_the_cache():
     assert cache.holds(signature, single.wahba_of_vectors.targetctx)
 
 
-def test_vectors_on_the_stack_lie_within_cache_lines(tmp_path, monkeypatch):
-    monkeypatch.setattr(caches.config, "CACHE_DIR", str(tmp_path))  # compiled here, not loaded
-
-    @entry
-    def doubles(x):
-        x[0] *= 2.0
-
-    doubles(np.ones(1))
-    (compiled,) = doubles.overloads.values()
-    assert f"alignstack={8 * WIDTH}" in compiled.library.get_llvm_str()
-
-
 # ---- what cached code needs of Numba -----------------------------------------------------------
 
 DOT = """
@@ -94,7 +80,7 @@ def squares(x):
 """
 
 
-def test_cached_code_that_calls_blas_is_loaded_in_another_process(parts):
+def test_cached_code_with_blas_is_loaded_in_another_process(parts):
     (parts.folder / "dot_of_test.py").write_text(SQUARES)
     for said_something in (True, False):
         output, said = parts.run(DOT)
@@ -103,9 +89,7 @@ def test_cached_code_that_calls_blas_is_loaded_in_another_process(parts):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_the_rest_of_numba_is_registered_only_where_cached_code_needs_it(
-    module, parts, monkeypatch, known
-):
+def test_numba_is_registered_where_cached_code_needs_it(module, parts, monkeypatch, known):
     assert call(module.a) == 11.0
     fresh = entry(module.sources["a"], module.SIGNATURE)
     refreshed = []
@@ -120,24 +104,14 @@ def test_the_rest_of_numba_is_registered_only_where_cached_code_needs_it(
 # ---- damaged and missing files -----------------------------------------------------------------
 
 
-def flipped(content):
-    """One bit in the middle of the machine code is another one."""
-    middle = len(content) // 2
-    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-
-
 @pytest.mark.parametrize(
     "damage",
     [
         lambda content: b"",
-        lambda content: content[:31],
         lambda content: content[:-1],
-        lambda content: content + b"\0",
-        lambda content: bytes(len(content)),
-        lambda content: content[32:],
-        flipped,
+        lambda content: content[:99] + bytes([content[99] ^ 1]) + content[100:],
     ],
-    ids=["empty", "a few bytes", "cut off", "longer", "zeros", "no checksum", "one bit"],
+    ids=["empty", "cut off", "one bit"],
 )
 def test_a_damaged_file_is_compiled_again_and_replaced(module, parts, damage, capfd):
     assert call(module.a) == 11.0
@@ -181,7 +155,7 @@ def test_stale_files_of_a_function_are_deleted(module, parts):
 # ---- where nothing can be written --------------------------------------------------------------
 
 
-def test_where_no_folder_can_be_written_parts_are_compiled_in_the_process(parts):
+def test_without_a_folder_parts_are_compiled_in_the_process(parts):
     parts.cache.write_text("a file where the folder should be")
     nowhere = parts.folder / "notes" / "below a file"
     parts.notes.touch()
@@ -193,7 +167,7 @@ def test_where_no_folder_can_be_written_parts_are_compiled_in_the_process(parts)
     assert len(said.splitlines()) == 2
 
 
-def test_where_the_package_cannot_be_written_the_users_folder_serves(parts):
+def test_code_goes_to_the_users_folder_beside_a_read_only_package(parts):
     parts.cache.write_text("a file where the folder should be")
     elsewhere = parts.folder / "elsewhere"
     for _ in range(2):
@@ -202,15 +176,6 @@ def test_where_the_package_cannot_be_written_the_users_folder_serves(parts):
         assert parts.compiled() == ["a", "b", "c"]
     assert said == ""
     assert len(list(elsewhere.rglob("*.code"))) == 3
-
-
-def test_code_beside_the_package_is_found_by_those_who_cannot_write_there(parts, module):
-    assert module.results() == [11.0, 12.0, 13.0]
-    fresh = entry(module.sources["a"], module.SIGNATURE)
-    fresh._cache.folder = parts.folder / "elsewhere"
-    assert fresh.is_cached()
-    assert call(fresh) == 11.0
-    assert parts.compiled() == ["a", "b", "c"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no limits on the size of files")
@@ -226,26 +191,3 @@ def test_a_full_disk_costs_one_line_and_the_cache(parts):
     assert not parts.files("tmp")
     assert parts.run(processes=1)[0] == RIGHT
     assert len(parts.files("code")) == 3
-
-
-# ---- closures ----------------------------------------------------------------------------------
-
-
-def one(f, option):
-    f.y = f.x + 1.0
-
-
-def two(f, option):
-    f.y = f.x + 2.0
-
-
-def test_functions_of_one_piece_of_source_have_files_of_their_own():
-    """As many as are not deleted as old ones of each other."""
-    pairs = [(body, Compiled(body, x=(), y=())) for body in (one, two, one)]
-    x = np.arange(3.0)
-    for body, compiled in pairs:
-        for run in (compiled.on_floats, compiled.on_lanes):
-            np.testing.assert_array_equal(run(x=x)["y"], x + (1.0 if body is one else 2.0))
-    first, second, again = (compiled._on_records._cache for _, compiled in pairs)
-    assert first._stem == again._stem != second._stem
-    assert first._sources == again._sources != second._sources

@@ -40,7 +40,7 @@ MOVE, UPDATE, HELPER = (
     "quad_gym/kernels/filter/update.py",
     "tests/case.py",
 )
-STATEMENT, COMMENT, BLANK = "\n_MORE = 1\n", "\n# a comment\n", "\n\n\n"
+STATEMENT, COMMENT = "\n_MORE = 1\n", "\n# a comment\n"
 DOCSTRING = '"""Another docstring."""'
 EDITS = {
     # what: (file, old, new, whether the code of MOVE, UPDATE and HELPER depends on it)

@@ -51,16 +51,8 @@ def test_parts_are_compiled_once_and_by_processes_of_their_own(parts):
     assert parts.compiled() == ["a", "b", "c"]
 
 
-def test_one_process_compiles_by_itself_and_says_as_much(parts):
-    output, said = parts.run(processes=1)
-    assert output == RIGHT
-    assert len(parts.compilers()) == 1
-    assert len(said.splitlines()) == 2
-
-
 @pytest.mark.parametrize(
-    "what",
-    ["prepare(parts.NAMES, processes=2)", pytest.param("pass", marks=pytest.mark.slow)],
+    "what", ["prepare(parts.NAMES, processes=2)", pytest.param("pass", marks=pytest.mark.slow)]
 )
 def test_six_processes_that_begin_at_once_compile_each_part_once(parts, what):
     """By `prepare`, or by calls that find nothing prepared."""
@@ -72,7 +64,7 @@ def test_six_processes_that_begin_at_once_compile_each_part_once(parts, what):
     assert len([line for line in lines if "quad_gym: compiling" in line]) in (1, 3)
 
 
-def test_what_killed_workers_have_not_compiled_the_parent_compiles(parts):
+def test_parts_of_killed_workers_are_compiled_by_the_parent(parts):
     output, _ = parts.run(MOOD="die")
     assert output == RIGHT
     assert parts.compiled() == ["a", "a", "b", "b", "c"]  # two workers died over a and b
