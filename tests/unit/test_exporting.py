@@ -79,9 +79,8 @@ def stable_baselines_file(folder, algorithm, keywords=None):
 
     chosen = recipe(CIRCLE, algorithm).replace(n_envs=2)
     if algorithm == "ppo":
-        chosen = chosen.replace(
-            activation="tanh", parameters={**chosen.parameters, "batch_size": 64}
-        )
+        small = {**chosen.parameters, "batch_size": 64}
+        chosen = chosen.replace(activation="tanh", parameters=small)
     plan = Plan(recipe=chosen, environment=keywords or {}, threads=1)
     model = make_model(plan, plan.make_flights())
     let_act(model)
@@ -309,9 +308,8 @@ def test_a_filters_header_is_c99_with_the_same_numbers(suite, tmp_path):
     program = f'#include <stdio.h>\n#include "filter.h"\nint main(void)\n{{\n{prints}}}\n'
     (tmp_path / "it.c").write_text(program)
     flags = [flag for flag in FLAGS if flag != "-Wextra"] + ["-Wno-unused"]
-    subprocess.run(
-        [COMPILER, *flags, str(tmp_path / "it.c"), "-o", str(tmp_path / "it")], check=True
-    )
+    line = [COMPILER, *flags, str(tmp_path / "it.c"), "-o", str(tmp_path / "it")]
+    subprocess.run(line, check=True)
     told = subprocess.run([tmp_path / "it"], check=True, capture_output=True, text=True).stdout
     want = [numbers[name]["value"] for name in scalar] + [numbers["R_IG"]["value"][2][1]]
     assert [float(line) for line in told.split()] == want
