@@ -27,6 +27,7 @@ from quad_gym.estimation.tape import Tape, TapeWriter
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
+from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
 from quad_gym.rotations import dcm_to_quaternion
@@ -240,7 +241,7 @@ class Player:
         for frame in "GI":
             values = stream.values.get(f"{quantity}_{frame}")
             if values is not None and np.isfinite(values[k]).all():
-                vector = values[k] if frame == "G" else self.R_GI @ values[k]
+                vector = values[k] if frame == "G" else turned(self.R_GI, values[k])
                 from_center = frame == "G" and quantity == "position"
                 return vector - self.origin if from_center else vector
         return None

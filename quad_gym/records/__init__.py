@@ -16,6 +16,7 @@ from quad_gym.records.results import *
 from quad_gym.records.settings import *
 from quad_gym.records.shown import *
 from quad_gym.records.sizes import *
+from quad_gym.records.starts import *
 from quad_gym.records.streams import *
 from quad_gym.records.tape import *
 from quad_gym.records.work import *

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter, read_log, replay
+from quad_gym.params.portable import turned
 from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import dcm_to_quaternion
 from tests.logged_flights import RTK, Recorded, flown
@@ -75,7 +76,7 @@ class SampleBySample:
         R_GI = self.kf._engine.params["R_IG"][0, ..., 0].T
         names = {**GNSS, "baseline_I": "gnss_baseline_G"}
         return {
-            keyword: R_GI @ values[key][k]
+            keyword: turned(R_GI, values[key][k])
             for key, keyword in names.items()
             if key in values and np.isfinite(values[key][k]).all()
         }
