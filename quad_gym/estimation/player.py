@@ -16,6 +16,7 @@ from quad_gym.estimation.filters import (
     KalmanFilter,
     UnscentedKalmanFilter,
 )
+from quad_gym.estimation.first_motion import with_wide_start
 from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
@@ -54,7 +55,7 @@ class Player:
     ) -> None:
         self.log, self.suite, self.estimator = log, suite, estimator
         self.start, self.reported = start, reported_noise
-        self.filter = ESTIMATORS[estimator](suite, window=window)
+        self.filter = ESTIMATORS[estimator](with_wide_start(suite, log), window=window)
         self.window = window
         self.averages = suite.imu.samples == "average"
         self.imu_times: list[float] = log.imu.time.tolist()
@@ -286,7 +287,7 @@ class Player:
 
     def started(self, suite: SensorSuite) -> KalmanFilter:
         """Return a filter for another suite in the state in which the tape begins."""
-        kf = ESTIMATORS[self.estimator](suite, window=self.window)
+        kf = ESTIMATORS[self.estimator](with_wide_start(suite, self.log), window=self.window)
         kf.initialize(**self.first_state)
         if self.log.barometer_from_start:
             kf._engine.steps["level"] = np.nan

@@ -139,9 +139,6 @@ def test_an_environment_travels_to_a_worker_in_mid_episode():
     assert_same(pickle.loads(done.stdout), further(env))
 
 
-# ---- cores and imports ---------------------------------------------------------------------------
-
-
 def test_cores_are_limited_by_quota_affinity_and_variable(monkeypatch):
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)

@@ -321,15 +321,9 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
 
 
 def test_every_observation_fits():
-    table = quad_gym.observation_layout(
-        "measurements",
-        include_std=True,
-        privileged=True,
-        feature_count=MAX_FEATURES,
-        gnss_velocity=True,
-        aids=tuple(Aid),
-        drawn=tuple(COLUMNS),
-    )
+    shown = {"include_std": True, "privileged": True, "gnss_velocity": True}
+    shown |= {"feature_count": MAX_FEATURES, "aids": tuple(Aid), "drawn": tuple(COLUMNS)}
+    table = quad_gym.observation_layout("measurements", **shown)
     assert 256 < table[-1].slice.stop <= MAX_OBSERVATION
     longer = [*table, table[0]._replace(slice=slice(0, MAX_OBSERVATION + 1))]
     with pytest.raises(ValueError, match="an observation must have at most 512 numbers, got 513"):

@@ -88,9 +88,6 @@ def test_the_true_distance_is_hidden_from_the_controller():
         QuadEnv(base="hover", world=OBSTACLES, task=Peeking)
 
 
-# ---- records and pictures -----------------------------------------------------------------------
-
-
 def test_a_flight_keeps_its_obstacles(tmp_path):
     env, flight, _ = recorded_flight("hover", 3, world=OBSTACLES)
     centers = env.flights.batch.record("obstacle_center")[0, :2]

@@ -214,9 +214,6 @@ def test_invalid_number_of_environments_is_refused(count):
             make("QuadGym/Hover-v0", count)
 
 
-# ---- options -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "options",
     [

@@ -125,9 +125,7 @@ def test_gradients_are_those_of_torch(activation, normalize, size, critic_only):
     entropy = normal.entropy().sum(dim=1)
     A = torch.as_tensor(advantage)
     ratio = torch.exp(log_prob - tensors["log_probs"])
-    assert (
-        0.1 < float((abs(ratio - 1.0) > 0.2).double().mean()) < 0.9
-    )  # both kinds of samples are there
+    assert 0.1 < float((abs(ratio - 1.0) > 0.2).double().mean()) < 0.9  # both kinds are there
     policy_loss = -torch.min(A * ratio, A * torch.clamp(ratio, 0.8, 1.2)).mean()
     value_loss = torch.nn.functional.mse_loss(tensors["returns"], values.flatten())
     (policy_loss - 0.02 * entropy.mean() + 0.7 * value_loss).backward()
@@ -174,7 +172,7 @@ def test_advantages_are_the_sums_that_define_them():
             assert found[t, flight] == pytest.approx(want, rel=1e-4, abs=1e-5)
 
 
-def test_a_truncated_episode_earns_what_the_critic_expects_and_a_terminated_one_does_not():
+def test_truncated_episodes_alone_earn_what_the_critic_expects():
     env = sliders(4)
     model = CompiledPPO(env, small_recipe(parameters={"n_steps": 50}), seed=2)
     seen = []
@@ -288,11 +286,7 @@ def test_a_diverged_training_says_so():
         (sliders(), small_recipe(policy={"ortho_init": False}), "ortho_init is not a keyword"),
         (sliders(), small_recipe(parameters={"critic_only": -1}), "critic_only must be at least 0"),
         (sliders(), small_recipe(parameters={"critic_only": 0.5}), "critic_only must be a whole"),
-        (
-            sliders(),
-            small_recipe(parameters={"critic_only": 3}),
-            "must leave the actor at least one of 3 observed values, got 3",
-        ),
+        (sliders(), small_recipe(parameters={"critic_only": 3}), "at least one of 3 obs.*, got 3"),
     ],
 )
 def test_what_does_not_fit_is_refused(env, recipe, message):

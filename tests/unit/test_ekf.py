@@ -52,9 +52,6 @@ def started(sensors, filter_class, seed, covariance=None):
     return ukf
 
 
-# ---- the derivatives, against the exact motion ----
-
-
 def exact_motion(state, error, noise, gyro, accel, imu):
     """Where a body goes in a tick of constant rates and constant force in the frame halfway.
 
@@ -162,9 +159,6 @@ def test_a_reset_turns_the_covariance_as_the_error_angles_turn(turn):
             other.covariance / np.outer(sd, sd), expected / np.outer(sd, sd), rtol=0.0, atol=1e-8
         )
         np.testing.assert_array_equal(other.R_BI, plain.R_BI)
-
-
-# ---- one estimator, whatever the interface ----
 
 
 def test_a_batch_flies_the_filter_of_the_friendly_class():

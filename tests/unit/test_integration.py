@@ -131,18 +131,6 @@ def test_rotors_approach_their_speed_exponentially():
     np.testing.assert_allclose(end["rotor_speeds"], expected, rtol=1e-9)
 
 
-def test_drag_never_adds_energy_to_a_tumbling_fall():
-    vehicle, start = LAB.replace(disc_area=2.0), random_start(7)
-    for name in ("rotor_speeds", "voltages", "disturbance"):
-        start[name] = 0.0
-
-    def energy(flight):
-        return 0.5 * vehicle.mass * flight["v"] @ flight["v"] + vehicle.mass * 9.8 * flight["r"][2]
-
-    energies = [energy(flown(vehicle, t, 400, **start)) for t in np.linspace(1e-3, 2.0, 30)]
-    assert (np.diff(energies) < 0.0).all()
-
-
 STATE = {"r": (3,), "v": (3,), "q": (4,), "w": (3,), "rotor_speeds": (4,)}
 PARAMS = dict.fromkeys(("dt", "gravity", "mass", "half_drag", "thrust_coefficient"), ())
 PARAMS |= dict.fromkeys(("motor_time_constant", "motor_speed_per_volt"), ())

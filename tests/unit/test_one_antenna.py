@@ -98,7 +98,7 @@ def test_the_sample_that_starts_a_filter_counts_once():
         assert np.isfinite(nis).all() == (start == "warm")
 
 
-def test_there_is_no_baseline_ever():
+def test_there_is_no_baseline():
     batch = fly(CONSUMER, 16)
     for _ in range(30):
         steps(batch, 0.05)

@@ -50,21 +50,13 @@ def test_a_batch_flies_on_the_motors_it_is_told():
     np.testing.assert_array_equal(batch.record("voltages"), voltages)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"seeds": [1, 2]},
-        {"seeds": [1, 2, 3, -1]},
-        {"seeds": []},
-        {"keys": np.zeros((3, 2), np.uint64)},
-        {"keys": np.zeros(8, np.uint64)},
-        {"mask": np.ones(3, bool)},
-        {"mask": [1, 0, 1, 0]},
-        {"mask": np.ones((4, 1), bool)},
-        {"seeds": [1, 2, 3, 4], "mask": "all"},
-    ],
-    ids=str,
-)
+UNFIT = [{"seeds": seeds} for seeds in ([1, 2], [1, 2, 3, -1], [])]
+UNFIT += [{"keys": np.zeros(shape, np.uint64)} for shape in ((3, 2), 8)]
+MASKS = (np.ones(3, bool), [1, 0, 1, 0], np.ones((4, 1), bool), "all")
+UNFIT += [{"seeds": [1, 2, 3, 4], "mask": mask} for mask in MASKS]
+
+
+@pytest.mark.parametrize("arguments", UNFIT, ids=str)
 def test_a_reset_that_does_not_fit_raises_and_changes_nothing(arguments):
     batch = fly(SEEDS[:4], steps=3)
     before, results = batch.snapshot(), batch.results.copy()

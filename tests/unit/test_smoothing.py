@@ -21,8 +21,6 @@ def cross(v):
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-# ---- a linear case -------------------------------------------------------------------------------
-
 LINEAR = RTK.replace(
     camera=None,
     gnss=RTK.gnss.replace(primary_antenna_B=(0.0, 0.0, 0.0), secondary_antenna_B=None),
@@ -125,8 +123,6 @@ def test_linear_case_equals_least_squares(estimator):
     assert abs((found - x) / sigma).max() < 0.002
     assert abs((result.covariance - P) / scales).max() < 0.002
 
-
-# ---- simulated flights ---------------------------------------------------------------------------
 
 SEEDS, APART = range(20, 26), 2.0
 

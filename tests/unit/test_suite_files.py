@@ -127,9 +127,6 @@ def test_an_environment_flies_with_a_suite_in_a_file(tmp_path):
     np.testing.assert_array_equal(*observations)
 
 
-# ---- commands -----------------------------------------------------------------------------------
-
-
 def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()

@@ -45,9 +45,6 @@ def estimated_biases(batch):
     return np.hstack([batch.record("b_a_hat"), batch.record("b_g_hat")])
 
 
-# ---- the errors of the start -----------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", SUITES)
 @pytest.mark.parametrize("start", ["hover", "ground"])
 def test_whitened_errors_of_the_start_are_standard_normal(name, start):
@@ -127,9 +124,6 @@ def test_nees_is_right_from_the_first_instant_on(name):
     assert not batch.record("filter_status").any()
 
 
-# ---- what does not change --------------------------------------------------------------------
-
-
 def test_cold_is_the_default_and_the_truth_is_the_same():
     default, cold, warm = (
         fly(quad_gym.sensor_suite("rtk").simplified(), 20, task="hover", **keywords)
@@ -171,9 +165,6 @@ def test_filter_that_cannot_know_its_heading_starts_cold(camera):
     with pytest.raises(ValueError, match=r"filter_start must be 'cold' .* baseline"):
         FlightBatch(1, sensors=suite, filter_start="warm")
     FlightBatch(1, sensors=suite)  # cold it may fly
-
-
-# ---- the interfaces --------------------------------------------------------------------------
 
 
 def test_every_episode_starts_warm_anew():
