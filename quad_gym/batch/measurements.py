@@ -144,7 +144,9 @@ class Measurements:
         if not has:
             return None
         found = self._reading(name, self._new(block, 1)[:, 0], Sensor.GNSS)
-        return found._replace(value=found.value @ self._batch.R_IG.T)
+        x, y, z = found.value.T[:, :, np.newaxis]
+        R = self._batch.R_IG
+        return found._replace(value=x * R[:, 0] + y * R[:, 1] + z * R[:, 2])  # as in any batch
 
     def _aid(self, aid: Aid) -> Reading | None:
         name = aid.name.lower()
