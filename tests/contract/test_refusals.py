@@ -111,7 +111,7 @@ REFUSED = [
     ("export policy pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
     ("export policy pretrained QuadGym/Hover-v0 --output /dev/null/it.c", "cannot write"),
     ("export policy pretrained hover --env action=motor", "trained with action ctbr"),
-    ("export filter --sensors gps --to json", "sensors must be one of"),
+    ("export filter --sensors gps", "sensors must be one of"),
 ]
 NAMED = {
     "benchmark": (

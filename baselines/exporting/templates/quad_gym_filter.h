@@ -1,9 +1,11 @@
 /* @TITLE@
  *
- * The filter with which a controller was trained, for @TARGET@: a static library of its compiled
- * kernels (libquad_gym_filter.a), and this header. The estimates are bitwise those of
- * `quad-gym replay`. One .c file of your program defines QUAD_GYM_FILTER_IMPLEMENTATION before it
- * includes this header; link it with libquad_gym_filter.a and the math library.
+ * For: @TARGET@.
+ *
+ * The filter with which a controller was trained: a static library of its compiled kernels
+ * (libquad_gym_filter.a), and this header. The estimates are bitwise those of `quad-gym replay`.
+ * One .c file of your program defines QUAD_GYM_FILTER_IMPLEMENTATION before it includes this
+ * header; link it with libquad_gym_filter.a and the math library.
  *
  * SI units. I: inertial, east, north, up, from the reference antenna; G: Earth-centered (ECEF);
  * B: body, x ahead, y left, z up. Vectors have 3 numbers. Times are time stamps with one common
@@ -32,23 +34,23 @@ enum qg_result {
     QG_CONTRADICTION   /* arguments that exclude each other */
 };
 
-#define QG_TICK @TICK@             /* period of the IMU for which the noise is stated [s] */
-#define QG_IMU_AVERAGES @AVERAGES@          /* 1: IMU samples are means over their time; 0: values at its start */
-#define QG_LONGEST_STEP @LONGEST@   /* longest time of one prediction [s] */
+#define QG_TICK @TICK@ /* period of the IMU for which the noise is stated [s] */
+#define QG_IMU_AVERAGES @AVERAGES@ /* 1: IMU samples are means over their time; 0: values at its start */
+#define QG_LONGEST_STEP @LONGEST@ /* longest time of one prediction [s] */
 #ifndef QG_WINDOW
-#define QG_WINDOW @WINDOW@          /* longest delay of a measurement [s] */
+#define QG_WINDOW @WINDOW@ /* longest delay of a measurement [s] */
 #endif
 #ifndef QG_COPY_EVERY
-#define QG_COPY_EVERY 8          /* inputs between two copies of the filter; fewer copies: less memory,
-                                  * and more time for a delayed measurement */
+#define QG_COPY_EVERY 8 /* inputs between two copies of the filter; fewer copies: less memory, and
+                         * more time for a delayed measurement */
 #endif
 #ifndef QG_EVENTS
-#define QG_EVENTS @EVENTS@          /* samples and measurements within the window */
+#define QG_EVENTS @EVENTS@ /* samples and measurements within the window */
 #endif
 #ifndef QG_MEASUREMENTS
-#define QG_MEASUREMENTS @MEASUREMENTS@      /* measurements among them */
+#define QG_MEASUREMENTS @MEASUREMENTS@ /* measurements among them */
 #endif
-#define QG_WAITING 16            /* measurements that may wait for later samples */
+#define QG_WAITING 16 /* measurements that may wait for later samples */
 #define QG_COPIES (QG_EVENTS / QG_COPY_EVERY + 2)
 
 @SENSOR_MACROS@
@@ -56,8 +58,7 @@ typedef struct qg_filter qg_filter; /* see the end of this header */
 
 /* ---- start ---- */
 
-@START_API@
-/* A level vehicle at rest at a known place: position in I [m], heading of body x, from east toward
+@START_API@/* A level vehicle at rest at a known place: position in I [m], heading of body x, from east toward
  * north [rad]; with the errors of the suite's initial pose. */
 int qg_init_at_rest(qg_filter *filter, const double position[3], double heading, double time);
 
