@@ -41,6 +41,19 @@ def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one():
     np.testing.assert_allclose(own.covariance(), built_in.covariance(), rtol=0.0, atol=1e-9)
 
 
+def test_error_state_ekf_is_as_accurate_as_the_built_in_filter():
+    """Estimation errors of four flights over 2 s of the circle, without latency."""
+    errors = []
+    for estimator in (None, gallery("error_state_ekf").ErrorStateEKF):
+        made = batch(4, sensors="standard", control_rate=50.0, gains="tuned", estimator=estimator)
+        squares = []
+        for _ in range(100):
+            made.step()
+            squares.append(made.result("estimation_error") ** 2)
+        errors.append(np.sqrt(np.mean(squares)))
+    assert errors[1] < 1.1 * errors[0]
+
+
 @pytest.mark.parametrize("form", ["R_BI", "quaternion"])
 @pytest.mark.parametrize("layout", ["relative", "absolute"])
 def test_controller_observes_the_estimate(form, layout):

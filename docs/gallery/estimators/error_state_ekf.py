@@ -2,7 +2,7 @@
 
 The nominal state (r, v, R_BI, b_a, b_g) is integrated. The covariance is the error's, (r, v, e,
 b_a, b_g) with R_BI = (1 - [e x]) R_hat. Each sensor updates with the Jacobian of its model; its
-time-correlated errors are not estimated, but added to the noise.
+time-correlated errors are not estimated, but added to the noise, and latency is ignored.
 """
 
 import numpy as np
@@ -89,28 +89,28 @@ class ErrorStateEKF(quad_gym.Estimator):
             lever, w = np.array(gnss.primary_antenna_B), m.gyro_now - s.b_g
             variance = np.square(gnss.position_sigma_I) + np.square(gnss.drift_sigma_I)
             d = m.gnss_position.value - s.r - R_IB @ lever
-            self.fuse(m.gnss_position.new, d, {R: EYE, E: -R_IB @ cross(lever)}, variance)
+            self.fuse(m.gnss_position.new, d, [(R, EYE), (E, -R_IB @ cross(lever))], variance)
             if m.gnss_velocity is not None:
                 v_B = np.cross(w, lever)
                 d = m.gnss_velocity.value - s.v - apply(R_IB, v_B)
                 variance = gnss.velocity_sigma**2
-                self.fuse(m.gnss_velocity.new, d, {V: EYE, E: -R_IB @ cross(v_B)}, variance)
+                self.fuse(m.gnss_velocity.new, d, [(V, EYE), (E, -R_IB @ cross(v_B))], variance)
             if m.gnss_baseline is not None:
                 u_B = np.array(gnss.secondary_antenna_B) - lever
                 u_B /= np.linalg.norm(u_B)
                 d = m.gnss_baseline.value
                 d = d / np.linalg.norm(d, axis=1, keepdims=True) - R_IB @ u_B
                 variance = gnss.baseline_sigma**2
-                self.fuse(m.gnss_baseline.new, d, {E: -R_IB @ cross(u_B)}, variance)
+                self.fuse(m.gnss_baseline.new, d, [(E, -R_IB @ cross(u_B))], variance)
         if m.magnetometer is not None and m.magnetometer.new.any():
             sensor = m.sensors.magnetometer
             variance = sensor.noise_sigma**2 + sensor.hard_iron_sigma**2
             m_B = s.R @ np.array(sensor.field_I)
             d = m.magnetometer.value - m_B
-            self.fuse(m.magnetometer.new, d, {E: cross(m_B)}, variance)
+            self.fuse(m.magnetometer.new, d, [(E, cross(m_B))], variance)
         if m.barometer is not None and m.barometer.new.any():
             sensor = m.sensors.barometer
-            d, H = m.barometer.value[:, None] - s.r[:, 2:], {R: EYE[2:]}
+            d, H = m.barometer.value[:, None] - s.r[:, 2:], [(R, EYE[2:])]
             variance = sensor.noise_sigma**2 + sensor.bias_sigma**2
             self.fuse(m.barometer.new, d, H, variance)
         if m.pixels is not None and m.pixels.new.any():
@@ -130,13 +130,15 @@ class ErrorStateEKF(quad_gym.Estimator):
                 J = np.array([[one, none, -x / z], [none, one, -y / z]]) * camera.focal_length / z
                 J = np.moveaxis(J, -1, 0) @ R_CB
                 d = m.pixels.value[:, k] - camera.focal_length * np.stack([x / z, y / z], axis=1)
-                self.fuse(new, d, {R: -J @ self.state.R, E: J @ cross(X_B)}, camera.pixel_sigma**2)
+                self.fuse(
+                    new, d, [(R, -J @ self.state.R), (E, J @ cross(X_B))], camera.pixel_sigma**2
+                )
 
     def fuse(self, new, d, jacobian, variance):
         """Update flights in `new` with residuals d (n, k), by the blocks of the Jacobian."""
         s, (count, size) = self.state, d.shape
         H = np.zeros((count, size, 15))
-        for part, block in jacobian.items():
+        for part, block in jacobian:
             H[:, :, part] = block
         H[~new], d = 0.0, np.where(new[:, None], d, 0.0)
         P_xz = s.P @ H.transpose(0, 2, 1)
