@@ -7,6 +7,7 @@ array copies.
 from quad_gym.records.call import *
 from quad_gym.records.draws import *
 from quad_gym.records.enums import *
+from quad_gym.records.exchange import *
 from quad_gym.records.flight import *
 from quad_gym.records.gathered import *
 from quad_gym.records.layout import *

@@ -6,6 +6,7 @@ import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
 from quad_gym.faults import RotorLoss
 from quad_gym.faults.presets import faults_of
+from tests.estimators import Certain, Simple
 from tests.golden.flights import AIDED
 from tests.tasks.tasks import Chase, Near
 
@@ -103,6 +104,11 @@ CONFIGURATIONS = {
     "drawn features": (
         "hover",
         {"sensors": "indoor", "randomization": FEATURES, "privileged": True, "task": Near()},
+    ),
+    "own estimator": ("circle", {"estimator": Simple(), "sensors": LATE, "action": "attitude"}),
+    "own estimator with faults": (
+        "waypoints",
+        FAULTY | {"estimator": Certain, "include_std": True, "control_rate": 100, "task": Near()},
     ),
     "own task": ("hover", {"task": Chase(), "innovations": True}),
 }
