@@ -34,10 +34,12 @@ from quad_gym.records import Ending
 
 if TYPE_CHECKING:  # _LAZY imports them on first use
     from quad_gym.batch.flight_batch import FlightBatch
+    from quad_gym.batch.measurements import Measurements
     from quad_gym.envs.single import QuadEnv
     from quad_gym.envs.spaces import observation_layout
     from quad_gym.envs.vector import QuadVectorEnv
     from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+    from quad_gym.estimation.own import Estimator
     from quad_gym.flights.record import Flight, FlightRecorder
     from quad_gym.tasks import ObservationSpec, Task, TaskError, rewards
     from quad_gym.tasks.view import View
@@ -62,10 +64,12 @@ def __dir__() -> list[str]:
 
 
 _LAZY = {
+    "Estimator": "quad_gym.estimation.own",
     "ExtendedKalmanFilter": "quad_gym.estimation",
     "Flight": "quad_gym.flights.record",
     "FlightBatch": "quad_gym.batch.flight_batch",
     "FlightRecorder": "quad_gym.flights.record",
+    "Measurements": "quad_gym.batch.measurements",
     "ObservationSpec": "quad_gym.tasks",
     "QuadEnv": "quad_gym.envs.single",
     "QuadVectorEnv": "quad_gym.envs.vector",
@@ -86,6 +90,7 @@ __all__ = [
     "Cylinder",
     "Ending",
     "EnvKeywords",
+    "Estimator",
     "ExtendedKalmanFilter",
     "FilterParams",
     "Flight",
@@ -98,6 +103,7 @@ __all__ = [
     "LogDelays",
     "LogUniform",
     "MagnetometerParams",
+    "Measurements",
     "NoisyObservationParams",
     "Normal",
     "ObservationSpec",

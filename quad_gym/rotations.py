@@ -116,7 +116,13 @@ def dcm_to_quaternion(R_BI: ArrayLike) -> NDArray[np.float64]:
         ValueError: If `R_BI` has another shape or is not finite.
     """
     R = _rows("R_BI", R_BI, (3, 3))
-    turns = _rotations().from_matrix(R.reshape(-1, 3, 3).transpose(0, 2, 1))
-    q = turns.as_quat(scalar_first=True)
-    largest = np.take_along_axis(q, np.abs(q).argmax(axis=1)[:, np.newaxis], axis=1)
-    return np.where(largest < 0.0, -q, q).reshape(*R.shape[:-2], 4)
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R, (-2, -1), (0, 1))
+    rows = (  # each is the quaternion times four times one of its components
+        (1.0 + a + e + i, f - h, g - c, b - d),
+        (f - h, 1.0 + a - e - i, b + d, g + c),
+        (g - c, b + d, 1.0 - a + e - i, f + h),
+        (b - d, g + c, f + h, 1.0 - a - e + i),
+    )
+    largest = np.argmax([rows[k][k] for k in range(4)], axis=0)
+    w, x, y, z = (np.choose(largest, column) for column in zip(*rows, strict=True))
+    return np.stack([w, x, y, z], axis=-1) / np.sqrt(w * w + x * x + y * y + z * z)[..., np.newaxis]

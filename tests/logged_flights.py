@@ -19,9 +19,7 @@ from quad_gym.rotations import quaternion_to_dcm
 
 RTK = quad_gym.sensor_suite("rtk")
 PX4 = RTK.replace(
-    camera=None,
-    barometer=quad_gym.BarometerParams(),
-    magnetometer=quad_gym.MagnetometerParams(),
+    camera=None, barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
 )
 """What a log of PX4 can hold, and two antennas."""
 LOST, JITTER = 0.01, 0.05

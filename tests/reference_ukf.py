@@ -19,6 +19,11 @@ import numpy as np
 WGS84_A, WGS84_INVERSE_FLATTENING = 6378137, "298.257223563"
 
 
+TOLERANCES = {"position": 1e-9, "velocity": 1e-8, "R_BI": 1e-9, "accel_bias": 1e-7}
+TOLERANCES |= {"gyro_bias": 1e-10}
+"""Of filters in floats against these in 45 digits."""
+
+
 def array_of(number, values):
     """`values` as an array of the number type: np.float64, np.longdouble or Decimal."""
     convert = np.frompyfunc(number, 1, 1)

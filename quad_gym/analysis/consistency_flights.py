@@ -104,7 +104,8 @@ def measure_consistency(
     """Fly, and compare errors and innovations with the covariances of the filters.
 
     Args:
-        batch: Flights of a task without endings, see `endless`, with `innovations=True`.
+        batch: Flights of a task without endings, see `endless`, with `innovations=True` or a user's
+            estimator, whose innovations are unknown.
         seeds: Seeds of the flights.
         duration: Length of the flights [s].
         every: Time between two evaluations of the errors [s].
@@ -124,7 +125,7 @@ def measure_consistency(
     steps, stride = round(duration / dt), max(1, round(every / dt))
     squares = NeesRecorder()
     bins = dt * stride * np.arange(steps // stride + 1)
-    innovations = InnovationRecorder(batch, bins, settle)
+    innovations = InnovationRecorder(batch, bins, settle) if batch.innovations else None
     tracking = RunningSummary(batch.count, steps)
     astray = np.zeros(batch.count, bool)
     batch.reset(seeds=seeds)
@@ -133,7 +134,8 @@ def measure_consistency(
     squares.add(batch, 0.0)
     for step in range(1, steps + 1):
         batch.step()
-        innovations.add(batch, step * dt)
+        if innovations is not None:
+            innovations.add(batch, step * dt)
         distance = batch.result("position_error")
         tracking.add(distance)
         astray |= ~(distance < ASTRAY)
@@ -143,8 +145,8 @@ def measure_consistency(
     errors, claimed = squares.errors()
     return Findings(
         nees=squares.nees(),
-        nis=innovations.nis(),
-        whiteness=innovations.whiteness(),
+        nis={} if innovations is None else innovations.nis(),
+        whiteness={} if innovations is None else innovations.whiteness(),
         errors=errors,
         claimed=claimed,
         tracking=tracking.result(),

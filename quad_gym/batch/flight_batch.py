@@ -13,11 +13,13 @@ from quad_gym.batch.cold_start import check_cold_start
 from quad_gym.batch.following import check_reference
 from quad_gym.batch.innovations import innovations_of
 from quad_gym.batch.memory import FlightMemory, configuration_digest
+from quad_gym.batch.own_estimator import OwnFilter
 from quad_gym.batch.quantities import read
 from quad_gym.batch.standing import check_standing
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import pack_warm_start
+from quad_gym.estimation.own import Estimator
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing.configuration import FlightConfiguration
@@ -28,6 +30,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.resolved import taking
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import (
+    EXCHANGE_BLOCK,
     FLIGHT_BLOCK,
     RESULTS,
     WIDTH,
@@ -69,6 +72,10 @@ class FlightBatch(FlightMemory):
         self.randomization, self.faults = c.randomization, c.possible_faults
         self.run_filter, self.innovations = c.filters, c.innovations
         self.threads = resolve_threads(c.threads)
+        self._own_filter: OwnFilter | None = None
+        if c.estimator is not None:
+            given = check.own("estimator", c.estimator, Estimator)
+            self._own_filter = OwnFilter(given, self.count)
         if c.filters and c.filter_start == "cold":
             check_cold_start(c.sensors, c.draws)
         check_reference(c.task, c.vehicle, c.actions, c.control)
@@ -94,6 +101,8 @@ class FlightBatch(FlightMemory):
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
         self.final_innovations: dict[str, NDArray[Any]] = {}
         self._results = np.zeros((len(RESULTS), padded + WIDTH))  # no rows 4 KiB apart
+        own = self._own_filter is not None
+        self._exchange = aligned_zeros(len(self._blocks) if own else 0, EXCHANGE_BLOCK)
         self._crew: Crew | None = None
 
     def _allocate_for_threads(self) -> None:
@@ -197,12 +206,38 @@ class FlightBatch(FlightMemory):
             )
         self._begun = True
 
+    def snapshot(self) -> NDArray[Any]:
+        """Return a copy of all flights, with which `restore` restores this instant bitwise."""
+        flights = super().snapshot()
+        return flights if self._own_filter is None else self._own_filter.state.kept_with(flights)
+
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Restore all flights from a snapshot of this batch, or of another one like it.
+
+        Raises:
+            ValueError: If the snapshot is from a batch of another size, or with other settings,
+                parameters or estimator. The time limit and the number of threads may differ.
+        """
+        own, flights = self._own_filter, snapshot
+        if own is not None:
+            flights = own.state.flights_of(snapshot, self._blocks.dtype, own.name)
+        super().restore(flights)
+        if own is not None:
+            own.restore(self, snapshot)
+
     def _run(self, command: Command) -> NDArray[np.float32]:
+        """Step or reset the flights; return the observations."""
+        if self._own_filter is not None:
+            return self._own_filter.run(self, command)
+        return self._fly(command)
+
+    def _fly(self, command: int) -> NDArray[np.float32]:
+        """Have the threads carry out a `Command`; return the observations."""
         if self._crew is None or self._crew.process != os.getpid():
             self._calls = self._calls_of_threads()
             self._crew = Crew(self._calls, len(self._blocks), self.threads, self._group)
         self._crew.gather()
-        if self._observations.nbytes < _WORTH_NO_COPY:
+        if command >= Command.TICK or self._observations.nbytes < _WORTH_NO_COPY:
             self._crew.run(int(command))
             return self._observations.copy()
         self._observations = np.empty_like(self._observations)
@@ -213,7 +248,7 @@ class FlightBatch(FlightMemory):
     def _group_of_blocks(self) -> int:
         """Return how many blocks a thread flies side by side, see `kernels/gathering.py`."""
         s = self._settings[0]
-        own = s["randomized"] or s["faults"] or s["features_drawn"]
+        own = s["randomized"] or s["faults"] or s["features_drawn"] or s["own_estimator"]
         if own or not s["run_filter"] or s["sensor_ticks"].max() <= 1:
             return 1
         return max(1, _GROUP_MEMORY // self._room.dtype.itemsize)
@@ -240,6 +275,7 @@ class FlightBatch(FlightMemory):
             Call.OBSERVATIONS: self._observations,
             Call.FINAL_OBSERVATIONS: self.final_observations,
             Call.RESULTS: self._results,
+            Call.EXCHANGE: self._exchange,
             Call.OWN: self._own,
             Call.BELIEVED: self._believed,
             Call.WORK: self._work,

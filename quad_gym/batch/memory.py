@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import named_faults
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import checks as check
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
@@ -51,6 +52,7 @@ def configuration_digest(*records: NDArray[Any]) -> int:
 class FlightMemory:
     """The records of `count` flights, in blocks of WIDTH."""
 
+    configuration: FlightConfiguration
     count: int
     run_filter: bool
     task: TaskParams

@@ -91,6 +91,8 @@ def _time(batch: FlightMemory, flights: Flights) -> Floats:
 
 
 def _estimated_rates(batch: FlightMemory, flights: Flights) -> Floats:
+    if batch.configuration.estimator is not None:
+        return batch.record("w_hat", flights)
     return np.asarray(batch.record("w_meas", flights) - batch.record("b_g_hat", flights))
 
 

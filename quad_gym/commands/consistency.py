@@ -5,6 +5,7 @@
   quad-gym consistency --sensors lab               the report's filter
   quad-gym consistency --sensors lab --form corrected   the same sensors, all corrections
   quad-gym consistency --estimator ekf             an extended Kalman filter
+  quad-gym consistency --estimator module:Class    a quad_gym.Estimator of your own
   quad-gym consistency --mass-factor 1.2           a vehicle heavier than the controller assumes
   quad-gym consistency --noise-factor 1.5          sensors noisier than the filter assumes
 
@@ -36,6 +37,7 @@ from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import (
     TRACKING,
+    EstimatorName,
     SuiteName,
     Threads,
     TrackingId,
@@ -45,6 +47,7 @@ from quad_gym.commands.options import (
     usage_errors,
 )
 from quad_gym.envs import IDS
+from quad_gym.envs.configuration import own_estimator
 from quad_gym.experiments.consistency import matrix, recovery
 from quad_gym.experiments.consistency.cases import Case, CaseFlights, run_cases, unexpected
 from quad_gym.experiments.consistency.single import run_single
@@ -98,8 +101,7 @@ class ConsistencyArgs:
     bearing_noise_at: Literal["measured", "predicted", "pinhole"] | None = None
     """direction to which the filter assumes camera noise is perpendicular; if not given, the
     form's"""
-    estimator: Literal["ukf", "ekf"] | None = None
-    """filter; if not given, the suite's"""
+    estimator: EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
     imu_rate: float | None = None
@@ -141,6 +143,26 @@ class ConsistencyArgs:
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
 
+        if self.own_estimator is not None:
+            for name in (
+                "form",
+                "filter_start",
+                "integration",
+                "attitude_reset",
+                "bearing_noise_at",
+            ):
+                value = getattr(self, name)
+                if value not in ("suite", "cold", "warm", None):
+                    raise ValueError(
+                        f"{option_name(name)} {value} has no effect with an own --estimator, and "
+                        "must not be given"
+                    )
+
+    @property
+    def own_estimator(self) -> str | None:
+        """A user's estimator; None for built-in filters."""
+        return own_estimator(self.estimator)
+
     @property
     def flights(self) -> CaseFlights:
         """Number, seeds and length of the flights."""
@@ -164,7 +186,8 @@ def suite_of(args: ConsistencyArgs) -> SensorSuite:
         samples = "instant" if args.form == "report" else "average"
         form = FilterParams() if args.form == "report" else FIELD_FILTER
         suite = suite.replace(estimator=form)
-    chosen = {"kind": args.estimator} if args.estimator is not None else {}
+    own = args.own_estimator
+    chosen = {"kind": args.estimator} if args.estimator is not None and own is None else {}
     for name in ("integration", "attitude_reset", "bearing_noise_at"):
         if getattr(args, name) is not None:
             chosen[name] = getattr(args, name)
@@ -190,6 +213,8 @@ def case_of(args: ConsistencyArgs) -> Case:
         "world": args.world,
         "faults": args.faults,
     }
+    if args.own_estimator is not None:
+        keywords["estimator"] = args.own_estimator
     start: Literal["cold", "warm"] = "warm" if args.filter_start == "warm" else "cold"
     return Case(title_of(suite, args), suite, IDS[args.env_id], start, keywords)
 
@@ -197,6 +222,8 @@ def case_of(args: ConsistencyArgs) -> Case:
 def title_of(suite: SensorSuite, args: ConsistencyArgs) -> str:
     """Title of the report and of the figures."""
     choices = suite.estimator
+    if args.own_estimator is not None:
+        return f"{args.estimator}, suite {args.sensors}, {args.filter_start} start"
     parts = [
         f"{choices.kind.upper()}, suite {args.sensors}, {args.filter_start} start",
         f"{suite.imu.samples} samples",

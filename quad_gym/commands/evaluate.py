@@ -24,6 +24,7 @@ from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable, short_name
 from quad_gym.commands.options import (
     EnvId,
+    EstimatorName,
     Keywords,
     OwnSuite,
     Threads,
@@ -33,6 +34,7 @@ from quad_gym.commands.options import (
     require_at_least,
     sensors_of,
     usage_errors,
+    with_estimator,
     with_full_id,
 )
 from quad_gym.envs.effects import with_effect
@@ -56,6 +58,7 @@ class EvaluateArgs:
     """observations on which the policies fly: truth, estimate, noisy, or measurements (for policies
     trained on raw measurements)"""
     sensors: OwnSuite = None
+    estimator: EstimatorName = None
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
@@ -122,7 +125,7 @@ def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) 
     given = leave(args.env, {name: f"--{name}" for name in ("observation", "sensors", "threads")})
     keywords = {
         **keywords_of_policy(policy, args.env_id),
-        **given,
+        **with_estimator(given, args.estimator),
         "observation": observation,
         "sensors": sensors_of(args.env_id, args.sensors),
     }

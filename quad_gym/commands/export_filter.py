@@ -1,19 +1,18 @@
-"""Export the parameters of a filter to an autopilot.
+"""Export a suite's filter as a C library.
 
-    quad-gym export filter --sensors rtk
-    quad-gym export filter --sensors rtk --to json
+    quad-gym export filter --sensors rtk --output filter
+    quad-gym export filter --sensors mine.toml --target cortex-m7 --output filter
+    quad-gym export filter --policy pretrained --env-id QuadGym/Circle-v0 --output pilot
 
-The parameters are written as a C header or JSON, in the form used in the equations of the filter.
-docs/deployment.md explains them.
+Writes a folder with a static library, a C99 header, an example that filters a log, and a CMake
+file. The estimates are bitwise those of `quad-gym replay`. docs/deployment.md explains the use.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from quad_gym.commands.options import SuiteName, usage_errors, writable_file
-
-_SUFFIXES = {"json": ".json", "header": ".h"}
+from quad_gym.commands.options import SuiteName, full_id, refuse_overwriting, usage_errors
 
 
 @dataclass(frozen=True)
@@ -21,31 +20,36 @@ class ExportFilterArgs:
     """Options of the export."""
 
     sensors: SuiteName = "standard"
-    to: Literal["header", "json"] = "header"
-    """format of the file"""
+    target: Literal["x86-64", "aarch64", "cortex-m7", "wasm32"] = "x86-64"
+    """processor: x86-64 (with AVX2) or aarch64 with Linux, cortex-m7, or WebAssembly"""
+    policy: str | None = None
+    """also export a policy that acts on the estimate: pretrained, or a file of quad-gym train"""
+    env_id: str | None = None
+    """environment of the policy; if not given, from its training record"""
     output: Path | None = None
-    """file to write; if not given, in results/export"""
+    """folder to write; if not given, in results/export"""
     overwrite: bool = False
-    """replace an existing file"""
-
-
-def export(args: ExportFilterArgs, file: Path) -> str:
-    """Write the parameters of a filter; return a message for the user."""
-    from baselines.exporting.filter_numbers import filter_header, filter_json
-    from quad_gym.params.suites import sensor_suite, suite_label
-
-    suite, name = sensor_suite(args.sensors), suite_label(args.sensors)
-    text = filter_json(suite) if args.to == "json" else filter_header(suite, name)
-    file.write_text(text, encoding="utf-8")
-    return f'Parameters of the {suite.estimator.kind.upper()} of the suite "{args.sensors}".'
+    """replace an existing library"""
 
 
 def main(args: ExportFilterArgs) -> None:
     """Export a filter."""
-    from quad_gym.params.suites import suite_label
+    from baselines.exporting import controller_of
+    from baselines.exporting.filter_library import LIBRARY, export_filter
+    from quad_gym.analysis.reports import require_writable
+    from quad_gym.params.suites import sensor_suite, suite_label
 
-    with usage_errors():
-        name = f"filter_{suite_label(args.sensors)}"
-        file = writable_file(args.output, name, _SUFFIXES[args.to], args.overwrite)
-        message = export(args, file)
-    print(f"Wrote {file}. {message}")
+    with usage_errors((ValueError, OSError, ImportError, RuntimeError)):
+        suite, label = sensor_suite(args.sensors), suite_label(args.sensors)
+        folder = args.output or Path("results/export") / f"filter_{label}_{args.target}"
+        refuse_overwriting(folder / LIBRARY, args.overwrite)
+        require_writable("--output", folder)
+        if args.env_id is not None and args.policy is None:
+            raise ValueError("--env-id must come with --policy")
+        env_id = None if args.env_id is None else full_id(args.env_id)
+        policy = None if args.policy is None else controller_of(args.policy, env_id)
+        files = export_filter(suite, label, args.target, folder, policy)
+    print(
+        f"Wrote {len(files)} files to {folder}: the {suite.estimator.kind.upper()} of the suite "
+        f'"{args.sensors}" for {args.target}. README.md there explains how to build and call it.'
+    )

@@ -31,12 +31,14 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import (
     EnvId,
+    EstimatorName,
     Keywords,
     OwnSuite,
     leave,
     require_at_least,
     sensors_of,
     usage_errors,
+    with_estimator,
     with_full_id,
 )
 from quad_gym.evaluation import Policy
@@ -69,9 +71,10 @@ class FlyArgs:
     duration: float | None = None
     """time limit [s]; if not given, the task's default"""
     env: Keywords = field(default_factory=dict)
-    """further keywords of the environment, such as control_rate=100 estimator=ekf"""
+    """further keywords of the environment, such as control_rate=100 world=breeze"""
 
     sensors: OwnSuite = None
+    estimator: EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
     gnss_rate: float | None = None
@@ -165,7 +168,7 @@ def make_env(args: FlyArgs) -> Any:
     """Make an environment with one flight."""
     args = with_full_id(args)
     names = ("observation", "action", "sensors", "camera", "duration", "faults")
-    given = leave(args.env, {name: f"--{name}" for name in names})
+    given = with_estimator(leave(args.env, {name: f"--{name}" for name in names}), args.estimator)
     suite = sensor_suite(sensors_of(args.env_id, args.sensors))
     keywords: dict[str, Any] = {**keywords_of_policy(args.policy, args.env_id), **given}
     if not args.camera:

@@ -25,7 +25,7 @@ COMMANDS = {
     "ablation": "measure the effects of filter corrections and of model mismatch",
     "benchmark": "measure the speed of all parts",
     "export policy": "export a trained policy to an autopilot: C or ONNX",
-    "export filter": "export the parameters of a filter to an autopilot: C or JSON",
+    "export filter": "export a filter to an autopilot: a C library with the same estimates",
     "compile": "compile the kernels into the cache before their first use",
     "completion": "print a script for the completion of commands and options in a shell",
     "version": "print the version",

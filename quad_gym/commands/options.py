@@ -114,6 +114,13 @@ def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[st
     return keywords
 
 
+def with_estimator(keywords: Mapping[str, Any], estimator: str | None) -> dict[str, Any]:
+    """Add the option `--estimator` to the keywords of an environment."""
+    if estimator is None:
+        return dict(keywords)
+    return {**leave(keywords, {"estimator": "--estimator"}), "estimator": estimator}
+
+
 def refuse_overwriting(file: Path, overwrite: bool) -> None:
     """Reject replacing the results of an earlier run without `--overwrite`."""
     if file.exists() and not overwrite:
@@ -280,6 +287,15 @@ OwnSuite = Annotated[
     ),
 ]
 """Name or file of a sensor suite; None: the task's default."""
+
+EstimatorName = Annotated[
+    str | None,
+    tyro.conf.arg(
+        help="estimator: ukf, ekf, or module:Class of a quad_gym.Estimator; if not given, the "
+        "suite's"
+    ),
+]
+"""Name of a built-in filter, or of a user's estimator; None: the suite's."""
 
 SuiteNames = Annotated[
     tuple[str, ...],

@@ -23,6 +23,7 @@ from quad_gym import IDS
 from quad_gym.commands.options import (
     Engine,
     EnvId,
+    EstimatorName,
     Keywords,
     OwnSuite,
     Parameters,
@@ -30,6 +31,7 @@ from quad_gym.commands.options import (
     flying_options,
     require_at_least,
     usage_errors,
+    with_estimator,
     with_full_id,
 )
 
@@ -43,6 +45,7 @@ class TrainArgs:
     """reinforcement learning algorithm"""
     engine: Engine = "sb3"
     sensors: OwnSuite = None
+    estimator: EstimatorName = None
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth action=motor camera=false"""
     steps: int | None = None
@@ -80,7 +83,7 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     from quad_gym.analysis.reports import require_writable
 
     args = with_full_id(args)
-    environment = dict(args.env)
+    environment = with_estimator(args.env, args.estimator)
     if args.sensors is not None:
         if "sensors" in environment:
             raise ValueError("--sensors must not be given with --env sensors=...")

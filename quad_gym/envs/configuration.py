@@ -148,6 +148,7 @@ class Flights:
         self.observation, self.action = keywords["observation"], keywords["action"]
         self.layout, self.reward_terms = keywords["layout"], keywords["reward_terms"]
         flown["sensors"] = suite = _suite(keywords, "camera" in asked)
+        flown["estimator"] = own_estimator(keywords["estimator"])
         flown["faults"] = _faults(keywords, suite)
         drawn = flown["randomization"] = Randomization.of(keywords["randomization"])
         place = world_params(flown["world"]) if isinstance(flown["world"], str) else flown["world"]
@@ -225,10 +226,15 @@ def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:
         suite = suite.replace(camera=None)
     elif camera_is_wanted and suite.camera is None:
         raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
-    if estimator is None:
+    if estimator is None or own_estimator(estimator) is not None:
         return suite
     check.choice("estimator", estimator, ("ukf", "ekf"))
     return suite.replace(estimator=suite.estimator.replace(kind=estimator))
+
+
+def own_estimator(given: Any) -> Any:
+    """Return a user's estimator; None for the names of built-in ones."""
+    return given if not isinstance(given, str) or ":" in given else None
 
 
 def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...]:

@@ -23,6 +23,7 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 
 if TYPE_CHECKING:
+    from quad_gym.estimation.own import Estimator
     from quad_gym.tasks import Task
 
 
@@ -64,7 +65,7 @@ class EnvKeywords(TaskKeywords, total=False):
     vehicle: VehicleParams | str
     action_params: ActionParams | None
     camera: bool
-    estimator: Literal["ukf", "ekf"] | None
+    estimator: "Literal['ukf', 'ekf'] | Estimator | type[Estimator] | str | None"
     filter_start: Literal["cold", "warm"]
     control_rate: float
     action_delay: float

@@ -158,7 +158,8 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         vehicle: Name of a preset, or `VehicleParams`.
         action_params: Scales of the actions, and bandwidths of the inner loops.
         camera: False: leave out the camera of the sensors.
-        estimator: "ukf" or "ekf", in place of the estimator of the sensors.
+        estimator: "ukf" or "ekf", in place of the estimator of the sensors, or your own: a
+            `quad_gym.Estimator`, its class, or "module:Class".
         filter_start: "cold": the filter starts from its first fix, or without GNSS from the marked
             spot of `quad_gym.InitialPoseParams`; "warm": it has been running for 10 s before the
             episode, and has converged.

@@ -22,7 +22,7 @@ import numpy as np
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.likelihood import Likelihood, in_flight
 from quad_gym.estimation.logs import Log
-from quad_gym.estimation.numbers import Number, numbers_in
+from quad_gym.estimation.numbers import Number, has_baselines, numbers_in
 from quad_gym.estimation.replaying import origin_of, replay
 from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.validation import Validation, validate
@@ -37,18 +37,28 @@ _LARGEST, _LEAST = 3.0, -0.3
 sensor in flight is hardly better than at rest."""
 _SILENT = 0.8
 """Ratio of standard deviations after and before above which a log does not determine a number."""
+_COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
+"""Noise that the search begins with twice: as large as the samples admit, and at its prior."""
+_FEW_STEPS, _STEPS = 8, 25
+"""Steps of the search from each beginning, and after."""
 _CLUSTER = 5.0
 """Length of the parts of a log that are independent of each other [s]."""
-_COARSE, _FINE = np.arange(-0.6, 0.81, 0.1), np.arange(-0.1, 0.11, 0.05)
-_DELAY_SPREAD = 0.2
+_COARSE, _FINE = np.arange(-1.0, 1.01, 0.1), np.arange(-0.1, 0.11, 0.05)
+_DELAY_SPREAD = 0.3
 """Standard deviation of the prior of a delay [s]."""
 _LEAST_GAIN = 3.0
 """Drop of the log likelihood, two steps of a grid from its maximum, that determines a delay."""
+_IRON_TAU = 30.0
+"""Prior correlation time of hard iron that is constant in the suite [s]: currents of motors change
+in flight."""
+_DRIFT, _DRIFT_TAU = 3.0, 5.0
+"""Prior drift of GNSS in a suite without, in standard deviations of its noise, and its correlation
+time [s]: receivers filter their positions."""
 _WHITE = {
     "gnss.position_sigma_I[0, 1]": ("gnss_position", slice(0, 2), 1.5),
     "gnss.position_sigma_I[2]": ("gnss_position", slice(2, 3), 1.5),
     "gnss.velocity_sigma": ("gnss_velocity", slice(3), 2.0),
-    "magnetometer.noise_sigma": ("magnetometer", slice(3), 4.0),
+    "magnetometer.noise_sigma": ("magnetometer", slice(3), 2.0),
 }
 """White noise that is inflated where innovations are correlated: their sensor, its axes, and the
 largest factor, which is smaller where the filter estimates a correlated error of the sensor."""
@@ -126,13 +136,13 @@ def calibrate(
     check.number("share", share, least=0.05, most=0.95)
     check.flag("delays", delays)
     whole = read_log(log, body=body)
-    prior = _with_field(origin_of(whole, suite), whole)
+    prior = _prior_of(origin_of(whole, suite), whole)
     time = whole.imu.time
     split = float(time[0] + share * (time[-1] - time[0]))
     search = _Search(whole.until(split), prior, dict(start or {}), progress or (lambda _: None))
     if delays:
         search.find_delays(coarse=True)
-    search.fit()
+    search.fit(first=True)
     if delays:
         search.find_delays(coarse=False)
     search.inflate()
@@ -145,9 +155,22 @@ def calibrate(
     return Calibration(new, prior, found, dict(search.delays), before, after, split)
 
 
-def _with_field(suite: SensorSuite, log: Log) -> SensorSuite:
-    """Return the suite with strength and inclination of the magnetic field as the log has them."""
-    compass, stream = suite.magnetometer, log.magnetometer
+def _prior_of(suite: SensorSuite, log: Log) -> SensorSuite:
+    """Return the suite with errors that change slowly, and with the magnetic field of the log."""
+    imu, gnss, compass, stream = suite.imu, suite.gnss, suite.magnetometer, log.magnetometer
+    root = math.sqrt(imu.dt)  # vibration and density are one white noise in a log
+    imu = imu.replace(
+        accel_noise_density=imu.accel_noise * root,
+        gyro_noise_density=imu.gyro_noise * root,
+        accel_vibration=0.0,
+        gyro_vibration=0.0,
+    )
+    if gnss is not None and not gnss.drifts:
+        drift = tuple(_DRIFT * sigma for sigma in gnss.position_sigma_I)
+        gnss = gnss.replace(drift_sigma_I=drift, drift_tau=_DRIFT_TAU)
+    if gnss is not None and not has_baselines(log):
+        gnss = gnss.replace(secondary_antenna_B=None)
+    suite = suite.replace(imu=imu, gnss=gnss)
     if compass is None or stream is None:
         return suite
     field = stream.values["magnetometer"]
@@ -156,8 +179,11 @@ def _with_field(suite: SensorSuite, log: Log) -> SensorSuite:
     )
     sizes = np.linalg.norm(field, axis=1)
     up = (field * accel).sum(axis=1) / np.linalg.norm(accel, axis=1)
-    inclination = -math.asin(float(np.clip(up.mean() / sizes.mean(), -0.99, 0.99)))
-    compass = compass.replace(strength=float(sizes.mean()), inclination=inclination)
+    compass = compass.replace(
+        strength=float(sizes.mean()),
+        inclination=-math.asin(float(np.clip(up.mean() / sizes.mean(), -0.99, 0.99))),
+        hard_iron_tau=min(compass.hard_iron_tau, _IRON_TAU),
+    )
     return suite.replace(magnetometer=compass)
 
 
@@ -189,27 +215,29 @@ class _Search:
     ) -> None:
         self.log, self.prior, self.start, self.progress = log, prior, start, progress
         self.measured = {name for name in log.streams if getattr(prior, name, None) is not None}
-        self.numbers = numbers_in(prior, self.measured)
+        self.numbers = numbers_in(prior, log)
         self.values = np.array([number.of(prior) for number in self.numbers])
         self.low = np.array([_lowest(number) for number in self.numbers])
         own = vars(prior.log_delays)
         self.delays = {name: own[name] for name in own if name in self.measured}
         self.x = np.clip(self._first(), self.low, _LARGEST)
-        self._updates = int(self.likelihood(self.delays).counts.sum())
 
     def _first(self) -> Floats:
         """Return where the search begins: with noise as wide as the log may need."""
         x = np.zeros(len(self.numbers))
-        imu, rough = self.log.imu, {}
-        dt = float(np.median(np.diff(imu.time)))
-        for name in ("accel", "gyro"):
-            moving = np.diff(imu.values[name], axis=0).std() / math.sqrt(2.0)
-            rough[f"imu.{name}_noise_density"] = moving * math.sqrt(dt)
         for k, (number, value) in enumerate(zip(self.numbers, self.values, strict=True)):
             wide = {"gnss.velocity_sigma": 4.0, "magnetometer.hard_iron_sigma": 3.0}
-            first = max(rough.get(number.name, 0.0), wide.get(number.name, 1.0) * value)
-            x[k] = number.coordinate(value, first) if number.positive else 0.0
+            if number.positive:
+                x[k] = number.coordinate(value, wide.get(number.name, 1.0) * value)
+            if number.name in _COARSE_NOISE:  # of the largest that the samples admit
+                x[k] = max(0.0, number.coordinate(value, self._roughness(number)))
         return x
+
+    def _roughness(self, number: Number) -> float:
+        """Return the noise density of the IMU if its samples changed by noise only."""
+        values = self.log.imu.values[number.field.split("_")[0]]
+        dt = float(np.median(np.diff(self.log.imu.time)))
+        return float(np.diff(values, axis=0).std()) * math.sqrt(0.5 * dt)
 
     def suite(self, x: Floats | None = None, gate: bool = True) -> SensorSuite:
         """Return the suite at coordinates."""
@@ -223,7 +251,7 @@ class _Search:
     def likelihood(self, delays: Mapping[str, float]) -> Likelihood:
         """Return the likelihood of the log with delays."""
         log = self.log.without_delays(delays)
-        return Likelihood(log, self.prior, self.start, reported_noise=False)
+        return Likelihood(log, self.prior, self.start)
 
     def find_delays(self, coarse: bool) -> None:
         """Find the delay of each sensor, with the others as they are."""
@@ -241,8 +269,8 @@ class _Search:
         delays = self.delays[name] + steps
         likelihoods = (self.likelihood(self.delays | {name: float(d)}) for d in delays)
         suite = self.suite(gate=False)
-        mean = np.array([float(found.losses([suite]).mean()) for found in likelihoods])
-        loss = self._updates * mean + 0.5 * (delays / _DELAY_SPREAD) ** 2
+        total = np.array([float(found.losses([suite]).sum()) for found in likelihoods])
+        loss = total + 0.5 * (delays / _DELAY_SPREAD) ** 2
         k = int(np.clip(np.argmin(loss), 2, len(loss) - 3))
         near = slice(k - 2, k + 3)
         bend, slope, _ = np.polyfit(delays[near] - delays[k], loss[near], 2)
@@ -252,22 +280,33 @@ class _Search:
         step = float(np.clip(-0.5 * slope / bend, -2.0 * reach, 2.0 * reach))
         self.delays[name] = float(np.clip(delays[k] + step, -2.0, 2.0))
 
-    def fit(self) -> None:
-        """Find the numbers with the delays as they are."""
-        from scipy.optimize import minimize
+    def fit(self, first: bool = False) -> None:
+        """Find the numbers with the delays as they are.
 
+        Args:
+            first: True: the likelihood has several maxima, as noise of the IMU and drift of GNSS
+                both explain large innovations; begin with much and with little of the first.
+        """
         self.progress(f"Search for {len(self.numbers)} numbers")
         self._current = self.likelihood(self.delays)
-        bounds = [(low, _LARGEST) for low in self.low]
-        found = minimize(
+        if first:
+            little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
+            tried = [self._minimize(x, _FEW_STEPS) for x in (self.x, little)]
+            self.x = min(tried, key=lambda found: float(found.fun)).x
+        self.x = self._minimize(self.x, _STEPS).x
+
+    def _minimize(self, x: Floats, steps: int) -> Any:
+        """Return the result of a quasi-Newton search from coordinates."""
+        from scipy.optimize import minimize
+
+        return minimize(
             self._loss,
-            np.clip(self.x, self.low, _LARGEST),
+            np.clip(x, self.low, _LARGEST),
             jac=True,
             method="L-BFGS-B",
-            bounds=bounds,
-            options={"maxiter": 25, "ftol": 1e-6},
+            bounds=[(low, _LARGEST) for low in self.low],
+            options={"maxiter": steps, "ftol": 1e-5},
         )
-        self.x = found.x
 
     def _loss(self, x: Floats) -> tuple[float, Floats]:
         """Return the loss per thousand, with the prior, and its derivative."""
@@ -299,22 +338,22 @@ class _Search:
         The covariance is H^-1 J H^-1 (Godambe), with the curvature H from differences of
         derivatives and J the sum of squares of the derivatives over parts of the log.
         """
-        n, steps = len(self.x), (1.0, -1.0)
-        axes, (row, column) = _STEP * np.eye(n), np.triu_indices(n)
-        pairs = zip(axes[row], axes[column], strict=True)
-        points = [self.x + s * e + t * f for e, f in pairs for s in steps for t in steps]
-        points += [self.x + s * e for e in axes for s in steps]
+        n = len(self.x)
+        axes, (row, column) = _STEP * np.eye(n), np.triu_indices(n, 1)
+        points = [self.x, *(self.x + s * e for e in axes for s in (1.0, -1.0))]
+        points += [self.x + axes[i] + axes[j] for i, j in zip(row, column, strict=True)]
         losses = self._current.losses([self.suite(p, gate=False) for p in points])
-        total = losses[:, : 4 * len(row)].sum(axis=0).reshape(-1, 4)
-        H = np.zeros((n, n))
-        H[row, column] = H[column, row] = total @ [1.0, -1.0, -1.0, 1.0] / (4.0 * _STEP**2)
-        single = losses[:, 4 * len(row) :]
-        slopes = (single[:, 0::2] - single[:, 1::2]) / (2.0 * _STEP)
-        times = self._current.times[self._current.counts]
+        total = losses.sum(axis=0)
+        ahead, back, both = total[1 : 2 * n : 2], total[2 : 2 * n + 1 : 2], total[2 * n + 1 :]
+        H = np.diag(ahead + back - 2.0 * total[0])
+        H[row, column] = H[column, row] = both - ahead[row] - ahead[column] + total[0]
+        H /= _STEP**2
+        slopes = (losses[:, 1 : 2 * n : 2] - losses[:, 2 : 2 * n + 1 : 2]) / (2.0 * _STEP)
+        times = self._current.times
         parts = ((times - times[0]) // _CLUSTER).astype(int)
         sums = np.array([slopes[parts == part].sum(axis=0) for part in np.unique(parts)])
         J = sums.T @ sums
-        values, vectors = np.linalg.eigh(0.5 * (H + H.T))
+        values, vectors = np.linalg.eigh(H)
         information = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.eye(n)
         root = np.linalg.solve(information, np.linalg.cholesky(J + np.eye(n)))
         sigmas = np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0)
@@ -330,7 +369,8 @@ class _Search:
 
 def _lowest(number: Number) -> float:
     """Return the lower bound of a coordinate."""
-    standard_deviation = number.positive and number.field != "strength"
+    standard_deviation = "sigma" in number.field or "density" in number.field
+    standard_deviation &= number.field != "drift_sigma_I"
     return _LEAST / number.spread if standard_deviation else -_LARGEST
 
 

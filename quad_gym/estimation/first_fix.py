@@ -24,6 +24,7 @@ from quad_gym.estimation.starts import (
 )
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
+from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import Aid
 
@@ -146,11 +147,11 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
         x_I = np.zeros(3)
         if fix.heading is not None:
             angle = check.number("heading", fix.heading)
-            x_I[:2] = np.cos(angle), np.sin(angle)
+            x_I[:2] = math.cos(angle), math.sin(angle)
         return FilterStart(position, sigmas, velocity, speeds, baseline, x_I)
     tilt = _first_tilt(sensors, fix)
     headings = _first_headings(sensors, fix, tilt, velocity, float(speeds[0]), baseline)
-    antenna_I = ecef_to_enu(sensors.gnss.reference_antenna_G) @ position
+    antenna_I = turned(ecef_to_enu(sensors.gnss.reference_antenna_G), position)
     root = math.sqrt(sensors.estimator.initial_covariance_scale) * _root(sigmas, covariance)
     still = np.zeros(3) if velocity is None else velocity
     found = [still_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
@@ -188,7 +189,7 @@ def _first_velocity(sensors: SensorSuite, fix: FirstFix) -> tuple[Floats | None,
     if noise is None:
         raise ValueError("velocity_sigma must be given: the suite has no GNSS velocity")
     v_G = check.array("gnss_velocity_G", fix.gnss_velocity_G, (3,))
-    return ecef_to_enu(gnss.reference_antenna_G) @ v_G, np.full(3, noise)
+    return turned(ecef_to_enu(gnss.reference_antenna_G), v_G), np.full(3, noise)
 
 
 def _first_tilt(sensors: SensorSuite, fix: FirstFix) -> Tilt:
@@ -260,7 +261,7 @@ def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> FirstH
     gnss = sensors.gnss
     assert gnss is not None
     sigma = math.sqrt(sensors.estimator.initial_covariance_scale) * gnss.first_baseline_sigma
-    baseline_I = ecef_to_enu(gnss.reference_antenna_G) @ baseline_G
+    baseline_I = turned(ecef_to_enu(gnss.reference_antenna_G), baseline_G)
     found = baseline_heading(np.array(gnss.baseline_B), baseline_I, sigma, tilt)
     if found is None:
         raise ValueError(
@@ -273,11 +274,12 @@ def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> FirstH
 def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) -> FirstHeading:
     if velocity is None:
         raise ValueError("course must come with gnss_velocity_G")
-    speed = math.hypot(velocity[0], velocity[1])
+    speed = math.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
     if speed < LEAST_COURSE * sigma:
         raise ValueError(
             f"course must belong to a moving vehicle, at least {LEAST_COURSE * sigma:g} m/s over "
             f"the ground, got {speed:g} m/s"
         )
     angle = math.atan2(velocity[1], velocity[0])
-    return known_heading(angle, math.hypot(own, sigma / speed), tilt)
+    across = sigma / speed
+    return known_heading(angle, math.sqrt(own * own + across * across), tilt)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.logs import Log
 from quad_gym.params.sensors import SensorSuite
 
 
@@ -61,6 +62,7 @@ class Number:
 
 
 _LEVEL, _UP = (0, 1), (2,)
+_LEVER, _PRECISE = "primary_antenna_B", 0.1  # [m]
 _WIDE, _NARROW = 1.5, 0.7  # logarithms: factors of 4.5 and 2
 
 # fmt: off
@@ -73,11 +75,17 @@ NUMBERS = (
     Number(sensor="gnss", field="position_sigma_I", axes=_UP, spread=_WIDE, unit="m"),
     Number(sensor="gnss", field="drift_sigma_I", axes=_LEVEL, spread=_WIDE, unit="m"),
     Number(sensor="gnss", field="drift_sigma_I", axes=_UP, spread=_WIDE, unit="m"),
+    Number(sensor="gnss", field="drift_tau", spread=_WIDE, unit="s"),
     Number(sensor="gnss", field="velocity_sigma", spread=_WIDE, unit="m/s"),
+    *(
+        Number(sensor="gnss", field=_LEVER, axes=(k,), spread=0.15, positive=False, unit="m")
+        for k in range(3)
+    ),
     Number(sensor="barometer", field="noise_sigma", spread=_WIDE, unit="m"),
     Number(sensor="barometer", field="bias_sigma", spread=_WIDE, unit="m"),
     Number(sensor="magnetometer", field="noise_sigma", spread=_WIDE, unit="T"),
     Number(sensor="magnetometer", field="hard_iron_sigma", spread=_WIDE, unit="T"),
+    Number(sensor="magnetometer", field="hard_iron_tau", spread=_NARROW, unit="s"),
     Number(sensor="magnetometer", field="declination", spread=0.3, positive=False, unit="rad"),
     Number(sensor="magnetometer", field="inclination", spread=0.1, positive=False, unit="rad"),
     Number(sensor="magnetometer", field="strength", spread=0.2, unit="T"),
@@ -87,14 +95,22 @@ NUMBERS = (
 sensor at rest, and vibration, airflow and motor currents multiply its noise."""
 
 
-def numbers_in(suite: SensorSuite, measured: set[str]) -> list[Number]:
+def numbers_in(suite: SensorSuite, log: Log) -> list[Number]:
     """Return the numbers of the sensors that a suite has and a log contains."""
-    found = []
+    found, paired = [], has_baselines(log)
     for number in NUMBERS:
         part = getattr(suite, number.sensor)
-        if part is None or (number.sensor != "imu" and number.sensor not in measured):
+        if part is None or number.sensor not in log.streams:
             continue
+        if number.field == _LEVER and (paired or max(part.position_sigma_I) > _PRECISE):
+            continue  # the direction of a baseline would change, or noise hides the lever arm
         value = getattr(part, number.field)
         if value is not None and (not number.positive or np.all(np.asarray(value) != 0.0)):
             found.append(number)
     return found
+
+
+def has_baselines(log: Log) -> bool:
+    """Return True if a log has baselines between two antennas."""
+    given = {} if log.gnss is None else log.gnss.values
+    return "baseline_G" in given or "baseline_I" in given

@@ -35,6 +35,12 @@ MOST_NIS = 10.0
 """Mean NIS of the measurements used, over their degrees of freedom [-]."""
 MOST_REJECTED = 0.1
 """Share of the measurements of a sensor that the gate rejects [-]."""
+MOST_CORRELATED, FEWEST = 0.8, 50
+"""Correlation of successive innovations of GNSS that all axes exceed, and the number of innovations
+that shows it: they are then no noise, but errors of the clock, or motion that the filter misses."""
+MOST_BIAS = 4.0
+"""Root mean square of an estimated bias, over the standard deviation in the suite [-]: a wrong
+field, clock or mounting moves the biases before it moves the innovations."""
 MOST_DIVERGED = 0.25
 """Share of the samples at which the filter counts as diverged [-]."""
 
@@ -53,7 +59,7 @@ NAMES = {
 
 ADVICE = (
     "Check the units, axes and time stamps of the log, or use a suite with the noise, delays and "
-    "mounting of these sensors: `quad-gym calibrate LOG` finds noise and delays."
+    "mounting of these sensors: `quad-gym calibrate LOG` finds noise, delays and lever arms."
 )
 
 
@@ -82,7 +88,7 @@ def problems_of(log: Log, body: str, suite: SensorSuite, result: Replay) -> tupl
         )
     if not result.measured and result.unused:
         found.append(f"{nothing_in_common(result.unused)}: the estimates are dead reckoning")
-    return (*found, *_misfits(result.measured))
+    return (*found, *_misfits(result.measured), *_biases(result, suite))
 
 
 def nothing_in_common(unused: tuple[str, ...]) -> str:
@@ -153,6 +159,34 @@ def _misfits(measured: Mapping[str, Measured]) -> Iterator[str]:
             yield (
                 f"{NAMES[name]}: mean NIS {nis.mean():.3g}, {freedom} expected, {_percent(share)} "
                 "rejected: this suite does not describe this log"
+            )
+        elif name.startswith("gnss") and (rho := _correlation(m)) > MOST_CORRELATED:
+            yield (
+                f"{NAMES[name]}: successive innovations have a correlation of {rho:.2f}, 0 "
+                "expected: time stamps or noise of this suite do not describe this log"
+            )
+
+
+def _correlation(m: Measured) -> float:
+    """Return the correlation of successive innovations after the start, the least of all axes."""
+    scaled = (m.innovation / m.sigma)[np.isfinite(m.nis)]
+    scaled = scaled[len(scaled) // 5 :]
+    if len(scaled) < FEWEST:
+        return 0.0
+    both = (scaled[1:] * scaled[:-1]).mean(axis=0) / (scaled**2).mean(axis=0)
+    return float(both.min())
+
+
+def _biases(result: Replay, suite: SensorSuite) -> Iterator[str]:
+    """Biases of the IMU that the suite does not admit."""
+    for name, unit in (("accel", "m/s^2"), ("gyro", "rad/s")):
+        found = np.sqrt((getattr(result, f"{name}_bias") ** 2).mean(axis=0)).max()
+        sigma = getattr(suite.imu, f"{name}_bias_sigma")
+        if not found <= MOST_BIAS * sigma:
+            word = {"accel": "accelerometer", "gyro": "gyro"}[name]
+            yield (
+                f"{word}: estimated bias {found:.2g} {unit}, {sigma:.2g} expected: magnetic field, "
+                "time stamps, mounting or noise of this suite do not describe this log"
             )
 
 

@@ -16,6 +16,7 @@ from quad_gym.estimation.filters import (
     KalmanFilter,
     UnscentedKalmanFilter,
 )
+from quad_gym.estimation.first_motion import with_wide_start
 from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
@@ -27,6 +28,7 @@ from quad_gym.estimation.tape import Tape, TapeWriter
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
+from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
 from quad_gym.rotations import dcm_to_quaternion
@@ -53,7 +55,7 @@ class Player:
     ) -> None:
         self.log, self.suite, self.estimator = log, suite, estimator
         self.start, self.reported = start, reported_noise
-        self.filter = ESTIMATORS[estimator](suite, window=window)
+        self.filter = ESTIMATORS[estimator](with_wide_start(suite, log), window=window)
         self.window = window
         self.averages = suite.imu.samples == "average"
         self.imu_times: list[float] = log.imu.time.tolist()
@@ -240,7 +242,7 @@ class Player:
         for frame in "GI":
             values = stream.values.get(f"{quantity}_{frame}")
             if values is not None and np.isfinite(values[k]).all():
-                vector = values[k] if frame == "G" else self.R_GI @ values[k]
+                vector = values[k] if frame == "G" else turned(self.R_GI, values[k])
                 from_center = frame == "G" and quantity == "position"
                 return vector - self.origin if from_center else vector
         return None
@@ -285,7 +287,7 @@ class Player:
 
     def started(self, suite: SensorSuite) -> KalmanFilter:
         """Return a filter for another suite in the state in which the tape begins."""
-        kf = ESTIMATORS[self.estimator](suite, window=self.window)
+        kf = ESTIMATORS[self.estimator](with_wide_start(suite, self.log), window=self.window)
         kf.initialize(**self.first_state)
         if self.log.barometer_from_start:
             kf._engine.steps["level"] = np.nan

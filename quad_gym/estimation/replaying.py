@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.plausibility import problems_of
@@ -79,13 +80,13 @@ def prepared(log: Any, sensors: SensorSuite | str, body: str) -> tuple[Log, Sens
 
 
 def origin_of(log: Log, suite: SensorSuite) -> SensorSuite:
-    """Return a suite whose reference antenna is the origin of I of a log."""
+    """Return a suite whose reference antenna is the origin of I of a log, with the field there."""
     if suite.gnss is None:
         return suite
     origin = log.origin(np.array(suite.gnss.reference_antenna_G))
     if origin is None:
         return suite
-    return suite.replace(gnss=suite.gnss.replace(reference_antenna_G=tuple(origin.tolist())))
+    return at_place(suite, origin)
 
 
 def named_start(start: Mapping[str, Any] | None) -> dict[str, Any]:

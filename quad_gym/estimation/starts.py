@@ -27,10 +27,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.kernels.single import start_level
 from quad_gym.packing.aids import slow_states
 from quad_gym.params import checks as check
+from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import Aid
+from quad_gym.records import START, Aid
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +51,7 @@ STEEP = 0.2
 """Horizontal fraction of a baseline, 12 degrees from the vertical, below which it does not observe
 the heading; as in `kernels/filter/align.py`."""
 
-_R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
+_D = 15  # the first time-correlated error among the states
 
 
 class FirstHeading(NamedTuple):
@@ -153,21 +155,21 @@ def magnetic_heading(
     """
     magnetometer = sensors.magnetometer
     assert magnetometer is not None
-    field = tilt.T.T @ field_B
+    field = turned(tilt.T.T, field_B)
     m_I = np.array(magnetometer.field_I)
-    strength = math.hypot(field[0], field[1])
+    strength = math.sqrt(field[0] * field[0] + field[1] * field[1])
     if strength < 1e-3 * magnetometer.strength:
         raise ValueError(f"magnetometer must measure a level part of the field, got {field_B}")
     angle = math.atan2(m_I[1], m_I[0]) - math.atan2(field[1], field[0])
     R_hat = level(angle)
-    f, g = R_hat @ m_I, R_hat @ np.cross(m_I, (0.0, 0.0, 1.0))
-    f_h = math.hypot(f[0], f[1])
+    f, g = turned(R_hat, m_I), turned(R_hat, (m_I[1], -m_I[0], 0.0))
+    f_h = math.sqrt(f[0] * f[0] + f[1] * f[1])
     u = np.array([f[0], f[1], 0.0]) / f_h
     t = np.array([-u[1], u[0], 0.0])
     states = slow_states(sensors)
     iron, declination = states.vectors[Aid.MAGNETOMETER], states.scalars[Aid.MAGNETOMETER]
-    of_slow = {iron + i: float(by / f_h) for i, by in enumerate(tilt.T @ t)}
-    of_slow[declination] = float(t @ g / f_h)
+    of_slow = {iron + i: float(by / f_h) for i, by in enumerate(turned(tilt.T, t))}
+    of_slow[declination] = float((t[0] * g[0] + t[1] * g[1]) / f_h)
     white = magnetometer.noise_sigma if sigma is None else sigma
     of_tilt = (float(f[2] * u[0] / f_h), float(f[2] * u[1] / f_h))
     return FirstHeading(angle, white / f_h, of_tilt, of_slow)
@@ -217,34 +219,31 @@ def still_start(
     """
     assert sensors.gnss is not None
     imu, slow = sensors.imu, slow_states(sensors).first_sigmas
-    n = _D + len(slow)
-    R_BI = tilt.T @ level(heading.angle)
-    lever = np.array(sensors.gnss.primary_antenna_B)
-    G = np.zeros((n, n + 1))  # the last is of second order, see above
-    G[_R : _R + 3, _R : _R + 3] = position_root
-    G[_V : _V + 3, _V : _V + 3] = np.diag(velocity_sigma)
-    e = np.zeros((3, n + 1))  # the error angles in the level frame, by independent errors
-    bias = tilt.of_bias * imu.accel_bias_sigma
-    e[0, _BA : _BA + 3], e[1, _BA : _BA + 3] = -bias * tilt.T[:, 1], bias * tilt.T[:, 0]
-    e[0, _E] = e[1, _E + 1] = tilt.sigma
-    e[2] = heading.of_tilt[0] * e[0] + heading.of_tilt[1] * e[1]
-    e[2, _E + 2] = heading.sigma
+    record = np.zeros(1, START)
+    given = {
+        "antenna_I": antenna_I,
+        "position_root": position_root,
+        "velocity_sigma": velocity_sigma,
+        "T": tilt.T,
+        "tilt_sigma": tilt.sigma,
+        "tilt_of_bias": tilt.of_bias,
+        "heading": heading.angle,
+        "heading_sigma": heading.sigma,
+        "heading_of_tilt": heading.of_tilt,
+        "lever_B": sensors.gnss.primary_antenna_B,
+        "accel_bias_sigma": imu.accel_bias_sigma,
+        "gyro_bias_sigma": imu.gyro_bias_sigma,
+        "slow_states": len(slow),
+    }
+    for name, value in given.items():
+        record[name] = value
+    record["slow_sigma"][0, : len(slow)] = slow
     for place, gain in heading.of_slow.items():
-        e[2, _D + place] = gain * slow[place]
-    variance, k = float(e[2] @ e[2]), tilt.T[:, 2]
-    turned = bias * math.sqrt(variance)  # an error of the tilt by one of the heading
-    third = math.sqrt(15.0 * variance**3) / 6.0 * math.hypot(k[0], k[1])
-    e[0, _E] = e[1, _E + 1] = math.hypot(tilt.sigma, turned, third)
-    e = tilt.T @ e
-    q = np.array([k[1] * k[2], -k[0] * k[2], -k[0] * k[1]])
-    e[:, n] = math.sqrt(0.75) * variance * q
-    G[_E : _E + 3] = e
-    x, y, z = lever
-    G[_R : _R + 3] += R_BI.T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ e
-    for first, sigma in ((_BA, imu.accel_bias_sigma), (_BG, imu.gyro_bias_sigma)):
-        G[first : first + 3, first : first + 3] = sigma * np.eye(3)
-    G[_D:, _D:n] = np.diag(slow)
-    return FirstEstimate(antenna_I - R_BI.T @ lever, velocity, R_BI, lower_factor(G))
+        record["heading_of_slow"][0, place] = gain
+    found, n = record[0], _D + len(slow)
+    start_level(found)
+    factor = found["factor"][:n, :n].copy()
+    return FirstEstimate(found["position"].copy(), velocity, found["R_BI"].copy(), factor)
 
 
 def state_at_rest(

@@ -19,6 +19,7 @@ from quad_gym.kernels.simd.addresses import (
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
 from quad_gym.kernels.simd.lanes import all_of, any_of, select
 from quad_gym.records import (
+    EXCHANGE_BLOCK,
     FIRST_BLOCK,
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
@@ -59,6 +60,7 @@ _SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
 _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
 _RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
+_EXCHANGE, _EXCHANGE_PITCH = int(Call.EXCHANGE), EXCHANGE_BLOCK.itemsize
 _SHOWN, _SHOWN_PITCH = int(Call.SHOWN), int(Call.SHOWN_PITCH)
 
 _CORE = offset_of(FLIGHT_BLOCK, "r")
@@ -66,7 +68,7 @@ _TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
 """Bytes of the fields that every step needs, which come first in a record's core."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
-_params_at = lanes_at(PARAMS_BLOCK)
+_exchange_at, _params_at = lanes_at(EXCHANGE_BLOCK), lanes_at(PARAMS_BLOCK)
 _work_at, _plain_work_at = lanes_at(WORK_BLOCK), record_at(WORK_BLOCK)
 _settings_at, _stages_at = record_at(SETTINGS), record_at(STAGE_TABLE)
 _floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u1")
@@ -205,6 +207,54 @@ def _fly_ticks(call, first, last, world, model, settings, work, stages):
 
 
 @kernel
+def _give_samples(call, index, flight):
+    """Copy the IMU sample of a block for the user's estimator."""
+    exchange = _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH)
+    for i in range(3):
+        exchange.gyro[i], exchange.accel[i] = flight.gyro[i], flight.accel[i]
+        exchange.w_meas[i] = flight.w_meas[i]
+
+
+@kernel
+def _give_estimate(call, index, flight):
+    """Copy the estimate of a block for the user's estimator, which begins some of its episodes."""
+    exchange = _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH)
+    for i in range(3):
+        exchange.r_hat[i], exchange.v_hat[i] = flight.r_hat[i], flight.v_hat[i]
+        exchange.b_a_hat[i], exchange.b_g_hat[i] = flight.b_a_hat[i], flight.b_g_hat[i]
+        exchange.w_hat[i] = flight.w_hat[i]
+        for j in range(3):
+            exchange.R_hat[i, j] = flight.R_hat[i, j]
+
+
+@kernel
+def _take_estimate(call, index, flight):
+    """Copy the estimate of a block from the user's estimator."""
+    exchange = _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH)
+    for i in range(3):
+        flight.r_hat[i], flight.v_hat[i] = exchange.r_hat[i], exchange.v_hat[i]
+        flight.b_a_hat[i], flight.b_g_hat[i] = exchange.b_a_hat[i], exchange.b_g_hat[i]
+        flight.w_hat[i] = exchange.w_hat[i]
+        for j in range(3):
+            flight.R_hat[i, j] = exchange.R_hat[i, j]
+
+
+@kernel
+def _fly_tick(call, first, last, left, world, model, settings, work, stages):
+    """Observe the user's estimate of the last tick, then fly one up to its measurements.
+
+    `left`: number of ticks after it in the control period.
+    """
+    for index in range(first, last):
+        flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+        if left < settings.ticks_per_step - 1:
+            _take_estimate(call, index, flight)
+            look(flight, world, model, settings, work, stages, 1)
+        move_and_measure(flight, world, model, settings, work, stages, min(left, 1))
+        _give_samples(call, index, flight)
+
+
+@kernel
 def _judge_step(flight, world, model, settings, work, stages):
     """Set reward and endings of a step; return masks of lanes that begin and end an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
@@ -224,16 +274,27 @@ def _judge_step(flight, world, model, settings, work, stages):
 
 @kernel
 def _end_block(call, index, command, nominal, true, believed, settings, work, stages):
-    """Reset the flights of one block, or set the results of the step that they have flown."""
+    """Reset the flights of one block, or set the results of the step that they have flown.
+
+    `Command.LOOK` only observes again.
+    """
     flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
     observing, written = call[_SIZE] > 0, False
-    if command == Command.RESET:
+    begins = work.mask < 0.0  # none
+    if command == Command.LOOK:
+        _take_estimate(call, index, flight)
+        work.mask = 1.0
+        run(Stage.LOOK, (flight, true, believed, settings, work, stages))
+    elif command == Command.RESET:
         resets, plain = _bytes_at(call[_RESETS], call[_COUNT]), _plain_work_at(call[_WORK])
         for lane in range(WIDTH):
             known = index * WIDTH + lane < call[_COUNT]
             plain.begins[lane] = resets[index * WIDTH + lane] if known else 1.0
         begins = work.begins > 0.0
     else:
+        if command == Command.FINISH:
+            _take_estimate(call, index, flight)
+            look(flight, true, believed, settings, work, stages, 0)
         begins, done = _judge_step(flight, true, believed, settings, work, stages)
         if settings.autoreset == Autoreset.SAME_STEP and any_of(begins):
             _write_results(call, flight, work, index)  # of the episodes that end
@@ -243,7 +304,10 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
             _write_rows(call, call[_FINALS], index, work, begins & done)
     if any_of(begins):
         begin_episode(flight, nominal, true, believed, settings, work, stages, begins)
-    if command != Command.RESET and not written:
+        if settings.own_estimator:
+            _give_samples(call, index, flight)
+            _give_estimate(call, index, flight)
+    if command != Command.RESET and command != Command.LOOK and not written:
         _write_results(call, flight, work, index)
     if observing:
         _observe(call, flight, true, believed, settings, work, stages)
@@ -258,15 +322,19 @@ def _fly_group(call, first, last, command, nominal, true, believed, settings, wo
 
     If flights have their own parameters, this is a single block.
     """
+    left = command - Command.TICK
     for index in range(first, last):
         flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
         run(Stage.IMPOSE, (flight, true, nominal, settings, work, stages))
         run(Stage.PLACE_FEATURES, (flight, true, believed, settings, work, stages))
         run(Stage.MEET_ROTORS, (flight, true, believed, settings, work, stages))
-        if command != Command.RESET:
+        if command == Command.STEP or left == settings.ticks_per_step - 1:
             _begin_step(call, index, settings)
-    if command != Command.RESET:
+    if command == Command.STEP:
         _fly_ticks(call, first, last, true, believed, settings, work, stages)
+    if left >= 0:
+        _fly_tick(call, first, last, left, true, believed, settings, work, stages)
+        return
     for index in range(first, last):
         _end_block(call, index, command, nominal, true, believed, settings, work, stages)
 
@@ -282,8 +350,8 @@ def fly(call, board, number, command, serving):
         call: (len(Call),) arguments of this thread; their memory outlives the call.
         board: Words that the threads share, see `board.py`.
         number: Index of this thread; thread 0 posts steps.
-        command: A `Command` to post, unless `serving`; if negative, nothing is posted, and the
-            thread waits for the last command.
+        command: A `Command` to post (TICK: plus a number), unless `serving`; if negative, nothing
+            is posted, and the thread waits for the last command.
         serving: True: fly the steps that thread 0 posts, until none comes for a while.
 
     Returns:

@@ -11,11 +11,12 @@ import numpy as np
 from numba import types
 from numba.np.numpy_support import from_dtype
 
-from quad_gym.kernels.compiling import Stage, call_stage, entry
+from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.align import initialize
 from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
+from quad_gym.kernels.filter.still import start_still
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.linalg import diagonal, load3, load4, load33, outer, store
 from quad_gym.kernels.obstacles.shapes import crosses, distance_from
@@ -41,6 +42,7 @@ from quad_gym.records import (
     PARAMS,
     PARAMS_BLOCK,
     SETTINGS,
+    START,
     WORK_BLOCK,
     Sensor,
 )
@@ -53,9 +55,15 @@ SENSORS_AND_VEHICLE = tuple(
     f"{__name__}:{name}"
     for name in (
         *("sense_features", "sense_gnss", "body_accelerations_in_air", "integrate_flight"),
-        *("sense_imu_average", "sense_imu", "body_accelerations", "wahba_of_vectors"),
-        *("step_biases", "step_gnss_drift", "draw_sensor_errors", "disturb_imu"),
-        *("turn_gnss_baseline", "limit_features", "nearest_obstacles", "hide_points"),
+        *("sense_imu_average", "sense_imu", "body_accelerations", "start_level"),
+        *("wahba_of_vectors", "step_biases", "step_gnss_drift", "draw_sensor_errors"),
+        *(
+            "disturb_imu",
+            "turn_gnss_baseline",
+            "limit_features",
+            "nearest_obstacles",
+            "hide_points",
+        ),
     )
 )
 """Names of the other entries of this module, the slowest to compile first."""
@@ -75,16 +83,28 @@ def _entry(*arguments, returns=types.none):
     return lambda function: entry(function, returns(*arguments))
 
 
+@kernel
+def begin_filter(block, params, settings, work, x_I):
+    """Start the filters of a block, see `start_filter`."""
+    flight, mask = lanes_of(block), lanes_of(work).mask > 0.0
+    forget_innovations(flight, settings.feature_count, mask)
+    initialize(flight, lanes_of(params), mask, x_I)
+    begin_slow(flight, lanes_of(params), settings, mask)
+
+
 @_entry(_BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
 def start_filter(blocks, params, settings, work, x_I):
     """Start the filters of blocks[0] from their first fixes, where `work.mask`.
 
     x_I: (3,) known direction of body x in I, or zeros if unknown.
     """
-    flight, mask = lanes_of(blocks[0]), lanes_of(work[0]).mask > 0.0
-    forget_innovations(flight, settings[0].feature_count, mask)
-    initialize(flight, lanes_of(params[0]), mask, load3(x_I))
-    begin_slow(flight, lanes_of(params[0]), settings[0], mask)
+    begin_filter(blocks[0], params[0], settings[0], work[0], load3(x_I))
+
+
+@_entry(from_dtype(START))
+def start_level(start):
+    """Compute the first estimate of a vehicle of known tilt, from a START record."""
+    start_still(start)
 
 
 @_entry(

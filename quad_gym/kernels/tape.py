@@ -163,6 +163,32 @@ def _replace_noise(p, m, own):
 
 
 @kernel
+def predict_sample(flight, params, ticks, steps, settings, work, table, mask, sample):
+    """Propagate the filters of a block over the time of a sample; see `run_tape`."""
+    p, tick, scratch = lanes_of(params), lanes_of(ticks), lanes_of(work)
+    if sample.dt == ticks.dt[0]:
+        _set_tick(p, tick, settings.slow_states)
+    else:
+        _set_step(p, tick, lanes_of(steps), settings.slow_states, sample.dt)
+    _take_sample(flight, tick, sample)
+    scratch.mask = mask
+    features = settings.feature_count
+    call_stage(table, _PREDICT_STAGE, flight, p, p, settings, scratch, features)
+
+
+@kernel
+def update_with(flight, params, ticks, steps, settings, work, table, mask, measurement):
+    """Update the filters of a block with the measurements of an instant; see `run_tape`."""
+    p, tick, scratch = lanes_of(params), lanes_of(ticks), lanes_of(work)
+    features = settings.feature_count
+    _set_tick(p, tick, settings.slow_states)
+    _take_measurement(flight, lanes_of(steps), measurement, features)
+    _replace_noise(p, measurement, tick)
+    scratch.mask = mask
+    call_stage(table, _UPDATE_STAGE, flight, p, p, settings, scratch, features)
+
+
+@kernel
 def _store3(address, place, v):
     """Write three lanes from a place of a row on; return the next place."""
     for i in range(3):
@@ -171,7 +197,7 @@ def _store3(address, place, v):
 
 
 @kernel
-def _keep(flight, address):
+def keep_estimate(flight, address):
     """Store the estimate in a row, see KEPT."""
     place = _store3(address, 0, flight.r_hat)
     place = _store3(address, place, flight.v_hat)
@@ -242,27 +268,34 @@ def run_tape(
         kept: Address of the rows of estimates.
         reported: Address of the rows of innovations.
     """
-    flight, scratch = lanes_of(flights[0]), lanes_of(work[0])
-    p, tick, step = lanes_of(params[0]), lanes_of(ticks[0]), lanes_of(steps[0])
-    mask, features = scratch.mask, settings[0].feature_count
-    slow_states = settings[0].slow_states
+    flight, mask = lanes_of(flights[0]), lanes_of(work[0]).mask
     row = REPORTED * len(blocks) * _LANES
     for k in range(len(operations)):
         code, index, target = operations[k].code, operations[k].index, operations[k].target
         if code == _PREDICT:
-            if samples[index].dt == ticks[0].dt[0]:
-                _set_tick(p, tick, slow_states)
-            else:
-                _set_step(p, tick, step, slow_states, samples[index].dt)
-            _take_sample(flight, tick, samples[index])
-            scratch.mask = mask
-            call_stage(table[0], _PREDICT_STAGE, flight, p, p, settings[0], scratch, features)
+            predict_sample(
+                flight,
+                params[0],
+                ticks[0],
+                steps[0],
+                settings[0],
+                work[0],
+                table[0],
+                mask,
+                samples[index],
+            )
         elif code == _UPDATE:
-            _set_tick(p, tick, slow_states)
-            _take_measurement(flight, step, measurements[index], features)
-            _replace_noise(p, measurements[index], tick)
-            scratch.mask = mask
-            call_stage(table[0], _UPDATE_STAGE, flight, p, p, settings[0], scratch, features)
+            update_with(
+                flight,
+                params[0],
+                ticks[0],
+                steps[0],
+                settings[0],
+                work[0],
+                table[0],
+                mask,
+                measurements[index],
+            )
             if target >= 0:
                 _report(flight, blocks, reported + target * row)
         elif code == _COPY:
@@ -272,4 +305,4 @@ def run_tape(
             for i in range(len(memory)):
                 memory[i] = slots[target, i]
         elif code == _KEEP:
-            _keep(flight, kept + target * KEPT * _LANES)
+            keep_estimate(flight, kept + target * KEPT * _LANES)

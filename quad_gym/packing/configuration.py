@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +15,19 @@ from quad_gym.params import checks as check
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.draw_limits import check_draws
+from quad_gym.params.filter import FilterParams
 from quad_gym.params.randomization import DrawingTable, Randomization
 from quad_gym.params.randomization import Given as Drawn
 from quad_gym.params.resolved import Resolved, resolving
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import sensor_suite
+from quad_gym.params.suites import ALL_SUITES, sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
+
+if TYPE_CHECKING:
+    from quad_gym.estimation.own import Estimator
 
 MOST_FLIGHTS = 10**7
 """Largest number of flights in a batch."""
@@ -85,6 +90,9 @@ class FlightConfiguration:
     """start of the next episode after one has ended"""
     run_filter: bool | None = None
     """True: sensors and filter run; None: they run if another argument needs them"""
+    estimator: "Estimator | type[Estimator] | str | None" = None
+    """a user's `quad_gym.Estimator` in place of the filter of the sensors, its class, or
+    "module:Class" of either; see `quad_gym.estimation.own`"""
     filter_start: str = "cold"
     """"cold": the filter starts from its first fix; "warm": it has converged in
     `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn from
@@ -146,8 +154,11 @@ class FlightConfiguration:
                     f"{name} must not be given with Control.{self.control.name}: it uses none"
                 )
         if self.filters:
+            if self.estimator is not None:
+                self._require_effect_on_own()
             return
         for name, value, idle in (
+            ("estimator", self.estimator, None),
             ("include_std", self.include_std, False),
             ("innovations", self.innovations, False),
             ("truncate_when_diverged", self.task.truncate_when_diverged, False),
@@ -155,6 +166,26 @@ class FlightConfiguration:
         ):
             if value != idle:
                 raise ValueError(f"{name} needs a filter, and none runs here, got {value!r}")
+
+    def _require_effect_on_own(self) -> None:
+        """Refuse arguments that have an effect on the built-in filter only."""
+        for name, value in (
+            ("innovations", self.innovations),
+            ("truncate_when_diverged", self.task.truncate_when_diverged),
+        ):
+            if value:
+                raise ValueError(
+                    f"{name} has no effect with an own estimator, and must not be given"
+                )
+        presets = [sensor_suite(name).estimator for name in ALL_SUITES]
+        for field in fields(FilterParams):
+            value = getattr(self.sensors.estimator, field.name)
+            chosen = all(value != getattr(preset, field.name) for preset in presets)
+            if chosen and not field.name.startswith("initial") and field.name != "reuse_first_fix":
+                raise ValueError(
+                    f"SensorSuite.estimator.{field.name} has no effect with an own estimator, and "
+                    f"must have the value of a preset, got {value!r}"
+                )
 
     @property
     def pd_gains(self) -> PDGains:

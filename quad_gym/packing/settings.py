@@ -44,6 +44,7 @@ def settings_record(c: FlightConfiguration) -> NDArray[Any]:
     s["include_std"], s["privileged"] = c.include_std, c.privileged
     s["autoreset"] = Autoreset.DISABLED if c.begins_after_step else c.autoreset
     s["run_filter"], s["reuse_first_fix"] = c.filters, assumed.estimator.reuse_first_fix
+    s["own_estimator"] = c.estimator is not None
     draws_lever = {"lever_arm_B", "center_of_mass_B"} & set(c.randomization.names)
     lever_arm = lever_form(assumed.imu, c.randomization.known and bool(draws_lever))
     s["form"] = form_of(assumed.estimator, c.keeps_innovations, lever_arm)

@@ -5,6 +5,8 @@ import difflib
 import importlib
 import inspect
 import math
+import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from types import NoneType, UnionType
@@ -189,6 +191,53 @@ def instance(name: str, value: T, kind: type) -> T:
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be a {kind.__name__}, got {value!r}")
     return value
+
+
+_Kind = TypeVar("_Kind")
+
+
+def own(name: str, given: Any, kind: type[_Kind]) -> _Kind:
+    """Return an object of a class that users extend.
+
+    Args:
+        name: Name of the argument.
+        given: An instance; a subclass, which is instantiated without arguments; or "module:name" of
+            either. Modules in the working directory are found, too.
+        kind: The class.
+
+    Raises:
+        ValueError: If it is none of these.
+    """
+    found = _named(name, given, kind.__name__) if isinstance(given, str) else given
+    if isinstance(found, type) and issubclass(found, kind):
+        found = found()
+    if not isinstance(found, kind):
+        raise ValueError(
+            f'{name} must be a quad_gym.{kind.__name__} or its "module:name", got {given!r}'
+        )
+    return found
+
+
+def _named(argument: str, name: str, kind: str) -> Any:
+    """Return the object specified by "module:name".
+
+    Raises:
+        ValueError: If the module or the name in it does not exist.
+    """
+    module, colon, attribute = name.partition(":")
+    if not (colon and module and attribute):
+        raise ValueError(f'{argument} must be "module:name" of a quad_gym.{kind}, got {name!r}')
+    here = os.getcwd()
+    added = here not in sys.path and "" not in sys.path
+    if added:  # console commands do not have the working directory on the path
+        sys.path.insert(0, here)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{argument} must name a quad_gym.{kind}, got {name!r}: {error}") from None
+    finally:
+        if added:
+            sys.path.remove(here)
 
 
 def choice(name: str, value: Any, choices: Sequence[str]) -> str:

@@ -28,6 +28,9 @@ class MagnetometerParams(AidParams):
     """standard deviation of the vehicle's own field that calibration leaves, per axis, constant in
     a flight [T]; the default is 2.4 degrees of heading; engineering judgment. The filter estimates
     this field in three augmented states"""
+    hard_iron_tau: Annotated[float, check.positive_or_infinite] = math.inf
+    """correlation time of this field [s]: currents of motors change with thrust and attitude, and
+    their field with them; infinite: constant in a flight"""
     soft_iron_sigma: Annotated[float, check.between(0.0, 1.0)] = 0.0
     """standard deviation of each element of D, constant in a flight [-]; the filter does not
     estimate D, but assumes hard iron larger by its effect on the field"""
@@ -66,12 +69,13 @@ class MagnetometerParams(AidParams):
     @property
     def slow_vector(self) -> SlowError:
         """Hard iron, per axis [T]."""
-        return SlowError(self.hard_iron_sigma)
+        return SlowError(self.hard_iron_sigma, self.hard_iron_tau)
 
     @property
     def assumed_vector(self) -> SlowError:
         """Hard iron, increased by the effect of soft iron on the field, per axis [T]."""
-        return SlowError(math.hypot(self.hard_iron_sigma, self.soft_iron_sigma * self.strength))
+        sigma = math.hypot(self.hard_iron_sigma, self.soft_iron_sigma * self.strength)
+        return SlowError(sigma, self.hard_iron_tau)
 
     @property
     def slow_scalar(self) -> SlowError:

@@ -29,6 +29,13 @@ def _times(x: float, y: float) -> float:
     return x * y
 
 
+def turned(matrix: ArrayLike, vector: ArrayLike) -> Floats:
+    """Product of a matrix (n, 3) and a vector (3,), with plain sums, as C code computes it."""
+    x, y, z = np.asarray(vector, np.float64).tolist()
+    rows = np.asarray(matrix, np.float64).tolist()
+    return np.array([a * x + b * y + c * z for a, b, c in rows])
+
+
 def inverse(matrix: ArrayLike) -> Floats:
     """Inverse of a regular matrix (n, n), by elimination with partial pivoting."""
     rows = np.asarray(matrix, np.float64).tolist()

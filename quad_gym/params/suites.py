@@ -294,23 +294,26 @@ FLOWN = _changed(
     CONSUMER,
     # noise that explains real flights of a small quadrotor: "quad122a" of P. Riseborough's
     # InertialNav (BSD-3-Clause), an ArduPilot vehicle with a disturbed compass, replayed with the
-    # delays in its log. Roll and pitch differ by 1.2 degrees rms from the autopilot's estimate
-    imu={"accel_noise_density": 0.1, "gyro_noise_density": 0.002},
+    # delays in its log. Roll and pitch differ by 1.1 degrees rms from the autopilot's estimate
+    imu={"accel_noise_density": 0.1, "gyro_noise_density": 0.001, "accel_bias_sigma": 0.15},
     gnss={
         "rate": 5.0,
         "latency": 0.2,
-        "position_sigma_I": (0.5, 0.5, 1.0),
+        "position_sigma_I": (0.4, 0.4, 0.8),
         "drift_sigma_I": (1.5, 1.5, 2.2),
         "velocity_sigma": 0.3,
     },
     estimator={"initial_tilt_sigma": 0.05},
 ).replace(
-    barometer=BarometerParams(rate=10.0, noise_sigma=0.3, bias_sigma=3.0),
+    barometer=BarometerParams(rate=10.0, noise_sigma=0.2, bias_sigma=3.0),
     magnetometer=MagnetometerParams(
-        rate=10.0, noise_sigma=3.0 * MICROTESLA, hard_iron_sigma=2.4 * MICROTESLA
+        rate=10.0,
+        noise_sigma=1.5 * MICROTESLA,
+        hard_iron_sigma=2.4 * MICROTESLA,
+        hard_iron_tau=30.0,  # currents of the motors change
     ),
     noisy=NoisyObservationParams(
-        position=0.607, velocity=0.145, attitude=0.0111, body_rates=0.0303
+        position=0.572, velocity=0.136, attitude=0.0087, body_rates=0.0176
     ),  # measured, see above
 )
 """A hobby vehicle as it flies: `consumer` with noise that explains the log of a real flight."""

@@ -7,6 +7,7 @@ array copies.
 from quad_gym.records.call import *
 from quad_gym.records.draws import *
 from quad_gym.records.enums import *
+from quad_gym.records.exchange import *
 from quad_gym.records.flight import *
 from quad_gym.records.gathered import *
 from quad_gym.records.layout import *
@@ -16,6 +17,7 @@ from quad_gym.records.results import *
 from quad_gym.records.settings import *
 from quad_gym.records.shown import *
 from quad_gym.records.sizes import *
+from quad_gym.records.starts import *
 from quad_gym.records.streams import *
 from quad_gym.records.tape import *
 from quad_gym.records.work import *

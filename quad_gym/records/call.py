@@ -56,6 +56,8 @@ class Call(IntEnum):
     """(len(RESULTS), at least blocks WIDTH) float64, written in a STEP."""
     RESULT_PITCH = auto()
     """Bytes from one row of the results to the next."""
+    EXCHANGE = auto()
+    """EXCHANGE_BLOCK of each block of flights, for a user's estimator."""
     SHOWN = auto()
     """(SHOWN_SIZE, blocks WIDTH) float64, written if the setting `shown` is on."""
     SHOWN_PITCH = auto()

@@ -235,7 +235,15 @@ class Command(IntEnum):
     """Operation of a call of the batch kernel."""
 
     STEP = 0
+    """fly a control period"""
     RESET = 1
+    """begin episodes"""
+    FINISH = 2
+    """end a control period flown by TICK: observe the user's estimate, set results, observe"""
+    LOOK = 3
+    """observe again, after a user's estimator has begun episodes"""
+    TICK = 4
+    """fly one tick up to its measurements; TICK + k: k more follow in the control period"""
 
 
 class Supply(IntEnum):

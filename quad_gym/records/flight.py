@@ -78,6 +78,10 @@ _RAW_FIELDS = (
     Field("gyro_sum", (3,), "rad/s", "gyro, summed over the samples since the last step"),
     Field("accel_sum", (3,), "m/s^2", "accel, likewise"),
 )
+_OWN_FIELDS = (
+    # a user's estimator
+    Field("w_hat", (3,), "rad/s", "its body rates in B"),
+)
 _CORE_FIELDS = (
     # read and written at every tick: the truth, clocks, the random stream
     Field("r", (3,), "m", "position r_I of the center of mass"),
@@ -226,6 +230,7 @@ PARTS = (
     ("draws", _DRAW_FIELDS),
     ("actions", _ACTION_FIELDS),
     ("raw", _RAW_FIELDS),
+    ("own", _OWN_FIELDS),
     ("core", _CORE_FIELDS),
     ("filter", _FILTER_FIELDS),
     ("errors", _ERROR_FIELDS),

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.records.exchange import EXCHANGE_FIELDS
 from quad_gym.records.flight import FLIGHT_FIELDS, PARTS
 from quad_gym.records.params import PARAMS_FIELDS
 from quad_gym.records.settings import SETTINGS_FIELDS
@@ -29,6 +30,7 @@ def block_dtype(fields: tuple[Field, ...]) -> np.dtype:
 FLIGHT, FLIGHT_BLOCK = scalar_dtype(FLIGHT_FIELDS), block_dtype(FLIGHT_FIELDS)
 PARAMS, PARAMS_BLOCK = scalar_dtype(PARAMS_FIELDS), block_dtype(PARAMS_FIELDS)
 WORK, WORK_BLOCK = scalar_dtype(WORK_FIELDS), block_dtype(WORK_FIELDS)
+EXCHANGE_BLOCK = block_dtype(EXCHANGE_FIELDS)
 SETTINGS = scalar_dtype(SETTINGS_FIELDS)
 
 
@@ -76,3 +78,13 @@ def field_of_flights(blocks: NDArray[Any], name: str, count: int) -> NDArray[Any
     lane = values.ndim - 1
     values = values.transpose(0, lane, *range(1, lane)).copy()
     return values.reshape(-1, *values.shape[2:])[:count]
+
+
+def put_in_flights(blocks: NDArray[Any], name: str, values: NDArray[Any]) -> None:
+    """Write one field of the first flights from an array (count, ...)."""
+    target, whole, shape = blocks[name], len(values) // WIDTH, values.shape[1:]
+    last, axes = whole * WIDTH, range(2, 2 + len(shape))
+    target[:whole] = values[:last].reshape(whole, WIDTH, *shape).transpose(0, *axes, 1)
+    if last < len(values):
+        rest = values[last:]
+        target[whole, ..., : len(rest)] = rest.transpose(*range(1, rest.ndim), 0)

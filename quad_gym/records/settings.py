@@ -39,6 +39,7 @@ SETTINGS_FIELDS = (
     Field("imu_averages", (), "0 or 1", "whether IMU samples are averages over the tick", "i8"),
     Field("source", (), "-", "what the controller sees, see Source", "i8"),
     Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),
+    Field("own_estimator", (), "0 or 1", "whether a user's estimator replaces the filter", "i8"),
     Field("control", (), "-", "what the action means, see Control", "i8"),
     Field("action_delays", (), "steps", "the longest delay of an action, rounded up; 0: none", "i8"),
     Field("task", (), "-", "see TaskKind", "i8"),

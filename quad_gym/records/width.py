@@ -2,8 +2,8 @@
 
 import os
 
-WIDTHS = (2, 4, 8)
-"""Supported numbers of lanes."""
+WIDTHS = (1, 2, 4, 8)
+"""Supported numbers of lanes; 1 is for filters on other processors."""
 
 
 def lanes_of_machine() -> int:

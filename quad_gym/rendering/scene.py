@@ -294,9 +294,10 @@ class Scene:
         if not np.isfinite(believed).all():
             return
         view, canvas = self._view, self._canvas
-        if self._flight.estimated:
+        covariance, scale = self._now["covariance"][:3, :3], 1.0
+        if self._flight.estimated and np.isfinite(covariance).all():  # estimators may have none
             scale = ellipsoid_scale(self._flight) if self._magnified else 1.0
-            axes = scale * ellipsoid_axes(self._now["covariance"][:3, :3], SIGMAS)
+            axes = scale * ellipsoid_axes(covariance, SIGMAS)
             outline = ellipsoid_outline(believed, axes, view)
             canvas.polygon(outline, colors.VERMILLION, 0.16)
             canvas.line(outline, colors.VERMILLION, 1.2, closed=True)

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.state import State
 from quad_gym.params.checks import did_you_mean
 from quad_gym.tasks.fields import Group
-from quad_gym.tasks.state import State
 from quad_gym.tasks.task import Task, TaskError, label
 from quad_gym.tasks.view import VIEW_FIELDS, View
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.starts import checked_mask
+from quad_gym.batch.state import State
 from quad_gym.params import checks as check
 from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
 from quad_gym.tasks import answers
@@ -16,7 +17,6 @@ from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.observing import Joiner, Part
 from quad_gym.tasks.starts import Start, starts
-from quad_gym.tasks.state import State
 from quad_gym.tasks.task import METHODS, Task, label
 from quad_gym.tasks.view import View
 
@@ -286,29 +286,13 @@ class TaskBatch(ReadableBatch):
 
     def snapshot(self) -> NDArray[Any]:
         """Copy all flights and the task's state, for `restore`."""
-        flights = super().snapshot()
-        if not self._state.names:
-            return flights
-        kept, rows = np.zeros(len(flights), self._kind_of_snapshot), self._state.rows()
-        kept["flights"] = flights
-        kept["state"][self._block, self._lane] = rows
-        return kept
-
-    @property
-    def _kind_of_snapshot(self) -> np.dtype[Any]:
-        """Data type of a snapshot with the task's state."""
-        rows = (self._state.rows().dtype, (WIDTH,))
-        return np.dtype([("flights", self._blocks.dtype), ("state", *rows)])
+        return self._state.kept_with(super().snapshot())
 
     def restore(self, snapshot: NDArray[Any]) -> None:
         """Restore all flights from a snapshot of this batch, or of another one of equal size."""
-        if not self._state.names:
-            super().restore(snapshot)
-        elif getattr(snapshot, "dtype", None) != self._kind_of_snapshot:
-            raise ValueError(f"snapshot must be one of a batch with {label(self.own_task)}")
-        else:
-            super().restore(snapshot["flights"])
-            self._state.put(snapshot["state"][self._block, self._lane], np.ones(self.count, bool))
+        kind = super().snapshot().dtype
+        super().restore(self._state.flights_of(snapshot, kind, label(self.own_task)))
+        self._state.restore(snapshot)
         self._returns = self.record("episode_return")
         self.began = self.record("tick") == 0.0
         self._failed[:] = False

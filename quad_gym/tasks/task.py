@@ -1,15 +1,14 @@
 """`Task`: reward, endings, observation and reset defined by a user instead of the built-in ones."""
 
 import difflib
-import importlib
-import os
-import sys
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from quad_gym.params import checks as check
 
 if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
@@ -181,11 +180,7 @@ def resolve_task(given: Any) -> Task:
     Raises:
         ValueError: If it is none of these, or its attributes are invalid.
     """
-    found = _named(given) if isinstance(given, str) else given
-    if isinstance(found, type) and issubclass(found, Task):
-        found = found()
-    if not isinstance(found, Task):
-        raise ValueError(f'task must be a quad_gym.Task or its "module:name", got {given!r}')
+    found = check.own("task", given, Task)
     for name in ("replaces_observation", "privileged"):
         if not isinstance(getattr(found, name), bool):
             raise ValueError(
@@ -200,24 +195,6 @@ def resolve_task(given: Any) -> Task:
                 f"got {part!r} for {name!r}"
             )
     return found
-
-
-def _named(name: str) -> Any:
-    """Object specified by "module:name"."""
-    module, colon, attribute = name.partition(":")
-    if not (colon and module and attribute):
-        raise ValueError(f'task must be "module:name" of a quad_gym.Task, got {name!r}')
-    here = os.getcwd()
-    added = here not in sys.path and "" not in sys.path
-    if added:  # console commands do not have the working directory on the path
-        sys.path.insert(0, here)
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"task must name a quad_gym.Task, got {name!r}: {error}") from None
-    finally:
-        if added:
-            sys.path.remove(here)
 
 
 def label(task: Task) -> str:

@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.state import State
 from quad_gym.params.world import WorldParams
 from quad_gym.tasks.fields import Group, GroupField, field, quantity, shown
 from quad_gym.tasks.groups import BuiltinView, EstimateView, MeasuredView, ObservedView, TruthView
 from quad_gym.tasks.memory import ReadableBatch
-from quad_gym.tasks.state import State
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]

@@ -13,7 +13,7 @@ minari = pytest.importorskip("minari")
 SHORT = {"max_episode_steps": 20}
 
 
-def test_minari_keeps_flights_of_pd_and_makes_their_environment_again(tmp_path, monkeypatch):
+def test_minari_keeps_flights_and_makes_their_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     env = minari.DataCollector(gymnasium.make("QuadGym/Hover-v0", **SHORT), record_infos=True)
     policy = PDPolicy(env, gains="tuned")

@@ -6,13 +6,13 @@ import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
 from quad_gym.faults import RotorLoss
 from quad_gym.faults.presets import faults_of
+from tests.estimators import Certain, Simple
 from tests.golden.flights import AIDED
 from tests.tasks.tasks import Chase, Near
 
 LAB, STANDARD, RTK = (quad_gym.sensor_suite(name) for name in ("lab", "standard", "rtk"))
 AVERAGES = LAB.replace(
-    imu=LAB.imu.replace(samples="average"),
-    estimator=LAB.estimator.replace(integration="midpoint"),
+    imu=LAB.imu.replace(samples="average"), estimator=LAB.estimator.replace(integration="midpoint")
 )
 LATE = RTK.replace(gnss=RTK.gnss.replace(latency=0.1), camera=RTK.camera.replace(latency=0.04))
 GROUND = WorldParams(ground=quad_gym.GroundParams(), wind_I=(2.0, 0.0, 0.0))
@@ -87,10 +87,7 @@ CONFIGURATIONS = {
     "aided": ("circle", {"sensors": AIDED, "innovations": True, "observation": "measurements"}),
     "ekf": ("hover", {"sensors": "crazyflie", "vehicle": "crazyflie", "estimator": "ekf"}),
     "drawn": ("hover", DRAWN),
-    "drawn and known": (
-        "waypoints",
-        {**DRAWN, "randomization": Randomization(DRAWS, known=True)},
-    ),
+    "drawn and known": ("waypoints", {**DRAWN, "randomization": Randomization(DRAWS, known=True)}),
     "faults": ("hover", {**FAULTY, "innovations": True}),
     "faults on a course": ("waypoints", FAULTY),
     "weak rotors": ("hover", {"faults": RotorLoss(rate=4.0, duration=0.2, share=(0.2, 0.6))}),
@@ -107,6 +104,11 @@ CONFIGURATIONS = {
     "drawn features": (
         "hover",
         {"sensors": "indoor", "randomization": FEATURES, "privileged": True, "task": Near()},
+    ),
+    "own estimator": ("circle", {"estimator": Simple(), "sensors": LATE, "action": "attitude"}),
+    "own estimator with faults": (
+        "waypoints",
+        FAULTY | {"estimator": Certain, "include_std": True, "control_rate": 100, "task": Near()},
     ),
     "own task": ("hover", {"task": Chase(), "innovations": True}),
 }

@@ -1,23 +1,19 @@
 """The environments among processes, threads and caches that are not theirs alone."""
 
-import contextlib
 import functools
 import os
 import pickle
 import select
-import shutil
 import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-import quad_gym
 from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.kernels.compiling import cores
@@ -141,60 +137,6 @@ def test_an_environment_travels_to_a_worker_in_mid_episode():
         timeout=PATIENCE,
     )
     assert_same(pickle.loads(done.stdout), further(env))
-
-
-# ---- the cache of compiled kernels ---------------------------------------------------------------
-
-SMALL = (
-    "import numpy as np; from quad_gym.estimation import solve_wahba;"
-    "R = solve_wahba(np.ones(3), np.eye(3), np.eye(3)[[1, 2, 0]]);"
-    "print(np.abs(R @ np.eye(3).T - np.eye(3)[[1, 2, 0]].T).max() < 1e-12)"
-)
-"""A program that compiles one small kernel."""
-
-
-def start(cache, **environment):
-    return subprocess.Popen(
-        [sys.executable, "-c", SMALL],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "NUMBA_CACHE_DIR": str(cache), **environment},
-    )
-
-
-def outcome(process):
-    """Whether it compiled rather than loaded; fails if it did not compute the right thing."""
-    output, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, errors
-    assert output.strip() == "True"
-    return "compiling" in errors
-
-
-@pytest.mark.slow  # nine processes; which edits count is in tests/unit/compiling/test_digest.py
-def test_changed_kernel_is_compiled_again(tmp_path):
-    copy = tmp_path / "quad_gym"
-    source = Path(quad_gym.__file__).parent
-    shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
-
-    def compiles():
-        with contextlib.chdir(tmp_path):  # where the copy is imported from
-            return outcome(start(tmp_path / "cache", PYTHONPATH=str(tmp_path)))
-
-    assert compiles()
-    assert not compiles()
-    for room, change, stale in (
-        ("maths/rotation.py", "# a comment", False),
-        ("task/reference.py", "_CHANGED = True", False),
-        ("maths/rotation.py", "_CHANGED = True", True),
-    ):
-        with (copy / "kernels" / room).open("a") as file:
-            file.write(f"\n{change}\n")
-        assert compiles() == stale
-        assert not compiles()
-
-
-# ---- cores and imports ---------------------------------------------------------------------------
 
 
 def test_cores_are_limited_by_quota_affinity_and_variable(monkeypatch):

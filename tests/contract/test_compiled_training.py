@@ -178,7 +178,7 @@ class SameDraws:
         return step * self.flights + flight
 
 
-def test_with_the_same_draws_a_training_is_that_of_stable_baselines():
+def test_training_with_the_same_draws_equals_stable_baselines():
     """Rollouts, episodes that end and are cut off, rewards, epochs, learning rate, all together."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("stable_baselines3")

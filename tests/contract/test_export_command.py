@@ -1,7 +1,5 @@
 """`quad-gym export`: what it writes, what it says, what it refuses."""
 
-import json
-
 import pytest
 
 from quad_gym.commands.main import main
@@ -46,11 +44,12 @@ def test_names_of_files_become_names_of_functions(tmp_path):
     assert "int policy_2nd_try(" in (tmp_path / "2nd-try.c").read_text()
 
 
-@pytest.mark.parametrize(("kind", "suffix"), [("json", ".json"), ("header", ".h")])
-def test_a_filter_becomes_json_or_a_header(tmp_path, kind, suffix):
-    assert main(f"export filter --sensors indoor --to {kind}".split()) == 0
-    text = (tmp_path / "results" / "export" / f"filter_indoor{suffix}").read_text()
-    if kind == "json":
-        assert json.loads(text)["choices"]["kind"] == "ukf"
-    else:
-        assert "static const double dt = 0.005;" in text
+def test_a_filter_becomes_a_folder_with_a_library(tmp_path, capsys):
+    assert main(["export", "filter", "--sensors", "indoor", "--target", "aarch64"]) == 0
+    folder = tmp_path / "results" / "export" / "filter_indoor_aarch64"
+    names = ["CMakeLists.txt", "README.md", "libquad_gym_filter.a", "main.c", "quad_gym_filter.h"]
+    assert sorted(file.name for file in folder.iterdir()) == names
+    assert "int qg_update_pixels(" in (folder / "quad_gym_filter.h").read_text()
+    assert "README.md" in capsys.readouterr().out
+    line = "export filter --sensors indoor --target aarch64"
+    assert "libquad_gym_filter.a exists: use --overwrite" in refused(line, capsys)

@@ -31,8 +31,7 @@ def fly(*options, cwd, **environment):
 def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
     size = ("--size", 320, 240, "--fps", 5)
     done = fly(
-        *("hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif"),
-        cwd=tmp_path,
+        *("hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif"), cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
     assert "time limit after 1.00 s" in done.stdout

@@ -136,8 +136,6 @@ def test_invalid_action_before_reset_raises_reset_needed():
         env.step(np.full(4, np.nan))
 
 
-# ---- hundreds of them ----------------------------------------------------------------------------
-
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 rows = st.one_of(
     hnp.arrays(np.float64, 4, elements=numbers),

@@ -18,6 +18,7 @@ from quad_gym import faults as fault_kinds
 from quad_gym.faults.base import DirectedFault
 from quad_gym.records import Autoreset, Control
 from tests.builders import flat
+from tests.filter_states import at_rest
 
 RTK, INDOOR = quad_gym.sensor_suite("rtk"), quad_gym.sensor_suite("indoor")
 NUMBERS = [np.nan, np.inf, -np.inf, -1.0, 0.0, 10**400]
@@ -279,14 +280,7 @@ def test_fields_of_faults(kind, name):
 def test_arguments_of_filters(kind, method, name):
     good = {
         "initialize": {"gnss_position_G": np.ones(3), "gnss_baseline_G": [0.1, 0.1, 0.0]},
-        "set_state": {
-            "position": np.zeros(3),
-            "velocity": np.zeros(3),
-            "R_BI": np.eye(3),
-            "accel_bias": np.zeros(3),
-            "gyro_bias": np.zeros(3),
-            "covariance": np.eye(15) * 1e-2,
-        },
+        "set_state": at_rest(covariance=np.eye(15) * 1e-2),
         "update": {},
         "predict": {"gyro": np.zeros(3), "accel": np.array([0.0, 0.0, 9.8])},
     }

@@ -28,9 +28,6 @@ from quad_gym.records import Autoreset, Control, Source
 ROOT = Path(__file__).parents[2]
 
 
-# ---- names ---------------------------------------------------------------------------------------
-
-
 def test_dir_shows_every_public_name_and_no_internal_one():
     assert set(dir(quad_gym)) >= set(quad_gym.__all__)
     assert not {"register_all", "envs", "params", "records", "Any"} & set(dir(quad_gym))
@@ -43,9 +40,6 @@ def test_every_name_of_the_api_pages_is_public():
     found = re.findall(r"auto(?:class|function):: quad_gym\.(\w+)$", pages, flags=re.MULTILINE)
     assert len(found) > 30
     assert set(found) <= set(quad_gym.__all__)
-
-
-# ---- signatures ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -123,9 +117,6 @@ def test_a_type_checker_refuses_wrong_keywords(tmp_path):
     assert 'Unexpected keyword argument "obsevation"' in done.stdout
 
 
-# ---- what is refused -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("make", "meant"),
     [
@@ -182,18 +173,14 @@ def test_they_are_accepted_where_they_have_one(keywords):
     quad_gym.QuadEnv("hover", **keywords)
 
 
-def test_a_comparison_gives_the_filters_keywords_where_a_filter_runs(tmp_path):
+def test_comparison_gives_filter_keywords_where_a_filter_runs(tmp_path):
     args = evaluate.EvaluateArgs(env={"filter_start": "warm", "estimator": "ekf"}, output=tmp_path)
     for observation in ("truth", "noisy", "estimate"):
         evaluate.make_flights(args, observation, 1, "pd").close()
     given = {**args.env, "sensors": "rtk"}
-    assert with_effect({**given, "observation": "truth"}) == {
-        **{"observation": "truth", "sensors": "rtk"}
-    }
-    assert with_effect({**given, "observation": "estimate"}) == {
-        **{"observation": "estimate"},
-        **given,
-    }
+    truth, estimate = ({"observation": name} for name in ("truth", "estimate"))
+    assert with_effect(given | truth) == truth | {"sensors": "rtk"}
+    assert with_effect(given | estimate) == estimate | given
 
 
 @pytest.mark.parametrize(

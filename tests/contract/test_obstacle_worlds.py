@@ -41,23 +41,6 @@ def test_hitting_a_wall_is_a_crash_and_info_says_so():
     assert Crash()(view)[0] == 1.0
 
 
-def test_leaving_the_geofence_is_a_crash_too():
-    fenced = OBSTACLES.replace(obstacles=())
-    nearest = quad_gym.Task.of(
-        observe=lambda view: {"wall_distance": view.observed.obstacle_distance}
-    )
-    env = QuadEnv(base="hover", world=fenced, observation="truth", task=nearest)
-    with pytest.raises(quad_gym.TaskError, match=r"finite 'wall_distance', got array\(\[inf\]\)"):
-        env.reset(seed=0)
-    env = single_env(seed=0, world=fenced, observation="truth", out_of_bounds=50.0)
-    for _ in range(400):
-        *_, terminated, truncated, info = env.step(EASTWARD)
-        if terminated or truncated:
-            break
-    assert terminated
-    assert info["ending"] == Ending.LEFT_GEOFENCE
-
-
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
     env = gymnasium.make_vec(
@@ -103,19 +86,6 @@ class Peeking(quad_gym.Task):
 def test_the_true_distance_is_hidden_from_the_controller():
     with pytest.raises(quad_gym.TaskError, match="observe cannot read the truth"):
         QuadEnv(base="hover", world=OBSTACLES, task=Peeking)
-
-
-def test_starts_within_obstacles_are_refused():
-    in_wall = quad_gym.Task.of(reset=lambda view, rng: {"position": (5.5, 0.0, 1.0)})
-    with pytest.raises(quad_gym.TaskError, match="reset returned an invalid start: position"):
-        hovering(2, task=in_wall).reset(seed=0)
-    env = hovering(2)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="position must be farther than vehicle_radius"):
-        env.reset(options={"position": (2.0, 0.5, 1.0)})
-
-
-# ---- records and pictures -----------------------------------------------------------------------
 
 
 def test_a_flight_keeps_its_obstacles(tmp_path):

@@ -12,8 +12,7 @@ from baselines.policies import load_policy
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.evaluation import evaluate, roll_out
-from quad_gym.params.control import PDGains
+from quad_gym.evaluation import roll_out
 from quad_gym.records import Control
 from tests.contract.comparing import ACTIONS
 
@@ -191,21 +190,9 @@ def test_other_environments_and_gains_are_refused():
         PDPolicy(QuadEnv("hover"), gains="huge")
 
 
-@pytest.mark.parametrize("action", ["motor", "wrench"])
-def test_torques_at_a_low_rate_are_warned_of(action):
-    with pytest.warns(UserWarning, match="Hz"):
+@pytest.mark.parametrize("action", ["motor", "wrench", "ctbr", "attitude"])
+def test_low_rates_without_inner_loops_are_warned_of(action):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         PDPolicy(QuadEnv("hover", action=action, control_rate=50))
-
-
-@pytest.mark.parametrize("action", ["ctbr", "attitude"])
-def test_nothing_is_warned_of_where_inner_loops_run(action):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        PDPolicy(QuadEnv("hover", action=action, control_rate=50))
-
-
-def test_gains_may_be_given_as_an_object():
-    episodes = evaluate(
-        PDPolicy(QuadEnv("hover"), gains=PDGains(position=7.0)), TRACKING[0], episodes=8
-    )
-    assert not episodes.crashed.any()
+    assert ["Hz" in str(w.message) for w in caught] == [True] * (action in ("motor", "wrench"))

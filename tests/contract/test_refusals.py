@@ -83,16 +83,8 @@ REFUSED = [
     ("evaluate trajectory --policy pretrained", "no policy is included for QuadGym/Trajectory-v0"),
     ("evaluate --observation measurements", "select a --policy that was trained on measurements"),
     ("evaluate --observation estimat", "did you mean estimate?"),
-    (
-        "evaluate --policy pretrained --env include_std=true",
-        "trained with observations of 9 fields, but the environment returns 14 (it adds "
-        "position_sigma, velocity_sigma, attitude_sigma, accel_bias_sigma, gyro_bias_sigma):",
-    ),
-    (
-        "evaluate --policy pretrained --env layout=absolute",
-        "but the environment returns 13 (it lacks position_error, velocity_error, up, heading "
-        "and adds position, ",
-    ),
+    ("evaluate --policy pretrained --env include_std=true", "returns 14 (it adds position_sigma,"),
+    ("evaluate --policy pretrained --env layout=absolute", "13 (it lacks position_error, velocit"),
     ("evaluate --policy pretrained --env action=motor", "trained with action ctbr"),
     ("evaluate hover --policy pretrained --env wings=2", "wings is not"),
     ("evaluate --env acton=motor", "did you mean action?"),
@@ -119,7 +111,7 @@ REFUSED = [
     ("export policy pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
     ("export policy pretrained QuadGym/Hover-v0 --output /dev/null/it.c", "cannot write"),
     ("export policy pretrained hover --env action=motor", "trained with action ctbr"),
-    ("export filter --sensors gps --to json", "sensors must be one of"),
+    ("export filter --sensors gps", "sensors must be one of"),
 ]
 NAMED = {
     "benchmark": (
@@ -179,20 +171,14 @@ def test_a_wrong_suite_is_refused_before_a_missing_package(monkeypatch):
     assert "did you mean rtk?" in plain(done.stderr)
 
 
-def test_help_lists_all_commands():
-    done = console_commands.run("--help")
-    export = console_commands.run("export", "--help")
-    assert (done.returncode, export.returncode) == (0, 0)
-    for command, text in COMMANDS.items():
-        assert text in plain((export if " " in command else done).stdout)
-
-
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_every_command_has_its_description(command):
+def test_help_has_all_commands_and_their_descriptions(command):
     done = console_commands.run(*command.split(), "--help")
     assert done.returncode == 0
     assert f"usage: quad-gym {command}" in done.stdout
     assert COMMANDS[command] not in plain(done.stdout)  # the full text instead
+    above = console_commands.run(*command.split()[:-1], "--help")
+    assert COMMANDS[command] in plain(above.stdout)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

@@ -16,9 +16,6 @@ from tests.contract.configurations import CONFIGURATIONS
 TASKS = tuple(quad_gym.IDS.values())
 
 
-# ---- seeds and options ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_the_seed_of_reset_is_honoured_at_any_time(name):
     base, keywords = CONFIGURATIONS[name]
@@ -48,9 +45,6 @@ def test_the_options_of_reset_are_honoured_at_any_time(task):
         assert yaw == pytest.approx(0.7, abs=0.02)
     env.reset()
     assert (env.flights.batch.record("r")[0] != start["position"]).all()
-
-
-# ---- global state --------------------------------------------------------------------------------
 
 
 def global_state():
@@ -83,8 +77,6 @@ def test_the_global_random_states_do_not_touch_the_flights():
         seen.append([env.reset(seed=9)[0], env.step(np.zeros(4))[0], env.reset()[0]])
     assert_same(seen[0], seen[1])
 
-
-# ---- keywords ------------------------------------------------------------------------------------
 
 NONSENSE = [
     {"frameskip": 1},

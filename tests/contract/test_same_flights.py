@@ -63,9 +63,6 @@ def test_another_process_flies_the_same_flights():
     assert other.stdout.strip() == digest()
 
 
-# ---- copies in mid-episode -----------------------------------------------------------------------
-
-
 def pickled(env):
     return pickle.loads(pickle.dumps(env))
 

@@ -42,12 +42,9 @@ def test_training_validation_and_test_share_no_stream():
         assert_disjoint([keys[purpose, seed] for seed in SEEDS])
 
 
-def test_seeds_of_a_test_are_those_that_are_documented():
+def test_blocks_are_as_documented_and_end_before_the_next_begins():
     assert list(flight_seeds("test", 0, 1000)) == list(range(1000))
     assert first_seed("test", 17, 5) == 17
-
-
-def test_blocks_end_before_the_next_begins_at_their_limits():
     assert flight_seeds("test", TEST_END - 4, 4)[-1] < flight_seeds("training", 0, 1)[0]
     assert flight_seeds("training", 3, BLOCK)[-1] < flight_seeds("training", 4, 1)[0]
     assert flight_seeds("training", MAX_SEED, BLOCK)[-1] < flight_seeds("validation", 0, 1)[0]
@@ -80,13 +77,8 @@ def test_trainings_are_judged_on_flights_of_their_own_block():
 
     flown = []
     for seed in (0, 4):
-        plan = Plan(
-            recipe=recipe("QuadGym/Circle-v0").replace(n_envs=16),
-            environment={"duration": 0.1},
-            seed=seed,
-            threads=1,
-            episodes=8,
-        )
+        small = {"environment": {"duration": 0.1}, "threads": 1, "episodes": 8}
+        plan = Plan(recipe=recipe("QuadGym/Circle-v0").replace(n_envs=16), seed=seed, **small)
         env, judge = plan.make_flights(), plan.make_judge()
         model = make_model(plan, env)
         env.reset()
@@ -102,16 +94,13 @@ def test_trainings_are_judged_on_flights_of_their_own_block():
     assert_disjoint([*flown, keys_of(range(1000))])
 
 
-# ---- pairs ---------------------------------------------------------------------------------------
-
 START = ("r", "v", "q", "w", "b_a", "b_g", "ref_cos", "ref_sin", "key")
 
 
 def starts_of(rng, episodes, count=11):
     """Starts of episodes with random actions and lengths."""
-    task = TaskParams(
-        kind="random_trajectory", start="hover", randomize_reference=True, duration=0.0
-    )
+    endless = {"start": "hover", "randomize_reference": True, "duration": 0.0}
+    task = TaskParams(kind="random_trajectory", **endless)
     made = {"task": task, "sensors": "rtk", "control": Control.CTBR, "control_rate": 50.0}
     flights = batch(count, seed=300, **made)
     found = [{name: flights.record(name) for name in START}]

@@ -12,11 +12,10 @@ from quad_gym.commands import study as command
 from quad_gym.commands.main import main
 from quad_gym.evaluation import Episodes
 from quad_gym.experiments import flown as flights
-from quad_gym.experiments.arms import ARMS, Arm, chosen_arms
+from quad_gym.experiments.arms import Arm, chosen_arms
 from quad_gym.experiments.flown import Flown
-from quad_gym.experiments.study import Study, results_of
+from quad_gym.experiments.study import Study
 from quad_gym.experiments.study_tasks import STUDIED, stays
-from quad_gym.experiments.study_words import conclusions
 
 QUICK = ["study", "--quick", "--steps", "4096", "--env", "duration=0.6"]
 MINE = """
@@ -165,36 +164,7 @@ def flown(returns, crashed, error):
     return Flown(episodes, {"in_view": np.full(count, 0.5), "mean_speed": np.ones(count)})
 
 
-def results(tmp_path, numbers):
-    study = study_of("look_around", chosen_arms(ARMS, numbers), tmp_path)
-    rng = np.random.default_rng(0)
-    found = {}
-    for arm in study.arms:
-        level, crashes, error = numbers[arm.name]
-        wrong = np.arange(40) < 40 * crashes
-        found[arm.name] = [
-            flown(rng.normal(level, 3.0, 40), wrong, error)
-            for _ in (study.seeds if arm.trained else [0])
-        ]
-    return results_of(study, found, {})
-
-
 def test_success_needs_a_complete_episode_and_a_small_late_error():
     some = flown([1.0, 1.0, 1.0], [False, True, False], 0.3)
     np.testing.assert_array_equal(stays(some, 0.5), [True, False, True])
     np.testing.assert_array_equal(stays(some, 0.3), [False, False, False])
-
-
-def test_conclusions_follow_from_the_numbers(tmp_path):
-    clear = {"pd_features": (130, 0.0, 0.05), "truth": (60, 0.6, 1.2), "std": (150, 0.0, 0.1)}
-    words = " ".join(conclusions(results(tmp_path, clear)))
-    assert "a difference of 100 [88, 100] percentage points" in words
-    assert "12.0 times smaller" in words
-    assert "significantly above the best fixed rule (PD, facing the features" in words
-
-    refuted = {"pd_features": (150, 0.0, 0.05), "truth": (99, 0.0, 0.1), "std": (99, 0.0, 0.2)}
-    words = " ".join(conclusions(results(tmp_path, refuted)))
-    assert "no significant difference" in words
-    assert "0.200 m, not smaller than 0.100 m" in words
-    assert "significantly below the best fixed rule" in words
-    assert "the intervals are wide" not in words

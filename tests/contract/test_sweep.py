@@ -26,9 +26,6 @@ n_envs = 16
 """
 
 
-# ---- expansion -----------------------------------------------------------------------------------
-
-
 def test_every_combination_has_a_folder_first_seeds_first(tmp_path):
     given = {
         "env_ids": ["QuadGym/Hover-v0", "QuadGym/Circle-v0"],
@@ -53,11 +50,8 @@ def test_every_combination_has_a_folder_first_seeds_first(tmp_path):
 
 def test_arms_define_observation_and_reward_of_trainings(tmp_path):
     arms = {arm.name: arm for arm in ARMS}
-    given = {
-        "env_ids": ["QuadGym/LookAround-v0"],
-        "arms": ["truth", "std_certainty"],
-        "engine": "compiled",
-    }
+    given = {"env_ids": ["QuadGym/LookAround-v0"], "engine": "compiled"}
+    given["arms"] = ["truth", "std_certainty"]
     truth, sure = expand(given, arms, tmp_path)
     assert truth.case == "look_around,compiled_ppo,truth"
     assert truth.plan.environment["observation"] == "truth"
@@ -72,8 +66,7 @@ def test_options_override_the_file(tmp_path):
     done = console_commands.run("sweep", *line.split(), where=tmp_path)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    want = "results/sweep/mine/runs/circle,compiled_ppo,camera=true,gamma=0.9/seed_0"
-    assert lines[0] == want
+    assert lines[0].endswith("mine/runs/circle,compiled_ppo,camera=true,gamma=0.9/seed_0")
     assert lines[-1] == "6 trainings, 245,760 steps."
     assert not (tmp_path / "results").exists()
 
@@ -114,9 +107,6 @@ def test_missing_package_of_executor_is_named(tmp_path, monkeypatch, executor):
     done = console_commands.run("sweep", *options, where=tmp_path)
     assert done.returncode == 2
     assert f'needs {package}: pip install "quad-gym[sweep]"' in done.stderr
-
-
-# ---- tables --------------------------------------------------------------------------------------
 
 
 def pretend(training, error):

@@ -299,8 +299,7 @@ def test_the_circle_starts_on_the_ground_or_hovering():
 def test_randomize_draws_phase_radius_period_and_sense(task):
     n = 2000
     plain, drawn = (
-        QuadVectorEnv(n, task, randomize_reference=flag, out_of_bounds=99)
-        for flag in (0 > 1, 1 > 0)
+        QuadVectorEnv(n, task, randomize_reference=flag, out_of_bounds=99) for flag in (False, True)
     )
     first, second = plain.reset(seed=1), drawn.reset(seed=1)
     assert first[0].shape == second[0].shape
@@ -321,26 +320,3 @@ def test_randomize_draws_phase_radius_period_and_sense(task):
     if task == "circle":
         turn = np.cross(batch.record("ref_cos")[:, 0], batch.record("ref_sin")[:, 0])[:, 2]
         assert 0.4 < (turn > 0).mean() < 0.6
-
-
-def test_random_trajectories_keep_their_bounds_and_differ():
-    env = vec_env("random_trajectory", 300, seed=1, autoreset_mode="Disabled", out_of_bounds=999)
-    batch = env.flights.batch
-    path = np.array(
-        [reference_of("random_trajectory", t, batch)[0] for t in np.arange(0, 12, 0.02)]
-    )
-    speed = np.linalg.norm(np.diff(path, axis=0), axis=2) / 0.02
-    acceleration = np.linalg.norm(np.diff(path, 2, axis=0), axis=2) / 0.02**2
-    assert speed.max() <= 2.5
-    assert acceleration.max() <= 3.0 + 1e-6
-    assert speed.max() > 1.2
-    assert np.ptp(path[0], axis=0).min() > 0.1
-
-
-def test_gates_lie_within_the_radius_and_apart():
-    env = vec_env("waypoints", 500, seed=1)
-    gates = env.flights.batch.record("gates")[:, :5]
-    assert np.linalg.norm(gates[..., :2], axis=2).max() <= 3.5
-    assert gates[..., 2].min() > 0.5
-    assert np.linalg.norm(np.diff(gates, axis=1), axis=2).min() > 1.0
-    assert (gates[0] != gates[1]).all()

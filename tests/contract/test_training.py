@@ -136,13 +136,10 @@ def wait_for(condition, process, seconds=1200.0):
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize(
-    "number",
-    [
-        signal.SIGKILL,
-        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGINT, signal.SIGTERM)),
-    ],
-)
+CALM = [pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGINT, signal.SIGTERM)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, *CALM])
 def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
     folder = tmp_path / "run"
     line = script(folder, "--steps", "500000", "--evaluations", "400")

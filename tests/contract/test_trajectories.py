@@ -10,7 +10,6 @@ from quad_gym import FlightBatch, FlightRecorder, TaskParams, Trajectory
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Source
-from tests.builders import single_env
 
 FIVE = [(0, 0, 1.5), (1, 0.5, 2), (1, -0.5, 1), (-1, 0.5, 2), (-1, -0.5, 1)]
 WHEN = [0.0, 1.0, 2.2, 3.2, 4.8]
@@ -162,11 +161,6 @@ def test_pd_control_follows_the_default(action):
     assert np.mean(errors[150:]) < 0.15
 
 
-def test_the_filter_starts_warm_on_it():
-    env = single_env("trajectory", seed=0, trajectory=OPEN, filter_start="warm", sensors="rtk")
-    assert env.step(np.zeros(4))[4]["estimation_error"] < 0.5
-
-
 def test_the_time_limit_is_the_trajectorys():
     for given, seconds in ((OPEN, 4.8), (CLOSED, 6.2), (SEVERAL, 6.2), (None, 10.0)):
         env = QuadEnv("trajectory", trajectory=given, observation="truth")
@@ -211,9 +205,3 @@ def test_what_does_not_fit_is_refused():
     env.reset(options={"position": (2.0, 0.0, 1.0)})
     with pytest.raises(ValueError, match="position must be within"):
         env.reset(options={"position": (9.0, 0.0, 1.0)})
-
-
-def test_others_have_no_room_for_it():
-    plain = FlightBatch(8, **TRUTH)
-    assert "path_r" not in plain.snapshot().dtype.names
-    assert plain.trajectory(0) is None

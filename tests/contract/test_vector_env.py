@@ -8,7 +8,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.records import Ending
 from tests.builders import SHORT, STEPS, actions_for, actions_of, vec_env
 from tests.contract.comparing import assert_same, state_of
 from tests.contract.configurations import CONFIGURATIONS
@@ -128,31 +127,6 @@ def test_changes_to_returned_arrays_do_not_reach_flights():
             array[...] = None if array.dtype == object else 1
 
 
-def test_same_step_autoreset_has_final_observation_and_info():
-    env = vec_env(count=3, seed=4, autoreset_mode="SameStep", out_of_bounds=1.5, duration=1.0)
-    for _ in range(49):
-        *_, info = env.step(np.zeros((3, 4)))
-        assert "final_obs" not in info
-    observation, _, terminated, truncated, info = env.step(np.zeros((3, 4)))
-    assert truncated.all()
-    assert not terminated.any()
-    assert info["_final_obs"].all()
-    assert info["_final_info"].all()
-    assert (info["final_info"]["ending"] == Ending.TIME_LIMIT).all()
-    assert (info["ending"] == Ending.NONE).all()
-    assert all((info["final_obs"][i] != observation[i]).any() for i in range(3))
-
-
-def test_integer_seeds_flight_i_with_seed_plus_i():
-    env = QuadVectorEnv(5, "random_trajectory")
-    by_number, _ = env.reset(seed=30)
-    by_list, _ = env.reset(seed=[34, 33, 32, 31, 30])
-    assert_same(by_number, by_list[::-1].copy())
-    single = gymnasium.make("QuadGym/RandomTrajectory-v0")
-    for i in range(5):
-        assert_same(by_number[i], single.reset(seed=30 + i)[0])
-
-
 def test_none_in_a_list_of_seeds_lets_a_flights_stream_go_on():
     env, goes_on = (QuadVectorEnv(3, "hover") for _ in range(2))
     env.reset(seed=6)
@@ -238,24 +212,6 @@ def test_invalid_number_of_environments_is_refused(count):
     for make in (gymnasium.make_vec, quad_gym.make_sb3_vec_env):
         with pytest.raises(ValueError, match=r"^num_envs must be"):
             make("QuadGym/Hover-v0", count)
-
-
-# ---- options -------------------------------------------------------------------------------------
-
-
-def test_options_set_the_starts_of_one_episode():
-    env = QuadVectorEnv(3, "hover", max_episode_steps=1)
-    start = {"position": [4.5, 0.5, 1.5], "velocity": [0.1, 0.2, 0.3]}
-    env.reset(seed=1, options=start)
-    batch = env.flights.batch
-    np.testing.assert_array_equal(batch.record("r"), np.tile(start["position"], (3, 1)))
-    np.testing.assert_array_equal(batch.record("v"), np.tile(start["velocity"], (3, 1)))
-    each = [4.0, 0.0, 1.0] + np.arange(9.0).reshape(3, 3) / 10.0
-    env.reset(options={"position": each, "yaw": np.array([0.1, 0.2, 0.3])})
-    np.testing.assert_array_equal(batch.record("r"), each)
-    env.step(np.zeros((3, 4)))
-    env.step(np.zeros((3, 4)))
-    assert (np.linalg.norm(batch.record("r") - [4.0, 0.0, 1.0], axis=1) < 1.6).all()
 
 
 @pytest.mark.parametrize(

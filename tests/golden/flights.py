@@ -87,11 +87,7 @@ def cases():
         found[f"observation {observation}"] = {"observation": observation}
     for suite in SUITES:
         found[f"observation truth, {suite}"] = {
-            **{
-                "observation": "truth",
-                "sensors": suite,
-                "randomize_reference": True,
-            },
+            **{"observation": "truth", "sensors": suite, "randomize_reference": True},
             **{"faults": ["rotor_loss"], "world": "fresh_breeze", "action_delay": 0.5},
         }
     for action in ("motor", "wrench", "attitude", "velocity"):

@@ -15,6 +15,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
+from tests.builders import batch as flights_of
 from tests.consistent import assert_consistent
 
 LAB = quad_gym.sensor_suite("lab")
@@ -49,9 +50,8 @@ def test_a_suite_is_consistent_from_its_first_instant_on(suite, kind, start):
 @pytest.mark.parametrize("gnss_rate", [200.0, 10.0])
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 def test_the_laboratorys_sensors_can_have_a_consistent_filter(kind, gnss_rate):
-    sensors = LAB.replace(
-        imu=LAB.imu.replace(samples="average"), estimator=FIELD_FILTER.replace(kind=kind)
-    )
+    imu, estimator = LAB.imu.replace(samples="average"), FIELD_FILTER.replace(kind=kind)
+    sensors = LAB.replace(imu=imu, estimator=estimator)
     findings = flown(sensors.with_rates(gnss=gnss_rate), matched=True)
     assert all(part.consistent for part in findings.nees.values())
 
@@ -59,18 +59,13 @@ def test_the_laboratorys_sensors_can_have_a_consistent_filter(kind, gnss_rate):
 @pytest.mark.slow
 def test_each_correction_has_its_share():
     """The reset is what matters at 200 Hz; the report's form is overconfident throughout."""
-    without_camera = LAB.replace(camera=None)
-    report, turned = (
-        flown(
-            without_camera.replace(estimator=LAB.estimator.replace(attitude_reset=reset)),
-            flights=1000,
-            seconds=5.0,
-            matched=True,
-        )
-        .since(1.0)
-        .nees["state"]
-        for reset in (False, True)
-    )
+    found = []
+    for reset in (False, True):
+        estimator = LAB.estimator.replace(attitude_reset=reset)
+        suite = LAB.replace(camera=None, estimator=estimator)
+        flights = flown(suite, flights=1000, seconds=5.0, matched=True)
+        found.append(flights.since(1.0).nees["state"])
+    report, turned = found
     assert report.share_inside < 0.05
     assert 16.0 < report.overall < 21.0
     assert np.abs(turned.overall - 15.0) < 0.4 * (report.overall - 15.0)
@@ -83,16 +78,10 @@ def test_errors_of_prediction_alone_are_as_claimed(kind):
     runs = 10_000
     sensors = quad_gym.sensor_suite("rtk").simplified()
     sensors = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
-    batch = FlightBatch(
-        runs,
-        sensors=sensors,
-        gains="tuned",
-        task=endless(TASK_DEFAULTS["circle"]),
-        source=Source.TRUTH,  # so that all fly alike, and claim alike
-        run_filter=True,
-        filter_start="warm",
-    )
-    batch.reset(seeds=range(runs))
+    alike = {"source": Source.TRUTH, "run_filter": True}  # so that all fly and claim alike
+    task = endless(TASK_DEFAULTS["circle"])
+    made = {"sensors": sensors, "gains": "tuned", "task": task, "filter_start": "warm"}
+    batch = flights_of(runs, **made, **alike)
     start_matched(batch, seed=7)
     batch.switch_sensors(gnss=False, camera=False)
     first = np.sqrt(np.diagonal(batch.covariance()[0]))

@@ -32,9 +32,6 @@ def of_kind(suite, kind):
     return suite.replace(estimator=suite.estimator.replace(kind=kind))
 
 
-# ---- how uncertainty grows ---------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suite", [LAB, RTK], ids=["euler", "midpoint"])
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
 def test_uncertainty_at_rest_grows_in_closed_form(kind, suite):
@@ -137,9 +134,7 @@ def test_in_an_outage_of_a_minute_uncertainty_grows_as_theory_says(kind):
         ("consumer", "ukf", "random_trajectory", OUTAGE),
     ],
 )
-def test_after_an_outage_of_a_minute_the_error_is_soon_back_inside_three_sigma(
-    name, kind, task, dark
-):
+def test_error_after_an_outage_is_soon_inside_three_sigma(name, kind, task, dark):
     """Also where the camera is back before, and sees features that the filter has long lost."""
     batch = lost_for_a_minute(of_kind(quad_gym.sensor_suite(name), kind), task, dark)
     steps(batch, OUTAGE - batch.sensors.imu.dt)
@@ -162,9 +157,6 @@ def test_after_an_outage_of_a_minute_the_error_is_soon_back_inside_three_sigma(
         batch.sensors.gnss.position_sigma_I
     ) + 3.0 * np.linalg.norm(batch.sensors.gnss.drift_sigma_I)
     assert not batch.record("filter_status").any()
-
-
-# ---- outliers ----------------------------------------------------------------------------------
 
 
 def rms_error(suite, faults):
@@ -208,9 +200,6 @@ def test_without_the_gate_outliers_do_harm():
     clean = rms_error(open_, None)
     corrupt = rms_error(open_, GnssOutliers(share=0.05, size=(10.0, 100.0)))
     assert corrupt > 3.0 * clean
-
-
-# ---- jumps -------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -14,12 +14,7 @@ def measured_errors(suite):
     """Root mean square errors per axis of what control on the estimate sees, on the circle."""
     task = TaskParams(kind="circle", start="hover", duration=0.0, out_of_bounds=100.0)
     batch = FlightBatch(
-        FLIGHTS,
-        sensors=suite,
-        task=task,
-        source=Source.ESTIMATE,
-        control_rate=RATE,
-        gains="tuned",
+        FLIGHTS, sensors=suite, task=task, source=Source.ESTIMATE, control_rate=RATE, gains="tuned"
     )
     batch.reset(seeds=range(91_000, 91_000 + FLIGHTS))
     squares = []
@@ -39,7 +34,7 @@ def measured_errors(suite):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["rtk", "consumer", "indoor"])
-def test_the_noise_of_a_suite_is_the_error_of_its_own_converged_filter(suite):
+def test_noise_of_a_suite_is_the_error_of_its_filter(suite):
     noisy = sensor_suite(suite).noisy
     stated = [noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates]
     np.testing.assert_allclose(stated, measured_errors(suite), rtol=0.25)

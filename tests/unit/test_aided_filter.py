@@ -13,7 +13,7 @@ from quad_gym.packing.aids import slow_states
 from quad_gym.records import Aid, GateDecision
 from tests.circle_flight import record_circle
 from tests.reference_aids import AidedEKF, AidedUKF
-from tests.reference_ukf import PlainUKF, array_of, rotation_312
+from tests.reference_ukf import TOLERANCES, PlainUKF, array_of, rotation_312
 
 LAB = quad_gym.sensor_suite("lab")
 BOTH = {"barometer": BarometerParams(bias_tau=20.0), "magnetometer": MagnetometerParams()}
@@ -68,13 +68,7 @@ def test_the_filter_equals_a_plain_one(name, kinds):
                     magnetometer=fields[k],
                 )
                 one.predict(recording.gyro[k], recording.accel[k])
-        for field, tolerance in (
-            ("position", 1e-9),
-            ("velocity", 1e-8),
-            ("R_BI", 1e-9),
-            ("accel_bias", 1e-7),
-            ("gyro_bias", 1e-10),
-        ):
+        for field, tolerance in TOLERANCES.items():
             gap = abs(array_of(Decimal, getattr(ours, field)) - getattr(plain, field)).max()
             assert float(gap) < tolerance, field
         P, d = plain.P.astype(float), plain._state().astype(float)

@@ -107,10 +107,8 @@ def test_sensors_measure_at_their_rates_and_phases(phase):
 @pytest.mark.parametrize("periods", [1, 2])
 def test_late_measurements_arrive_as_they_were_taken(periods):
     """At latencies of one period and of the longest, two: at the limit."""
-    late = LAB.replace(
-        barometer=BarometerParams(phase=0.0, latency=periods * 0.02),
-        magnetometer=MagnetometerParams(phase=0.0, latency=periods * 0.02),
-    )
+    waits = {"phase": 0.0, "latency": periods * 0.02}
+    late = LAB.replace(barometer=BarometerParams(**waits), magnetometer=MagnetometerParams(**waits))
     prompt, delayed = fly(AIDED, 16, task="hover"), fly(late, 16, task="hover")
     delay, noise, truth = 4 * periods, [], []
     for tick in range(60):
@@ -182,9 +180,8 @@ def test_observation_and_info_have_what_was_measured():
     found = info["innovations"]
     assert found["nis"].shape == (5,)  # position, baseline, velocity, barometer, magnetometer
     assert found["measured"][3:].all()
-    assert found["nis"][3] == pytest.approx(
-        (found["innovation"][3, 0] / found["sigma"][3, 0]) ** 2, rel=1e-9
-    )
+    ratio = found["innovation"][3, 0] / found["sigma"][3, 0]
+    assert found["nis"][3] == pytest.approx(ratio**2, rel=1e-9)
     assert np.isfinite(found["innovation"][4]).all()
     env.close()
 

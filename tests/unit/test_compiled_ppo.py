@@ -125,9 +125,7 @@ def test_gradients_are_those_of_torch(activation, normalize, size, critic_only):
     entropy = normal.entropy().sum(dim=1)
     A = torch.as_tensor(advantage)
     ratio = torch.exp(log_prob - tensors["log_probs"])
-    assert (
-        0.1 < float((abs(ratio - 1.0) > 0.2).double().mean()) < 0.9
-    )  # both kinds of samples are there
+    assert 0.1 < float((abs(ratio - 1.0) > 0.2).double().mean()) < 0.9  # both kinds are there
     policy_loss = -torch.min(A * ratio, A * torch.clamp(ratio, 0.8, 1.2)).mean()
     value_loss = torch.nn.functional.mse_loss(tensors["returns"], values.flatten())
     (policy_loss - 0.02 * entropy.mean() + 0.7 * value_loss).backward()
@@ -137,48 +135,6 @@ def test_gradients_are_those_of_torch(activation, normalize, size, critic_only):
     np.testing.assert_allclose(sums[0] / size, policy_loss.item(), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(sums[1] / size, value_loss.item(), rtol=1e-5)
     np.testing.assert_allclose(sums[3], int((abs(ratio - 1.0) > 0.2).sum()))
-
-
-@pytest.mark.parametrize("max_grad_norm", [0.5, 100.0])
-def test_adam_and_the_clipping_of_gradients_are_those_of_torch(max_grad_norm):
-    ours, _, _ = models("tanh", {"max_grad_norm": max_grad_norm})
-    import torch
-
-    learner, params = ours.learner, ours.networks.params
-    tensor = torch.nn.Parameter(torch.as_tensor(params.astype(np.float64)))
-    adam = torch.optim.Adam([tensor], lr=3e-3, eps=1e-5)
-    draw = rng()
-    for scale in (0.001, 1.0, 0.01, 30.0, 0.1):  # norms on both sides of the limits
-        parts = draw.normal(0.0, scale, learner.gradients.shape).astype(np.float32)
-        learner.gradients[:] = parts
-        learner.descend(3e-3)
-        tensor.grad = torch.as_tensor(parts.astype(np.float64).sum(axis=0))
-        torch.nn.utils.clip_grad_norm_([tensor], max_grad_norm)
-        adam.step()
-    np.testing.assert_allclose(params, tensor.detach().numpy(), rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("activation", ["relu", "tanh"])
-def test_learning_from_the_same_samples_is_that_of_stable_baselines(activation):
-    """Three epochs of minibatches, the last of which is a partial one."""
-    ours, theirs, samples = models(activation, {"ent_coef": 0.01})
-    from stable_baselines3.common.logger import Logger
-
-    buffer = theirs.rollout_buffer
-    for name in ("observations", "actions", "log_probs", "advantages", "returns", "values"):
-        getattr(buffer, name)[:, 0] = samples[name]
-    buffer.full = True
-    theirs.set_logger(Logger(None, []))
-    np.random.seed(5)  # noqa: NPY002
-    theirs.train()
-    np.random.seed(5)  # noqa: NPY002
-    before = ours.networks.params.copy()
-    ours.learner.learn(3e-3, np.random)  # shuffled as Stable-Baselines3 does
-    for (tensor, part), (_, first) in zip(
-        pairs_of(theirs, ours.networks.params, ours), pairs_of(theirs, before, ours), strict=True
-    ):
-        want = tensor.detach().numpy()
-        assert np.linalg.norm(part - want) < 1e-3 * np.linalg.norm(want - first)
 
 
 def test_first_weights_are_orthogonal_as_those_of_stable_baselines():
@@ -216,7 +172,7 @@ def test_advantages_are_the_sums_that_define_them():
             assert found[t, flight] == pytest.approx(want, rel=1e-4, abs=1e-5)
 
 
-def test_a_truncated_episode_earns_what_the_critic_expects_and_a_terminated_one_does_not():
+def test_truncated_episodes_alone_earn_what_the_critic_expects():
     env = sliders(4)
     model = CompiledPPO(env, small_recipe(parameters={"n_steps": 50}), seed=2)
     seen = []
@@ -330,11 +286,7 @@ def test_a_diverged_training_says_so():
         (sliders(), small_recipe(policy={"ortho_init": False}), "ortho_init is not a keyword"),
         (sliders(), small_recipe(parameters={"critic_only": -1}), "critic_only must be at least 0"),
         (sliders(), small_recipe(parameters={"critic_only": 0.5}), "critic_only must be a whole"),
-        (
-            sliders(),
-            small_recipe(parameters={"critic_only": 3}),
-            "must leave the actor at least one of 3 observed values, got 3",
-        ),
+        (sliders(), small_recipe(parameters={"critic_only": 3}), "at least one of 3 obs.*, got 3"),
     ],
 )
 def test_what_does_not_fit_is_refused(env, recipe, message):

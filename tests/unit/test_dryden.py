@@ -71,15 +71,10 @@ def test_the_discretization_is_exact(h):
     # Van Loan's own entries lose digits where h^3 vanishes beside 1: compare in their proportions
     sizes = np.sqrt(np.diag([h, h**3 / 3])) if h < 1e-2 else np.eye(2)
     whiten = np.linalg.inv(sizes)
-    if h >= 1e-3:
-        np.testing.assert_allclose(
-            whiten @ (factor @ factor.T) @ whiten, whiten @ noise @ whiten, rtol=1e-8, atol=1e-8
-        )
-    else:  # the leading terms of the integrals of e^(-2t), t e^(-2t), t^2 e^(-2t)
-        leading = np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]])
-        np.testing.assert_allclose(
-            whiten @ (factor @ factor.T) @ whiten, whiten @ leading @ whiten, rtol=3 * h + 1e-6
-        )
+    found, tolerance = whiten @ (factor @ factor.T) @ whiten, {"rtol": 1e-8, "atol": 1e-8}
+    if h < 1e-3:  # the leading terms of the integrals of e^(-2t), t e^(-2t), t^2 e^(-2t)
+        noise, tolerance = np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]]), {"rtol": 3 * h + 1e-6}
+    np.testing.assert_allclose(found, whiten @ noise @ whiten, **tolerance)
     np.testing.assert_allclose(got["u"][0], np.exp(-h), rtol=1e-15)
     np.testing.assert_allclose(got["u"][2] ** 2, -np.expm1(-2 * h), rtol=1e-6)
 
@@ -91,34 +86,14 @@ def test_sinh_less_its_argument_keeps_its_digits():
     np.testing.assert_allclose(got, series, rtol=1e-14)
 
 
-def test_the_stationary_covariance_stays():
-    stationary = np.array([[0.5, 0.25], [0.25, 0.25]])
-    for h in (1e-4, 0.1, 2.0):
-        got = filter_of.on_floats(
-            x=[1, 0, 0, 0], y=[0, 1, 0, 0], n=[0, 0, 1, 0], m=[0, 0, 0, 1], h=[h] * 4
-        )
-        response = np.stack([got["v"], got["w"]])
-        inputs = np.zeros((4, 4))
-        inputs[:2, :2], inputs[2:, 2:] = stationary, np.eye(2)
-        np.testing.assert_allclose(response @ inputs @ response.T, stationary, atol=1e-14)
-
-
-# ---- gusts as flights meet them ------------------------------------------------------------------
-
-
 def hovering_in_gusts(count, *, height=HEIGHT, wind=(0.0, WIND, 0.0), dt=0.005):
     """Vehicles that nothing moves: no drag, level, thrust as large as the weight."""
     vehicle = quad_gym.vehicle_params("lab").replace(disc_area=0.0)
     sensors = quad_gym.sensor_suite("lab").replace(camera=None).with_rates(imu=1.0 / dt)
-    batch = FlightBatch(
-        count,
-        vehicle=vehicle,
-        sensors=sensors,
-        source=Source.TRUTH,
-        control=Control.MOTOR,
-        task=quad_gym.TaskParams(kind="hover", start="hover", duration=0.0),
-        world=quad_gym.WorldParams(wind_I=wind, gust_wind_speed=WIND, ground_height=0.0),
-    )
+    task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0)
+    world = quad_gym.WorldParams(wind_I=wind, gust_wind_speed=WIND, ground_height=0.0)
+    made = {"vehicle": vehicle, "sensors": sensors, "task": task, "world": world}
+    batch = FlightBatch(count, source=Source.TRUTH, control=Control.MOTOR, **made)
     batch.reset(seeds=range(count), position=(0.0, 0.0, height), velocity=(0.0, 0.0, 0.0), yaw=0.0)
     batch._blocks["q"] = np.array([1.0, 0.0, 0.0, 0.0])[:, np.newaxis]
     return batch

@@ -1,8 +1,7 @@
-"""Exported controllers act as the policies they come from; exported numbers are the filter's."""
+"""Exported controllers act as the policies they come from."""
 
 import ctypes
 import json
-import re
 import shutil
 import subprocess
 from functools import partial
@@ -14,18 +13,15 @@ import numpy as np
 import pytest
 
 import quad_gym
-from baselines.exporting import c_source, controller_of, filter_header, filter_numbers, save_onnx
+from baselines.exporting import c_source, controller_of, save_onnx
 from baselines.exporting.actions import action_fields
 from baselines.mlp import MlpPolicy
 from quad_gym.packing.flight import params_record
-from quad_gym.params.suites import SUITES
-from quad_gym.records import PARAMS
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror")
 CIRCLE = "QuadGym/Circle-v0"
-KERNELS = Path(quad_gym.__file__).parent / "kernels" / "filter"
 
 
 def compiled(controller, folder):
@@ -244,74 +240,3 @@ def test_a_policy_that_sees_the_truth_is_refused(tmp_path):
     file = stable_baselines_file(tmp_path, "ppo", keywords)
     with pytest.raises(ValueError, match="observes the truth"):
         controller_of(str(file), CIRCLE, keywords)
-
-
-# ---- the filter ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("suite", SUITES)
-def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
-    found = filter_numbers(quad_gym.sensor_suite(suite))["numbers"]
-    source = "".join(file.read_text(encoding="utf-8") for file in KERNELS.rglob("*.py"))
-    for name in ("gnss_position", "gnss_baseline", "gnss_velocity", "camera"):
-        text = (KERNELS.parent / "sensors" / f"{name}.py").read_text(encoding="utf-8")
-        source += text.partition("# ---- update")[2]  # before it is what sensors do
-    read = set(re.findall(r"(?<![\w.])(?:p|params|model)\.(\w+)", source)) & set(PARAMS.names)
-    camera = {"camera", "R_CB", "focal_length", "features", "pixel_sigma", "blur"}
-    camera |= {"noise_at_prediction", "noise_pinhole", "recursive_update_threshold"}
-    gates = {"gate_position", "gate_direction", "gate_uncertainty"}  # open ones are left out
-    present = quad_gym.sensor_suite(suite)
-    absent = set() if present.camera is not None else camera
-    if present.gnss is not None and not present.gnss.has_baseline:
-        absent |= {"baseline", "baseline_length", "baseline_noise"}
-        absent |= {"baseline_sigma", "first_baseline_sigma"}
-    if not present.drifts:
-        absent |= {"slow_sigma", "slow_decay", "slow_drive"}
-    if present.magnetometer is None:
-        absent |= {"aid_numbers"}
-    assert read - set(found) <= gates | absent
-    assert len(read) > 40
-
-
-def test_a_filters_numbers_hold_those_of_aiding_sensors():
-    suite = quad_gym.sensor_suite("consumer")
-    found = filter_numbers(suite)
-    numbers = {name: entry["value"] for name, entry in found["numbers"].items()}
-    assert len(numbers["slow_sigma"]) == 3 + 1 + 4  # drift; bias; hard iron and declination
-    sigmas = [suite.barometer.noise_sigma, suite.magnetometer.noise_sigma]
-    assert numbers["aid_sigma"] == [*sigmas, 0.0, 0.0]
-    np.testing.assert_allclose(numbers["aid_numbers"][1], suite.magnetometer.field_I)
-    assert found["rates"]["magnetometer"] == suite.magnetometer.rate
-    assert "aid_numbers" in filter_header(suite, "aided")
-
-
-def test_a_filters_numbers_are_those_of_the_report():
-    """Sampled noise of the laboratory's IMU from its densities, over the tick of 5 ms."""
-    found = filter_numbers(quad_gym.sensor_suite("lab"))
-    numbers = {name: entry["value"] for name, entry in found["numbers"].items()}
-    imu = quad_gym.sensor_suite("lab").imu
-    assert numbers["dt"] == 0.005
-    assert numbers["accel_noise"] == pytest.approx(imu.accel_noise_density / np.sqrt(0.005))
-    assert numbers["gyro_bias_decay"] == pytest.approx(np.exp(-0.005 / imu.gyro_bias_tau))
-    assert numbers["features"] == [list(p) for p in quad_gym.sensor_suite("lab").camera.features_I]
-    assert found["choices"]["integration"] == "euler"
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-
-
-@needs_compiler
-@pytest.mark.parametrize("suite", SUITES)
-def test_a_filters_header_is_c99_with_the_same_numbers(suite, tmp_path):
-    numbers = filter_numbers(quad_gym.sensor_suite(suite))["numbers"]
-    (tmp_path / "filter.h").write_text(filter_header(quad_gym.sensor_suite(suite), suite))
-    scalar = [name for name, entry in numbers.items() if not isinstance(entry["value"], list)]
-    prints = "".join(f'    printf("%.17g\\n", {name});\n' for name in scalar)
-    prints += '    printf("%.17g\\n", R_IG[2][1]);\n'
-    program = f'#include <stdio.h>\n#include "filter.h"\nint main(void)\n{{\n{prints}}}\n'
-    (tmp_path / "it.c").write_text(program)
-    flags = [flag for flag in FLAGS if flag != "-Wextra"] + ["-Wno-unused"]
-    subprocess.run(
-        [COMPILER, *flags, str(tmp_path / "it.c"), "-o", str(tmp_path / "it")], check=True
-    )
-    told = subprocess.run([tmp_path / "it"], check=True, capture_output=True, text=True).stdout
-    want = [numbers[name]["value"] for name in scalar] + [numbers["R_IG"]["value"][2][1]]
-    assert [float(line) for line in told.split()] == want

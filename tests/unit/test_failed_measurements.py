@@ -27,7 +27,7 @@ FIELD = LAB.replace(
         integration="midpoint",
         attitude_reset=True,
         false_alarm_probability=1e-4,
-    ),
+    )
 )
 RECORDING = record_circle(LAB.replace(estimator=FIELD.estimator), 60, 3)
 TICK = int(np.flatnonzero(np.isfinite(RECORDING.pixels).all(axis=(1, 2)))[0])

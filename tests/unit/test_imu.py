@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.kernels.single import integrate_flight
@@ -61,21 +60,6 @@ def test_specific_force_is_that_of_a_moving_point_of_the_body(seed):
     limit = 3e-6 * (1.0 + np.abs(expected).max())
     np.testing.assert_allclose(accel, expected, rtol=0.0, atol=limit)
     np.testing.assert_allclose(gyro, state["body_rates"], rtol=0.0, atol=1e-12)
-
-
-def test_steady_spin_is_felt_by_an_offset_accelerometer():
-    state = resting() | {"body_rates": np.array([0.0, 0.0, 5.0])}
-    imu = Imu(QUIET.replace(lever_arm_B=(0.1, 0.0, 0.2)), np.random.default_rng(1), VEHICLE)
-    _, accel = imu.measure(state)
-    # centripetal acceleration toward the axis, and the weight that the rotors carry
-    np.testing.assert_allclose(accel, [-0.1 * 25.0, 0.0, 9.8], rtol=0.0, atol=1e-10)
-
-
-def test_in_free_fall_nothing_is_felt():
-    state = resting() | {"rotor_speeds": np.zeros(4), "R_BI": Rotation.random(rng=1).as_matrix()}
-    gyro, accel = Imu(QUIET, np.random.default_rng(1), VEHICLE).measure(state)
-    np.testing.assert_allclose(accel, 0.0, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(gyro, 0.0, rtol=0.0, atol=1e-12)
 
 
 @functools.cache

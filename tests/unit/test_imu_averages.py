@@ -20,8 +20,7 @@ from tests.unit.test_imu import QUIET
 
 LAB = quad_gym.sensor_suite("lab")
 AVERAGE = LAB.replace(
-    imu=LAB.imu.replace(samples="average"),
-    estimator=LAB.estimator.replace(integration="midpoint"),
+    imu=LAB.imu.replace(samples="average"), estimator=LAB.estimator.replace(integration="midpoint")
 )
 # hardly any drag: it has a kink where the flow through the rotors turns, which quadrature feels
 VEHICLE = quad_gym.VehicleParams(disc_area=1e-9)

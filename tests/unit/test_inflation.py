@@ -91,7 +91,7 @@ def test_an_alarm_inflates_each_deviation_up_to_its_bound(deviations):
     )
 
 
-def test_alarms_that_repeat_leave_what_nothing_measures_bounded():
+def test_repeated_alarms_leave_unmeasured_states_bounded():
     """Only velocities are measured: nothing tells the position or the heading for 25 alarms."""
     ukf = started(np.repeat([0.1, 0.05, 0.05, 0.05, 0.005], 3))
     for _ in range(25):

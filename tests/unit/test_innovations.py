@@ -145,9 +145,6 @@ def test_a_lane_gates_for_itself():
     np.testing.assert_array_equal(filters.get("gate")[:, POSITION_BLOCK], [1, 1, 1, 2, 1, 1, 1, 1])
 
 
-# ---- many flights ----------------------------------------------------------------------------
-
-
 def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
     suite = quad_gym.sensor_suite("consumer").simplified()
     two = suite.gnss.replace(secondary_antenna_B=(0.1, 0.0, 0.0472), baseline_sigma=0.035)

@@ -123,43 +123,12 @@ def test_a_fall_in_vacuum_is_a_parabola():
     np.testing.assert_allclose(end["v"], v + 1.5 * g, rtol=0.0, atol=1e-13)
 
 
-def test_a_flat_fall_in_air_approaches_the_terminal_speed():
-    vehicle = LAB.replace(disc_area=1.0)
-    drag = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
-    terminal = np.sqrt(vehicle.mass * vehicle.gravity / drag)
-    end = flown(vehicle, 1.2, 1_000)
-    phase = vehicle.gravity * 1.2 / terminal
-    height = -(terminal**2) / vehicle.gravity * np.log(np.cosh(phase))
-    assert end["v"][2] == pytest.approx(-terminal * np.tanh(phase), rel=1e-11)
-    assert end["r"][2] == pytest.approx(height, rel=1e-11)
-
-
 def test_rotors_approach_their_speed_exponentially():
     speeds, voltages = np.array([0.0, 500.0, 2400.0, 100.0]), np.array([12.0, 1.0, 0.0, 3.0])
     end = flown(LAB, 0.12, 200, rotor_speeds=speeds, voltages=voltages)
     target = LAB.motor_speed_per_volt * voltages
     expected = target + (speeds - target) * np.exp(-0.12 / LAB.motor_time_constant)
     np.testing.assert_allclose(end["rotor_speeds"], expected, rtol=1e-9)
-
-
-def test_a_hovering_vehicle_stays_where_it_is():
-    speed = LAB.motor_speed_per_volt * LAB.hover_voltage
-    end = flown(LAB, 10.0, 2_000, r=(1.0, 2.0, 3.0), rotor_speeds=speed, voltages=LAB.hover_voltage)
-    np.testing.assert_allclose(end["r"], [1.0, 2.0, 3.0], rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(end["v"], 0.0, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(end["w"], 0.0, rtol=0.0, atol=1e-9)
-
-
-def test_drag_never_adds_energy_to_a_tumbling_fall():
-    vehicle, start = LAB.replace(disc_area=2.0), random_start(7)
-    for name in ("rotor_speeds", "voltages", "disturbance"):
-        start[name] = 0.0
-
-    def energy(flight):
-        return 0.5 * vehicle.mass * flight["v"] @ flight["v"] + vehicle.mass * 9.8 * flight["r"][2]
-
-    energies = [energy(flown(vehicle, t, 400, **start)) for t in np.linspace(1e-3, 2.0, 30)]
-    assert (np.diff(energies) < 0.0).all()
 
 
 STATE = {"r": (3,), "v": (3,), "q": (4,), "w": (3,), "rotor_speeds": (4,)}

@@ -26,9 +26,6 @@ def estimate_of(sample):
     return Estimated(sample.mean(), *mean_interval(sample))
 
 
-# ---- coverage -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [2, 3, 5, 10, 20, 100, 1000])
 def test_interval_of_a_mean_covers_95_percent_of_normal_values(count):
     samples = np.random.default_rng(count).normal(3.0, 2.0, (DRAWS, count))
@@ -92,9 +89,6 @@ def test_probability_of_improvement_covers_90_percent(seeds, apart):
     assert np.mean(held) > 0.86
 
 
-# ---- closed forms -------------------------------------------------------------------------------
-
-
 def test_worst_tenth_of_a_fixed_rule_covers_95_percent():
     exact = -norm.pdf(norm.ppf(0.1)) / 0.1
     samples = np.random.default_rng(1).normal(size=(200, 1, 200))
@@ -116,7 +110,7 @@ def test_interval_of_a_rate_is_clopper_and_pearson_s(count, trials):
     np.testing.assert_allclose(found, [expected.low, expected.high], rtol=1e-9)
 
 
-def test_interval_over_trainings_is_student_s_where_one_part_varies():
+def test_interval_over_trainings_is_students_if_one_part_varies():
     rng = np.random.default_rng(2)
     episodes, trainings = rng.normal(3.0, 2.0, 400), rng.normal(size=5)
     of_rule = mean_over_trainings([episodes])
@@ -174,9 +168,6 @@ def test_the_probability_of_improvement_at_its_limits():
     assert better == (1.0, pytest.approx(0.501, abs=1e-3), 1.0)
     assert worse == (0.0, 0.0, pytest.approx(1.0 - better.low))
     assert probability_of_improvement([1.0, 1.0], [1.0]).value == 0.5
-
-
-# ---- pairs --------------------------------------------------------------------------------------
 
 
 def test_pairs_show_what_seeds_hide():

@@ -178,9 +178,7 @@ def test_words_are_added_and_turned_modulo_two_to_the_sixty_four(instance):
     np.testing.assert_array_equal(got["x"], [1.0 + (i >> 12) / 2**52 for i, _ in pairs])
 
 
-@given(
-    st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_size=1, max_size=20),
-)
+@given(st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_size=1, max_size=20))
 def test_floats_and_lanes_agree_to_the_last_bits(pairs):
     x, y = np.array(pairs).T
     with np.errstate(all="ignore"):

@@ -107,9 +107,8 @@ def test_a_log_of_ardupilot_is_the_log_that_was_flown(recorded, table, tmp_path)
     log = read_log(tmp_path / "flight.bin")
     check_imu(log, table, BOOT, atol=2e-6)
     check_positions(log, table, atol=0.03)
-    np.testing.assert_allclose(
-        log.gnss.values["velocity_I"], table.gnss.values["velocity_I"], atol=1e-4
-    )
+    speeds = (one.gnss.values["velocity_I"] for one in (log, table))
+    np.testing.assert_allclose(*speeds, atol=1e-4)
     np.testing.assert_allclose(log.gnss.received - log.gnss.time, 0.1)
     np.testing.assert_allclose(log.gnss.values["position_sigma_I"][0], [0.3, 0.3, 0.6], rtol=1e-6)
     for sensor, atol in (("barometer", 1e-4), ("magnetometer", 1e-7)):  # in the order of time

@@ -57,8 +57,7 @@ def test_a_start_is_as_good_as_its_covariance_says(kind):
         antenna = r + R_BI.T @ GNSS.primary_antenna_B
         field = R_BI @ field_in_I(delta) + iron + rng.normal(0.0, MAGNETOMETER.noise_sigma, 3)
         ukf.initialize(
-            R_IG.T @ (antenna + rng.normal(0.0, GNSS.position_sigma_I)),
-            magnetometer=field,
+            R_IG.T @ (antenna + rng.normal(0.0, GNSS.position_sigma_I)), magnetometer=field
         )
         angles = small_euler_angles((R_BI @ ukf.R_BI.T)[np.newaxis])[0]
         biases = b_a - ukf.accel_bias, b_g - ukf.gyro_bias
@@ -99,7 +98,7 @@ def test_the_sample_that_starts_a_filter_counts_once():
         assert np.isfinite(nis).all() == (start == "warm")
 
 
-def test_there_is_no_baseline_ever():
+def test_there_is_no_baseline():
     batch = fly(CONSUMER, 16)
     for _ in range(30):
         steps(batch, 0.05)

@@ -10,6 +10,7 @@ from quad_gym.params.portable import euler_dcm
 from quad_gym.params.vehicle import vehicle_params
 from quad_gym.records import AID_BLOCKS, Aid, Control, GateDecision
 from quad_gym.rotations import quaternion_to_dcm
+from tests.builders import batch as flights_of
 from tests.field_flights import fly, nees, steps
 
 CRAZYFLIE = quad_gym.sensor_suite("crazyflie").simplified()
@@ -36,9 +37,8 @@ def test_measurements_have_the_closed_form_and_their_noise():
         names = ("r", "v", "w")
         states = [batch.record(name) for name in names]
         R_BI = quaternion_to_dcm(batch.record("q"))
-        truth = np.array(
-            [expected(r, v, R, w)[:3] for r, v, w, R in zip(*states, R_BI, strict=True)]
-        )
+        rows = zip(*states, R_BI, strict=True)
+        truth = np.array([expected(r, v, R, w)[:3] for r, v, w, R in rows])
         measured = batch.record("aid_measurement")
         valid = batch.record("block_valid")[:, AID_BLOCKS + FLOW :].all(axis=1)  # not too fast
         error = np.column_stack([measured[:, FLOW, :2], measured[:, RANGE, :1]]) - truth
@@ -147,14 +147,9 @@ def test_filters_are_consistent(kind, start, late):
 
 
 def test_a_crazyflie_hovers_on_its_estimate():
-    batch = quad_gym.FlightBatch(
-        16,
-        vehicle=vehicle_params("crazyflie"),
-        sensors="crazyflie",
-        task=quad_gym.TaskParams(kind="hover", start="hover"),
-        control=Control.VELOCITY,
-    )
-    batch.reset(seeds=range(16))
+    task = quad_gym.TaskParams(kind="hover", start="hover")
+    made = {"vehicle": vehicle_params("crazyflie"), "sensors": "crazyflie", "task": task}
+    batch = flights_of(16, control=Control.VELOCITY, **made)
     for _ in range(400):
         batch.step(np.zeros((16, 4)))
     assert (np.linalg.norm(batch.record("v"), axis=1) < 0.3).all()

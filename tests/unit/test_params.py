@@ -66,6 +66,7 @@ BAD_VALUES = {
     "MagnetometerParams": SENSOR
     | {
         "noise_sigma hard_iron_sigma declination_sigma": NOT_POSITIVE,
+        "hard_iron_tau": [0.0, -1.0, float("nan")],
         "soft_iron_sigma": BELOW_ZERO,
         "strength": [*NOT_POSITIVE, 46.0],
         "declination": [4.0, -4.0, *NO_NUMBERS],
@@ -199,26 +200,19 @@ def test_arrays_become_tuples_so_that_nobody_can_change_them():
     assert vehicle.inertia == ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 3.0))
 
 
-@pytest.mark.parametrize(
-    ("preset", "argument"),
-    [
-        (quad_gym.sensor_suite, "sensors"),
-        (quad_gym.vehicle_params, "vehicle"),
-        (quad_gym.pd_gains, "gains"),
-    ],
-)
-def test_presets_are_known_by_name(preset, argument):
-    assert preset("lab") == preset("lab")
+PRESETS = {"sensors": quad_gym.sensor_suite, "vehicle": quad_gym.vehicle_params}
+PRESETS |= {"gains": quad_gym.pd_gains}
+
+
+@pytest.mark.parametrize("argument", PRESETS)
+def test_presets_are_known_by_name(argument):
     for unknown in ("garage", None, ["lab"]):
         with pytest.raises(ValueError, match=rf"^{argument} must be one of (standard, )?lab"):
-            preset(unknown)
+            PRESETS[argument](unknown)
 
 
 def test_the_laboratory_presets_hold_the_laboratorys_numbers():
-    suite, vehicle, gains = (
-        preset("lab")
-        for preset in (quad_gym.sensor_suite, quad_gym.vehicle_params, quad_gym.pd_gains)
-    )
+    suite, vehicle, gains = (preset("lab") for preset in PRESETS.values())
     assert (vehicle.mass, vehicle.gravity, vehicle.max_voltage) == (0.78, 9.8, 12.0)
     assert np.diag(vehicle.inertia).tolist() == [1.7565e-3, 3.5723e-3, 4.7134e-3]
     assert (gains.position, gains.velocity) == (5.0, 3.1)
@@ -259,14 +253,11 @@ def test_rate_without_a_whole_number_of_ticks_is_refused(sensor, rate):
         suite.with_rates(**{sensor: rate})
 
 
-def test_a_suite_whose_clocks_do_not_fit_is_refused():
+def test_scaled_noise_and_clocks_of_a_suite():
     with pytest.raises(ValueError, match=r"^GnssParams\.rate must"):
         quad_gym.SensorSuite(gnss=quad_gym.GnssParams(rate=30.0))
     with pytest.raises(ValueError, match=r"^CameraParams\.rate must"):
         quad_gym.SensorSuite(camera=quad_gym.CameraParams(rate=150.0))
-
-
-def test_scaled_noise_scales_every_white_noise_and_nothing_else():
     lab = quad_gym.sensor_suite("lab")
     loud = lab.scaled_noise(3.0)
     assert loud.gnss.position_sigma_I == pytest.approx((0.018, 0.018, 0.036))

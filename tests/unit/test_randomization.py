@@ -257,7 +257,7 @@ def test_each_rotor_has_its_efficiency():
     np.testing.assert_allclose(R @ pull, [0.0, 0.0, forces.sum() / LAB.mass], atol=0.1)
 
 
-def test_image_of_a_drawn_camera_rotation_is_that_of_a_turned_camera():
+def test_drawn_camera_rotation_turns_the_image():
     draws = {"camera_rotation": Uniform(-0.1, 0.1), "pixel_sigma": Uniform(1e-9, 1e-9)}
     flight, camera = flown(ticks=0, randomization=draws), SUITE.camera
     turn = euler_to_dcm(flight.read("camera_rotation")[0])

@@ -40,7 +40,7 @@ def test_filter_is_consistent_or_lost_ten_seconds_after_a_step(fault):
     assert not (wrong & ~lost).any()
 
 
-def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
+def test_filter_says_soon_after_a_bias_step_that_it_is_lost():
     batch = flown("rtk", STEP, 3.25)
     assert beyond(batch, 6.0).mean() > 0.9
     steps(batch, 0.75)

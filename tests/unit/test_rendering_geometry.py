@@ -8,7 +8,6 @@ from quad_gym.envs.configuration import Flights
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import Autoreset
 from quad_gym.rendering.geometry import (
-    Perspective,
     chase_view,
     ellipsoid_axes,
     ellipsoid_outline,
@@ -88,17 +87,6 @@ def test_a_fitted_view_shows_all_points_and_could_not_be_closer(seed):
     assert touching.min() < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_axes_of_the_ellipsoid_are_eigenvectors(seed):
-    P = a_covariance(np.random.default_rng(seed))
-    axes = ellipsoid_axes(P, 3.0)
-    for axis in axes:
-        variance = axis @ axis / 9.0
-        np.testing.assert_allclose(P @ axis, variance * axis, atol=1e-10)
-    np.testing.assert_allclose(axes.T @ axes / 9.0, P, atol=1e-10)
-    np.testing.assert_allclose(axes @ axes.T, np.diag(np.diag(axes @ axes.T)), atol=1e-10)
-
-
 @pytest.mark.parametrize("seed", range(10))
 def test_the_outline_is_that_of_the_ellipsoids_surface(seed):
     rng = np.random.default_rng(seed)
@@ -133,9 +121,6 @@ def test_the_chase_view_has_the_vehicle_near_its_middle():
     pixels, depth = chase_view(flight, 640, 367).project(flight["position"][-1])
     assert 1.0 < depth < 4.0
     assert (abs(pixels - (320.0, 183.0)) < 90.0).all()
-
-
-# ---- the vehicle's camera ------------------------------------------------------------------------
 
 
 def poses(count, seed):
@@ -194,14 +179,7 @@ def test_the_inset_shows_the_image_upright_and_to_scale():
         np.testing.assert_array_equal(step, expected)
 
 
-def test_views_are_rotations():
-    for view in (fixed_view(a_flight(), 640, 367), chase_view(a_flight(), 640, 367)):
-        assert isinstance(view, Perspective)
-        np.testing.assert_allclose(view.R_VI @ view.R_VI.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(view.R_VI) == pytest.approx(1.0)
-
-
-def test_a_polygon_that_reaches_behind_the_eye_is_cut_off_in_front_of_it():
+def test_polygon_behind_the_eye_is_cut_off():
     view = look_at(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 1.0]), 500.0, CENTER)
     floor = np.array([[-1.0, -5.0, 0.0], [1.0, -5.0, 0.0], [1.0, 5.0, 0.0], [-1.0, 5.0, 0.0]])
     outline = view.outline(floor)
@@ -215,7 +193,7 @@ def test_a_polygon_that_reaches_behind_the_eye_is_cut_off_in_front_of_it():
     np.testing.assert_array_equal(view.outline(before), view.project(before)[0])
 
 
-def test_the_faces_of_an_obstacle_that_are_seen_are_those_turned_to_the_eye():
+def test_faces_turned_to_the_eye_are_seen():
     wall = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 0.1, 1.0, 0.0, 1.0])  # its length points north
     (face,) = faces_of(wall, np.array([5.0, 0.0, 1.0]))
     np.testing.assert_allclose(face[:, 0], 0.1)

@@ -114,9 +114,6 @@ def test_tiles_fill_a_grid():
     assert (sheet[2:, 6:] == 255).all()
 
 
-# ---- files ---------------------------------------------------------------------------------------
-
-
 def test_an_mp4_has_the_frames_of_the_flight(flight, tmp_path):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     file = save_video(flight, tmp_path / "new" / "hover.mp4", size=(320, 240), fps=20.0)

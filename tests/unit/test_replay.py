@@ -86,16 +86,14 @@ def test_a_log_of_px4_replays_to_the_errors_of_the_flight(tmp_path):
     origin = np.array(PX4.gnss.reference_antenna_G)
     there = log.gnss.values["position_G"] - origin
     here = [s[2]["gnss_position"] for s in recorded.gnss]
-    np.testing.assert_allclose(
-        np.linalg.norm(there, axis=1), np.linalg.norm(here, axis=1), atol=1e-5
-    )
-    np.testing.assert_allclose(
-        log.gnss.values["velocity_I"], [s[2]["gnss_velocity"] for s in recorded.gnss], atol=1e-5
-    )
+    lengths = (np.linalg.norm(places, axis=1) for places in (there, here))
+    np.testing.assert_allclose(*lengths, atol=1e-5)
+    speeds = [s[2]["gnss_velocity"] for s in recorded.gnss]
+    np.testing.assert_allclose(log.gnss.values["velocity_I"], speeds, atol=1e-5)
 
 
 @pytest.mark.slow  # three flights of 5 s, each replayed
-def test_baselines_added_to_a_px4_log_give_the_attitude_of_the_flight(tmp_path):
+def test_baselines_added_to_a_px4_log_give_the_attitude(tmp_path):
     """With the baselines that its messages cannot hold, attitude errors are within 10 %, too.
 
     From 1 s on, over all flights together; 6 % were seen. Without baselines it is 20 to 50 %.
@@ -121,10 +119,8 @@ def test_baselines_added_to_a_px4_log_give_the_attitude_of_the_flight(tmp_path):
 def test_late_aiding_sensors_find_a_heading_that_nothing_told(tmp_path):
     """Barometer and magnetometer arrive late, and the first magnetic field comes after 3 s."""
     pytest.importorskip("pyulog")
-    suite = PX4.replace(
-        barometer=quad_gym.BarometerParams(latency=0.04),
-        magnetometer=quad_gym.MagnetometerParams(latency=0.04),
-    )
+    kinds = {"barometer": quad_gym.BarometerParams, "magnetometer": quad_gym.MagnetometerParams}
+    suite = PX4.replace(**{name: kind(latency=0.04) for name, kind in kinds.items()})
     recorded = Recorded(flown(suite, 8.0, seed=11), suite)
     recorded.write_ulog(tmp_path / "flight.ulg", boot=1.0)
     whole = read_log(tmp_path / "flight.ulg")
@@ -153,7 +149,7 @@ def test_a_regular_log_replays_as_it_was_flown(flight):
     assert gap.max() < 0.1 * sizes(errors_in_flight(recorded, k)[late])[0]
 
 
-def test_measurements_that_come_too_late_or_without_a_sensor_are_counted(table):
+def test_late_and_unused_measurements_are_counted(table):
     result = replay(table, sensors=RTK, window=0.12)
     assert 0 < result.too_late < 70
     assert np.isfinite(result.position).all()
@@ -268,12 +264,7 @@ def small(**changes):
     """A log of four rows."""
     time = np.array([0.0, 0.01, 0.02, 0.03])
     ones = np.ones((4, 3))
-    log = {
-        "time": time,
-        "gyro": 0.0 * ones,
-        "accel": ones * [0.0, 0.0, 9.8],
-        "gnss_enu": 0.0 * ones,
-    }
+    log = {"time": time, "gyro": 0.0 * ones, "accel": ones * [0, 0, 9.8], "gnss_enu": 0.0 * ones}
     return {name: value for name, value in (log | changes).items() if value is not None}
 
 

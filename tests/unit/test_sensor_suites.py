@@ -72,9 +72,8 @@ def ticks_of_fixes(suite, count, ticks):
 
 
 def test_sensors_measure_at_their_phase_and_rate():
-    suite = RTK.replace(
-        gnss=RTK.gnss.replace(phase=0.25), camera=RTK.camera.replace(rate=50.0, phase=0.5)
-    )
+    gnss, camera = RTK.gnss.replace(phase=0.25), RTK.camera.replace(rate=50.0, phase=0.5)
+    suite = RTK.replace(gnss=gnss, camera=camera)
     batch = fly(suite, 3, task="hover")
     fixes, images = [], []
     for tick in range(1, 101):

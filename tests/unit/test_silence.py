@@ -43,9 +43,6 @@ def share_silent(batch, times, every):
     return np.mean(found)
 
 
-# ---- who watches -------------------------------------------------------------------------------
-
-
 def test_flights_of_the_default_suite_with_faults_are_lost():
     env = QuadVectorEnv(16, "hover", faults=STEP, start="hover", filter_start="warm")
     _, info = env.reset(seed=0)
@@ -74,9 +71,6 @@ def test_watching_changes_no_bit_of_a_flight(suite):
         assert (np.isfinite(batch.record("block_nis")[:, 0]) == watches).all()
 
 
-# ---- without a gate ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("tau", [100.0, 1e6])
 def test_filter_is_lost_about_as_long_as_it_is_wrong(tau):
     """Of biases that hardly change, the filter becomes surer and surer, and its errors last."""
@@ -101,9 +95,6 @@ def test_jump_of_gnss_does_not_go_undetected_without_a_gate():
     batch = fly(quad_gym.sensor_suite("standard"), 128, filter_start="warm", faults=fault)
     steps(batch, 5.0)
     assert share_silent(batch, times=8, every=0.5) <= 0.01
-
-
-# ---- a drift that is none ------------------------------------------------------------------------
 
 
 def test_corrections_of_the_drift_have_their_variance():
@@ -210,9 +201,6 @@ def test_rejected_fixes_raise_nothing_while_the_camera_fits(fits):
         flight.assert_position_is_known()
     else:
         assert np.sqrt(flight.ukf.covariance[0, 0]) > 30.0
-
-
-# ---- doubts that repeat --------------------------------------------------------------------------
 
 
 def test_doubts_of_rejections_do_not_add_up():

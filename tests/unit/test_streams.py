@@ -11,7 +11,6 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import quad_gym.kernels
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults import GnssJump, GnssOutage
 from quad_gym.params.distributions import Normal, Uniform
 from quad_gym.params.task import TASKS, TaskParams
@@ -27,6 +26,7 @@ from quad_gym.records import (
     FaultKind,
 )
 from quad_gym.records.streams import _claim
+from tests.builders import batch as begun
 from tests.unit.alarms import alarm_score
 
 COUNT = 10_000
@@ -245,7 +245,7 @@ def assert_independent(one, other, names, same):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_what_an_episode_begins_with_is_independent(task):
-    batch = FlightBatch(
+    batch = begun(
         COUNT,
         sensors="consumer",
         task=TaskParams(kind=task, randomize_reference=True, start="hover", radius=3.0),
@@ -257,7 +257,6 @@ def test_what_an_episode_begins_with_is_independent(task):
         faults=(GnssOutage(start=(1.0, 5.0), duration=(1.0, 2.0)), GnssJump(start=(1.0, 5.0))),
         threads=2,
     )
-    batch.reset(seeds=range(COUNT))
     first = quantities_of(batch, task)
     batch.reset()
     second = quantities_of(batch, task)
@@ -268,13 +267,10 @@ def test_what_an_episode_begins_with_is_independent(task):
     assert_independent(now, later, names, same=False)
 
 
-def test_what_an_episode_draws_does_not_depend_on_the_length_of_the_last_one():
+def test_draws_do_not_depend_on_the_length_of_the_last_episode():
     found = []
     for steps in (0, 1, 37):
-        batch = FlightBatch(
-            9, task=TaskParams(kind="waypoints", randomize_reference=True, start="hover")
-        )
-        batch.reset(seeds=range(9))
+        batch = begun(9, task=TaskParams(kind="waypoints", randomize_reference=True, start="hover"))
         for _ in range(steps):
             batch.step()
         batch.reset()

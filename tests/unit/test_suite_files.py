@@ -71,10 +71,8 @@ def test_a_base_gives_what_the_file_leaves_out(tmp_path):
         imu=base.imu.replace(rate=100.0),
     )
 
-
-def test_a_table_that_the_base_lacks_has_the_defaults_of_its_class(tmp_path):
-    mine = read(tmp_path, 'base = "rtk"\n[barometer]\nnoise_sigma = 0.3')
-    assert mine.barometer == quad_gym.BarometerParams(noise_sigma=0.3)
+    lacked = read(tmp_path, 'base = "rtk"\n[barometer]\nnoise_sigma = 0.3').barometer
+    assert lacked == quad_gym.BarometerParams(noise_sigma=0.3)
 
 
 @pytest.mark.parametrize(
@@ -107,13 +105,10 @@ def test_a_wrong_file_is_refused_by_file_and_field(text, message, tmp_path):
         read(tmp_path, text)
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path):
+def test_bytes_missing_files_and_other_endings_are_refused(tmp_path):
     (tmp_path / "mine.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=r"mine.toml must be a file of TOML"):
         quad_gym.sensor_suite(str(tmp_path / "mine.toml"))
-
-
-def test_a_missing_file_and_another_ending_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.toml"):
         quad_gym.sensor_suite(str(tmp_path / "none.toml"))
     with pytest.raises(ValueError, match=r"file must end with .toml, got 'mine.txt'"):
@@ -130,9 +125,6 @@ def test_an_environment_flies_with_a_suite_in_a_file(tmp_path):
         env.reset(seed=3)
         observations.append(env.step(env.action_space.low)[0])
     np.testing.assert_array_equal(*observations)
-
-
-# ---- commands -----------------------------------------------------------------------------------
 
 
 def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys, monkeypatch):
@@ -170,17 +162,14 @@ def test_the_record_of_a_training_has_the_contents_of_the_file(tmp_path):
     assert "suite_files" not in description(Plan(environment={"sensors": "rtk"}))
 
 
-def test_a_comparison_refuses_two_files_of_one_name(tmp_path):
-    files = []
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        files.append(str(quad_gym.sensor_suite("rtk").save(tmp_path / folder / "mine.toml")))
+def test_comparison_refuses_names_twice_and_a_changed_file(tmp_path):
+    (tmp_path / "b").mkdir()
+    file, other = (
+        str(quad_gym.sensor_suite("rtk").save(tmp_path / folder / "mine.toml"))
+        for folder in (".", "b")
+    )
     with pytest.raises(ValueError, match="--sensors must have different names, got mine mine"):
-        configure(CompareArgs(sensors=tuple(files), engine="compiled", output=tmp_path / "out"))
-
-
-def test_comparison_with_a_changed_suite_file_is_rejected(tmp_path):
-    file = str(quad_gym.sensor_suite("rtk").save(tmp_path / "mine.toml"))
+        configure(CompareArgs(sensors=(file, other), engine="compiled", output=tmp_path / "out"))
     args = CompareArgs(sensors=(file,), engine="compiled", output=tmp_path / "out")
     training = configure(args).trainings[0]
     assert training.folder == tmp_path / "out/runs/mine/truth/seed_0"

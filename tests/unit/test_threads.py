@@ -10,20 +10,17 @@ import time
 import numpy as np
 import pytest
 
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
 from quad_gym.kernels import board
 from quad_gym.records import WIDTH, Control, Source
+from tests.builders import batch
 
 COUNT = 3 * MIN_BLOCKS_PER_THREAD * WIDTH + 3
 
 
 def batch_of(threads, count=COUNT):
-    batch = FlightBatch(
-        count, source=Source.TRUTH, control=Control.CTBR, control_rate=50.0, threads=threads
-    )
-    batch.reset(seeds=range(count))
-    return batch
+    options = {"source": Source.TRUTH, "control": Control.CTBR, "control_rate": 50.0}
+    return batch(count, threads=threads, **options)
 
 
 def flown(batch, steps=20, pause=0.0):
@@ -55,29 +52,29 @@ def test_two_batches_take_turns():
     assert one.snapshot().tobytes() == other.snapshot().tobytes() == flown(batch_of(1))
 
 
-@pytest.mark.parametrize("twin", [copy.deepcopy, lambda batch: pickle.loads(pickle.dumps(batch))])
+@pytest.mark.parametrize("twin", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
 def test_a_copy_has_threads_of_its_own(twin):
-    batch = batch_of(2)
-    flown(batch, 3)
-    other = twin(batch)
-    assert flown(batch) == flown(other)
+    one = batch_of(2)
+    flown(one, 3)
+    other = twin(one)
+    assert flown(one) == flown(other)
 
 
-def child(batch, pipe):
-    pipe.send(flown(batch))
+def child(parent, pipe):
+    pipe.send(flown(parent))
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_after_a_fork_the_child_flies_with_threads_of_its_own():
-    batch = batch_of(2)
-    flown(batch, 3)
+    parent = batch_of(2)
+    flown(parent, 3)
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe()
-    process = context.Process(target=child, args=(batch, there))
+    process = context.Process(target=child, args=(parent, there))
     process.start()
     assert here.poll(60.0)
-    assert here.recv() == flown(batch)
+    assert here.recv() == flown(parent)
     process.join(10.0)
     assert process.exitcode == 0
 
@@ -85,10 +82,10 @@ def test_after_a_fork_the_child_flies_with_threads_of_its_own():
 def test_helpers_end_with_their_batch():
     gc.collect()
     before = len(helpers())
-    batch = batch_of(3)
-    flown(batch, 3)
+    threaded = batch_of(3)
+    flown(threaded, 3)
     assert len(helpers()) == before + 2
-    del batch
+    del threaded
     gc.collect()
     deadline = time.monotonic() + 10.0
     while len(helpers()) > before and time.monotonic() < deadline:
@@ -131,7 +128,7 @@ def test_what_goes_wrong_in_a_helper_is_raised():
             crew.run(0)
 
 
-def test_after_an_interrupted_step_the_next_one_waits_for_what_it_left():
+def test_step_after_an_interrupted_one_waits_for_it():
     seen = []
 
     def fly(words, number, command, serving):

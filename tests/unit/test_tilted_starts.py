@@ -57,7 +57,7 @@ def start(kf, flight, how):
 
 
 @pytest.mark.parametrize("how", ["heading", "magnetometer", "baseline", "course"])
-def test_errors_of_a_tilted_start_are_as_large_as_the_covariance_says(how):
+def test_errors_of_a_tilted_start_match_the_covariance(how):
     """Mean NEES of the state and its first three parts over 300 draws; each fails 1 in 1,000."""
     squares, kf = [], UnscentedKalmanFilter(MAGNETIC)
     for seed in range(300):
@@ -88,7 +88,7 @@ def test_without_errors_the_attitude_is_exact(how):
     np.testing.assert_allclose(antenna, 0.0, atol=1e-12)
 
 
-def test_level_and_resting_starts_agree_where_the_vehicle_is_level():
+def test_level_and_resting_starts_of_a_level_vehicle_agree():
     level, resting = UnscentedKalmanFilter(MAGNETIC), UnscentedKalmanFilter(MAGNETIC)
     level.initialize(FIX, heading=0.7)
     resting.initialize(FIX, heading=0.7, accel=[0.0, 0.0, GRAVITY])
@@ -100,20 +100,7 @@ def test_level_and_resting_starts_agree_where_the_vehicle_is_level():
     assert claimed == pytest.approx(math.hypot(imu.accel_bias_sigma, one_sample), rel=2e-3)
 
 
-def test_motion_tells_the_heading_of_a_tilted_vehicle_too():
-    flight = resting(3, roll=0.3, pitch=0.2)
-    flight.amplitude = 0.5
-    kf = UnscentedKalmanFilter(MAGNETIC)
-    kf.initialize(flight.gnss(0.0)[0], accel=force(flight), accel_sigma=WHITE)
-    assert not kf.heading_known
-    for k in range(1, 126):
-        kf.predict(*flight.sample(0.02 * (k - 1), 0.02), dt=0.02)
-        if k % 5 == 0:
-            position, velocity = flight.gnss(0.02 * k)
-            kf.update(position, gnss_velocity_G=velocity)
-    assert kf.heading_known
-    assert flight.nees(kf, 2.5) < 40.0  # of 15, once in 2,000
-    assert abs(nose(kf.R_BI) - nose(flight.R)) < 0.1
+REST = {"accel": [0.0, 0.0, GRAVITY]}
 
 
 @pytest.mark.parametrize(
@@ -124,21 +111,13 @@ def test_motion_tells_the_heading_of_a_tilted_vehicle_too():
         ({"accel": [GRAVITY, 0.0, 0.0]}, "x axis is not vertical"),
         ({"accel": [0.0, GRAVITY]}, "accel must have shape"),
         ({"accel_sigma": 0.1}, "accel_sigma must come with accel"),
-        ({"accel": [0.0, 0.0, GRAVITY], "accel_sigma": 0.0}, "accel_sigma"),
-        ({"accel": [0.0, 0.0, GRAVITY], "tilt_sigma": 0.1}, "tilt_sigma must not be given with"),
-        (
-            {"accel": [0.0, 0.0, GRAVITY], "gnss_baseline_G": [0.1, 0.0, 0.0], "heading": 0.1},
-            "got heading and gnss_baseline_G",
-        ),
+        ({**REST, "accel_sigma": 0.0}, "accel_sigma"),
+        ({**REST, "tilt_sigma": 0.1}, "tilt_sigma must not be given with"),
+        ({**REST, "gnss_baseline_G": [0.1, 0.0, 0.0], "heading": 0.1}, "got heading and gnss_bas"),
+        ({**REST, "gnss_baseline_G": R_IG.T @ [0, 0, 0.2]}, "within 12 degrees of the vertical"),
     ],
 )
 def test_bad_tilted_starts_raise(given, message):
-    kf = UnscentedKalmanFilter(MAGNETIC)
+    kf = UnscentedKalmanFilter(MAGNETIC.replace(gnss=UPRIGHT))
     with pytest.raises(ValueError, match=message):
         kf.initialize(FIX, **given)
-
-
-def test_a_baseline_that_stands_upright_tells_no_heading():
-    rtk = UnscentedKalmanFilter(MAGNETIC.replace(gnss=UPRIGHT))
-    with pytest.raises(ValueError, match="within 12 degrees of the vertical"):
-        rtk.initialize(FIX, R_IG.T @ [0.0, 0.0, 0.2], accel=[0.0, 0.0, GRAVITY])

@@ -7,13 +7,10 @@ import baselines
 import quad_gym
 
 
-def test_both_packages_say_that_they_are_typed():
+def test_packages_and_names_imported_on_first_use_have_types():
+    """A type checker does not run `__getattr__`: it reads the imports that are for it alone."""
     for package in (quad_gym, baselines):
         assert (Path(package.__file__).parent / "py.typed").exists()
-
-
-def test_names_imported_on_first_use_have_types():
-    """A type checker does not run `__getattr__`: it reads the imports that are for it alone."""
     tree = ast.parse(Path(quad_gym.__file__).read_text(encoding="utf-8"))
     (block,) = [node for node in tree.body if isinstance(node, ast.If)]
     assert ast.unparse(block.test) == "TYPE_CHECKING"

@@ -24,6 +24,8 @@ from tests.vague_starts import (
 )
 
 SUITES = ("standard", "rtk", "consumer", "indoor")
+POSES = ("heading, indoor", "heading and position, indoor")
+VAGUE = ("baseline, standard", *POSES, "hard iron, consumer")
 
 
 def warnings_of(suite, **keywords):
@@ -31,9 +33,6 @@ def warnings_of(suite, **keywords):
         warnings.simplefilter("always")
         FlightBatch(1, sensors=suite, **keywords)
     return [str(warning.message) for warning in caught if warning.category is UserWarning]
-
-
-# ---- tilts -----------------------------------------------------------------------------------
 
 
 def test_a_hovering_accelerometer_measures_its_thrust_at_any_tilt():
@@ -72,31 +71,19 @@ def test_the_largest_tilt_leaves_the_filter_consistent(name, kind):
     assert BAND[0] < found < BAND[1]
 
 
-# ---- suites ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", quad_gym.params.suites.ALL_SUITES)
 def test_no_suite_by_name_warns(name):
-    assert warnings_of(quad_gym.sensor_suite(name)) == []
+    assert not warnings_of(quad_gym.sensor_suite(name))
 
 
 @pytest.mark.parametrize(
     ("suite", "message"),
     [
-        (
-            with_baseline("standard", 0.2),
-            "GnssParams.baseline_sigma is 0.2 rad, more than 0.15 rad",
-        ),
+        (with_baseline("standard", 0.2), "GnssParams.baseline_sigma is 0.2 rad, more than 0.15 r"),
         (with_mark("indoor", heading_sigma=1.1), "InitialPoseParams.heading_sigma is 1.1 rad, mor"),
         (with_mark("indoor", position_sigma=2.0), "InitialPoseParams.position_sigma is 2 m, more"),
-        (
-            one_antenna(with_mark("rtk", heading_sigma=0.3)),
-            "InitialPoseParams.heading_sigma is 0.3 rad, more than 0.1 rad",
-        ),
-        (
-            vague_suites(2.0)["hard iron, consumer"],
-            "MagnetometerParams.hard_iron_sigma is 4.81e-06 T, more than 2.41e-06 T",
-        ),
+        (one_antenna(with_mark("rtk", heading_sigma=0.3)), "InitialPoseParams.heading_sigma is 0."),
+        (vague_suites(2.0)["hard iron, consumer"], "MagnetometerParams.hard_iron_sigma is 4.81e-0"),
     ],
 )
 def test_a_suite_that_starts_too_vaguely_warns_once_by_name(suite, message):
@@ -107,7 +94,7 @@ def test_a_suite_that_starts_too_vaguely_warns_once_by_name(suite, message):
 
 @pytest.mark.parametrize("vague", vague_suites())
 def test_a_suite_at_its_bound_does_not_warn(vague):
-    assert warnings_of(vague_suites()[vague]) == []
+    assert not warnings_of(vague_suites()[vague])
 
 
 def test_a_baseline_that_is_partly_vertical_has_a_lower_bound():
@@ -115,34 +102,20 @@ def test_a_baseline_that_is_partly_vertical_has_a_lower_bound():
     half_up = suite.gnss.replace(
         primary_antenna_B=(0.0, 0.0, 0.0), secondary_antenna_B=(0.1, 0.0, 0.1 * np.sqrt(3.0))
     )
-    assert warnings_of(suite) == []
+    assert not warnings_of(suite)
     (found,) = warnings_of(suite.replace(gnss=half_up))
     assert found.startswith("GnssParams.baseline_sigma is 0.1 rad, more than 0.075 rad")
-
-
-def test_a_warm_start_of_a_vague_suite_does_not_warn():
-    assert warnings_of(with_baseline("standard", 0.25), filter_start="warm") == []
-
-
-# ---- estimates -------------------------------------------------------------------------------
+    assert not warnings_of(with_baseline("standard", 0.25), filter_start="warm")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    "vague",
-    [
-        "baseline, standard",
-        "heading, indoor",
-        "heading and position, indoor",
-        "hard iron, consumer",
-    ],
-)
+@pytest.mark.parametrize("vague", VAGUE)
 def test_a_filter_that_starts_vaguely_is_consistent(vague, kind):
     for found in mean_nees(of_kind(vague_suites()[vague], kind), (0.2, 0.5)):
         assert BAND[0] < found < BAND[1]
 
 
-def test_coarse_baselines_leave_the_filter_consistent_beyond_the_bound():
+def test_coarse_baselines_leave_the_filter_consistent():
     """Noise of 0.3 rad, which shortens the part along the baseline by 0.09."""
     with pytest.warns(UserWarning, match="baseline_sigma"):
         means = mean_nees(with_baseline("standard", 0.3), (0.2, 0.5))
@@ -150,7 +123,7 @@ def test_coarse_baselines_leave_the_filter_consistent_beyond_the_bound():
         assert BAND[0] < found < BAND[1]
 
 
-def test_a_flight_in_few_steps_does_not_notice_one_in_many_beside_it():
+def test_flight_in_few_steps_does_not_depend_on_others():
     suite = with_mark("indoor", heading_sigma=0.25, position_sigma=0.5)
     batch = fly(suite, 16)
     steps(batch, 0.3)

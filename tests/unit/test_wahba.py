@@ -46,7 +46,7 @@ def test_the_reports_grid_over_all_euler_angles():
 
 
 @given(seeds, st.integers(3, 12), st.floats(1e-6, 1.0))
-def test_noisy_vectors_give_scipys_rotation_and_none_nearby_is_better(seed, count, noise):
+def test_noisy_vectors_give_scipys_and_the_best_rotation(seed, count, noise):
     weights, v_I, v_B, _ = noisy_problem(seed, count, noise)
     s = np.linalg.svd((weights[:, np.newaxis] * v_B).T @ v_I, compute_uv=False)
     assume(s[1] - s[2] > 1e-2 * s[0])
@@ -61,24 +61,15 @@ def test_noisy_vectors_give_scipys_rotation_and_none_nearby_is_better(seed, coun
             assert loss(turn @ R_BI, weights, v_I, v_B) >= least - 1e-12
 
 
-@given(seeds)
-def test_two_directions_are_enough(seed):
-    _, v_I, _, R_BI = noisy_problem(seed, 2, 0.0)
-    directions = v_I / np.linalg.norm(v_I, axis=1, keepdims=True)
-    assume(np.linalg.norm(np.cross(*directions)) > 0.05)
-    found = solve_wahba([1.0, 1.0], v_I, v_I @ R_BI.T)
-    assert_proper(found)
-    np.testing.assert_allclose(found, R_BI, rtol=0.0, atol=1e-12)
-
-
-@given(seeds)
-def test_vectors_in_a_plane_are_enough(seed):
-    weights, v_I, _, R_BI = noisy_problem(seed, 5, 0.0)
+@given(seeds, st.integers(2, 5))
+def test_vectors_in_a_plane_are_enough(seed, count):
+    weights, v_I, _, R_BI = noisy_problem(seed, count, 0.0)
     v_I[:, 2] = 0.0
     turned = v_I @ Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
-    s = np.linalg.svd(turned, compute_uv=False)
+    s = np.linalg.svd(np.sqrt(weights)[:, np.newaxis] * turned, compute_uv=False)
     assume(s[1] > 0.1 * s[0])
     found = solve_wahba(weights, turned, turned @ R_BI.T)
+    assert_proper(found)
     np.testing.assert_allclose(found, R_BI, rtol=0.0, atol=1e-12)
 
 
@@ -107,29 +98,19 @@ def test_a_vector_without_weight_is_ignored():
 
 
 X, Y, Z = np.eye(3)
-
-
-@pytest.mark.parametrize(
-    ("weights", "v_I", "v_B"),
-    [
-        ([1.0], [X], [Y]),
-        ([1.0, 1.0], [X, X], [Y, Y]),
-        ([1.0, 2.0, 1.0], [X, -2 * X, 3 * X], [Z, -2 * Z, 3 * Z]),
-        ([1.0, 1.0], [X, Y], [Z, Z]),
-        ([1.0, 0.0], [X, Y], [X, Y]),
-        ([1.0, 1.0], [0 * X, 0 * X], [X, Y]),
-        ([1.0, 1.0, 1.0], [X, Y, Z], [-X, -Y, -Z]),
-    ],
-    ids=["one", "equal", "parallel", "onto one", "one weighted", "zero", "point reflection"],
-)
-def test_data_that_leave_the_rotation_open_are_refused(weights, v_I, v_B):
-    with pytest.raises(ValueError, match="must determine a rotation"):
-        solve_wahba(weights, v_I, v_B)
+OPEN = "v_I and v_B"
 
 
 @pytest.mark.parametrize(
     ("name", "weights", "v_I", "v_B"),
-    [
+    [  # the first leave the rotation open
+        (OPEN, [1.0], [X], [Y]),
+        (OPEN, [1.0, 1.0], [X, X], [Y, Y]),
+        (OPEN, [1.0, 2.0, 1.0], [X, -2 * X, 3 * X], [Z, -2 * Z, 3 * Z]),
+        (OPEN, [1.0, 1.0], [X, Y], [Z, Z]),
+        (OPEN, [1.0, 0.0], [X, Y], [X, Y]),
+        (OPEN, [1.0, 1.0], [0 * X, 0 * X], [X, Y]),
+        (OPEN, [1.0, 1.0, 1.0], [X, Y, Z], [-X, -Y, -Z]),
         ("weights", [-1.0, 1.0], [X, Y], [X, Y]),
         ("weights", [0.0, 0.0], [X, Y], [X, Y]),
         ("weights", [], np.zeros((0, 3)), np.zeros((0, 3))),

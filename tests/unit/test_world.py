@@ -12,8 +12,9 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Control, Source
 from quad_gym.rotations import quaternion_to_dcm
 from quad_gym.vehicle import state_derivative
+from tests.body_states import random_state, state_of
 from tests.builders import flown_batch
-from tests.unit.test_vehicle import LAB, NO_FORCE, SKEWED, at_rest, newton_and_euler, random_state
+from tests.unit.test_vehicle import LAB, NO_FORCE, SKEWED, at_rest, newton_and_euler
 
 FULL = WorldParams(
     wind_I=(3.0, -2.0, 1.0),
@@ -23,6 +24,7 @@ FULL = WorldParams(
     ground_height=-0.3,
 )
 HOVER_SPEED = LAB.motor_speed_per_volt * LAB.hover_voltage
+HOVERING = {"voltage": LAB.hover_voltage, "speed": HOVER_SPEED}
 
 
 def in_world(state, voltages, d_I, p, world):
@@ -89,7 +91,7 @@ def test_thrust_grows_by_a_third_at_most_however_deep():
         assert rise == pytest.approx(LAB.gravity / 3, rel=1e-12)
 
 
-def test_the_ground_rights_a_tilted_vehicle_and_does_nothing_to_one_upside_down():
+def test_ground_rights_a_tilted_vehicle_but_none_upside_down():
     world = WorldParams(ground_effect=True, ground_height=0.0)
     roll = 0.1  # the left side, at body +y, up
     R_BI = np.array([[1, 0, 0], [0, np.cos(roll), np.sin(roll)], [0, -np.sin(roll), np.cos(roll)]])
@@ -106,22 +108,10 @@ def test_the_ground_rights_a_tilted_vehicle_and_does_nothing_to_one_upside_down(
 
 def motors_only(world, *, vehicle=LAB, voltage=0.0, speed=0.0, velocity=(0, 0, 0), yaw=0.0, **more):
     """One vehicle, level, at a steady voltage; nothing ends its episode."""
-    batch = FlightBatch(
-        1,
-        vehicle=vehicle,
-        source=Source.TRUTH,
-        control=Control.MOTOR,
-        task=quad_gym.TaskParams(
-            kind="hover",
-            start="ground",
-            pad=False,
-            duration=0.0,
-            out_of_bounds=1e9,
-            min_height=-1e9,
-        ),
-        world=world,
-        **more,
-    )
+    far = {"duration": 0.0, "out_of_bounds": 1e9, "min_height": -1e9}
+    task = quad_gym.TaskParams(kind="hover", start="ground", pad=False, **far)
+    options = {"vehicle": vehicle, "task": task, "world": world, **more}
+    batch = FlightBatch(1, source=Source.TRUTH, control=Control.MOTOR, **options)
     batch.reset(seeds=[1], position=(0.0, 0.0, 10.0), velocity=velocity, yaw=yaw)
     batch._blocks["rotor_speeds"] = speed
     action = voltage / batch.vehicle.hover_voltage - 1.0
@@ -157,13 +147,8 @@ def test_a_hovering_vehicle_drifts_off_with_the_wind(yaw, by_rotor_speed):
     if by_rotor_speed:
         drag = {"linear_drag_B": 0.5 * D, "rotor_drag_B": 0.5 * D / (4 * HOVER_SPEED)}
     wind = np.array([4.0, -3.0, 0.5])
-    batch, action = motors_only(
-        WorldParams(wind_I=wind, **drag),
-        vehicle=LAB.replace(disc_area=0.0),
-        voltage=LAB.hover_voltage,
-        speed=HOVER_SPEED,
-        yaw=yaw,
-    )
+    world, vehicle = WorldParams(wind_I=wind, **drag), LAB.replace(disc_area=0.0)
+    batch, action = motors_only(world, vehicle=vehicle, yaw=yaw, **HOVERING)
     flown(batch, action, 2.0)
     R_BI = quaternion_to_dcm(batch.record("q"))[0]
     expected = R_BI.T @ ((R_BI @ wind) * -np.expm1(-D * 2.0 / LAB.mass))
@@ -186,45 +171,20 @@ def test_a_flight_in_a_wind_is_the_calm_flight_carried_along(seed):
     np.testing.assert_allclose(blown.record("q"), calm.record("q"), atol=1e-10)
 
 
-def test_air_forces_take_energy_in_still_air():
-    world = WorldParams(linear_drag_B=(0.5, 0.3, 0.1), rotor_drag_B=(1e-5, 1e-5, 1e-5))
-    batch, off = motors_only(world, velocity=(5.0, 4.0, 8.0), yaw=1.0)
-    energies = []
-    for _ in range(50):
-        flown(batch, off, 0.02)
-        v, z = batch.record("v")[0], batch.record("r")[0, 2]
-        energies.append(0.5 * LAB.mass * v @ v + LAB.mass * LAB.gravity * z)
-    assert (np.diff(energies) < 0.0).all()
-
-
 def test_the_accelerometer_feels_what_the_air_does():
     """Without noise it reads R (a + g e3) with the derivative of the present instant."""
     quiet = dict.fromkeys(
         ("accel_noise_density", "gyro_noise_density", "accel_bias_sigma", "gyro_bias_sigma"),
         Uniform(1e-14, 1e-14),
     )
-    sensors = quad_gym.sensor_suite("lab")
+    sensors, lever = quad_gym.sensor_suite("lab"), np.array([0.1, -0.2, 0.05])
+    sensors = sensors.replace(imu=sensors.imu.replace(lever_arm_B=lever))
+    task = quad_gym.TaskParams(kind="hover", start="hover", height=0.3)
     world = FULL.replace(gust_wind_speed=8.0)
-    batch = FlightBatch(
-        8,
-        sensors=sensors.replace(imu=sensors.imu.replace(lever_arm_B=(0.1, -0.2, 0.05))),
-        task=quad_gym.TaskParams(kind="hover", start="hover", height=0.3),
-        world=world,
-        randomization=quiet,
-    )
-    batch.reset(seeds=range(8))
-    for _ in range(150):
-        batch.step()
-    lever = np.array([0.1, -0.2, 0.05])
+    batch = flown_batch(range(8), 150, sensors=sensors, task=task, world=world, randomization=quiet)
     for i in range(8):
-        R_BI, w = quaternion_to_dcm(batch.record("q"))[i], batch.record("w")[i]
-        state = {
-            "position": batch.record("r")[i],
-            "velocity": batch.record("v")[i],
-            "R_BI": R_BI,
-            "body_rates": w,
-            "rotor_speeds": batch.record("rotor_speeds")[i],
-        }
+        state = state_of(batch.record, i)
+        R_BI, w = state["R_BI"], state["body_rates"]
         now = world.replace(wind_I=batch.record("wind")[i], gust_wind_speed=0.0)
         rates = state_derivative(state, np.zeros(4), NO_FORCE, LAB, now)
         a = R_BI @ (rates["velocity"] + [0.0, 0.0, LAB.gravity])
@@ -257,8 +217,7 @@ def test_the_battery_gives_what_it_has_and_no_more():
         assert charge == pytest.approx(1.0 - taken / battery.energy, rel=1e-12)
         voltage, power = battery_law(charge, speeds, battery)
         batch.step(np.ones((1, 4)))
-        asked = 2.0 * LAB.hover_voltage
-        expected = min(asked, voltage)
+        expected = min(2.0 * LAB.hover_voltage, voltage)
         np.testing.assert_allclose(batch.record("voltages")[0], expected, rtol=1e-12)
         taken += 0.005 * power
     assert taken > 0.0
@@ -286,7 +245,7 @@ def most_power_speed(resistance):
 
 
 @pytest.mark.parametrize("resistance", [0.05, 0.1, 0.2, 0.24])
-def test_rotors_that_want_more_power_than_there_is_settle_where_they_take_it_all(resistance):
+def test_rotors_that_want_too_much_power_take_it_all(resistance):
     battery = BatteryParams(energy=1e12, resistance=resistance)
     batch, _ = motors_only(WorldParams(battery=battery))
     settled = most_power_speed(resistance)
@@ -296,7 +255,7 @@ def test_rotors_that_want_more_power_than_there_is_settle_where_they_take_it_all
     assert batch.record("voltages")[0].max() < LAB.max_voltage / 2.0
 
 
-def test_faster_rotors_than_there_is_power_for_slow_down_and_drain_what_there_is():
+def test_rotors_too_fast_for_the_battery_slow_down():
     resistance = 0.2
     battery = BatteryParams(energy=1e6, resistance=resistance)
     batch, _ = motors_only(WorldParams(battery=battery), speed=2.0 * HOVER_SPEED)
@@ -318,35 +277,23 @@ def test_a_resistance_with_which_it_cannot_hover_is_refused():
         world = WorldParams(battery=BatteryParams(resistance=resistance))
         with pytest.raises(ValueError, match=r"BatteryParams.resistance must be at most 0.24"):
             FlightBatch(1, world=world)
-        with pytest.raises(
-            ValueError, match=r"resistance must be at most 0.24\d ohm, drawn or not"
-        ):
-            FlightBatch(
-                1,
-                world=WorldParams(battery=BatteryParams()),
-                randomization={"battery_resistance": Uniform(0.01, resistance)},
-            )
-    batch, action = motors_only(
-        WorldParams(battery=BatteryParams(energy=1e12, resistance=0.999 * limit)),
-        voltage=LAB.hover_voltage,
-        speed=HOVER_SPEED,
-    )
+        world, drawn = WorldParams(battery=BatteryParams()), Uniform(0.01, resistance)
+        with pytest.raises(ValueError, match=r"must be at most 0.24\d ohm, drawn or not"):
+            FlightBatch(1, world=world, randomization={"battery_resistance": drawn})
+    world = WorldParams(battery=BatteryParams(energy=1e12, resistance=0.999 * limit))
+    batch, action = motors_only(world, **HOVERING)
     flown(batch, action, 5.0)
     np.testing.assert_allclose(batch.record("rotor_speeds")[0], HOVER_SPEED, rtol=1e-9)
 
 
 def test_an_empty_battery_cuts_off():
-    batch, action = motors_only(
-        WorldParams(battery=BatteryParams(energy=30.0)),
-        voltage=LAB.hover_voltage,
-        speed=HOVER_SPEED,
-    )
+    batch, action = motors_only(WorldParams(battery=BatteryParams(energy=30.0)), **HOVERING)
     flown(batch, action, 2.0)
     assert batch.record("charge")[0] == 0.0
     np.testing.assert_array_equal(batch.record("voltages"), 0.0)
 
 
-def test_the_true_vehicles_largest_voltage_holds_whatever_the_controller_believes():
+def test_true_vehicles_largest_voltage_holds():
     weak = LAB.replace(max_voltage=4.0)
     batch, _ = motors_only("calm", true_vehicle=weak)
     batch.step(np.ones((1, 4)))
@@ -367,12 +314,8 @@ def test_a_calm_world_flies_the_same_bits():
 def test_air_that_does_nothing_changes_nothing_but_rounding():
     vehicle = LAB.replace(disc_area=0.0)
     plain = flown_batch(range(9), 100, vehicle=vehicle)
-    blown = flown_batch(
-        range(9),
-        100,
-        vehicle=vehicle,
-        world=WorldParams(wind_I=(5.0, 0.0, 0.0), gust_wind_speed=5.0),
-    )
+    world = WorldParams(wind_I=(5.0, 0.0, 0.0), gust_wind_speed=5.0)
+    blown = flown_batch(range(9), 100, vehicle=vehicle, world=world)
     for name in ("b_a", "b_g", "key", "instant"):  # random draws are those of the calm flight
         np.testing.assert_array_equal(blown.record(name), plain.record(name))
     for name in ("r", "v", "q", "w", "r_hat", "accel", "pixels"):

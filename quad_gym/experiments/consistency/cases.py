@@ -62,7 +62,7 @@ class Case:
             task=endless(TASK_DEFAULTS[self.task]),
             gains="tuned",
             filter_start=self.start,
-            innovations=True,
+            innovations="estimator" not in self.keywords,  # which only the built-in filter has
             threads=threads,
             **self.keywords,
         )

@@ -90,10 +90,14 @@ class EntryLibrary(_AlignedLibrary):
         }
         super().finalize()
 
-    def _optimize_final_module(self) -> None:
+    def hide_kernels(self) -> None:
+        """Make the kernels internal to the entry's module."""
         for function in self._final_module.functions:
             if function.name in self._kernels and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
+
+    def _optimize_final_module(self) -> None:
+        self.hide_kernels()
         # one run: the cheap one before it, by which Numba prunes reference counts, has nothing
         # to prune in kernels
         passes, builder = self._codegen._module_pass_manager()
@@ -158,7 +162,9 @@ _NOT_FOR_KERNELS = frozenset(
 with arguments that vary; together a tenth of the time that kernels take to compile."""
 
 
-def _compiler_with(lowering: type, left_out: frozenset[str] = frozenset()) -> type:
+def compiler_with(lowering: type, left_out: frozenset[str] = frozenset()) -> type:
+    """Return Numba's compiler with another lowering, and without some passes."""
+
     class Compiler(CompilerBase):  # type: ignore[misc]
         def define_pipelines(self) -> list[Any]:
             passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
@@ -173,8 +179,8 @@ def _compiler_with(lowering: type, left_out: frozenset[str] = frozenset()) -> ty
     return Compiler
 
 
-KernelCompiler = _compiler_with(KernelLowering, _NOT_FOR_KERNELS)
-EntryCompiler = _compiler_with(EntryLowering)
+KernelCompiler = compiler_with(KernelLowering, _NOT_FOR_KERNELS)
+EntryCompiler = compiler_with(EntryLowering)
 
 
 class KernelDispatcher(CPUDispatcher):  # type: ignore[misc]

@@ -131,9 +131,16 @@ def _filter_and(needed: Callable[[Any], Any]) -> Callable[[Any], bool]:
     return lambda settings: bool(settings["run_filter"] and needed(settings))
 
 
+def _built_in(*names: str) -> Callable[[Any], bool]:
+    """Make a test of settings: the built-in filter runs, and all of these are set."""
+    needed = _with("run_filter", *names)
+    return lambda settings: needed(settings) and not settings["own_estimator"]
+
+
 _always, _filter, _faults = _with(), _with("run_filter"), _with("faults")
 _corrupts, _air = _with("run_filter", "faults"), _with("air")
 _late, _slow = _with("run_filter", "late"), _with("run_filter", "slow_states")
+_own = _with("run_filter", "own_estimator")
 _REWINDS = ("run_filter", "late", "rewinds")
 _grounded, _contacts, _drawn = _with("grounded"), _with("contacts"), _with("randomized")
 _MONITORED = FilterForm.GATE | FilterForm.INNOVATIONS
@@ -156,12 +163,12 @@ def _sensor_source(sensor: Sensor) -> Kernel:
 
 
 SOURCES = (
-    _stage("filter.update:update_with_slow", _slow, "filter", "slow"),
-    _stage("filter.update:update", _filter, "filter"),
-    _stage("filter.predict:predict_with_slow", _slow, "filter", "slow"),
-    _stage("filter.predict:predict", _filter, "filter"),
-    _stage("filter.delayed:late_update_with_slow", _with(*_REWINDS, "slow_states"), "late"),
-    _stage("filter.delayed:late_update", _with(*_REWINDS), "late"),
+    _stage("filter.update:update_with_slow", _built_in("slow_states"), "filter", "slow"),
+    _stage("filter.update:update", _built_in(), "filter"),
+    _stage("filter.predict:predict_with_slow", _built_in("slow_states"), "filter", "slow"),
+    _stage("filter.predict:predict", _built_in(), "filter"),
+    _stage("filter.delayed:late_update_with_slow", _built_in(*_REWINDS, "slow_states"), "late"),
+    _stage("filter.delayed:late_update", _built_in(*_REWINDS), "late"),
     *map(_sensor_source, Sensor),
     _stage("sensors.imu:sample", _filter, "filter"),
     _stage("task.draws:draw", _drawn, "draws"),
@@ -169,6 +176,7 @@ SOURCES = (
     _stage("task.places:place_features", _with("features_drawn"), "places"),
     _stage("task.episode:begin", _always),
     Kernel(Stage.MOVE, "vehicle.air:move_in_air", _air, ()),
+    _stage("filter.align:align", _slow, "filter", "slow"),
     _stage("filter.align:align", _filter, "filter"),
     _stage("task.observation:observe", _always),
     _stage("task.show:show", _with("shown")),
@@ -183,6 +191,7 @@ SOURCES = (
     _stage("sensors.faults:corrupt_features", _corrupts),
     _stage("sensors.faults:corrupt_gnss", _corrupts),
     _stage("filter.preintegration:increment", _late, "late"),
+    Kernel(Stage.LOOK, "task.look:look_at_own", _own, ("own",)),
     _stage("task.look:look", _always),
     _stage("task.reward_and_endings:judge", _always),
     _stage("sensors.imu:drift_biases", _filter),

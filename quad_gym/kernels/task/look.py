@@ -9,15 +9,26 @@ from quad_gym.records import DRAW_NOISY, Control, Source
 
 
 @kernel
-def _look(flight, model, settings, mask):
-    """Set the state that the controller observes from its source, where `mask`."""
+def _estimated_rates(flight, own):
+    """Body rates of the estimate: the gyro minus its bias, or those of a user's estimator."""
+    if own is not None:
+        return load3(flight.w_hat)
+    return load3(flight.w_meas) - load3(flight.b_g_hat)
+
+
+@kernel
+def _look(flight, model, settings, mask, own=None):
+    """Set the state that the controller observes from its source, where `mask`.
+
+    `own`: the settings, if the estimate is a user's; else None.
+    """
     R_BI = quaternion_to_dcm(load4(flight.q))
     r, v, w_B = load3(flight.r), load3(flight.v), load3(flight.w)
     if settings.source == Source.ESTIMATE or settings.source == Source.MEASUREMENTS:
         r, v, R_BI = load3(flight.r_hat), load3(flight.v_hat), load33(flight.R_hat)
         w_B = load3(flight.w_meas)
         if settings.source == Source.ESTIMATE:
-            w_B = w_B - load3(flight.b_g_hat)
+            w_B = _estimated_rates(flight, own)
     elif settings.source == Source.NOISY:
         stream, s = stream_of(flight), load4(model.noisy_sigma)
         n_r, n_v = six_normals(stream, DRAW_NOISY)
@@ -33,13 +44,13 @@ def _look(flight, model, settings, mask):
 
 
 @kernel
-def _look_within(flight, model, settings):
+def _look_within(flight, model, settings, own=None):
     """Set the body rates that an inner loop reads, at an instant within a control period."""
     control, source = settings.control, settings.source
     if control != Control.MOTOR and control != Control.WRENCH:
         w_B = load3(flight.w)
         if source == Source.ESTIMATE:
-            w_B = load3(flight.w_meas) - load3(flight.b_g_hat)
+            w_B = _estimated_rates(flight, own)
         elif source == Source.MEASUREMENTS:
             w_B = load3(flight.w_meas)
         elif source == Source.NOISY:
@@ -55,3 +66,12 @@ def look_stage(flight, world, model, settings, work, stages, flag):
         _look_within(flight, model, settings)
     else:
         _look(flight, model, settings, work.mask > 0.0)
+
+
+@stage
+def look_at_own_stage(flight, world, model, settings, work, stages, flag):
+    """Set the state that the controller observes, where a user's estimator runs."""
+    if flag and settings.control <= Control.CTBR:
+        _look_within(flight, model, settings, settings)
+    else:
+        _look(flight, model, settings, work.mask > 0.0, settings)

@@ -38,9 +38,6 @@ def call(function):
     return x[0]
 
 
-# ---- kernels and entries -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("decorator", [kernel, routine])
 def test_python_cannot_call_a_kernel(decorator):
     def grows(x):
@@ -60,8 +57,6 @@ def test_an_entry_is_called_and_found_in_the_cache():
     signature = next(iter(single.wahba_of_vectors.overloads))
     assert cache.holds(signature, single.wahba_of_vectors.targetctx)
 
-
-# ---- what cached code needs of Numba -----------------------------------------------------------
 
 DOT = """
 import numpy as np
@@ -99,9 +94,6 @@ def test_numba_is_registered_where_cached_code_needs_it(module, parts, monkeypat
     assert bool(refreshed) != known
     assert call(fresh) == 11.0
     assert parts.compiled() == ["a"]
-
-
-# ---- damaged and missing files -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -150,9 +142,6 @@ def test_stale_files_of_a_function_are_deleted(module, parts):
     assert old[-1] in files
     assert old[0] not in files
     assert not parts.files("tmp")
-
-
-# ---- where nothing can be written --------------------------------------------------------------
 
 
 def test_without_a_folder_parts_are_compiled_in_the_process(parts):

@@ -117,9 +117,6 @@ def test_an_edit_makes_stale_what_depends_on_it_alone(digests, what):
     assert stale == EDITS[what][-1]
 
 
-# ---- what functions hold -----------------------------------------------------------------------
-
-
 def holding(held, default=1.0):
     def function(x, more=default):
         return x + held

@@ -52,8 +52,7 @@ def test_parts_are_compiled_once_and_by_processes_of_their_own(parts):
 
 
 @pytest.mark.parametrize(
-    "what",
-    ["prepare(parts.NAMES, processes=2)", pytest.param("pass", marks=pytest.mark.slow)],
+    "what", ["prepare(parts.NAMES, processes=2)", pytest.param("pass", marks=pytest.mark.slow)]
 )
 def test_six_processes_that_begin_at_once_compile_each_part_once(parts, what):
     """By `prepare`, or by calls that find nothing prepared."""

@@ -1,10 +1,12 @@
-"""State variables that a task keeps for each flight."""
+"""State variables that a task or an estimator of a user keeps for each flight."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from quad_gym.records import WIDTH
 
 _KINDS = {"b": np.bool_, "i": np.int64, "u": np.int64, "f": np.float64}
 
@@ -39,7 +41,7 @@ class State:
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         if name[0] == "_" or name not in self.names:
-            raise AttributeError(f"the task declares no state {name!r}: add it to `state`")
+            raise AttributeError(f"its class declares no state {name!r}: add it to `state`")
         return self._rows[name]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -73,3 +75,41 @@ class State:
         self.lock(False)
         self._rows[chosen] = rows
         self.lock(True)
+
+    def kept_with(self, flights: NDArray[Any]) -> NDArray[Any]:
+        """Join a snapshot of flights with this state, if there is any."""
+        if not self.names:
+            return flights
+        kept = np.zeros(len(flights), self._kind_with(flights.dtype))
+        kept["flights"] = flights
+        kept["state"][np.divmod(np.arange(len(self._rows)), WIDTH)] = self._rows
+        return kept
+
+    def flights_of(
+        self, snapshot: NDArray[Any], flights: np.dtype[Any], owner: str
+    ) -> NDArray[Any]:
+        """Return the flights of a snapshot that `kept_with` has joined with a state.
+
+        Args:
+            snapshot: Snapshot.
+            flights: Data type of the flights.
+            owner: Task or estimator that needs the state, for the message.
+
+        Raises:
+            ValueError: If it has no state like this one.
+        """
+        if not self.names:
+            return snapshot
+        if getattr(snapshot, "dtype", None) != self._kind_with(flights):
+            raise ValueError(f"snapshot must be one of a batch with {owner}")
+        return np.asarray(snapshot["flights"])
+
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Restore the state that `kept_with` has joined with flights."""
+        if self.names:
+            places = np.divmod(np.arange(len(self._rows)), WIDTH)
+            self.put(snapshot["state"][places], np.ones(len(self._rows), bool))
+
+    def _kind_with(self, flights: np.dtype[Any]) -> np.dtype[Any]:
+        """Data type of flights with this state."""
+        return np.dtype([("flights", flights), ("state", self._rows.dtype, (WIDTH,))])

@@ -1,0 +1,161 @@
+"""A suite's filter as a static library for another processor, with its header and an example.
+
+The library has the kernels of `quad_gym.estimation` for one vehicle, with one flight in a block.
+Records have another layout then, so a separate process writes the files.
+"""
+
+import concurrent.futures
+import multiprocessing
+import os
+import pickle
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from baselines.exporting.controller import Controller
+from baselines.exporting.filter_policy import PolicySources, policy_sources
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+
+LIBRARY, HEADER = "libquad_gym_filter.a", "quad_gym_filter.h"
+
+
+class Target(NamedTuple):
+    """A processor for which filters are exported."""
+
+    processor: tuple[str, ...]
+    """triple of four parts, processor and relocation, in LLVM's words"""
+    words: str
+    """description"""
+    build: str
+    """commands that build the example"""
+
+
+_CMAKE = "cmake -B build && cmake --build build"
+_BARE = """\
+arm-none-eabi-gcc -std=c99 -O2 -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-d16 \\
+    main.c libquad_gym_filter.a -lm  # with the start-up code and linker script of your board"""
+_WASM = """\
+clang --target=wasm32-wasi --sysroot=/usr -std=c99 -O2 -D_WASI_EMULATED_PROCESS_CLOCKS \\
+    main.c libquad_gym_filter.a -lm -lwasi-emulated-process-clocks -o example.wasm  # wasi-libc"""
+TARGETS = {
+    "x86-64": Target(
+        ("x86_64-unknown-linux-gnu", "x86-64-v3"),
+        "Linux on x86-64 with AVX2 and FMA (since 2013)",
+        _CMAKE,
+    ),
+    "aarch64": Target(
+        ("aarch64-unknown-linux-gnu", "generic"),
+        "Linux on AArch64",
+        _CMAKE.replace("build &&", "build -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc &&", 1),
+    ),
+    "cortex-m7": Target(
+        ("thumbv7em-unknown-none-eabihf", "cortex-m7", "static"),
+        "Cortex-M7 with double-precision FPU, hard-float ABI",
+        _BARE,
+    ),
+    "wasm32": Target(("wasm32-unknown-unknown", "generic", "static"), "WebAssembly", _WASM),
+}
+"""Processors by the names that users write."""
+
+
+def export_filter(
+    suite: SensorSuite, label: str, target: str, folder: Path, policy: Controller | None = None
+) -> list[Path]:
+    """Write a filter's library, header, example, and files that build and explain them.
+
+    Args:
+        suite: Sensor suite with its filter.
+        label: Name of the suite.
+        target: One of TARGETS.
+        folder: Folder to write to; created if it does not exist.
+        policy: Policy that acts on the estimate; None: the filter alone.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
+            observes more than the estimate.
+        RuntimeError: If the kernels cannot be emitted for the target.
+    """
+    check.choice("target", target, tuple(TARGETS))
+    suite.require_filter()
+    text = PolicySources() if policy is None else policy_sources(policy)
+    env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
+    done = subprocess.run(
+        [sys.executable, "-c", f"from {__name__} import write; write()"],
+        input=pickle.dumps((suite, label, target, tuple(text))),
+        stdout=subprocess.PIPE,
+        env={**os.environ, **env, "PYTHONPATH": path},
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(f"the filter could not be compiled for {target}, see above")
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, content in pickle.loads(done.stdout).items():
+        files.append(folder / name)
+        files[-1].write_bytes(content)
+    return files
+
+
+def write() -> None:
+    """Write the files for a pickled suite on standard input, pickled, to standard output."""
+    sys.stdout.buffer.write(pickle.dumps(_contents(*pickle.load(sys.stdin.buffer))))
+
+
+def _contents(
+    suite: SensorSuite, label: str, target: str, policy: tuple[str, ...]
+) -> dict[str, bytes]:
+    """Return the files by name; records must have one lane."""
+    from baselines.exporting.filter_sources import Sources
+    from quad_gym.kernels.compiling.cache import say
+    from quad_gym.kernels.compiling.foreign import (
+        Processor,
+        emitted,
+        is_cached,
+        loaded_size,
+        object_of,
+        symbol_of,
+    )
+
+    sources, processor = (
+        Sources(suite, label, target, policy),
+        Processor(*TARGETS[target].processor),
+    )
+    missing = [name for name in sources.functions if not is_cached(name, processor)]
+    if missing:
+        say(f"quad_gym: compiling {len(missing)} parts of the filter for {target} (once)")
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(min(4, os.cpu_count() or 1), context) as pool:
+            tasks = [pool.submit(object_of, name, processor) for name in missing]
+            for task in tasks:
+                task.result()
+    objects = {symbol_of(name): object_of(name, processor) for name in sources.functions}
+    for symbol, numbers in sources.constants.items():
+        text = "".join(f"\\{byte:02X}" for byte in numbers)
+        ir = f'@{symbol} = constant [{len(numbers)} x i8] c"{text}", align 64\n'
+        objects[symbol] = emitted(ir, processor)
+    flash = sum(map(loaded_size, objects.values()))
+    return {LIBRARY: archive(objects), **sources.texts(flash)}
+
+
+def archive(objects: dict[str, bytes]) -> bytes:
+    """Return a static library of object files, each with one symbol, in the format of GNU ar."""
+    index_size = 4 + 4 * len(objects) + sum(len(name) + 1 for name in objects)
+    place, offsets, members = 8 + 60 + index_size + index_size % 2, [], b""
+    for k, content in enumerate(objects.values()):
+        offsets.append(place + len(members))
+        members += _member(f"{k}.o/", content)
+    index = struct.pack(f">{1 + len(offsets)}I", len(offsets), *offsets)
+    index += b"".join(name.encode() + b"\0" for name in objects)
+    return b"!<arch>\n" + _member("/", index) + members
+
+
+def _member(name: str, content: bytes) -> bytes:
+    head = f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(content):<10}`\n"
+    return head.encode() + content + b"\n" * (len(content) % 2)

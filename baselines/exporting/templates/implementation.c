@@ -1,0 +1,490 @@
+#include <math.h>
+#include <string.h>
+
+/* products and sums must be rounded one by one, as in Python */
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#pragma GCC push_options
+#pragma GCC optimize("fp-contract=off")
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define QGI_SAME_TIME 1e-6
+#define QGI_STAGE(name) \
+    extern int name(void *, void *, void *, void *, void *, void *, void *, void *, int64_t)
+
+typedef int qgi_run(void *, void *, void *, void *, const void *, void *, const void *, void *,
+                    void *, const void *);
+extern qgi_run qg_core_predict, qg_core_update;
+extern int qg_core_start(void *, void *, void *, void *, const void *, void *, const void *);
+extern int qg_core_start_level(void *, void *, void *);
+extern int qg_core_keep(void *, void *, const void *, int64_t);
+extern const char qg_core_params[], qg_core_steps[], qg_core_settings[], qg_core_first[];
+@STAGE_DECLARATIONS@
+
+/* The address of the full record, of which only the used parts are in memory. */
+static char *qgi_flight(const qg_filter *f)
+{
+    return (char *)(uintptr_t)f->flight - @SKIPPED@;
+}
+
+static double *qgi_field(const qg_filter *f, int offset)
+{
+    return (double *)(void *)(qgi_flight(f) + offset);
+}
+
+static int qgi_finite(const double *x, int n)
+{
+    for (int i = 0; i < n; i++)
+        if (!isfinite(x[i]))
+            return 0;
+    return 1;
+}
+
+#ifdef QG_GNSS
+static void qgi_turn(const double m[9], const double v[3], double out[3])
+{
+    for (int i = 0; i < 3; i++)
+        out[i] = m[3 * i] * v[0] + m[3 * i + 1] * v[1] + m[3 * i + 2] * v[2];
+}
+#endif
+
+/* ---- one operation of the filter ---- */
+
+static void qgi_run_on(qg_filter *f, qgi_run *run, const void *input)
+{
+    void *result, *raised;
+    run(&result, &raised, qgi_flight(f), f->params, qg_core_params, f->steps, qg_core_settings,
+        f->work, f->table, input);
+}
+
+static void qgi_apply(qg_filter *f, const qg_event *e)
+{
+    if (e->measurement < 0)
+        qgi_run_on(f, qg_core_predict, &e->sample);
+    else
+        qgi_run_on(f, qg_core_update, &f->measurement[e->measurement]);
+}
+
+static const int qgi_parts[][2] = {@COPIED@}; /* offsets and lengths of what is copied, in doubles */
+
+static void qgi_copy(qg_filter *f, double *copy, int restores)
+{
+    for (unsigned k = 0; k < sizeof qgi_parts / sizeof qgi_parts[0]; k++) {
+        double *part = f->flight + qgi_parts[k][0];
+        size_t size = 8 * (size_t)qgi_parts[k][1];
+        if (restores)
+            memcpy(part, copy, size);
+        else
+            memcpy(copy, part, size);
+        copy += qgi_parts[k][1];
+    }
+}
+
+/* ---- inputs within the window, to filter them again ---- */
+
+static int qgi_free(const char *used, int n)
+{
+    for (int k = 0; k < n; k++)
+        if (!used[k])
+            return k;
+    return -1;
+}
+
+static void qgi_drop(qg_filter *f, int count)
+{
+    for (int k = 0; k < count; k++) {
+        if (f->event[k].measurement >= 0)
+            f->measurement_used[f->event[k].measurement] = 0;
+        if (f->event[k].copy >= 0)
+            f->copy_used[f->event[k].copy] = 0;
+    }
+    f->events -= count;
+    memmove(f->event, f->event + count, (size_t)f->events * sizeof f->event[0]);
+}
+
+/* Drop the events before the last copy that is older than a time. */
+static void qgi_forget(qg_filter *f, double reach)
+{
+    int keep = 0;
+    for (int k = 0; k < f->events && f->event[k].start <= reach; k++)
+        if (f->event[k].copy >= 0)
+            keep = k;
+    qgi_drop(f, keep);
+}
+
+/* Drop the events before the second copy, where memory is short: the window shrinks. */
+static void qgi_shrink(qg_filter *f)
+{
+    int k = 1;
+    while (k < f->events && f->event[k].copy < 0)
+        k++;
+    qgi_drop(f, k);
+}
+
+/* Make room for two more events, and for a measurement; return its place. */
+static int qgi_room(qg_filter *f)
+{
+    int place;
+    while (f->events > QG_EVENTS - 2)
+        qgi_shrink(f);
+    while ((place = qgi_free(f->measurement_used, QG_MEASUREMENTS)) < 0)
+        qgi_shrink(f);
+    return place;
+}
+
+static void qgi_add(qg_filter *f, qg_event e)
+{
+    e.start = f->time;
+    e.time = f->time + (e.measurement < 0 ? e.sample.dt : 0.0);
+    e.copy = -1;
+    f->since_copy++;
+    if (!f->events || f->since_copy >= QG_COPY_EVERY) {
+        e.copy = qgi_free(f->copy_used, QG_COPIES);
+        if (e.copy >= 0) {
+            f->copy_used[e.copy] = 1;
+            qgi_copy(f, f->copy[e.copy], 0);
+            f->since_copy = 0;
+        }
+    }
+    f->event[f->events++] = e;
+    f->time = e.time;
+    qgi_apply(f, &e);
+    qgi_forget(f, f->time - QG_WINDOW);
+}
+
+/* Split a sample after a time: the gyro's rate of change is the whole sample's in both parts. */
+static void qgi_split(const qg_sample_record *whole, double first, qg_sample_record part[2])
+{
+    part[0] = part[1] = *whole;
+    part[0].dt = first;
+    part[1].dt = whole->dt - first;
+    for (int k = 0; k < 2; k++)
+        for (int i = 0; i < 3; i++)
+            part[k].gyro_before[i] =
+                whole->gyro[i] - part[k].dt * ((whole->gyro[i] - whole->gyro_before[i]) / whole->dt);
+}
+
+/* Insert a measurement at its time stamp, and filter again everything after it. */
+static void qgi_insert(qg_filter *f, int place, double time)
+{
+    qg_event *e = f->event, taken;
+    int i = f->events - 1, first, added = 1;
+    while (i > 0 && e[i - 1].time > time + QGI_SAME_TIME)
+        i--;
+    for (first = i; e[first].copy < 0;)
+        first--;
+    taken.measurement = place;
+    taken.copy = -1;
+    if (time - e[i].start > QGI_SAME_TIME) {
+        qg_sample_record part[2];
+        qgi_split(&e[i].sample, time - e[i].start, part);
+        memmove(e + i + 2, e + i, (size_t)(f->events - i) * sizeof *e);
+        e[i].sample = part[0];
+        e[i].time = time;
+        e[i + 2].sample = part[1];
+        e[i + 2].start = time;
+        e[i + 2].copy = -1;
+        taken.start = taken.time = time;
+        e[i + 1] = taken;
+        added = 2;
+    } else {
+        memmove(e + i + 1, e + i, (size_t)(f->events - i) * sizeof *e);
+        taken.start = taken.time = e[i].start;
+        taken.copy = e[i].copy;
+        e[i + 1].copy = -1;
+        e[i] = taken;
+    }
+    f->events += added;
+    qgi_copy(f, f->copy[e[first].copy], 1);
+    for (int k = first; k < f->events; k++) {
+        if (k > first && e[k].copy >= 0)
+            qgi_copy(f, f->copy[e[k].copy], 0);
+        qgi_apply(f, &e[k]);
+    }
+}
+
+static void qgi_take(qg_filter *f, const qg_measurement_record *record, double time)
+{
+    qg_event e;
+    int place = qgi_room(f);
+    f->measurement[place] = *record;
+    f->measurement_used[place] = 1;
+    memset(&e, 0, sizeof e);
+    e.measurement = place;
+    if (time >= f->time - QGI_SAME_TIME || !f->events)
+        qgi_add(f, e);
+    else
+        qgi_insert(f, place, time);
+}
+
+static void qgi_take_first_waiting(qg_filter *f)
+{
+    qg_pending first = f->waits[0];
+    f->waiting--;
+    memmove(f->waits, f->waits + 1, (size_t)f->waiting * sizeof f->waits[0]);
+    qgi_take(f, &first.record, first.time);
+}
+
+int qg_predict(qg_filter *f, const double gyro[3], const double accel[3], double dt)
+{
+    qg_event e;
+    double end;
+    if (!f->started)
+        return QG_NOT_STARTED;
+    if (!qgi_finite(gyro, 3) || !qgi_finite(accel, 3) || !isfinite(dt))
+        return QG_NOT_FINITE;
+    if (dt < 1e-9 || dt > QG_LONGEST_STEP)
+        return QG_OUT_OF_RANGE;
+    memset(&e, 0, sizeof e);
+    e.measurement = -1;
+    for (int i = 0; i < 3; i++) {
+        e.sample.gyro[i] = gyro[i];
+        e.sample.accel[i] = accel[i];
+        e.sample.gyro_before[i] = f->has_gyro ? f->gyro[i] : gyro[i];
+        f->gyro[i] = gyro[i];
+    }
+    f->has_gyro = 1;
+    e.sample.dt = dt;
+    end = f->time + dt;
+    while (f->waiting && f->waits[0].time < end - QGI_SAME_TIME) {
+        double elapsed = f->waits[0].time - f->time;
+        if (elapsed > QGI_SAME_TIME) {
+            qg_sample_record part[2];
+            qgi_split(&e.sample, elapsed, part);
+            e.sample = part[0];
+            qgi_room(f);
+            qgi_add(f, e);
+            e.sample = part[1];
+        }
+        qgi_take_first_waiting(f);
+    }
+    qgi_room(f);
+    qgi_add(f, e);
+    while (f->waiting && f->waits[0].time <= f->time + QGI_SAME_TIME)
+        qgi_take_first_waiting(f);
+    return QG_OK;
+}
+
+double qg_time(const qg_filter *f)
+{
+    return f->time;
+}
+
+double qg_oldest_time(const qg_filter *f)
+{
+    double reach = f->time - QG_WINDOW;
+    if (!f->events)
+        return f->time;
+    return reach > f->event[0].start ? reach : f->event[0].start;
+}
+
+static int qgi_update(qg_filter *f, const qg_measurement_record *record, double time, int rank)
+{
+    int k;
+    if (time > f->time + QGI_SAME_TIME) {
+        if (time > f->time + QG_LONGEST_STEP)
+            return QG_TOO_NEW;
+        if (f->waiting == QG_WAITING)
+            return QG_FULL;
+        for (k = f->waiting; k > 0; k--) {
+            const qg_pending *before = &f->waits[k - 1];
+            if (before->time < time || (before->time == time && before->rank <= rank))
+                break;
+            f->waits[k] = *before;
+        }
+        f->waits[k].record = *record;
+        f->waits[k].time = time;
+        f->waits[k].rank = rank;
+        f->waiting++;
+        return QG_OK;
+    }
+    if (time < qg_oldest_time(f) - QGI_SAME_TIME)
+        return QG_TOO_OLD;
+    qgi_take(f, record, time);
+    return QG_OK;
+}
+
+/* The noise of a measurement: standard deviations of at least a limit. */
+static int qgi_noise(const double *measured, const double *sigma, int n, double least, double *out)
+{
+    if (!measured)
+        return QG_CONTRADICTION;
+    for (int i = 0; i < n; i++) {
+        if (!isfinite(sigma[i]))
+            return QG_NOT_FINITE;
+        if (sigma[i] < least)
+            return QG_OUT_OF_RANGE;
+        out[i] = sigma[i];
+    }
+    return QG_OK;
+}
+
+/* The numbers of a measurement; NULL: not measured. */
+static int qgi_block(const double *given, int n, double *valid, double *place)
+{
+    if (!given)
+        return QG_OK;
+    if (!qgi_finite(given, n))
+        return QG_NOT_FINITE;
+    *valid = 1.0;
+    memcpy(place, given, 8 * (size_t)n);
+    return QG_OK;
+}
+
+#ifdef QG_GNSS
+/* Scale a baseline by a power of two: its length is not used. */
+static int qgi_baseline(const double *given, double out[3])
+{
+    double largest = 0.0;
+    int exponent;
+    if (!qgi_finite(given, 3))
+        return QG_NOT_FINITE;
+    for (int i = 0; i < 3; i++)
+        largest = fabs(given[i]) > largest ? fabs(given[i]) : largest;
+    if (largest == 0.0)
+        return QG_OUT_OF_RANGE;
+    frexp(largest, &exponent);
+    for (int i = 0; i < 3; i++)
+        out[i] = ldexp(given[i], -exponent);
+    return QG_OK;
+}
+#endif
+
+int qg_update(qg_filter *f, const qg_measurements *m, double time)
+{
+    qg_measurement_record r;
+    int error = QG_OK, rank = 9;
+    if (!f->started)
+        return QG_NOT_STARTED;
+    if (!isfinite(time))
+        return QG_NOT_FINITE;
+    memset(&r, 0, sizeof r);
+@BLANK@
+@TAKE@
+    return error ? error : qgi_update(f, &r, time, rank);
+}
+
+@UPDATE_SOURCE@
+/* ---- start ---- */
+
+static void qgi_begin(qg_filter *f, double time)
+{
+    memset(f, 0, sizeof *f);
+    memcpy(f->params, qg_core_params, sizeof f->params);
+    memcpy(f->steps, qg_core_steps, sizeof f->steps);
+    memcpy(&f->first, qg_core_first, sizeof f->first);
+@FILL_TABLE@
+    *(double *)(void *)((char *)f->work + @OF_MASK@) = 1.0;
+    f->time = time;
+}
+
+static void qgi_start(qg_filter *f)
+{
+    void *result, *raised;
+    for (int i = 0; i < 3; i++)
+        qgi_field(f, @OF_W_BEFORE@)[i] = NAN;
+    qg_core_start(&result, &raised, qgi_flight(f), f->params, qg_core_settings, f->work, &f->first);
+    f->started = 1;
+}
+
+int qg_init_at_rest(qg_filter *f, const double position[3], double heading, double time)
+{
+    static const double sigma[15] = {@REST_SIGMA@};
+    double *R, *L;
+    if (!qgi_finite(position, 3) || !isfinite(heading) || !isfinite(time))
+        return QG_NOT_FINITE;
+    qgi_begin(f, time);
+    qgi_start(f);
+    R = qgi_field(f, @OF_R_HAT@);
+    L = qgi_field(f, @OF_L@);
+    R[0] = R[4] = cos(heading);
+    R[1] = sin(heading);
+    R[3] = -R[1];
+    R[2] = R[5] = R[6] = R[7] = 0.0;
+    R[8] = 1.0;
+    for (int i = 0; i < 3; i++) {
+        qgi_field(f, @OF_POSITION@)[i] = position[i];
+        qgi_field(f, @OF_VELOCITY@)[i] = qgi_field(f, @OF_ACCEL_BIAS@)[i] = 0.0;
+        qgi_field(f, @OF_GYRO_BIAS@)[i] = 0.0;
+    }
+    for (int i = 0; i < 15; i++)
+        for (int j = 0; j < 15; j++)
+            L[15 * i + j] = i == j ? sigma[i] : 0.0;
+    return QG_OK;
+}
+
+@START_SOURCE@
+/* ---- outputs ---- */
+
+static void qgi_quaternion(const double R[9], double q[4])
+{
+    const double a = R[0], b = R[1], c = R[2], d = R[3], e = R[4], f = R[5], g = R[6], h = R[7],
+                 i = R[8];
+    const double rows[4][4] = {{1.0 + a + e + i, f - h, g - c, b - d},
+                               {f - h, 1.0 + a - e - i, b + d, g + c},
+                               {g - c, b + d, 1.0 - a + e - i, f + h},
+                               {b - d, g + c, f + h, 1.0 - a - e + i}};
+    int k = 0;
+    const double *r;
+    double size;
+    for (int j = 1; j < 4; j++)
+        if (rows[j][j] > rows[k][k])
+            k = j;
+    r = rows[k];
+    size = sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + r[3] * r[3]);
+    for (int j = 0; j < 4; j++)
+        q[j] = r[j] / size;
+}
+
+int qg_state(const qg_filter *f, qg_estimate *estimate)
+{
+    double row[@KEPT@];
+    void *result, *raised;
+    if (!f->started)
+        return QG_NOT_STARTED;
+    qg_core_keep(&result, &raised, qgi_flight(f), (int64_t)(uintptr_t)row);
+    estimate->time = f->time;
+    memcpy(estimate->position, row, 3 * 8);
+    memcpy(estimate->velocity, row + 3, 3 * 8);
+    memcpy(estimate->R_BI, row + 6, 9 * 8);
+    memcpy(estimate->accel_bias, row + 15, 3 * 8);
+    memcpy(estimate->gyro_bias, row + 18, 3 * 8);
+    for (int i = 0; i < 15; i++)
+        estimate->sigma[i] = sqrt(row[21 + i]);
+    estimate->diverged = row[36] > 0.0;
+    qgi_quaternion(estimate->R_BI, estimate->quaternion);
+    return QG_OK;
+}
+
+int qg_covariance(const qg_filter *f, double covariance[225])
+{
+    const double *L = qgi_field(f, @OF_L@);
+    if (!f->started)
+        return QG_NOT_STARTED;
+    for (int i = 0; i < 15; i++)
+        for (int j = 0; j < 15; j++) {
+            double sum = 0.0;
+            for (int k = 0; k <= (i < j ? i : j); k++)
+                sum += L[15 * i + k] * L[15 * j + k];
+            covariance[15 * i + j] = sum;
+        }
+    return QG_OK;
+}
+
+unsigned qg_status(const qg_filter *f)
+{
+    return f->started ? (unsigned)*(const uint64_t *)(const void *)qgi_field(f, @OF_STATUS@) : 0;
+}
+@POLICY_ACTION@
+#ifdef __cplusplus
+}
+#endif
+
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC pop_options
+#endif

@@ -1,0 +1,151 @@
+/* @TITLE@
+ *
+ * For: @TARGET@.
+ *
+ * The filter with which a controller was trained: a static library of its compiled kernels
+ * (libquad_gym_filter.a), and this header. The estimates are bitwise those of `quad-gym replay`.
+ * One .c file of your program defines QUAD_GYM_FILTER_IMPLEMENTATION before it includes this
+ * header; link it with libquad_gym_filter.a and the math library.
+ *
+ * SI units. I: inertial, east, north, up, from the reference antenna; G: Earth-centered (ECEF);
+ * B: body, x ahead, y left, z up. Vectors have 3 numbers. Times are time stamps with one common
+ * zero. No function allocates memory; all memory of a filter is its `qg_filter`, for which a static
+ * variable is the right place: about @RAM@ bytes. Filters are independent of each other.
+ *
+ * A call that returns an error has changed nothing. */
+#ifndef QUAD_GYM_FILTER_H
+#define QUAD_GYM_FILTER_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+enum qg_result {
+    QG_OK = 0,
+    QG_NOT_STARTED,    /* call an init function first */
+    QG_NOT_FINITE,     /* an argument is infinite or not a number */
+    QG_OUT_OF_RANGE,   /* an argument is out of the range that its comment states */
+    QG_TOO_OLD,        /* the time stamp is before qg_oldest_time */
+    QG_TOO_NEW,        /* the time stamp is more than QG_LONGEST_STEP later than the filter */
+    QG_FULL,           /* too many measurements wait for the prediction up to their time stamps */
+    QG_NO_HEADING,     /* a start needs one of: baseline, heading, magnetometer, course */
+    QG_CONTRADICTION   /* arguments that exclude each other */
+};
+
+#define QG_TICK @TICK@ /* period of the IMU for which the noise is stated [s] */
+#define QG_IMU_AVERAGES @AVERAGES@ /* 1: IMU samples are means over their time; 0: values at its start */
+#define QG_LONGEST_STEP @LONGEST@ /* longest time of one prediction [s] */
+#ifndef QG_WINDOW
+#define QG_WINDOW @WINDOW@ /* longest delay of a measurement [s] */
+#endif
+#ifndef QG_COPY_EVERY
+#define QG_COPY_EVERY 8 /* inputs between two copies of the filter; fewer copies: less memory, and
+                         * more time for a delayed measurement */
+#endif
+#ifndef QG_EVENTS
+#define QG_EVENTS @EVENTS@ /* samples and measurements within the window */
+#endif
+#ifndef QG_MEASUREMENTS
+#define QG_MEASUREMENTS @MEASUREMENTS@ /* measurements among them */
+#endif
+#define QG_WAITING 16 /* measurements that may wait for later samples */
+#define QG_COPIES (QG_EVENTS / QG_COPY_EVERY + 2)
+
+@SENSOR_MACROS@
+typedef struct qg_filter qg_filter; /* see the end of this header */
+
+/* ---- start ---- */
+
+@START_API@/* A level vehicle at rest at a known place: position in I [m], heading of body x, from east toward
+ * north [rad]; with the errors of the suite's initial pose. */
+int qg_init_at_rest(qg_filter *filter, const double position[3], double heading, double time);
+
+/* ---- inputs ---- */
+
+/* Propagate the estimate over dt, from 1e-9 s to QG_LONGEST_STEP: angular rate [rad/s] and specific
+ * force [m/s^2] in B. */
+int qg_predict(qg_filter *filter, const double gyro[3], const double accel[3], double dt);
+
+/* Measurements of one instant, for one joint update. NULL: not measured. Standard deviations are
+ * per axis; 0 or NULL: the suite's. */
+typedef struct {
+@MEASUREMENT_FIELDS@} qg_measurements;
+
+/* Update the estimate. A time stamp may be late, back to qg_oldest_time: everything since then is
+ * filtered again, with bitwise the result of timely arrival. It may also be later than the filter:
+ * the measurement then waits for the prediction. */
+int qg_update(qg_filter *filter, const qg_measurements *measured, double time);
+
+/* The same for one measurement alone. */
+@UPDATE_API@
+/* ---- outputs ---- */
+
+typedef struct {
+    double time;          /* up to which the filter has predicted [s] */
+    double position[3];   /* of the center of mass, in I [m] */
+    double velocity[3];   /* in I [m/s] */
+    double R_BI[9];       /* attitude, row by row: v_B = R_BI v_I */
+    double quaternion[4]; /* (w, x, y, z), body to inertial */
+    double accel_bias[3]; /* in B [m/s^2] */
+    double gyro_bias[3];  /* in B [rad/s] */
+    double sigma[15];     /* standard deviations: position, velocity, error angles, biases */
+    int diverged;         /* 1 while innovations show that the estimate is wrong */
+} qg_estimate;
+
+int qg_state(const qg_filter *filter, qg_estimate *estimate);
+
+/* Covariance (15, 15), row by row, in the order of qg_estimate.sigma. */
+int qg_covariance(const qg_filter *filter, double covariance[225]);
+
+enum { QG_PREDICTION_FAILED = 1, QG_UPDATE_FAILED = 2 };
+
+/* Numerical failures since the start, as flags; after a failure the filter keeps its last good
+ * state. 0: none. */
+unsigned qg_status(const qg_filter *filter);
+
+double qg_time(const qg_filter *filter);        /* up to which it has predicted [s] */
+double qg_oldest_time(const qg_filter *filter); /* oldest time stamp that qg_update accepts [s] */
+@POLICY_API@
+/* ---- memory: use the functions above ---- */
+
+@STRUCTS@
+typedef struct {
+    double start, time; /* when it begins, and the time after it */
+    qg_sample_record sample;
+    int measurement; /* index of a measurement; -1: a sample */
+    int copy;        /* index of a copy of the filter before it; -1: none */
+} qg_event;
+
+typedef struct {
+    qg_measurement_record record;
+    double time;
+    int rank; /* order among equal time stamps */
+    int used;
+} qg_pending;
+
+struct qg_filter {
+    double flight[@FLIGHT_WORDS@], params[@PARAMS_WORDS@], work[@WORK_WORDS@], steps[@STEPS_WORDS@];
+    uint64_t table[@STAGES@];
+    qg_start_record first;
+    double time, gyro[3];
+    float last_action[4];
+    int started, has_gyro, events, since_copy, waiting;
+    qg_event event[QG_EVENTS];
+    qg_pending waits[QG_WAITING];
+    qg_measurement_record measurement[QG_MEASUREMENTS];
+    char measurement_used[QG_MEASUREMENTS], copy_used[QG_COPIES];
+    double copy[QG_COPIES][@COPY_WORDS@];
+};
+
+#ifdef __cplusplus
+}
+#endif
+#endif
+
+#if defined(QUAD_GYM_FILTER_IMPLEMENTATION) && !defined(QUAD_GYM_FILTER_IMPLEMENTED)
+#define QUAD_GYM_FILTER_IMPLEMENTED
+@POLICY_NETWORK@
+@IMPLEMENTATION@
+#endif

@@ -1,0 +1,218 @@
+"""`Measurements` of many flights that arrive at an instant, and the `Start` of episodes."""
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.records import (
+    AID_BLOCKS,
+    AID_FREEDOMS,
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
+    POSITION_BLOCK,
+    VELOCITY_BLOCK,
+    WIDTH,
+    Aid,
+    Sensor,
+    field_of_flights,
+)
+
+if TYPE_CHECKING:
+    from quad_gym.batch.flight_batch import FlightBatch
+
+Floats = NDArray[np.float64]
+Truths = NDArray[np.bool_]
+
+
+class Reading(NamedTuple):
+    """Measurement of one sensor, of all flights."""
+
+    value: Floats
+    """One row per flight; NaN where no measurement arrives at this instant"""
+    new: Truths
+    """True where one arrives: (n,), for pixels (n, features)"""
+    age: float
+    """Time since the measurement was taken, its time stamp: the latency of the sensor [s]"""
+
+
+class Measurements:
+    """IMU sample of a tick, and the measurements that arrive at its end.
+
+    Arrays have one row per flight, and are read when first used. Measurements are raw: with biases,
+    noise, latency and faults. A sensor that the suite lacks is None.
+
+    Attributes:
+        count: Number of flights, n.
+        dt: Duration of a tick [s].
+        sensors: The suite that an estimator may assume.
+        vehicle: The vehicle that it may assume.
+    """
+
+    def __init__(self, batch: "FlightBatch", sample: NDArray[Any]) -> None:
+        self._batch, self._sample = batch, sample
+        self.count, self.dt = batch.count, batch.sensors.imu.dt
+        self.sensors: SensorSuite = batch.sensors
+        self.vehicle: VehicleParams = batch.vehicle
+
+    @cached_property
+    def gyro(self) -> Floats:
+        """Angular rate in B, (n, 3) [rad/s]: the sample with which to predict over the tick.
+
+        It is taken at the start of the tick or, with `ImuParams.samples="average"`, the mean.
+        """
+        return field_of_flights(self._sample, "gyro", self.count)
+
+    @cached_property
+    def accel(self) -> Floats:
+        """Specific force in B, (n, 3) [m/s^2], of the same sample."""
+        return field_of_flights(self._sample, "accel", self.count)
+
+    @cached_property
+    def time(self) -> Floats:
+        """Time since the start of the episode, (n,) [s]."""
+        return self._batch.record("tick") * self.dt
+
+    @cached_property
+    def gyro_now(self) -> Floats:
+        """Angular rate that the gyro measures at this instant, the end of the tick, (n, 3)."""
+        return field_of_flights(self._batch._exchange, "w_meas", self.count)
+
+    @cached_property
+    def action(self) -> Floats:
+        """Action of the control period, in [-1, 1], (n, 4)."""
+        return self._batch.record("action")
+
+    @cached_property
+    def features(self) -> Floats:
+        """Features of the camera on the map, (n, features, 3) in I [m]."""
+        return self._batch.feature_places()
+
+    # ---- readings -----------------------------------------------------------------------------
+
+    @cached_property
+    def gnss_position(self) -> Reading | None:
+        """Primary antenna, (n, 3) in I [m]."""
+        return self._gnss("gnss_position", POSITION_BLOCK, self.sensors.gnss is not None)
+
+    @cached_property
+    def gnss_baseline(self) -> Reading | None:
+        """Vector from the primary to the secondary antenna, (n, 3) in I [m]."""
+        gnss = self.sensors.gnss
+        return self._gnss("gnss_baseline", BASELINE_BLOCK, gnss is not None and gnss.has_baseline)
+
+    @cached_property
+    def gnss_velocity(self) -> Reading | None:
+        """Velocity of the primary antenna, (n, 3) in I [m/s]."""
+        gnss = self.sensors.gnss
+        has = gnss is not None and gnss.velocity_sigma is not None
+        return self._gnss("gnss_velocity", VELOCITY_BLOCK, has)
+
+    @cached_property
+    def pixels(self) -> Reading | None:
+        """Projections of the features, from the center of the image, (n, features, 2) [pixels]."""
+        if self.sensors.camera is None:
+            return None
+        count = len(self.sensors.camera.features_I)
+        new = self._new(FEATURE_BLOCKS, count)
+        return self._reading("pixels", new, Sensor.CAMERA, slice(None), slice(count))
+
+    @cached_property
+    def barometer(self) -> Reading | None:
+        """Altitude, (n,) [m]."""
+        return self._aid(Aid.BAROMETER)
+
+    @cached_property
+    def magnetometer(self) -> Reading | None:
+        """Magnetic field, (n, 3) in B [T]."""
+        return self._aid(Aid.MAGNETOMETER)
+
+    @cached_property
+    def optical_flow(self) -> Reading | None:
+        """Angular rate of the ground below, (n, 2) in B [rad/s]."""
+        return self._aid(Aid.OPTICAL_FLOW)
+
+    @cached_property
+    def range_finder(self) -> Reading | None:
+        """Distance to the ground along body -z, (n,) [m]."""
+        return self._aid(Aid.RANGE_FINDER)
+
+    def _gnss(self, name: str, block: int, has: bool) -> Reading | None:
+        if not has:
+            return None
+        found = self._reading(name, self._new(block, 1)[:, 0], Sensor.GNSS)
+        x, y, z = found.value.T[:, :, np.newaxis]
+        R = self._batch.R_IG
+        return found._replace(value=x * R[:, 0] + y * R[:, 1] + z * R[:, 2])  # as in any batch
+
+    def _aid(self, aid: Aid) -> Reading | None:
+        name = aid.name.lower()
+        if getattr(self.sensors, name) is None:
+            return None
+        numbers = AID_FREEDOMS[aid]
+        new = self._new(AID_BLOCKS + aid, 1)[:, 0]
+        part = (slice(None), int(aid), 0 if numbers == 1 else slice(numbers))
+        return self._reading("aid_measurement", new, Sensor[aid.name], *part)
+
+    def _new(self, first: int, count: int) -> Truths:
+        """True where one of some blocks arrives, (n, count)."""
+        valid = self._batch._blocks["block_valid"][:, first : first + count]
+        rows = valid.transpose(0, 2, 1).reshape(len(valid) * WIDTH, count)
+        return np.asarray(rows[: self.count] > 0.0)
+
+    def _reading(self, field: str, new: Truths, sensor: Sensor, *part: int | slice) -> Reading:
+        age = float(self._batch._settings["sensor_delay"][0, sensor] * self.dt)
+        values = self._batch.record(field)[part or slice(None)]
+        values[~new] = np.nan
+        return Reading(values, new, age)
+
+
+class Start(Measurements):
+    """Start of episodes as the built-in filter has it, and the measurements at that instant.
+
+    A cold filter has its first fix: the position from the antenna, or from the mark from which the
+    vehicle starts; the heading from the baseline, the magnetometer, or the mark; a level attitude;
+    velocity and biases of zero. With `filter_start="warm"` it has converged. The first fix is not
+    among the measurements, except with `FilterParams.reuse_first_fix`. `gyro` and `accel` are the
+    sample of the first instant; they have no meaning with `ImuParams.samples="average"`.
+    """
+
+    def __init__(self, batch: "FlightBatch", sample: NDArray[Any], mask: Truths) -> None:
+        super().__init__(batch, sample)
+        self._mask = mask
+
+    def _new(self, first: int, count: int) -> Truths:
+        return super()._new(first, count) & self._mask[:, np.newaxis]
+
+    @cached_property
+    def position(self) -> Floats:
+        """Position, (n, 3) in I [m]."""
+        return self._batch.record("r_hat")
+
+    @cached_property
+    def velocity(self) -> Floats:
+        """Velocity, (n, 3) in I [m/s]."""
+        return self._batch.record("v_hat")
+
+    @cached_property
+    def R_BI(self) -> Floats:
+        """Attitude, (n, 3, 3)."""
+        return self._batch.record("R_hat")
+
+    @cached_property
+    def accel_bias(self) -> Floats:
+        """Accelerometer bias, (n, 3) in B [m/s^2]."""
+        return self._batch.record("b_a_hat")
+
+    @cached_property
+    def gyro_bias(self) -> Floats:
+        """Gyro bias, (n, 3) in B [rad/s]."""
+        return self._batch.record("b_g_hat")
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance in the order of estimates, (n, 15, 15)."""
+        return self._batch.covariance()

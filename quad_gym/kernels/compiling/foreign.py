@@ -1,0 +1,208 @@
+"""Object code of entries for other processors than this machine's.
+
+Entries are lowered and linked by Numba as for this machine, and then optimized and emitted by LLVM
+for the other processor. Linked code, which is the same for all processors, and objects are cached.
+"""
+
+import contextlib
+import hashlib
+import os
+import re
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import llvmlite.binding as llvm
+from numba.core import compiler, typed_passes
+from numba.core.compiler_machinery import register_pass
+from numba.core.registry import cpu_target
+
+from quad_gym.kernels.compiling.linking import EntryLibrary, compiler_with
+from quad_gym.kernels.compiling.workers import dispatcher_of
+
+_OPTIONS = {"nopython": True, "boundscheck": None, "error_model": "numpy", "nogil": True}
+_KEPT = 8
+"""Number of cached files of a kind for a function."""
+_FORM = 2
+"""Version of the emission; after a change, no older object is found."""
+_LIBRARY = re.compile(
+    r"sin|cos|sqrt|"
+    r"llvm\.(sin|cos|sqrt|fma|fabs|copysign|floor|rint|roundeven|fsh[lr]|[su](min|max)|abs|ctpop|"
+    r"mem(cpy|set|move)|lifetime|assume|experimental|vector|is)\b.*"
+)
+"""Functions that emitted code may call: LLVM's, and those of a C library."""
+
+
+_LOADED = (b".text", b".rodata", b".data", b"CODE", b"DATA")
+"""Beginnings of the names of sections with code and constants."""
+
+
+class Processor(NamedTuple):
+    """A processor, in LLVM's words."""
+
+    triple: str
+    cpu: str
+    reloc: str = "pic"
+
+
+class _ForeignLibrary(EntryLibrary):
+    """An entry with all kernels that it reaches, as IR that is neither optimized nor emitted."""
+
+    def _optimize_final_module(self) -> None:
+        self.hide_kernels()
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _ForeignLowering(typed_passes.NativeLowering):  # type: ignore[misc]
+    """Lower and link."""
+
+    _name = "quad_gym_foreign_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """Lower one entry."""
+        state.library = _ForeignLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        flags = state.flags.copy()
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        state.flags = flags
+        super().run_pass(state)
+        lowered = state["cr"]
+        state.library.finalize()
+        state["cr"] = compiler._LowerResult(
+            lowered.fndesc, lowered.call_helper, cfunc=None, env=lowered.env
+        )
+        return True
+
+
+_ForeignCompiler = compiler_with(_ForeignLowering)
+
+
+def symbol_of(name: str) -> str:
+    """Return the name of an entry's function in its object."""
+    return f"qg_core_{name.partition(':')[2]}"
+
+
+def is_cached(name: str, processor: Processor) -> bool:
+    """Return True if `object_of` need not compile."""
+    file = _file(name, processor)
+    return file is not None and file.is_file()
+
+
+def object_of(name: str, processor: Processor) -> bytes:
+    """Return an object file with an entry as its only public function, cached by its sources.
+
+    Args:
+        name: "module:function" of an entry.
+        processor: Processor to emit code for.
+
+    Raises:
+        RuntimeError: If the code calls other functions than those of a C library.
+    """
+    file, ir_file = _file(name, processor), _file(name)
+    made = _read(file)
+    if made is None:
+        linked = _read(ir_file)
+        if linked is None:
+            linked = _linked(name).encode()
+            _write(ir_file, linked)
+        made = emitted(linked.decode(), processor)
+        _write(file, made)
+    return made
+
+
+def _file(name: str, processor: Processor | None = None) -> Path | None:
+    """Return the cached object of an entry, or its linked IR; None: no folder is writable."""
+    entry = dispatcher_of(name)
+    if entry._cache.folder is None:
+        return None
+    code = entry._cache._name(entry.signature, cpu_target.target_context).removesuffix(".code")
+    digest = hashlib.sha256(repr((processor, _FORM)).encode()).hexdigest()[:12]
+    return Path(entry._cache.folder, f"{code}.{digest}.{'ir' if processor is None else 'o'}")
+
+
+def _read(file: Path | None) -> bytes | None:
+    """Return the content of a cached file; None if it is missing or damaged."""
+    with contextlib.suppress(OSError, zlib.error):
+        return None if file is None else zlib.decompress(file.read_bytes())
+    return None
+
+
+def _write(file: Path | None, content: bytes) -> None:
+    """Write a cached file, and remove the oldest ones of its function."""
+    if file is None:
+        return
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary = file.with_suffix(f".{os.getpid()}.tmp")
+        temporary.write_bytes(zlib.compress(content))
+        temporary.replace(file)
+        function = ".".join(file.name.split(".")[:3])
+        files = file.parent.glob(f"{function}.*{file.suffix}")
+        for old in sorted(files, key=lambda found: found.stat().st_mtime)[:-_KEPT]:
+            old.unlink(missing_ok=True)
+
+
+def _linked(name: str) -> str:
+    """Return the IR of an entry with all kernels that it reaches, its only public function."""
+    entry, flags = dispatcher_of(name), compiler.Flags()
+    cpu_target.options.parse_as_flags(flags, _OPTIONS)
+    result = compiler.compile_extra(
+        cpu_target.typing_context,
+        cpu_target.target_context,
+        entry.py_func,
+        tuple(entry.signature.args),
+        entry.signature.return_type,
+        flags,
+        {},
+        pipeline_class=_ForeignCompiler,
+    )
+    module = result.library._final_module
+    for function in module.functions:
+        if function.name == result.fndesc.llvm_func_name:
+            function.name = symbol_of(name)
+        elif not function.is_declaration:
+            function.linkage = llvm.Linkage.internal
+    return _without_python(str(module))
+
+
+def emitted(text: str, processor: Processor) -> bytes:
+    """Return the object file of IR.
+
+    Raises:
+        RuntimeError: If the code calls other functions than those of a C library.
+    """
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    machine = llvm.Target.from_triple(processor.triple).create_target_machine(
+        cpu=processor.cpu,
+        opt=2,
+        reloc=processor.reloc,
+        codemodel="small",
+    )
+    module = llvm.parse_assembly(text)
+    module.triple, module.data_layout = processor.triple, str(machine.target_data)
+    builder = llvm.create_pass_builder(machine, llvm.PipelineTuningOptions(speed_level=2))
+    builder.getModulePassManager().run(module, builder)
+    missing = [
+        function.name
+        for function in module.functions
+        if function.is_declaration and not _LIBRARY.fullmatch(function.name)
+    ]
+    if missing:
+        raise RuntimeError(f"kernels must not call {', '.join(missing)}")
+    return bytes(machine.emit_object(module))
+
+
+def loaded_size(made: bytes) -> int:
+    """Return the size of code and constants in an object file."""
+    sections = llvm.object_file.ObjectFileRef.from_data(made).sections()
+    return sum(s.size() for s in sections if (s.name() or b"").startswith(_LOADED))
+
+
+def _without_python(text: str) -> str:
+    """Return IR without references to Numba's run time: kernels allocate no memory."""
+    text = re.sub(r"(?m)^ *(tail )?call void @NRT_(inc|dec)ref\(.*$", "", text)
+    text = re.sub(r"\buwtable\b(\(sync\))?", "", text)
+    return text.replace("= common ", "= internal ")

@@ -1,0 +1,80 @@
+"""Estimators that tests fly on: simple ones, and those of docs/gallery/estimators."""
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+import quad_gym
+from tests.examples import example
+
+FOLDER = Path(__file__).parents[1] / "docs" / "gallery" / "estimators"
+
+
+def gallery(name):
+    """A module of docs/gallery/estimators."""
+    return example(name, FOLDER)
+
+
+class Simple(quad_gym.Estimator):
+    """Positions filtered by a constant gain, velocities of the start, attitudes of the gyro."""
+
+    state: ClassVar = {"r": np.zeros(3), "v": np.zeros(3), "R": np.eye(3), "ticks": 0}
+
+    def reset(self, view, mask):
+        self.state.r, self.state.v, self.state.R = view.position, view.velocity, view.R_BI
+        return self.estimate()
+
+    def update(self, measurements):
+        s, fix = self.state, measurements.gnss_position
+        s.ticks += 1
+        s.r += measurements.dt * s.v
+        x, y, z = (measurements.dt * measurements.gyro.T)[..., np.newaxis]
+        rows = s.R[:, 0].copy(), s.R[:, 1].copy(), s.R[:, 2].copy()
+        s.R[:, 0] += z * rows[1] - y * rows[2]
+        s.R[:, 1] += x * rows[2] - z * rows[0]
+        s.R[:, 2] += y * rows[0] - x * rows[1]
+        s.R /= np.linalg.norm(s.R, axis=2, keepdims=True)
+        if fix is not None:
+            s.r += np.where(fix.new[:, np.newaxis], 0.2 * (fix.value - s.r), 0.0)
+        return self.estimate()
+
+    def estimate(self):
+        s = self.state
+        return {"position": s.r, "velocity": s.v, "R_BI": s.R}
+
+
+class Certain(Simple):
+    """The same with a covariance and biases."""
+
+    def estimate(self):
+        n = len(self.state.r)
+        return super().estimate() | {
+            "accel_bias": np.full((n, 3), 0.01),
+            "gyro_bias": np.full((n, 3), 0.02),
+            "covariance": np.tile(np.diag(np.arange(1.0, 16.0) ** 2), (n, 1, 1)),
+        }
+
+
+class Given(quad_gym.Estimator):
+    """An estimate that is given."""
+
+    def __init__(self, **changes):
+        self.changes = changes
+
+    def reset(self, view, mask):
+        return self.update(view)
+
+    def update(self, measurements):
+        n = measurements.count
+        estimate = {
+            "position": np.tile([1.0, 2.0, 3.0], (n, 1)),
+            "velocity": np.tile([0.1, 0.2, 0.3], (n, 1)),
+            "R_BI": np.tile(np.eye(3), (n, 1, 1)),
+        }
+        estimate |= {name: value(n) for name, value in self.changes.items() if value is not None}
+        return {name: value for name, value in estimate.items() if name not in self.without}
+
+    @property
+    def without(self):
+        return [name for name, value in self.changes.items() if value is None]

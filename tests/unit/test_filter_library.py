@@ -1,0 +1,370 @@
+"""Exported filters: the example's estimates are bitwise those of a replay, on any processor."""
+
+import ctypes
+import dataclasses
+import functools
+import math
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines.exporting import controller_of, export_filter
+from baselines.exporting.filter_library import LIBRARY, archive
+from quad_gym.estimation import UnscentedKalmanFilter, replay
+from quad_gym.estimation.starts import state_at_rest
+from tests.logged_flights import Recorded, flown
+
+FOLDER = Path(tempfile.mkdtemp(prefix="quad_gym_filters_"))
+CROSS = "aarch64-linux-gnu-gcc"
+needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler (cc)")
+needs_wasm = pytest.mark.skipif(
+    not (shutil.which("clang") and shutil.which("node") and Path("/usr/lib/wasm32-wasi").exists()),
+    reason="no clang, wasi-libc or node",
+)
+needs_cmake = pytest.mark.skipif(not shutil.which("cmake"), reason="no CMake")
+needs_aarch64 = pytest.mark.skipif(
+    not (shutil.which(CROSS) and shutil.which("qemu-aarch64-static")),
+    reason="no gcc-aarch64-linux-gnu, or no qemu-user-static",
+)
+FROM_REST = ("--start-position", "0", "0", "1.5", "--heading", "20")
+REST = {"position": (0.0, 0.0, 1.5), "heading": math.radians(20.0)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _folder():
+    yield
+    shutil.rmtree(FOLDER)
+
+
+def exported(name, target="x86-64", policy=None):
+    folder = FOLDER / f"{name}_{target}_{policy is None}"
+    if not folder.exists():
+        export_filter(quad_gym.sensor_suite(name), name, target, folder, policy)
+    return folder
+
+
+@functools.cache
+def logged(name):
+    """A log with delays, jitter and losses, without columns of sensors that the suite lacks."""
+    suite = quad_gym.sensor_suite(name)
+    recorded = Recorded(flown(suite, 3.0), suite)
+    table = recorded.table()
+    absent = [k for k, v in table.items() if "gnss" in k and np.isnan(v).all()]
+    absent += [k for k in table if k.startswith("pixel") and suite.camera is None]
+    recorded.table = lambda: {k: v for k, v in table.items() if k not in absent}
+    recorded.write_csv(FOLDER / f"{name}.csv")
+    return FOLDER / f"{name}.csv"
+
+
+def example(name, target, *flags, compiler="cc"):
+    program = exported(name, target) / "example"
+    if not program.exists():
+        files = [program.with_name("main.c"), program.with_name(LIBRARY)]
+        subprocess.run([compiler, "-O2", *flags, *files, "-lm", "-o", program], check=True)
+    return program
+
+
+def estimates(*command):
+    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    names, *rows = told.split()
+    return names.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
+
+
+def require_equal(found, log, suite, start):
+    wanted = replay(log, sensors=suite, start=start)
+    names, rows = found
+    assert names == list(wanted.columns())
+    np.testing.assert_array_equal(rows, np.array(list(wanted.columns().values())).T)
+    assert len(rows) > 100
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["rtk", "consumer", "standard", "indoor"])
+def test_example_prints_what_a_replay_computes(name):
+    suite, log = quad_gym.sensor_suite(name), logged(name)
+    rests = suite.gnss is None
+    found = estimates(example(name, "x86-64"), log, *(FROM_REST if rests else ()))
+    require_equal(found, log, suite, REST if rests else {})
+
+
+@needs_compiler
+@pytest.mark.parametrize("option", ["heading", "course"])
+def test_example_starts_as_a_replay_does(option, tmp_path):
+    """In flight, with a known heading or along the course, without baseline and magnetic field."""
+    lines = [line.split(",") for line in logged("consumer").read_text().split()]
+    lines = [lines[0], *(line for line in lines[1:] if float(line[1]) > 1.5)]
+    kept = [k for k, name in enumerate(lines[0]) if not name.startswith("magnetometer")]
+    log = tmp_path / "log.csv"
+    log.write_text("\n".join(",".join(line[k] for k in kept) for line in lines))
+    given = {"heading": ("--heading", "50"), "course": ("--course",)}[option]
+    start = {"heading": {"heading": math.radians(50.0)}, "course": {"course": True}}[option]
+    found = estimates(example("consumer", "x86-64"), log, *given)
+    require_equal(found, log, quad_gym.sensor_suite("consumer"), start)
+
+
+@needs_aarch64
+@pytest.mark.parametrize("name", ["rtk", "consumer"])
+def test_example_on_aarch64_prints_what_a_replay_computes_here(name):
+    program = example(name, "aarch64", "-static", compiler=CROSS)
+    found = estimates("qemu-aarch64-static", program, logged(name))
+    require_equal(found, logged(name), quad_gym.sensor_suite(name), {})
+
+
+@needs_wasm
+def test_example_as_webassembly_prints_what_a_replay_computes_here(tmp_path):
+    folder, log = exported("rtk", "wasm32"), logged("rtk")
+    program, run = tmp_path / "example.wasm", tmp_path / "run.mjs"
+    clock = ["-D_WASI_EMULATED_PROCESS_CLOCKS", "-lwasi-emulated-process-clocks", "-lm"]
+    files = [folder / "main.c", folder / LIBRARY]
+    line = ["clang", "--target=wasm32-wasi", "--sysroot=/usr", "-std=c99", "-O2", *files, *clock]
+    subprocess.run([*line, "-o", program], check=True, capture_output=True)
+    run.write_text(
+        "import { readFile } from 'node:fs/promises';\nimport { WASI } from 'node:wasi';\n"
+        f"const given = {{ version: 'preview1', args: ['example', '{log}'], "
+        f"preopens: {{ '{log.parent}': '{log.parent}' }} }};\nconst wasi = new WASI(given);\n"
+        f"const program = await WebAssembly.instantiate(await readFile('{program}'), "
+        "wasi.getImportObject());\nwasi.start(program.instance);\n"
+    )
+    require_equal(estimates("node", run), log, quad_gym.sensor_suite("rtk"), {})
+
+
+@needs_compiler
+@needs_cmake
+def test_cmake_builds_the_example_without_warnings(tmp_path):
+    flags = "-DCMAKE_C_FLAGS=-Wall -Wextra -pedantic -Werror"
+    subprocess.run(["cmake", "-S", exported("rtk"), "-B", tmp_path, flags], check=True)
+    subprocess.run(["cmake", "--build", tmp_path], check=True)
+    assert estimates(tmp_path / "example", logged("rtk"))[1].shape[1] == 33
+
+
+@needs_compiler
+@pytest.mark.parametrize("words", [["--fast"], [], ["--start-position", "0", "0", "1"], ["no.csv"]])
+def test_example_refuses_wrong_options(words):
+    done = subprocess.run([example("rtk", "x86-64"), *words], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+
+
+# ---- the interface, call by call -------------------------------------------------------------
+
+
+class Estimate(ctypes.Structure):
+    _fields_ = (
+        *(("time", ctypes.c_double), ("numbers", ctypes.c_double * (3 + 3 + 9 + 4 + 3 + 3 + 15))),
+        ("diverged", ctypes.c_int),
+    )
+
+
+OK, NOT_STARTED, NOT_FINITE, OUT_OF_RANGE, TOO_OLD, TOO_NEW = range(6)
+
+
+class Library:
+    """The exported filter of a suite, called from here."""
+
+    def __init__(self, name, policy=None):
+        folder = exported(name, "x86-64", policy)
+        source = folder / "all.c"
+        source.write_text(
+            '#define QUAD_GYM_FILTER_IMPLEMENTATION\n#include "quad_gym_filter.h"\n'
+            "unsigned long qg_size(void) { return sizeof(qg_filter); }\n"
+        )
+        shared = folder / "all.so"
+        flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC"]
+        subprocess.run(["cc", *flags, source, folder / LIBRARY, "-lm", "-o", shared], check=True)
+        self._c = ctypes.CDLL(str(shared))
+        self._c.qg_time.restype = self._c.qg_oldest_time.restype = ctypes.c_double
+        self.memory = ctypes.create_string_buffer(self._c.qg_size() + 64)
+
+    def call(self, name, *arguments):
+        """Call a function; floats are numbers, sequences arrays of them."""
+        given = [
+            ctypes.c_double(a) if np.ndim(a) == 0 else (ctypes.c_double * len(a))(*a)
+            for a in arguments
+        ]
+        return getattr(self._c, f"qg_{name}")(self.memory, *given)
+
+    def estimate(self):
+        found = Estimate()
+        assert self._c.qg_state(self.memory, ctypes.byref(found)) == OK
+        return np.array(found.numbers)
+
+    def covariance(self):
+        found = np.empty((15, 15))
+        pointer = found.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+        assert self._c.qg_covariance(self.memory, pointer) == OK
+        return found
+
+
+@functools.cache
+def library(name):
+    return Library(name)
+
+
+def started(name):
+    suite = quad_gym.sensor_suite(name)
+    ukf, c = UnscentedKalmanFilter(suite), library(name)
+    ukf.set_state(**state_at_rest(suite, (1.0, -2.0, 0.8), 0.4, 10.0))
+    assert c.call("init_at_rest", [1.0, -2.0, 0.8], 0.4, 10.0) == OK
+    return ukf, c
+
+
+@needs_compiler
+def test_calls_give_the_estimates_of_the_python_filter():
+    """Samples of any length, measurements now and up to 0.4 s late."""
+    ukf, c = started("crazyflie")
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        kind, late = rng.integers(6), rng.uniform(0.0, 0.4) * rng.integers(2)
+        time = max(ukf.oldest_time, ukf.time - late)
+        if kind == 0:
+            flow = rng.normal(0.0, 0.2, 2)
+            ukf.update(optical_flow=flow, time=time)
+            assert c.call("update_optical_flow", flow, time) == OK
+        elif kind == 1:
+            height = 0.8 + rng.normal(0.0, 0.02)
+            ukf.update(range_finder=height, time=time)
+            assert c.call("update_range_finder", height, time) == OK
+        else:
+            gyro, dt = rng.normal(0.0, 0.2, 3), rng.choice([0.005, rng.uniform(0.001, 0.02)])
+            accel = rng.normal([0.0, 0.0, 9.8], 0.3)
+            ukf.predict(gyro, accel, dt=dt)
+            assert c.call("predict", gyro, accel, dt) == OK
+    assert c._c.qg_time(c.memory) == ukf.time
+    assert c._c.qg_oldest_time(c.memory) == ukf.oldest_time
+    assert c._c.qg_status(c.memory) == ukf.status == 0
+    parts = np.split(c.estimate(), np.cumsum([3, 3, 9, 4, 3, 3]))
+    wanted = (ukf.position, ukf.velocity, ukf.R_BI.ravel(), ukf.accel_bias, ukf.gyro_bias)
+    for found, values in zip((*parts[:3], *parts[4:6]), wanted, strict=True):
+        np.testing.assert_array_equal(found, values)
+    np.testing.assert_allclose(parts[6] ** 2, np.diag(ukf.covariance), rtol=1e-12)
+    np.testing.assert_allclose(c.covariance(), ukf.covariance, rtol=1e-9, atol=1e-18)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("result", "name", "arguments"),
+    [
+        (NOT_FINITE, "predict", ([0.0, math.nan, 0.0], [0.0, 0.0, 9.8], 0.005)),
+        (NOT_FINITE, "predict", ([0.0] * 3, [0.0, math.inf, 9.8], 0.005)),
+        (OUT_OF_RANGE, "predict", ([0.0] * 3, [0.0, 0.0, 9.8], 0.0)),
+        (OUT_OF_RANGE, "predict", ([0.0] * 3, [0.0, 0.0, 9.8], 1.1)),
+        (NOT_FINITE, "update_optical_flow", ([0.1, math.nan], 10.1)),
+        (NOT_FINITE, "update_range_finder", (0.8, math.nan)),
+        (TOO_OLD, "update_range_finder", (0.8, 9.9)),
+        (TOO_NEW, "update_range_finder", (0.8, 11.2)),
+        (NOT_FINITE, "init_at_rest", ([0.0, 0.0, math.inf], 0.0, 0.0)),
+    ],
+)
+def test_wrong_call_returns_an_error_and_changes_nothing(result, name, arguments):
+    c = started("crazyflie")[1]
+    for _ in range(20):
+        assert c.call("predict", [0.0] * 3, [0.0, 0.0, 9.8], 0.005) == OK
+    before = c.memory.raw
+    assert c.call(name, *arguments) == result
+    assert c.memory.raw == before
+
+
+@needs_compiler
+def test_calls_before_the_start_return_an_error():
+    c = Library("crazyflie")
+    assert c.call("predict", [0.0] * 3, [0.0, 0.0, 9.8], 0.005) == NOT_STARTED
+    assert c.call("update_range_finder", 0.8, 0.0) == NOT_STARTED
+
+
+@needs_compiler
+def test_measurement_of_the_future_waits_for_the_sample_of_its_time():
+    """As if the sample had been split there."""
+    c, whole = library("crazyflie"), []
+    for early in (True, False):
+        assert c.call("init_at_rest", [0.0, 0.0, 0.8], 0.0, 0.0) == OK
+        if early:
+            assert c.call("update_range_finder", 0.81, 0.004) == OK
+        assert c.call("predict", [0.0] * 3, [0.0, 0.0, 9.8], 0.01) == OK
+        if not early:
+            assert c.call("update_range_finder", 0.81, 0.004) == OK
+        whole.append(c.estimate())
+    np.testing.assert_array_equal(whole[0], whole[1])
+
+
+@needs_compiler
+def test_full_memory_shortens_the_window_only():
+    """Ten times as many measurements as the suite's rates announce."""
+    ukf, c = started("crazyflie")
+    rng = np.random.default_rng(1)
+    for _ in range(150):
+        ukf.predict([0.0] * 3, [0.0, 0.0, 9.8], dt=0.005)
+        assert c.call("predict", [0.0] * 3, [0.0, 0.0, 9.8], 0.005) == OK
+        for height in rng.normal(0.8, 0.02, 10):
+            ukf.update(range_finder=height)
+            assert c.call("update_range_finder", height, ukf.time) == OK
+    np.testing.assert_array_equal(c.estimate()[:3], ukf.position)
+    assert ukf.oldest_time < c._c.qg_oldest_time(c.memory) < ukf.time
+
+
+# ---- with a policy ---------------------------------------------------------------------------
+
+
+@needs_compiler
+def test_policy_acts_on_the_estimate_as_its_network_does():
+    controller = controller_of("pretrained", "QuadGym/Circle-v0")
+    c, rng, last = Library("crazyflie", controller), np.random.default_rng(2), np.zeros(4)
+    reference, action = rng.normal(0.0, 1.0, (6, 3)), (ctypes.c_float * 4)()
+    r, v, a, h, *later = reference
+    pointer = np.ascontiguousarray(reference).ctypes.data_as(ctypes.c_void_p)
+
+    def act():
+        return c._c.qg_action(c.memory, pointer, action)
+
+    assert act() == NOT_STARTED
+    assert c.call("init_at_rest", [1.0, -2.0, 0.8], 0.4, 0.0) == OK
+    for _ in range(5):
+        gyro = rng.normal(0.0, 0.2, 3)
+        assert c.call("predict", gyro, [0.1, 0.2, 9.7], 0.005) == OK
+        assert act() == OK
+        position, velocity, R, _, _, b_g, _ = np.split(c.estimate(), np.cumsum([3, 3, 9, 4, 3, 3]))
+        seen = [r - position, v - velocity, [0.0, 0.0, 1.0], h, a, later[0] - r, later[1] - r]
+        seen = [R.reshape(3, 3) @ x for x in seen]
+        observation = np.concatenate([*seen[:4], gyro - b_g, *seen[4:], last])
+        last = controller.act(observation)
+        np.testing.assert_allclose(list(action), last, atol=1e-6)
+    before, reference[0, 0] = c.memory.raw, np.nan
+    assert act() == NOT_FINITE
+    assert c.memory.raw == before
+
+
+def test_policy_that_observes_more_than_the_estimate_is_refused(tmp_path):
+    controller = controller_of("pretrained", "QuadGym/Circle-v0")
+    field = controller.table[0]._replace(name="true_position_error")
+    controller = dataclasses.replace(controller, table=(field, *controller.table[1:]))
+    with pytest.raises(ValueError, match="true_position_error"):
+        export_filter(quad_gym.sensor_suite("rtk"), "rtk", "x86-64", tmp_path, controller)
+
+
+# ---- files -----------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not shutil.which("ar"), reason="no ar")
+def test_archive_is_readable_by_ar(tmp_path):
+    (tmp_path / "it.a").write_bytes(archive({"one": b"odd", "two": b"even"}))
+    told = subprocess.run(["ar", "pv", tmp_path / "it.a"], check=True, capture_output=True)
+    assert told.stdout == b"\n<0.o>\n\nodd\n<1.o>\n\neven"
+
+
+@pytest.mark.parametrize("target", ["cortex-m7", "wasm32"])
+def test_library_for_a_foreign_processor_has_its_format(target):
+    library = (exported("crazyflie", target) / LIBRARY).read_bytes()
+    member = library[8 + 60 + int(library[8 + 48 : 8 + 58]) :].lstrip(b"\n")[60:]
+    machine = {"cortex-m7": b"\x7fELF\x01\x01", "wasm32": b"\0asm\x01\0\0\0"}[target]
+    assert member.startswith(machine)
+    text = (exported("crazyflie", target) / "README.md").read_text()
+    assert "@" not in text
+
+
+def test_unknown_target_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="target must be one of"):
+        export_filter(quad_gym.sensor_suite("rtk"), "rtk", "riscv", tmp_path)

@@ -1,0 +1,42 @@
+"""A replay that begins in motion starts with the uncertainty of one."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation.first_motion import with_wide_start
+from quad_gym.estimation.tables import read_log
+
+RTK = quad_gym.sensor_suite("rtk")
+
+
+def log(speed=0.0, turning=0.0, noise=0.0):
+    """Two seconds of a flight to the east: IMU at 100 Hz, positions at 10 Hz."""
+    time = 0.01 * np.arange(200)
+    east = np.where(np.arange(200) % 10 == 0, speed * time, np.nan)
+    position = np.column_stack([east, 0.0 * east, 0.0 * east])
+    position += np.random.default_rng(0).normal(0.0, noise + 1e-9, position.shape)
+    gyro = np.tile([turning, 0.0, 0.0], (200, 1))
+    accel = np.tile([0.0, 0.0, 9.8], (200, 1))
+    return read_log({"time": time, "gyro": gyro, "accel": accel, "gnss_enu": position})
+
+
+@pytest.mark.parametrize(("speed", "turning"), [(3.0, 0.0), (0.0, 0.8)])
+def test_start_in_motion_is_uncertain(speed, turning):
+    form = with_wide_start(RTK, log(speed, turning)).estimator
+    assert form.initial_tilt_sigma == 0.3
+    assert form.initial_velocity_variance == pytest.approx((1.0 + speed) ** 2)
+
+
+def test_start_at_rest_stays_as_it_is():
+    assert with_wide_start(RTK, log()) is RTK
+
+
+def test_noise_of_positions_is_no_motion():
+    suite = quad_gym.sensor_suite("consumer")
+    assert with_wide_start(suite, log(noise=0.2)) is suite
+
+
+def test_a_filter_that_solves_wahbas_problem_keeps_its_start():
+    lab = quad_gym.sensor_suite("lab")
+    assert with_wide_start(lab, log(speed=3.0)) is lab
