@@ -11,7 +11,7 @@ from baselines.recipes import Recipe, recipe, unfreeze
 from baselines.seeds import MAX_SEED, first_seed
 from quad_gym.analysis.reports import as_json
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 from quad_gym.params.suites import contents_of_suite_files
 
 if TYPE_CHECKING:

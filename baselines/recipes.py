@@ -13,7 +13,7 @@ from typing import Any
 
 from quad_gym import IDS
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector

@@ -23,7 +23,7 @@ SUITE, RESULT = "suite.toml", "calibration.json"
 
 
 @dataclass(frozen=True)
-class Args:
+class CalibrateArgs:
     """Options of the calibration."""
 
     log: LogFile
@@ -153,7 +153,7 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     return report.write()
 
 
-def main(args: Args) -> None:
+def main(args: CalibrateArgs) -> None:
     """Search, validate and write."""
     from quad_gym.analysis.plots import require_matplotlib
     from quad_gym.analysis.reports import require_writable, text_table, versions, write_json

@@ -31,7 +31,7 @@ MISFIT = 1
 
 
 @dataclass(frozen=True)
-class Args:
+class ReplayArgs:
     """Options of the replay."""
 
     log: LogFile
@@ -68,7 +68,7 @@ class Args:
     """replace the results of an earlier replay"""
 
 
-def folder_of(args: Args) -> Path:
+def folder_of(args: ReplayArgs) -> Path:
     """Check the output, and create its folder.
 
     Raises:
@@ -91,7 +91,7 @@ def folder_of(args: Args) -> Path:
     return folder
 
 
-def start_of(args: Args) -> dict[str, Any]:
+def start_of(args: ReplayArgs) -> dict[str, Any]:
     """Arguments for the start of the filter, from the options."""
     start: dict[str, Any] = {"course": True} if args.course else {}
     if args.heading is not None:
@@ -101,7 +101,7 @@ def start_of(args: Args) -> dict[str, Any]:
     return start
 
 
-def suite_of(args: Args) -> "SensorSuite":
+def suite_of(args: ReplayArgs) -> "SensorSuite":
     """Sensor suite, with sensors added by options."""
     from quad_gym.params.barometer import BarometerParams
     from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
@@ -172,7 +172,7 @@ def _lists(columns: "dict[str, Floats]") -> dict[str, list[float]]:
     return {name: values.tolist() for name, values in columns.items()}
 
 
-def main(args: Args) -> None:
+def main(args: ReplayArgs) -> None:
     """Read, filter, draw and write."""
     from quad_gym.analysis.reports import versions, write_csv, write_json
     from quad_gym.estimation import read_log, replay, smooth

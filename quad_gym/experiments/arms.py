@@ -15,7 +15,7 @@ from typing import Any
 from baselines.recipes import ALGORITHMS
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 
 @dataclass(frozen=True, kw_only=True)

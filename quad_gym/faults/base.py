@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 from quad_gym.params.portable import norm
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FaultKind

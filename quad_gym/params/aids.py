@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 from quad_gym.records import Aid
 
 

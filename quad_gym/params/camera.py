@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Matrix, Vector
 from quad_gym.records import MAX_FEATURES
 
 Positive2 = Annotated[Vector, partial(check.vector, length=2, least=0.0, open_end=True)]

@@ -5,7 +5,7 @@ from functools import partial
 from typing import Annotated
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 from quad_gym.records import LOG_UNIFORM, NORMAL, UNIFORM
 
 FARTHEST = 8.3

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 LEAST_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so

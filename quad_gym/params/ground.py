@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 FARTHEST_FOOT = 10.0
 """Largest distance of a foot from the center of mass [m]."""

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 MANEUVER = 0.5
 """Typical time for which a quadrotor accelerates in one direction [s]; engineering judgment,

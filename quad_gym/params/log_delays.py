@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 
 Delay = Annotated[float, check.between(-2.0, 2.0)]
 

@@ -10,7 +10,8 @@ from functools import partial
 from typing import Annotated
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Vector
 from quad_gym.records import Shape
 
 FARTHEST_OBSTACLE = 1e4

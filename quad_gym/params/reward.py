@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from typing import Annotated
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 from quad_gym.records import RewardTerm
 
 Weight = Annotated[float, check.between(0.0, 1e9)]

@@ -12,7 +12,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
-from quad_gym.params.checks import Checked
+from quad_gym.params.checked import Checked
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Vector
 from quad_gym.params.reward import RewardParams
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import MAX_GATES, Start, TaskKind

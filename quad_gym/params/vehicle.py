@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Vector
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.gravity import GRAVITY
 

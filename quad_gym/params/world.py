@@ -12,7 +12,8 @@ from typing import Annotated
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Matrix
+from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Matrix
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
 from quad_gym.records import MAX_OBSTACLES

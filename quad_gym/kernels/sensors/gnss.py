@@ -62,18 +62,6 @@ def _measure(flight, p, settings, work, stages, mask, corrupted):
 
 
 @kernel
-def _measured(flight):
-    """The blocks, and the arrays of their numbers."""
-    position, baseline = flight.gnss_position, flight.gnss_baseline
-    velocity = flight.gnss_velocity
-    return (
-        (POSITION_BLOCK, position),
-        (BASELINE_BLOCK, baseline),
-        (VELOCITY_BLOCK, velocity),
-    )
-
-
-@kernel
 def _flag(flags, mask, position, baseline, settings):
     """Set the flags of the three blocks, in the lanes `mask`."""
     flags[POSITION_BLOCK] = select(mask, position, flags[POSITION_BLOCK])
@@ -93,8 +81,9 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         _flag(flight.block_valid, mask, nothing, nothing, settings)
         return
     if delayed:
-        for block, values in _measured(flight):
-            keep_arrived(work, block, values, 3)
+        keep_arrived(work, POSITION_BLOCK, flight.gnss_position, 3)
+        keep_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3)
+        keep_arrived(work, VELOCITY_BLOCK, flight.gnss_velocity, 3)
     if settings.gnss_drifts > 0 and not starting and any_of(due):
         share = minimum(flight.tick / period, 1.0)
         gnss_position.drift_gnss(flight, p, due, share)
@@ -127,10 +116,13 @@ def _deliver_delayed(flight, work, settings, mask, starting):
     At the start of an episode the fix stays in the record, for the initialization of the filter.
     """
     taken, n = stamp(flight, settings, _GNSS, mask), settings.under_way[_GNSS]
-    for block, values in _measured(flight):
-        exchange(flight, work, block, values, 3, n, mask, taken)
-        if not starting:
-            deliver_arrived(work, block, values, 3, mask)
+    exchange(flight, work, POSITION_BLOCK, flight.gnss_position, 3, n, mask, taken)
+    exchange(flight, work, BASELINE_BLOCK, flight.gnss_baseline, 3, n, mask, taken)
+    exchange(flight, work, VELOCITY_BLOCK, flight.gnss_velocity, 3, n, mask, taken)
+    if not starting:
+        deliver_arrived(work, POSITION_BLOCK, flight.gnss_position, 3, mask)
+        deliver_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3, mask)
+        deliver_arrived(work, VELOCITY_BLOCK, flight.gnss_velocity, 3, mask)
 
 
 @kernel

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Vector
 from quad_gym.params.trajectories.feasibility import check_trajectory
 from quad_gym.params.trajectories.fitting import fit
 from quad_gym.params.trajectories.headings import HeadingRule, yaw_angles
