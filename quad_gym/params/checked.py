@@ -1,0 +1,84 @@
+"""Frozen dataclasses of parameters, whose types hold the rules of their values."""
+
+import dataclasses
+import inspect
+from functools import partial
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args, get_origin
+
+from quad_gym.params.checks import Rule, choice, flag, instance, keywords, number
+
+
+def _rule_of(hint: Any) -> tuple[Any, Rule | None]:
+    """Split the type of a field into the plain type and the rule of its values, if it has one."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return inner[0], inner[1]
+    if origin is Literal:
+        return hint, partial(choice, choices=inner)
+    if origin in (Union, UnionType) and len(inner) == 2 and inner[1] is NoneType:
+        plain, rule = _rule_of(inner[0])
+        return plain | None, rule and partial(_unless_none, rule)
+    if dataclasses.is_dataclass(hint):
+        return hint, partial(instance, kind=hint)  # type: ignore[arg-type]
+    plain_rules: dict[Any, Rule] = {bool: flag, float: number}
+    return hint, plain_rules.get(hint)
+
+
+def _unless_none(rule: Rule, name: str, value: Any) -> Any:
+    return None if value is None else rule(name, value)
+
+
+class _Signature:
+    """The signature of a dataclass that has a `__new__`, which Python would show in its place."""
+
+    def __get__(self, instance: Any, owner: type) -> inspect.Signature:
+        """The parameters of its `__init__`, less `self`."""
+        init = owner.__init__  # type: ignore[misc]
+        _, *parameters = inspect.signature(init).parameters.values()
+        return inspect.Signature(parameters)
+
+
+class Checked:
+    """A frozen dataclass whose fields are replaced by their checked form on creation.
+
+    The rule of a field is part of its type, as in `Annotated[float, rule]`, or follows from it.
+    """
+
+    __signature__ = _Signature()
+    _rules: ClassVar[dict[str, Rule]] = {}
+
+    def __init_subclass__(cls) -> None:
+        """Move the rules out of the types of fields, which then are plain."""
+        super().__init_subclass__()
+        split = {name: _rule_of(hint) for name, hint in inspect.get_annotations(cls).items()}
+        cls.__annotations__ = {name: plain for name, (plain, _) in split.items()}
+        cls._rules = cls._rules | {name: rule for name, (_, rule) in split.items() if rule}
+
+    def __post_init__(self) -> None:
+        """Apply the rules of all fields."""
+        for name, rule in self._rules.items():
+            self._set(name, rule(f"{type(self).__name__}.{name}", getattr(self, name)))
+
+    def __new__(cls, *_: Any, **given: Any) -> Self:
+        """Refuse keywords that are no fields, and name the field that may be meant.
+
+        Raises:
+            UnknownKeywordError: If there is one.
+        """
+        if given:
+            fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+            keywords(given, [field.name for field in fields if field.init], cls.__name__)
+        return super().__new__(cls)
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _check(self, rule: Any, *names: str, **options: Any) -> None:
+        for name in names:
+            label = f"{type(self).__name__}.{name}"
+            self._set(name, rule(label, getattr(self, name), **options))
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed; all values are checked again."""
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]
