@@ -13,6 +13,7 @@ import numpy as np
 import quad_gym
 from baselines.exporting.filter_inputs import LAST_RANK, inputs_of
 from baselines.exporting.filter_library import HEADER, TARGETS
+from quad_gym.estimation import first_motion
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.first_fix import FARTHEST_FIX, LEAST_COURSE
@@ -150,6 +151,8 @@ class Sources:
             "L_SLOW_PITCH": MAX_STATES,
             "OF_MASK": offset_of(WORK_BLOCK, "mask"),
             "OF_POSITION_SIGMA": offset_of(PARAMS_BLOCK, "position_sigma_I"),
+            "OF_TILT_SIGMA": offset_of(PARAMS_BLOCK, "initial_tilt_sigma"),
+            "OF_VELOCITY_VARIANCE": offset_of(PARAMS_BLOCK, "initial_velocity_variance"),
         }
         fields = {
             "POSITION": "r_hat",
@@ -199,6 +202,7 @@ class Sources:
         )
         rest = state_at_rest(suite, (0.0, 0.0, 0.0), 0.0, 0.0)["covariance"]
         return {
+            **self._motion_values(),
             "TITLE": f"State estimator: {suite.estimator.kind.upper()} of the sensor suite "
             f'"{self.label}", quad_gym {quad_gym.__version__}.',
             "SUITE": self.label,
@@ -239,6 +243,20 @@ class Sources:
             values["START_API"] = (_TEMPLATES / "start.h").read_text(encoding="utf-8")
             values["START_SOURCE"] = _filled("start.c", self._start_values())
         return values
+
+    def _motion_values(self) -> dict[str, str]:
+        """Return the numbers with which the example recognizes a start in motion."""
+        gnss, form = self.suite.gnss, self.suite.estimator
+        tilt = form.initial_tilt_sigma
+        return {
+            "MOTION_SPAN": repr(first_motion.SPAN),
+            "MOTION_TURNING": repr(first_motion.TURNING),
+            "MOTION_FAST": repr(first_motion.FAST),
+            "MOTION_CERTAIN": repr(first_motion.CERTAIN),
+            "MOTION_TILT": repr(0.0 if tilt is None else max(tilt, first_motion.TILT)),
+            "MOST_POSITION_SIGMA": repr(float(max(gnss.position_sigma_I))) if gnss else "0.0",
+            "SUITE_SPEED_SIGMA": repr(math.sqrt(form.initial_velocity_variance)),
+        }
 
     def _start_values(self) -> dict[str, Any]:
         suite, compass = self.suite, self.suite.magnetometer

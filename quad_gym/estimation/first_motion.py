@@ -5,13 +5,13 @@ import numpy as np
 from quad_gym.estimation.logs import Log
 from quad_gym.params.sensors import SensorSuite
 
-_SPAN = 1.0
+SPAN = 1.0
 """Time after the first fix whose positions show the speed at the first one [s]."""
-_TURNING, _FAST = 0.3, 1.0
+TURNING, FAST = 0.3, 1.0
 """Angular rate [rad/s] and speed [m/s] at the first fix of a vehicle that moves."""
-_CERTAIN = 4.0
+CERTAIN = 4.0
 """Standard deviations of a speed from positions beyond which it is no noise."""
-_TILT = 0.3
+TILT = 0.3
 """Standard deviation of roll and pitch of a vehicle that maneuvers [rad]."""
 
 
@@ -25,8 +25,8 @@ def with_wide_start(suite: SensorSuite, log: Log) -> SensorSuite:
     if speed is None or own.initial_tilt_sigma is None:
         return suite
     wide = own.replace(
-        initial_tilt_sigma=max(own.initial_tilt_sigma, _TILT),
-        initial_velocity_variance=max(own.initial_velocity_variance, (1.0 + speed) ** 2),
+        initial_tilt_sigma=max(own.initial_tilt_sigma, TILT),
+        initial_velocity_variance=max(own.initial_velocity_variance, (1.0 + round(speed)) ** 2),
     )
     return suite.replace(estimator=wide)
 
@@ -39,7 +39,7 @@ def _first_speed(log: Log, suite: SensorSuite) -> float | None:
     positions = next(v for k in "GI" if (v := gnss.values.get(f"position_{k}")) is not None)
     rows = np.isfinite(positions).all(axis=1)
     time, positions = gnss.time[rows], positions[rows]
-    rows = time < time[0] + _SPAN
+    rows = time < time[0] + SPAN
     nearest = int(np.argmin(np.abs(log.imu.time - time[0])))
     turning = float(np.linalg.norm(log.imu.values["gyro"][nearest]))
     speed, spread = 0.0, np.inf
@@ -48,5 +48,5 @@ def _first_speed(log: Log, suite: SensorSuite) -> float | None:
         fit = np.linalg.pinv(powers)[1]
         speed = float(np.linalg.norm(fit @ positions[rows]))
         spread = max(suite.gnss.position_sigma_I) * float(np.linalg.norm(fit))
-    moving = speed > max(_FAST, _CERTAIN * spread)
-    return speed if moving or turning > _TURNING else None
+    moving = speed > max(FAST, CERTAIN * spread)
+    return speed if moving or turning > TURNING else None

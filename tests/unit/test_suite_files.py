@@ -133,13 +133,13 @@ def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys, monkeypatch):
     quad_gym.sensor_suite("rtk").save("folder/my-suite.toml")
     for name in ("rtk", "folder/my-suite.toml"):
         main(["export", "filter", "--sensors", name])
-    numbers = [
-        (tmp_path / "results/export" / file).read_text().split("*/", 1)[1].split("\n", 3)[3]
-        for file in ("filter_rtk.h", "filter_my-suite.h")
-    ]
-    assert numbers[0].replace("FILTER_RTK", "FILTER_MY_SUITE") == numbers[1]
-    header = (tmp_path / "results/export/filter_my-suite.h").read_text()
-    assert "#define QUAD_GYM_FILTER_MY_SUITE_H\n" in header
+    preset, own = (
+        tmp_path / "results/export" / f"filter_{name}_x86-64" for name in ("rtk", "my-suite")
+    )
+    for file in ("libquad_gym_filter.a", "main.c"):
+        assert (preset / file).read_bytes() == (own / file).read_bytes()
+    header = (own / "quad_gym_filter.h").read_text()
+    assert header == (preset / "quad_gym_filter.h").read_text().replace('"rtk"', '"my-suite"')
     for name, message in (
         ("none.toml", "none.toml does not exist"),
         ("wrong.toml", "wrong.toml: imus is not a field of SensorSuite; did you mean imu?"),

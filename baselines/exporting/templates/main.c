@@ -311,6 +311,48 @@ static int position_G(const double *row, double out[3])
     return 1;
 }
 
+static double tilt_sigma, rest_sigma; /* of a start in motion; 0: the suite's */
+
+/* A start in motion is uncertain: roll, pitch and velocity by the speed at the first fix, from the
+ * positions of a second with a constant acceleration, as in quad_gym.estimation.first_motion. */
+static void find_motion(void)
+{
+    double begin = NAN, nearest = INFINITY, turning = 0.0, S[5] = {0}, c[3], det, v[3] = {0};
+    double speed, spread, p[3];
+    for (size_t k = 0; k < rows; k++) {
+        const double *row = table + k * COLUMNS;
+        if (!isnan(row[TIME]) && position_G(row, p)) {
+            double t = row[TIME] - @DELAY_GNSS@, power = 1.0;
+            begin = isnan(begin) ? t : begin;
+            for (int i = 0; t < begin + @MOTION_SPAN@ && i < 5; i++, power *= t - begin)
+                S[i] += power;
+        }
+    }
+    c[0] = S[1] * S[2] - S[3] * S[0];
+    c[1] = S[4] * S[0] - S[2] * S[2];
+    c[2] = S[3] * S[2] - S[4] * S[1];
+    det = S[3] * c[0] + S[2] * c[1] + S[1] * c[2];
+    for (size_t k = 0; k < rows; k++) {
+        const double *row = table + k * COLUMNS;
+        const double t = row[TIME] - @DELAY_GNSS@ - begin;
+        if (!isnan(row[TIME]) && position_G(row, p) && t < @MOTION_SPAN@)
+            for (int i = 0; i < 3; i++)
+                v[i] += (c[0] * t * t + c[1] * t + c[2]) / det * p[i];
+        if (all_finite(row + GYRO, 6) && fabs(row[TIME] - begin) < nearest) {
+            const double *w = row + GYRO;
+            nearest = fabs(row[TIME] - begin);
+            turning = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
+        }
+    }
+    speed = S[0] > 3.5 ? sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]) : 0.0;
+    spread = S[0] > 3.5 ? @MOST_POSITION_SIGMA@ * sqrt(c[1] / det) : INFINITY;
+    if ((speed > @MOTION_FAST@ && speed > @MOTION_CERTAIN@ * spread) || turning > @MOTION_TURNING@) {
+        tilt_sigma = @MOTION_TILT@;
+        rest_sigma = 1.0 + rint(speed);
+        rest_sigma = rest_sigma > @SUITE_SPEED_SIGMA@ ? rest_sigma : 0.0;
+    }
+}
+
 static const double *field; /* the last magnetic field before the start */
 
 #ifdef QG_MAGNETOMETER
@@ -351,6 +393,8 @@ static void try_to_start(const arrival *a)
     (void)baseline, (void)velocity;
     s.heading = isnan(heading) ? 0 : &heading;
     s.course = course;
+    s.tilt_sigma = tilt_sigma;
+    s.rest_sigma = rest_sigma;
 #ifdef QG_MAGNETOMETER
     if (!s.gnss_baseline && !s.heading && !course) {
         first_fix = a->received < first_fix ? a->received : first_fix;
@@ -492,6 +536,10 @@ int main(int count, char **words)
         stop("--start-position must come with --heading", "");
     read_log(path);
     sort_arrivals();
+#ifdef QG_GNSS
+    if (@MOTION_TILT@ > 0.0)
+        find_motion();
+#endif
     if (repeats > 0) {
         clock_t begin = clock();
         silent = 1;

@@ -66,6 +66,12 @@ static void qgi_level(qg_filter *f)
         }
 }
 
+/* A number of the parameters. */
+static double *qgi_number(qg_filter *f, int place)
+{
+    return (double *)(void *)((char *)f->params + place);
+}
+
 int qg_init(qg_filter *f, const qg_start *s)
 {
     static const double R_IG[9] = {@R_IG@};
@@ -74,6 +80,7 @@ int qg_init(qg_filter *f, const qg_start *s)
     qg_start_record first;
     double baseline[3] = {1.0, 0.0, 0.0}, velocity[3] = {0.0, 0.0, 0.0}, sigmas[3];
     double speed_sigma = s->velocity_sigma > 0.0 ? s->velocity_sigma : @VELOCITY_SIGMA@;
+    double tilt_sigma, velocity_variance;
     int error = QG_OK;
     memcpy(&first, qg_core_first, sizeof first);
     if (!s->gnss_position || !qgi_finite(s->gnss_position, 3) || !isfinite(s->time))
@@ -85,6 +92,13 @@ int qg_init(qg_filter *f, const qg_start *s)
     memcpy(sigmas, suite, sizeof sigmas);
     if (s->gnss_sigma && (error = qgi_noise(s->gnss_position, s->gnss_sigma, 3, 1e-9, sigmas)))
         return error;
+    if (!(s->tilt_sigma >= 0.0 && s->tilt_sigma <= 1.0 && s->rest_sigma >= 0.0) ||
+        isinf(s->rest_sigma))
+        return QG_OUT_OF_RANGE;
+    if (s->tilt_sigma > 0.0)
+        first.tilt_sigma = s->tilt_sigma;
+    for (int i = 0; i < 3 && s->rest_sigma > 0.0; i++)
+        first.velocity_sigma[i] = s->rest_sigma;
     if (s->gnss_velocity) {
         if (!qgi_finite(s->gnss_velocity, 3))
             return QG_NOT_FINITE;
@@ -116,15 +130,23 @@ int qg_init(qg_filter *f, const qg_start *s)
     if (error)
         return error;
     qgi_begin(f, s->time);
+    tilt_sigma = *qgi_number(f, @OF_TILT_SIGMA@);
+    velocity_variance = *qgi_number(f, @OF_VELOCITY_VARIANCE@);
     f->first = first;
     qgi_turn(R_IG, s->gnss_position, f->first.antenna_I);
     for (int i = 0; i < 3; i++) {
         qgi_field(f, @OF_GNSS_POSITION@)[i] = s->gnss_position[i];
         qgi_field(f, @OF_GNSS_BASELINE@)[i] = baseline[i];
         f->first.position_root[i][i] = @ROOT_SCALE@ * sigmas[i];
-        ((double *)(void *)((char *)f->params + @OF_POSITION_SIGMA@))[i] = sigmas[i];
+        qgi_number(f, @OF_POSITION_SIGMA@)[i] = sigmas[i];
     }
+    if (s->tilt_sigma > 0.0)
+        *qgi_number(f, @OF_TILT_SIGMA@) = s->tilt_sigma;
+    if (s->rest_sigma > 0.0)
+        *qgi_number(f, @OF_VELOCITY_VARIANCE@) = s->rest_sigma * s->rest_sigma;
     qgi_start(f);
+    *qgi_number(f, @OF_TILT_SIGMA@) = tilt_sigma;
+    *qgi_number(f, @OF_VELOCITY_VARIANCE@) = velocity_variance;
     memcpy((char *)f->params + @OF_POSITION_SIGMA@, suite, 3 * 8);
     if (!s->gnss_baseline)
         qgi_level(f);

@@ -11,6 +11,8 @@ typedef struct {
     const double *magnetometer;  /* magnetic field in B [T] */
     double magnetometer_sigma;   /* [T]; 0: the suite's */
     int course;                  /* 1: the vehicle flies nose first, along gnss_velocity */
+    double tilt_sigma;           /* of roll and pitch [rad]; 0: the suite's */
+    double rest_sigma;           /* of each axis of an unmeasured velocity [m/s]; 0: the suite's */
 } qg_start;
 
 int qg_init(qg_filter *filter, const qg_start *start);
