@@ -170,7 +170,7 @@ class Measurements:
         return Reading(values, new, age)
 
 
-class Start(Measurements):
+class StartView(Measurements):
     """Start of episodes as the built-in filter has it, and the measurements at that instant.
 
     A cold filter has its first fix: the position from the antenna, or from the mark from which the

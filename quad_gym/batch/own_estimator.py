@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.batch.measurements import Measurements, Start
+from quad_gym.batch.measurements import Measurements, StartView
 from quad_gym.batch.state import State
 from quad_gym.estimation.own import Estimator, checked_estimate, factors
 from quad_gym.params import checks as check
@@ -116,7 +116,7 @@ class OwnFilter:
         others = self.state.rows()
         self.state.begin(mask)
         self.state.lock(False)
-        view = Start(batch, _sample(batch), mask)
+        view = StartView(batch, _sample(batch), mask)
         estimate = self._estimator.reset(view, mask)
         self.state.put(others[~mask], ~mask)
         self.state.lock(False)

@@ -11,7 +11,7 @@ from quad_gym.params.checks import did_you_mean
 from quad_gym.rotations import quaternion_to_dcm
 
 if TYPE_CHECKING:
-    from quad_gym.batch.measurements import Measurements, Start
+    from quad_gym.batch.measurements import Measurements, StartView
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -65,7 +65,7 @@ class Estimator:
 
     state: Any = MappingProxyType({})
 
-    def reset(self, view: "Start", mask: Truths) -> Mapping[str, ArrayLike] | None:
+    def reset(self, view: "StartView", mask: Truths) -> Mapping[str, ArrayLike] | None:
         """Begin episodes.
 
         Args:
