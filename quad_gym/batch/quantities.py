@@ -45,6 +45,8 @@ class Quantity(NamedTuple):
     kind: type = float
     filtered: bool = False
     """True if only flights have it in which a filter, and so sensors, run"""
+    builtin: bool = False
+    """True if only the built-in filter has it: NaN with a user's estimator"""
 
 
 def read(batch: FlightMemory, name: str, flights: Flights) -> NDArray[Any]:
@@ -59,6 +61,8 @@ def read(batch: FlightMemory, name: str, flights: Flights) -> NDArray[Any]:
         raise ValueError(f"{name} needs a filter, and none runs in these flights")
     of = quantity.of
     values = batch.record(of, flights) if isinstance(of, str) else of(batch, flights)
+    if quantity.builtin and batch.configuration.estimator is not None:
+        return np.full_like(values, np.nan)
     if quantity.kind is bool:
         return np.asarray(values > 0.0)
     return values if quantity.kind is float else values.astype(np.int64)
@@ -206,10 +210,10 @@ QUANTITIES = {
     "estimated_body_rates": Quantity(_estimated_rates, (3,), "rad/s", "B", "measured rates minus the estimated bias", filtered=True),
     "estimated_accel_bias": Quantity("b_a_hat", (3,), "m/s^2", "B", "the filter's estimate of `accel_bias`", filtered=True),
     "estimated_gyro_bias": Quantity("b_g_hat", (3,), "rad/s", "B", "the filter's estimate of `gyro_bias`", filtered=True),
-    "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "the filter's estimate of `gnss_drift`", filtered=True),
+    "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "the filter's estimate of `gnss_drift`", filtered=True, builtin=True),
     "filter_status": Quantity("filter_status", (), "bits", "-", "numerical failures of the filter so far, see `FilterStatus`", int),
     "filter_diverged": Quantity("diverged", (), "-", "-", "the filter flags itself as diverged: the covariance does not explain the last innovations (filters with an innovation gate, or with `faults`, `truncate_when_diverged` or `innovations`)", bool),
-    "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update", filtered=True),
+    "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update", filtered=True, builtin=True),
     "nis_dimension": Quantity("nis_dimension", (), "-", "-", "measurements in the last update", int, filtered=True),
     # the state that the controller observes: the truth, the estimate, or the truth with noise
     "observed_position": Quantity("r_seen", (3,), "m", "I", "position from the controller's source"),

@@ -54,6 +54,13 @@ def test_error_state_ekf_is_as_accurate_as_the_built_in_filter():
     assert errors[1] < 1.1 * errors[0]
 
 
+def test_quantities_of_the_built_in_filter_are_nan():
+    made = batch(2, sensors="rtk", estimator=Simple)
+    made.step()
+    for name in ("nis", "estimated_gnss_drift"):
+        assert np.isnan(made.read(name)).all()
+
+
 @pytest.mark.parametrize("form", ["R_BI", "quaternion"])
 @pytest.mark.parametrize("layout", ["relative", "absolute"])
 def test_controller_observes_the_estimate(form, layout):
