@@ -216,27 +216,26 @@ def _give_samples(call, index, flight):
 
 
 @kernel
+def _copy_estimate(of, to):
+    """Copy the estimate of a block between its record and the exchange with a user's estimator."""
+    for i in range(3):
+        to.r_hat[i], to.v_hat[i] = of.r_hat[i], of.v_hat[i]
+        to.b_a_hat[i], to.b_g_hat[i] = of.b_a_hat[i], of.b_g_hat[i]
+        to.w_hat[i] = of.w_hat[i]
+        for j in range(3):
+            to.R_hat[i, j] = of.R_hat[i, j]
+
+
+@kernel
 def _give_estimate(call, index, flight):
     """Copy the estimate of a block for the user's estimator, which begins some of its episodes."""
-    exchange = _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH)
-    for i in range(3):
-        exchange.r_hat[i], exchange.v_hat[i] = flight.r_hat[i], flight.v_hat[i]
-        exchange.b_a_hat[i], exchange.b_g_hat[i] = flight.b_a_hat[i], flight.b_g_hat[i]
-        exchange.w_hat[i] = flight.w_hat[i]
-        for j in range(3):
-            exchange.R_hat[i, j] = flight.R_hat[i, j]
+    _copy_estimate(flight, _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH))
 
 
 @kernel
 def _take_estimate(call, index, flight):
     """Copy the estimate of a block from the user's estimator."""
-    exchange = _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH)
-    for i in range(3):
-        flight.r_hat[i], flight.v_hat[i] = exchange.r_hat[i], exchange.v_hat[i]
-        flight.b_a_hat[i], flight.b_g_hat[i] = exchange.b_a_hat[i], exchange.b_g_hat[i]
-        flight.w_hat[i] = exchange.w_hat[i]
-        for j in range(3):
-            flight.R_hat[i, j] = exchange.R_hat[i, j]
+    _copy_estimate(_exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH), flight)
 
 
 @kernel
