@@ -33,7 +33,7 @@ class _Signature:
     """The signature of a dataclass that has a `__new__`, which Python would show in its place."""
 
     def __get__(self, instance: Any, owner: type) -> inspect.Signature:
-        """The parameters of its `__init__`, less `self`."""
+        """Return the parameters of its `__init__` without `self`."""
         init = owner.__init__  # type: ignore[misc]
         _, *parameters = inspect.signature(init).parameters.values()
         return inspect.Signature(parameters)

@@ -87,7 +87,7 @@ def test_controller_observes_the_estimate(form, layout):
     assert np.isnan(flights.batch.covariance()).all()
 
 
-def test_body_rates_are_the_gyro_less_its_bias_unless_they_are_given():
+def test_body_rates_default_to_the_gyro_minus_its_bias():
     made = batch(estimator=Certain(), control=Control.CTBR, control_rate=50.0)
     made.step(np.zeros((5, 4)))
     expected = made.record("w_meas") - 0.02
