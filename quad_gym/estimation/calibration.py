@@ -248,11 +248,6 @@ class _Search:
             found = number.put(found, number.value(value, float(place)))
         return found
 
-    def likelihood(self, delays: Mapping[str, float]) -> Likelihood:
-        """Return the likelihood of the log with delays."""
-        log = self.log.without_delays(delays)
-        return Likelihood(log, self.prior, self.start)
-
     def find_delays(self, coarse: bool) -> None:
         """Find the delay of each sensor, with the others as they are."""
         for name in self.delays:
@@ -267,9 +262,12 @@ class _Search:
         Delays have a normal prior about zero. A delay that hardly changes the loss stays.
         """
         delays = self.delays[name] + steps
-        likelihoods = (self.likelihood(self.delays | {name: float(d)}) for d in delays)
-        suite = self.suite(gate=False)
-        total = np.array([float(found.losses([suite]).sum()) for found in likelihoods])
+        margin, suites = max(0.0, -float(delays.min())), [self.suite(gate=False)]
+        total = np.empty(len(delays))
+        for k, delay in enumerate(delays):
+            log = self.log.without_delays(self.delays | {name: float(delay)})
+            found = Likelihood(log, self.prior, self.start, fewer=False, margin=margin)
+            total[k] = found.losses(suites).sum()
         loss = total + 0.5 * (delays / _DELAY_SPREAD) ** 2
         k = int(np.clip(np.argmin(loss), 2, len(loss) - 3))
         near = slice(k - 2, k + 3)
@@ -288,7 +286,8 @@ class _Search:
                 both explain large innovations; begin with much and with little of the first.
         """
         self.progress(f"Search for {len(self.numbers)} numbers")
-        self._current = self.likelihood(self.delays)
+        log = self.log.without_delays(self.delays)
+        self._current = Likelihood(log, self.prior, self.start)
         if first:
             little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
             tried = [self._minimize(x, _FEW_STEPS) for x in (self.x, little)]
