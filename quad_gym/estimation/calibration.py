@@ -41,8 +41,9 @@ _COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
 """Noise that the search begins with twice: as large as the samples admit, and at its prior."""
 _FEW_STEPS, _STEPS = 8, 25
 """Steps of the search from each beginning, and after."""
-_CLUSTER = 5.0
-"""Length of the parts of a log that are independent of each other [s]."""
+_CLUSTER, _CLUSTERS = 5.0, 20
+"""Length of the parts of a log that are independent of each other [s], shorter in short logs: their
+least number."""
 _COARSE, _FINE = np.arange(-1.0, 1.01, 0.1), np.arange(-0.1, 0.11, 0.05)
 _DELAY_SPREAD = 0.3
 """Standard deviation of the prior of a delay [s]."""
@@ -349,7 +350,8 @@ class _Search:
         H /= _STEP**2
         slopes = (losses[:, 1 : 2 * n : 2] - losses[:, 2 : 2 * n + 1 : 2]) / (2.0 * _STEP)
         times = self._current.times
-        parts = ((times - times[0]) // _CLUSTER).astype(int)
+        length = min(_CLUSTER, (times.max() - times.min()) / _CLUSTERS)
+        parts = ((times - times.min()) // length).astype(int)
         sums = np.array([slopes[parts == part].sum(axis=0) for part in np.unique(parts)])
         J = sums.T @ sums
         values, vectors = np.linalg.eigh(H)
@@ -374,12 +376,16 @@ def _lowest(number: Number) -> float:
 
 
 def correlation_time(values: Floats) -> float:
-    """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white."""
-    centered = values - values.mean()
+    """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white.
+
+    The sum ends with the first correlation that white noise would also have, to two standard
+    deviations.
+    """
+    centered, least = values - values.mean(), max(0.05, 2.0 / math.sqrt(len(values)))
     variance, tau = float((centered**2).mean()), 1.0
     for lag in range(1, len(values) // 4):
         rho = float((centered[:-lag] * centered[lag:]).mean()) / variance
-        if rho < 0.05:
+        if rho < least:
             break
         tau += 2.0 * rho
     return tau
