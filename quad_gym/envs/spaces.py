@@ -34,18 +34,12 @@ STATE_NAMES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 class ObservationField(NamedTuple):
     """One named part of an observation."""
 
-    name: str
-    """name of the part"""
-    slice: slice
-    """elements of the flat observation"""
-    unit: str
-    """unit of the elements, "-" without one"""
-    frame: str
-    """frame of the elements: I: inertial, B: body, C: image, "-": none"""
-    low: float
-    """lower bound, to which observations are clipped"""
-    high: float
-    """upper bound, to which observations are clipped"""
+    name: str  #: name of the part
+    slice: slice  #: elements of the flat observation
+    unit: str  #: unit of the elements, "-" without one
+    frame: str  #: frame of the elements: I: inertial, B: body, C: image, "-": none
+    low: float  #: lower bound, to which observations are clipped
+    high: float  #: upper bound, to which observations are clipped
 
 
 _RELATIVE: tuple[Part, ...] = (
@@ -89,8 +83,7 @@ PRIVILEGED_NAMES = frozenset(name for name, *_ in _PRIVILEGED)
 """Names by which the privileged part of a table is recognized; parts of a user's task must not have
 them."""
 _LAST_ACTION: Part = ("last_action", 4, "-", "-", 1.0)
-_FLAG = 0.0
-"""Bound that marks a flag, in [0, 1]."""
+_FLAG = 0.0  # bound that marks a flag, in [0, 1]
 
 
 def _sensor_fields(
