@@ -65,8 +65,8 @@ class Raptor:
 
 # %%
 # It tracks without any number of the vehicle. LookAround is different: there, the camera sees its
-# markers only if the vehicle turns to them. A policy trained on the true state has no reason to, and
-# loses the estimate.
+# markers only if the vehicle turns to them. A policy trained on the true state has no reason to,
+# and loses the estimate.
 
 print("task          observation  mean error  estimation  crashed")
 for task in ("Hover", "Circle", "Lemniscate", "LookAround"):
@@ -85,9 +85,9 @@ for task in ("Hover", "Circle", "Lemniscate", "LookAround"):
         )
 
 # %%
-# It adapts. Here the true mass differs from the one that the environment assumes, by which the motor
-# commands are scaled: neutral commands lift half the weight, or twice. The error is the mean over the
-# second half of an episode.
+# It adapts. Here the true mass differs from the one that the environment assumes, by which the
+# motor commands are scaled: neutral commands lift half the weight, or twice. The error is the mean
+# over the second half of an episode.
 
 factors = [0.5, 0.75, 1.0, 1.5, 2.0, 2.6, 3.0]
 errors = []
