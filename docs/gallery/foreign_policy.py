@@ -19,9 +19,9 @@ EPISODES = 100
 
 # %%
 # The policy observes position, attitude, velocity, body rates and its last action at 100 Hz, and
-# commands the motors. It holds the origin, nose along x: the reference is subtracted, and axes are
-# those of the reference's heading. Its rotors count clockwise from the right front one, those of
-# this package counterclockwise.
+# commands the motors. It holds the origin with the nose along x, so the reference is subtracted and
+# all vectors are turned into axes along the reference's heading. It numbers the rotors clockwise
+# from the right front one; this package numbers them counterclockwise.
 
 ENVIRONMENT = {"action": "motor", "layout": "absolute", "control_rate": 100}
 COLUMNS = {field.name: field.slice for field in quad_gym.observation_layout(layout="absolute")}
