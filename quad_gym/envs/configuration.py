@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.batch.beginnings import check_in_bounds
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.batch.standing import check_pad
+from quad_gym.batch.references import check_in_bounds, check_pad
 from quad_gym.batch.starts import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.effects import require_effect, require_own_task, runs_no_sensor

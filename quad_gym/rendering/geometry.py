@@ -44,8 +44,8 @@ class Perspective:
 
     def segments(self, starts: Floats, ends: Floats) -> Floats:
         """Pixels (m, 2, 2) of line segments, (n, 3) or (3,) each, clipped where too near."""
-        both = np.broadcast_arrays(np.atleast_2d(starts), np.atleast_2d(ends))
-        both = self.in_view(np.stack(both, axis=1))
+        pairs = np.broadcast_arrays(np.atleast_2d(starts), np.atleast_2d(ends))
+        both = self.in_view(np.stack(pairs, axis=1))
         in_front = both[..., 2] > NEAR
         if in_front.all():
             return self.flatten(both)
