@@ -234,7 +234,7 @@ def own_estimator(given: Any) -> Any:
 
 
 def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...]:
-    """Return the faults that can occur; refuse those of sensors if none runs."""
+    """Return the faults that can occur; refuse faults of sensors if none runs."""
     true = keywords["true_sensors"]
     if true is not None:
         check.instance("true_sensors", true, SensorSuite)
