@@ -50,13 +50,7 @@ def make_compiled(plan: Plan) -> CompiledPPO:
     flights = plan.make_vector_flights()
     if plan.recipe.parameters.get("critic_only"):
         _require_leaving(plan, flights)
-    return CompiledPPO(
-        flights,
-        plan.recipe,
-        seed=plan.seed,
-        env_seed=seed,
-        threads=plan.threads,
-    )
+    return CompiledPPO(flights, plan.recipe, seed=plan.seed, env_seed=seed, threads=plan.threads)
 
 
 def _require_leaving(plan: Plan, flights: Any) -> None:

@@ -12,15 +12,7 @@ from quad_gym.analysis.consistency import (
     MeanSquare,
     Whiteness,
 )
-from quad_gym.analysis.plots import (
-    BLUE,
-    GREY,
-    INK,
-    PALE,
-    VERMILLION,
-    house_style,
-    panels,
-)
+from quad_gym.analysis.plots import BLUE, GREY, INK, PALE, VERMILLION, house_style, panels
 
 _TITLES = {
     "state": "whole state",

@@ -85,7 +85,7 @@ class FlyArgs:
         tuple[str, ...],
         arg(
             help="faults, one or several (also joined by +), which replace the task's own: "
-            f"{', '.join(FAULTS)}; or none",
+            f"{', '.join(FAULTS)}; or none"
         ),
     ] = ()
     fault_time: tuple[float, float] | None = None

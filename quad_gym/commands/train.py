@@ -136,11 +136,7 @@ def main(args: TrainArgs) -> None:
         print("TensorBoard is not installed; evaluations.csv contains the errors.")
     with usage_errors((RunError,)):
         done = train(
-            plan,
-            folder,
-            resume=args.resume,
-            tensorboard=tensorboard,
-            quiet=not args.progress,
+            plan, folder, resume=args.resume, tensorboard=tensorboard, quiet=not args.progress
         )
     total = time.perf_counter() - from_start
     print(

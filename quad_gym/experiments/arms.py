@@ -118,9 +118,7 @@ ARMS = (
         parameters=_FAR_SIGHTED,
     ),
     Arm(
-        name="certainty",
-        label="estimate, reward for certainty",
-        learning=_task("CertaintyReward"),
+        name="certainty", label="estimate, reward for certainty", learning=_task("CertaintyReward")
     ),
     Arm(
         name="std_certainty",
