@@ -12,7 +12,16 @@ from quad_gym.analysis.consistency import (
     MeanSquare,
     Whiteness,
 )
-from quad_gym.analysis.plots import BLUE, GREY, INK, PALE, VERMILLION, house_style, panels
+from quad_gym.analysis.plots import (
+    BLUE,
+    GREY,
+    INK,
+    PALE,
+    VERMILLION,
+    house_style,
+    logarithmic,
+    panels,
+)
 
 _TITLES = {
     "state": "whole state",
@@ -47,10 +56,7 @@ def _grid(count: int, title: str, label: str = "time [s]") -> tuple[Any, Any]:
 def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     """Draw a mean square over time with its band; the title states the share of instants inside.
 
-    Args:
-        axes: matplotlib Axes.
-        part: Mean square.
-        settle: Time before which instants are left out of the numbers in the title [s].
+    Instants before `settle` [s] are left out of the numbers in the title.
     """
     axes.fill_between(part.time, part.low, part.high, color=PALE, linewidth=0.0)
     axes.axhline(part.dimension, color=GREY, linewidth=0.8)
@@ -95,8 +101,7 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
             size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
             axis.plot(time, size, color=color, linestyle=dashes, linewidth=1.3)
         axis.set_title(f"{_TITLES[name]} [{unit}]")
-        axis.set_yscale("log", subs=(2.0, 5.0))
-        axis.yaxis.set_major_formatter("{x:g}")
+        logarithmic(axis, subs=(2.0, 5.0))
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(axis="y", which="minor", labelsize=7.0)
         axis.set_xlim(0.0, time[-1])

@@ -43,11 +43,7 @@ class TrackingSummary:
     error]"""
 
     def spreads(self, chosen: ArrayLike = True) -> "dict[str, Spread]":
-        """Distributions of both means over flights, by name.
-
-        Args:
-            chosen: True for flights to include, (...,); True: all flights.
-        """
+        """Distributions of both means over the flights for which `chosen` is True, by name."""
         parts = {"mean": self.mean, "last_half": self.last_half}
         return {name: spread(values[np.asarray(chosen)]) for name, values in parts.items()}
 
@@ -66,12 +62,7 @@ class RunningSummary:
         self._sums, self._counts = np.zeros((2, flights)), np.zeros((2, flights))
 
     def add(self, error: ArrayLike, counts: ArrayLike = True) -> None:
-        """Add the next instant.
-
-        Args:
-            error: Errors, (flights,).
-            counts: True for flights to include, (flights,); False for flights that have ended.
-        """
+        """Add the errors of the next instant, (flights,), where `counts` is True."""
         counted = np.broadcast_to(np.asarray(counts, bool), self._sums[0].shape)
         value = np.where(counted, np.asarray(error, np.float64), 0.0)
         parts = slice(0, 2 if self._instant >= self._half else 1)
@@ -104,11 +95,7 @@ class Spread:
 
 
 def spread(values: ArrayLike) -> Spread:
-    """Mean, standard deviation and percentiles of one number per seed.
-
-    Args:
-        values: One number per seed, (n,); n may be 0.
-    """
+    """Mean, standard deviation and percentiles of one number per seed, (n,); n may be 0."""
     x = np.asarray(values, np.float64).reshape(-1)
     if x.size == 0:
         return Spread(0, *[float("nan")] * 6)
@@ -133,14 +120,11 @@ def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats
     Raises:
         KeyError: If a quantity is missing.
     """
-
-    def difference(name: str) -> Floats:
-        return np.asarray(truth[name], np.float64) - np.asarray(estimate[name], np.float64)
-
+    names = ("position", "velocity", "accel_bias", "gyro_bias")
+    r, v, b_a, b_g = (np.subtract(truth[name], estimate[name]) for name in names)
     R_hat = np.asarray(estimate["R_BI"], np.float64)
     e = dcm_to_euler(np.asarray(truth["R_BI"], np.float64) @ np.swapaxes(R_hat, -1, -2))
-    parts = (difference("position"), difference("velocity"), e)
-    return np.concatenate([*parts, difference("accel_bias"), difference("gyro_bias")], axis=-1)
+    return np.concatenate([r, v, e, b_a, b_g], axis=-1, dtype=np.float64)
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
