@@ -19,19 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym import records
 from quad_gym.analysis.metrics import STATE_DIMENSION, mean_band, nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.records import (
-    AID_BLOCKS,
-    BASELINE_BLOCK,
-    FEATURE_BLOCKS,
-    FREEDOMS,
-    POSITION_BLOCK,
-    VELOCITY_BLOCK,
-    WIDTH,
-    Aid,
-    GateDecision,
-)
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 
 PARTS = {
@@ -93,7 +83,7 @@ def start_matched(batch: FlightBatch, seed: int) -> None:
     estimates["R_hat"] = turned @ quaternion_to_dcm(batch.record("q"))
     blocks, flight = batch.snapshot(), np.arange(flights)
     for name, values in estimates.items():
-        blocks[name][flight // WIDTH, ..., flight % WIDTH] = values
+        blocks[name][flight // records.WIDTH, ..., flight % records.WIDTH] = values
     batch.restore(blocks)
 
 
@@ -208,11 +198,11 @@ class NeesRecorder:
 
 
 SENSOR_BLOCKS = {
-    "position": (POSITION_BLOCK,),
-    "baseline": (BASELINE_BLOCK,),
-    "velocity": (VELOCITY_BLOCK,),
-    "feature": tuple(range(FEATURE_BLOCKS, AID_BLOCKS)),
-    **{aid.name.lower(): (AID_BLOCKS + aid,) for aid in Aid},
+    "position": (records.POSITION_BLOCK,),
+    "baseline": (records.BASELINE_BLOCK,),
+    "velocity": (records.VELOCITY_BLOCK,),
+    "feature": tuple(range(records.FEATURE_BLOCKS, records.AID_BLOCKS)),
+    **{aid.name.lower(): (records.AID_BLOCKS + aid,) for aid in records.Aid},
 }
 """Blocks of the measurement by sensor. Errors of features in one image are correlated through
 attitude and position, so that only the first one is used: the values of an instant are independent.
@@ -268,7 +258,9 @@ class InnovationRecorder:
         valid = batch.record("block_valid") > 0.0
         if not valid.any():
             return
-        valid &= batch.record("gate") != GateDecision.UNSURE  # the filter does not use these
+        valid &= (
+            batch.record("gate") != records.GateDecision.UNSURE
+        )  # the filter does not use these
         nis, innovation = batch.record("block_nis"), batch.record("innovation")
         white = innovation / batch.record("innovation_sigma")
         span = min(int(np.searchsorted(self._bins, time - 1e-9, "right")), self._bins.size - 1) - 1
@@ -298,7 +290,7 @@ class InnovationRecorder:
         for name, blocks in SENSOR_BLOCKS.items():
             some = self._counts[name] > 0
             if some.any():
-                counts, freedoms = self._counts[name][some], FREEDOMS[blocks[0]]
+                counts, freedoms = self._counts[name][some], records.FREEDOMS[blocks[0]]
                 means = self._sums[name][some] / counts
                 found[name] = _mean_square(name, freedoms, middle[some], means, counts)
         return found
