@@ -111,11 +111,7 @@ class MlpPolicy:
 
 
 def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
-    """Convert the deterministic actor of a Stable-Baselines3 model.
-
-    Args:
-        model: PPO, SAC, TD3 or TQC with an "MlpPolicy".
-        record: Training record.
+    """Convert the deterministic actor of a Stable-Baselines3 model with an "MlpPolicy".
 
     Raises:
         ValueError: If the model's actor is not a multilayer perceptron.

@@ -158,12 +158,6 @@ def _flights_of(env: Any) -> Any:
     return flights
 
 
-def _space_of(env: Any) -> gymnasium.Space[Any]:
-    """Space of the observations of one flight."""
-    space: gymnasium.Space[Any] = getattr(env, "single_observation_space", env.observation_space)
-    return space
-
-
 def _stable_baselines_policy(file: Path, env: Any) -> Policy:
     if not file.exists():
         raise ValueError(f"there is no policy {file}")
@@ -187,16 +181,16 @@ def _stable_baselines_policy(file: Path, env: Any) -> Policy:
         model = algorithm_class(_ALGORITHM_OF_MODULE[module]).load(file, device="cpu")
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
         raise ValueError(f"{file} cannot be loaded: {error}") from None
-    space = _space_of(env)
+    space = getattr(env, "single_observation_space", env.observation_space)
     if model.observation_space != space:
-        size = gymnasium.spaces.flatdim(model.observation_space)
-        _require_size(file, size, env)
+        _require_size(file, gymnasium.spaces.flatdim(model.observation_space), env)
         raise ValueError(f"{file} expects observations {model.observation_space}, not {space}")
     return model
 
 
 def _require_size(file: Path, size: int, env: Any) -> None:
-    here = gymnasium.spaces.flatdim(_space_of(env))
+    space = getattr(env, "single_observation_space", env.observation_space)
+    here = gymnasium.spaces.flatdim(space)
     if size != here:
         raise ValueError(
             f"{file} expects observations of {size} numbers, but the environment returns {here}: "
@@ -225,9 +219,10 @@ def _require_agreement(file: Path, record: Mapping[str, Any], env: Any) -> None:
 
 def _difference(trained: Sequence[str], here: Sequence[str]) -> str:
     """Describe the difference of two lists of names: sizes, missing and additional names."""
-    lacking = [name for name in trained if name not in here]
-    more = [name for name in here if name not in trained]
-    words = [f"lacks {', '.join(lacking)}"] if lacking else []
-    words += [f"adds {', '.join(more)}"] if more else []
+    differing = {
+        "lacks": ", ".join(name for name in trained if name not in here),
+        "adds": ", ".join(name for name in here if name not in trained),
+    }
+    words = [f"{verb} {names}" for verb, names in differing.items() if names]
     found = f"it {' and '.join(words)}" if words else "in another order"
     return f"{len(trained)} fields, but the environment returns {len(here)} ({found})"

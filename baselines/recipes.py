@@ -87,13 +87,8 @@ def unfreeze(recipe: Any) -> tuple[Any, ...]:
 _PPO = Recipe(
     algorithm="ppo",
     parameters={
-        "n_steps": 32,
-        "batch_size": 1024,
-        "n_epochs": 5,
-        "gamma": 0.97,
-        "gae_lambda": 0.95,
-        "clip_range": 0.2,
-        "ent_coef": 0.0,
+        **{"n_steps": 32, "batch_size": 1024, "n_epochs": 5},
+        **{"gamma": 0.97, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.0},
     },
     policy={"log_std_init": -1.0},
     flights={"start": "mixed", "randomize_reference": True},
@@ -101,18 +96,12 @@ _PPO = Recipe(
 """Result of a search over learning rates, reward scales, activations and batch sizes on Circle."""
 
 _RECURRENT_PPO = _PPO.replace(
-    algorithm="recurrent_ppo",
-    policy={**_PPO.policy, "lstm_hidden_size": 64},
+    algorithm="recurrent_ppo", policy={**_PPO.policy, "lstm_hidden_size": 64}
 )
 
 _OFF_POLICY = {
-    "batch_size": 1024,
-    "buffer_size": 500_000,
-    "learning_starts": 5_000,
-    "train_freq": 1,
-    "gradient_steps": 4,
-    "gamma": 0.95,
-    "tau": 0.01,
+    **{"batch_size": 1024, "buffer_size": 500_000, "learning_starts": 5_000},
+    **{"train_freq": 1, "gradient_steps": 4, "gamma": 0.95, "tau": 0.01},
 }
 _SAC = Recipe(
     algorithm="sac",
@@ -135,47 +124,41 @@ _DEFAULTS = {
 }
 """Default recipe of each algorithm, found on Circle."""
 
+
+def _changed(base: Recipe, parameters: Mapping[str, Any], **fields: Any) -> Recipe:
+    """Recipe with other fields, and other values of some parameters."""
+    found: Recipe = base.replace(parameters={**base.parameters, **parameters}, **fields)
+    return found
+
+
 _SPECIAL: dict[tuple[str, str], Recipe] = {
     # gates are seconds apart: with a shorter horizon, policies fly past them and out of bounds
-    ("QuadGym/Waypoints-v0", "ppo"): _PPO.replace(
-        steps=3_000_000, parameters={**_PPO.parameters, "gamma": 0.99}
-    ),
-    ("QuadGym/StaleRace-v0", "ppo"): _PPO.replace(
-        steps=4_000_000, reward_scale=1.0, parameters={**_PPO.parameters, "gamma": 0.99}
+    ("QuadGym/Waypoints-v0", "ppo"): _changed(_PPO, {"gamma": 0.99}, steps=3_000_000),
+    ("QuadGym/StaleRace-v0", "ppo"): _changed(
+        _PPO, {"gamma": 0.99}, steps=4_000_000, reward_scale=1.0
     ),
     # closer bounds than the task's: a flight that has lost its position teaches little
-    ("QuadGym/LookAround-v0", "ppo"): _PPO.replace(
-        steps=8_000_000,
-        parameters={**_PPO.parameters, "gamma": 0.99},
-        flights={"out_of_bounds": 3.0},
+    ("QuadGym/LookAround-v0", "ppo"): _changed(
+        _PPO, {"gamma": 0.99}, steps=8_000_000, flights={"out_of_bounds": 3.0}
     ),
     # As PPO on this task, with rollouts that are long enough to learn a memory of a second, and
     # large batches, because the time of a gradient step depends on the length of the sequence. It
     # is slow, and therefore has fewer steps than PPO.
-    ("QuadGym/LookAround-v0", "recurrent_ppo"): _RECURRENT_PPO.replace(
+    ("QuadGym/LookAround-v0", "recurrent_ppo"): _changed(
+        _RECURRENT_PPO,
+        {"gamma": 0.99, "n_steps": 64, "batch_size": 2048},
         steps=2_000_000,
-        parameters={
-            **_RECURRENT_PPO.parameters,
-            "gamma": 0.99,
-            "n_steps": 64,
-            "batch_size": 2048,
-        },
         flights={"out_of_bounds": 3.0},
     ),
     # During an outage, halving the speed prevents few crashes, and waiting for its end prevents
     # most: a policy has to discover pauses of seconds. Exploration noise drawn ten times a second
     # averages out, so training holds each action for 0.25 s. Rewards after 7 s of waiting are
     # discounted by 0.996^28 = 0.89.
-    ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
+    ("QuadGym/OutageDash-v0", "ppo"): _changed(
+        _PPO,
+        {"n_epochs": 10, "gamma": 0.996, "gae_lambda": 0.96, "batch_size": 2048},
         steps=1_200_000,
         reward_scale=0.02,
-        parameters={
-            **_PPO.parameters,
-            "n_epochs": 10,
-            "gamma": 0.996,
-            "gae_lambda": 0.96,
-            "batch_size": 2048,
-        },
         flights={"control_rate": 4.0},
     ),
 }

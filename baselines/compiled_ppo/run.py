@@ -97,7 +97,7 @@ def run(
         keeper.watch(model, model.num_timesteps)
         return not keeper.stopping
 
-    with keeper:
+    with keeper.running():
         model.prepare()
         keeper.begin(model.num_timesteps)
         model.learn(plan.recipe.steps, watch, quiet=True)  # the keeper has a progress bar

@@ -7,7 +7,7 @@ episodes. To define your own arms, write a file like this one with a tuple `ARMS
 
 import runpy
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,7 +18,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Arm(Checked):
     """Arm of a study: the training and the test of one kind of controller."""
 
@@ -26,6 +26,7 @@ class Arm(Checked):
     """Short name, for folders"""
     label: str
     """Label for tables and figures"""
+    _: KW_ONLY
     policy: str | None = None
     """Name of a policy that needs no training (`baselines.policies.load_policy`); None: trained"""
     flies: str | None = None
@@ -89,46 +90,39 @@ the size of the errors of a filter that always has features in view."""
 _WITH_STD = _task("WithStd")
 
 ARMS = (
-    Arm(name="pd_reference", label="PD, facing as rewarded", policy="pd"),
-    Arm(name="pd_features", label="PD, facing the features", policy="pd:features"),
+    Arm("pd_reference", "PD, facing as rewarded", policy="pd"),
+    Arm("pd_features", "PD, facing the features", policy="pd:features"),
     Arm(
-        name="pd_features_when_uncertain",
-        label="PD, facing the features when uncertain",
+        "pd_features_when_uncertain",
+        "PD, facing the features when uncertain",
         policy="pd:features_when_uncertain",
         environment={"include_std": True},
     ),
-    Arm(name="truth", label="truth", training={"observation": "truth"}),
-    Arm(name="noisy", label="truth + independent noise", training={"observation": "noisy"}),
+    Arm("truth", "truth", training={"observation": "truth"}),
+    Arm("noisy", "truth + independent noise", training={"observation": "noisy"}),
     Arm(
-        name="noisier",
-        label="truth + independent noise as large as the errors met",
+        "noisier",
+        "truth + independent noise as large as the errors met",
         training={"observation": "noisy", "sensors": _NOISIER},
     ),
-    Arm(name="estimate", label="estimate", parameters=_FAR_SIGHTED),
+    Arm("estimate", "estimate", parameters=_FAR_SIGHTED),
+    Arm("std", "estimate + standard deviation", environment=_WITH_STD, parameters=_FAR_SIGHTED),
     Arm(
-        name="std",
-        label="estimate + standard deviation",
-        environment=_WITH_STD,
-        parameters=_FAR_SIGHTED,
-    ),
-    Arm(
-        name="std_history",
-        label="estimate + standard deviation + history",
+        "std_history",
+        "estimate + standard deviation + history",
         environment=_task("WithStdHistory"),
         parameters=_FAR_SIGHTED,
     ),
+    Arm("certainty", "estimate, reward for certainty", learning=_task("CertaintyReward")),
     Arm(
-        name="certainty", label="estimate, reward for certainty", learning=_task("CertaintyReward")
-    ),
-    Arm(
-        name="std_certainty",
-        label="estimate + standard deviation, reward for certainty",
+        "std_certainty",
+        "estimate + standard deviation, reward for certainty",
         environment=_WITH_STD,
         learning=_task("WithStdCertaintyReward"),
     ),
     Arm(
-        name="std_certainty_privileged",
-        label="estimate + standard deviation, reward for certainty, privileged critic",
+        "std_certainty_privileged",
+        "estimate + standard deviation, reward for certainty, privileged critic",
         environment=_WITH_STD,
         learning=_task("WithStdCertaintyRewardForCritic", "arm_critics"),
         parameters={"critic_only": 15},
@@ -136,8 +130,8 @@ ARMS = (
     # rewarded for certainty like `certainty` and `std_certainty`, so that they differ only in the
     # information available to the policy
     Arm(
-        name="recurrent",
-        label="estimate, LSTM, reward for certainty",
+        "recurrent",
+        "estimate, LSTM, reward for certainty",
         learning=_task("CertaintyReward"),
         algorithm="recurrent_ppo",
     ),
@@ -154,32 +148,26 @@ _COMPENSATED = {
 _WITH_HISTORY = {**_task("RaceWithHistory"), **_STD}
 
 STALE_RACE = (
-    Arm(name="pd", label="PD", policy="pd"),
-    Arm(name="truth", label="truth", training=_TRUTH),
-    Arm(name="std", label="estimate + 15 standard deviations", environment=_STD),
+    Arm("pd", "PD", policy="pd"),
+    Arm("truth", "truth", training=_TRUTH),
+    Arm("std", "estimate + 15 standard deviations", environment=_STD),
+    Arm("std_history", "estimate + 15 standard deviations + history", environment=_WITH_HISTORY),
     Arm(
-        name="std_history",
-        label="estimate + 15 standard deviations + history",
-        environment=_WITH_HISTORY,
-    ),
-    Arm(
-        name="residual",
-        label="truth + residual model",
+        "residual",
+        "truth + residual model",
         environment=_task("ObservedRace"),
         training={**_task("ResidualRace"), **_TRUTH},
     ),
+    Arm("truth_on_truth", "truth, tested on the truth", flies="truth", environment=_TRUTH),
     Arm(
-        name="truth_on_truth", label="truth, tested on the truth", flies="truth", environment=_TRUTH
-    ),
-    Arm(
-        name="truth_delay_compensated",
-        label="truth, tested with delay compensation",
+        "truth_delay_compensated",
+        "truth, tested with delay compensation",
         flies="truth",
         environment=_COMPENSATED,
     ),
     Arm(
-        name="std_delay_compensated",
-        label="estimate + 15 standard deviations, tested with delay compensation",
+        "std_delay_compensated",
+        "estimate + 15 standard deviations, tested with delay compensation",
         flies="std",
         environment={**_STD, **_COMPENSATED},
     ),
@@ -191,38 +179,27 @@ _WITH_UNCERTAINTY = _task("WithUncertainty")
 _CONSTANT_CRASH_COST = _task("ConstantCrashCost")
 
 OUTAGE_DASH = (
-    Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
-    Arm(name="pd_slow", label="PD at 2.4 m/s", policy="pd:slow"),
+    Arm("pd", "PD at 4.7 m/s", policy="pd"),
+    Arm("pd_slow", "PD at 2.4 m/s", policy="pd:slow"),
+    Arm("pd_waiting", "PD that waits when uncertain", policy="pd:waiting", environment=_STD),
+    Arm("truth", "truth", environment=_SCALED, training=_TRUTH, learning=_CONSTANT_CRASH_COST),
+    Arm("estimate", "estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
     Arm(
-        name="pd_waiting",
-        label="PD that waits when uncertain",
-        policy="pd:waiting",
-        environment=_STD,
-    ),
-    Arm(
-        name="truth",
-        label="truth",
-        environment=_SCALED,
-        training=_TRUTH,
-        learning=_CONSTANT_CRASH_COST,
-    ),
-    Arm(name="estimate", label="estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
-    Arm(
-        name="std",
-        label="estimate + normalized uncertainty",
+        "std",
+        "estimate + normalized uncertainty",
         environment=_WITH_UNCERTAINTY,
         learning=_task("ConstantCrashCostWithUncertainty"),
     ),
     Arm(
-        name="std_privileged",
-        label="estimate + normalized uncertainty, privileged critic",
+        "std_privileged",
+        "estimate + normalized uncertainty, privileged critic",
         environment=_WITH_UNCERTAINTY,
         learning=_task("ConstantCrashCostWithUncertaintyForCritic", "arm_critics"),
         parameters={"critic_only": 16},
     ),
     Arm(
-        name="truth_on_truth",
-        label="truth, tested on the truth",
+        "truth_on_truth",
+        "truth, tested on the truth",
         flies="truth",
         environment={**_SCALED, **_TRUTH},
     ),
