@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 from quad_gym import IDS
 from quad_gym.params import checks as check
@@ -23,53 +23,52 @@ ACTIVATIONS = ("relu", "tanh", "elu")
 """Activations between the layers of a policy."""
 
 
+_rates = partial(check.vector, length=2, least=0.0, open_end=True)
+
+
+def _sizes(name: str, sizes: Any) -> tuple[int, ...]:
+    if not sizes:
+        raise ValueError(f"{name} must be positive whole numbers, got {sizes}")
+    return tuple(check.whole(name, size) for size in sizes)
+
+
+def _read_only(name: str, values: Any) -> Mapping[str, Any]:
+    return MappingProxyType(dict(check.instance(name, values, Mapping)))
+
+
+ReadOnly = Annotated[Mapping[str, Any], _read_only]
+"""A mapping that is copied, and cannot be changed."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recipe(Checked):
     """Hyperparameters of a training."""
 
-    algorithm: str = "ppo"
+    algorithm: Annotated[str, partial(check.choice, choices=ALGORITHMS)] = "ppo"
     """Algorithm, one of `ALGORITHMS`"""
-    steps: int = 1_800_000
+    steps: Annotated[int, check.whole] = 1_800_000
     """Environment steps, summed over all flights"""
-    n_envs: int = 256
+    n_envs: Annotated[int, check.whole] = 256
     """Number of parallel flights"""
-    learning_rate: tuple[float, float] = (1e-3, 1e-4)
+    learning_rate: Annotated[tuple[float, float], _rates] = (1e-3, 1e-4)
     """Learning rate at the beginning and at the end, with linear decay between"""
-    layers: tuple[int, ...] = (64, 64)
+    layers: Annotated[tuple[int, ...], _sizes] = (64, 64)
     """Number of units in each hidden layer of the policy"""
-    critic_layers: tuple[int, ...] = (64, 64)
+    critic_layers: Annotated[tuple[int, ...], _sizes] = (64, 64)
     """Number of units in each hidden layer of the value function, or of each critic"""
-    activation: str = "relu"
+    activation: Annotated[str, partial(check.choice, choices=ACTIVATIONS)] = "relu"
     """Activation of hidden layers, one of `ACTIVATIONS`"""
-    reward_scale: float = 0.2
+    reward_scale: check.Positive = 0.2
     """Factor on the rewards that the algorithm receives; a perfect circle then returns 160"""
-    action_noise: float = 0.1
+    action_noise: check.Positive = 0.1
     """Standard deviation of the exploration noise on actions of TD3; the policies of the other
     algorithms are stochastic themselves"""
-    flights: Mapping[str, Any] = field(default_factory=lambda: {"start": "mixed"})
+    flights: ReadOnly = field(default_factory=lambda: {"start": "mixed"})
     """Keywords of the environment for training only, unless they are given explicitly"""
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: ReadOnly = field(default_factory=dict)
     """Further arguments of the algorithm's class"""
-    policy: Mapping[str, Any] = field(default_factory=dict)
+    policy: ReadOnly = field(default_factory=dict)
     """Further arguments of the policy's class"""
-
-    def __post_init__(self) -> None:
-        self._check(check.choice, "algorithm", choices=ALGORITHMS)
-        self._check(check.choice, "activation", choices=ACTIVATIONS)
-        self._check(check.whole, "steps", "n_envs")
-        self._check(check.positive, "reward_scale", "action_noise")
-        self._check(check.vector, "learning_rate", length=2)
-        if min(self.learning_rate) <= 0.0:
-            raise ValueError(
-                f"Recipe.learning_rate must be greater than 0, got {self.learning_rate}"
-            )
-        for name in ("layers", "critic_layers"):
-            sizes = getattr(self, name)
-            if not sizes:
-                raise ValueError(f"Recipe.{name} must be positive whole numbers, got {sizes}")
-            self._set(name, tuple(check.whole(f"Recipe.{name}", n) for n in sizes))
-        for name in ("flights", "parameters", "policy"):
-            self._set(name, MappingProxyType(dict(getattr(self, name))))
 
     def __reduce__(self) -> Any:
         """Support pickling, which read-only mappings do not."""

@@ -6,52 +6,52 @@ episodes. To define your own arms, write a file like this one with a tuple `ARMS
 """
 
 import runpy
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
-from baselines.recipes import ALGORITHMS
+from baselines.recipes import ALGORITHMS, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
+
+
+def _word(name: str, value: Any) -> str:
+    if not (isinstance(value, str) and value.isidentifier()):
+        raise ValueError(f"{name} must be a word of letters and digits, got {value!r}")
+    return value
 
 
 @dataclass(frozen=True)
 class Arm(Checked):
     """Arm of a study: the training and the test of one kind of controller."""
 
-    name: str
+    name: Annotated[str, _word]
     """Short name, for folders"""
-    label: str
+    label: Annotated[str, partial(check.instance, kind=str)]
     """Label for tables and figures"""
     _: KW_ONLY
     policy: str | None = None
     """Name of a policy that needs no training (`baselines.policies.load_policy`); None: trained"""
     flies: str | None = None
     """Name of a trained arm whose policies this arm tests in another environment, as a control"""
-    environment: Mapping[str, Any] = field(default_factory=dict)
+    environment: ReadOnly = field(default_factory=dict)
     """Keywords of the environment in the test, such as the observation"""
-    training: Mapping[str, Any] = field(default_factory=dict)
+    training: ReadOnly = field(default_factory=dict)
     """Keywords that override `environment` in training and in the selection of the best policy"""
-    learning: Mapping[str, Any] = field(default_factory=dict)
+    learning: ReadOnly = field(default_factory=dict)
     """Keywords that override both in training, but not in the selection of the best policy, such as
     another reward"""
-    algorithm: str = "ppo"
+    algorithm: Annotated[str, partial(check.choice, choices=ALGORITHMS)] = "ppo"
     """Algorithm, one of `baselines.recipes.ALGORITHMS`; PPO is trained with the compiled engine,
     the others with Stable-Baselines3"""
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: ReadOnly = field(default_factory=dict)
     """Parameters of the algorithm that override the recipe's"""
 
     def __post_init__(self) -> None:
-        self._check(check.choice, "algorithm", choices=ALGORITHMS)
-        if not (isinstance(self.name, str) and self.name.isidentifier()):
-            raise ValueError(f"Arm.name must be a word of letters and digits, got {self.name!r}")
-        check.instance("Arm.label", self.label, str)
-        for name in ("environment", "training", "learning", "parameters"):
-            check.instance(f"Arm.{name}", getattr(self, name), Mapping)
-            self._set(name, MappingProxyType(dict(getattr(self, name))))
+        super().__post_init__()
         given = self.policy if self.flies is None else f"taken from {self.flies}"
         learns = self.training or self.learning or self.parameters or self.algorithm != "ppo"
         if given is not None and learns:
