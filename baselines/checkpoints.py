@@ -80,11 +80,7 @@ def save_model(folder: Path, model: BaseAlgorithm, keeper: Keeper) -> None:
 
 
 def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) -> BaseAlgorithm:
-    """Load the model of `last.zip` into an untrained one, and restore flights, keeper and draws.
-
-    Raises:
-        ValueError: If the file is damaged.
-    """
+    """Load the model of `last.zip` into an untrained one, and restore flights, keeper and draws."""
     try:
         with zipfile.ZipFile(folder / LAST) as archive:
             state = pickle.loads(archive.read(STATE))

@@ -31,12 +31,7 @@ class BusyError(RunError):
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock the existing folder of a run.
-
-    Raises:
-        ValueError: If another process has the lock (`BusyError`).
-        OSError: If the folder is not writable.
-    """
+    """Lock the existing folder of a run, or raise a `BusyError` if another process has the lock."""
     lock = FileLock(folder / LOCK, timeout=PATIENCE)
     try:
         lock.acquire()

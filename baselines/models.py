@@ -35,9 +35,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> BaseAlgorithm:
     """Make the untrained model of a plan's recipe.
 
-    Raises:
-        ValueError: If a parameter of the recipe is unknown to the algorithm, or its value is
-            invalid.
+    Raises a ValueError if a parameter is unknown to the algorithm, or its value is invalid.
     """
     chosen = plan.recipe
     parameters: dict[str, Any] = {}

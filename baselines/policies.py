@@ -47,9 +47,6 @@ def interface_of(env: Any) -> dict[str, Any]:
 
     The source of the observation is left out: a policy trained on the truth may fly on the
     estimate.
-
-    Raises:
-        ValueError: If it is no environment of this package.
     """
     flights = _flights_of(env)
     return {
@@ -104,12 +101,7 @@ def load_policy(name: str, env: Any) -> Policy:
 def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
     """Keywords that an environment needs for a policy, in addition to the defaults of its id.
 
-    Args:
-        name: Name or file, as in `load_policy`.
-        env_id: Id from `quad_gym.IDS`.
-
-    Raises:
-        ValueError: If the name is "pretrained" and no policy is included for the task.
+    Raises a ValueError if the name is "pretrained" and no policy is included for the task.
     """
     if name in ("pd:features_when_uncertain", "pd:waiting"):
         return {"include_std": True}
@@ -131,11 +123,7 @@ def _gains_of(file: Path) -> PDGains:
 
 
 def pretrained_file(env_id: str) -> Path:
-    """File of the included policy for a task.
-
-    Raises:
-        ValueError: If no policy is included for it.
-    """
+    """File of the included policy for a task; a ValueError if there is none."""
     file = PRETRAINED / f"{IDS[env_id]}.npz"
     if not file.exists():
         known = sorted(f.stem for f in PRETRAINED.glob("*.npz"))

@@ -165,15 +165,7 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
 
 
 def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
-    """Included recipe for a task and an algorithm.
-
-    Args:
-        env_id: Id from `quad_gym.IDS`.
-        algorithm: One of `ALGORITHMS`.
-
-    Raises:
-        ValueError: If either is unknown.
-    """
+    """Included recipe for a task, by its id, and one of `ALGORITHMS`."""
     check.choice("env_id", env_id, tuple(IDS))
     check.choice("algorithm", algorithm, ALGORITHMS)
     return _SPECIAL.get((env_id, algorithm), _DEFAULTS[algorithm])

@@ -71,9 +71,6 @@ def fit(errors: Floats, velocities: Floats) -> ResidualModel:
         errors: Errors of n flights at successive control steps, (t, n, 12); NaN after the end of a
             flight.
         velocities: True velocities, (t, n, 3) in I [m/s].
-
-    Raises:
-        ValueError: If there are too few errors, or the fitted model is unstable.
     """
     before, after, moving = errors[:-1], errors[1:], velocities[:-1]
     whole = np.isfinite(after).all(axis=2) & np.isfinite(before).all(axis=2)

@@ -76,12 +76,7 @@ def train(
 
 
 def require_model(plan: Plan) -> None:
-    """Make the untrained model once, to check a plan.
-
-    Raises:
-        ValueError: If the plan is invalid.
-        ImportError: If the training engine is not installed.
-    """
+    """Make the untrained model once, to check a plan, and that its engine is installed."""
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import make_compiled
 
@@ -97,9 +92,8 @@ def require_model(plan: Plan) -> None:
 def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
     """Record of the run in a folder that is resumed; None: a new run begins.
 
-    Raises:
-        RunError: If the folder contains a run and `resume` is not set, or contains the run of
-            another plan.
+    Raises a `RunError` if the folder contains a run and `resume` is not set, or contains the run of
+    another plan.
     """
     if not has_checkpoint(folder):
         return None
@@ -167,8 +161,7 @@ def _write_record(folder: Path, record: Any) -> None:
 def export(training: TrainingResult, file: Path) -> None:
     """Write the best policy of a training, with its record, to a file that requires only NumPy.
 
-    Raises:
-        ValueError: If the policy is not a multilayer perceptron.
+    Raises a ValueError if the policy is not a multilayer perceptron.
     """
     record = json.loads((training.folder / "training.json").read_text(encoding="utf-8"))
     if training.best_policy.suffix == ".npz":

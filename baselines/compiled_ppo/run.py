@@ -41,11 +41,7 @@ class CompiledKeeper(RunKeeper):
 
 
 def make_compiled(plan: Plan) -> CompiledPPO:
-    """Make the untrained model of a plan, with its environment.
-
-    Raises:
-        ValueError: If the compiled PPO does not support the plan.
-    """
+    """Make the untrained model of a plan, with its environment."""
     seed = first_seed("training", plan.seed, plan.recipe.n_envs)
     flights = plan.make_vector_flights()
     if plan.recipe.parameters.get("critic_only"):
@@ -54,11 +50,7 @@ def make_compiled(plan: Plan) -> CompiledPPO:
 
 
 def _require_leaving(plan: Plan, flights: Any) -> None:
-    """Check that `critic_only` leaves the actor exactly the observation of the policy in tests.
-
-    Raises:
-        ValueError: If the observation in training without the critic's part is another one.
-    """
+    """Check that `critic_only` leaves the actor exactly the observation of the policy in tests."""
     judge: Any = plan.make_judge()
     learned, judged = (env.unwrapped.flights.table for env in (flights, judge))
     judge.close()

@@ -73,9 +73,6 @@ def export_filter(
         folder: Folder to write to; created if it does not exist.
         policy: Policy that acts on the estimate; None: the filter alone.
 
-    Returns:
-        The files.
-
     Raises:
         ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
             observes more than the estimate.

@@ -30,8 +30,7 @@ _FIELDS = {
 def policy_values(controller: Controller) -> dict[str, Any]:
     """Return the values of a policy for the templates of an exported filter.
 
-    Raises:
-        ValueError: If its observation has parts that do not follow from the estimate.
+    Raises a ValueError if its observation has parts that do not follow from the estimate.
     """
     names = [field.name for field in controller.table]
     unknown = [name for name in names if name not in _FIELDS]

@@ -57,13 +57,9 @@ _WINDOW = 0.5
 
 
 class Sources:
-    """Contents of the files of an exported filter.
+    """Contents of the files of an exported filter of a suite, for one of TARGETS.
 
-    Args:
-        suite: Sensor suite with its filter.
-        label: Name of the suite.
-        target: One of TARGETS.
-        policy: Values of a policy for the templates (`policy_values`), or none.
+    `policy` are the values of a policy for the templates (`policy_values`), or none.
     """
 
     def __init__(self, suite: SensorSuite, label: str, target: str, policy: dict[str, Any]) -> None:
@@ -99,11 +95,7 @@ class Sources:
         }
 
     def texts(self, flash: int) -> dict[str, bytes]:
-        """Return header, example, CMake file and README, by name.
-
-        Args:
-            flash: Size of the library [bytes].
-        """
+        """Return header, example, CMake file and README by name, for a library's size [bytes]."""
         values = {**self._suite_values(), **self._record_values(), **self._sensor_values()}
         values |= {"POLICY": False, **self.policy, "FLASH": f"{flash:,}"}
         values["IMPLEMENTATION"] = filled("implementation.c", values)

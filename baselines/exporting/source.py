@@ -32,17 +32,7 @@ def c_source(controller: Controller, name: str) -> str:
     """Generate C99 code of a controller that requires only the math library.
 
     It has no state and allocates no memory; arithmetic is single precision, as on processors of
-    autopilots.
-
-    Args:
-        controller: Controller to convert.
-        name: Name of the function.
-
-    Returns:
-        Text of the file.
-
-    Raises:
-        ValueError: If `name` is not a C identifier.
+    autopilots. `name` of the function must be a C identifier.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a C identifier, got {name!r}")

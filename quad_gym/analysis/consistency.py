@@ -61,16 +61,12 @@ def flight_errors(batch: FlightBatch) -> Floats:
 
 
 def start_matched(batch: FlightBatch, seed: int) -> None:
-    """Give all filters initial errors drawn from their own covariances.
+    """Give all filters of flights that have just been reset errors drawn from their covariances.
 
     After a first fix, errors and covariance do not match: a level attitude is assumed with an
     assumed uncertainty, which matters for as long as tilt and accelerometer bias cannot be
     distinguished. Here the estimates become the truth minus errors drawn from each filter's
     covariance.
-
-    Args:
-        batch: Flights that have just been reset; only their estimates are changed.
-        seed: Seed of the draws.
     """
     flights, factor = batch.count, batch.record("L")
     draws = np.random.default_rng(seed).normal(size=(flights, STATE_DIMENSION, 1))
@@ -125,11 +121,7 @@ class MeanSquare:
         return self.share_inside >= CONSISTENT_SHARE
 
     def since(self, start: float) -> "MeanSquare":
-        """Select the instants from `start` on [s].
-
-        Raises:
-            ValueError: If there are no such instants.
-        """
+        """Select the instants from `start` on [s]; a ValueError if there are none."""
         kept = self.time >= start - 1e-9
         if not kept.any():
             raise ValueError(f"start must be before the last instant, got {start}")

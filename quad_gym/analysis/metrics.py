@@ -49,12 +49,7 @@ class TrackingSummary:
 
 
 class RunningSummary:
-    """Recorder for a `TrackingSummary`, which stores only sums.
-
-    Args:
-        flights: Number of flights.
-        instants: Number of instants of a complete flight.
-    """
+    """Recorder for a `TrackingSummary` of flights with some instants, which stores only sums."""
 
     def __init__(self, flights: int, instants: int) -> None:
         self._half = instants // 2
@@ -109,16 +104,11 @@ def spread(values: ArrayLike) -> Spread:
 def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats:
     """Error of the filter in the coordinates of its covariance.
 
-    Args:
-        truth: True "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI"
-            (..., 3, 3); position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
-        estimate: Estimates with the same names, shapes, units and frames.
+    Truth and estimate have "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI"
+    (..., 3, 3); position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
 
     Returns:
         Truth minus estimate, (..., 15); attitude as Euler angles e [rad] with R_BI = R(e) R_hat.
-
-    Raises:
-        KeyError: If a quantity is missing.
     """
     names = ("position", "velocity", "accel_bias", "gyro_bias")
     r, v, b_a, b_g = (np.subtract(truth[name], estimate[name]) for name in names)
@@ -135,14 +125,10 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
         covariances: Covariances of the filter in the same coordinates, (..., n, n).
 
     Returns:
-        NEES, (...,) [-]; chi-square distributed with n degrees of freedom if the filter is
-        consistent.
+        NEES, (...,) [-]; of a consistent filter, chi-square distributed with n degrees of freedom.
 
     Raises:
         ValueError: If the shapes do not fit or a covariance is singular.
-
-    Source: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Applications to Tracking and
-    Navigation, 2001, section 5.4.
     """
     e, P = np.asarray(errors, np.float64), np.asarray(covariances, np.float64)
     if e.ndim < 1 or P.shape[-2:] != (e.shape[-1], e.shape[-1]):
@@ -169,9 +155,6 @@ def mean_band(
 
     Returns:
         Lower and upper ends, (...,) each.
-
-    Raises:
-        ValueError: If a number is out of range.
     """
     n = np.asarray(counts, np.float64)
     _require_probability(probability)
@@ -195,9 +178,6 @@ def chi_square_quantile(dimension: int, probability: float) -> float:
     Args:
         dimension: Degrees of freedom, 15 for the whole state.
         probability: Probability that the NEES is below the quantile, between 0 and 1.
-
-    Raises:
-        ValueError: If a number is out of range.
     """
     _require_probability(probability)
     if dimension < 1:

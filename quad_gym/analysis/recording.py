@@ -128,8 +128,7 @@ def record_flights(
 class Tracer:
     """Recorder of the errors of all episodes over time, and of the path of the first one.
 
-    Pass its method `add` to `evaluation.roll_out` as `watch`. The environment must not use
-    same-step autoreset.
+    Its method `add` is a `watch` of `evaluation.roll_out`, without same-step autoreset.
     """
 
     def __init__(self) -> None:

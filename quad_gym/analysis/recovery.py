@@ -56,13 +56,11 @@ class Recovery:
         return ~(self.consistent | self.flagged)
 
     def time_to(self, flags: Flags, since: float) -> float:
-        """Time after `since` until `flags` hold permanently for the `REQUIRED` share of flights.
+        """Time after `since` until `flags` hold permanently for a `REQUIRED` share of flights [s].
 
         Even of a consistent filter, some of a hundred flights occasionally exceed the quantile by
-        chance. Shares above 1 - 2 (1 - `REQUIRED`) therefore do not interrupt a recovery.
-
-        Returns:
-            Time [s]; infinite if the share is never reached.
+        chance. Shares above 1 - 2 (1 - `REQUIRED`) therefore do not interrupt a recovery. The time
+        is infinite if the share is never reached.
         """
         after = self.time > since + 1e-9
         share = flags[after].mean(axis=1)
@@ -110,11 +108,8 @@ def follow_recovery(
     Args:
         batch: Flights of a task without endings, whose filters monitor their innovations.
         seeds: Seeds of the flights.
-        duration: Length of the flights [s].
+        duration: Length of the flights, at least two evaluations [s].
         every: Time between two evaluations [s].
-
-    Raises:
-        ValueError: If `duration` is shorter than two evaluations.
     """
     stride = max(1, round(every * batch.sensors.imu.rate))
     looks = round(duration * batch.sensors.imu.rate) // stride

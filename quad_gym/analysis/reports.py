@@ -40,11 +40,7 @@ _made: list[Path] = []
 
 
 def require_writable(option: str, folder: Path) -> None:
-    """Create a folder if it is missing, and check that files can be written in it.
-
-    Raises:
-        OSError: If files cannot be written in it; the message has the option that specified it.
-    """
+    """Create a folder if it is missing, or raise an OSError if files cannot be written in it."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -98,14 +94,7 @@ def stacked(tables: Iterable[Mapping[str, Iterable[Any]]]) -> dict[str, list[Any
 
 
 def write_csv(file: Path, columns: Mapping[str, Sequence[Any]]) -> Path:
-    """Write columns by heading as CSV; NaN and None become empty cells.
-
-    Returns:
-        Path of the file.
-
-    Raises:
-        ValueError: If the columns differ in length.
-    """
+    """Write columns of equal length by heading as CSV, with empty cells for NaN and None."""
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(columns)

@@ -42,17 +42,7 @@ def case_of(
     sensors: SensorSuite | None = None,
     **keywords: Any,
 ) -> Case:
-    """One configuration.
-
-    Args:
-        suite: Name of the sensor suite.
-        task: Name of the task.
-        start: Start of the filter.
-        condition: Name of the difference from the suite and the task.
-        wrong: Difference between the filter's model and the simulation; empty: none.
-        sensors: Sensor suite that flies; None: the one named `suite`.
-        **keywords: Further keywords of `FlightBatch`.
-    """
+    """One configuration; `wrong` is a difference between the filter's model and the simulation."""
     flown = sensors or sensor_suite(suite)
     expected = {}
     if suite == "lab":
