@@ -184,11 +184,9 @@ class PDPolicy:
     ) -> tuple[NDArray[np.float32], None]:
         """Return the action for an observation, with the signature of Stable-Baselines3.
 
-        The controller has no memory and is always deterministic: further arguments are not used.
-
-        Args:
-            observation: Observation, (n_observation,) or (n, n_observation), or a dictionary with
-                the key "policy".
+        The observation is (n_observation,) or (n, n_observation), or a dictionary with the key
+        "policy". Further arguments are not used, because the controller has no memory and is always
+        deterministic.
 
         Returns:
             Action (4,) or (n, 4) in [-1, 1], and None.

@@ -35,7 +35,7 @@ PARTS = {
 """Parts of the error state, in the order of the covariance: all of it, and blocks of three."""
 
 _FIELDS = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
-"""Fields of the true values; those of the estimates end in `_hat`."""
+"""Fields of the true values; the fields of estimates end in `_hat`."""
 
 CONSISTENT_SHARE = 0.9
 """Share of instants that must be inside the band for a filter to be called consistent."""

@@ -175,7 +175,7 @@ class PairedDifference:
 def paired_difference(first: ArrayLike, second: ArrayLike) -> PairedDifference:
     """Compare two cases seed by seed, so that the effect of a seed on both cancels.
 
-    Both have one number a seed, (n,), of the same seeds; a seed with a NaN is left out.
+    Both have one number for each of these seeds, (n,); a seed with a NaN is left out.
     """
     a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
     if a.shape != b.shape or a.ndim != 1:

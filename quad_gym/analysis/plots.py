@@ -225,7 +225,7 @@ def flight_figure(
 ) -> Any:
     """Make a matplotlib Figure with a flight, drawn by `draw_path`, `draw_height` or `draw_error`.
 
-    Further arguments and options are those of `draw`.
+    It receives all further arguments and options.
     """
     size = (5.0, 5.0) if draw is draw_path else (6.0, 3.4)
     figure, ((axes,),) = panels(1, 1, size, title)
