@@ -118,9 +118,7 @@ class Likelihood:
 class _Part:
     """Losses of the innovations of one log."""
 
-    def __init__(
-        self, log: Log, suite: SensorSuite, start: dict[str, Any], margin: float
-    ) -> None:
+    def __init__(self, log: Log, suite: SensorSuite, start: dict[str, Any], margin: float) -> None:
         self.suite, self.weight = suite, 1.0
         player = Player(log, suite, "ukf", start, False, _REACH)
         player.write_tape()
