@@ -117,7 +117,7 @@ def on_aarch64(name, log):
 
 
 def on_arm(name, log):
-    """The code for Cortex-M7 in a program of Linux; its attributes forbid that, its code does not."""
+    """The code for Cortex-M7, without the attributes that forbid its use in a program of Linux."""
     folder = exported(name, "cortex-m7")
     program, flat = folder / "example", folder / "without_attributes.a"
     if not program.exists():
