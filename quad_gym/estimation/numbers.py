@@ -69,8 +69,8 @@ _WIDE, _NARROW = 1.5, 0.7  # logarithms: factors of 4.5 and 2
 NUMBERS = (
     Number(sensor="imu", field="accel_noise_density", spread=2.5, unit="m/s^2/sqrt(Hz)"),
     Number(sensor="imu", field="gyro_noise_density", spread=2.0, unit="rad/s/sqrt(Hz)"),
-    Number(sensor="imu", field="accel_bias_sigma", spread=_NARROW, unit="m/s^2"),
-    Number(sensor="imu", field="gyro_bias_sigma", spread=_NARROW, unit="rad/s"),
+    Number(sensor="imu", field="accel_bias_sigma", spread=_WIDE, unit="m/s^2"),
+    Number(sensor="imu", field="gyro_bias_sigma", spread=_WIDE, unit="rad/s"),
     Number(sensor="gnss", field="position_sigma_I", axes=_LEVEL, spread=_WIDE, unit="m"),
     Number(sensor="gnss", field="position_sigma_I", axes=_UP, spread=_WIDE, unit="m"),
     Number(sensor="gnss", field="drift_sigma_I", axes=_LEVEL, spread=_WIDE, unit="m"),

@@ -4,6 +4,8 @@ Sources and licenses are in tests/data/flights.
 """
 
 import gzip
+import math
+import re
 from functools import cache
 from pathlib import Path
 
@@ -12,8 +14,8 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import replay
-from quad_gym.estimation.plausibility import MisfitError
 from quad_gym.params.suites import ALL_SUITES
+from tests.console_commands import run
 
 FOLDER = Path(__file__).parents[1] / "data" / "flights"
 STARTS = {
@@ -24,9 +26,13 @@ STARTS = {
 CASES = [(flight, suite) for flight in STARTS for suite in ALL_SUITES]
 
 
+def packed(flight):
+    return FOLDER / f"{flight}.csv.gz"
+
+
 @cache
 def table(flight):
-    with gzip.open(FOLDER / f"{flight}.csv.gz", "rt") as file:
+    with gzip.open(packed(flight), "rt") as file:
         names = file.readline().strip().split(",")
         values = np.genfromtxt(file, delimiter=",")
     return dict(zip(names, values.T, strict=True))
@@ -46,12 +52,14 @@ def test_suite_of_the_air_describes_the_flight_of_a_hobby_vehicle():
 
 
 @pytest.mark.parametrize(("flight", "suite"), [c for c in CASES if c != ("ardupilot", "flown")])
-def test_wrong_suite_is_named(flight, suite):
-    try:
-        problems = replayed(flight, suite).problems
-    except MisfitError:  # the suite has none of the sensors, exit code 1 as well
-        return
-    assert problems
+def test_command_with_a_wrong_suite_ends_with_a_sentence_and_exit_code_1(flight, suite, tmp_path):
+    (tmp_path / "flight.csv").write_bytes(gzip.decompress(packed(flight).read_bytes()))
+    start = [f"--{name}={math.degrees(angle)}" for name, angle in STARTS[flight].items()]
+    options = ["--sensors", suite, "--no-figure", "--output", "found", *start]
+    ended = run("replay", "flight.csv", *options, where=tmp_path)
+    sentences = ended.stdout.partition("files to found.")[2] or ended.stderr
+    assert ended.returncode == 1
+    assert re.search(r"does not describe|do not describe|uses no measurement|diverged", sentences)
 
 
 def test_estimates_of_the_rtk_flight_fit_with_its_clock_lever_arm_and_noise():
