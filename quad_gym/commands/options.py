@@ -6,6 +6,7 @@ help text. Types that several commands share are at the end of this file.
 
 import ast
 import dataclasses
+import itertools
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -38,9 +39,6 @@ def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
         kind: Dataclass whose fields are the options, or a union of subcommands.
         argv: Arguments without the program's name; None: the arguments of the process.
         **options: Further options of `tyro.cli`.
-
-    Returns:
-        Instance of the dataclass.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     with usage_errors((ValueError,)):
@@ -57,13 +55,9 @@ def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | No
     """Rule of tyro for whole numbers, which may be written as 1e6."""
 
     def read(words: list[str]) -> int:
-        try:
-            return int(words[0])
-        except ValueError:
-            pass
         if not float(words[0]).is_integer():
             raise ValueError(f"must be a whole number, got {words[0]!r}")
-        return int(float(words[0]))
+        return int(words[0]) if words[0].lstrip("+-").isdecimal() else int(float(words[0]))
 
     if info.type is not int:
         return None
@@ -99,9 +93,8 @@ def usage_errors(
     except kinds as error:
         message = str(error)
         if isinstance(error, OSError) and error.filename is not None:
-            message = f"{error.filename}: {error.strerror}"
-            if isinstance(error, FileNotFoundError):
-                message = f"{error.filename} does not exist"
+            missing = isinstance(error, FileNotFoundError)
+            message = f"{error.filename}{' does not exist' if missing else f': {error.strerror}'}"
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
 
@@ -138,11 +131,9 @@ def sensors_of(env_id: str, given: str | None) -> str:
 
 def free_folder(folder: Path, result: str) -> Path:
     """Folder without results: this one, or else FOLDER_2, FOLDER_3, ..."""
-    number, found = 1, folder
-    while (found / result).exists():
-        number += 1
-        found = folder.with_name(f"{folder.name}_{number}")
-    return found
+    names = itertools.chain([folder.name], (f"{folder.name}_{k}" for k in itertools.count(2)))
+    found = (folder.with_name(name) for name in names)
+    return next(path for path in found if not (path / result).exists())
 
 
 def flying_options(keywords: Mapping[str, Any]) -> str:
@@ -224,9 +215,8 @@ def full_id(name: str) -> str:
     return _ID_OF_TASK.get(name, name)
 
 
-def one_of(ids: Iterable[str]) -> str:
+def one_of(ids: Sequence[str]) -> str:
     """Help text of an option with a choice of ids."""
-    ids = list(ids)
     return f"task: {', '.join(IDS[env_id] for env_id in ids)}, or an id such as {ids[0]}"
 
 
@@ -258,7 +248,7 @@ EnvId = tyro.conf.Positional[
             is_instance=lambda value: isinstance(value, str),
             str_from_instance=lambda value: [IDS.get(value, value)],
         ),
-        tyro.conf.arg(help=one_of(IDS)),
+        tyro.conf.arg(help=one_of(tuple(IDS))),
     ]
 ]
 """Positional argument: id of an environment, or short name of its task."""
