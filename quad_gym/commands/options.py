@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
+from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from quad_gym.envs import IDS
@@ -180,27 +181,21 @@ Keywords = Annotated[
 """Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
 
 Parameters = Annotated[
-    Keywords,
-    tyro.conf.arg(
-        help="parameters of the algorithm that override the recipe's, such as gamma=0.98"
-    ),
+    Keywords, arg(help="parameters of the algorithm that override the recipe's, such as gamma=0.98")
 ]
-"""Parameters of the algorithm of a training."""
 
 Engine = Annotated[
     Literal["sb3", "compiled"],
-    tyro.conf.arg(
+    arg(
         help="training engine: Stable-Baselines3, or the compiled PPO, which is several times "
         "faster and needs no torch"
     ),
 ]
-"""Training engine."""
 
 Threads = Annotated[
     int | None,
-    tyro.conf.arg(help="number of threads; if not given, one per core; it does not affect results"),
+    arg(help="number of threads; if not given, one per core; it does not affect results"),
 ]
-"""Number of threads of the flights."""
 
 TRACKING = tuple(
     env_id for env_id, task in IDS.items() if task in TASK_DEFAULTS and task != "waypoints"
@@ -238,7 +233,7 @@ def with_full_id(args: _Args, ids: Iterable[str] = IDS) -> _Args:
     return replace(args, env_id=found)  # type: ignore[type-var]
 
 
-EnvId = tyro.conf.Positional[
+EnvId = Positional[
     Annotated[
         str,
         PrimitiveConstructorSpec(
@@ -248,49 +243,41 @@ EnvId = tyro.conf.Positional[
             is_instance=lambda value: isinstance(value, str),
             str_from_instance=lambda value: [IDS.get(value, value)],
         ),
-        tyro.conf.arg(help=one_of(tuple(IDS))),
+        arg(help=one_of(tuple(IDS))),
     ]
 ]
 """Positional argument: id of an environment, or short name of its task."""
 
-TrackingId = Annotated[EnvId, tyro.conf.arg(help=one_of(TRACKING))]
+TrackingId = Annotated[EnvId, arg(help=one_of(TRACKING))]
 """Positional argument: id or short name of a task with a reference to track."""
 
 _OR_FILE = f"{', '.join(ALL_SUITES)}, or a file of SensorSuite.save (.toml)"
 
-SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {_OR_FILE}")]
-"""Name or file of a sensor suite."""
+SuiteName = Annotated[str, arg(help=f"sensor suite: {_OR_FILE}")]
 
 OwnSuite = Annotated[
     str | None,
-    tyro.conf.arg(
-        help=f"sensor suite: {_OR_FILE}; if not given, the task's default, standard for most"
-    ),
+    arg(help=f"sensor suite: {_OR_FILE}; if not given, the task's default, standard for most"),
 ]
-"""Name or file of a sensor suite; None: the task's default."""
 
 EstimatorName = Annotated[
     str | None,
-    tyro.conf.arg(
+    arg(
         help="estimator: ukf, ekf, or module:Class of a quad_gym.Estimator; if not given, the "
         "suite's"
     ),
 ]
-"""Name of a built-in filter, or of a user's estimator; None: the suite's."""
 
 SuiteNames = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(help=f"sensor suites: {', '.join(SUITES)}, or files of suites (.toml)"),
+    tuple[str, ...], arg(help=f"sensor suites: {', '.join(SUITES)}, or files of suites (.toml)")
 ]
-"""Names or files of sensor suites."""
 
-LogFile = tyro.conf.Positional[
+LogFile = Positional[
     Annotated[
         Path,
-        tyro.conf.arg(
+        arg(
             metavar="LOG",
             help="table (.csv), log of PX4 (.ulg) or ArduPilot (.bin), ROS bag, or EuRoC folder",
         ),
     ]
 ]
-"""Log of a flight."""

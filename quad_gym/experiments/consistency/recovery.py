@@ -125,8 +125,6 @@ def table_of(cells: CaseResults, flights: CaseFlights) -> str:
     for title, (first, columns) in tables.items():
         chosen = {k: cell for k, cell in cells.items() if cell["values"].keys() == columns.keys()}
         if chosen:
-            parts.append(
-                "\n".join([title, "", *case_table(first, columns, chosen, "{:.1f}".format)])
-            )
+            parts.append("\n".join([title, "", *case_table(first, columns, chosen, text)]))
     end = "**Bold**: more than 1 % undetected failures. *Italics*: the same, expected."
     return "\n\n".join([*parts, end]) + "\n"
