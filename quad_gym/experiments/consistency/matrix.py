@@ -91,7 +91,7 @@ def _conditions(name: str) -> Iterator[dict[str, Any]]:
     """Arguments of `case_of` for the conditions of a suite."""
     suite = sensor_suite(name)
     for fault, parts in PRESETS.items():
-        ends = parts and all(getattr(part, "duration", math.inf) < math.inf for part in parts)
+        ends = parts and all(getattr(part, "duration", math.inf) != math.inf for part in parts)
         if ends and possible(fault, suite):
             corrupted = "corrupted measurements" if fault == "gnss_jump" else ""
             yield {"condition": fault, "wrong": corrupted, "faults": fault}
