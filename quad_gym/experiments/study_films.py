@@ -2,13 +2,8 @@
 
 The two arms are `truth` and the other trained arm with the largest return; of each arm, the
 training with the best validation is shown, so that test episodes do not affect the choice. The
-episode is the first test episode that shows a difference:
-
-- for "glance", the first one in which the rewarded heading is on average more than 100 degrees from
-  the features; otherwise policies see the features anyway;
-- for "pace", the first one that the policy trained on the truth ends with a crash.
-
-If there is none among the first `TRACED` episodes, it is the very first.
+episode is the first one of the first `TRACED` that shows a difference, see `CHOICES`, or else the
+very first: where the rewarded heading is near the features, policies see these anyway.
 """
 
 import math
