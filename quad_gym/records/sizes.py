@@ -79,6 +79,8 @@ STAMP = 28
 """Length of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates."""
 FAULT_KINDS = len(FaultKind)
 """Number of kinds of faults."""
+NEVER = 1e18
+"""A tick that no flight reaches."""
 
 
 class Field(NamedTuple):
