@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.kernels.entries import halve
 from quad_gym.params import checks as check
 from quad_gym.rendering import colors
 from quad_gym.rendering.colors import Color
-from quad_gym.rendering.shrink import halve
 
 Floats = NDArray[np.float64]
 Label = tuple[str, Floats, Color]

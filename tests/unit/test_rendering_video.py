@@ -5,11 +5,11 @@ import pytest
 
 import quad_gym
 from quad_gym.faults import GnssOutliers
+from quad_gym.kernels.entries import halve
 from quad_gym.records import GateDecision
 from quad_gym.rendering import Renderer, colors, record_flight, save_video, tile
 from quad_gym.rendering.geometry import fixed_view
 from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
-from quad_gym.rendering.shrink import halve
 
 pygame = pytest.importorskip("pygame")
 

@@ -1,17 +1,17 @@
 """Anti-aliasing: halving a picture by the mean of two by two pixels."""
 
-from typing import Any
-
 import numpy as np
 
+from quad_gym.kernels import entries
 from quad_gym.kernels.compiling import entry
+from quad_gym.kernels.compiling.signatures import signature_of
 
 _EVEN, _HALF = np.uint32(0x00FF00FF), np.uint32(0x00020002)
 _TWO, _EIGHT = np.uint32(2), np.uint32(8)
 
 
-@entry
-def halve(large: Any, small: Any) -> None:
+@entry(signature=signature_of(entries.halve))
+def halve(large, small):
     """Write the rounded means of two by two pixels.
 
     A pixel is a word of four bytes, of which two at a time are summed in the halves of a word.
