@@ -92,7 +92,8 @@ run_tape = Entry(
     "tape:run_tape",
     *(_BLOCK, _BLOCK_PARAMS, _BLOCK_PARAMS, _STEPS, _SETTINGS, _BLOCK_WORK, _TABLE),
     *_TAPE,
-    *(_INDICES, _WORDS, _SLOTS, int, int),
+    *(_INDICES, _WORDS, _SLOTS),
+    *(int, int),
 )
 start_filter = Entry("single:start_filter", _BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
 run_stage = Entry(
