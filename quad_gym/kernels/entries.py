@@ -98,7 +98,9 @@ run_tape = Entry(
 start_filter = Entry("single:start_filter", _BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
 run_stage = Entry(
     "single:run_stage",
-    *(*[int] * 4, _BLOCK_PARAMS, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _TABLE, int),
+    *[int] * 4,
+    *(_BLOCK_PARAMS, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _TABLE),
+    int,
 )
 sense_features = Entry("single:sense_features", _FLIGHT, _PARAMS, int)
 sense_gnss = Entry("single:sense_gnss", _FLIGHT, _PARAMS, bool)
