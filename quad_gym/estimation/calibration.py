@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_gym.estimation.engine import Floats
-from quad_gym.estimation.likelihood import Likelihood, in_flight
+from quad_gym.estimation.likelihood import SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.numbers import Number, has_baselines, numbers_in
 from quad_gym.estimation.replaying import origin_of, replay
@@ -44,6 +44,8 @@ _FEW_STEPS, _STEPS = 8, 25
 _CLUSTER, _CLUSTERS = 5.0, 20
 """Length of the parts of a log that are independent of each other [s], shorter in short logs: their
 least number."""
+_FEWEST_TAILS = 30
+"""Number of innovations that determines their tails."""
 _COARSE, _FINE = np.arange(-1.0, 1.01, 0.1), np.arange(-0.1, 0.11, 0.05)
 _DELAY_SPREAD = 0.3
 """Standard deviation of the prior of a delay [s]."""
@@ -146,7 +148,7 @@ def calibrate(
     search.fit(first=True)
     if delays:
         search.find_delays(coarse=False)
-    search.inflate()
+    search.adapt()
     search.fit()
     search.progress("Intervals")
     found = search.intervals()
@@ -215,6 +217,7 @@ class _Search:
         progress: Callable[[str], None],
     ) -> None:
         self.log, self.prior, self.start, self.progress = log, prior, start, progress
+        self.nu: dict[str, float] = {}
         self.measured = {name for name in log.streams if getattr(prior, name, None) is not None}
         self.numbers = numbers_in(prior, log)
         self.values = np.array([number.of(prior) for number in self.numbers])
@@ -288,7 +291,7 @@ class _Search:
         """
         self.progress(f"Search for {len(self.numbers)} numbers")
         log = self.log.without_delays(self.delays)
-        self._current = Likelihood(log, self.prior, self.start)
+        self._current = Likelihood(log, self.prior, self.start, self.nu)
         if first:
             little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
             tried = [self._minimize(x, _FEW_STEPS) for x in (self.x, little)]
@@ -315,18 +318,23 @@ class _Search:
         total = losses.sum(axis=0) + 0.5 * np.array([p @ p for p in points])
         return total[0] / 1e3, (total[1::2] - total[2::2]) / (2.0 * _STEP * 1e3)
 
-    def inflate(self) -> None:
-        """Widen the noise of sensors whose innovations are correlated in time."""
+    def adapt(self) -> None:
+        """Find the tails of the innovations, and widen noise where these are correlated in time."""
         log = self.log.without_delays(self.delays)
-        result = replay(log, sensors=self.suite(), start=self.start, reported_noise=False)
+        measured = replay(
+            log, sensors=self.suite(), start=self.start, reported_noise=False
+        ).measured
+        scaled = {}
+        for name, m in measured.items():
+            counts = in_flight(log, m.time) & (m.time > m.time[0] + SETTLING) & np.isfinite(m.nis)
+            scaled[name] = (m.innovation / m.sigma)[counts]
+            if len(scaled[name]) > _FEWEST_TAILS:
+                self.nu[name] = tails(m.nis[counts], scaled[name].shape[1])
         for k, number in enumerate(self.numbers):
             sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
-            if sensor not in result.measured:
+            if sensor not in scaled:
                 continue
-            measured = result.measured[sensor]
-            flying = in_flight(log, measured.time)
-            scaled = (measured.innovation / measured.sigma)[flying, axes]
-            tau = max(correlation_time(column) for column in scaled.T)
+            tau = max(correlation_time(column) for column in scaled[sensor][:, axes].T)
             factor = min(math.sqrt(tau), most)
             value = factor * number.value(self.values[k], float(self.x[k]))
             wide = number.coordinate(self.values[k], value)

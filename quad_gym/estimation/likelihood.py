@@ -5,9 +5,10 @@ numbers are correct. Real measurements have heavier tails; the loss of a measure
 
     (nu + d) / 2 log(1 + NIS / (nu - 2)) + sum log sigma_i,
 
-Student's t with the predicted covariance, d numbers and nu = 5 degrees of freedom. Correlations
-between sensors, and between axes, are left out: a composite likelihood, whose derivative is zero
-on average at the right numbers, too.
+Student's t with the predicted covariance, d numbers and nu degrees of freedom: 5 at first, then as
+the innovations of each sensor have them (`tails`), up to 100, where it is nearly Gaussian.
+Correlations between sensors, and between axes, are left out: a composite likelihood, whose
+derivative is zero on average at the right numbers, too.
 
 A filter with all measurements predicts over tenths of a second only, where errors of a receiver
 that are smooth in time look like motion, and are best explained by noise of the IMU. The loss
@@ -20,7 +21,7 @@ Student's t.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,14 +30,14 @@ import numpy as np
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Log, Stream
-from quad_gym.estimation.player import Player
+from quad_gym.estimation.player import Player, name_of
 from quad_gym.estimation.sets import run_sets
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FREEDOMS
 
-NU = 5.0
-"""Degrees of freedom of Student's t: a tenth of its weight lies beyond two standard deviations."""
+NU = (5.0, 8.0, 15.0, 100.0)
+"""Degrees of freedom of Student's t; of 5, a tenth of its weight lies beyond two scales."""
 SETTLING = 5.0
 """Time after the start whose measurements do not count [s]."""
 SPACING = 0.5
@@ -77,6 +78,24 @@ def thinned(log: Log) -> Log:
     return replace(log, **changes)
 
 
+def tails(nis: Floats, d: int) -> float:
+    """Return the degrees of freedom of Student's t that describe normalized innovations best.
+
+    Args:
+        nis: (n,) normalized innovations squared, up to a common factor.
+        d: Their degrees of freedom.
+    """
+    from scipy.special import gammaln
+
+    scales = np.exp(np.linspace(-3.0, 3.0, 61))[:, np.newaxis] * float(np.median(nis)) / d
+    losses = []
+    for nu in NU:
+        terms = 0.5 * (nu + d) * np.log1p(nis / (scales * (nu - 2.0))) + 0.5 * d * np.log(scales)
+        constant = gammaln(0.5 * nu) - gammaln(0.5 * (nu + d)) + 0.5 * d * math.log(nu - 2.0)
+        losses.append(terms.mean(axis=1).min() + constant)
+    return NU[int(np.argmin(losses))]
+
+
 class Likelihood:
     """Losses of the innovations of a log, and of the same log with fewer measurements.
 
@@ -84,6 +103,7 @@ class Likelihood:
         log: The log.
         suite: Its suite.
         start: Keywords of `initialize`.
+        nu: Degrees of freedom of Student's t by sensor; 5 for others.
         fewer: False: only the losses of all measurements, which determine delays.
         margin: Time before the end of the log whose measurements do not count [s], so that losses
             of logs with different delays contain the same measurements.
@@ -94,12 +114,13 @@ class Likelihood:
         log: Log,
         suite: SensorSuite,
         start: dict[str, Any],
+        nu: Mapping[str, float] | None = None,
         *,
         fewer: bool = True,
         margin: float = 0.0,
     ) -> None:
         logs = (log, thinned(log)) if fewer else (log,)
-        self._parts = [_Part(each, suite, start, margin) for each in logs]
+        self._parts = [_Part(each, suite, start, nu or {}, margin) for each in logs]
         counts = [int(part.counts.sum()) for part in self._parts]
         if counts[0] < _FEWEST:
             raise ValueError(
@@ -118,8 +139,15 @@ class Likelihood:
 class _Part:
     """Losses of the innovations of one log."""
 
-    def __init__(self, log: Log, suite: SensorSuite, start: dict[str, Any], margin: float) -> None:
-        self.suite, self.weight = suite, 1.0
+    def __init__(
+        self,
+        log: Log,
+        suite: SensorSuite,
+        start: dict[str, Any],
+        nu: Mapping[str, float],
+        margin: float,
+    ) -> None:
+        self.suite, self.nu, self.weight = suite, nu, 1.0
         player = Player(log, suite, "ukf", start, False, _REACH)
         player.write_tape()
         if not player.filter.heading_known:
@@ -145,6 +173,7 @@ class _Part:
         for row, block in enumerate(blocks_of(self.suite)):
             have, d = self._valid[:, block], FREEDOMS[block]
             nis, sigma = found[have, row, 6], found[have, row, 3 : 3 + d]
-            losses[have] += 0.5 * (NU + d) * np.log1p(nis / (NU - 2.0)) + np.log(sigma).sum(axis=1)
+            nu = self.nu.get(name_of(block), NU[0])
+            losses[have] += 0.5 * (nu + d) * np.log1p(nis / (nu - 2.0)) + np.log(sigma).sum(axis=1)
         # a filter that failed is as unlikely as one that is wrong by far
         return self.weight * np.nan_to_num(losses[self.counts], nan=1e3, posinf=1e3)

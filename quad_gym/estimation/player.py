@@ -357,7 +357,7 @@ class Player:
             have, freedoms = valid[:, block], FREEDOMS[block]
             if have.any():
                 values = reported[have, row]
-                found[_name_of(block)] = Measured(
+                found[name_of(block)] = Measured(
                     time[have],
                     received[have],
                     values[:, :freedoms],
@@ -368,7 +368,7 @@ class Player:
         return found
 
 
-def _name_of(block: int) -> str:
+def name_of(block: int) -> str:
     """Return the name of a block of innovations."""
     if block < FEATURE_BLOCKS:
         return ("gnss_position", "gnss_baseline", "gnss_velocity")[block]

@@ -8,7 +8,7 @@ import pytest
 import quad_gym
 from quad_gym.estimation import calibrate
 from quad_gym.estimation.calibration import correlation_time
-from quad_gym.estimation.likelihood import in_flight
+from quad_gym.estimation.likelihood import in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import NUMBERS
 from quad_gym.params.suites import CONSUMER
@@ -127,3 +127,12 @@ def test_vehicle_at_rest_is_not_in_flight():
     flying = in_flight(log, time)
     assert not flying[time < 7.0].any()
     assert flying[time > 9.0].mean() > 0.98
+
+
+def test_tails_of_normal_and_of_heavy_tailed_innovations_differ():
+    """Of Student's t with four degrees of freedom, and of a Gaussian with another variance."""
+    rng = np.random.default_rng(2)
+    normal = rng.normal(size=(1000, 3))
+    heavy = normal / np.sqrt(rng.chisquare(4, size=(1000, 1)) / 4.0)
+    assert tails(0.3 * (normal**2).sum(axis=1), 3) > 10.0
+    assert tails(0.3 * (heavy**2).sum(axis=1), 3) == 5.0
