@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 T = TypeVar("T")
+_NO_NUMBERS = (str, bytes, bytearray, bool, np.bool_)
 Vector = tuple[float, ...]
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -86,11 +87,6 @@ def did_you_mean(name: Any, known: Iterable[str]) -> str:
     return f"; did you mean {close}?" if close else ""
 
 
-def _no_number(value: Any) -> bool:
-    """Return True for a value that Python converts to a float, but is none: text, bool, array."""
-    return isinstance(value, (str, bytes, bytearray, bool, np.bool_)) or np.ndim(value) > 0
-
-
 def number(
     name: str,
     value: Any,
@@ -101,7 +97,7 @@ def number(
 ) -> float:
     """`value` as a finite float in [least, most] (above `least`, with `open_end`)."""
     try:
-        if _no_number(value):
+        if isinstance(value, _NO_NUMBERS) or np.ndim(value) > 0:  # which float would convert
             raise TypeError
         result = float(value)
     except OverflowError:
@@ -192,14 +188,8 @@ _Kind = TypeVar("_Kind")
 def own(name: str, given: Any, kind: type[_Kind]) -> _Kind:
     """Return an object of a class that users extend.
 
-    Args:
-        name: Name of the argument.
-        given: An instance; a subclass, which is instantiated without arguments; or "module:name" of
-            either. Modules in the working directory are found, too.
-        kind: The class.
-
-    Raises:
-        ValueError: If it is none of these.
+    `given` is an instance; a subclass, which is instantiated without arguments; or "module:name" of
+    either. Modules in the working directory are found, too.
     """
     found = _named(name, given, kind.__name__) if isinstance(given, str) else given
     if isinstance(found, type) and issubclass(found, kind):
@@ -212,13 +202,9 @@ def own(name: str, given: Any, kind: type[_Kind]) -> _Kind:
 
 
 def _named(argument: str, name: str, kind: str) -> Any:
-    """Return the object specified by "module:name".
-
-    Raises:
-        ValueError: If the module or the name in it does not exist.
-    """
-    module, colon, attribute = name.partition(":")
-    if not (colon and module and attribute):
+    """Return the object specified by "module:name"."""
+    module, _, attribute = name.partition(":")
+    if not (module and attribute):
         raise ValueError(f'{argument} must be "module:name" of a quad_gym.{kind}, got {name!r}')
     here = os.getcwd()
     added = here not in sys.path and "" not in sys.path
@@ -271,7 +257,7 @@ def _holds_no_numbers(value: Any) -> bool:
         return value.dtype.kind not in "iuf"
     if isinstance(value, (list, tuple)):
         return any(_holds_no_numbers(part) for part in value)
-    return value is None or isinstance(value, (str, bytes, bytearray, bool, np.bool_))
+    return value is None or isinstance(value, _NO_NUMBERS)
 
 
 def vector(

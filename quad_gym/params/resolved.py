@@ -56,7 +56,9 @@ def taking(
     """Return a decorator for a method of a dataclass, which then takes the fields as arguments."""
     make: Callable[..., Value] = kind
     fields = {
-        name: parameter.replace(annotation=_given_type(parameter.annotation))
+        name: parameter.replace(annotation=get_args(hint)[0])
+        if get_origin(hint := parameter.annotation) is Resolved  # the type in which it is given
+        else parameter
         for name, parameter in inspect.signature(kind).parameters.items()
     }
 
@@ -73,8 +75,3 @@ def taking(
         return take
 
     return decorate
-
-
-def _given_type(annotation: Any) -> Any:
-    """Return the type in which a field is given."""
-    return get_args(annotation)[0] if get_origin(annotation) is Resolved else annotation

@@ -93,7 +93,9 @@ def through(
     bounds = {"max_speed": max_speed, "max_acceleration": max_acceleration}
     if times is None:
         _refuse_equal_neighbors(places, closed)
-        when = choose_times(path, rough, places, *_bounds(bounds))
+        usual = zip(bounds.items(), (MAX_SPEED, MAX_ACCELERATION), strict=True)
+        limits = [check.positive(name, other if x is None else x) for (name, x), other in usual]
+        when = choose_times(path, rough, places, *limits)
     else:
         for name, bound in bounds.items():
             if bound is not None:
@@ -119,12 +121,6 @@ def _places(points: ArrayLike, fewest: int) -> Floats:
             f"{len(places)}"
         )
     return places
-
-
-def _bounds(given: dict[str, float | None]) -> list[float]:
-    """Return the bounds of speed and acceleration, or their defaults."""
-    defaults = zip(given.items(), (MAX_SPEED, MAX_ACCELERATION), strict=True)
-    return [check.positive(name, usual if x is None else x) for (name, x), usual in defaults]
 
 
 def _given_times(times: Any, count: int, closed: bool) -> Floats:
@@ -159,17 +155,10 @@ def _refuse_equal_neighbors(places: Floats, closed: bool) -> None:
 def coefficients(
     times: Floats, values: Floats, order: int, *, closed: bool = False, at_rest: bool = True
 ) -> Floats:
-    """Polynomials of the least integral of a squared derivative through values (m + 1, n) at times.
+    """Polynomials (8, m, n) of the least integral of a squared derivative of an order, 4 or 3.
 
-    Args:
-        times: (m + 1,) increasing.
-        values: (m + 1, n); closed: the last are the first.
-        order: Order of the derivative that is minimized: 4 or 3.
-        closed: True: the path repeats.
-        at_rest: True: derivatives below `order` are zero at both ends.
-
-    Returns:
-        (8, m, n), the highest power first, of times since the beginning of a segment.
+    They pass through values (m + 1, n) at times (m + 1,); the highest power of the time since the
+    beginning of a segment is first. At rest, derivatives below the order are zero at both ends.
     """
     from scipy.interpolate import make_interp_spline
 
