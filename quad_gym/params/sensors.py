@@ -6,6 +6,7 @@ laboratory's numbers from the Aerial Robotics course (ASE 479W, The University o
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
@@ -15,7 +16,6 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.params.log_delays import LogDelays
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
@@ -39,6 +39,7 @@ SENSOR_PARAMS: dict[str, type[SensorParams]] = {
 }
 """Parameters of all sensors but the IMU by their fields in `SensorSuite`."""
 
+Delay = Annotated[float, check.between(-2.0, 2.0)]
 _WORDS = {"gnss": "GNSS"}  # sensors in messages, where the name of the field is none
 
 
@@ -75,6 +76,24 @@ class NoisyObservationParams(Checked):
     """standard deviation of the attitude, per axis [rad]; measured on the laboratory's circle"""
     body_rates: check.NonNegative = 0.0123
     """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogDelays(Checked):
+    """Times by which the stamps of a vehicle's logs are later than the measurements themselves.
+
+    Autopilots often stamp a measurement when they receive it. A replay subtracts these delays; in
+    simulated flights time stamps are exact.
+    """
+
+    gnss: Delay = 0.0
+    """of GNSS, relative to the IMU [s]"""
+    camera: Delay = 0.0
+    """of images [s]"""
+    magnetometer: Delay = 0.0
+    """of the magnetometer [s]"""
+    barometer: Delay = 0.0
+    """of the barometer [s]"""
 
 
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
