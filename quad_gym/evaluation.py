@@ -166,7 +166,7 @@ def evaluate(
         env_id: Id from `quad_gym.IDS`, or one registered with `quad_gym.register_task`.
         episodes: Number of episodes.
         seed: Seed of the first episode; episode i has seed + i.
-        watch: Function called at the start and after every step, such as `recording.Tracer.add`.
+        watch: As in `roll_out`.
         keywords: Keywords of the environment.
 
     Returns:

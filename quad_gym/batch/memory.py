@@ -149,12 +149,7 @@ class FlightMemory:
         return self._blocks.copy()
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Restore all flights from a snapshot of this batch, or of another one like it.
-
-        Raises:
-            ValueError: If the snapshot is from a batch of another size, or with other settings or
-                parameters. The time limit and the number of threads may differ.
-        """
+        """Restore all flights from a snapshot; see `FlightBatch.restore`."""
         fits = (
             isinstance(snapshot, np.ndarray)
             and snapshot.dtype == self._blocks.dtype

@@ -234,9 +234,9 @@ class RotorLoss(Fault):
     def __post_init__(self) -> None:
         super().__post_init__()
         if ends(self.share)[1] > 1.0:
-            raise ValueError(f"RotorLoss.share must be at most 1, got {self.share}")
+            self._refuse("share", "be at most 1")
         if self.rotor is not None and self.rotor > 3:
-            raise ValueError(f"RotorLoss.rotor must be 0, 1, 2 or 3, got {self.rotor}")
+            self._refuse("rotor", "be 0, 1, 2 or 3")
 
     @property
     def numbers(self) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.aids import SensorBase
 from quad_gym.params.checks import Matrix, Vector
 from quad_gym.records import MAX_FEATURES
 
@@ -26,7 +26,7 @@ def _features(name: str, value: Any) -> Matrix:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraParams(Checked):
+class CameraParams(SensorBase):
     """A pinhole camera that measures the image coordinates of known features."""
 
     rate: check.Positive = 200.0
@@ -65,13 +65,13 @@ class CameraParams(Checked):
     """True: the ground (`WorldParams.ground_height`) occludes features below it, and all features
     if the camera is below it"""
 
-    def simplified(self) -> "CameraParams":
-        """Return a copy without latency, motion blur, and limits of range and ground."""
-        return self.replace(latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False)
-
-    def scaled_noise(self, factor: float) -> "CameraParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(pixel_sigma=factor * self.pixel_sigma)
+    _white_noise = ("pixel_sigma",)
+    _ideal: ClassVar = {
+        "latency": 0.0,
+        "max_range": math.inf,
+        "exposure": 0.0,
+        "ground_hides": False,
+    }
 
     @property
     def limited(self) -> bool:

@@ -64,10 +64,7 @@ class _Between(Distribution):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.low > self.high:
-            raise ValueError(
-                f"{type(self).__name__}.low must be at most its high, got {self.low:g} and "
-                f"{self.high:g}"
-            )
+            self._refuse("low", "be at most its high", f"{self.low:g} and {self.high:g}")
 
     @property
     def support(self) -> tuple[float, float]:

@@ -89,7 +89,4 @@ class FilterParams(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.false_alarm_probability >= 0.5:
-            raise ValueError(
-                "FilterParams.false_alarm_probability must be below 0.5, got "
-                f"{self.false_alarm_probability}"
-            )
+            self._refuse("false_alarm_probability", "be below 0.5")

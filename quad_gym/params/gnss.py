@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.aids import SensorBase
 
 LEAST_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so
@@ -27,7 +27,7 @@ def check_baseline(name: str, baseline: np.ndarray) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GnssParams(Checked):
+class GnssParams(SensorBase):
     """GNSS: position of the primary antenna and, with a second antenna, the baseline between them.
 
     With one antenna, the initial heading of the filter is measured by the magnetometer or, without
@@ -71,35 +71,20 @@ class GnssParams(Checked):
     [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods. Receivers take about 0.1
     s: the autopilot PX4 assumes 0.11 s (parameter EKF2_GPS_DELAY)"""
 
+    _white_noise = ("position_sigma_I", "baseline_sigma", "velocity_sigma")
+    _ideal: ClassVar = {"latency": 0.0, "heading_error_sigma": 0.0}
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.has_baseline:
             check_baseline("GnssParams.secondary_antenna_B and primary_antenna_B", self.baseline_B)
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
-            raise ValueError(
-                "GnssParams.reference_antenna_G must be a place on the Earth in ECEF meters, "
-                f"got {self.reference_antenna_G}"
-            )
-
-    def simplified(self) -> "GnssParams":
-        """Return a copy without latency and constant heading error."""
-        return self.replace(latency=0.0, heading_error_sigma=0.0)
-
-    def scaled_noise(self, factor: float) -> "GnssParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(
-            position_sigma_I=tuple(factor * sigma for sigma in self.position_sigma_I),
-            baseline_sigma=factor * self.baseline_sigma,
-            velocity_sigma=self.velocity_sigma and factor * self.velocity_sigma,
-        )
+            self._refuse("reference_antenna_G", "be a place on the Earth in ECEF meters")
 
     def require_filter(self) -> None:
         """Refuse positions with hardly any noise, by the square of which a filter divides."""
         if min(self.position_sigma_I) < 1e-9:
-            raise ValueError(
-                "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "
-                f"{self.position_sigma_I}"
-            )
+            self._refuse("position_sigma_I", "be at least 1e-9 m for a filter")
 
     @property
     def has_baseline(self) -> bool:

@@ -50,13 +50,9 @@ class GroundParams(Checked):
         super().__post_init__()
         feet = np.array(self.feet_B)
         if np.abs(feet).max() > FARTHEST_FOOT:
-            raise ValueError(
-                f"GroundParams.feet_B must be within {FARTHEST_FOOT:g} m, got {self.feet_B}"
-            )
+            self._refuse("feet_B", f"be within {FARTHEST_FOOT:g} m")
         if np.linalg.svd(feet[:, :2] - feet[:, :2].mean(axis=0))[1][1] < 1e-3 or not (
             np.ptp(feet[:, 2]) <= 1e-9 and feet[0, 2] < 0.0
         ):
-            raise ValueError(
-                "GroundParams.feet_B must be four points of a level plane below the center of "
-                f"mass, not all on one line, got {self.feet_B}"
-            )
+            must = "be four points of a level plane below the center of mass, not all on one line"
+            self._refuse("feet_B", must)

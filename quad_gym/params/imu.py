@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.aids import SensorBase
 
 MANEUVER = 0.5
 """Typical time for which a quadrotor accelerates in one direction [s]; engineering judgment,
@@ -21,7 +21,7 @@ _ERRORS = tuple(
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImuParams(Checked):
+class ImuParams(SensorBase):
     """Accelerometer and gyro, with white noise and Gauss-Markov biases (report eqs. 4, 6, 7)."""
 
     rate: Annotated[float, partial(check.positive, least=1.0, most=1e6)] = 200.0
@@ -69,17 +69,8 @@ class ImuParams(Checked):
     axis, after the IMU's own filters [rad/s]. The noise is white, and proportional to the square of
     the rotor speeds"""
 
-    def simplified(self) -> "ImuParams":
-        """Return a copy without errors of scale and alignment, and without vibration."""
-        none = dict.fromkeys(_ERRORS, 0.0)
-        return self.replace(accel_vibration=0.0, gyro_vibration=0.0, **none)
-
-    def scaled_noise(self, factor: float) -> "ImuParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(
-            accel_noise_density=factor * self.accel_noise_density,
-            gyro_noise_density=factor * self.gyro_noise_density,
-        )
+    _white_noise = ("accel_noise_density", "gyro_noise_density")
+    _ideal = dict.fromkeys((*_ERRORS, "accel_vibration", "gyro_vibration"), 0.0)
 
     @property
     def dt(self) -> float:

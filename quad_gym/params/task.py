@@ -94,7 +94,7 @@ class TaskParams(Checked):
         self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
         self.reward_params.require_effect(self.kind)
         if not 0.0 < self.max_tilt <= math.pi:
-            raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
+            self._refuse("max_tilt", "be in (0, pi]")
 
     @property
     def may_start_on_ground(self) -> bool:

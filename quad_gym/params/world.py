@@ -101,26 +101,15 @@ class WorldParams(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if np.linalg.norm(self.wind_I) > MAX_WIND:
-            raise ValueError(
-                f"WorldParams.wind_I must be at most {MAX_WIND:g} m/s, got {self.wind_I}"
-            )
+            self._refuse("wind_I", f"be at most {MAX_WIND:g} m/s")
         if not isinstance(self.obstacles, (tuple, list)):
-            raise ValueError(
-                "WorldParams.obstacles must be a tuple of Wall and Cylinder, got "
-                f"{self.obstacles!r}"
-            )
+            self._refuse("obstacles", "be a tuple of Wall and Cylinder", repr(self.obstacles))
         self._set("obstacles", tuple(self.obstacles))
         check_obstacles("WorldParams.obstacles", self.obstacles)
         if len(self.obstacles) > MAX_OBSTACLES:
-            raise ValueError(
-                f"WorldParams.obstacles must be at most {MAX_OBSTACLES}, got {len(self.obstacles)}"
-            )
-        if self.geofence is not None:
-            low, high = self.geofence
-            if not all(a < b for a, b in zip(low, high, strict=True)):
-                raise ValueError(
-                    f"WorldParams.geofence must be a lower and an upper corner, got {self.geofence}"
-                )
+            self._refuse("obstacles", f"be at most {MAX_OBSTACLES}", len(self.obstacles))
+        if not all(low < high for low, high in zip(*(self.geofence or ()), strict=True)):
+            self._refuse("geofence", "be a lower and an upper corner")
 
 
 def _slalom(first: float = 48.0, spacing: float = 12.0, gaps: int = 10) -> tuple[Wall, ...]:

@@ -1,23 +1,7 @@
 """Fields of a flight: true state, measurements, filter, clocks, reference, task and faults."""
 
 from quad_gym.records.draws import DRAWN_SIZE
-from quad_gym.records.sizes import (
-    AIDS,
-    DELAY_SLOTS,
-    FAULT_KINDS,
-    MAX_ACTION_DELAY,
-    MAX_BLOCKS,
-    MAX_FEATURES,
-    MAX_GATES,
-    MAX_HARMONICS,
-    MAX_OBSTACLES,
-    MAX_SLOW,
-    MAX_STATES,
-    SENSOR_GROUPS,
-    SENSORS,
-    STAMP,
-    Field,
-)
+from quad_gym.records.sizes import *
 
 # fmt: off
 PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (

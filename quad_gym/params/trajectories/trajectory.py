@@ -57,15 +57,10 @@ class Trajectory(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.times) < 2 or self.times[0] != 0.0 or not (np.diff(self.times) > 0.0).all():
-            raise ValueError(
-                "Trajectory.times must begin with 0 and increase, with at least two of them, got "
-                f"{self.times}"
-            )
+            self._refuse("times", "begin with 0 and increase, with at least two of them")
         if self.coefficients.shape[1] != len(self.times) - 1:
-            raise ValueError(
-                f"Trajectory.coefficients must have {len(self.times) - 1} segments, one less than "
-                f"there are times, got {self.coefficients.shape[1]}"
-            )
+            must = f"have {len(self.times) - 1} segments, one less than there are times"
+            self._refuse("coefficients", must, self.coefficients.shape[1])
         for array in (self.times, self.coefficients):
             array.flags.writeable = False
 
