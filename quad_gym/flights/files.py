@@ -73,7 +73,14 @@ def load_flight(path: Path) -> tuple[NDArray[Any], FlightScene, dict[str, Any]]:
         raise ValueError(f"{path} is not a flight, or damaged: {error}") from None
     header = _header(path, entries)
     try:
-        scene = _scene(header, entries)
+        found: dict[str, Any] = {}
+        for field in dataclasses.fields(FlightScene):
+            value = entries.get(f"scene/{field.name}", header.get(field.name))
+            if value is not None:
+                found[field.name] = value
+            elif field.default is field.default_factory is dataclasses.MISSING:
+                raise ValueError(f"it lacks {field.name}")  # older files lack optional fields
+        scene = FlightScene(**found)
         rows = _rows(entries, len(scene.features_I))
         return rows, scene, dict(header["about"])
     except (KeyError, ValueError, TypeError) as error:
@@ -94,17 +101,6 @@ def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
             f"version {VERSION}: use the quad_gym that wrote it, or a newer one"
         )
     return dict(header)
-
-
-def _scene(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> FlightScene:
-    found: dict[str, Any] = {}
-    for field in dataclasses.fields(FlightScene):
-        value = entries.get(f"scene/{field.name}", header.get(field.name))
-        if value is not None:
-            found[field.name] = value
-        elif field.default is field.default_factory is dataclasses.MISSING:
-            raise ValueError(f"it lacks {field.name}")  # older files lack optional fields
-    return FlightScene(**found)
 
 
 def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:

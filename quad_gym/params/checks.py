@@ -61,24 +61,23 @@ def closest(name: Any, known: Iterable[str]) -> str | None:
     """
     if not isinstance(name, str):
         return None
+
+    def likeness(word: str) -> float:
+        return difflib.SequenceMatcher(None, name.lower(), word.lower()).ratio()
+
     best, found = _RESEMBLES, None
     for word in known:
-        whole = _likeness(name, word)
+        whole = likeness(word)
         parts = [part for part in word.split("_") if len(part) > 2]
-        part = max((_likeness(name, part) for part in parts), default=0.0)
-        likeness = max(whole, _PART * part if part >= _PART else 0.0)
-        if likeness > best:
-            best, found = likeness, word
+        part = max(map(likeness, parts), default=0.0)
+        best_of_word = max(whole, _PART * part if part >= _PART else 0.0)
+        if best_of_word > best:
+            best, found = best_of_word, word
     return found
 
 
 _RESEMBLES, _PART = 0.6, 0.8
 """Likeness above which a word may be meant, and at which a part of it may; a part counts less."""
-
-
-def _likeness(a: str, b: str) -> float:
-    """The likeness of two words, whatever their case: from 0 to 1, the same."""
-    return difflib.SequenceMatcher(None, a.lower(), b.lower()).ratio()
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:

@@ -68,10 +68,9 @@ def taking(
             check.keywords(given, tuple(fields), name)
             method(self, make(*values, **given))
 
-        itself = next(iter(inspect.signature(method).parameters.values()))
-        take.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-            [itself, *fields.values()]
-        )
+        itself, *_ = inspect.signature(method).parameters.values()
+        shown = inspect.Signature([itself, *fields.values()])
+        take.__signature__ = shown  # type: ignore[attr-defined]
         return take
 
     return decorate
