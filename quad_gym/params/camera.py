@@ -30,8 +30,7 @@ class CameraParams(SensorBase):
     """A pinhole camera that measures the image coordinates of known features."""
 
     rate: check.Positive = 200.0
-    """frame rate [Hz]; the IMU rate must be a whole multiple of it; laboratory: an image at every
-    tick"""
+    """frame rate [Hz], which must divide the IMU rate; laboratory: an image at every tick"""
     position_B: check.Place = (0.1159, -0.0004, -0.0435)
     """(3,) projection center in B [m]; laboratory vehicle"""
     attitude: check.Vector3 = (math.radians(120.0), 0.0, math.radians(90.0))
@@ -59,8 +58,8 @@ class CameraParams(SensorBase):
     """distance beyond which a feature is too small to be detected [m]"""
     exposure: Annotated[float, check.between(0.0, 1.0)] = 0.0
     """exposure time of an image [s]: a body rate w smears a feature over `focal_length w exposure`
-    pixels, and the measured position is uniformly distributed along the smear; the filter inflates
-    the pixel noise in proportion to the measured body rate"""
+    pixels, on which its measured position is uniformly distributed; the filter inflates the pixel
+    noise accordingly"""
     ground_hides: bool = False
     """True: the ground (`WorldParams.ground_height`) occludes features below it, and all features
     if the camera is below it"""

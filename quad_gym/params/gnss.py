@@ -50,9 +50,8 @@ class GnssParams(SensorBase):
     baseline_sigma: check.Positive = 0.05
     """standard deviation of the white noise of the baseline's direction [rad]; laboratory"""
     heading_error_sigma: Annotated[float, check.between(0.0, 1.0)] = 0.0
-    """standard deviation of the heading error that all baselines of an episode have in common, a
-    rotation about the body z axis [rad]; causes are unequal antennas, their mounting or, for a
-    compass, iron nearby"""
+    """standard deviation of the heading error that all baselines of an episode have in common, due
+    to unequal antennas and their mounting, a rotation about the body z axis [rad]"""
     velocity_sigma: check.Positive | None = None
     """standard deviation of the velocity from Doppler shifts, per axis [m/s]; None: velocity is not
     measured (laboratory)"""
@@ -60,12 +59,11 @@ class GnssParams(SensorBase):
     """time of the first measurement after the start as a fraction of the measurement period, in [0,
     1), rounded to whole ticks; None: drawn at random in each episode"""
     drift_sigma_I: check.NonNegative3 = (0.0, 0.0, 0.0)
-    """(3,) stationary standard deviation of the time-correlated position error (drift) east, north,
-    up, in addition to the white noise [m]. The drift is a first-order Gauss-Markov process that is
-    zero at the start of an episode, because positions are relative to the place of the start"""
+    """(3,) stationary standard deviation of the drift of positions east, north, up [m], a
+    first-order Gauss-Markov process that is zero at the start of an episode, because positions are
+    relative to the place of the start"""
     drift_tau: check.Positive = 60.0
-    """correlation time of the position drift [s]; the filter estimates the drift in three augmented
-    states"""
+    """correlation time of the drift [s]; the filter estimates it in three augmented states"""
     latency: check.NonNegative = 0.0
     """delay from a measurement to its arrival at the filter, which receives it with its time stamp
     [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods. Receivers take about 0.1

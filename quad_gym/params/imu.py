@@ -31,9 +31,8 @@ class ImuParams(SensorBase):
     samples: Literal["instant", "average"] = "instant"
     """samples with which the filter predicts a tick: "instant", a sample of the motion at the start
     of the tick (report), or "average", the mean over the tick, as real IMUs provide by delta angles
-    and delta velocities with coning and sculling corrections. In both cases the inner loops read
-    the gyro at the present instant, with the noise of the last sample: a mean lags by half a tick,
-    too much for a tight rate loop"""
+    and delta velocities. In both cases the inner loops read the gyro at the present instant: a mean
+    lags by half a tick, too much for a tight rate loop"""
     accel_noise_density: check.Positive = 9.8e-3 * 0.1
     """noise density of the accelerometer [m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
     gyro_noise_density: check.Positive = math.radians(0.05)
@@ -65,9 +64,7 @@ class ImuParams(SensorBase):
     hover, per axis, after the IMU's own filters [m/s^2]. The noise is white, and proportional to
     the square of the rotor speeds, as the forces of unbalanced masses are"""
     gyro_vibration: check.NonNegative = 0.0
-    """standard deviation of the noise that rotor vibration adds to a gyro sample in hover, per
-    axis, after the IMU's own filters [rad/s]. The noise is white, and proportional to the square of
-    the rotor speeds"""
+    """standard deviation of this noise in a gyro sample [rad/s]"""
 
     _white_noise = ("accel_noise_density", "gyro_noise_density")
     _ideal = dict.fromkeys((*_ERRORS, "accel_vibration", "gyro_vibration"), 0.0)
