@@ -1,4 +1,4 @@
-"""Kinds of faults, by sensor, and those of the vehicle."""
+"""Kinds of faults: of sensors, one by one, and of the vehicle."""
 
 import math
 from dataclasses import dataclass

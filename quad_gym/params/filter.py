@@ -54,8 +54,8 @@ class FilterParams(Checked):
     """standard deviation of a feature's predicted direction above which an image is processed in
     several steps, each linearized about the estimate after the step before [rad]; None: always in a
     single update (report). The linearization error of pixels grows with the square of the direction
-    error, and exceeds a precise camera's noise at an uncertain start or after an outage. Where there
-    is GNSS, features beyond `max_direction_sigma` are then ignored even without a gate"""
+    error, and exceeds a precise camera's noise at an uncertain start or after an outage. With GNSS,
+    features beyond `max_direction_sigma` are then ignored even without a gate"""
     false_alarm_probability: check.NonNegative = 0.0
     """probability that the innovation gate rejects a valid measurement: a position, baseline,
     velocity or feature, or a measurement of an aiding sensor, is left out of the update if its

@@ -34,7 +34,7 @@ class GroundParams(Checked):
         (-0.15, -0.15, -0.1),
     )
     """(4, 3) positions of the soles of the feet relative to the center of mass, in B [m], in a
-    level plane below all rotor hubs; default: legs 0.1 m long under the laboratory vehicle's arms"""
+    level plane below all rotor hubs; default: legs of 0.1 m under the laboratory vehicle's arms"""
     friction: Annotated[float, check.between(0.0, 100.0)] = 0.6
     """Coulomb friction coefficient, for sticking and sliding; rubber on concrete has 0.6 to 0.85;
     0: no friction"""
