@@ -129,14 +129,7 @@ def roll_out(
     complete = (lengths == limit) & ~crashed
     late_error = np.where(complete, late / np.maximum(late_steps, 1), np.nan)
     return Episodes(
-        returns,
-        lengths,
-        errors / lengths,
-        late_error,
-        estimation / lengths,
-        crashed,
-        gates,
-        ending,
+        returns, lengths, errors / lengths, late_error, estimation / lengths, crashed, gates, ending
     )
 
 

@@ -38,10 +38,7 @@ class CameraParams(SensorBase):
     axis along the optical axis [rad]; laboratory"""
     focal_length: check.Positive = 1657.72
     """focal length [pixels]; laboratory"""
-    image_size: Positive2 = (
-        3840.0,
-        2160.0,
-    )
+    image_size: Positive2 = (3840.0, 2160.0)
     """(2,) width and height of the image, with the origin of image coordinates at its center
     [pixels]; laboratory"""
     pixel_sigma: check.Positive = 20.0

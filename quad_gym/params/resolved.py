@@ -49,10 +49,7 @@ def resolving(
 
 def taking(
     kind: Callable[Arguments, Value], name: str
-) -> Callable[
-    [Callable[[Owner, Value], None]],
-    Callable[Concatenate[Owner, Arguments], None],
-]:
+) -> Callable[[Callable[[Owner, Value], None]], Callable[Concatenate[Owner, Arguments], None]]:
     """Return a decorator for a method of a dataclass, which then takes the fields as arguments."""
     make: Callable[..., Value] = kind
     fields = {

@@ -126,7 +126,7 @@ RTK = SensorSuite(
     ),
     camera=_CAMERA.replace(
         # three rows of four markers on the ground of the flying field
-        features_I=tuple((x, y, 0.0) for x in (-4.5, -1.5, 1.5, 4.5) for y in (-3.0, 0.0, 3.0)),
+        features_I=tuple((x, y, 0.0) for x in (-4.5, -1.5, 1.5, 4.5) for y in (-3.0, 0.0, 3.0))
     ),
     estimator=FIELD_FILTER,
     noisy=_noise(0.00135, 0.0032, 0.00021, 0.0028),
@@ -230,7 +230,7 @@ ONE_WALL = _changed(
     },
 ).replace(
     # as above, but of LookAround with PD control that faces the wall, 127 flights
-    noisy=_noise(0.0079, 0.0139, 0.00089, 0.0107),
+    noisy=_noise(0.0079, 0.0139, 0.00089, 0.0107)
 )
 """The suite of `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west
 wall."""

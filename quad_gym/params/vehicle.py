@@ -50,11 +50,7 @@ class VehicleParams(Checked):
 
     mass: Annotated[float, partial(check.positive, least=1e-3)] = 0.78
     """mass [kg]; laboratory vehicle"""
-    inertia: check.Matrix33 = (
-        (1.7565e-3, 0.0, 0.0),
-        (0.0, 3.5723e-3, 0.0),
-        (0.0, 0.0, 4.7134e-3),
-    )
+    inertia: check.Matrix33 = ((1.7565e-3, 0.0, 0.0), (0.0, 3.5723e-3, 0.0), (0.0, 0.0, 4.7134e-3))
     """(3, 3) inertia about the center of mass, in B [kg m^2]; laboratory vehicle"""
     rotor_positions_B: check.Matrix43 = (
         (0.21, -0.21, 0.0),

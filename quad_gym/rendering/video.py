@@ -18,12 +18,7 @@ Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 
 def record_flight(
-    policy: Any,
-    env_id: str,
-    *,
-    seed: int = 0,
-    about: dict[str, Any] | None = None,
-    **keywords: Any,
+    policy: Any, env_id: str, *, seed: int = 0, about: dict[str, Any] | None = None, **keywords: Any
 ) -> Flight:
     """Run a policy for one episode and return the flight.
 

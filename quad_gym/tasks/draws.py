@@ -71,10 +71,7 @@ class FlightRandom:
         return np.ascontiguousarray((a >> np.uint64(11)) * 2.0**-53).reshape(shape)
 
     def uniform(
-        self,
-        low: ArrayLike = 0.0,
-        high: ArrayLike = 1.0,
-        size: int | tuple[int, ...] | None = None,
+        self, low: ArrayLike = 0.0, high: ArrayLike = 1.0, size: int | tuple[int, ...] | None = None
     ) -> NDArray[np.float64]:
         """Draw uniform numbers in [low, high); see `random` for `size`."""
         floor = np.asarray(low, np.float64)
