@@ -1,11 +1,12 @@
 """`Measurements` of many flights that arrive at an instant, and the `Start` of episodes."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.memory import FlightMemory
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
@@ -20,9 +21,6 @@ from quad_gym.records import (
     Sensor,
     field_of_flights,
 )
-
-if TYPE_CHECKING:
-    from quad_gym.batch.flight_batch import FlightBatch
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -75,7 +73,7 @@ class Measurements:
         vehicle: The vehicle that it may assume.
     """
 
-    def __init__(self, batch: "FlightBatch", sample: NDArray[Any]) -> None:
+    def __init__(self, batch: FlightMemory, sample: NDArray[Any]) -> None:
         self._batch, self._sample = batch, sample
         self.count, self.dt = batch.count, batch.sensors.imu.dt
         self.sensors: SensorSuite = batch.sensors
@@ -176,7 +174,7 @@ class StartView(Measurements):
     sample of the first instant; they have no meaning with `ImuParams.samples="average"`.
     """
 
-    def __init__(self, batch: "FlightBatch", sample: NDArray[Any], mask: Truths) -> None:
+    def __init__(self, batch: FlightMemory, sample: NDArray[Any], mask: Truths) -> None:
         super().__init__(batch, sample)
         self._mask = mask
 
