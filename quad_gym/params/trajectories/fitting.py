@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.trajectories.headings import heading_choice
-from quad_gym.params.trajectories.splines import polynomials
+from quad_gym.params.trajectories.splines import heading_choice, polynomials
 
 if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory

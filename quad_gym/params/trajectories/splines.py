@@ -7,19 +7,19 @@ from the k-th on (natural), or repeating, SciPy's interpolating splines are that
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.trajectories.headings import heading_choice
 from quad_gym.params.trajectories.timing import choose_times
 
 if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+HeadingRule = Literal["given", "along", "toward"]
 
 ORDERS = {"snap": 4, "jerk": 3}  # order of the derivative that is minimized, by name
 
@@ -108,6 +108,28 @@ def through(
     else:
         terms[-1, :, 3] = angles
     return cls(times=when, coefficients=terms, closed=closed, heading=rule, point=point)
+
+
+def heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, float], Any]:
+    """Return the rule that a heading follows, `Trajectory.heading`, and its point (2,).
+
+    The third value is the source of the angles: a number, or `yaw` itself if it is a function or an
+    array.
+    """
+    if look_at is not None:
+        if yaw is not None:
+            raise ValueError("yaw must not be given with look_at, which sets the heading")
+        size = np.size(look_at)
+        point = check.vector("look_at", look_at, length=3 if size == 3 else 2)
+        return "toward", (point[0], point[1]), 0.0
+    if isinstance(yaw, str):
+        check.choice("yaw", yaw, ("along",))
+        return "along", (0.0, 0.0), 0.0
+    if yaw is None:
+        return "given", (0.0, 0.0), 0.0
+    if callable(yaw) or np.ndim(yaw) > 0:
+        return "given", (0.0, 0.0), yaw
+    return "given", (0.0, 0.0), check.angle("yaw", yaw)
 
 
 def _places(points: ArrayLike, fewest: int) -> Floats:
