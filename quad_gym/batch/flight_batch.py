@@ -18,8 +18,8 @@ from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import pack_warm_start
 from quad_gym.estimation.own import Estimator
-from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import needed_stages, used_parts
+from quad_gym.kernels.linked import linked_table
+from quad_gym.kernels.stages import needed_stages, used_parts
 from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.packing.flight import params_block, params_record
 from quad_gym.packing.paths import pack_paths

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels import single
+from quad_gym.kernels import entries
 from quad_gym.packing.world import pack_obstacles
 from quad_gym.params.obstacles import Obstacle
 from quad_gym.params.world import WorldParams
@@ -26,7 +26,7 @@ def nearest_obstacle(
     """
     distances, vectors = np.full(len(points), np.inf), np.zeros((len(points), 3))
     given = (np.ascontiguousarray(array, np.float64) for array in (points, centers))
-    single.nearest_obstacles(*given, _settings(tuple(obstacles)), distances, vectors)
+    entries.nearest_obstacles(*given, _settings(tuple(obstacles)), distances, vectors)
     return distances, vectors
 
 
@@ -40,7 +40,7 @@ def hidden_points(
     each = np.broadcast_to(points, (len(eyes), *points.shape[-2:]))
     hidden = np.zeros(each.shape[:2], bool)
     given = (np.ascontiguousarray(array, np.float64) for array in (eyes, each, centers))
-    single.hide_points(*given, _settings(tuple(obstacles)), hidden)
+    entries.hide_points(*given, _settings(tuple(obstacles)), hidden)
     return hidden
 
 

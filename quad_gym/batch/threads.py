@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels import board
-from quad_gym.kernels.compiling.cores import available_cores
+from quad_gym.kernels.cores import available_cores
 from quad_gym.params import checks as check
+from quad_gym.records import board
 
 MIN_BLOCKS_PER_THREAD = 4  # smallest number of blocks that is worth a hand-over to another thread
 

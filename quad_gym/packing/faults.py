@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from quad_gym.faults import Fault, Span, ends
-from quad_gym.kernels.sensors.faults import NEVER
+from quad_gym.records import NEVER
 
 
 def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:

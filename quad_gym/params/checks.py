@@ -231,11 +231,11 @@ def choice(name: str, value: Any, choices: Sequence[str]) -> str:
 def array(
     name: str, value: ArrayLike, shape: tuple[int | None, ...], *, allow_nan: bool = False
 ) -> NDArray[np.float64]:
-    """`value` as a new float64 array of `shape` (None: any length), finite or NaN if allowed."""
+    """`value` as a new float64 array in C order, of `shape` (None: any length), finite or NaN."""
     try:
         if _holds_no_numbers(value):
             raise TypeError
-        result = np.array(value, dtype=np.float64)
+        result = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be an array of numbers, got {value!r}") from None
     fits = result.ndim == len(shape) and all(

@@ -51,6 +51,7 @@ WARM_SLOW_DRAWS = 2 * MAX_SLOW
 errors, three for the estimate, then three for the true values."""
 STAMP = 28  # length of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates
 FAULT_KINDS = len(FaultKind)  # number of kinds of faults
+NEVER = 1e18  # a tick that no flight reaches
 # fmt: on
 
 
