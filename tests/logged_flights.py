@@ -26,21 +26,23 @@ LOST, JITTER = 0.01, 0.05
 AXES_OF_FIELD = [f"magnetometer_{axis}" for axis in "xyz"]
 
 
-def flown(suite=RTK, seconds=10.0, seed=5, task="circle"):
+def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
     """A flight under PD control on the estimate, with a row per IMU sample.
 
-    Its `about` has what aiding sensors measured, (n, 2, 3), NaN where they did not.
+    Its `about` has what aiding sensors measured, (n, 2, 3), NaN where they did not, and the
+    voltages (n, 4) over the tick before each row.
     """
     rate = suite.imu.rate
-    env = QuadEnv(task, sensors=suite, control_rate=rate, duration=seconds)
+    env = QuadEnv(task, sensors=suite, control_rate=rate, duration=seconds, **options)
     policy, recorder = PDPolicy(env), FlightRecorder(env.flights.batch)
     observation, _ = env.reset(seed=seed)
     recorder.keep()
-    aids = []
+    aids, voltages = [], []
 
     def keep_aids():
         batch = env.flights.batch
         fresh = (batch.record("block_fresh") + batch.record("block_valid"))[0, AID_BLOCKS:] > 0.0
+        voltages.append(batch.record("voltages")[0].copy())
         aids.append(np.where(fresh[:, np.newaxis], batch.record("aid_measurement")[0], np.nan))
 
     keep_aids()
@@ -48,7 +50,7 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle"):
         observation = env.step(policy.predict(observation)[0])[0]
         recorder.keep()
         keep_aids()
-    recorder.flight.about["aids"] = np.array(aids)
+    recorder.flight.about |= {"aids": np.array(aids), "voltages": np.array(voltages)}
     return recorder.flight
 
 

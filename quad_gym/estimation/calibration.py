@@ -336,6 +336,8 @@ class _Search:
                 continue
             tau = max(correlation_time(column) for column in scaled[sensor][:, axes].T)
             factor = min(math.sqrt(tau), most)
+            if factor == 1.0:
+                continue
             value = factor * number.value(self.values[k], float(self.x[k]))
             wide = number.coordinate(self.values[k], value)
             self.low[k] = min(max(self.low[k], wide), _LARGEST - 0.1)

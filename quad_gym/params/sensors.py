@@ -19,7 +19,7 @@ from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
-from quad_gym.params.suite_files import SUFFIX, text_of
+from quad_gym.params.suite_files import save_params
 from quad_gym.records import MAX_UNDER_WAY, Aid
 
 SensorParams = GnssParams | CameraParams | AidParams  # parameters of a sensor other than the IMU
@@ -154,11 +154,7 @@ class SensorSuite(Checked):
             ValueError: If the path ends otherwise.
             OSError: If it cannot be written.
         """
-        path = Path(file)
-        if path.suffix != SUFFIX:
-            raise ValueError(f"file must end with {SUFFIX}, got {str(file)!r}")
-        path.write_text(text_of(self), encoding="utf-8")
-        return path
+        return save_params(self, file)
 
     @property
     def sensors(self) -> dict[str, SensorParams]:

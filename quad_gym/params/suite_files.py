@@ -1,6 +1,6 @@
-"""Sensor suites as TOML files.
+"""Sensor suites and vehicles as TOML files.
 
-A table for each sensor has the fields of its parameters by name::
+In a file of a suite, a table for each sensor has the fields of its parameters by name::
 
     base = "consumer"  # optional: the file changes this suite
     camera = "none"    # no camera; "none" stands for None
@@ -9,7 +9,8 @@ A table for each sensor has the fields of its parameters by name::
     primary_antenna_B = [0.0, 0.0, 0.12]
 
 Units are SI, angles in rad. Without `base` all tables are required; fields that a table leaves out
-have the defaults of its class, which are the laboratory's.
+have the defaults of its class, which are the laboratory's. A file of a vehicle has the fields of
+`VehicleParams`; ``base`` may name a built-in vehicle.
 """
 
 import dataclasses
@@ -26,22 +27,52 @@ from quad_gym.params import checks as check
 SUFFIX = ".toml"  # ending of the names of such files
 
 _NONE = "none"
-_HEAD = "# Sensor suite of quad_gym; units are SI, angles in rad.\n\n"
+_HEADS = {"SensorSuite": "Sensor suite", "VehicleParams": "Vehicle"}
+
+
+def is_params_file(name: Any) -> bool:
+    """True for the name of a file of a suite or vehicle."""
+    return isinstance(name, str | Path) and Path(name).suffix == SUFFIX
+
+
+def save_params(params: Any, file: str | Path) -> Path:
+    """Write a suite or vehicle to a file; return its path.
+
+    Raises:
+        ValueError: If the path does not end with ".toml".
+        OSError: If it cannot be written.
+    """
+    path = Path(file)
+    if path.suffix != SUFFIX:
+        raise ValueError(f"file must end with {SUFFIX}, got {str(file)!r}")
+    head = f"# {_HEADS[type(params).__name__]} of quad_gym; units are SI, angles in rad.\n\n"
+    path.write_text(head + text_of(params), encoding="utf-8")
+    return path
 
 
 def text_of(suite: Any) -> str:
-    """A suite as TOML, exactly: floating-point numbers have all their digits."""
+    """Parameters as TOML, exactly: floating-point numbers have all their digits."""
     values = {field.name: getattr(suite, field.name) for field in dataclasses.fields(suite)}
     tables = {name: v for name, v in values.items() if dataclasses.is_dataclass(v)}
     parts = [_lines({name: v for name, v in values.items() if name not in tables})]
     for name, table in tables.items():
         fields = {field.name: getattr(table, field.name) for field in dataclasses.fields(table)}
         parts.append(f"[{name}]\n{_lines(fields)}")
-    return _HEAD + "\n".join(part for part in parts if part)
+    return "\n".join(part for part in parts if part)
 
 
-def read_suite(file: Path, kind: type, base_of: Callable[[Any], Any]) -> Any:
-    """The suite, a `SensorSuite`, in a file; `base_of` makes one of the value of `base`."""
+def read_params(file: Path, kind: type, base_of: Callable[[Any], Any]) -> Any:
+    """The suite or vehicle in a file.
+
+    Args:
+        file: A path.
+        kind: `SensorSuite` or `VehicleParams`.
+        base_of: From the value of `base` to an instance.
+
+    Raises:
+        ValueError: If the file is no TOML, or a name or value in it is invalid.
+        OSError: If it cannot be read.
+    """
     try:
         given = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -48,7 +48,7 @@ from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.sensors import NoisyObservationParams, SensorSuite
-from quad_gym.params.suite_files import SUFFIX, read_suite
+from quad_gym.params.suite_files import is_params_file, read_params
 
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
@@ -313,8 +313,8 @@ def sensor_suite(name: str | Path) -> SensorSuite:
         ValueError: If there is no such suite, or a name or value in the file is invalid.
         OSError: If the file cannot be read.
     """
-    if is_suite_file(name):
-        return read_suite(
+    if is_params_file(name):
+        return read_params(
             Path(name), SensorSuite, lambda base: _ALL[check.choice("base", base, ALL_SUITES)]
         )
     if not isinstance(name, str) or name not in _ALL:
@@ -325,17 +325,12 @@ def sensor_suite(name: str | Path) -> SensorSuite:
     return _ALL[name]
 
 
-def is_suite_file(name: Any) -> bool:
-    """True for the name of a file of a suite."""
-    return isinstance(name, str | Path) and Path(name).suffix == SUFFIX
-
-
 def suite_label(name: str) -> str:
     """The name of a suite in titles and names of files: for a file, without folder and ending."""
-    return Path(name).stem if is_suite_file(name) else name
+    return Path(name).stem if is_params_file(name) else name
 
 
 def contents_of_suite_files(*names: Any) -> dict[str, Any]:
     """Suites in files among the names, as an entry of a record of results: files may change."""
-    found = {str(name): sensor_suite(name) for name in names if is_suite_file(name)}
+    found = {str(name): sensor_suite(name) for name in names if is_params_file(name)}
     return {"suite_files": found} if found else {}

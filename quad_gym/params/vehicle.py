@@ -8,7 +8,8 @@ Texas at Austin) whose third laboratory report this package implements.
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,7 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.gravity import GRAVITY
+from quad_gym.params.suite_files import is_params_file, read_params, save_params
 
 LEAST_MOMENT = 1e-9
 """Moment of inertia below which numbers are mistakes; a quadrotor of 10 g has 1e-6 [kg m^2]."""
@@ -113,6 +115,21 @@ class VehicleParams(Checked):
                 "(and rotor_spins, with torque_coefficient over thrust_coefficient as their arm)"
             )
 
+    def save(self, file: str | Path) -> Path:
+        """Write the vehicle to a file, which `quad_gym.vehicle_params` and environments read.
+
+        Args:
+            file: A path that ends with ".toml"; replaced if it exists.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: If the path ends otherwise.
+            OSError: If it cannot be written.
+        """
+        return save_params(self, file)
+
     @property
     def max_rotor_force(self) -> float:
         """Thrust of one rotor at full voltage [N]."""
@@ -199,6 +216,21 @@ CRAZYFLIE = VehicleParams(
 _VEHICLES = {"lab": VehicleParams(), "crazyflie": CRAZYFLIE}
 
 
-def vehicle_params(name: str) -> VehicleParams:
-    """Return the vehicle called `name`: "lab", of the laboratory report, or "crazyflie"."""
-    return _VEHICLES[check.choice("vehicle", name, tuple(_VEHICLES))]
+def vehicle_params(name: str | Path) -> VehicleParams:
+    """A built-in vehicle, or the vehicle in a file.
+
+    Args:
+        name: "lab", of the laboratory report, or "crazyflie"; or a file that ends with ".toml", as
+            `VehicleParams.save` writes it.
+
+    Raises:
+        ValueError: If there is no such vehicle, or a name or value in the file is invalid.
+        OSError: If the file cannot be read.
+    """
+    if is_params_file(name):
+        return read_params(Path(name), VehicleParams, _base)
+    return _base(name, "vehicle")
+
+
+def _base(name: Any, argument: str = "base") -> VehicleParams:
+    return _VEHICLES[check.choice(argument, name, tuple(_VEHICLES))]

@@ -1,0 +1,178 @@
+"""Parameters of the vehicle from a log with motor voltages.
+
+The smoothed trajectory of the log gives attitude, velocity and accelerometer bias. The specific
+force of the model is, in B,
+
+    f_B = a sum_i u_i^2 e3 - c |z_I . v| R_BI v,  du_i/dt = ((1 - s t) e_i - u_i) / tau_m,
+
+with the voltages e_i, a = kF cm^2 / m, c = Cd Ad rho / (2 m), the time constant tau_m of the rotors
+and the relative sag s of the battery. Least squares of the accelerometer's samples minus f_B find
+a, tau_m, c and s. Residuals that are correlated in time widen the intervals by the square root of
+their autocorrelation time.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_gym.estimation.calibration import correlation_time
+from quad_gym.estimation.logs import Floats
+from quad_gym.estimation.replaying import prepared
+from quad_gym.estimation.smoothing import smooth
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import LogDelays, SensorSuite
+from quad_gym.params.vehicle import VehicleParams, vehicle_params
+from quad_gym.rotations import quaternion_to_dcm
+
+_SETTLING = 1.0
+"""Time after the start whose samples do not count [s]."""
+_FIRST_LAG, _FIRST_DRAG = 0.05, 0.01
+"""Values at which the search begins: time constant of the rotors [s], drag over mass [1/m]."""
+
+
+class FittedNumber(NamedTuple):
+    """A number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+class FittedVehicle(NamedTuple):
+    """Result of `fit_vehicle`."""
+
+    vehicle: VehicleParams
+    """the vehicle with the thrust coefficient, drag coefficient and rotor lag that were found"""
+    thrust_over_mass: FittedNumber
+    """kF / m, thrust coefficient over mass [N/(rad/s)^2/kg]"""
+    motor_time_constant: FittedNumber
+    """time constant of the rotors [s]"""
+    drag_over_mass: FittedNumber
+    """Cd Ad rho / (2 m) [1/m]"""
+    sag: FittedNumber
+    """relative decrease of the voltage at the motors [1/s]"""
+    hover_voltage: FittedNumber
+    """voltage at which the rotors carry the weight, with a full battery [V]"""
+
+
+def fit_vehicle(
+    log: Any,
+    *,
+    motors: Mapping[str, ArrayLike],
+    sensors: SensorSuite | str,
+    vehicle: VehicleParams | str = "lab",
+    start: Mapping[str, Any] | None = None,
+    body: str = "flu",
+) -> FittedVehicle:
+    """Find thrust, rotor lag, drag and battery sag of a vehicle from a log.
+
+    Accelerations show forces over the mass: the mass stays as in `vehicle`, and the steady rotor
+    speed per volt as well.
+
+    Args:
+        log: A table or a file, see `read_log`.
+        motors: Commands of the motors: `time` (n,) [s] from which on they hold, and `voltages`
+            (n, 4) [V].
+        sensors: The suite that the smoother assumes, or its name.
+        vehicle: The vehicle to begin with, or its name.
+        start: Keywords of `initialize`, such as `{"heading": 0.5}`.
+        body: Axes of a table, see `read_log`.
+
+    Raises:
+        ValueError: If the log or an argument is invalid, or the commands are not during the flight.
+    """
+    from scipy.optimize import least_squares
+
+    known = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
+    check.instance("vehicle", known, VehicleParams)
+    times, voltages = _commands(motors)
+    whole, suite = prepared(log, sensors, body)
+    suite = suite.replace(log_delays=LogDelays())  # the log has none any more
+    smoothed = smooth(whole, sensors=suite, start=start)
+    first, last = max(smoothed.time[0], times[0]) + _SETTLING, min(smoothed.time[-1], times[-1])
+    ends = whole.imu.time
+    rows = np.flatnonzero((ends[:-1] >= first) & (ends[1:] <= last)) + 1
+    if len(rows) < 100:
+        raise ValueError(
+            "a log must have at least 100 IMU samples with motor commands, from "
+            f"{_SETTLING:g} s after the start on, got {len(rows)}"
+        )
+    R_BI, v, bias = _motion(smoothed, 0.5 * (ends[rows] + ends[rows - 1]))
+    measured = whole.imu.values["accel"][rows] - bias
+    drag_B = -(np.abs((R_BI[:, 2] * v).sum(axis=1)) * np.einsum("nij,nj->in", R_BI, v)).T
+    spans = (ends[rows - 1], ends[rows])
+
+    def residuals(x: Floats) -> Floats:
+        thrust = math.exp(x[0]) * _mean_squares(times, voltages, spans, math.exp(x[1]), x[3])
+        model = x[2] * drag_B
+        model[:, 2] += thrust
+        return (measured - model).ravel()
+
+    squares = known.gravity / (4.0 * known.hover_voltage**2)
+    begin = [math.log(squares), math.log(_FIRST_LAG), _FIRST_DRAG, 0.0]
+    found = least_squares(residuals, begin, x_scale=(0.1, 0.3, 0.02, 1e-3))
+    errors = found.fun.reshape(-1, 3)
+    tau = max(correlation_time(column) for column in errors.T)
+    variance = tau * float((errors**2).sum()) / (errors.size - len(begin))
+    spread = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    return _result(known, found.x, 1.96 * spread)
+
+
+def _commands(motors: Mapping[str, ArrayLike]) -> tuple[Floats, Floats]:
+    """Return checked times (n,) and voltages (n, 4)."""
+    check.keywords(motors, ("time", "voltages"), "motors")
+    times = check.array("motors['time']", motors["time"], (None,))
+    voltages = check.array("motors['voltages']", motors["voltages"], (len(times), 4))
+    if len(times) < 2 or not (np.diff(times) > 0.0).all():
+        raise ValueError("motors['time'] must increase")
+    return times, voltages
+
+
+def _result(known: VehicleParams, x: Floats, reach: Floats) -> FittedVehicle:
+    """Return the result for the coordinates log a, log tau_m, c, s, with half their intervals."""
+    ends = (x, x - reach, x + reach)
+    squares, lag = (FittedNumber(*(math.exp(end[k]) for end in ends)) for k in (0, 1))
+    drag, sag = (FittedNumber(*(float(end[k]) for end in ends)) for k in (2, 3))
+    per_speed = known.motor_speed_per_volt**2
+    full_drag = 0.5 * known.disc_area * known.air_density / known.mass
+    changes = {
+        "thrust_coefficient": squares.value * known.mass / per_speed,
+        "motor_time_constant": lag.value,
+    }
+    if full_drag:
+        changes["drag_coefficient"] = max(0.0, drag.value) / full_drag
+    hover = [
+        math.sqrt(known.gravity / (4.0 * a)) for a in (squares.value, squares.high, squares.low)
+    ]
+    per_mass = FittedNumber(*(a / per_speed for a in squares))
+    return FittedVehicle(known.replace(**changes), per_mass, lag, drag, sag, FittedNumber(*hover))
+
+
+def _motion(smoothed: Any, times: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return attitudes (n, 3, 3), velocities (n, 3) and accelerometer biases (n, 3) at times."""
+    nearest = np.clip(np.searchsorted(smoothed.time, times), 0, len(smoothed.time) - 1)
+    v, bias = (
+        np.column_stack([np.interp(times, smoothed.time, axis) for axis in values.T])
+        for values in (smoothed.velocity, smoothed.accel_bias)
+    )
+    return quaternion_to_dcm(smoothed.quaternion[nearest]), v, bias
+
+
+def _mean_squares(
+    times: Floats, voltages: Floats, spans: tuple[Floats, Floats], lag: float, sag: float
+) -> Floats:
+    """Return means over spans of the sum of u_i^2, the squared speeds of the rotors in volts."""
+    reached = voltages * (1.0 - sag * (times - times[0]))[:, np.newaxis]
+    decay = np.exp(-np.diff(times) / lag)
+    u = np.empty_like(reached)
+    u[0] = reached[0]
+    for k, keep in enumerate(decay):
+        u[k + 1] = reached[k] + keep * (u[k] - reached[k])
+    squares = (u**2).sum(axis=1)
+    steps = 0.5 * (squares[1:] + squares[:-1]) * np.diff(times)
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    begins, ends = (np.interp(span, times, total) for span in spans)
+    return np.asarray((ends - begins) / (spans[1] - spans[0]))

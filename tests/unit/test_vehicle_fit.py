@@ -1,0 +1,60 @@
+"""The vehicle of a simulated log is found, and kept in a file."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import VehicleParams, vehicle_params
+from quad_gym.estimation import fit_vehicle
+from tests.logged_flights import RTK, Recorded, flown
+
+LAB = VehicleParams()
+TRUE = LAB.replace(
+    thrust_coefficient=1.2 * LAB.thrust_coefficient, motor_time_constant=0.08, drag_coefficient=3.0
+)
+
+
+@pytest.fixture(scope="module")
+def found():
+    flight = flown(RTK, 12.0, task="lemniscate", vehicle=TRUE)
+    table = Recorded(flight, lost=0.0, jitter=0.0).table()
+    motors = {"time": flight["time"][:-1], "voltages": flight.about["voltages"][1:]}
+    return fit_vehicle(table, motors=motors, sensors=RTK)
+
+
+@pytest.mark.parametrize(
+    ("name", "true", "width"),
+    [
+        ("thrust_over_mass", TRUE.thrust_coefficient / TRUE.mass, 0.05),
+        ("motor_time_constant", TRUE.motor_time_constant, 0.5),
+        ("drag_over_mass", 0.5 * 3.0 * TRUE.disc_area * TRUE.air_density / TRUE.mass, 1.0),
+        ("hover_voltage", TRUE.hover_voltage, 0.05),
+    ],
+)
+def test_number_of_a_simulated_vehicle_is_within_a_narrow_interval(found, name, true, width):
+    number = getattr(found, name)
+    assert number.low < true < number.high
+    assert number.high - number.low < width * true
+
+
+def test_battery_of_a_simulation_does_not_sag(found):
+    assert found.sag.low < 0.0 < found.sag.high
+
+
+def test_vehicle_that_was_found_flies_from_a_file(found, tmp_path):
+    file = found.vehicle.save(tmp_path / "mine.toml")
+    assert vehicle_params(file) == vehicle_params(str(file)) == found.vehicle
+    env = quad_gym.QuadEnv("circle", vehicle=str(file))
+    env.reset(seed=0)
+    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+
+
+def test_file_with_unknown_field_is_refused(tmp_path):
+    (tmp_path / "mine.toml").write_text("mas = 1.0\n")
+    with pytest.raises(ValueError, match="mas is not a field of VehicleParams"):
+        vehicle_params(tmp_path / "mine.toml")
+
+
+def test_motor_commands_must_have_a_row_for_each_time():
+    with pytest.raises(ValueError, match="voltages"):
+        fit_vehicle({}, motors={"time": [0.0, 1.0], "voltages": np.zeros((3, 4))}, sensors=RTK)
