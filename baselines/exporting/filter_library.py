@@ -120,8 +120,8 @@ def _contents(
         is_cached,
         loaded_size,
         object_of,
-        symbol_of,
     )
+    from quad_gym.kernels.library import core_symbol
 
     sources, processor = (
         Sources(suite, label, target, policy),
@@ -135,7 +135,7 @@ def _contents(
             tasks = [pool.submit(object_of, name, processor) for name in missing]
             for task in tasks:
                 task.result()
-    objects = {symbol_of(name): object_of(name, processor) for name in sources.functions}
+    objects = {core_symbol(name): object_of(name, processor) for name in sources.functions}
     for symbol, numbers in sources.constants.items():
         text = "".join(f"\\{byte:02X}" for byte in numbers)
         ir = f'@{symbol} = constant [{len(numbers)} x i8] c"{text}", align 64\n'

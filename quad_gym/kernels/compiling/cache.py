@@ -24,6 +24,7 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from quad_gym.kernels.digest import digest_of_function
+from quad_gym.kernels.library import say
 from quad_gym.records import WIDTH
 
 _FORM = 4
@@ -35,12 +36,6 @@ _LOCATORS = (
     caching.InTreeCacheLocator,  # __pycache__ next to the kernels
     caching.UserWideCacheLocator,  # the user's cache folder, where the package is read-only
 )
-
-
-def say(text: str, end: str = "\n") -> None:
-    """Write a line to standard error, if there is one."""
-    if sys.stderr is not None:
-        print(text, file=sys.stderr, end=end, flush=True)
 
 
 def where_cached(*folders: Path | None) -> str:
