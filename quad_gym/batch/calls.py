@@ -17,10 +17,7 @@ Word = int | NDArray[Any] | Sequence[NDArray[Any]]
 
 
 class Calls:
-    """The calls of all threads of a batch; they keep its memory alive, not the batch.
-
-    `kept` are arrays whose addresses others hold.
-    """
+    """The calls of all threads of a batch; they keep its memory and the `kept` arrays alive."""
 
     def __init__(
         self,

@@ -22,7 +22,7 @@ def nearest_obstacle(
     """Return distances (n,) of points (n, 3) in I from the nearest obstacle's surface [m].
 
     They are negative inside, and infinite without obstacles. The second array (n, 3) holds vectors
-    to the nearest points, in I [m]; `centers` (n, obstacles, 3) are those of the obstacles.
+    to the nearest points, in I [m]; `centers` (n, obstacles, 3) belong to the obstacles.
     """
     distances, vectors = np.full(len(points), np.inf), np.zeros((len(points), 3))
     given = (np.ascontiguousarray(array, np.float64) for array in (points, centers))

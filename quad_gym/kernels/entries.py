@@ -120,7 +120,6 @@ _TAPE = (Rows(SAMPLE), Rows(MEASUREMENT), Rows(OPERATION))
 _VECTOR, _MATRIX, _CUBE = (Rows(np.dtype(np.float64), axes) for axes in (1, 2, 3))
 _INDICES, _MASK = Rows(np.dtype(np.int64)), Rows(np.dtype(np.bool_), 2)
 _WORDS, _SLOTS = Rows(np.dtype(np.uint64)), Rows(np.dtype(np.uint64), 2)
-_PIXELS = Rows(np.dtype(np.uint32), 2)
 
 fly = Entry("batch:fly", int, int, int, int, int, bool, returns=bool)
 run_tape = Entry(
@@ -161,7 +160,6 @@ turn_gnss_baseline = Entry("single:turn_gnss_baseline", _FLIGHT, _PARAMS)
 limit_features = Entry("single:limit_features", _FLIGHT, _PARAMS, bool, bool, int)
 nearest_obstacles = Entry("single:nearest_obstacles", _MATRIX, _CUBE, _SETTINGS, _VECTOR, _MATRIX)
 hide_points = Entry("single:hide_points", _MATRIX, _CUBE, _CUBE, _SETTINGS, _MASK)
-halve = Entry("pictures:halve", _PIXELS, _PIXELS)
 
 FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
 """Stages that a filter runs, as far as it needs them."""

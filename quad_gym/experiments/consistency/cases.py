@@ -116,12 +116,7 @@ def case_table(
 ) -> list[str]:
     """Lines of a table in Markdown: misses bold, or in italics if there is a reason.
 
-    Args:
-        first: Heading of the first column.
-        columns: Headings by name of the column.
-        cells: Results of the cases.
-        text: Format of a value.
-        *head: Rows above the cases.
+    `columns` are headings by name of the column, and rows in `head` are above the cases.
     """
     rows = [[first, *columns.values(), "remarks"], *head]
     for label, cell in cells.items():
