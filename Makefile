@@ -100,7 +100,7 @@ wheel: kernels  ## build sdist and a wheel with the libraries into dist, and che
 	QUAD_GYM_WHEEL=$$(uname -m) $(BIN)/python -m build --installer pip --wheel
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
-	$(BIN)/auditwheel show dist/*.whl | tee /dev/stderr | grep -q manylinux_2_17
+	$(BIN)/auditwheel show dist/*.whl | tee /dev/stderr | grep -q '"manylinux_2_'
 
 clean:
 	rm -rf quad_gym/kernels/libraries

@@ -27,7 +27,7 @@ class KernelsHook(BuildHookInterface[Any]):
             return
         package = Path(self.root, "quad_gym")
         functions = runpy.run_path(str(package / "kernels" / "sources.py"))
-        libraries = sorted((package / "kernels" / "libraries").glob(f"kernels-{family}-*.so"))
+        libraries = sorted((package / "kernels" / "libraries").glob(f"kernels_{family}_*.so"))
         digest = functions["sources_digest"](package)
         stale = [f.name for f in libraries if functions["digest_in"](f.read_bytes()) != digest]
         if stale or not libraries:

@@ -29,7 +29,7 @@ def machine() -> str:
 
 def file_of(lanes: int) -> Path:
     """Return the file of this machine's library with a number of lanes."""
-    return FOLDER / f"kernels-{machine()}-{lanes}.so"
+    return FOLDER / f"kernels_{machine()}_{lanes}.so"
 
 
 def core_symbol(name: str) -> str:

@@ -56,14 +56,14 @@ def test_missing_or_stale_library_is_an_error_where_it_is_demanded(folder, monke
     if stale:
         write_stale()
     monkeypatch.setenv("QUAD_GYM_KERNELS", "library")
-    why = "belongs to other sources" if stale else "there is no kernels-"
+    why = "belongs to other sources" if stale else "there is no kernels_"
     with pytest.raises(ImportError, match=f"cannot be used: .*{why}"):
         library()
 
 
 def test_message_names_the_extra_where_numba_is_missing(folder, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"there is no kernels-.*quad-gym\[compile\]"):
+    with pytest.raises(ImportError, match=r"there is no kernels_.*quad-gym\[compile\]"):
         library()
 
 
@@ -77,7 +77,7 @@ def test_library_for_wider_registers_than_the_processor_has_is_not_used(folder, 
     write_stale()
     monkeypatch.setattr(libraries, "runs_lanes", lambda lanes: False)
     monkeypatch.setenv("QUAD_GYM_KERNELS", "library")
-    with pytest.raises(ImportError, match="this processor does not run kernels-"):
+    with pytest.raises(ImportError, match="this processor does not run kernels_"):
         library()
 
 
