@@ -25,7 +25,7 @@ LIBRARY, HEADER = "libquad_gym_filter.a", "quad_gym_filter.h"
 class Target(NamedTuple):
     """A processor for which filters are exported."""
 
-    processor: tuple[str, ...]
+    processor: tuple[str, str, str]
     """triple of four parts, processor and relocation, in LLVM's words"""
     words: str
     """description"""
@@ -42,12 +42,12 @@ clang --target=wasm32-wasi --sysroot=/usr -std=c99 -O2 -D_WASI_EMULATED_PROCESS_
     main.c libquad_gym_filter.a -lm -lwasi-emulated-process-clocks -o example.wasm  # wasi-libc"""
 TARGETS = {
     "x86-64": Target(
-        ("x86_64-unknown-linux-gnu", "x86-64-v3"),
+        ("x86_64-unknown-linux-gnu", "x86-64-v3", "pic"),
         "Linux on x86-64 with AVX2 and FMA (since 2013)",
         _CMAKE,
     ),
     "aarch64": Target(
-        ("aarch64-unknown-linux-gnu", "generic"),
+        ("aarch64-unknown-linux-gnu", "generic", "pic"),
         "Linux on AArch64",
         _CMAKE.replace("build &&", "build -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc &&", 1),
     ),
@@ -110,7 +110,6 @@ def _contents(
 ) -> dict[str, bytes]:
     """Return the files by name; records must have one lane."""
     from baselines.exporting.filter_sources import Sources
-    from quad_gym.kernels.compiling.cache import say
     from quad_gym.kernels.compiling.foreign import (
         Processor,
         emitted,
@@ -118,7 +117,7 @@ def _contents(
         loaded_size,
         object_of,
     )
-    from quad_gym.kernels.library import core_symbol
+    from quad_gym.kernels.library import core_symbol, say
 
     sources = Sources(suite, label, target, policy)
     processor = Processor(*TARGETS[target].processor)

@@ -71,7 +71,7 @@ class Entry:
             _check(self.name, wanted, given[k])
         if library() is None:
             return functools.partial(self._function, *given)
-        words = []
+        words: list[int] = []
         for value in given:
             if isinstance(value, np.ndarray):
                 words += (value.ctypes.data, *value.shape)
