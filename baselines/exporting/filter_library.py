@@ -76,10 +76,12 @@ def export_filter(
     Raises:
         ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
             observes more than the estimate.
+        ImportError: If Numba is not installed.
         RuntimeError: If the kernels cannot be emitted for the target.
     """
     check.choice("target", target, tuple(TARGETS))
     suite.require_filter()
+    check.package("numba", "exporting a filter", "compile")
     values = {} if policy is None else policy_values(policy)
     env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))

@@ -28,6 +28,7 @@ from typing import Any, Literal
 
 from quad_gym.commands.options import require_at_least, usage_errors
 from quad_gym.kernels.library import library
+from quad_gym.params import checks as check
 
 Kind = Literal["plain", "truth", "single", "all"]
 
@@ -84,12 +85,14 @@ def main(args: CompileArgs) -> int:
     Returns:
         Exit code.
     """
-    if args.library:
-        return _build(args)
-    found = library()
-    if found is not None:
-        print(f"nothing to compile: {found.file.name} has all functions")
-        return 0
+    with usage_errors((ValueError, RuntimeError, ImportError)):
+        found = None if args.library else library()
+        if found is not None:
+            print(f"nothing to compile: {found.file.name} has all functions")
+            return 0
+        check.package("numba", "compiling", "compile")
+        if args.library:
+            return _build(args)
     from quad_gym.kernels.compiling.cache import where_cached
     from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
 
@@ -113,11 +116,10 @@ def main(args: CompileArgs) -> int:
 
 def _build(args: CompileArgs) -> int:
     """Build the libraries, and list them with their sizes."""
-    with usage_errors((ValueError, RuntimeError, ImportError)):
-        from quad_gym.kernels.compiling.building import build
+    from quad_gym.kernels.compiling.building import build
 
-        for file in build(args.lanes, args.jobs):
-            print(f"{file.stat().st_size / 1e6:.1f} MB  {file}")
+    for file in build(args.lanes, args.jobs):
+        print(f"{file.stat().st_size / 1e6:.1f} MB  {file}")
     return 0
 
 

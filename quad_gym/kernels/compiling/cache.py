@@ -27,7 +27,7 @@ from quad_gym.kernels.digest import digest_of_function
 from quad_gym.kernels.library import say
 from quad_gym.records import WIDTH
 
-_FORM = 4
+_FORM = 5
 """Version of the files' contents and of the compilation; after a change, no older file is found."""
 KEPT = 8
 """Number of files kept for a function: the latest for other sources, processors or signatures."""
@@ -75,11 +75,9 @@ def _written(arguments: tuple[Any, ...]) -> str:
 
 def _compiler(context: Any) -> str:
     """The compiler, its options, and the processor that it compiles for."""
-    from quad_gym.kernels.compiling.decorators import LEAN
-
     options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
     versions = f"{numba.__version__} {llvmlite.__version__}"
-    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {LEAN} {WIDTH} {options}"
+    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {WIDTH} {options}"
 
 
 def _needed(module: Any) -> tuple[str, ...]:

@@ -26,12 +26,7 @@ _KEPT = 8
 """Number of cached files of a kind for a function."""
 _FORM = 2
 """Version of the emission; after a change, no older object is found."""
-_LIBRARY = re.compile(
-    r"sin|cos|sqrt|"
-    r"llvm\.(sin|cos|sqrt|fma|fabs|copysign|floor|rint|roundeven|fsh[lr]|[su](min|max)|abs|ctpop|"
-    r"mem(cpy|set|move)|lifetime|assume|experimental|vector|is|masked|prefetch|"
-    r"x86\.sse2\.pause|aarch64\.hint)\b.*"
-)
+_LIBRARY = re.compile(r"sin|cos|sqrt|llvm\..*")
 """Functions that emitted code may call: LLVM's, and those of a C library."""
 
 

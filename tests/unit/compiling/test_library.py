@@ -105,6 +105,18 @@ def test_missing_compiler_is_named(monkeypatch):
         building.require_compiler()
 
 
+@pytest.mark.parametrize("lanes", ["3", "16", "eight"])
+def test_a_number_of_lanes_that_there_is_not_is_refused(lanes):
+    done = subprocess.run(
+        [sys.executable, "-c", "import quad_gym.records"],
+        env=os.environ | {"PYTHONPATH": str(PACKAGE.parent), "QUAD_GYM_LANES": lanes},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert f"QUAD_GYM_LANES must be 2, 4 or 8, got '{lanes}'" in done.stderr
+
+
 # ---- with libraries, which take minutes to build, or seconds if most code is cached -----------
 
 
