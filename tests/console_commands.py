@@ -1,7 +1,5 @@
 """Commands run in the test's own process, which has imported already what each would import anew.
-
-What needs a process of its own, such as a signal, starts one by `line`.
-"""
+What needs a process of its own, such as a signal, starts one by `line`."""
 
 import contextlib
 import io

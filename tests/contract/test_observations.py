@@ -144,9 +144,6 @@ def test_the_privileged_part_is_the_truth(source):
     close(seen["rotor_speeds"], batch.record("rotor_speeds") / hover)
 
 
-# ---- sensors -------------------------------------------------------------------------------------
-
-
 def test_measurements_come_with_flags_at_their_own_rates():
     # looking at the origin from where the camera sees both features
     suite = quad_gym.sensor_suite("standard").with_rates(gnss=10.0, camera=25.0)
@@ -241,9 +238,6 @@ def test_measurements_scatter_about_what_the_true_state_implies():
         assert inside.mean() > 0.5
         noise = (seen[f"feature_{k}"] * half - pixel)[inside]
         np.testing.assert_allclose(noise.std(axis=0), camera.pixel_sigma, rtol=0.1)
-
-
-# ---- noise ---------------------------------------------------------------------------------------
 
 
 def test_noisy_observations_have_the_stated_noise_and_no_memory():

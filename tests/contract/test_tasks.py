@@ -157,9 +157,6 @@ def test_rest_on_the_reference_has_nearly_the_largest_reward():
     assert 1.5 < reward <= 1.6
 
 
-# ---- endings -------------------------------------------------------------------------------------
-
-
 def last_step(env, action, *, start=None, seed=1):
     env.reset(seed=seed, options=start)
     for _ in range(2000):
@@ -260,9 +257,6 @@ def test_failed_filter_truncates_with_finite_observations(privileged):
     _, info = env.reset(seed=2)
     assert info["filter_status"] == 0
     assert not any(env.step(STILL)[2:4])
-
-
-# ---- starts --------------------------------------------------------------------------------------
 
 
 def test_a_hovering_start_has_the_documented_spread():

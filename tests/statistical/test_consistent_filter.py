@@ -1,9 +1,7 @@
 """The suites' filters are consistent, for UKF and EKF alike; the report's is not, by how much.
-
 Means over 1,500 flights of random trajectories, on the estimate, judged by the band of 1,000
 flights. Errors of biases last for seconds, so that the means of fewer flights are all high or all
-low for long, by chance.
-"""
+low for long, by chance."""
 
 import numpy as np
 import pytest

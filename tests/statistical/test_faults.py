@@ -1,11 +1,9 @@
 """Outages, outliers and jumps over 1,000 flights: the filter knows how lost it is, and comes back.
-
 "Inside 3 sigma" of an error of d numbers means that its normalized square is below the chi-square
 quantile that holds 99.73 % of a consistent filter's errors, as 3 sigma do of a single number. Of
 1,000 flights of such a filter nearly three lie outside at any given instant, so that no filter can
 have all of them inside at one instant; it must have each of them inside at some instant of the time
-allowed, and all of them within the quantile of 1e-6 in 1,000 at its end.
-"""
+allowed, and all of them within the quantile of 1e-6 in 1,000 at its end."""
 
 import numpy as np
 import pytest
@@ -35,11 +33,9 @@ def of_kind(suite, kind):
 @pytest.mark.parametrize("suite", [LAB, RTK], ids=["euler", "midpoint"])
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
 def test_uncertainty_at_rest_grows_in_closed_form(kind, suite):
-    """Double and triple integrals of white noise and of constants, at rest and level.
-
-    Gravity couples tilt into horizontal acceleration; constant biases, for their time constant is a
-    million years here.
-    """
+    """Double and triple integrals of white noise and of constants, at rest and level. Gravity
+    couples tilt into horizontal acceleration; constant biases, for their time constant is a million
+    years here."""
     forever = {"accel_bias_tau": 3e13, "gyro_bias_tau": 3e13}
     suite = suite.replace(imu=suite.imu.replace(**forever))
     g, dt = suite.estimator.gravity, suite.imu.dt
@@ -61,12 +57,10 @@ def test_uncertainty_at_rest_grows_in_closed_form(kind, suite):
 
 
 def hovering_theory(P, attitudes, sensors, step):
-    """(15, 15) covariance after some steps [s] without fixes, of a vehicle that hovers level.
-
-    The continuous error model, dr' = dv, dv' = R^T (de x f - db_a) + noise, de' = -db_g + noise,
-    db' = -db / tau + noise, with f = g e3 and the attitude R that the filter believes in, (n, 3, 3)
-    for n steps, integrated by Van Loan's matrix exponential.
-    """
+    """(15, 15) covariance after some steps [s] without fixes, of a vehicle that hovers level. The
+    continuous error model, dr' = dv, dv' = R^T (de x f - db_a) + noise, de' = -db_g + noise, db' =
+    -db / tau + noise, with f = g e3 and the attitude R that the filter believes in, (n, 3, 3) for n
+    steps, integrated by Van Loan's matrix exponential."""
     imu, g = sensors.imu, sensors.estimator.gravity
     F, Q = np.zeros((15, 15)), np.zeros((15, 15))
     F[R, V], F[E, BG] = np.eye(3), -np.eye(3)

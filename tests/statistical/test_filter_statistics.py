@@ -1,8 +1,6 @@
-"""What the filter believes of its errors, and what they are: over thousands of flights.
-
-Seeds are fixed, so a run of these tests is repeatable; the bounds leave a false alarm less often
-than once in a million draws of seeds.
-"""
+"""What the filter believes of its errors, and what they are: over thousands of flights. Seeds are
+fixed, so a run of these tests is repeatable; the bounds leave a false alarm less often than once in
+a million draws of seeds."""
 
 import numpy as np
 import pytest
@@ -27,11 +25,9 @@ def circle_batch(sensors=LAB, source=Source.ESTIMATE, **options):
 
 
 def whitened_errors_on_imu_alone(rates, runs, seed):
-    """(15, runs) errors after half a second without fixes, whitened by the filter's own factor.
-
-    The runs follow the model of the process with their own noise, given the same IMU samples; the
-    vehicle turns at constant `rates` [rad/s].
-    """
+    """(15, runs) errors after half a second without fixes, whitened by the filter's own factor. The
+    runs follow the model of the process with their own noise, given the same IMU samples; the
+    vehicle turns at constant `rates` [rad/s]."""
     ticks, imu, dt = 100, LAB.imu, LAB.imu.dt
     rng = np.random.default_rng(seed)
     sigmas = np.repeat([0.01, 0.02, 0.02, 0.05, 0.001], 3)
@@ -67,10 +63,8 @@ def whitened_errors_on_imu_alone(rates, runs, seed):
 
 @pytest.mark.parametrize("yaw_rate", [0.0, 0.6])
 def test_predicted_covariance_is_that_of_many_runs(yaw_rate):
-    """The sample covariance of 15 whitened errors is the identity, in all of its 225 entries.
-
-    By chance its eigenvalues lie within (1 +- sqrt(15/20,000))^2 = 1 +- 5.5 %, and hardly stray.
-    """
+    """The sample covariance of 15 whitened errors is the identity, in all of its 225 entries. By
+    chance its eigenvalues lie within (1 +- sqrt(15/20,000))^2 = 1 +- 5.5 %, and hardly stray."""
     runs = 20_000
     whitened = whitened_errors_on_imu_alone((0.0, 0.0, yaw_rate), runs, seed=11)
     eigenvalues = np.linalg.eigvalsh(np.cov(whitened))
@@ -81,10 +75,8 @@ def test_predicted_covariance_is_that_of_many_runs(yaw_rate):
 
 def test_covariance_of_a_rolling_vehicle_turns_too_little():
     """Known: the report's filter sets e to zero after each step and leaves its covariance alone.
-
     The new error angles are not the old ones less their mean, as rotations do not add: a turn about
-    the body's z axis loses nothing, in one about x or y the covariance lags behind by the angle.
-    """
+    the body's z axis loses nothing, in one about x or y the covariance lags behind by the angle."""
     whitened = whitened_errors_on_imu_alone((0.5, 0.0, 0.0), 4000, seed=12)
     eigenvalues = np.linalg.eigvalsh(np.cov(whitened))
     assert 1.3 < eigenvalues[-1] < 2.5
@@ -105,11 +97,9 @@ def test_the_errors_are_about_as_large_as_the_filter_believes(sensors):
 
 
 def test_noise_across_measured_directions_is_overconfident():
-    """Known: the report's form takes the gap between two directions for information along one.
-
-    A median flight is off by half, and the worst by far, which is why `bearing_noise_at` can be
-    "predicted". The form is kept, as the report defines it.
-    """
+    """Known: the report's form takes the gap between two directions for information along one. A
+    median flight is off by half, and the worst by far, which is why `bearing_noise_at` can be
+    "predicted". The form is kept, as the report defines it."""
     values = nees_after_five_seconds(LAB)
     assert np.median(values) > 18.0
     assert values.mean() > 30.0

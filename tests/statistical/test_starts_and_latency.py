@@ -72,12 +72,10 @@ def test_any_yaw_is_known_to_a_degree_within_ten_seconds(name, camera):
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("camera", [True, False], ids=["camera", "no camera"])
 def test_a_vertical_baseline_does_no_harm(camera, start):
-    """From any yaw, which the mark of the start tells: the filter stays consistent and close.
-
-    A filter that has hovered knows the balance of tilt and accelerometer bias to 0.4 mrad. Half the
+    """From any yaw, which the mark of the start tells: the filter stays consistent and close. A
+    filter that has hovered knows the balance of tilt and accelerometer bias to 0.4 mrad. Half the
     square of a heading wrong by 50 mrad is more than that: without a camera the error angles bend
-    too much for it at first, and NEES is 22. It is right for a heading known to 20 mrad.
-    """
+    too much for it at first, and NEES is 22. It is right for a heading known to 20 mrad."""
     suite = BASELINE_UP if camera else BASELINE_UP.replace(camera=None)
     if start == "warm" and not camera:
         suite = suite.replace(initial_pose=quad_gym.InitialPoseParams(heading_sigma=0.02))

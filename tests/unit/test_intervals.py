@@ -1,7 +1,5 @@
 """Confidence intervals: their coverage by simulation, and closed forms and SciPy's where there are.
-
-A coverage of 95 % over 2,000 draws has a standard deviation of 0.5 %.
-"""
+A coverage of 95 % over 2,000 draws has a standard deviation of 0.5 %."""
 
 import numpy as np
 import pytest

@@ -34,9 +34,6 @@ OUTAGE, JUMP = int(FaultKind.GNSS_OUTAGE), int(FaultKind.GNSS_JUMP)
 KERNELS = Path(quad_gym.kernels.__file__).parent
 
 
-# ---- the table -------------------------------------------------------------------------------
-
-
 def test_no_two_ranges_share_a_draw():
     owners = {}
     for quantity, first, count in DRAW_RANGES:
@@ -54,8 +51,6 @@ def test_a_draw_that_is_taken_is_refused(end):
         _claim("a test", first, 3)
     assert before == DRAW_RANGES
 
-
-# ---- what the kernels draw -------------------------------------------------------------------
 
 DRAWS_OF = {
     "uniform_pair": 1,
@@ -142,9 +137,6 @@ def test_every_range_is_drawn_from():
         assert len(taken) >= 0.6 * count, quantity  # a fault leaves some of its draws to others
 
 
-# ---- what an episode begins with -------------------------------------------------------------
-
-
 def angle_of(vectors):
     return np.arctan2(vectors[:, 1], vectors[:, 0])
 
@@ -217,10 +209,8 @@ def quantities_of(batch, task):
 
 
 def features_of(quantities):
-    """Functions of the ranks of each quantity, centered, of unit length: (COUNT, n, 4).
-
-    They see whether one quantity is a function of another, be it an angle or its double.
-    """
+    """Functions of the ranks of each quantity, centered, of unit length: (COUNT, n, 4). They see
+    whether one quantity is a function of another, be it an angle or its double."""
     columns = []
     for name, values in quantities.items():
         u = (stats.rankdata(values) - 0.5) / len(values)
