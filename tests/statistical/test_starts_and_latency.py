@@ -5,8 +5,6 @@ import pytest
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.analysis.consistency import InnovationRecorder, NeesRecorder
-from tests.consistent import assert_consistent
 from tests.field_flights import attitudes, fly, nees, small_euler_angles, state_errors, steps
 
 ANY_YAW = {"start_yaw": Uniform(-np.pi, np.pi)}
@@ -29,25 +27,6 @@ def yaw_errors(batch):
     """(n,) degrees."""
     R_error = attitudes(batch.record("q")) @ batch.record("R_hat").transpose(0, 2, 1)
     return np.degrees(np.abs(small_euler_angles(R_error)[:, 2]))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ukf", "ekf"])
-@pytest.mark.parametrize("late", [False, True], ids=["prompt", "late"])
-def test_a_warm_filter_is_consistent_from_the_first_instant_on(kind, late):
-    """NEES of state and blocks and NIS of all sensors in their bands, innovations white."""
-    suite = delayed(RTK, kind) if late else RTK.replace(estimator=RTK.estimator.replace(kind=kind))
-    batch = fly(suite, 1000, filter_start="warm")
-    recorder = NeesRecorder()
-    innovations = InnovationRecorder(batch, np.linspace(0.0, 10.0, 201))
-    recorder.add(batch, 0.0)
-    for tick in range(1, 2001):
-        batch.step()
-        innovations.add(batch, tick / 200)
-        if tick % 10 == 0:
-            recorder.add(batch, tick / 200)
-    assert not batch.record("filter_status").any()
-    assert_consistent(recorder.nees(), innovations.nis(), innovations.whiteness())
 
 
 @pytest.mark.slow
