@@ -1,8 +1,6 @@
-"""Logs of simulated flights, as a recorder on board would have written them.
-
-IMU samples at irregular times (means over one to three ticks), some lost; measurements with their
-right time stamps, some lost, arriving with a jitter beside their latency. As CSV and as ULog.
-"""
+"""Logs of simulated flights, as a recorder on board would have written them. IMU samples at
+irregular times (means over one to three ticks), some lost; measurements with their right time
+stamps, some lost, arriving with a jitter beside their latency. As CSV and as ULog."""
 
 import csv
 import struct
