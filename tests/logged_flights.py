@@ -48,7 +48,7 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
         observation = env.step(policy.predict(observation)[0])[0]
         recorder.keep()
         keep_aids()
-    recorder.flight.about |= {"aids": np.array(aids), "voltages": np.array(voltages)}
+    recorder.flight.about.update(aids=np.array(aids), voltages=np.array(voltages))
     return recorder.flight
 
 
