@@ -10,7 +10,7 @@ In a file of a suite, a table for each sensor has the fields of its parameters b
 
 Units are SI, angles in rad. Without `base` all tables are required; fields that a table leaves out
 have the defaults of its class, which are the laboratory's. A file of a vehicle has the fields of
-`VehicleParams`; ``base`` may name a built-in vehicle.
+`VehicleParams`, all of them without `base`.
 """
 
 import dataclasses
@@ -81,9 +81,9 @@ def read_params(file: Path, kind: type, base_of: Callable[[Any], Any]) -> Any:
         base = base_of(given.pop("base")) if "base" in given else None
         for field in dataclasses.fields(kind):
             if base is None and field.default is not None and field.name not in given:
-                raise ValueError(
-                    f'there must be a table [{field.name}], or base = "NAME" of a suite'
-                )
+                number = isinstance(field.default, float | tuple)
+                what = f"a value {field.name}" if number else f"a table [{field.name}]"
+                raise ValueError(f'there must be {what}, or base = "NAME" of a built-in one')
         return _built(kind, given, base, "")
     except (ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from None

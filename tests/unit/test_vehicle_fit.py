@@ -49,9 +49,17 @@ def test_vehicle_that_was_found_flies_from_a_file(found, tmp_path):
     assert np.isfinite(env.step(env.action_space.sample())[0]).all()
 
 
-def test_file_with_unknown_field_is_refused(tmp_path):
-    (tmp_path / "mine.toml").write_text("mas = 1.0\n")
-    with pytest.raises(ValueError, match="mas is not a field of VehicleParams"):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('base = "lab"\nmas = 1.0\n', "mas is not a field of VehicleParams"),
+        ("mass = 1.0\n", "there must be a value inertia"),
+        ('base = "la"\n', "base must be one of"),
+    ],
+)
+def test_file_of_a_vehicle_with_a_mistake_is_refused(text, message, tmp_path):
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(ValueError, match=message):
         vehicle_params(tmp_path / "mine.toml")
 
 
