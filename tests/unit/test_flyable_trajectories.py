@@ -64,25 +64,9 @@ def test_what_a_motion_takes_is_what_makes_it(options, closed):
     assert demand.speed == pytest.approx(speed, rel=1e-3)
     assert demand.acceleration == pytest.approx(acceleration, rel=1e-3)
     assert demand.thrust == pytest.approx((force.min(), force.max()), rel=1e-3)
+    rates = np.abs(motion_of(path, VEHICLE, fine).body_rates).max(axis=0)
+    assert demand.body_rates == pytest.approx(rates, rel=1e-3)
     assert demand.tilt == pytest.approx(np.arccos(attitudes(path, fine)[:, 2, 2]).max(), rel=1e-3)
-
-
-def test_a_circle_takes_what_books_say():
-    """At 5 m and 4 m/s: tilt atan(v^2 / r g), thrust m sqrt(g^2 + (v^2/r)^2), yaw rate v / r."""
-    rate = 4.0 / 5.0
-    path = Trajectory.of(
-        lambda t: (5.0 * math.cos(rate * t), 5.0 * math.sin(rate * t), 1.0),
-        2.0 * math.pi / rate,
-        closed=True,
-        yaw="along",
-    )
-    inward, g = 16.0 / 5.0, VEHICLE.gravity
-    demand, tilt = path.check(VEHICLE), math.atan(inward / g)
-    assert demand.tilt == pytest.approx(tilt, rel=1e-4)
-    assert demand.thrust == pytest.approx([VEHICLE.mass * math.hypot(g, inward)] * 2, rel=1e-4)
-    assert demand.body_rates[2] == pytest.approx(rate * math.cos(tilt), rel=1e-3)
-    assert demand.body_rates[0] == pytest.approx(0.0, abs=1e-3)
-    assert demand.body_rates[1] == pytest.approx(rate * math.sin(tilt), rel=1e-3)
 
 
 def test_what_cannot_be_flown_is_refused_with_its_place_and_size():

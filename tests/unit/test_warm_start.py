@@ -46,7 +46,7 @@ def estimated_biases(batch):
 
 
 @pytest.mark.parametrize("name", SUITES)
-@pytest.mark.parametrize("start", ["hover", "ground"])
+@pytest.mark.parametrize("start", ["hover", "ground", "moving"])
 def test_whitened_errors_of_the_start_are_standard_normal(name, start):
     batch = fly(unmeasured(name), 4000, filter_start="warm", start=start)
     assert_normal(whitened_errors(batch), np.zeros(15), np.eye(15))

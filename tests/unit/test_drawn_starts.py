@@ -1,4 +1,4 @@
-"""Starts that move: how their motion is distributed, and what the filter knows of it."""
+"""Starts that move or are drawn: their distribution, and a filter that stays consistent."""
 
 import gymnasium
 import numpy as np
@@ -6,12 +6,12 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym import Uniform
+from quad_gym import LogUniform, Normal, Uniform
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.params.randomization import DrawingTable, Randomization
 from tests.field_flights import fly, nees, steps
 
 FLIGHTS = 20_000
-CONSISTENT = 256
-BAND = 5 * np.sqrt(2 * 15 / CONSISTENT)
 
 
 def begun(count=FLIGHTS, start="moving", options=None, env_id="QuadGym/Hover-v0", **keywords):
@@ -49,18 +49,6 @@ def test_motion_is_uniform_within_its_bounds(moving, hovering):
             assert stats.kstest(column, stats.uniform(-most, 2.0 * most).cdf).pvalue > 1e-4, name
 
 
-@pytest.mark.parametrize("name", ["standard", "rtk", "consumer", "indoor"])
-def test_the_filter_is_consistent_after_a_moving_start(name):
-    """Mean NEES at the start and in the second after it may be too small, but not too large."""
-    batch = fly(quad_gym.sensor_suite(name), CONSISTENT, task="hover", start="moving")
-    found = [nees(batch).mean()]
-    for _ in range(4):
-        steps(batch, 0.25)
-        found.append(nees(batch).mean())
-    assert max(found) < 15.0 + BAND
-    assert not (batch.record("diverged") > 0.0).any()
-
-
 @pytest.mark.parametrize(
     ("drawn", "expected"),
     [({}, 1.5**2 / 3.0), ({"start_velocity_I": Uniform(-3.0, 3.0)}, 1.5**2 / 3.0 + 3.0)],
@@ -83,13 +71,6 @@ def test_draws_come_on_top_of_the_motion(moving):
     assert (on_top.min() >= 2.0 - 1e-12) & (on_top.max() <= 3.0 + 1e-12)
 
 
-def test_velocity_of_a_reset_replaces_that_of_the_start(moving):
-    batch = begun(16, options={"velocity": (0.5, 0.0, 0.0)})
-    np.testing.assert_array_equal(batch.record("v"), np.tile((0.5, 0.0, 0.0), (16, 1)))
-    np.testing.assert_array_equal(batch.record("v_hat"), batch.record("v"))
-    np.testing.assert_array_equal(batch.record("w"), moving.record("w")[:16])
-
-
 @pytest.mark.parametrize("env_id", sorted(quad_gym.IDS))
 def test_every_task_can_start_moving(env_id):
     still, moving = (begun(64, start, env_id=env_id) for start in ("hover", "moving"))
@@ -106,9 +87,69 @@ def test_a_pad_for_a_start_in_the_air_is_refused(start, pad):
         gymnasium.make("QuadGym/Circle-v0", pad=pad, start=start)
 
 
-def test_warm_filter_is_as_close_to_a_moving_start():
-    errors = [
-        np.abs(batch.record("v_hat") - batch.record("v")).mean()
-        for batch in (begun(2000, start, filter_start="warm") for start in ("moving", "hover"))
-    ]
-    assert errors[0] == pytest.approx(errors[1], rel=0.1)
+CONSISTENT = 256
+BAND = 5 * np.sqrt(2 * 15 / CONSISTENT)
+SUITES = ("standard", "rtk", "consumer", "indoor")
+DRAWS = {
+    "velocity": {"start_velocity_I": Uniform(-1.0, 1.0)},
+    "tilt and yaw": {
+        "start_roll": Uniform(-0.1, 0.1),
+        "start_pitch": Normal(0.03, 0.05),
+        "start_yaw": Uniform(-3.0, 3.0),
+    },
+    "rates": {"start_body_rates": Uniform(-1.0, 1.0)},
+}
+
+
+def worst(batch):
+    """The largest mean NEES at the start and in the second after it, which may be too small."""
+    found = [nees(batch).mean()]
+    for _ in range(4):
+        steps(batch, 0.25)
+        found.append(nees(batch).mean())
+    return max(found)
+
+
+@pytest.mark.parametrize("drawn", [*DRAWS, "moving"])
+@pytest.mark.parametrize("name", SUITES)
+def test_a_start_that_is_drawn_or_moves_leaves_the_filter_consistent(name, drawn):
+    suite = quad_gym.sensor_suite(name)
+    how = {"start": "moving"} if drawn == "moving" else {"randomization": DRAWS[drawn]}
+    batch = fly(suite, CONSISTENT, **{"task": "circle", "start": "hover", **how})
+    assert worst(batch) < 15.0 + BAND
+    assert not (batch.record("diverged") > 0.0).any()
+
+
+@pytest.mark.parametrize("filter_start", ["cold", "warm"])
+@pytest.mark.parametrize("task", TASK_DEFAULTS)
+def test_filter_of_the_default_suite_is_consistent_on_every_task(task, filter_start):
+    suite = quad_gym.QuadEnv("hover").flights.batch.sensors
+    batch = fly(suite, CONSISTENT, task=task, filter_start=filter_start)
+    steps(batch, 0.5)  # from the ground it is cautious at first
+    for _ in range(4):
+        steps(batch, 0.5)
+        assert abs(nees(batch).mean() - 15.0) < BAND
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_the_filter_is_told_a_velocity_that_a_reset_gives(name):
+    batch = fly(quad_gym.sensor_suite(name), CONSISTENT, task="circle", start="hover")
+    batch.reset(seeds=range(CONSISTENT), velocity=(1.0, 0.5, 0.2))
+    np.testing.assert_array_equal(batch.record("v_hat"), np.tile((1.0, 0.5, 0.2), (CONSISTENT, 1)))
+    assert worst(batch) < 15.0 + BAND
+
+
+@pytest.mark.parametrize(
+    ("distribution", "expected"),
+    [
+        (Uniform(-1.0, 2.0), 1.0),  # (b^3 - a^3) / (3 (b - a))
+        (Normal(0.5, 0.2), 0.29),  # mean^2 + sigma^2
+        (LogUniform(0.5, 2.0), (4.0 - 0.25) / (2.0 * np.log(4.0))),
+    ],
+)
+def test_mean_squares_of_distributions(distribution, expected):
+    given = Randomization({"start_roll": distribution})
+    table = DrawingTable(
+        given, quad_gym.VehicleParams(), quad_gym.SensorSuite(), quad_gym.WorldParams()
+    )
+    assert table.mean_square("start_roll")[0] == pytest.approx(expected, rel=2e-3)
