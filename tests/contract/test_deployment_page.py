@@ -41,7 +41,6 @@ def test_c_of_the_page_observes_as_the_environment(tmp_path):
     library = tmp_path / "it.so"
     subprocess.run([COMPILER, *flags, str(tmp_path / "it.c"), "-o", str(library)], check=True)
     observe = ctypes.CDLL(str(library)).observe
-
     keywords = {"num_envs": 3, "start": "hover", "randomize_reference": True}
     absolute, relative = (
         gymnasium.make_vec("QuadGym/Circle-v0", layout=layout, **keywords)

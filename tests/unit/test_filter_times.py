@@ -134,7 +134,6 @@ def test_a_stamp_within_a_sample_splits_it(samples_of):
     late.update(np.zeros(3), gnss_sigma=wide, time=0.153)
     np.testing.assert_allclose(late.velocity, whole.velocity, atol=0.02)
     np.testing.assert_allclose(late.position, whole.position, atol=0.005)
-
     in_parts, late = started(suite=SUITE), started(suite=SUITE)
     given = samples(30)
     for k, (gyro, accel) in enumerate(given):
