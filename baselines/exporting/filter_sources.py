@@ -17,8 +17,8 @@ from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.first_fix import FARTHEST_FIX, LEAST_COURSE
 from quad_gym.estimation.starts import LEVEL_SIGMA, state_at_rest
 from quad_gym.kernels.compiling.foreign import symbol_of
-from quad_gym.kernels.compiling.stages import Stage, needed_stages
-from quad_gym.kernels.single import FILTER_STAGES
+from quad_gym.kernels.entries import FILTER_STAGES
+from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.packing.aids import slow_states
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
@@ -45,7 +45,7 @@ from quad_gym.records import (
 )
 
 _ENTRIES = tuple(f"quad_gym.kernels.exported:{n}" for n in ("predict", "update", "start", "keep"))
-_LEVEL = "quad_gym.kernels.single:start_level"
+_LEVEL = "quad_gym.kernels.exported:start_level"
 _AID_NOTES = {
     Aid.BAROMETER: "height in I from static pressure [m]",
     Aid.MAGNETOMETER: "magnetic field in B [T]",

@@ -18,7 +18,7 @@ from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import as_json
 from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Episodes, Policy, roll_out
-from quad_gym.kernels.compiling.digest import flights_digest
+from quad_gym.kernels.digest import flights_digest
 from quad_gym.params.suites import contents_of_suite_files
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import learning, stages
 from quad_gym.experiments.benchmark.timing import Timing, by_turns
-from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.kernels.stages import needed_stages
 from quad_gym.params.suites import SUITES
 from quad_gym.records import POSITION_BLOCK, WIDTH
 

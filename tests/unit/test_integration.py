@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import quad_gym
-from quad_gym.kernels.single import integrate_flight
+from quad_gym.kernels.entries import integrate_flight
 from quad_gym.kernels.vehicle.dynamics import integrate
 from quad_gym.packing.flight import params_record
 from quad_gym.records import FLIGHT

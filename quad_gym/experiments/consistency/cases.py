@@ -12,7 +12,7 @@ from quad_gym.analysis.consistency_flights import Findings, endless, measure_con
 from quad_gym.analysis.reports import as_json, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.kernels.compiling.digest import flights_digest
+from quad_gym.kernels.digest import flights_digest
 from quad_gym.params.sensors import SensorSuite
 
 CaseResults = dict[str, dict[str, Any]]
