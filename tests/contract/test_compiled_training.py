@@ -181,7 +181,7 @@ class SameDraws:
 @pytest.mark.parametrize("normalize", [True, False])
 @pytest.mark.parametrize("activation", ["relu", "tanh", "elu"])
 def test_training_with_the_same_draws_equals_stable_baselines(activation, normalize):
-    """Rollouts, episodes that end and are cut off, rewards, advantages, gradients, epochs, rates."""
+    """Rollouts, episodes that end and are cut off, advantages, gradients, epochs, learning rate."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("stable_baselines3")
     from baselines.compiled_ppo.run import make_compiled

@@ -8,11 +8,9 @@ import pytest
 import quad_gym
 import quad_gym.frames
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import AccelBiasStep, GnssRamp, GyroBiasStep
 from quad_gym.records import Ending, Source
 from tests.field_flights import fly, state_errors, steps
-from tests.filter_states import set_at_rest
 
 FLIGHTS = 256
 STEP = GyroBiasStep(start=3.0, size=math.radians(1.0))
@@ -118,22 +116,3 @@ def test_info_tells_of_it_and_episodes_can_end_with_it():
         endings += info["ending"][truncated].tolist()
     assert lost.mean() > 0.9
     assert endings.count(Ending.FILTER_DIVERGED) > 16
-
-
-@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
-def test_a_filter_alone_doubts_itself_after_any_start(kind):
-    """Sound fixes 5 m away from where it was told to be, at 10 Hz: it moves there."""
-    suite = quad_gym.sensor_suite("rtk").simplified().replace(camera=None)
-    kalman = kind(sensors=suite)
-    R_IG = quad_gym.frames.ecef_to_enu(suite.gnss.reference_antenna_G)
-    antenna, baseline = np.array(suite.gnss.primary_antenna_B), suite.gnss.baseline_B
-    set_at_rest(kalman, 1e-4 * np.eye(15))
-    away = np.array([5.0, 0.0, 0.0])
-    for tick in range(1200):
-        kalman.predict(np.zeros(3), (0.0, 0.0, 9.8))
-        if tick % 20 == 19:
-            fix = {"gnss_position_G": R_IG.T @ (away + antenna)}
-            kalman.update(**fix, gnss_baseline_G=R_IG.T @ baseline, gnss_velocity_G=np.zeros(3))
-        if tick == 100:
-            assert np.linalg.norm(kalman.position) < 0.5  # the first fixes are rejected
-    np.testing.assert_allclose(kalman.position, away, atol=0.1)
