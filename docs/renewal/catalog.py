@@ -196,6 +196,18 @@ CATALOG = {
             texts=texts.console("learning"),
         ),
         Result(
+            name="filters",
+            commands=[
+                f"benchmark --only filters --batch 64 --sensors {suite} --output OUT --estimators "
+                "docs.gallery.estimators.error_state_ekf:ErrorStateEKF "
+                "docs.gallery.estimators.invariant_ekf:InvariantEKF "
+                "docs.gallery.estimators.complementary:Complementary"
+                for suite in ("standard", "rtk", "consumer", "indoor")
+            ],
+            flights=("RandomTrajectory, *", "Circle, *", "fault *"),
+            texts=texts.filters,
+        ),
+        Result(
             name="outage",
             commands=[
                 "fly circle --no-camera --seed 1 --faults gnss_outage --fault-time 4 7 --fps 20 "
