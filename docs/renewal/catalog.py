@@ -31,6 +31,7 @@ class Result:
 _EVALUATE = (
     "evaluate QuadGym/{}-v0 --policy pd pd:lab pretrained --observation estimate --output OUT"
 )
+_GALLERY = "docs.gallery.estimators"
 _DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
 
 CATALOG = {
@@ -199,9 +200,8 @@ CATALOG = {
             name="filters",
             commands=[
                 f"benchmark --only filters --batch 64 --sensors {suite} --output OUT --estimators "
-                "docs.gallery.estimators.error_state_ekf:ErrorStateEKF "
-                "docs.gallery.estimators.invariant_ekf:InvariantEKF "
-                "docs.gallery.estimators.complementary:Complementary"
+                f"{_GALLERY}.error_state_ekf:ErrorStateEKF {_GALLERY}.invariant_ekf:InvariantEKF"
+                + ("" if suite == "indoor" else f" {_GALLERY}.complementary:Complementary")
                 for suite in ("standard", "rtk", "consumer", "indoor")
             ],
             flights=("RandomTrajectory, *", "Circle, *", "fault *"),
