@@ -108,8 +108,8 @@ def filters(folder: Path, _: Sequence[str]) -> dict[str, str]:
     parts = {"position": (1e3, ".1f"), "velocity": (1e3, ".1f"), "attitude": (1e3, ".2f")}
     faults = ("none", "gnss_outage", "gnss_outliers", "wrong_associations")
     accuracy, control = [], []
-    for number in range(4):
-        found = _read(folder / f"{number}/benchmark.json")["sections"]["filters"]
+    for suite in range(4):
+        found = _read(folder / f"{suite}/benchmark.json")["sections"]["filters"]
         for row in found:
             first = [f"`{row['suite']}`", row["name"]]
             if row["failed"]:

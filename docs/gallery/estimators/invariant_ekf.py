@@ -185,7 +185,8 @@ class InvariantEKF(quad_gym.Estimator):
             H[..., part] = block.reshape(-1, size, 3)
         H = H @ back
         sigma = np.sqrt((H @ P * H).sum(axis=-1) + variance)
-        valid = np.abs(d) < GATE * sigma  # neither missing nor an outlier
+        fits = (np.abs(d) < GATE * sigma).reshape(len(rows), reading.new[0].size, -1).all(axis=2)
+        valid = np.repeat(fits, size // fits.shape[1], axis=1)  # neither missing nor an outlier
         H, d = np.where(valid[..., None], H, 0.0), np.where(valid, d, 0.0)
         P_xz = P @ transposed(H)
         P_zz = H @ P_xz + np.eye(size) * np.broadcast_to(variance, d.shape)[..., None]
