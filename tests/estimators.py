@@ -56,6 +56,13 @@ class Certain(Simple):
         }
 
 
+class Diverges(Simple):
+    """The same until a position is not a number."""
+
+    def update(self, measurements):
+        return super().update(measurements) | {"position": np.full((measurements.count, 3), np.nan)}
+
+
 class Given(quad_gym.Estimator):
     """An estimate that is given."""
 

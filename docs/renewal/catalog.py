@@ -29,6 +29,7 @@ class Result:
 _EVALUATE = (
     "evaluate QuadGym/{}-v0 --policy pd pd:lab pretrained --observation estimate --output OUT"
 )
+_GALLERY = "docs.gallery.estimators"
 _DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
 
 CATALOG = {
@@ -192,6 +193,17 @@ CATALOG = {
             commands=["benchmark --only learning --output OUT"],
             flights=("Circle, standard", "Circle, mixed"),
             texts=texts.console("learning"),
+        ),
+        Result(
+            name="filters",
+            commands=[
+                f"benchmark --only filters --batch 64 --sensors {suite} --output OUT --estimators "
+                f"{_GALLERY}.error_state_ekf:ErrorStateEKF {_GALLERY}.invariant_ekf:InvariantEKF"
+                + ("" if suite == "indoor" else f" {_GALLERY}.complementary:Complementary")
+                for suite in ("standard", "rtk", "consumer", "indoor")
+            ],
+            flights=("RandomTrajectory, *", "Circle, *", "fault *"),
+            texts=texts.filters,
         ),
         Result(
             name="outage",

@@ -103,6 +103,53 @@ def ablation(which: str) -> Texts:
     return texts
 
 
+def filters(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    """Errors and consistency of filters, and what control on their estimates costs."""
+    parts = {"position": (1e3, ".1f"), "velocity": (1e3, ".1f"), "attitude": (1e3, ".2f")}
+    faults = ("none", "gnss_outage", "gnss_outliers", "wrong_associations")
+    accuracy, control = [], []
+    for suite in range(4):
+        found = _read(folder / f"{suite}/benchmark.json")["sections"]["filters"]
+        for row in found:
+            first = [f"`{row['suite']}`", row["name"]]
+            if row["failed"]:
+                accuracy.append([*first, row["failed"], *[""] * 6])
+                continue
+            errors = [_bracketed(row[f"{part}_rmse"], *form) for part, form in parts.items()]
+            ratios = [row[f"{part}_ratio"] for part in parts]
+            ratio = " / ".join("-" if r is None else f"{r:.2f}" for r in ratios)
+            nees, nis, us = row["nees"], row["nis"], row["seconds"]
+            accuracy.append(
+                [
+                    *first,
+                    *errors,
+                    "" if ratios[0] is None else ratio,
+                    "" if nees is None else f"{nees[0]:,.2f}",
+                    "" if nis is None else f"{nis:.2f}",
+                    "" if us is None else f"{1e6 * us:,.1f}",
+                ]
+            )
+            if row["tracking"] is not None:
+                lost = [
+                    f"{row['lost'][fault][0]:.0%}" if fault in row["lost"] else ""
+                    for fault in faults
+                ]
+                control.append([*first, _bracketed(row["tracking"], 1e3, ".0f"), *lost])
+    heads = ("suite", "filter", "position [mm]", "velocity [mm/s]", "attitude [mrad]")
+    more = ("over the bound", "NEES", "NIS", "us a tick")
+    lost_heads = ("lost", "GNSS outage", "GNSS outliers", "wrong features")
+    return {
+        "filters": table((*heads, *more), accuracy),
+        "filters.control": table(("suite", "filter", "error [mm]", *lost_heads), control),
+    }
+
+
+def _bracketed(found: Sequence[float], scale: float, form: str) -> str:
+    """A mean, with its interval if there is one."""
+    value, *ends = (format(scale * number, form) for number in found)
+    return f"{value} [{', '.join(ends)}]" if ends else value
+
+
 def consistency(folder: Path, _: Sequence[str]) -> dict[str, str]:
     rows = []
     for k, label in enumerate(SUITES):

@@ -5,9 +5,10 @@
     quad-gym benchmark --only compile
 
 A time is the best of several repeats, because other load on the machine can only increase it;
-"spread" is the excess of the median. All ratios are measured within one run. The sections compile
-and learning take minutes and run only with `--only`; learning trains the compiled PPO with ten
-seeds, and reports when each was first better than tuned PD control.
+"spread" is the excess of the median. All ratios are measured within one run. The sections compile,
+filters and learning take minutes and run only with `--only`. Learning trains the compiled PPO with
+ten seeds, and reports when each was first better than tuned PD control; filters compares the
+built-in filters and `--estimators` on the same flights.
 
 Progress goes to stderr, tables go to stdout, and everything goes to benchmark.json with the
 configuration, the versions and the processor. Run it on an idle machine.
@@ -19,11 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from quad_gym.analysis.linear_sensors import SuiteModel
 from quad_gym.analysis.reports import require_writable, versions, write_json
-from quad_gym.commands.options import require_at_least, usage_errors
+from quad_gym.commands.options import SuiteNames, require_at_least, usage_errors
+from quad_gym.estimation.own import Estimator
 from quad_gym.experiments.benchmark import (
     compiling,
     filter,
+    filters,
     interfaces,
     learning,
     machine,
@@ -33,9 +37,11 @@ from quad_gym.experiments.benchmark import (
 )
 from quad_gym.experiments.benchmark.timing import Effort, Row, Scope
 from quad_gym.kernels.cores import available_cores
+from quad_gym.params import checks as check
+from quad_gym.params.suites import sensor_suite
 from quad_gym.records import WIDTH
 
-ALONE = ("compile", "learning")
+ALONE = ("compile", "filters", "learning")
 """Sections that take minutes."""
 
 
@@ -46,6 +52,7 @@ class BenchmarkArgs:
     only: Literal[
         "all",
         "filter",
+        "filters",
         "tick",
         "options",
         "interfaces",
@@ -53,9 +60,9 @@ class BenchmarkArgs:
         "compile",
         "learning",
     ] = "all"
-    """section to run; all: every section but compile and learning"""
+    """section to run; all: every section but compile, filters and learning"""
     batch: int = 256
-    """number of flights in the batches of filter, tick and options, a multiple of eight"""
+    """number of flights in the batches of filter, filters, tick and options, a multiple of eight"""
     n_envs: int = 1024
     """number of environments in the batches of interfaces, of flights with each suite in tick"""
     threads: int | None = None
@@ -64,6 +71,9 @@ class BenchmarkArgs:
     """number of training seeds of learning"""
     steps: int | None = None
     """number of environment steps of each training of learning; if not given, the recipe's"""
+    sensors: SuiteNames = ("standard", "rtk", "consumer", "indoor")
+    estimators: tuple[str, ...] = ()
+    """own estimators among filters, module:Class each"""
     quick: bool = False
     """two short repeats instead of --repeats and --seconds, to check that it runs"""
     repeats: int = 7
@@ -92,11 +102,14 @@ class BenchmarkArgs:
             steps=self.steps,
             effort=Effort(2, 0.01) if self.quick else Effort(self.repeats, self.seconds),
             quick=self.quick,
+            suites=self.sensors,
+            estimators=self.estimators,
         )
 
 
 SECTIONS = {
     "filter": filter.SECTION,
+    "filters": filters.SECTION,
     "tick": stages.SECTION,
     "options": options.SECTION,
     "interfaces": interfaces.SECTION,
@@ -116,6 +129,10 @@ def main(args: BenchmarkArgs) -> None:
     """Run the chosen sections."""
     with usage_errors():
         require_writable("--output", args.output)
+        for name in args.sensors:
+            SuiteModel(sensor_suite(name))
+        for name in args.estimators:
+            check.own("--estimators", name, Estimator)
     cpu = machine.processor()
     print(f"{cpu['model']}, {cpu['cores']} cores for this process.\n")
     sections: dict[str, list[Row]] = {}

@@ -31,6 +31,30 @@ def test_filter_section_compares_all_filters(tmp_path, capsys):
     assert "plain NumPy, 12 measurements" in capsys.readouterr().out
 
 
+def test_filters_section_compares_filters_on_the_same_flights(tmp_path, capsys):
+    options = ("--batch", "8", "--sensors", "indoor", "--estimators", "tests.estimators:Simple")
+    rows = run(tmp_path, "--only", "filters", *options)["sections"]["filters"]
+    found = {row["name"]: row for row in rows}
+    assert list(found) == ["bound", "UKF", "EKF", "Simple"]
+    for row in (found["UKF"], found["EKF"]):
+        for part in ("position", "velocity", "attitude"):
+            (value, low, high), (bound,) = row[f"{part}_rmse"], found["bound"][f"{part}_rmse"]
+            assert low < value < high
+            assert row[f"{part}_ratio"] == pytest.approx(value / bound)
+            assert 0.5 < value / bound < 2.0  # of eight flights
+        assert row["seconds"] > 0.0
+        assert list(row["lost"]) == ["none", "wrong_associations"]
+    assert (found["Simple"]["nees"], found["Simple"]["nis"]) == (None, None)
+    assert "Simple" in capsys.readouterr().out
+
+
+def test_filters_section_reports_an_estimator_that_fails(tmp_path, capsys):
+    options = ("--batch", "8", "--sensors", "indoor", "--estimators", "tests.estimators:Diverges")
+    rows = run(tmp_path, "--only", "filters", *options)["sections"]["filters"]
+    assert rows[-1]["failed"].startswith("Diverges.update must return finite numbers")
+    assert "indoor, Diverges: Diverges.update must return" in capsys.readouterr().out
+
+
 def test_tick_section_names_every_stage_of_a_suite(tmp_path):
     rows = run(tmp_path, "--only", "tick", "--batch", "16", "--n-envs", "16")["sections"]["tick"]
     assert {row["suite"] for row in rows if row["kind"] == "suite"} == set(SUITES)

@@ -55,6 +55,18 @@ def test_error_state_ekf_is_as_accurate_as_the_built_in_filter():
     assert errors[1] < 1.1 * errors[0]
 
 
+def test_updates_of_filterpy_give_the_flights_of_the_error_state_ekf():
+    pytest.importorskip("filterpy")
+    folder = "docs.gallery.estimators"
+    names = (f"{folder}.error_state_ekf:ErrorStateEKF", f"{folder}.filterpy_update:FilterpyEKF")
+    numpy, filterpy = (batch(2, sensors="rtk", estimator=name) for name in names)
+    for _ in range(60):
+        numpy.step()
+        filterpy.step()
+    compared = ("position", "estimated_position", "estimated_velocity", "estimated_R_BI")
+    assert max(differences(numpy, filterpy, *compared)) < 1e-9
+
+
 @pytest.mark.parametrize("sensors", ["standard", "rtk"])
 def test_invariant_ekf_is_consistent_and_as_accurate_as_the_built_in_filter(sensors):
     """From 1 s to 2.5 s on the circle; `rtk` has a latency of 0.1 s.

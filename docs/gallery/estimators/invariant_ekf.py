@@ -20,7 +20,7 @@ import quad_gym
 from quad_gym.rotations import euler_to_dcm
 
 R, V, E, BA, BG = (slice(k, k + 3) for k in range(0, 15, 3))
-EYE, STAMPS = np.eye(3), 41  # ticks that are remembered
+EYE, STAMPS, GATE = np.eye(3), 41, 5.0  # ticks that are remembered; standard deviations
 GNSS = ("gnss_position", "gnss_velocity", "gnss_baseline")
 
 
@@ -172,7 +172,7 @@ class InvariantEKF(quad_gym.Estimator):
         return pixels, [(R, -J), (E, J @ cross(X_I))], camera.pixel_sigma**2 + blur
 
     def correct(self, m, name):
-        """Update the flights for which a sensor has measured; all features of an image at once."""
+        """Update the flights for which a sensor has measured, without outliers."""
         reading, s = getattr(m, name), self.state
         if reading is None or not reading.new.any():
             return
@@ -180,10 +180,14 @@ class InvariantEKF(quad_gym.Estimator):
         *then, back = self.at_stamp(m, reading.age, rows)
         predicted, jacobian, variance = getattr(self, name)(m.sensors, *then, m.features[rows])
         d = reading.value[rows].reshape(len(rows), -1) - predicted.reshape(len(rows), -1)
-        H, valid, size = np.zeros((*d.shape, 15)), np.isfinite(d), d.shape[1]
+        H, size, P = np.zeros((*d.shape, 15)), d.shape[1], s.P[rows]
         for part, block in jacobian:
             H[..., part] = block.reshape(-1, size, 3)
-        H, d, P = np.where(valid[..., None], H @ back, 0.0), np.where(valid, d, 0.0), s.P[rows]
+        H = H @ back
+        sigma = np.sqrt((H @ P * H).sum(axis=-1) + variance)
+        fits = (np.abs(d) < GATE * sigma).reshape(len(rows), reading.new[0].size, -1).all(axis=2)
+        valid = np.repeat(fits, size // fits.shape[1], axis=1)  # neither missing nor an outlier
+        H, d = np.where(valid[..., None], H, 0.0), np.where(valid, d, 0.0)
         P_xz = P @ transposed(H)
         P_zz = H @ P_xz + np.eye(size) * np.broadcast_to(variance, d.shape)[..., None]
         K = transposed(np.linalg.solve(P_zz, transposed(P_xz)))

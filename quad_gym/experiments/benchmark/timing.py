@@ -23,7 +23,7 @@ class Scope:
     """Extent of the measurements."""
 
     batch: int
-    """Number of flights in the batches of filter, tick and options"""
+    """Number of flights in the batches of filter, filters, tick and options"""
     envs: int
     """Number of environments in the batches of interfaces, and of flights in those of all suites"""
     threads: int
@@ -35,6 +35,10 @@ class Scope:
     effort: Effort
     quick: bool
     """True for a check that the sections run"""
+    suites: Sequence[str] = ()
+    """Suites of filters"""
+    estimators: Sequence[str] = ()
+    """Own estimators among filters, "module:Class" each"""
 
 
 class Timing(NamedTuple):
