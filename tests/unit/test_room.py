@@ -55,7 +55,7 @@ def test_memory_beside_the_flights_is_neither_written_nor_read(monkeypatch, name
 def test_parts_that_a_record_lacks_are_neither_written_nor_read(monkeypatch, name):
     """The same flights in full records, of which what there was no room for is filled before."""
     small = flown(cases()[name], steps=12)
-    kept = set(small.snapshot().dtype.names)
+    kept = set(small._blocks.dtype.names)
     monkeypatch.setattr(flight_batch, "room_of", lambda used: room_of(EVERYTHING))
     begin = FlightBatch.reset
 
@@ -66,7 +66,7 @@ def test_parts_that_a_record_lacks_are_neither_written_nor_read(monkeypatch, nam
 
     monkeypatch.setattr(FlightBatch, "reset", fill_and_reset)
     full = flown(cases()[name], steps=12)
-    assert full.snapshot().dtype == FLIGHT_BLOCK
+    assert full._blocks.dtype == FLIGHT_BLOCK
     for field in FLIGHT_BLOCK.names:
         if field in kept:
             np.testing.assert_array_equal(small.record(field), full.record(field), err_msg=field)

@@ -145,20 +145,26 @@ def battery_law(charge, speeds, battery, vehicle=LAB):
 
 
 @pytest.mark.parametrize(
-    ("resistance", "speed", "limited"),
-    [(0.01, 0.0, False), (0.1, 0.0, True), (0.24, 0.0, True), (0.2, 2.0 * HOVER_SPEED, True)],
-    ids=["enough power", "too little", "least", "rotors too fast"],
+    ("mass", "resistance", "speed", "limited"),
+    [
+        (0.78, 0.01, 0.0, False),
+        (3.3, 0.005, 0.0, False),  # hovers at 6.03 V, so that full action asks for 12 V
+        (0.78, 0.1, 0.0, True),
+        (0.78, 0.24, 0.0, True),
+        (0.78, 0.2, 2.0 * HOVER_SPEED, True),
+    ],
+    ids=["enough power", "loaded", "too little", "least", "rotors too fast"],
 )
-def test_the_battery_gives_what_it_has_and_no_more(resistance, speed, limited):
-    battery = BatteryParams(energy=5000.0, resistance=resistance)
-    batch, _ = motors_only(WorldParams(battery=battery), speed=speed)
+def test_the_battery_gives_what_it_has_and_no_more(mass, resistance, speed, limited):
+    battery, vehicle = BatteryParams(energy=5000.0, resistance=resistance), LAB.replace(mass=mass)
+    batch, _ = motors_only(WorldParams(battery=battery), vehicle=vehicle, speed=speed)
     taken, most = 0.0, 12.0**2 / (4.0 * resistance)
     for _ in range(200):
         charge, speeds = batch.record("charge")[0], batch.record("rotor_speeds")[0]
         assert charge == pytest.approx(1.0 - taken / battery.energy, rel=1e-12)
         voltage, power = battery_law(charge, speeds, battery)
         batch.step(np.ones((1, 4)))
-        expected = min(2.0 * LAB.hover_voltage, voltage)
+        expected = min(2.0 * vehicle.hover_voltage, voltage)
         np.testing.assert_allclose(batch.record("voltages")[0], expected, rtol=1e-12)
         taken += 0.005 * power
     assert (power > 0.9 * most * (0.83 + 0.17 * charge) ** 2) == limited
