@@ -72,6 +72,7 @@ _exchange_at, _params_at = lanes_at(EXCHANGE_BLOCK), lanes_at(PARAMS_BLOCK)
 _work_at, _plain_work_at = lanes_at(WORK_BLOCK), record_at(WORK_BLOCK)
 _settings_at, _stages_at = record_at(SETTINGS), record_at(STAGE_TABLE)
 _floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u1")
+_words_at, _CALL = array_at("i8"), len(Call)
 
 
 @kernel
@@ -338,6 +339,22 @@ def _fly_group(call, first, last, command, nominal, true, believed, settings, wo
         _end_block(call, index, command, nominal, true, believed, settings, work, stages)
 
 
+@kernel
+def _fly_range(call, first, last, command):
+    """Step or reset the flights of the blocks from `first` to before `last`, group by group."""
+    settings, work = _settings_at(call[_SETTINGS]), _work_at(call[_WORK])
+    stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
+    differ = settings.randomized > 0 or settings.faults > 0
+    true = _params_at(call[_OWN] if differ else call[_WORLD])
+    model = call[_BELIEVED] if settings.features_drawn else call[_MODEL]
+    believed = true if settings.known else _params_at(model)
+    groups = (last - first - 1) // call[_GROUP] + 1
+    group = (last - first - 1) // groups + 1
+    for one in range(first, last, group):
+        end = min(one + group, last)
+        _fly_group(call, one, end, command, nominal, true, believed, settings, work, stages)
+
+
 _WORDS = types.Array(types.int64, 1, "C")
 
 
@@ -356,12 +373,6 @@ def fly(call, board, number, command, serving):
     Returns:
         True if all blocks are finished; False if another thread is still flying.
     """
-    settings, work = _settings_at(call[_SETTINGS]), _work_at(call[_WORK])
-    stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
-    differ = settings.randomized > 0 or settings.faults > 0
-    true = _params_at(call[_OWN] if differ else call[_WORLD])
-    model = call[_BELIEVED] if settings.features_drawn else call[_MODEL]
-    believed = true if settings.known else _params_at(model)
     if not serving and command >= 0:
         post(board, command)
     while True:  # a single pass unless serving
@@ -370,14 +381,22 @@ def fly(call, board, number, command, serving):
             first, last = take(board, number)
             if first == last:
                 break
-            posted = read_shared(board, COMMAND)
-            groups = (last - first - 1) // call[_GROUP] + 1
-            group = (last - first - 1) // groups + 1
-            for one in range(first, last, group):
-                end = min(one + group, last)
-                _fly_group(call, one, end, posted, nominal, true, believed, settings, work, stages)
+            _fly_range(call, first, last, read_shared(board, COMMAND))
             add_shared(board, FINISHED, last - first)
         if not serving:
             return finished(board)
         if not comes(board, number, seen):
             return True
+
+
+@entry(signature=types.none(types.int64, types.int64, types.int64, types.int64))
+def fly_alone(call, first, last, command):
+    """Step or reset some blocks without other threads, for processors without Python.
+
+    Args:
+        call: Address of the arguments, (len(Call),) int64.
+        first: First block.
+        last: Block after the last one.
+        command: A `Command`.
+    """
+    _fly_range(_words_at(call, _CALL), first, last, command)

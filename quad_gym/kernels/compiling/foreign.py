@@ -28,7 +28,7 @@ _FORM = 2
 _LIBRARY = re.compile(
     r"sin|cos|sqrt|"
     r"llvm\.(sin|cos|sqrt|fma|fabs|copysign|floor|rint|roundeven|fsh[lr]|[su](min|max)|abs|ctpop|"
-    r"mem(cpy|set|move)|lifetime|assume|experimental|vector|is)\b.*"
+    r"mem(cpy|set|move)|lifetime|assume|experimental|prefetch|vector|is)\b.*"
 )
 """Functions that emitted code may call: LLVM's, and those of a C library."""
 
