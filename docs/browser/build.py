@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 _HERE = Path(__file__).parent
+POLICIES = _HERE / "policies"
+"""Policies trained on the true state, for this page."""
 _BASE = 1 << 20
 """Address of the first record, above code's constants and the stack."""
 _ONE_LANE = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
@@ -26,13 +28,36 @@ def contents() -> dict[str, Any]:
     image, scenes = Image(_BASE), {}
     for name, batch in batches.items():
         scenes[name] = {**put_batch(image, batch, stages), **described(name, batch)}
+    policies, weights = _policies({scene.trained for scene in SCENES.values()})
     return {
         "module": _packed(module),
         "memory": _packed(image.content),
         "base": _BASE,
         "size": image.size,
         "scenes": scenes,
+        "policies": policies,
+        "weights": _packed(weights),
     }
+
+
+def _policies(names: set[str]) -> tuple[dict[str, Any], bytes]:
+    """Return the layers of the policies of tasks, and all weights, float32 one after another."""
+    from baselines.mlp import MlpPolicy
+    from baselines.policies import PRETRAINED
+
+    layers: dict[str, Any] = {}
+    weights = b""
+    for name in sorted(names):
+        files = {"truth": POLICIES / f"{name}_truth.npz", "estimate": PRETRAINED / f"{name}.npz"}
+        layers[name] = {}
+        for source, file in files.items():
+            policy = MlpPolicy.load(file)
+            each = zip(policy.weights, policy.biases, policy.activations, strict=True)
+            layers[name][source] = []
+            for W, b, activation in each:
+                layers[name][source].append([*W.shape, activation])
+                weights += W.astype("<f4").tobytes() + b.astype("<f4").tobytes()
+    return layers, weights
 
 
 def _packed(content: bytes) -> str:

@@ -32,6 +32,17 @@ function pdAction(flights, k) {
   return [F[2] / weight - 1, ...rates];
 }
 
+// Networks by task and source, from the shapes of their layers and all weights in one array.
+function networksOf(layers, weights) {
+  let place = 0;
+  const next = (count) => weights.subarray(place, (place += count));
+  const network = (shapes) => shapes.map(([outputs, inputs, activation]) => (
+    { weights: next(outputs * inputs), biases: next(outputs), activation }
+  ));
+  const each = (values, change) => Object.fromEntries(Object.entries(values).map(([name, value]) => [name, change(value)]));
+  return each(layers, (sources) => each(sources, network));
+}
+
 // Output of a network with layers x <- activation(W x + b).
 function networkOutput(layers, inputs) {
   let x = inputs;

@@ -10,7 +10,7 @@ from quad_gym.records import PARAMS_BLOCK, SETTINGS, Call
 
 _LINE = 64
 _FLIGHT = (
-    *("r", "v", "q", "w", "rotor_speeds", "tick", "wind", "key", "instant", "episode"),
+    *("r", "v", "q", "w", "rotor_speeds", "tick", "disturbance", "key", "instant", "episode"),
     *("b_a", "b_g", "wait", "block_fresh", "ref_omega", "ref_center", "ref_cos", "ref_sin"),
     *("ref_heading_rule", "ref_heading_point", "r_seen", "R_seen", "terminated", "ending"),
     *("position_error", "filter_status", "diverged", "gnss_position", "pixels", "w_meas"),
@@ -18,9 +18,17 @@ _FLIGHT = (
     *("fault_active", "fault_from", "fault_until", "action"),
 )
 _PARAMS = (
-    *("mass", "gravity", "rotor_positions_B", "rate_scale", "wind_I", "R_CB", "camera"),
-    *("focal_length", "half_image", "features", "position_sigma_I", "velocity_sigma"),
-    *("first_baseline_sigma", "pixel_sigma", "aid_sigma"),
+    *("mass", "gravity", "rotor_positions_B", "rate_scale", "R_CB", "camera"),
+    *(
+        "focal_length",
+        "half_image",
+        "features",
+        "R_IG",
+        "antenna",
+        "position_sigma_I",
+        "velocity_sigma",
+    ),
+    *("baseline_sigma", "baseline_noise", "pixel_sigma", "aid_sigma"),
 )
 _SETTINGS = ("sensor_delay", "sensor_ticks", "under_way", "max_steps")
 """Fields that the page reads or writes."""

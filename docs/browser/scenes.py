@@ -9,19 +9,18 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.spaces import ObservationField, layout_bounds, layout_of_suite
-from quad_gym.faults import Fault, GnssOutage, GyroBiasStep
+from quad_gym.faults import GyroBiasStep
 from quad_gym.params.control import pd_gains
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams
-from quad_gym.params.world import WorldParams
 from quad_gym.records import Control, Source
 
 CONTROLLERS = 3
-"""Flights of a scene: PD control, a policy trained on the true state, one trained on the estimate."""
+"""Flights of a scene: PD control, policies trained on the true state and on the estimate."""
 CONTROL_RATE = 50.0
 _NEVER = 1e9
-"""Start of faults [s], which the page's buttons set."""
+"""Start of the fault [s], which a button of the page sets."""
 
 
 class Scene(NamedTuple):
@@ -32,24 +31,32 @@ class Scene(NamedTuple):
     sensors: str
     trained: str
     """name of its policies"""
+    magnified: int
+    """factor of the errors of the estimate in pictures"""
 
 
 _ENDLESS: dict[str, Any] = {"start": "hover", "duration": 0.0}
 SCENES = {
     "circle": Scene(
-        "Circle: RTK GNSS and a camera", TASK_DEFAULTS["circle"].replace(**_ENDLESS), "rtk", "circle"
+        "Circle: RTK GNSS and a camera",
+        TASK_DEFAULTS["circle"].replace(**_ENDLESS),
+        "rtk",
+        "circle",
+        20,
     ),
     "consumer": Scene(
         "Circle: consumer GNSS, barometer, magnetometer",
         TASK_DEFAULTS["circle"].replace(**_ENDLESS),
         "consumer",
         "circle",
+        1,
     ),
     "look_around": Scene(
         "LookAround: markers on one wall, no GNSS",
         BENCHMARKS["look_around"].task.replace(**_ENDLESS),
         "one_wall",
         "look_around",
+        1,
     ),
 }
 """Scenes by name."""
@@ -60,9 +67,6 @@ def batch_of(name: str) -> FlightBatch:
     scene = SCENES[name]
     suite = sensor_suite(scene.sensors)
     step = GyroBiasStep(start=_NEVER, size=math.radians(3.0), direction=(0.0, 0.0, 1.0))
-    faults: tuple[Fault, ...] = (step,)
-    if suite.gnss is not None:
-        faults = (GnssOutage(start=_NEVER), step)
     return FlightBatch(
         CONTROLLERS,
         task=scene.task,
@@ -71,8 +75,7 @@ def batch_of(name: str) -> FlightBatch:
         control=Control.CTBR,
         control_rate=CONTROL_RATE,
         bounds=layout_bounds(_table_of(suite)),
-        world=WorldParams(wind_I=(0.0, 0.5, 0.0)),
-        faults=faults,
+        faults=step,
         threads=1,
     )
 
@@ -91,6 +94,9 @@ def described(name: str, batch: FlightBatch) -> dict[str, Any]:
         "ticksPerStep": round(suite.imu.rate / CONTROL_RATE),
         "harmonics": int(batch._settings["harmonics"][0]),
         "features": 0 if suite.camera is None else len(suite.camera.features_I),
+        "magnified": SCENES[name].magnified,
+        "trained": SCENES[name].trained,
+        "biasFault": int(GyroBiasStep.kind),
         "gnss": suite.gnss is not None,
         "observation": {f.name: [f.slice.start, f.slice.stop] for f in _table_of(suite)},
         "gains": vars(pd_gains("tuned")),
