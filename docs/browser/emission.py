@@ -10,9 +10,8 @@ from pathlib import Path
 
 from quad_gym.kernels.compiling.cache import say
 from quad_gym.kernels.compiling.foreign import Processor, is_cached, object_of, symbol_of
+from quad_gym.kernels.entries import fly
 
-FLY = "quad_gym.kernels.batch:fly_alone"
-"""The entry that the page calls."""
 _PROCESSOR = Processor("wasm32-unknown-unknown", "generic", "static")
 _HERE = Path(__file__).parent
 _LIBC = "/usr/lib/wasm32-wasi"
@@ -30,10 +29,10 @@ def missing_tools() -> list[str]:
 def module_of(stages: Collection[str]) -> tuple[bytes, list[str]]:
     """Return a module with `fly` and stages, and the stages in the order of `stage_address`."""
     names = sorted(stages)
-    _prepare([FLY, *names])
+    _prepare([fly.name, *names])
     with tempfile.TemporaryDirectory() as folder:
         objects = []
-        for name in (FLY, *names):
+        for name in (fly.name, *names):
             objects.append(Path(folder, f"{symbol_of(name)}.o"))
             objects[-1].write_bytes(object_of(name, _PROCESSOR))
         Path(folder, "stages.c").write_text(_table(names))
@@ -42,7 +41,7 @@ def module_of(stages: Collection[str]) -> tuple[bytes, list[str]]:
             clang = ["clang", "--target=wasm32-wasi", "-O2", "-ffp-contract=off"]
             subprocess.run([*clang, "-c", source, "-o", objects[-1]], check=True)
         module = Path(folder, "module.wasm")
-        exports = [f"--export={name}" for name in (symbol_of(FLY), "stage_address", "__heap_base")]
+        exports = [f"--export={name}" for name in (symbol_of(fly.name), "stage_address", "__heap_base")]
         options = ["--no-entry", "--strip-all", "--stack-first", "-z", f"stack-size={STACK}"]
         link = ["wasm-ld", *options, *exports, "--wrap=fma", *objects, f"{_LIBC}/libc.a"]
         subprocess.run([*link, "-o", module], check=True)

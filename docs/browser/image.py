@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.compiling.stages import STAGE_TABLE
+from quad_gym.batch.threads import board_of
+from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.records import PARAMS_BLOCK, SETTINGS, Call
 
 _LINE = 64
@@ -77,8 +78,12 @@ def put_batch(image: Image, batch: FlightBatch, stages: list[str]) -> dict[str, 
     words[Call.BLOCKS] = places["blocks"] - room.skipped
     words[Call.PITCH] = room.dtype.itemsize
     words[Call.STAGES] = places["stages"] = image.put(bytes(STAGE_TABLE.itemsize))
+    board = board_of(len(batch._blocks), 1)
     return {
         "call": image.put(words.tobytes()),
+        "board": image.put(board.tobytes()),
+        "boardSize": len(board),
+        "result": image.put(bytes(8)),
         "places": places,
         "pitch": room.dtype.itemsize,
         "resultPitch": int(words[Call.RESULT_PITCH]),

@@ -73,8 +73,10 @@ class Flights {
     this.run(STEP);
   }
 
+  // Call `quad_gym.kernels.batch.fly`, as the only thread.
   run(command) {
-    this.kernels.qg_core_fly_alone(0, 0, BigInt(this.info.call), 0n, BigInt(CONTROLLERS), command);
+    const { call, board, boardSize, result } = this.info;
+    this.kernels.qg_core_fly(result, 0, BigInt(call), BigInt(board), BigInt(boardSize), 0n, command, 0);
   }
 
   get time() {

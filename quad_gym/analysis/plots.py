@@ -22,39 +22,7 @@ BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 INK, GREY, PALE = "#222222", "#767676", "#DDDDDD"
 """Colors of text and the reference, of axes, and of the grid."""
 
-_STYLE = {
-    "font.size": 9.0,
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "text.color": INK,
-    "axes.titlesize": 10.0,
-    "axes.titlelocation": "left",
-    "axes.titlepad": 9.0,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": GREY,
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "grid.color": PALE,
-    "grid.linewidth": 0.6,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "legend.frameon": True,
-    "legend.edgecolor": "none",
-    "legend.framealpha": 0.85,
-    "legend.fancybox": False,
-    "legend.fontsize": 8.5,
-    "legend.handlelength": 1.8,
-    "lines.linewidth": 1.6,
-    "lines.solid_capstyle": "round",
-    "figure.dpi": 100.0,
-    "savefig.dpi": 200.0,
-    "svg.hashsalt": "quad_gym",
-}
+_STYLE = Path(__file__).with_name("house.mplstyle")
 
 _REFERENCE: dict[str, Any] = {"color": INK, "linestyle": (0, (4, 3)), "linewidth": 1.0}
 _REST: dict[str, Any] = {"marker": "+", "markersize": 9.0, "linestyle": "none", "zorder": 4}
@@ -110,21 +78,16 @@ def house_style() -> Iterator[None]:
     require_matplotlib()
     import matplotlib
 
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(fname=_STYLE):
         yield
 
 
 def panels(
     rows: int, columns: int, size: tuple[float, float], title: str = "", **options: Any
 ) -> tuple[Any, NDArray[Any]]:
-    """Make a matplotlib Figure with axes, (rows, columns).
+    """Make a matplotlib Figure of a size [inch] with axes, (rows, columns).
 
-    Args:
-        rows: Number of rows.
-        columns: Number of columns.
-        size: Width and height [inch].
-        title: Title of the figure.
-        **options: Further options of `Figure.subplots`.
+    `options` are further options of `Figure.subplots`.
     """
     from matplotlib.figure import Figure
 
@@ -138,13 +101,9 @@ def panels(
 
 
 def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool = True) -> None:
-    """Draw a flight from above, with ticks for the heading; both axes have the same scale.
+    """Draw a flight from above, with a tick for the heading every `tick_every` seconds.
 
-    Args:
-        axes: matplotlib Axes.
-        trace: Flight.
-        tick_every: Time between heading ticks [s].
-        legend: True to add a legend.
+    Both axes have the same scale.
     """
     from matplotlib.collections import LineCollection
 
@@ -174,12 +133,7 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
 
 
 def draw_height(axes: Any, trace: Trace) -> None:
-    """Draw height over time, with the reference.
-
-    Args:
-        axes: matplotlib Axes.
-        trace: Flight.
-    """
+    """Draw height over time, with the reference."""
     axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2, label="flown")
     axes.plot(trace.time, trace.reference[:, 2], label="reference", **_REFERENCE)
     start = (trace.time[0], trace.position[0, 2])
@@ -237,14 +191,9 @@ def error_limits(traces: Sequence[Trace], bands: Sequence[Band]) -> tuple[float,
 def flight_figure(
     draw: Callable[..., None], trace: Trace, *args: Any, title: str = "", **options: Any
 ) -> Any:
-    """Make a matplotlib Figure with one drawing of a flight.
+    """Make a matplotlib Figure with a flight, drawn by `draw_path`, `draw_height` or `draw_error`.
 
-    Args:
-        draw: `draw_path`, `draw_height` or `draw_error`.
-        trace: Flight.
-        *args: Further arguments of `draw`.
-        title: Title of the figure.
-        **options: Options of `draw`.
+    It receives all further arguments and options.
     """
     size = (5.0, 5.0) if draw is draw_path else (6.0, 3.4)
     figure, ((axes,),) = panels(1, 1, size, title)
@@ -267,9 +216,6 @@ def overview_figure(
         errors: Flight and band of each plot of errors, by its title.
         title: Title of the path.
         label: Name of a flight in the legends.
-
-    Returns:
-        matplotlib Figure.
     """
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -292,12 +238,7 @@ def overview_figure(
 def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     """Write a figure as PNG and SVG; equal figures give bitwise identical files.
 
-    Args:
-        figure: matplotlib Figure.
-        stem: Path without file extension.
-
-    Returns:
-        Paths of the two files.
+    `stem` is the path without file extension; returns the paths of the two files.
     """
     files = {Path(f"{stem}.png"): {"Software": None}, Path(f"{stem}.svg"): {"Date": None}}
     for file, metadata in files.items():
@@ -305,8 +246,8 @@ def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     return list(files)
 
 
-def logarithmic(axes: Any) -> None:
+def logarithmic(axes: Any, **options: Any) -> None:
     """Scale the ordinate logarithmically, labeled with numbers such as 0.1, not powers of ten."""
-    axes.set_yscale("log")
+    axes.set_yscale("log", **options)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("")

@@ -37,13 +37,9 @@ INTERRUPTED, CLOSED_PIPE = 130, 141
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; Ctrl-C ends it with a message.
+    """Run a command and its options, of the process by default; returns the exit code.
 
-    Args:
-        argv: Command and its options; None: the arguments of the process.
-
-    Returns:
-        Exit code.
+    Ctrl-C ends it with a message.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:

@@ -13,12 +13,7 @@ from tqdm import tqdm
 from quad_gym import PDGains, SensorSuite, TaskParams, vehicle_params
 from quad_gym.analysis import plots
 from quad_gym.analysis.intervals import PairedDifference, paired_difference
-from quad_gym.analysis.metrics import (
-    STATE_DIMENSION,
-    TrackingSummary,
-    chi_square_quantile,
-    spread,
-)
+from quad_gym.analysis.metrics import STATE_DIMENSION, TrackingSummary, chi_square_quantile, spread
 from quad_gym.analysis.recording import Recording, record_flights
 from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
 from quad_gym.batch.flight_batch import FlightBatch
@@ -48,14 +43,8 @@ class Setup:
     def fly(self, case: str) -> Recording:
         """Fly and record all seeds of one case."""
         source, sensors = self.cases[case]
-        batch = FlightBatch(
-            len(self.seeds),
-            sensors=sensors,
-            gains=self.gains,
-            task=self.task,
-            source=source,
-            threads=self.threads,
-        )
+        given: dict[str, Any] = {"gains": self.gains, "task": self.task, "threads": self.threads}
+        batch = FlightBatch(len(self.seeds), sensors=sensors, source=source, **given)
         bar = {"desc": f"{LABELS[case]:19}", "unit": " ticks"}
         return record_flights(batch, self.seeds, self.ticks, progress=lambda x: tqdm(x, **bar))
 

@@ -1,11 +1,11 @@
 """Compiled entry that steps or resets the blocks of a batch."""
 
 import numpy as np
-from numba import types
 
-from quad_gym.kernels.board import COMMAND, FINISHED, TICKET, comes, finished, post, take
+from quad_gym.kernels import entries
+from quad_gym.kernels.board import comes, finished, post, take
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
-from quad_gym.kernels.compiling.stages import STAGE_TABLE
+from quad_gym.kernels.compiling.signatures import signature_of
 from quad_gym.kernels.flight import begin_episode, look, move_and_measure, run, update
 from quad_gym.kernels.gathering import update_group
 from quad_gym.kernels.simd.addresses import (
@@ -18,6 +18,7 @@ from quad_gym.kernels.simd.addresses import (
 )
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
 from quad_gym.kernels.simd.lanes import all_of, any_of, select
+from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.records import (
     EXCHANGE_BLOCK,
     FIRST_BLOCK,
@@ -36,6 +37,7 @@ from quad_gym.records import (
     RewardTerm,
     offset_of,
 )
+from quad_gym.records.board import COMMAND, FINISHED, TICKET
 
 _REWARD = int(Result.REWARD)
 _TERMINATED = int(Result.TERMINATED)
@@ -52,6 +54,7 @@ _FAULTS = int(Result.FAULTS)
 _FILTER_DIVERGED = int(Result.FILTER_DIVERGED)
 _TERMS, _REWARD_TERMS = len(RewardTerm), len(Result)
 
+_CALL_WORDS = len(Call)
 _BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
 _RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
 _WORLD, _OWN, _MODEL = int(Call.WORLD), int(Call.OWN), int(Call.MODEL)
@@ -72,7 +75,7 @@ _exchange_at, _params_at = lanes_at(EXCHANGE_BLOCK), lanes_at(PARAMS_BLOCK)
 _work_at, _plain_work_at = lanes_at(WORK_BLOCK), record_at(WORK_BLOCK)
 _settings_at, _stages_at = record_at(SETTINGS), record_at(STAGE_TABLE)
 _floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u1")
-_words_at, _CALL = array_at("i8"), len(Call)
+_words_at = array_at("i8")
 
 
 @kernel
@@ -339,32 +342,14 @@ def _fly_group(call, first, last, command, nominal, true, believed, settings, wo
         _end_block(call, index, command, nominal, true, believed, settings, work, stages)
 
 
-@kernel
-def _fly_range(call, first, last, command):
-    """Step or reset the flights of the blocks from `first` to before `last`, group by group."""
-    settings, work = _settings_at(call[_SETTINGS]), _work_at(call[_WORK])
-    stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
-    differ = settings.randomized > 0 or settings.faults > 0
-    true = _params_at(call[_OWN] if differ else call[_WORLD])
-    model = call[_BELIEVED] if settings.features_drawn else call[_MODEL]
-    believed = true if settings.known else _params_at(model)
-    groups = (last - first - 1) // call[_GROUP] + 1
-    group = (last - first - 1) // groups + 1
-    for one in range(first, last, group):
-        end = min(one + group, last)
-        _fly_group(call, one, end, command, nominal, true, believed, settings, work, stages)
-
-
-_WORDS = types.Array(types.int64, 1, "C")
-
-
-@entry(signature=types.boolean(_WORDS, _WORDS, types.int64, types.int64, types.boolean))
-def fly(call, board, number, command, serving):
+@entry(signature=signature_of(entries.fly))
+def fly(call_at, board_at, size, number, command, serving):
     """Step or reset the flights of a batch, together with the other threads of a board.
 
     Args:
-        call: (len(Call),) arguments of this thread; their memory outlives the call.
-        board: Words that the threads share, see `board.py`.
+        call_at: Address of the (len(Call),) arguments of this thread.
+        board_at: Address of the words that the threads share, see `board.py`.
+        size: Number of these words.
         number: Index of this thread; thread 0 posts steps.
         command: A `Command` to post (TICK: plus a number), unless `serving`; if negative, nothing
             is posted, and the thread waits for the last command.
@@ -373,6 +358,13 @@ def fly(call, board, number, command, serving):
     Returns:
         True if all blocks are finished; False if another thread is still flying.
     """
+    call, board = _words_at(call_at, _CALL_WORDS), _words_at(board_at, size)
+    settings, work = _settings_at(call[_SETTINGS]), _work_at(call[_WORK])
+    stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
+    differ = settings.randomized > 0 or settings.faults > 0
+    true = _params_at(call[_OWN] if differ else call[_WORLD])
+    model = call[_BELIEVED] if settings.features_drawn else call[_MODEL]
+    believed = true if settings.known else _params_at(model)
     if not serving and command >= 0:
         post(board, command)
     while True:  # a single pass unless serving
@@ -381,22 +373,14 @@ def fly(call, board, number, command, serving):
             first, last = take(board, number)
             if first == last:
                 break
-            _fly_range(call, first, last, read_shared(board, COMMAND))
+            posted = read_shared(board, COMMAND)
+            groups = (last - first - 1) // call[_GROUP] + 1
+            group = (last - first - 1) // groups + 1
+            for one in range(first, last, group):
+                end = min(one + group, last)
+                _fly_group(call, one, end, posted, nominal, true, believed, settings, work, stages)
             add_shared(board, FINISHED, last - first)
         if not serving:
             return finished(board)
         if not comes(board, number, seen):
             return True
-
-
-@entry(signature=types.none(types.int64, types.int64, types.int64, types.int64))
-def fly_alone(call, first, last, command):
-    """Step or reset some blocks without other threads, for processors without Python.
-
-    Args:
-        call: Address of the arguments, (len(Call),) int64.
-        first: First block.
-        last: Block after the last one.
-        command: A `Command`.
-    """
-    _fly_range(_words_at(call, _CALL), first, last, command)

@@ -7,7 +7,7 @@ from quad_gym.commands import study as command
 from quad_gym.commands.main import main
 from quad_gym.experiments.arms import chosen_arms
 from quad_gym.experiments.flown import Flown
-from quad_gym.experiments.study import results_of
+from quad_gym.experiments.study import StudyResults
 from quad_gym.experiments.study_films import RATE, pair_of, side_of
 from quad_gym.experiments.study_tasks import STUDIED
 from quad_gym.rendering.side_by_side import HOLD, SIDE
@@ -99,7 +99,7 @@ def test_pace_shows_best_trainings_and_first_crash_on_truth(tmp_path):
         "std": 3 * [flown(3.0, [True] * 4, speed)],
     }
     seen = {"truth": curves(5.0, 6.0, 7.0), "std": curves(2.0, 4.0, 3.0)}
-    pair = pair_of(results_of(study, found, seen))
+    pair = pair_of(StudyResults(study, found, seen))
     assert pair.trainings == {"truth": 2, "std": 1}
     assert pair.episode == 2
 
@@ -111,6 +111,6 @@ def test_glance_shows_the_first_episode_with_a_far_heading(tmp_path):
     traces["off_wall"][1, 0] = np.nan  # the episode has ended
     found = dict.fromkeys(("truth", "std"), 3 * [flown(1.0, [False] * 4, traces)])
     seen = dict.fromkeys(found, curves(1.0, 1.0, 0.0))
-    pair = pair_of(results_of(study, found, seen))
+    pair = pair_of(StudyResults(study, found, seen))
     assert pair.trainings == {"truth": 0, "std": 0}
     assert pair.episode == 2
