@@ -41,7 +41,9 @@ def module_of(stages: Collection[str]) -> tuple[bytes, list[str]]:
             clang = ["clang", "--target=wasm32-wasi", "-O2", "-ffp-contract=off"]
             subprocess.run([*clang, "-c", source, "-o", objects[-1]], check=True)
         module = Path(folder, "module.wasm")
-        exports = [f"--export={name}" for name in (symbol_of(fly.name), "stage_address", "__heap_base")]
+        exports = [
+            f"--export={name}" for name in (symbol_of(fly.name), "stage_address", "__heap_base")
+        ]
         options = ["--no-entry", "--strip-all", "--stack-first", "-z", f"stack-size={STACK}"]
         link = ["wasm-ld", *options, *exports, "--wrap=fma", *objects, f"{_LIBC}/libc.a"]
         subprocess.run([*link, "-o", module], check=True)
