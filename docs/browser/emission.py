@@ -9,8 +9,9 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from quad_gym.kernels.compiling.cache import say
-from quad_gym.kernels.compiling.foreign import Processor, is_cached, object_of, symbol_of
+from quad_gym.kernels.compiling.foreign import Processor, is_cached, object_of
 from quad_gym.kernels.entries import fly
+from quad_gym.kernels.library import core_symbol
 
 _PROCESSOR = Processor("wasm32-unknown-unknown", "generic", "static")
 _HERE = Path(__file__).parent
@@ -33,7 +34,7 @@ def module_of(stages: Collection[str]) -> tuple[bytes, list[str]]:
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for name in (fly.name, *names):
-            objects.append(Path(folder, f"{symbol_of(name)}.o"))
+            objects.append(Path(folder, f"{core_symbol(name)}.o"))
             objects[-1].write_bytes(object_of(name, _PROCESSOR))
         Path(folder, "stages.c").write_text(_table(names))
         for source in (Path(folder, "stages.c"), _HERE / "fma.c"):
@@ -42,7 +43,7 @@ def module_of(stages: Collection[str]) -> tuple[bytes, list[str]]:
             subprocess.run([*clang, "-c", source, "-o", objects[-1]], check=True)
         module = Path(folder, "module.wasm")
         exports = [
-            f"--export={name}" for name in (symbol_of(fly.name), "stage_address", "__heap_base")
+            f"--export={name}" for name in (core_symbol(fly.name), "stage_address", "__heap_base")
         ]
         options = ["--no-entry", "--strip-all", "--stack-first", "-z", f"stack-size={STACK}"]
         link = ["wasm-ld", *options, *exports, "--wrap=fma", *objects, f"{_LIBC}/libc.a"]
@@ -63,7 +64,7 @@ def _prepare(names: Sequence[str]) -> None:
 
 def _table(names: Sequence[str]) -> str:
     """Return the C source of `stage_address`."""
-    symbols = [symbol_of(name) for name in names]
+    symbols = [core_symbol(name) for name in names]
     return "\n".join(
         [
             *(f"extern void {symbol}(void);" for symbol in symbols),
