@@ -8,10 +8,9 @@ import tempfile
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from quad_gym.kernels.compiling.cache import say
 from quad_gym.kernels.compiling.foreign import Processor, is_cached, object_of
 from quad_gym.kernels.entries import fly
-from quad_gym.kernels.library import core_symbol
+from quad_gym.kernels.library import core_symbol, say
 
 _PROCESSOR = Processor("wasm32-unknown-unknown", "generic", "static")
 _HERE = Path(__file__).parent
