@@ -7,6 +7,7 @@ import subprocess
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -16,6 +17,7 @@ from baselines.mlp import MlpPolicy
 from baselines.pd import PDPolicy
 from baselines.policies import pretrained_file
 from docs.browser import build, emission, scenes
+from docs.extensions import browser_page
 from quad_gym.analysis.metrics import nees, state_error
 
 KEY, STEPS, EVERY = 7, 500, 25
@@ -208,3 +210,14 @@ def test_page_is_one_file_without_references_to_others():
     assert "http" not in text.split("<script>")[0].replace("<!doctype html>", "")
     assert 'src="' not in text
     assert len(text) < 700_000
+
+
+def test_site_holds_the_page_or_a_sentence(tmp_path, monkeypatch):
+    app = SimpleNamespace(builder=SimpleNamespace(format="html"), outdir=tmp_path)
+    (tmp_path / "_static").mkdir()
+    browser_page.write_page(app, None)
+    written = tmp_path / "_static" / "fly.html"
+    assert written.read_text() == build.page()
+    monkeypatch.setattr(browser_page, "missing_tools", lambda: ["clang"])
+    browser_page.write_page(app, None)
+    assert "a machine without clang" in written.read_text()
