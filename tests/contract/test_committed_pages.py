@@ -1,4 +1,4 @@
-"""README and pages hold the texts of the ledger, and changed flights make results stale."""
+"""Pages are those that code, ledger and the table of words make."""
 
 import json
 from pathlib import Path

@@ -15,7 +15,7 @@ import quad_gym
 from quad_gym import BarometerParams, FlightBatch, TaskParams, WorldParams
 from quad_gym import faults as fault_kinds
 from quad_gym.faults.base import DirectedFault
-from quad_gym.records import Autoreset, Control
+from quad_gym.records import Control
 from tests.builders import flat
 from tests.filter_states import at_rest
 
@@ -294,8 +294,3 @@ def test_arguments_of_filters(kind, method, name):
     more += [(np.nan, 0.0, 1.0), (0.0, np.inf, 1.0), np.zeros((3, 2)), [[0, np.inf], [0, 0]]]
     for value in [*NUMBERS, *OTHERS, *vectors(3), *more]:
         assert_refused_or_flown(use, name, value)
-
-
-def test_kinds_of_autoreset_are_listed_by_their_enumeration():
-    with pytest.raises(ValueError, match="Autoreset"):
-        Autoreset("sometimes")

@@ -1,4 +1,4 @@
-"""`info` of environments with faults and innovations."""
+"""`info` and the privileged observation: faults, innovations, draws and wind."""
 
 import numpy as np
 

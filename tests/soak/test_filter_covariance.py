@@ -93,7 +93,6 @@ def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fa
         looked_at = np.flatnonzero(made | (ticks % 20 == 0))
         if looked_at.size:
             assert_positive_definite(batch.record("L", looked_at))
-
         # a crashed vehicle, or one long in the air, begins anew
         lost = ~(np.abs(batch.record("r")).max(axis=1) < 1e3) | (ticks % 4000 == 0)
         if lost.any():

@@ -37,14 +37,6 @@ def test_a_filter_with_both_is_consistent(suite, kind, late, start):
     assert_flights_consistent(aided(suite, kind, late), start)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("gate", [False, True], ids=["open", "gated"])
-@pytest.mark.parametrize("lacking", ["barometer", "magnetometer"])
-@pytest.mark.parametrize("start", ["cold", "warm"])
-def test_a_filter_with_either_is_consistent(lacking, gate, start):
-    assert_flights_consistent(aided("rtk", gate=gate, **{lacking: None}), start)
-
-
 def assert_flights_consistent(sensors, start):
     batch = fly(sensors, 1000, filter_start=start)
     findings = measure_consistency(batch, seeds=range(1000), duration=10.0)

@@ -89,7 +89,6 @@ def test_examples_do_what_the_page_says():
     for point in names["points"]:
         assert np.linalg.norm(flown(times) - point, axis=1).min() < 1e-3
     path.reset(seed=0)
-
     observation, _ = wall.reset(seed=0)
     batch = wall.unwrapped.flights.batch
     seen = batch.record("r_seen")[0]

@@ -302,7 +302,6 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
     np.testing.assert_array_equal(calm.record("w"), faulty.record("w"))
     speeds, z_I = calm.record("rotor_speeds"), quaternion_to_dcm(calm.record("q"))[:, 2]
     step(calm, faulty)
-
     vehicle, gain = calm.vehicle, faulty.record("rotor_gain")
     which, lost = gain.argmin(axis=1), 1.0 - gain.min(axis=1)
     assert (gain.max(axis=1) == 1.0).all()

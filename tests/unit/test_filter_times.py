@@ -9,7 +9,6 @@ import quad_gym
 from quad_gym.estimation import LONGEST_STEP, ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.packing.flight import params_record
 from quad_gym.params.vehicle import VehicleParams
-from tests.filter_states import set_like
 from tests.level_flights import R_IG
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
@@ -52,18 +51,6 @@ def estimate(kf):
 def assert_same(one, other):
     for name, value in estimate(one).items():
         np.testing.assert_array_equal(value, estimate(other)[name], err_msg=name)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_tick_by_name_is_a_tick(kind):
-    plain, named = started(kind), started(kind)
-    for gyro, accel in samples(20):
-        plain.predict(gyro, accel)
-        named.predict(gyro, accel, dt=TICK)
-        named.predict(gyro, accel, dt=2.0 * TICK)  # and back
-        set_like(named, plain)
-        set_like(plain, plain)
-        assert_same(plain, named)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -147,7 +134,6 @@ def test_a_stamp_within_a_sample_splits_it(samples_of):
     late.update(np.zeros(3), gnss_sigma=wide, time=0.153)
     np.testing.assert_allclose(late.velocity, whole.velocity, atol=0.02)
     np.testing.assert_allclose(late.position, whole.position, atol=0.005)
-
     in_parts, late = started(suite=SUITE), started(suite=SUITE)
     given = samples(30)
     for k, (gyro, accel) in enumerate(given):

@@ -75,7 +75,6 @@ def test_rotors_too_fast_for_the_integration_are_refused(substeps):
     draws = {"motor_time_constant": Uniform(fast, 0.1)}
     message = "randomization of 'motor_time_constant'"
     refused(message, QuadEnv, "hover", randomization=draws, substeps=substeps)
-
     batch = FlightBatch(1, vehicle=slow_ones, substeps=substeps, source=Source.TRUTH)
     batch.reset(seeds=[1])
     for _ in range(400):

@@ -10,8 +10,8 @@ import pytest
 import quad_gym
 from quad_gym.analysis.replay_plots import replay_figure
 from quad_gym.estimation import LOG_COLUMNS, Stream, read_log, replay
-from quad_gym.estimation.player import Player
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
+from quad_gym.params.suites import CONSUMER
 from tests.console_commands import run
 from tests.filter_states import at_rest
 from tests.logged_flights import PX4, RTK, Recorded, errors_in_flight, errors_in_replay, flown
@@ -150,22 +150,6 @@ def test_late_and_unused_measurements_are_counted(table):
     assert np.isfinite(result.position).all()
     result = replay(small(barometer=np.ones(4)), sensors=RTK, start={"heading": 0.0})
     assert result.unused == ("barometer",)
-
-
-def test_memory_of_corrections_does_not_depend_on_stamps(flight):
-    """Fixes 0.1 ms after a sample split the next one: the filter ends with as many corrections."""
-    recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, most_ticks=1)
-    found = []
-    for shift in (0.0, 1e-4):
-        recorded.gnss = [
-            (stamp + shift, received + shift, v) for stamp, received, v in recorded.gnss
-        ]
-        player = Player(read_log(recorded.table()), RTK, "ukf", {}, True, 0.5)
-        player.play()
-        engine = player.filter._engine
-        found.append(engine.read("corrected_variance")[0])
-        assert engine.read("tick")[0] * RTK.imu.dt == pytest.approx(SECONDS, abs=0.02)
-    np.testing.assert_allclose(found[1], found[0], rtol=0.05)
 
 
 def test_tables_of_any_kind_are_the_same_log(recorded, table, tmp_path):
@@ -360,3 +344,15 @@ def test_the_figure_has_a_picture_for_each_sensor(table):
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in figure.axes]
     assert len(titles) == 7
     assert any("features" in title for title in titles)
+
+
+def test_unknown_zero_of_the_barometer_is_its_first_height():
+    """An offset of all heights changes no estimate."""
+    table = Recorded(flown(CONSUMER, 3.0), CONSUMER).table()
+    log = read_log({name: np.asarray(column, float) for name, column in table.items()})
+    coarse, found = np.round(256.0 * log.barometer.values["barometer"]) / 256.0, []
+    for offset in (0.0, 64.0):
+        barometer = dataclasses.replace(log.barometer, values={"barometer": coarse + offset})
+        shifted = dataclasses.replace(log, barometer=barometer, barometer_from_start=True)
+        found.append(replay(shifted, sensors=CONSUMER, start={"heading": 0.3}))
+    np.testing.assert_allclose(found[1].position, found[0].position, atol=1e-9)

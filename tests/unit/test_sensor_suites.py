@@ -88,16 +88,6 @@ def test_the_slow_error_grows_as_a_gauss_markov_process():
     assert_normal(np.hstack([early, late]), np.zeros(6), covariance)
 
 
-def test_drift_grows_until_the_first_fix():
-    """Half a period here; 4,000 flights tell a deviation to 3 %."""
-    gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.6, 0.6), phase=0.5)
-    batch = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover")
-    for after in (0.05, 0.15):
-        steps(batch, 0.05 if after < 0.1 else 0.1)
-        expected = 0.6 * np.sqrt(-np.expm1(-2.0 * after / 60.0))
-        np.testing.assert_allclose(batch.record("gnss_drift").std(axis=0), expected, rtol=0.06)
-
-
 def test_a_receiver_measures_white_noise_and_the_slow_error():
     gnss = CONSUMER.gnss.replace(drift_tau=1.0)
     receiver = GnssReceiver(gnss, np.random.default_rng(5))

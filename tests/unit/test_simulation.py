@@ -13,7 +13,6 @@ from quad_gym.records import (
     FLIGHT,
     POSITION_BLOCK,
     RESULTS,
-    Autoreset,
     Control,
     Source,
 )
@@ -92,19 +91,6 @@ def test_four_thousand_flights_fit_in_two_hundred_megabytes():
         tracemalloc.stop()
     assert peak < 200e6
     assert batch.snapshot().nbytes < 100e6
-
-
-def test_step_after_the_time_limit_begins_another_episode():
-    task = TaskParams(duration=0.05, out_of_bounds=100.0)
-    batch = new_batch(9, task=task, autoreset=Autoreset.NEXT_STEP)
-    batch.reset(seeds=list(range(9)))
-    for k in range(1, 11):
-        batch.step()
-        np.testing.assert_array_equal(batch.result("truncated"), float(k == 10))
-    batch.step()
-    np.testing.assert_array_equal(batch.record("tick"), 0.0)
-    np.testing.assert_array_equal(batch.record("episode"), 2.0)
-    np.testing.assert_array_equal(batch.result("truncated"), 0.0)
 
 
 def test_sensors_that_are_switched_off_measure_nothing():

@@ -141,16 +141,6 @@ def test_chosen_times_are_better_than_those_by_distance():
         assert path.duration < 0.999 * needed
 
 
-def test_two_points_are_the_known_polynomial():
-    """From rest to rest: the minimum-snap polynomial 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7."""
-    path = Trajectory.through([(0, 0, 1), (2, 0, 1)], [0.0, 3.0])
-    s = np.linspace(0.0, 1.0, 50)
-    expected = 2.0 * (35 * s**4 - 84 * s**5 + 70 * s**6 - 20 * s**7)
-    np.testing.assert_allclose(path(3.0 * s)[:, 0], expected, rtol=0.0, atol=1e-12)
-    fast = Trajectory.through([(0, 0, 1), (2, 0, 1)], max_speed=1.0, max_acceleration=1e3)
-    assert fast.duration == pytest.approx(2.0 * 35 / 16, rel=1e-6)  # its largest slope
-
-
 @pytest.mark.parametrize("closed", [False, True])
 def test_yaw_and_its_derivatives(closed):
     angles = np.array([0.0, 1.0, 2.5, 4.0, 5.0])
