@@ -19,6 +19,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
+    "extensions.browser_page",
     "extensions.docstrings",
     "extensions.environment_pages",
     "extensions.equations",

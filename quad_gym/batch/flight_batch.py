@@ -244,7 +244,12 @@ class FlightBatch(FlightMemory):
     def _calls_of_threads(self) -> Calls:
         """Return the arguments with which the threads call the compiled code."""
         self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
-        words: dict[Call, Word] = {
+        words = {**self.memory_of_call(), Call.STAGES: linked_table(self._stages)}
+        return Calls(self._blocks, self._room, words, self._paths)
+
+    def memory_of_call(self) -> dict[Call, Word]:
+        """Return the arguments of a call without blocks and stages; lists: one for each thread."""
+        return {
             Call.COUNT: self.count,
             Call.GROUP: self._group,
             Call.WORD_COUNT: len(self._words),
@@ -256,7 +261,6 @@ class FlightBatch(FlightMemory):
             Call.MODEL: self._model,
             Call.SETTINGS: self._settings,
             Call.WORDS: self._words,
-            Call.STAGES: linked_table(self._stages),
             Call.ACTIONS: self._actions,
             Call.LOW: self._low,
             Call.HIGH: self._high,
@@ -269,7 +273,6 @@ class FlightBatch(FlightMemory):
             Call.WORK: self._work,
             Call.GATHERED: self._gathered,
         }
-        return Calls(self._blocks, self._room, words, self._paths)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the threads, which a copy starts again."""

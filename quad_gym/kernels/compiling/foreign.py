@@ -175,6 +175,8 @@ def emitted(text: str, processor: Processor) -> bytes:
         reloc=processor.reloc,
         codemodel="small",
     )
+    if not processor.triple.startswith("x86"):
+        text = re.sub(r"(?m)^.*@llvm\.x86\.sse2\.pause\(\).*$", "", text)  # a hint while waiting
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = processor.triple, str(machine.target_data)
     builder = llvm.create_pass_builder(

@@ -1,0 +1,30 @@
+"""The page on which one flies in the browser, bundled when the site is built."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from docs.browser.build import page
+from docs.browser.emission import missing_tools
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+_WITHOUT = (
+    "<!doctype html><title>quad_gym</title><p>This site was built on a machine without {tools}, "
+    "which the page needs. In a clone: <code>python -m docs.browser.build fly.html</code></p>\n"
+)
+"""The page where it cannot be built."""
+
+
+def write_page(app: "Sphinx", error: Exception | None) -> None:
+    """Write `_static/fly.html` into the site, or a sentence where tools are missing."""
+    if error is None and app.builder.format == "html":
+        missing = missing_tools()
+        text = _WITHOUT.format(tools=", ".join(missing)) if missing else page()
+        Path(app.outdir, "_static", "fly.html").write_text(text, encoding="utf-8")
+
+
+def setup(app: "Sphinx") -> dict[str, bool]:
+    """Register the extension."""
+    app.connect("build-finished", write_page)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
