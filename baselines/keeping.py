@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+from tqdm.auto import tqdm
 
 from baselines.plans import Plan
 from baselines.seeds import first_seed
@@ -87,7 +88,7 @@ class RunKeeper(ABC):
         self.last: dict[str, float] = {}
         self._since: float | None = None
         self._stop = False
-        self._bar: Any = None
+        self._bar: Any = tqdm(disable=True)  # until the run begins
 
     # ---- specific to the engine -----------------------------------------------------------------
 
@@ -106,17 +107,13 @@ class RunKeeper(ABC):
 
     def begin(self, steps: int) -> None:
         """Start the clock and the progress bar at a number of steps, after compilation."""
-        if not self._quiet:
-            from tqdm.auto import tqdm
-
-            total = self._plan.recipe.steps
-            self._bar = tqdm(total=total, initial=steps, unit=" steps", unit_scale=True)
+        look: dict[str, Any] = {"unit": " steps", "unit_scale": True, "disable": self._quiet}
+        self._bar = tqdm(total=self._plan.recipe.steps, initial=steps, **look)
         self.steps, self._since = steps, time.perf_counter()
 
     def watch(self, model: Policy, steps: int) -> None:
         """Evaluate and store the policy if this is due; to be called before every rollout."""
-        if self._bar is not None:
-            self._bar.update(steps - self._bar.n)
+        self._bar.update(steps - self._bar.n)
         due = steps // self._interval > self.steps // self._interval
         self.steps = steps
         if due or not self.rows:
@@ -139,8 +136,7 @@ class RunKeeper(ABC):
             try:
                 yield
             finally:
-                if self._bar is not None:
-                    self._bar.close()
+                self._bar.close()
 
     def _interrupt(self, number: int) -> None:
         """Stop the run after the present step; after a second signal, immediately."""
@@ -150,8 +146,7 @@ class RunKeeper(ABC):
 
     def finish(self, model: Policy, steps: int) -> None:
         """Store the policy after the last step, if the run is complete."""
-        if self._bar is not None:
-            self._bar.update(steps - self._bar.n)
+        self._bar.update(steps - self._bar.n)
         self.finished = steps >= self._plan.recipe.steps
         if self.finished and self.steps < steps:
             self.steps = steps
@@ -186,8 +181,7 @@ class RunKeeper(ABC):
         writer.writeheader()
         writer.writerows(self.rows)
         replace_file(self._folder / EVALUATIONS, text.getvalue().encode())
-        if self._bar is not None:
-            self._bar.set_postfix_str(f"error {row['mean_error']:.3f} m")
+        self._bar.set_postfix_str(f"error {row['mean_error']:.3f} m")
         self._since = time.perf_counter()
 
     def _count_seconds(self) -> None:

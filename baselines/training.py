@@ -132,12 +132,9 @@ def _train(plan: Plan, folder: Path, resume: bool, options: Mapping[str, bool]) 
     record = {
         "plan": described,
         "interface": interface_of(judge),
-        "finished": keeper.finished,
-        "steps": keeper.steps,
+        **{name: getattr(keeper, name) for name in ("finished", "steps", "best", "last")},
         "training_seconds": keeper.seconds,
         "steps_per_second": keeper.steps / max(keeper.seconds, 1e-9),
-        "best": keeper.best,
-        "last": keeper.last,
         "threads": resolve_threads(plan.threads),
         "ended": time.strftime("%Y-%m-%d %H:%M:%S"),
         "versions": versions("numpy", "numba", "torch", "stable_baselines3", "sb3_contrib"),
