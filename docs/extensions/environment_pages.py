@@ -29,7 +29,7 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
 from quad_gym.envs.keywords import TASK_KEYWORDS
 from quad_gym.envs.spaces import ObservationField
-from quad_gym.flights.record import COLUMNS, FEATURES
+from quad_gym.flights.columns import COLUMNS, FEATURES
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES
 from quad_gym.tasks.view import VIEW_FIELDS

@@ -15,9 +15,9 @@ from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, GnssOutliers
+from quad_gym.flights.columns import COLUMNS
 from quad_gym.flights.files import table
 from quad_gym.flights.flight_scene import FlightScene
-from quad_gym.flights.record import COLUMNS
 from quad_gym.frames import ecef_to_enu
 from quad_gym.records import FaultKind, GateDecision
 from quad_gym.rendering import record_flight
@@ -291,7 +291,7 @@ def test_csv_keeps_every_number(tmp_path):
     with flight.to_csv(tmp_path / "flight.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(flight)
-    for name, values in table(flight).items():
+    for name, values in table(flight.rows).items():
         read = np.array([float(row[name] or "nan") for row in rows])
         np.testing.assert_array_equal(read, values, err_msg=name)
     assert rows[1]["gnss_position_x"] == ""
@@ -299,7 +299,7 @@ def test_csv_keeps_every_number(tmp_path):
 
 def test_the_table_names_every_number_once():
     _, flight, _ = recorded_flight()
-    columns = table(flight)
+    columns = table(flight.rows)
     numbers = sum(int(np.prod(flight[c.name].shape[1:])) for c in COLUMNS)
     assert len(columns) == numbers - 225 + 15  # the covariance has its standard deviations
     np.testing.assert_array_equal(columns["quaternion_w"], flight["quaternion"][:, 0])
@@ -317,7 +317,7 @@ def test_pandas_gets_the_same_table(monkeypatch):
     frame = flight.to_pandas()
     assert frame.index.name == "time"
     np.testing.assert_array_equal(frame.index, flight["time"])
-    for name, values in table(flight).items():
+    for name, values in table(flight.rows).items():
         if name != "time":
             np.testing.assert_array_equal(frame[name], values)
     monkeypatch.setitem(sys.modules, "pandas", None)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from quad_gym import FlightBatch, TaskParams, sensor_suite
 from quad_gym.batch.quantities import QUANTITIES
-from quad_gym.flights.record import COLUMNS
+from quad_gym.flights.columns import COLUMNS
 from quad_gym.records import FLIGHT_FIELDS, Source
 from quad_gym.tasks.view import VIEW_FIELDS
 from tests import builders
