@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint
-from baselines.locks import locked
+from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint, locked
 from baselines.mlp import MlpPolicy, mlp_of
 from baselines.plans import Plan, description
 from baselines.policies import interface_of
@@ -52,7 +51,7 @@ def train(
     """Train a policy, or resume a training that was stopped.
 
     Ctrl-C or SIGTERM stops the run at the next step, from which it can be resumed. The folder is
-    locked during the run (`baselines.locks`).
+    locked during the run (`baselines.keeping`).
 
     Args:
         plan: Plan of the training.
