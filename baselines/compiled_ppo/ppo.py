@@ -19,9 +19,17 @@ from quad_gym.batch.threads import resolve_threads
 from quad_gym.params import checks as check
 
 PARAMETERS = {
-    **{"n_steps": 2048, "batch_size": 64, "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.95},
-    **{"clip_range": 0.2, "normalize_advantage": True, "ent_coef": 0.0, "vf_coef": 0.5},
-    **{"max_grad_norm": 0.5, "critic_only": 0},
+    "n_steps": 2048,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_range": 0.2,
+    "normalize_advantage": True,
+    "ent_coef": 0.0,
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+    "critic_only": 0,
 }
 """Parameters of a recipe, with the defaults of Stable-Baselines3, which lacks `critic_only`: the
 number of values at the end of an observation for the critic only, such as the true state."""

@@ -15,10 +15,18 @@ from quad_gym.experiments.experiment import Training, make_trainings
 from quad_gym.params import checks as check
 
 DEFAULTS: Mapping[str, Any] = {
-    **{"env_ids": ["QuadGym/Circle-v0"], "arms": []},
-    **{"algorithm": "ppo", "steps": None, "n_envs": None, "engine": "sb3"},
-    **{"seeds": 1, "evaluations": 20, "episodes": 100},
-    **{"env": {}, "set": {}, "recipe": {}},
+    "env_ids": ["QuadGym/Circle-v0"],
+    "arms": [],
+    "algorithm": "ppo",
+    "steps": None,
+    "n_envs": None,
+    "engine": "sb3",
+    "seeds": 1,
+    "evaluations": 20,
+    "episodes": 100,
+    "env": {},
+    "set": {},
+    "recipe": {},
 }
 """Keys of a sweep, see `docs/sweeps.md`; None: as in the recipe."""
 
