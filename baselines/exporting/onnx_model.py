@@ -94,8 +94,11 @@ def _metadata(controller: Controller) -> dict[str, Any]:
         "action_kind": controller.action,
         "observation": [
             {
-                **{"name": f.name, "unit": f.unit, "frame": f.frame, "first": f.slice.start},
+                "name": f.name,
+                "first": f.slice.start,
                 "size": f.slice.stop - f.slice.start,
+                "unit": f.unit,
+                "frame": f.frame,
             }
             for f in controller.table
         ],
