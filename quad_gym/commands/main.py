@@ -26,7 +26,7 @@ COMMANDS = {
     "benchmark": "measure the speed of all parts",
     "export policy": "export a trained policy to an autopilot: C or ONNX",
     "export filter": "export a filter to an autopilot: a C library with the same estimates",
-    "compile": "compile the kernels into the cache before their first use",
+    "compile": "compile the kernels before their first use, or build libraries of them",
     "completion": "print a script for the completion of commands and options in a shell",
     "version": "print the version",
 }

@@ -253,3 +253,18 @@ def test_a_policy_that_ships_has_the_record_of_its_training(file):
     record = MlpPolicy.load(file).record
     assert record["finished"]
     assert {"plan", "steps", "best", "versions"} <= set(record)
+
+
+def test_the_compiled_engine_writes_files_for_tensorboard(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    from baselines.compiled_ppo.events import Events
+
+    events = Events(tmp_path / "run")
+    for step in (0, 100):
+        events.add(step, {"evaluation/mean_error": 0.5 + step, "train/loss": 0.25})
+    events.close()
+    found = accumulator.EventAccumulator(str(tmp_path / "run"))
+    found.Reload()
+    assert sorted(found.Tags()["scalars"]) == ["evaluation/mean_error", "train/loss"]
+    errors = found.Scalars("evaluation/mean_error")
+    assert [(e.step, e.value) for e in errors] == [(0, 0.5), (100, 100.5)]

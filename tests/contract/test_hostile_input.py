@@ -1,8 +1,7 @@
 """Hostile values for every keyword: refused by name, or flown without a number that is not finite.
-
 A table: every keyword of every interface, of flights, filters, parameters, draws and faults, with
-values that are not numbers, not finite, too large, too small, of another kind, or of another shape.
-"""
+values that are not numbers, not finite, too large, too small, of another kind, or of another
+shape."""
 
 import dataclasses
 import inspect
@@ -44,8 +43,6 @@ def assert_refused_or_flown(call, name, value):
     for array in seen:
         assert np.isfinite(array).all(), f"{name}={value!r}"
 
-
-# ---- environments --------------------------------------------------------------------------------
 
 ONE_TASK = {
     "gate_count": "Waypoints",
@@ -119,8 +116,6 @@ def test_arguments_of_reset(name):
         assert_refused_or_flown(reset, name, value)
 
 
-# ---- flights -------------------------------------------------------------------------------------
-
 FIELDS = ("r", "v", "q", "w", "rotor_speeds", "r_hat", "v_hat", "R_hat", "b_a_hat", "L", "reward")
 
 
@@ -165,9 +160,6 @@ def test_arguments_of_a_batch_that_is_reset(name):
 
     for value in [*NUMBERS, *OTHERS, *vectors(3)]:
         assert_refused_or_flown(reset, name, value)
-
-
-# ---- parameters ----------------------------------------------------------------------------------
 
 
 def suite_of(**parts):
@@ -262,9 +254,6 @@ def test_fields_of_faults(kind, name):
             name,
             value,
         )
-
-
-# ---- filters -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [quad_gym.UnscentedKalmanFilter, quad_gym.ExtendedKalmanFilter])

@@ -48,10 +48,3 @@ def test_learning_curves_of_the_engines_do_not_differ(compiled, tmp_path):
     assert compiled.shape == (SEEDS, 4)
     p = p_values(compiled, reference)
     assert np.all(p > ALARM), f"{p}\n{compiled}\n{reference}"
-
-
-@pytest.mark.slow  # eight more trainings
-def test_half_the_learning_rate_shows_in_these_curves(compiled, tmp_path):
-    """What the comparison above is able to find."""
-    slower = SHORT.replace(learning_rate=tuple(rate / 2 for rate in SHORT.learning_rate))
-    assert np.any(p_values(compiled, curves(tmp_path, "compiled", SEEDS, slower)) < ALARM)

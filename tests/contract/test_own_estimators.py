@@ -357,9 +357,6 @@ def test_an_instance_flies_in_several_environments_at_once():
     assert estimator.state is Simple.state
 
 
-# ---- commands ---------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def named(monkeypatch):
     """Name of an estimator in the working directory of commands."""

@@ -1,8 +1,6 @@
-"""Filters with a barometer and a magnetometer are consistent, in every combination of options.
-
-The slow tests fly 1,000 flights for 10 s; the fast one flies fewer, of both filters, late and
-gated, and fails by chance once in some ten thousand seeds.
-"""
+"""Filters with a barometer and a magnetometer are consistent, in every combination of options. The
+slow tests fly 1,000 flights for 10 s; the fast one flies fewer, of both filters, late and gated,
+and fails by chance once in some ten thousand seeds."""
 
 import numpy as np
 import pytest
@@ -69,11 +67,8 @@ def test_late_and_gated_flights_are_consistent_after_two_seconds(kind):
 
 
 def test_a_heading_is_as_wrong_as_claimed_while_maneuvers_tell_it():
-    """Mean square of 1,200 headings, of deviation 0.04.
-
-    It is 1.3 where velocities tell nothing of the heading and hard iron does not follow it; the
-    unit tests notice either by itself.
-    """
+    """Mean square of 1,200 headings, of deviation 0.04. It is 1.3 where velocities tell nothing of
+    the heading and hard iron does not follow it; the unit tests notice either by itself."""
     batch = fly(quad_gym.sensor_suite("consumer"), 1200, task="hover", filter_start="cold")
     steps(batch, 1.5)
     vertical = batch.record("R_hat")[:, :, 2]

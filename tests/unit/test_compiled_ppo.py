@@ -14,9 +14,6 @@ def rng():
     return np.random.default_rng(0)
 
 
-# ---- against torch and Stable-Baselines3 ---------------------------------------------------------
-
-
 def models(activation, parameters, count=300, critic_only=0):
     """A model of each kind with the same weights, and the same samples to learn from."""
     torch = pytest.importorskip("torch")
@@ -148,9 +145,6 @@ def test_first_weights_are_orthogonal_as_those_of_stable_baselines():
     assert not b1.any()
 
 
-# ---- rollouts ------------------------------------------------------------------------------------
-
-
 def test_advantages_are_the_sums_that_define_them():
     """A_t = sum_k (gamma lambda)^k d_{t+k}, up to the end of the episode."""
     draw, gamma, decay = rng(), 0.9, 0.8
@@ -208,9 +202,6 @@ def test_actions_have_the_probability_that_is_kept_with_them():
     np.testing.assert_allclose(model._log_probs.reshape(-1), want, atol=1e-4)
     assert abs(z.mean()) < 0.3
     assert 0.7 < z.std() < 1.3
-
-
-# ---- the whole -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("critic_only", [0, 1])

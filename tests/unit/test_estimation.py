@@ -85,9 +85,6 @@ def test_calls_before_the_start_raise():
             getattr(ukf, name)
 
 
-# ---- the start ----
-
-
 @pytest.mark.parametrize("yaw", np.linspace(-3.0, 3.0, 7))
 def test_exact_fix_gives_position_and_attitude(yaw):
     gnss, ukf = LAB.gnss, UnscentedKalmanFilter(LAB)
@@ -159,9 +156,6 @@ def test_initialize_starts_anew_and_forgets_failures():
     assert_same(estimate(running_filter(cycles=0)), estimate(ukf))
 
 
-# ---- set_state ----
-
-
 def given_state(**changes):
     factor = np.tril(np.random.default_rng(2).normal(size=(15, 15))) + 5.0 * np.eye(15)
     state = {
@@ -207,8 +201,6 @@ def test_set_state_refuses_what_is_no_state_and_changes_nothing(name, value):
         ukf.set_state(**given_state(**{name: value}))
     assert_same(before, estimate(ukf))
 
-
-# ---- what it survives ----
 
 EXTREMES = [1e300, -1e300, 1e160, 1e100, -1e30, 1e17]
 

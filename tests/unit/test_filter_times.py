@@ -54,9 +54,6 @@ def assert_same(one, other):
         np.testing.assert_array_equal(value, estimate(other)[name], err_msg=name)
 
 
-# ---- how long a sample is ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_tick_by_name_is_a_tick(kind):
     plain, named = started(kind), started(kind)
@@ -114,9 +111,6 @@ def test_bad_lengths_raise_and_change_nothing(dt):
     assert kf.time == 0.0
     kf.predict(np.zeros(3), [0.0, 0.0, 9.8], dt=LONGEST_STEP)
     assert np.isfinite(kf.covariance).all()
-
-
-# ---- late measurements ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -212,9 +206,6 @@ def test_the_last_update_is_of_what_was_given_even_late():
     assert np.isfinite(on_time.nis).tolist() == [True, False, False, False, False]
     assert np.isfinite(report.nis).tolist() == [False, False, False, True, False]
     assert report.nis[3] == pytest.approx((report.innovation[3, 0] / report.sigma[3, 0]) ** 2)
-
-
-# ---- noise ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)

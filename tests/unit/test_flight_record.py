@@ -39,9 +39,6 @@ def assert_same_flights(ours, theirs):
     assert ours.about == theirs.about
 
 
-# ---- what is kept --------------------------------------------------------------------------------
-
-
 def test_rows_are_control_steps_from_the_start():
     _, flight, _ = recorded_flight(steps=12, control_rate=100.0)
     assert len(flight) == 13
@@ -216,9 +213,6 @@ def test_a_recorded_policy_flies_what_it_flies_unrecorded():
     assert flight.about == {"seed": 6, "env_id": "QuadGym/Waypoints-v0", "by": "pd"}
     with pytest.raises(ValueError, match="time limit"):
         record_flight(policy, "QuadGym/Waypoints-v0", duration=0.0)
-
-
-# ---- files ---------------------------------------------------------------------------------------
 
 
 SAVED = [{}, {"task": "waypoints"}, {"observation": "truth"}, {"camera": False}]

@@ -28,10 +28,8 @@ def test_a_slow_error_in_one_axis_leaves_the_others_without():
 
 
 def riccati(gnss, axis, seconds, speed_sigma=0.03):
-    """Variance of the position of a vehicle on a line, by a Kalman filter of (r, v, b, d).
-
-    Attitude and lever arms are known, so that no filter of the vehicle can do better.
-    """
+    """Variance of the position of a vehicle on a line, by a Kalman filter of (r, v, b, d). Attitude
+    and lever arms are known, so that no filter of the vehicle can do better."""
     dt, imu = 1.0 / gnss.rate, CONSUMER.imu
     decay, kept = np.exp(-dt / imu.accel_bias_tau), np.exp(-dt / gnss.drift_tau)
     F = np.array([[1, dt, -(dt**2) / 2, 0], [0, 1, -dt, 0], [0, 0, decay, 0], [0, 0, 0, kept]])

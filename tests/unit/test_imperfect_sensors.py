@@ -1,8 +1,6 @@
 """Errors of scale and alignment, vibration, constant heading errors, and what limits a camera.
-
 Flights on the true state fly alike whatever measures them, so that samples with an effect and
-without it, of the same seeds, differ by the effect alone.
-"""
+without it, of the same seeds, differ by the effect alone."""
 
 import itertools
 import math
@@ -169,9 +167,6 @@ def test_filter_counts_the_vibration_of_the_measured_thrust(lift):
     np.testing.assert_allclose(added[6:9], gyro, rtol=1e-6)
 
 
-# ---- headings ---------------------------------------------------------------------------------
-
-
 def test_baselines_of_an_episode_share_a_turn_about_body_z():
     sigma, count = 0.1, 400
     erring = LAB.replace(gnss=LAB.gnss.replace(heading_error_sigma=sigma))
@@ -189,9 +184,6 @@ def test_baselines_of_an_episode_share_a_turn_about_body_z():
         np.testing.assert_allclose(after[:, 2], before[:, 2], atol=1e-9)
     low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], count)
     assert low < np.sum(np.square(error / sigma)) < high
-
-
-# ---- the camera -------------------------------------------------------------------------------
 
 
 def seen_by_projection(flights, camera, ground=None):
@@ -253,10 +245,8 @@ def test_blur_grows_with_the_body_rate(rate):
 
 @pytest.mark.parametrize("kind", [quad_gym.UnscentedKalmanFilter, quad_gym.ExtendedKalmanFilter])
 def test_errors_of_scale_and_alignment_add_noise_in_a_maneuver(kind):
-    """As so much more white noise: by that of half a second of the same force.
-
-    An axis errs by its own scale and by its alignment to two others: the mean over the axes counts.
-    """
+    """As so much more white noise: by that of half a second of the same force. An axis errs by its
+    own scale and by its alignment to two others: the mean over the axes counts."""
     accel, error = np.array([1.5, -0.7, 11.0]), 0.004
     plain, dt = with_imu(STANDARD, accel_misalignment_sigma=0.0), STANDARD.imu.dt
     excess = np.linalg.norm(accel - [0.0, 0.0, 9.8])
@@ -280,9 +270,6 @@ def test_errors_of_scale_and_alignment_add_noise_in_a_maneuver(kind):
     np.testing.assert_allclose(scaled, noisy, rtol=1e-12, atol=1e-18)
     grown = np.diag(aligned - exact)[3:6]
     np.testing.assert_allclose(grown, dt * (error * excess) ** 2 / 3.0, rtol=1e-6)
-
-
-# ---- sensors of one vehicle -------------------------------------------------------------------
 
 
 def test_classes_of_one_vehicle_have_every_effect():

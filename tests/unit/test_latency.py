@@ -37,9 +37,6 @@ def corrected_lab(kind="ukf", quiet=False, **latencies):
     return late(suite, **latencies, **choices)
 
 
-# ---- when measurements arrive ----------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("gnss", "camera"),
     [(0.035, 0.015), (0.1, 0.04), (0.13, 0.055), (0.2, 0.08), (0.0, 0.06), (0.11, 0.0)],
@@ -71,14 +68,9 @@ def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
     assert images > 20 * 10
 
 
-# ---- what they do to the estimate ------------------------------------------------------------
-
-
 def deviations_from_the_reference(suite, plain, seconds=1.0):
-    """Worst deviation of the means in claimed deviations, and of the covariances' entries.
-
-    Of a circle, against a filter that filters all over again.
-    """
+    """Worst deviation of the means in claimed deviations, and of the covariances' entries. Of a
+    circle, against a filter that filters all over again."""
     batch = fly(suite, 1, task="circle", start="hover", filter_start="warm")
     start = plain(suite)
     for name in ("r", "v", "R", "b_a", "b_g"):
@@ -126,10 +118,8 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
 def test_late_measurements_leave_what_filtering_all_over_again_does(
     plain, quiet, gnss, camera, bounds
 ):
-    """Up to the second order, and to what measurements in between tell about the IMU's noise.
-
-    At two periods one measurement is taken at the instant at which another arrives.
-    """
+    """Up to the second order, and to what measurements in between tell about the IMU's noise. At
+    two periods one measurement is taken at the instant at which another arrives."""
     kind = "ekf" if plain is PlainEKF else "ukf"
     suite = corrected_lab(kind, quiet=quiet, gnss=gnss, camera=camera)
     seconds = 1.5 if 0.2 in (gnss, 2.5 * camera) else 1.0
@@ -175,9 +165,6 @@ def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
     assert (informed.record("rejections").sum(axis=1) > 0).mean() < 0.05
 
 
-# ---- what must not change --------------------------------------------------------------------
-
-
 def test_failed_late_measurement_leaves_the_estimate():
     suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25), camera=None), gnss=0.05)
     batch = fly(suite, 10, task="hover")
@@ -221,9 +208,6 @@ def test_an_episode_begins_with_nothing_under_way():
         assert batch.record("block_valid")[:, POSITION_BLOCK].all()
         steps(batch, 0.7)
         batch.reset()
-
-
-# ---- nonsense --------------------------------------------------------------------------------
 
 
 def test_nonsense_is_refused():

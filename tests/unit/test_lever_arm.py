@@ -55,9 +55,7 @@ def test_a_known_lever_arm_leaves_the_filter_consistent(name):
 )
 def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind, tolerance):
     """The closed form: f = dw x l + w x (w x l) + g e3, with w = (0, 0, a t) about the vertical.
-
-    The UKF's mean has a second order: the gyro's noise makes the force point up a little less.
-    """
+    The UKF's mean has a second order: the gyro's noise makes the force point up a little less."""
     arm, rate = np.array([0.3, -0.2, 0.1]), 4.0
     suite = mounted("lab", tuple(arm))
     kalman = kind(sensors=suite)

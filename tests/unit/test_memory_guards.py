@@ -1,8 +1,6 @@
-"""Flights touch the memory that they have room for, and nothing beside it.
-
-A batch has room for the parts of a flight's record that it uses. Here that room lies between
-guards: whatever flies, they stay as they are, and what is in them makes no difference.
-"""
+"""Flights touch the memory that they have room for, and nothing beside it. A batch has room for the
+parts of a flight's record that it uses. Here that room lies between guards: whatever flies, they
+stay as they are, and what is in them makes no difference."""
 
 import gymnasium
 import numpy as np

@@ -40,10 +40,8 @@ def factor_of(kf):
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
 def test_a_start_is_as_good_as_its_covariance_says(kind):
-    """Errors of state, hard iron and declination together, over starts with any heading.
-
-    The mean of 600 NEES deviates by 0.25.
-    """
+    """Errors of state, hard iron and declination together, over starts with any heading. The mean
+    of 600 NEES deviates by 0.25."""
     rng, ukf, errors, factors = np.random.default_rng(7), kind(CONSUMER), [], []
     tilt = CONSUMER.estimator.initial_tilt_sigma
     for _ in range(600):

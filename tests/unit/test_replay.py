@@ -49,9 +49,6 @@ def compare(recorded, result, settle, boot=0.0):
     )
 
 
-# ---- errors as in flight -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("estimator", ["ukf", "ekf"])
 def test_a_csv_replays_to_the_errors_of_the_flight(recorded, tmp_path, estimator):
     """Irregular times, 1 % lost, 50 ms of jitter: within 10 % (4 % were seen)."""
@@ -94,10 +91,8 @@ def test_a_log_of_px4_replays_to_the_errors_of_the_flight(tmp_path):
 
 @pytest.mark.slow  # three flights of 5 s, each replayed
 def test_baselines_added_to_a_px4_log_give_the_attitude(tmp_path):
-    """With the baselines that its messages cannot hold, attitude errors are within 10 %, too.
-
-    From 1 s on, over all flights together; 6 % were seen. Without baselines it is 20 to 50 %.
-    """
+    """With the baselines that its messages cannot hold, attitude errors are within 10 %, too. From
+    1 s on, over all flights together; 6 % were seen. Without baselines it is 20 to 50 %."""
     pytest.importorskip("pyulog")
     R_GI = quad_gym.frames.ecef_to_enu(PX4.gnss.reference_antenna_G).T
     sums = np.zeros(2)
@@ -171,9 +166,6 @@ def test_memory_of_corrections_does_not_depend_on_stamps(flight):
         found.append(engine.read("corrected_variance")[0])
         assert engine.read("tick")[0] * RTK.imu.dt == pytest.approx(SECONDS, abs=0.02)
     np.testing.assert_allclose(found[1], found[0], rtol=0.05)
-
-
-# ---- ways to give a log --------------------------------------------------------------------------
 
 
 def test_tables_of_any_kind_are_the_same_log(recorded, table, tmp_path):
@@ -250,9 +242,6 @@ def test_starts_may_be_told(table):
         replay(short, sensors=suite, start={"position": np.zeros(3)})
     with pytest.raises(ValueError, match="keywords of set_state"):
         replay(short, sensors=suite, start={"position": np.zeros(3), "R_BI": np.eye(3)})
-
-
-# ---- what is refused -----------------------------------------------------------------------------
 
 
 def latitude(degrees):
@@ -334,9 +323,6 @@ def test_files_that_are_none_are_refused(tmp_path):
     (tmp_path / "broken.ulg").write_bytes(b"no log at all")
     with pytest.raises(ValueError, match="must be a ULog"):
         replay(tmp_path / "broken.ulg", sensors=RTK)
-
-
-# ---- the command ---------------------------------------------------------------------------------
 
 
 def test_command_writes_estimates_and_innovations(recorded, tmp_path):

@@ -17,9 +17,6 @@ FIELD = [name for name in SUITES if name != "lab"]
 RTK, CONSUMER = (quad_gym.sensor_suite(name).simplified() for name in ("rtk", "consumer"))
 
 
-# ---- the start ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suite", FIELD)
 def test_errors_at_a_level_start_are_as_claimed(suite):
     """All 15 together: the position depends on the attitude: the antenna's is measured."""
@@ -40,9 +37,6 @@ def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
     nis = np.concatenate(squares)
     assert len(nis) > 3000
     assert ALARM < stats.chi2.cdf(nis.sum(), 3 * len(nis)) < 1.0 - ALARM
-
-
-# ---- rates and phases ------------------------------------------------------------------------
 
 
 def ticks_of_fixes(suite, count, ticks):
@@ -77,9 +71,6 @@ def test_random_phases_are_uniform_and_new_in_each_episode():
     np.testing.assert_array_equal(flags[1:21].sum(axis=0), 1)  # one in every period
     counts = np.bincount(first % 20, minlength=20)
     assert stats.chisquare(counts).pvalue > ALARM
-
-
-# ---- GNSS whose error drifts -----------------------------------------------------------------
 
 
 def test_the_slow_error_grows_as_a_gauss_markov_process():
@@ -119,9 +110,6 @@ def test_a_receiver_measures_white_noise_and_the_slow_error():
     np.testing.assert_allclose(lag, np.square(gnss.drift_sigma_I) * np.exp(-1.0), rtol=0.3)
 
 
-# ---- velocity --------------------------------------------------------------------------------
-
-
 def test_gnss_velocity_is_that_of_the_antenna_with_its_noise():
     gnss = RTK.gnss.replace(rate=200.0, phase=0.0, primary_antenna_B=(0.3, 0.0, 0.1))
     batch = fly(RTK.replace(gnss=gnss), 500, task="hover")
@@ -147,9 +135,6 @@ def test_velocity_is_measured_by_suites_that_have_it_only():
         quad_gym.sensor_suite("indoor").with_rates(gnss=10.0)
     with pytest.raises(ValueError, match="camera_rate must not be given without a camera"):
         CONSUMER.with_rates(camera=25.0)
-
-
-# ---- flying without GNSS ---------------------------------------------------------------------
 
 
 def test_indoor_filter_starts_from_its_mark_without_fixes():
@@ -179,9 +164,6 @@ def test_velocity_is_observed_together_with_the_position():
     assert fixes == 5
     without = quad_gym.QuadEnv("hover", observation="measurements", sensors="lab")
     assert "gnss_velocity" not in {field.name for field in without.flights.table}
-
-
-# ---- sensors that are not what the filter believes -------------------------------------------
 
 
 def test_errors_of_the_start_are_those_of_the_true_sensors():
@@ -231,9 +213,6 @@ def test_fixes_come_from_the_true_antenna_with_its_true_noise():
     angles = np.linalg.norm(np.cross(measured, baseline), axis=1) / size**2
     rayleigh = np.sqrt(np.pi / 2) * RTK.gnss.baseline_sigma
     np.testing.assert_allclose(angles.mean(), rayleigh, rtol=0.05)
-
-
-# ---- what real sensors do ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["rtk", "consumer", "indoor"])

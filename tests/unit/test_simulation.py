@@ -81,21 +81,6 @@ def test_every_field_is_readable_as_a_copy(hundred):
         hundred.record("altitude")
 
 
-def test_the_covariance_is_that_of_the_factor(hundred):
-    P, L = hundred.covariance(), hundred.record("L")
-    assert P.shape == (100, 15, 15)
-    np.testing.assert_allclose(P[42], L[42] @ L[42].T, rtol=1e-13, atol=1e-25)
-    assert (np.linalg.eigvalsh(P)[:, 0] > 0.0).all()
-    assert (np.triu(L, k=1) == 0.0).all()
-
-
-def test_results_are_those_of_the_records(hundred):
-    for name in ("position_error", "estimation_error", "reward"):
-        np.testing.assert_array_equal(hundred.result(name), hundred.record(name))
-    gap = np.linalg.norm(hundred.record("r_hat") - hundred.record("r"), axis=1)
-    np.testing.assert_allclose(hundred.result("estimation_error"), gap, rtol=1e-12)
-
-
 def test_four_thousand_flights_fit_in_two_hundred_megabytes():
     tracemalloc.start()
     try:

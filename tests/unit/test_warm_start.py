@@ -92,11 +92,9 @@ def test_the_estimated_biases_are_independent_of_their_errors(name):
 
 @pytest.mark.parametrize("name", SUITES)
 def test_covariance_is_that_of_a_filter_that_has_run_as_long(name):
-    """Of other flights, under another controller.
-
-    Simplified: a heading with a constant error is known better after the moves of a flight than
-    after hovering. So is hard iron, and with the heading tilt and level accelerometer bias.
-    """
+    """Of other flights, under another controller. Simplified: a heading with a constant error is
+    known better after the moves of a flight than after hovering. So is hard iron, and with the
+    heading tilt and level accelerometer bias."""
     suite = quad_gym.sensor_suite(name).simplified()
     cold = fly(suite, 40, task="hover")
     steps(cold, WARM_UP)
