@@ -1,18 +1,21 @@
-"""Evaluations and checkpoints of a run, for both engines; on Ctrl-C, too."""
+"""Evaluations, checkpoints and lock of a run, for both engines; on Ctrl-C, too."""
 
 import csv
 import io
 import os
 import signal
+import socket
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+from filelock import FileLock, Timeout
+from tqdm.auto import tqdm
 
 from baselines.plans import Plan
 from baselines.seeds import first_seed
@@ -87,7 +90,7 @@ class RunKeeper(ABC):
         self.last: dict[str, float] = {}
         self._since: float | None = None
         self._stop = False
-        self._bar: Any = None
+        self._bar: Any = tqdm(disable=True)  # until the run begins
 
     # ---- specific to the engine -----------------------------------------------------------------
 
@@ -106,17 +109,13 @@ class RunKeeper(ABC):
 
     def begin(self, steps: int) -> None:
         """Start the clock and the progress bar at a number of steps, after compilation."""
-        if not self._quiet:
-            from tqdm.auto import tqdm
-
-            total = self._plan.recipe.steps
-            self._bar = tqdm(total=total, initial=steps, unit=" steps", unit_scale=True)
+        look: dict[str, Any] = {"unit": " steps", "unit_scale": True, "disable": self._quiet}
+        self._bar = tqdm(total=self._plan.recipe.steps, initial=steps, **look)
         self.steps, self._since = steps, time.perf_counter()
 
     def watch(self, model: Policy, steps: int) -> None:
         """Evaluate and store the policy if this is due; to be called before every rollout."""
-        if self._bar is not None:
-            self._bar.update(steps - self._bar.n)
+        self._bar.update(steps - self._bar.n)
         due = steps // self._interval > self.steps // self._interval
         self.steps = steps
         if due or not self.rows:
@@ -139,8 +138,7 @@ class RunKeeper(ABC):
             try:
                 yield
             finally:
-                if self._bar is not None:
-                    self._bar.close()
+                self._bar.close()
 
     def _interrupt(self, number: int) -> None:
         """Stop the run after the present step; after a second signal, immediately."""
@@ -150,8 +148,7 @@ class RunKeeper(ABC):
 
     def finish(self, model: Policy, steps: int) -> None:
         """Store the policy after the last step, if the run is complete."""
-        if self._bar is not None:
-            self._bar.update(steps - self._bar.n)
+        self._bar.update(steps - self._bar.n)
         self.finished = steps >= self._plan.recipe.steps
         if self.finished and self.steps < steps:
             self.steps = steps
@@ -186,8 +183,7 @@ class RunKeeper(ABC):
         writer.writeheader()
         writer.writerows(self.rows)
         replace_file(self._folder / EVALUATIONS, text.getvalue().encode())
-        if self._bar is not None:
-            self._bar.set_postfix_str(f"error {row['mean_error']:.3f} m")
+        self._bar.set_postfix_str(f"error {row['mean_error']:.3f} m")
         self._since = time.perf_counter()
 
     def _count_seconds(self) -> None:
@@ -228,3 +224,56 @@ def replace_file(file: Path, content: bytes) -> None:
         stream.flush()
         os.fsync(stream.fileno())
     part.replace(file)
+
+
+# ---- locks ---------------------------------------------------------------------------------------
+# The operating system releases a lock when the process ends for any reason. Locks also work between
+# machines on a shared file system that supports them (NFS, or Lustre mounted with `flock`).
+
+LOCK = "training.lock"
+"""Name of the lock file in the folder."""
+
+HOLDER = "training.process"
+"""Name of the file with the process that has or had the lock."""
+
+PATIENCE = 0.5
+"""Time to wait for a lock [s]; checking for a lock takes it briefly."""
+
+
+class BusyError(RunError):
+    """Error raised when another process trains in the folder."""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock the existing folder of a run, or raise a `BusyError` if another process has the lock."""
+    lock = FileLock(folder / LOCK, timeout=PATIENCE)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise BusyError(f"folder {folder} is in use by {holder(folder)}") from None
+    try:
+        with suppress(OSError):  # a full disk
+            (folder / HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+        yield
+    finally:
+        lock.release()
+
+
+def is_locked(folder: Path) -> bool:
+    """True if a process trains in the folder now."""
+    if not (folder / LOCK).exists():  # never begun
+        return False
+    try:
+        with FileLock(folder / LOCK, timeout=0.0):
+            return False
+    except Timeout:
+        return True
+
+
+def holder(folder: Path) -> str:
+    """Process that has the lock of a folder, or had it last."""
+    try:
+        return (folder / HOLDER).read_text(encoding="utf-8").strip() or "another process"
+    except OSError:
+        return "another process"

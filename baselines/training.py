@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint
-from baselines.locks import locked
+from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint, locked
 from baselines.mlp import MlpPolicy, mlp_of
 from baselines.plans import Plan, description
 from baselines.policies import interface_of
@@ -53,7 +52,7 @@ def train(
     """Train a policy, or resume a training that was stopped.
 
     Ctrl-C or SIGTERM stops the run at the next step, from which it can be resumed. The folder is
-    locked during the run (`baselines.locks`).
+    locked during the run (`baselines.keeping`).
 
     Args:
         plan: Plan of the training.
@@ -134,12 +133,9 @@ def _train(plan: Plan, folder: Path, resume: bool, options: Mapping[str, bool]) 
     record = {
         "plan": described,
         "interface": interface_of(judge),
-        "finished": keeper.finished,
-        "steps": keeper.steps,
+        **{name: getattr(keeper, name) for name in ("finished", "steps", "best", "last")},
         "training_seconds": keeper.seconds,
         "steps_per_second": keeper.steps / max(keeper.seconds, 1e-9),
-        "best": keeper.best,
-        "last": keeper.last,
         "threads": resolve_threads(plan.threads),
         "ended": time.strftime("%Y-%m-%d %H:%M:%S"),
         "versions": versions("numpy", "numba", "torch", "stable_baselines3", "sb3_contrib"),

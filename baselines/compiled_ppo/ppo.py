@@ -19,9 +19,17 @@ from quad_gym.batch.threads import resolve_threads
 from quad_gym.params import checks as check
 
 PARAMETERS = {
-    **{"n_steps": 2048, "batch_size": 64, "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.95},
-    **{"clip_range": 0.2, "normalize_advantage": True, "ent_coef": 0.0, "vf_coef": 0.5},
-    **{"max_grad_norm": 0.5, "critic_only": 0},
+    "n_steps": 2048,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_range": 0.2,
+    "normalize_advantage": True,
+    "ent_coef": 0.0,
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+    "critic_only": 0,
 }
 """Parameters of a recipe, with the defaults of Stable-Baselines3, which lacks `critic_only`: the
 number of values at the end of an observation for the critic only, such as the true state."""
@@ -203,21 +211,14 @@ def advantages(
     gamma: float,
     gae_lambda: float,
 ) -> NDArray[np.float32]:
-    """Generalized advantage estimation (Schulman et al. 2016, eq. 16).
+    """Generalized advantage estimation (Schulman et al. 2016, eq. 16): advantages (T, n).
 
     A_t = d_t + gamma lambda A_{t+1}, d_t = r_t + gamma V(s_{t+1}) - V(s_t); both recursions stop at
     the end of an episode.
 
-    Args:
-        rewards: Rewards of steps, (T, n), with the bootstrapped value at a truncation.
-        values: Values of the observations before the steps, (T, n).
-        ended: True if an episode ended with the step, (T, n).
-        next_values: Values of the observations after the last step, (n,).
-        gamma: Discount factor.
-        gae_lambda: Trade-off between bias and variance, from 0 (one step) to 1 (full returns).
-
-    Returns:
-        Advantages, (T, n).
+    Rewards (T, n) include the bootstrapped value at a truncation. Values (T, n) are of observations
+    before the steps, and `next_values` (n,) of those after the last one. `ended` (T, n) is True if
+    an episode ended with the step.
     """
     found = np.empty_like(values)
     ahead = np.zeros_like(next_values)

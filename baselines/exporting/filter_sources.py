@@ -152,15 +152,9 @@ class Sources:
             "OF_TILT_SIGMA": offset_of(PARAMS_BLOCK, "initial_tilt_sigma"),
             "OF_VELOCITY_VARIANCE": offset_of(PARAMS_BLOCK, "initial_velocity_variance"),
         }
-        fields = {
-            "POSITION": "r_hat",
-            "VELOCITY": "v_hat",
-            "R_HAT": "R_hat",
-            "ACCEL_BIAS": "b_a_hat",
-            "GYRO_BIAS": "b_g_hat",
-            "STATUS": "filter_status",
-        }
-        for name in ("L", "L_slow", "w_before", "gnss_position", "gnss_baseline"):
+        fields = {"POSITION": "r_hat", "VELOCITY": "v_hat", "STATUS": "filter_status"}
+        fields |= {"ACCEL_BIAS": "b_a_hat", "GYRO_BIAS": "b_g_hat"}
+        for name in ("R_hat", "L", "L_slow", "w_before", "gnss_position", "gnss_baseline"):
             fields[name.upper()] = name
         values |= {f"OF_{key}": offset_of(FLIGHT_BLOCK, name) for key, name in fields.items()}
         values["STRUCTS"] = "\n".join(
@@ -247,10 +241,8 @@ class Sources:
             "VELOCITY": gnss is not None and gnss.velocity_sigma is not None,
             "BAROMETER": Aid.BAROMETER in suite.aids,
             "MAGNETOMETER": Aid.MAGNETOMETER in suite.aids,
-            "FEATURE_BLOCKS": FEATURE_BLOCKS,
-            "POSITION_BLOCK": POSITION_BLOCK,
-            "BASELINE_BLOCK": BASELINE_BLOCK,
-            "VELOCITY_BLOCK": VELOCITY_BLOCK,
+            **{"FEATURE_BLOCKS": FEATURE_BLOCKS, "POSITION_BLOCK": POSITION_BLOCK},
+            **{"BASELINE_BLOCK": BASELINE_BLOCK, "VELOCITY_BLOCK": VELOCITY_BLOCK},
         }
         return values if gnss is None else {**values, **self._start_values()}
 
@@ -258,11 +250,9 @@ class Sources:
         """Return the numbers with which the example recognizes a start in motion."""
         gnss, form = self.suite.gnss, self.suite.estimator
         tilt = form.initial_tilt_sigma
+        names = ("SPAN", "TURNING", "FAST", "CERTAIN")
         return {
-            "MOTION_SPAN": repr(first_motion.SPAN),
-            "MOTION_TURNING": repr(first_motion.TURNING),
-            "MOTION_FAST": repr(first_motion.FAST),
-            "MOTION_CERTAIN": repr(first_motion.CERTAIN),
+            **{f"MOTION_{name}": repr(getattr(first_motion, name)) for name in names},
             "MOTION_TILT": repr(0.0 if tilt is None else max(tilt, first_motion.TILT)),
             "MOST_POSITION_SIGMA": repr(float(max(gnss.position_sigma_I))) if gnss else "0.0",
             "SUITE_SPEED_SIGMA": repr(math.sqrt(form.initial_velocity_variance)),

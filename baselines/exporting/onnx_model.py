@@ -46,16 +46,13 @@ def onnx_model(controller: Controller) -> Any:
             nodes.append(helper.make_node(_ACTIVATIONS[activation], [linear], [f"x{k + 1}"]))
     last = f"x{len(policy.weights)}"
     nodes.append(helper.make_node("Clip", [last, "least", "most"], ["action"]))
-    graph = helper.make_graph(
-        nodes,
-        "controller",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", policy.inputs])],
-        [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", 4])],
-        [
-            numpy_helper.from_array(np.asarray(value, np.float32), name)
-            for name, value in constants.items()
-        ],
+    inputs, outputs = (
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])]
+        for name, size in (("observation", policy.inputs), ("action", 4))
     )
+    arrays = {name: np.asarray(value, np.float32) for name, value in constants.items()}
+    stored = [numpy_helper.from_array(value, name) for name, value in arrays.items()]
+    graph = helper.make_graph(nodes, "controller", inputs, outputs, stored)
     model = helper.make_model(
         graph,
         opset_imports=[helper.make_opsetid("", OPSET)],

@@ -41,8 +41,7 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
         axes.plot(time, middle, label=label, **style)
     plots.logarithmic(axes)
     axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("position error [m]\nmedian, 5 to 95 % of episodes")
+    axes.set(xlabel="time [s]", ylabel="position error [m]\nmedian, 5 to 95 % of episodes")
     _legend_below(figure, axes)
     return figure
 
@@ -75,8 +74,7 @@ def learning_figure(
     if not linear:
         plots.logarithmic(axes)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("training [million steps]")
-    axes.set_ylabel(score)
+    axes.set(xlabel="training [million steps]", ylabel=score)
     _legend_below(figure, axes)
     return figure
 

@@ -79,10 +79,9 @@ class Findings:
         for name, part in self.nis.items():
             said[f"nis_{name}"] = f"NIS of the {verdict(part)}{known.get(name, '')}"
         for name, white in self.whiteness.items():
-            largest = f"largest autocorrelation {white.largest:+.3f}"
-            judged = "white" if white.white else "not white"
-            told = f"Innovations of the {name}: {largest}: {judged}."
-            said[f"innovations_{name}"] = told + known.get(name, "")
+            found = f"largest autocorrelation {white.largest:+.3f}: {'' if white.white else 'not '}"
+            said[f"innovations_{name}"] = f"Innovations of the {name}: {found}white."
+            said[f"innovations_{name}"] += known.get(name, "")
         return said
 
 
@@ -142,6 +141,7 @@ def measure_consistency(
             squares.add(batch, step * dt)
             progress(step * dt)
     errors, claimed = squares.errors()
+    gnss = batch.sensors.gnss
     return Findings(
         nees=squares.nees(),
         nis={} if innovations is None else innovations.nis(),
@@ -151,11 +151,5 @@ def measure_consistency(
         tracking=tracking.result(),
         astray=astray,
         failed=int((batch.record("filter_status") != 0).sum()),
-        counted_as_noise=_counted_as_noise(batch),
+        counted_as_noise=frozenset({"baseline"} if gnss and gnss.heading_errs else ()),
     )
-
-
-def _counted_as_noise(batch: FlightBatch) -> frozenset[str]:
-    """Sensors of `Findings.counted_as_noise`."""
-    gnss = batch.sensors.gnss
-    return frozenset({"baseline"} if gnss is not None and gnss.heading_errs else ())

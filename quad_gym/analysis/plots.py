@@ -125,9 +125,7 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
     margin = 0.09 * extent
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, east [m]")
-    axes.set_ylabel("y, north [m]")
+    axes.set(aspect="equal", xlabel="x, east [m]", ylabel="y, north [m]")
     if legend:
         axes.legend(loc="best")
 
@@ -139,8 +137,7 @@ def draw_height(axes: Any, trace: Trace) -> None:
     start = (trace.time[0], trace.position[0, 2])
     axes.plot(*start, label="start", clip_on=False, **_START)
     axes.set_xlim(trace.time[0] - 0.01 * np.ptp(trace.time), trace.time[-1])
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("height z [m]")
+    axes.set(xlabel="time [s]", ylabel="height z [m]")
     axes.legend(loc="lower right")
 
 
@@ -170,8 +167,7 @@ def draw_error(
     axes.set_xlim(trace.time[0], trace.time[-1])
     axes.set_ylim(limits or error_limits([trace], [band] if band else []))
     axes.grid(True, which="minor", axis="y", linewidth=0.3)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("position error [m]")
+    axes.set(xlabel="time [s]", ylabel="position error [m]")
     logarithmic(axes)
     axes.legend(loc="upper right")
 

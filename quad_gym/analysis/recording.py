@@ -71,19 +71,16 @@ def record_flights(
     nees_samples: int = 20,
     progress: Callable[[range], Iterable[int]] = iter,
 ) -> Recording:
-    """Fly and record all flights of a batch with built-in PD control.
+    """Fly a batch of `Control.PD` without autoreset, and record `steps + 1` instants.
 
-    A flight is recorded up to the step before the one that ends its episode.
+    A flight is recorded from its start up to the step before the one that ends its episode.
 
     Args:
-        batch: Flights of `Control.PD` without autoreset.
+        batch: Flights.
         seeds: Seeds of the flights.
         steps: Number of control periods.
         nees_samples: Number of evenly spaced instants at which NEES is computed.
         progress: Function that wraps the range of instants, such as `tqdm.tqdm`.
-
-    Returns:
-        Recording of `steps + 1` instants, of which the start is the first.
     """
     count = batch.count
     times = np.arange(steps + 1, dtype=np.float64) / batch.clocks.control_rate

@@ -17,16 +17,11 @@ import numpy as np
 
 def versions(*packages: str) -> dict[str, str | None]:
     """Versions of Python, quad_gym and further packages; None if a package is not installed."""
-    found: dict[str, str | None] = {
-        "python": platform.python_version(),
-        "quad_gym": version("quad-gym"),
-    }
+    found: dict[str, str | None] = dict.fromkeys(packages)
     for package in packages:
-        try:
+        with suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
-    return found
+    return {"python": platform.python_version(), "quad_gym": version("quad-gym"), **found}
 
 
 def short_name(policy: str) -> str:
@@ -128,11 +123,6 @@ def text_table(groups: Mapping[str, Sequence[str]], rows: Sequence[Sequence[str]
         ]
         return " | ".join("  ".join(padded[k] for k in span) for _, span, _ in spans).rstrip()
 
-    return "\n".join(
-        [
-            " | ".join(group.center(width) for group, _, width in spans).rstrip(),
-            line(headings),
-            "-+-".join("-" * width for _, _, width in spans),
-            *map(line, rows),
-        ]
-    )
+    groups_line = " | ".join(group.center(width) for group, _, width in spans).rstrip()
+    rule = "-+-".join("-" * width for _, _, width in spans)
+    return "\n".join([groups_line, line(headings), rule, *map(line, rows)])

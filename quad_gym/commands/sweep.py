@@ -30,7 +30,7 @@ from quad_gym.commands.options import (
     usage_errors,
     value_of,
 )
-from quad_gym.experiments.arms import ARMS, Arm, chosen_arms, read_arms
+from quad_gym.experiments.arms import ARMS, chosen_arms, read_arms
 from quad_gym.experiments.driver import RETRIES, train_all
 from quad_gym.experiments.executors import make_executor
 from quad_gym.experiments.experiment import Training, check_trainings
@@ -98,7 +98,9 @@ def configure(args: SweepArgs) -> tuple[list[Training], Path]:
     given["env_ids"] = [known_id("env_ids", name) for name in given.get("env_ids", ["circle"])]
     name = IDS[given["env_ids"][0]] if args.file is None else args.file.stem
     folder = args.output or Path("results/sweep") / name
-    trainings = expand(given, _arms(given, args), folder, threads=args.threads)
+    known = ARMS if args.arms_file is None else read_arms(args.arms_file)
+    arms = {arm.name: arm for arm in chosen_arms(known, given.get("arms", []))}
+    trainings = expand(given, arms, folder, threads=args.threads)
     check_trainings(trainings)
     return trainings, folder
 
@@ -125,12 +127,6 @@ def _listed(given: Any) -> Any:
     if isinstance(given, str) and "," in given:
         return [value_of(word) for word in given.split(",")]
     return given
-
-
-def _arms(given: dict[str, Any], args: SweepArgs) -> dict[str, Arm]:
-    """Arms by name."""
-    known = ARMS if args.arms_file is None else read_arms(args.arms_file)
-    return {arm.name: arm for arm in chosen_arms(known, given.get("arms", []))}
 
 
 def main(args: SweepArgs) -> int:

@@ -206,9 +206,6 @@ OUTAGE_DASH = (
 )
 """Arms of `QuadGym/OutageDash-v0`."""
 
-ARMS_OF = {"look_around": ARMS, "stale_race": STALE_RACE, "outage_dash": OUTAGE_DASH}
-"""Arms by task."""
-
 
 def read_arms(file: Path) -> tuple[Arm, ...]:
     """Read the tuple `ARMS` of a Python file.

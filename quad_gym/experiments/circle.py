@@ -75,8 +75,7 @@ def error_table(results: Recordings) -> str:
 
 def consistency_table(results: Recordings) -> str:
     """Format a table of filter consistency."""
-    bound = chi_square_quantile(STATE_DIMENSION, 1.0 - NEES_TAIL)
-    median = chi_square_quantile(STATE_DIMENSION, 0.5)
+    bound, median = (chi_square_quantile(STATE_DIMENSION, p) for p in (1.0 - NEES_TAIL, 0.5))
 
     def cells(values: NDArray[Any]) -> list[str]:
         values = values[np.isfinite(values)]
@@ -174,18 +173,11 @@ def write_numbers(results: Recordings, setup: Setup, seconds: float, arguments: 
     for case, flights in results.items():
         done, nothing = flights.finished, np.full(len(setup.seeds), np.nan)
         estimation = flights.estimation or TrackingSummary(nothing, nothing)
-        tables.append(
-            {
-                "case": [case] * len(setup.seeds),
-                "seed": setup.seeds,
-                "tracking_error_mean_m": flights.tracking.mean,
-                "tracking_error_last_half_m": flights.tracking.last_half,
-                "estimation_error_mean_m": estimation.mean,
-                "estimation_error_last_half_m": estimation.last_half,
-                "ending": flights.ending_names(),
-                "ended_at_s": flights.ended_at,
-            }
-        )
+        columns: dict[str, Any] = {"case": [case] * len(setup.seeds), "seed": setup.seeds}
+        for name, errors in (("tracking", flights.tracking), ("estimation", estimation)):
+            columns |= {f"{name}_error_{k}_m": values for k, values in vars(errors).items()}
+        ended = {"ending": flights.ending_names(), "ended_at_s": flights.ended_at}
+        tables.append({**columns, **ended})
         cases[case] = {
             "finished": done.sum(),
             "crashed": flights.count(filter_failed=False),

@@ -79,16 +79,10 @@ class Comparison(Experiment):
 
     def description(self) -> dict[str, Any]:
         """Everything that affects the results, for JSON."""
+        names = ("env_id", "engine", "recipe", "episodes", "first_episode", "environment")
         return {
-            "env_id": self.env_id,
-            "engine": self.engine,
-            "recipe": self.recipe,
-            "sensors": self.suites,
-            "trained_on": self.sources,
-            "training_seeds": self.seeds,
-            "episodes": self.episodes,
-            "first_episode": self.first_episode,
-            "environment": self.environment,
+            **{name: getattr(self, name) for name in names},
+            **{"sensors": self.suites, "trained_on": self.sources, "training_seeds": self.seeds},
             **contents_of_suite_files(*self.suites),
         }
 
@@ -114,18 +108,13 @@ class MatrixCell:
     def texts(self) -> tuple[str, str, str]:
         """Error and its interval, late error [mm], and crash rate."""
         error = in_brackets(float(np.mean(self.errors)), self.interval, ".1f", 1e3)
-        late, crashed = float(np.mean(self.late_errors)), float(np.mean(self.crash_rates))
-        return error, f"{1e3 * late:.1f}", f"{crashed:.1%}"
+        return error, f"{1e3 * np.mean(self.late_errors):.1f}", f"{np.mean(self.crash_rates):.1%}"
 
     def description(self) -> dict[str, Any]:
         """Numbers for JSON."""
-        return {
-            "mean_error": float(np.mean(self.errors)),
-            "interval_95": self.interval,
-            "late_error": float(np.mean(self.late_errors)),
-            "crash_rate": float(np.mean(self.crash_rates)),
-            "mean_error_of_each_seed": self.errors,
-        }
+        error, late, crashed = map(np.mean, (self.errors, self.late_errors, self.crash_rates))
+        means = {"mean_error": error, "late_error": late, "crash_rate": crashed}
+        return {**means, "interval_95": self.interval, "mean_error_of_each_seed": self.errors}
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,15 +240,10 @@ def _write_numbers(matrix: ComparisonResults) -> list[Path]:
         trainings: list[Any] = comparison.trainings_of(case_of(suite, source)) or [None]
         flights = matrix.flown[case_of(suite, source, observation)]
         for training, flown in zip(trainings, flights, strict=True):
-            rows.append(
-                {
-                    **about,
-                    "training_seed": training and training.plan.seed,
-                    "flown_on": observation,
-                    **flown.episodes.summary(),
-                    "training_seconds": training and training.record()["training_seconds"],
-                }
-            )
+            which = {"training_seed": training and training.plan.seed, "flown_on": observation}
+            seconds = training and training.record()["training_seconds"]
+            numbers = {**flown.episodes.summary(), "training_seconds": seconds}
+            rows.append({**about, **which, **numbers})
         cell = matrix.cell(suite, source, observation)
         cells.append({**about, "flown_on": observation, **cell.description()})
     summary = {

@@ -8,8 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from baselines.keeping import signals_to
-from baselines.locks import holder, is_locked
+from baselines.keeping import holder, is_locked, signals_to
 from baselines.training import train
 from quad_gym.experiments.executors import Ended, Executor, Job
 from quad_gym.experiments.experiment import Training

@@ -65,8 +65,10 @@ def write_evaluation(
     count = len(next(iter(results.values())).episodes.returns)
     tables = (
         {
-            **{"policy": [policy] * count, "observation": [observation] * count},
-            **{"seed": range(seed, seed + count), **flown.episodes._asdict()},
+            "policy": [policy] * count,
+            "observation": [observation] * count,
+            "seed": range(seed, seed + count),
+            **flown.episodes._asdict(),
         }
         for (policy, observation), flown in results.items()
     )

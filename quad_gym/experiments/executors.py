@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
-from baselines.locks import BusyError
+from baselines.keeping import BusyError
 from baselines.plans import Plan
 from baselines.training import train
 from quad_gym.experiments.experiment import Training

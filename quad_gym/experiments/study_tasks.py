@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.intervals import Score, mean, worst_tenth
-from quad_gym.experiments.arms import ARMS_OF, Arm
+from quad_gym.experiments.arms import ARMS, OUTAGE_DASH, STALE_RACE, Arm
 from quad_gym.experiments.flown import Flown
 
 
@@ -89,7 +89,7 @@ def _gates(heading: str) -> dict[str, StudyColumn]:
 
 STUDIED: Mapping[str, StudiedTask] = {
     "look_around": StudiedTask(
-        arms=ARMS_OF["look_around"],
+        arms=ARMS,
         carrying=(
             *("pd_reference", "pd_features", "pd_features_when_uncertain"),
             *("truth", "std_certainty"),
@@ -108,7 +108,7 @@ STUDIED: Mapping[str, StudiedTask] = {
         figure="glance",
     ),
     "stale_race": StudiedTask(
-        arms=ARMS_OF["stale_race"],
+        arms=STALE_RACE,
         carrying=(
             *("pd", "truth", "std", "truth_on_truth", "truth_delay_compensated"),
             "std_delay_compensated",
@@ -123,7 +123,7 @@ STUDIED: Mapping[str, StudiedTask] = {
         course=("gates", 8),
     ),
     "outage_dash": StudiedTask(
-        arms=ARMS_OF["outage_dash"],
+        arms=OUTAGE_DASH,
         carrying=("pd", "pd_slow", "pd_waiting", "truth", "estimate", "std", "truth_on_truth"),
         evaluations=12,
         success=lambda run: passes(run, 10),

@@ -261,7 +261,7 @@ def test_a_policy_that_ships_has_the_record_of_its_training(file):
 
 def test_the_compiled_engine_writes_files_for_tensorboard(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    from baselines.compiled_ppo.events import Events
+    from baselines.compiled_ppo.run import Events
 
     events = Events(tmp_path / "run")
     for step in (0, 100):

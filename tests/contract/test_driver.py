@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from baselines.locks import BusyError, holder, is_locked, locked
+from baselines.keeping import BusyError, holder, is_locked, locked
 from quad_gym.experiments.driver import Driver
 from quad_gym.experiments.executors import Ended, work
 from quad_gym.experiments.sweep_plan import expand, read
