@@ -80,17 +80,7 @@ def save_model(folder: Path, model: BaseAlgorithm, keeper: Keeper) -> None:
 
 
 def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) -> BaseAlgorithm:
-    """Load the model of `last.zip`, and restore flights and random number generators.
-
-    Args:
-        folder: Folder of the run.
-        model: Untrained model of the same plan.
-        env: Environment of the model.
-        keeper: Keeper whose state is restored.
-
-    Raises:
-        ValueError: If the file is damaged.
-    """
+    """Load the model of `last.zip` into an untrained one, and restore flights, keeper and draws."""
     try:
         with zipfile.ZipFile(folder / LAST) as archive:
             state = pickle.loads(archive.read(STATE))
@@ -131,7 +121,7 @@ def run(
     if resuming:
         model = load_model(folder, model, env, keeper)
     steps = plan.recipe.steps - model.num_timesteps
-    with keeper:
+    with keeper.running():
         if steps > 0:
             model.learn(steps, callback=keeper, reset_num_timesteps=not resuming, tb_log_name="run")
         keeper.finish(model, model.num_timesteps)

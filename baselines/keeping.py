@@ -7,9 +7,10 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Any
 
 import gymnasium
 
@@ -21,17 +22,9 @@ EVALUATIONS = "evaluations.csv"
 STATE = "training_state.pickle"
 """Name of the state within the file of the last policy; loading the policy ignores it."""
 _COLUMNS = (
-    "steps",
-    "training_seconds",
-    "mean_error",
-    "late_error",
-    "crash_rate",
-    "return",
-    "gates_passed",
-    "training_return",
+    *("steps", "training_seconds", "mean_error", "late_error", "crash_rate", "return"),
+    *("gates_passed", "training_return"),
 )
-
-
 SUFFIXES = {"sb3": ".zip", "compiled": ".npz"}
 """Extensions of policy files, by engine."""
 
@@ -70,16 +63,10 @@ def score(summary: dict[str, float], duration: float) -> float:
 
 
 class RunKeeper(ABC):
-    """Evaluations of the policy during a run, and files of the run.
+    """Evaluations of the policy during a run by an environment, `judge`, and files of the run.
 
     Evaluations and checkpoints are made between two rollouts. A checkpoint is written under another
     name and then renamed, so that the previous one survives an interruption at any time.
-
-    Args:
-        plan: Plan of the training.
-        folder: Folder of the run.
-        judge: Environment for evaluations.
-        quiet: True to hide the progress bar.
     """
 
     def __init__(
@@ -100,7 +87,6 @@ class RunKeeper(ABC):
         self.last: dict[str, float] = {}
         self._since: float | None = None
         self._stop = False
-        self._handlers: dict[int, Any] = {}
         self._bar: Any = None
 
     # ---- specific to the engine -----------------------------------------------------------------
@@ -146,26 +132,17 @@ class RunKeeper(ABC):
 
     # ---- the beginning and the end --------------------------------------------------------------
 
-    def __enter__(self) -> Self:
-        """Install handlers for SIGINT and SIGTERM."""
-        if threading.current_thread() is threading.main_thread():  # Python allows no other thread
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._handlers[number] = signal.signal(number, self._interrupt)
-        return self
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Context of a run, in which SIGINT and SIGTERM stop it."""
+        with signals_to(self._interrupt):
+            try:
+                yield
+            finally:
+                if self._bar is not None:
+                    self._bar.close()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Restore the previous signal handlers."""
-        while self._handlers:
-            signal.signal(*self._handlers.popitem())
-        if self._bar is not None:
-            self._bar.close()
-
-    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+    def _interrupt(self, number: int) -> None:
         """Stop the run after the present step; after a second signal, immediately."""
         if self._stop:
             raise KeyboardInterrupt
@@ -204,7 +181,11 @@ class RunKeeper(ABC):
         is_best = not self.best or self.last["score"] > self.best["score"]
         self.best = self.last if is_best else self.best
         self._save(model, best=is_best)
-        self._write_rows()
+        text = io.StringIO()
+        writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        replace_file(self._folder / EVALUATIONS, text.getvalue().encode())
         if self._bar is not None:
             self._bar.set_postfix_str(f"error {row['mean_error']:.3f} m")
         self._since = time.perf_counter()
@@ -224,12 +205,19 @@ class RunKeeper(ABC):
             setattr(self, name, value)
         self.steps = steps
 
-    def _write_rows(self) -> None:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        replace_file(self._folder / EVALUATIONS, text.getvalue().encode())
+
+@contextmanager
+def signals_to(handle: Callable[[int], Any]) -> Iterator[None]:
+    """Context in which SIGINT and SIGTERM only call a function with their number."""
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():  # Python allows no other thread
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, lambda number, _: handle(number))
+    try:
+        yield
+    finally:
+        for given, handler in before.items():
+            signal.signal(given, handler)
 
 
 def replace_file(file: Path, content: bytes) -> None:

@@ -30,18 +30,9 @@ class BusyError(RunError):
 
 
 @contextmanager
-def locked(folder: Path, patience: float = PATIENCE) -> Iterator[None]:
-    """Lock the folder of a run.
-
-    Args:
-        folder: Existing folder of the run.
-        patience: Time to wait for the lock [s].
-
-    Raises:
-        ValueError: If another process has the lock (`BusyError`).
-        OSError: If the folder is not writable.
-    """
-    lock = FileLock(folder / LOCK, timeout=patience)
+def locked(folder: Path) -> Iterator[None]:
+    """Lock the existing folder of a run, or raise a `BusyError` if another process has the lock."""
+    lock = FileLock(folder / LOCK, timeout=PATIENCE)
     try:
         lock.acquire()
     except Timeout:

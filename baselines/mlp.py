@@ -68,11 +68,7 @@ class MlpPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Return actions for observations (..., n), and None; always deterministic.
-
-        Raises:
-            ValueError: If the observations have another length.
-        """
+        """Return actions for observations (..., n), and None; always deterministic."""
         x = np.asarray(observation, np.float32)
         if x.shape[-1:] != (self.inputs,):
             raise ValueError(f"observation must be (..., {self.inputs}), got shape {x.shape}")
@@ -89,11 +85,7 @@ class MlpPolicy:
 
     @classmethod
     def load(cls, file: str | Path) -> "MlpPolicy":
-        """Read a policy.
-
-        Raises:
-            ValueError: If the file does not exist, or is not a policy in this format.
-        """
+        """Read a policy; a ValueError if the file does not exist or is no policy in this format."""
         file = Path(file)
         if not file.exists():
             raise ValueError(f"there is no policy {file}")
@@ -111,14 +103,9 @@ class MlpPolicy:
 
 
 def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
-    """Convert the deterministic actor of a Stable-Baselines3 model.
+    """Convert the deterministic actor of a Stable-Baselines3 model with an "MlpPolicy".
 
-    Args:
-        model: PPO, SAC, TD3 or TQC with an "MlpPolicy".
-        record: Training record.
-
-    Raises:
-        ValueError: If the model's actor is not a multilayer perceptron.
+    Raises a ValueError if the actor is not a multilayer perceptron.
     """
     from torch import nn
 

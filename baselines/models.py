@@ -35,17 +35,20 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> BaseAlgorithm:
     """Make the untrained model of a plan's recipe.
 
-    Raises:
-        ValueError: If a parameter of the recipe is unknown to the algorithm, or its value is
-            invalid.
+    Raises a ValueError if a parameter is unknown to the algorithm, or its value is invalid.
     """
     chosen = plan.recipe
+    parameters: dict[str, Any] = {}
     if chosen.parameters.get("critic_only"):
         raise ValueError(
             "critic_only must be 0 with Stable-Baselines3, where actor and critic share inputs, "
             f'got {chosen.parameters["critic_only"]}: it needs engine="compiled"'
         )
-    parameters = _checked_parameters(chosen)
+    if chosen.algorithm == "td3":  # whose policy is deterministic
+        mean = np.zeros(env.action_space.shape or ())
+        noise = NormalActionNoise(mean, np.full_like(mean, chosen.action_noise))
+        parameters = {"action_noise": noise}
+    parameters |= _checked_parameters(chosen)
     first, last = chosen.learning_rate
     activations = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
     policy = {
@@ -64,7 +67,6 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
             env,
             learning_rate=Linear(first, last),
             policy_kwargs=policy,
-            **_exploration(chosen, env),
             seed=plan.seed,
             device="cpu",
             tensorboard_log=None if tensorboard is None else str(tensorboard),
@@ -102,11 +104,3 @@ def _checked_parameters(chosen: Recipe) -> dict[str, Any]:
             if share and value > 1.0:
                 raise ValueError(f"{name} must be at most 1, got {value!r}")
     return found
-
-
-def _exploration(chosen: Recipe, env: VecEnv) -> dict[str, Any]:
-    """Exploration noise for TD3, whose policy is deterministic."""
-    if chosen.algorithm != "td3":
-        return {}
-    mean = np.zeros(env.action_space.shape or ())
-    return {"action_noise": NormalActionNoise(mean, np.full_like(mean, chosen.action_noise))}

@@ -68,11 +68,7 @@ _ABSOLUTE_FIELDS = (
 
 
 def _require_plain_observations(env: Any) -> None:
-    """Reject environments whose wrappers change the observation.
-
-    Raises:
-        ValueError: If a wrapper changes observations or their space.
-    """
+    """Reject environments with wrappers that change observations or their space."""
     layer = env
     while True:
         inner = getattr(layer, "env", None) or getattr(layer, "venv", None)
@@ -188,18 +184,12 @@ class PDPolicy:
     ) -> tuple[NDArray[np.float32], None]:
         """Return the action for an observation, with the signature of Stable-Baselines3.
 
-        Args:
-            observation: Observation, (n_observation,) or (n, n_observation), or a dictionary with
-                the key "policy".
-            state: Not used; the controller has no memory.
-            episode_start: Not used.
-            deterministic: Not used; the controller is always deterministic.
+        The observation is (n_observation,) or (n, n_observation), or a dictionary with the key
+        "policy". Further arguments are not used, because the controller has no memory and is always
+        deterministic.
 
         Returns:
             Action (4,) or (n, 4) in [-1, 1], and None.
-
-        Raises:
-            ValueError: If the length of the observations is not the one of the environment.
         """
         flat = observation["policy"] if isinstance(observation, dict) else observation
         rows = np.atleast_2d(np.asarray(flat, np.float64))

@@ -1,13 +1,13 @@
 """Plans of trainings, and the environments that they define."""
 
 from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium
 
 import quad_gym
-from baselines.recipes import Recipe, recipe, unfreeze
+from baselines.recipes import ReadOnly, Recipe, recipe, unfreeze
 from baselines.seeds import MAX_SEED, first_seed
 from quad_gym.analysis.reports import as_json
 from quad_gym.params import checks as check
@@ -25,35 +25,24 @@ ENGINES = ("sb3", "compiled")
 class Plan(Checked):
     """Plan of a training and its evaluations."""
 
-    env_id: str = "QuadGym/Circle-v0"
+    env_id: Annotated[str, partial(check.choice, choices=tuple(quad_gym.IDS))] = "QuadGym/Circle-v0"
     """Id of the environment, from `quad_gym.IDS`"""
-    environment: Any = field(default_factory=dict)
+    environment: ReadOnly = field(default_factory=dict)
     """Keywords of the environment in training and evaluation; they override the recipe's"""
-    learning: Any = field(default_factory=dict)
+    learning: ReadOnly = field(default_factory=dict)
     """Keywords of the environment in training only; they override all others"""
     recipe: Recipe = field(default_factory=lambda: recipe("QuadGym/Circle-v0"))
-    seed: int = 0
+    seed: Annotated[int, partial(check.whole, least=0, most=MAX_SEED)] = 0
     """Seed of the networks; it also determines the blocks of seeds of the flights in training and
     validation, see `baselines.seeds`"""
     threads: int | None = None
     """Number of threads of the flights; None: one per core. It does not affect results"""
-    engine: str = "sb3"
+    engine: Annotated[str, partial(check.choice, choices=ENGINES)] = "sb3"
     """Training engine, one of `ENGINES`"""
-    evaluations: int = 20
+    evaluations: Annotated[int, check.whole] = 20
     """Number of evaluations, each with a checkpoint, during the training"""
-    episodes: int = 100
+    episodes: Annotated[int, check.whole] = 100
     """Number of episodes in each evaluation"""
-
-    def __post_init__(self) -> None:
-        self._check(check.choice, "env_id", choices=tuple(quad_gym.IDS))
-        self._check(check.choice, "engine", choices=ENGINES)
-        self._check(check.whole, "evaluations", "episodes")
-        self._check(check.whole, "seed", least=0)
-        if self.seed > MAX_SEED:
-            raise ValueError(f"Plan.seed must be at most {MAX_SEED}, got {self.seed}")
-        check.instance("Plan.recipe", self.recipe, Recipe)
-        for name in ("environment", "learning"):
-            self._set(name, MappingProxyType(dict(getattr(self, name))))
 
     def __reduce__(self) -> Any:
         """Support pickling, to send plans to other processes."""

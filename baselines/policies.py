@@ -47,9 +47,6 @@ def interface_of(env: Any) -> dict[str, Any]:
 
     The source of the observation is left out: a policy trained on the truth may fly on the
     estimate.
-
-    Raises:
-        ValueError: If it is no environment of this package.
     """
     flights = _flights_of(env)
     return {
@@ -104,12 +101,7 @@ def load_policy(name: str, env: Any) -> Policy:
 def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
     """Keywords that an environment needs for a policy, in addition to the defaults of its id.
 
-    Args:
-        name: Name or file, as in `load_policy`.
-        env_id: Id from `quad_gym.IDS`.
-
-    Raises:
-        ValueError: If the name is "pretrained" and no policy is included for the task.
+    Raises a ValueError if the name is "pretrained" and no policy is included for the task.
     """
     if name in ("pd:features_when_uncertain", "pd:waiting"):
         return {"include_std": True}
@@ -131,11 +123,7 @@ def _gains_of(file: Path) -> PDGains:
 
 
 def pretrained_file(env_id: str) -> Path:
-    """File of the included policy for a task.
-
-    Raises:
-        ValueError: If no policy is included for it.
-    """
+    """File of the included policy for a task; a ValueError if there is none."""
     file = PRETRAINED / f"{IDS[env_id]}.npz"
     if not file.exists():
         known = sorted(f.stem for f in PRETRAINED.glob("*.npz"))
@@ -156,12 +144,6 @@ def _flights_of(env: Any) -> Any:
     if flights is None:
         raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
     return flights
-
-
-def _space_of(env: Any) -> gymnasium.Space[Any]:
-    """Space of the observations of one flight."""
-    space: gymnasium.Space[Any] = getattr(env, "single_observation_space", env.observation_space)
-    return space
 
 
 def _stable_baselines_policy(file: Path, env: Any) -> Policy:
@@ -187,16 +169,16 @@ def _stable_baselines_policy(file: Path, env: Any) -> Policy:
         model = algorithm_class(_ALGORITHM_OF_MODULE[module]).load(file, device="cpu")
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
         raise ValueError(f"{file} cannot be loaded: {error}") from None
-    space = _space_of(env)
+    space = getattr(env, "single_observation_space", env.observation_space)
     if model.observation_space != space:
-        size = gymnasium.spaces.flatdim(model.observation_space)
-        _require_size(file, size, env)
+        _require_size(file, gymnasium.spaces.flatdim(model.observation_space), env)
         raise ValueError(f"{file} expects observations {model.observation_space}, not {space}")
     return model
 
 
 def _require_size(file: Path, size: int, env: Any) -> None:
-    here = gymnasium.spaces.flatdim(_space_of(env))
+    space = getattr(env, "single_observation_space", env.observation_space)
+    here = gymnasium.spaces.flatdim(space)
     if size != here:
         raise ValueError(
             f"{file} expects observations of {size} numbers, but the environment returns {here}: "
@@ -225,9 +207,10 @@ def _require_agreement(file: Path, record: Mapping[str, Any], env: Any) -> None:
 
 def _difference(trained: Sequence[str], here: Sequence[str]) -> str:
     """Describe the difference of two lists of names: sizes, missing and additional names."""
-    lacking = [name for name in trained if name not in here]
-    more = [name for name in here if name not in trained]
-    words = [f"lacks {', '.join(lacking)}"] if lacking else []
-    words += [f"adds {', '.join(more)}"] if more else []
+    differing = {
+        "lacks": ", ".join(name for name in trained if name not in here),
+        "adds": ", ".join(name for name in here if name not in trained),
+    }
+    words = [f"{verb} {names}" for verb, names in differing.items() if names]
     found = f"it {' and '.join(words)}" if words else "in another order"
     return f"{len(trained)} fields, but the environment returns {len(here)} ({found})"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 from quad_gym import IDS
 from quad_gym.params import checks as check
@@ -23,53 +23,52 @@ ACTIVATIONS = ("relu", "tanh", "elu")
 """Activations between the layers of a policy."""
 
 
+_rates = partial(check.vector, length=2, least=0.0, open_end=True)
+
+
+def _sizes(name: str, sizes: Any) -> tuple[int, ...]:
+    if not sizes:
+        raise ValueError(f"{name} must be positive whole numbers, got {sizes}")
+    return tuple(check.whole(name, size) for size in sizes)
+
+
+def _read_only(name: str, values: Any) -> Mapping[str, Any]:
+    return MappingProxyType(dict(check.instance(name, values, Mapping)))
+
+
+ReadOnly = Annotated[Mapping[str, Any], _read_only]
+"""A mapping that is copied, and cannot be changed."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recipe(Checked):
     """Hyperparameters of a training."""
 
-    algorithm: str = "ppo"
+    algorithm: Annotated[str, partial(check.choice, choices=ALGORITHMS)] = "ppo"
     """Algorithm, one of `ALGORITHMS`"""
-    steps: int = 1_800_000
+    steps: Annotated[int, check.whole] = 1_800_000
     """Environment steps, summed over all flights"""
-    n_envs: int = 256
+    n_envs: Annotated[int, check.whole] = 256
     """Number of parallel flights"""
-    learning_rate: tuple[float, float] = (1e-3, 1e-4)
+    learning_rate: Annotated[tuple[float, float], _rates] = (1e-3, 1e-4)
     """Learning rate at the beginning and at the end, with linear decay between"""
-    layers: tuple[int, ...] = (64, 64)
+    layers: Annotated[tuple[int, ...], _sizes] = (64, 64)
     """Number of units in each hidden layer of the policy"""
-    critic_layers: tuple[int, ...] = (64, 64)
+    critic_layers: Annotated[tuple[int, ...], _sizes] = (64, 64)
     """Number of units in each hidden layer of the value function, or of each critic"""
-    activation: str = "relu"
+    activation: Annotated[str, partial(check.choice, choices=ACTIVATIONS)] = "relu"
     """Activation of hidden layers, one of `ACTIVATIONS`"""
-    reward_scale: float = 0.2
+    reward_scale: check.Positive = 0.2
     """Factor on the rewards that the algorithm receives; a perfect circle then returns 160"""
-    action_noise: float = 0.1
+    action_noise: check.Positive = 0.1
     """Standard deviation of the exploration noise on actions of TD3; the policies of the other
     algorithms are stochastic themselves"""
-    flights: Mapping[str, Any] = field(default_factory=lambda: {"start": "mixed"})
+    flights: ReadOnly = field(default_factory=lambda: {"start": "mixed"})
     """Keywords of the environment for training only, unless they are given explicitly"""
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: ReadOnly = field(default_factory=dict)
     """Further arguments of the algorithm's class"""
-    policy: Mapping[str, Any] = field(default_factory=dict)
+    policy: ReadOnly = field(default_factory=dict)
     """Further arguments of the policy's class"""
-
-    def __post_init__(self) -> None:
-        self._check(check.choice, "algorithm", choices=ALGORITHMS)
-        self._check(check.choice, "activation", choices=ACTIVATIONS)
-        self._check(check.whole, "steps", "n_envs")
-        self._check(check.positive, "reward_scale", "action_noise")
-        self._check(check.vector, "learning_rate", length=2)
-        if min(self.learning_rate) <= 0.0:
-            raise ValueError(
-                f"Recipe.learning_rate must be greater than 0, got {self.learning_rate}"
-            )
-        for name in ("layers", "critic_layers"):
-            sizes = getattr(self, name)
-            if not sizes:
-                raise ValueError(f"Recipe.{name} must be positive whole numbers, got {sizes}")
-            self._set(name, tuple(check.whole(f"Recipe.{name}", n) for n in sizes))
-        for name in ("flights", "parameters", "policy"):
-            self._set(name, MappingProxyType(dict(getattr(self, name))))
 
     def __reduce__(self) -> Any:
         """Support pickling, which read-only mappings do not."""
@@ -87,13 +86,8 @@ def unfreeze(recipe: Any) -> tuple[Any, ...]:
 _PPO = Recipe(
     algorithm="ppo",
     parameters={
-        "n_steps": 32,
-        "batch_size": 1024,
-        "n_epochs": 5,
-        "gamma": 0.97,
-        "gae_lambda": 0.95,
-        "clip_range": 0.2,
-        "ent_coef": 0.0,
+        **{"n_steps": 32, "batch_size": 1024, "n_epochs": 5},
+        **{"gamma": 0.97, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.0},
     },
     policy={"log_std_init": -1.0},
     flights={"start": "mixed", "randomize_reference": True},
@@ -101,18 +95,12 @@ _PPO = Recipe(
 """Result of a search over learning rates, reward scales, activations and batch sizes on Circle."""
 
 _RECURRENT_PPO = _PPO.replace(
-    algorithm="recurrent_ppo",
-    policy={**_PPO.policy, "lstm_hidden_size": 64},
+    algorithm="recurrent_ppo", policy={**_PPO.policy, "lstm_hidden_size": 64}
 )
 
 _OFF_POLICY = {
-    "batch_size": 1024,
-    "buffer_size": 500_000,
-    "learning_starts": 5_000,
-    "train_freq": 1,
-    "gradient_steps": 4,
-    "gamma": 0.95,
-    "tau": 0.01,
+    **{"batch_size": 1024, "buffer_size": 500_000, "learning_starts": 5_000},
+    **{"train_freq": 1, "gradient_steps": 4, "gamma": 0.95, "tau": 0.01},
 }
 _SAC = Recipe(
     algorithm="sac",
@@ -135,47 +123,41 @@ _DEFAULTS = {
 }
 """Default recipe of each algorithm, found on Circle."""
 
+
+def _changed(base: Recipe, parameters: Mapping[str, Any], **fields: Any) -> Recipe:
+    """Recipe with other fields, and other values of some parameters."""
+    found: Recipe = base.replace(parameters={**base.parameters, **parameters}, **fields)
+    return found
+
+
 _SPECIAL: dict[tuple[str, str], Recipe] = {
     # gates are seconds apart: with a shorter horizon, policies fly past them and out of bounds
-    ("QuadGym/Waypoints-v0", "ppo"): _PPO.replace(
-        steps=3_000_000, parameters={**_PPO.parameters, "gamma": 0.99}
-    ),
-    ("QuadGym/StaleRace-v0", "ppo"): _PPO.replace(
-        steps=4_000_000, reward_scale=1.0, parameters={**_PPO.parameters, "gamma": 0.99}
+    ("QuadGym/Waypoints-v0", "ppo"): _changed(_PPO, {"gamma": 0.99}, steps=3_000_000),
+    ("QuadGym/StaleRace-v0", "ppo"): _changed(
+        _PPO, {"gamma": 0.99}, steps=4_000_000, reward_scale=1.0
     ),
     # closer bounds than the task's: a flight that has lost its position teaches little
-    ("QuadGym/LookAround-v0", "ppo"): _PPO.replace(
-        steps=8_000_000,
-        parameters={**_PPO.parameters, "gamma": 0.99},
-        flights={"out_of_bounds": 3.0},
+    ("QuadGym/LookAround-v0", "ppo"): _changed(
+        _PPO, {"gamma": 0.99}, steps=8_000_000, flights={"out_of_bounds": 3.0}
     ),
     # As PPO on this task, with rollouts that are long enough to learn a memory of a second, and
     # large batches, because the time of a gradient step depends on the length of the sequence. It
     # is slow, and therefore has fewer steps than PPO.
-    ("QuadGym/LookAround-v0", "recurrent_ppo"): _RECURRENT_PPO.replace(
+    ("QuadGym/LookAround-v0", "recurrent_ppo"): _changed(
+        _RECURRENT_PPO,
+        {"gamma": 0.99, "n_steps": 64, "batch_size": 2048},
         steps=2_000_000,
-        parameters={
-            **_RECURRENT_PPO.parameters,
-            "gamma": 0.99,
-            "n_steps": 64,
-            "batch_size": 2048,
-        },
         flights={"out_of_bounds": 3.0},
     ),
     # During an outage, halving the speed prevents few crashes, and waiting for its end prevents
     # most: a policy has to discover pauses of seconds. Exploration noise drawn ten times a second
     # averages out, so training holds each action for 0.25 s. Rewards after 7 s of waiting are
     # discounted by 0.996^28 = 0.89.
-    ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
+    ("QuadGym/OutageDash-v0", "ppo"): _changed(
+        _PPO,
+        {"n_epochs": 10, "gamma": 0.996, "gae_lambda": 0.96, "batch_size": 2048},
         steps=1_200_000,
         reward_scale=0.02,
-        parameters={
-            **_PPO.parameters,
-            "n_epochs": 10,
-            "gamma": 0.996,
-            "gae_lambda": 0.96,
-            "batch_size": 2048,
-        },
         flights={"control_rate": 4.0},
     ),
 }
@@ -183,15 +165,7 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
 
 
 def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
-    """Included recipe for a task and an algorithm.
-
-    Args:
-        env_id: Id from `quad_gym.IDS`.
-        algorithm: One of `ALGORITHMS`.
-
-    Raises:
-        ValueError: If either is unknown.
-    """
+    """Included recipe for a task, by its id, and one of `ALGORITHMS`."""
     check.choice("env_id", env_id, tuple(IDS))
     check.choice("algorithm", algorithm, ALGORITHMS)
     return _SPECIAL.get((env_id, algorithm), _DEFAULTS[algorithm])

@@ -45,12 +45,9 @@ class ResidualModel:
     """Lower Cholesky factor of the covariance of the residuals of the fit, (12, 12)"""
 
     def advance(self, error: Floats, velocity: Floats, noise: Floats) -> Floats:
-        """Compute the errors one step later, (n, 12).
+        """Compute the errors (n, 12) one step later.
 
-        Args:
-            error: Errors, (n, 12).
-            velocity: True velocities, (n, 3) in I [m/s].
-            noise: Independent standard normal numbers, (n, 12).
+        Velocities (n, 3) are true ones in I [m/s]; the noise (n, 12) is standard normal.
         """
         return error @ self.A.T + _inputs(velocity) @ self.B.T + noise @ self.L.T
 
@@ -74,9 +71,6 @@ def fit(errors: Floats, velocities: Floats) -> ResidualModel:
         errors: Errors of n flights at successive control steps, (t, n, 12); NaN after the end of a
             flight.
         velocities: True velocities, (t, n, 3) in I [m/s].
-
-    Raises:
-        ValueError: If there are too few errors, or the fitted model is unstable.
     """
     before, after, moving = errors[:-1], errors[1:], velocities[:-1]
     whole = np.isfinite(after).all(axis=2) & np.isfinite(before).all(axis=2)
@@ -104,9 +98,7 @@ def record(
     errors, velocities = [], []
 
     def watch(step: int, batch: Any, flying: NDArray[np.bool_]) -> None:
-        error = error_of(batch.view)
-        error[~flying] = np.nan
-        errors.append(error)
+        errors.append(np.where(flying[:, np.newaxis], error_of(batch.view), np.nan))
         velocities.append(batch.view.velocity.copy())
 
     roll_out(policy, env, seed=seed, watch=watch)
@@ -117,15 +109,8 @@ def error_of(view: Any) -> Floats:
     """Error of the observed state: observed minus true, (n, 12)."""
     seen, truth = view.observed, view.truth
     turn = Rotation.from_matrix(seen.R_BI @ truth.R_BI.transpose(0, 2, 1)).as_rotvec()
-    return np.concatenate(
-        [
-            seen.position - truth.position,
-            seen.velocity - truth.velocity,
-            turn,
-            seen.body_rates - truth.body_rates,
-        ],
-        axis=1,
-    )
+    dr, dv = seen.position - truth.position, seen.velocity - truth.velocity
+    return np.concatenate([dr, dv, turn, seen.body_rates - truth.body_rates], axis=1)
 
 
 def _inputs(velocity: Floats) -> Floats:
@@ -138,8 +123,7 @@ def fit_task(env_id: str, policy: str = "pd", episodes: int = 500) -> ResidualMo
     Args:
         env_id: Id from `quad_gym.IDS`.
         policy: Name or file, see `baselines.policies.load_policy`.
-        episodes: Number of episodes; their seeds are for training, not for tests
-            (`baselines.seeds`).
+        episodes: Number of episodes, with seeds for training (`baselines.seeds`).
     """
     from baselines.policies import load_policy
     from baselines.seeds import first_seed

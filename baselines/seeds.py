@@ -32,18 +32,10 @@ _FIRST = {"training": TEST_END, "validation": 10**12, "test": 0}
 
 
 def flight_seeds(purpose: str, seed: int, count: int) -> range:
-    """Seeds of the flights of one training, validation or test.
+    """Seeds (count,) of the flights of one training, validation or test.
 
-    Args:
-        purpose: One of `PURPOSES`.
-        seed: Seed of the training; for a test, seed of its first flight.
-        count: Number of flights.
-
-    Returns:
-        One seed per flight, (count,).
-
-    Raises:
-        ValueError: If the purpose is unknown, or the seeds are outside the block of the purpose.
+    `seed` is the one of the training or, for a test, of its first flight. Raises a ValueError if
+    the seeds are outside the block of the purpose.
     """
     check.choice("purpose", purpose, PURPOSES)
     check.whole("seed", seed, least=0)

@@ -72,16 +72,11 @@ def train(
     """
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
-        return _train(plan, folder, resume=resume, tensorboard=tensorboard, quiet=quiet)
+        return _train(plan, folder, resume, {"tensorboard": tensorboard, "quiet": quiet})
 
 
 def require_model(plan: Plan) -> None:
-    """Make the untrained model once, to check a plan.
-
-    Raises:
-        ValueError: If the plan is invalid.
-        ImportError: If the training engine is not installed.
-    """
+    """Make the untrained model once, to check a plan, and that its engine is installed."""
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import make_compiled
 
@@ -97,14 +92,8 @@ def require_model(plan: Plan) -> None:
 def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
     """Record of the run in a folder that is resumed; None: a new run begins.
 
-    Args:
-        folder: Folder of the run.
-        plan: Plan of the training.
-        resume: True to continue from the folder's last checkpoint.
-
-    Raises:
-        RunError: If the folder contains a run and `resume` is not set, or contains the run of
-            another plan.
+    Raises a `RunError` if the folder contains a run and `resume` is not set, or contains the run of
+    another plan.
     """
     if not has_checkpoint(folder):
         return None
@@ -123,9 +112,7 @@ def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
     return before
 
 
-def _train(
-    plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: bool
-) -> TrainingResult:
+def _train(plan: Plan, folder: Path, resume: bool, options: Mapping[str, bool]) -> TrainingResult:
     described = description(plan)
     before = run_in(folder, plan, resume=resume)
     if before is not None and before["finished"]:
@@ -137,11 +124,11 @@ def _train(
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import run as run_compiled
 
-        keeper: RunKeeper = run_compiled(plan, folder, judge, tensorboard=tensorboard, quiet=quiet)
+        keeper: RunKeeper = run_compiled(plan, folder, judge, **options)
     else:
         from baselines.checkpoints import run
 
-        keeper = run(plan, folder, judge, tensorboard=tensorboard, quiet=quiet)
+        keeper = run(plan, folder, judge, **options)
     record = {
         "plan": described,
         "interface": interface_of(judge),
@@ -161,14 +148,9 @@ def _train(
 
 
 def _result(plan: Plan, folder: Path, record: Mapping[str, Any]) -> TrainingResult:
-    return TrainingResult(
-        folder=folder,
-        steps=record["steps"],
-        seconds=record["training_seconds"],
-        finished=record["finished"],
-        best=record["best"],
-        best_policy=best_file(plan, folder),
-    )
+    values = {name: record[name] for name in ("steps", "finished", "best")}
+    best = best_file(plan, folder)
+    return TrainingResult(folder, seconds=record["training_seconds"], best_policy=best, **values)
 
 
 def _write_record(folder: Path, record: Any) -> None:
@@ -179,8 +161,7 @@ def _write_record(folder: Path, record: Any) -> None:
 def export(training: TrainingResult, file: Path) -> None:
     """Write the best policy of a training, with its record, to a file that requires only NumPy.
 
-    Raises:
-        ValueError: If the policy is not a multilayer perceptron.
+    Raises a ValueError if the policy is not a multilayer perceptron.
     """
     record = json.loads((training.folder / "training.json").read_text(encoding="utf-8"))
     if training.best_policy.suffix == ".npz":

@@ -35,23 +35,17 @@ class Policy(Protocol):
 class Episodes(NamedTuple):
     """Results of n episodes; each field is an array (n,)."""
 
-    returns: NDArray[np.float64]
-    """Sums of rewards"""
-    lengths: NDArray[np.int64]
-    """steps"""
-    mean_error: NDArray[np.float64]
-    """True position error, mean over the episode [m]"""
+    returns: NDArray[np.float64]  #: sums of rewards
+    lengths: NDArray[np.int64]  #: steps
+    mean_error: NDArray[np.float64]  #: true position error, mean over the episode [m]
     late_error: NDArray[np.float64]
     """True position error, mean over the second half of the time limit [m]; NaN for episodes that
     crashed or ended before the time limit"""
     estimation_error: NDArray[np.float64]
     """Distance between observed and true position, mean over the episode [m]"""
-    crashed: NDArray[np.bool_]
-    """True for episodes that ended in a crash"""
-    gates_passed: NDArray[np.int64]
-    """Number of gates passed on a course of gates"""
-    ending: NDArray[Any]
-    """name of the ending, as text"""
+    crashed: NDArray[np.bool_]  #: True for episodes that ended in a crash
+    gates_passed: NDArray[np.int64]  #: number of gates passed on a course of gates
+    ending: NDArray[Any]  #: name of the ending, as text
 
     def summary(self) -> dict[str, float]:
         """Means over the episodes, and the share of episodes that crashed, by name."""

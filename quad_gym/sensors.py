@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.kernels import single
+from quad_gym.kernels import entries
 from quad_gym.packing.flight import params_record
 from quad_gym.params import checks as check
 from quad_gym.params.camera import CameraParams
@@ -55,7 +55,7 @@ class GnssReceiver(_Sensor):
         self._drifts, self._paired = params.drifts, params.has_baseline
         self._turns = params.heading_errs
         if self._turns:
-            single.draw_sensor_errors(self._flight, self._params)
+            entries.draw_sensor_errors(self._flight, self._params)
 
     def measure(
         self, position: ArrayLike, R_BI: ArrayLike
@@ -75,10 +75,10 @@ class GnssReceiver(_Sensor):
         """
         self._place(position, R_BI)
         if self._drifts:
-            single.step_gnss_drift(self._flight, self._params)
-        single.sense_gnss(self._flight, self._params, self._paired)
+            entries.step_gnss_drift(self._flight, self._params)
+        entries.sense_gnss(self._flight, self._params, self._paired)
         if self._turns:
-            single.turn_gnss_baseline(self._flight, self._params)
+            entries.turn_gnss_baseline(self._flight, self._params)
         baseline = self._flight["gnss_baseline"][0].copy()
         return self._flight["gnss_position"][
             0
@@ -125,10 +125,10 @@ class Camera(_Sensor):
         rates = check.array("body_rates", body_rates, (3,))
         self._place(position, R_BI)
         self._flight["w"] = rates
-        single.sense_features(self._flight, self._params, self._features)
+        entries.sense_features(self._flight, self._params, self._features)
         if self._limited:
             limits = (self._blurs, self._hides, self._features)
-            single.limit_features(self._flight, self._params, *limits)
+            entries.limit_features(self._flight, self._params, *limits)
         seen = self._flight["block_valid"][0, FEATURE_SLICE][: self._features] > 0.0
         return np.where(seen[:, np.newaxis], self._flight["pixels"][0, : self._features], np.nan)
 
@@ -155,7 +155,7 @@ class Imu(_Sensor):
         self._flight["b_g"] = rng.normal(0.0, params.gyro_bias_sigma, 3)
         self._disturbed = params.errs or params.vibrates
         if params.errs:
-            single.draw_sensor_errors(self._flight, self._params)
+            entries.draw_sensor_errors(self._flight, self._params)
 
     @property
     def accel_bias(self) -> NDArray[np.float64]:
@@ -202,13 +202,13 @@ class Imu(_Sensor):
         self._set(f, s)
         f["disturbance"] = force
         if self._averages:
-            single.sense_imu_average(f, self._params, self._start)
+            entries.sense_imu_average(f, self._params, self._start)
         else:
-            single.sense_imu(f, self._params)
+            entries.sense_imu(f, self._params)
         if self._disturbed:
-            single.disturb_imu(f, self._params)
+            entries.disturb_imu(f, self._params)
         gyro, accel = f["gyro"][0].copy(), f["accel"][0].copy()
-        single.step_biases(f, self._params)
+        entries.step_biases(f, self._params)
         return gyro, accel
 
     @staticmethod

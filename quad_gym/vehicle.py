@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.kernels import single
+from quad_gym.kernels import entries
 from quad_gym.packing.flight import params_record
 from quad_gym.packing.world import world_settings
 from quad_gym.params import checks as check
@@ -72,10 +72,10 @@ def state_derivative(
     motion = (s["R_BI"], s["velocity"], s["body_rates"], s["rotor_speeds"], d_I)
     record = params_record(params, SensorSuite(), world=world)
     if world is None:
-        single.body_accelerations(*motion, record, a_I, dw_B)
+        entries.body_accelerations(*motion, record, a_I, dw_B)
     else:
         settings = world_settings(world)
-        single.body_accelerations_in_air(s["position"], *motion, record, settings, a_I, dw_B)
+        entries.body_accelerations_in_air(s["position"], *motion, record, settings, a_I, dw_B)
     lag = params.motor_speed_per_volt * ea - s["rotor_speeds"]
     return {
         "position": s["velocity"],

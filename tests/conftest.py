@@ -4,11 +4,11 @@ import os
 
 from hypothesis import HealthCheck, settings
 
-from quad_gym.kernels.compiling.cores import available_cores
-from quad_gym.kernels.compiling.linked import names_of
-from quad_gym.kernels.compiling.stages import SOURCES
 from quad_gym.kernels.compiling.workers import prepare
-from quad_gym.kernels.single import FILTER_ENTRIES, SENSORS_AND_VEHICLE
+from quad_gym.kernels.cores import available_cores
+from quad_gym.kernels.entries import FILTER_ENTRIES, SENSORS_AND_VEHICLE
+from quad_gym.kernels.linked import names_of
+from quad_gym.kernels.stages import SOURCES
 
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # for this process and those that it starts
     share = str(max(1, available_cores() // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])))

@@ -7,14 +7,7 @@ from typing import Any
 
 
 class Events:
-    """Writer of scalars over steps for TensorBoard.
-
-    Args:
-        folder: Folder for the files.
-
-    Raises:
-        ImportError: If TensorBoard is not installed.
-    """
+    """Writer of scalars over steps for TensorBoard, which must be installed, into a folder."""
 
     def __init__(self, folder: Path) -> None:
         from tensorboard.compat.proto import event_pb2, summary_pb2

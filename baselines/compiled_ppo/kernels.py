@@ -13,9 +13,10 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.board import FINISHED, TICKET, comes, finished, post, take
+from quad_gym.kernels.board import comes, finished, post, take
 from quad_gym.kernels.compiling import entry, kernel, routine
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
+from quad_gym.records.board import FINISHED, TICKET
 
 TILE = 64
 """Number of samples in a tile."""

@@ -19,14 +19,9 @@ Samples = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], N
 
 
 class Learner:
-    """Training of networks on samples, as in `stable_baselines3.PPO.train`.
+    """Training on samples with advantages (n,), as in `stable_baselines3.PPO.train`.
 
-    Args:
-        networks: Networks to train.
-        samples: Samples, read again in each `learn`.
-        advantages: Advantages of the samples, (n,), read again in each `learn`.
-        parameters: Complete parameters of a recipe.
-        threads: Number of threads.
+    Each `learn` reads samples and advantages again; `parameters` are a recipe's complete ones.
     """
 
     def __init__(
@@ -65,8 +60,7 @@ class Learner:
     def learn(self, rate: float, rng: np.random.Generator) -> dict[str, float]:
         """Train on all samples for `n_epochs` epochs; returns means of `SUMS` over the last one.
 
-        Raises:
-            FloatingPointError: If a gradient is not finite because the training has diverged.
+        Raises a FloatingPointError if a gradient is not finite because the training has diverged.
         """
         count, size = len(self.order), self.parameters["batch_size"]
         for _ in range(self.parameters["n_epochs"]):

@@ -13,17 +13,11 @@ from baselines.recipes import ACTIVATIONS, Recipe
 
 
 class Networks:
-    """Gaussian policy and value function.
+    """Gaussian policy and value function of a recipe, for observations and actions of some lengths.
 
     The vector of parameters contains the actor's layers, the logarithms of the policy's standard
     deviations, and the critic's layers. Initial values are drawn as in Stable-Baselines3.
-
-    Args:
-        inputs: Length of an observation in training.
-        outputs: Length of an action.
-        recipe: Recipe with layers, activation and initial standard deviations.
-        rng: Generator for the initial weights.
-        critic_only: Number of inputs, at the end, for the critic only.
+    `critic_only` inputs, at the end, are for the critic only.
     """
 
     def __init__(

@@ -99,12 +99,10 @@ class CompiledPPO:
         *,
         quiet: bool = False,
     ) -> None:
-        """Train until a total number of environment steps is reached.
+        """Train until a total number of environment steps, summed over all flights, is reached.
 
-        Args:
-            steps: Number of steps, summed over all flights; the last rollout is completed.
-            watch: Function called between rollouts; the training stops if it returns False.
-            quiet: True to hide the progress bar.
+        The last rollout is completed. `watch` is called between rollouts; the training stops if it
+        returns False. `quiet` hides the progress bar.
         """
         from tqdm.auto import tqdm
 

@@ -41,30 +41,16 @@ class CompiledKeeper(RunKeeper):
 
 
 def make_compiled(plan: Plan) -> CompiledPPO:
-    """Make the untrained model of a plan, with its environment.
-
-    Raises:
-        ValueError: If the compiled PPO does not support the plan.
-    """
+    """Make the untrained model of a plan, with its environment."""
     seed = first_seed("training", plan.seed, plan.recipe.n_envs)
     flights = plan.make_vector_flights()
     if plan.recipe.parameters.get("critic_only"):
         _require_leaving(plan, flights)
-    return CompiledPPO(
-        flights,
-        plan.recipe,
-        seed=plan.seed,
-        env_seed=seed,
-        threads=plan.threads,
-    )
+    return CompiledPPO(flights, plan.recipe, seed=plan.seed, env_seed=seed, threads=plan.threads)
 
 
 def _require_leaving(plan: Plan, flights: Any) -> None:
-    """Check that `critic_only` leaves the actor exactly the observation of the policy in tests.
-
-    Raises:
-        ValueError: If the observation in training without the critic's part is another one.
-    """
+    """Check that `critic_only` leaves the actor exactly the observation of the policy in tests."""
     judge: Any = plan.make_judge()
     learned, judged = (env.unwrapped.flights.table for env in (flights, judge))
     judge.close()
@@ -103,7 +89,7 @@ def run(
         keeper.watch(model, model.num_timesteps)
         return not keeper.stopping
 
-    with keeper:
+    with keeper.running():
         model.prepare()
         keeper.begin(model.num_timesteps)
         model.learn(plan.recipe.steps, watch, quiet=True)  # the keeper has a progress bar

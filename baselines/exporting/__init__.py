@@ -5,11 +5,4 @@ from baselines.exporting.filter_library import TARGETS, export_filter
 from baselines.exporting.onnx_model import save_onnx
 from baselines.exporting.source import c_source
 
-__all__ = [
-    "TARGETS",
-    "Controller",
-    "c_source",
-    "controller_of",
-    "export_filter",
-    "save_onnx",
-]
+__all__ = ["TARGETS", "Controller", "c_source", "controller_of", "export_filter", "save_onnx"]

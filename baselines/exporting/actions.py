@@ -28,14 +28,9 @@ class ActionField(NamedTuple):
 
 
 def action_fields(action: str, params: Any) -> tuple[ActionField, ...]:
-    """Describe the four components of an action.
+    """Describe the four components of an action, the keyword `action` of an environment.
 
-    Args:
-        action: Keyword `action` of the environment.
-        params: Nominal parameters, one scalar PARAMS record (`packing.flight.params_record`).
-
-    Raises:
-        ValueError: If the action is unknown.
+    `params` are nominal parameters, one scalar PARAMS record (`packing.flight.params_record`).
     """
     check.choice("action", action, ("ctbr", "motor", "wrench", "attitude", "velocity"))
     weight = float(params["mass"] * params["gravity"])

@@ -46,13 +46,9 @@ class Controller:
         return low.astype(np.float32), high.astype(np.float32)
 
     def act(self, observations: Any) -> NDArray[np.float32]:
-        """Return the actions that an exported controller must return.
+        """Return the actions (..., 4) in [-1, 1] that an exported controller must return.
 
-        Args:
-            observations: Observations described by `table`, (..., n); they are clipped to bounds.
-
-        Returns:
-            Actions, (..., 4) in [-1, 1].
+        Observations (..., n), described by `table`, are clipped to bounds.
         """
         within = np.clip(np.asarray(observations, np.float32), *self.bounds)
         return self.policy.predict(within)[0]

@@ -12,10 +12,10 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from baselines.exporting.controller import Controller
-from baselines.exporting.filter_policy import PolicySources, policy_sources
+from baselines.exporting.filter_policy import policy_values
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 
@@ -73,9 +73,6 @@ def export_filter(
         folder: Folder to write to; created if it does not exist.
         policy: Policy that acts on the estimate; None: the filter alone.
 
-    Returns:
-        The files.
-
     Raises:
         ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
             observes more than the estimate.
@@ -83,12 +80,12 @@ def export_filter(
     """
     check.choice("target", target, tuple(TARGETS))
     suite.require_filter()
-    text = PolicySources() if policy is None else policy_sources(policy)
+    values = {} if policy is None else policy_values(policy)
     env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
     done = subprocess.run(
         [sys.executable, "-c", f"from {__name__} import write; write()"],
-        input=pickle.dumps((suite, label, target, tuple(text))),
+        input=pickle.dumps((suite, label, target, values)),
         stdout=subprocess.PIPE,
         env={**os.environ, **env, "PYTHONPATH": path},
         check=False,
@@ -109,7 +106,7 @@ def write() -> None:
 
 
 def _contents(
-    suite: SensorSuite, label: str, target: str, policy: tuple[str, ...]
+    suite: SensorSuite, label: str, target: str, policy: dict[str, Any]
 ) -> dict[str, bytes]:
     """Return the files by name; records must have one lane."""
     from baselines.exporting.filter_sources import Sources
@@ -123,10 +120,8 @@ def _contents(
         symbol_of,
     )
 
-    sources, processor = (
-        Sources(suite, label, target, policy),
-        Processor(*TARGETS[target].processor),
-    )
+    sources = Sources(suite, label, target, policy)
+    processor = Processor(*TARGETS[target].processor)
     missing = [name for name in sources.functions if not is_cached(name, processor)]
     if missing:
         say(f"quad_gym: compiling {len(missing)} parts of the filter for {target} (once)")

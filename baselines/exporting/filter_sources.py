@@ -4,26 +4,28 @@ Records must have one lane, see `filter_library`.
 """
 
 import math
-import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import quad_gym
-from baselines.exporting.filter_inputs import LAST_RANK, inputs_of
 from baselines.exporting.filter_library import HEADER, TARGETS
+from baselines.exporting.source import filled
 from quad_gym.estimation import first_motion
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.first_fix import FARTHEST_FIX, LEAST_COURSE
 from quad_gym.estimation.starts import LEVEL_SIGMA, state_at_rest
 from quad_gym.kernels.compiling.foreign import symbol_of
-from quad_gym.kernels.compiling.stages import Stage, needed_stages
-from quad_gym.kernels.single import FILTER_STAGES
+from quad_gym.kernels.entries import FILTER_STAGES
+from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.packing.aids import slow_states
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
+    AID_BLOCKS,
+    AID_FREEDOMS,
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
     FLIGHT_BLOCK,
     KEPT,
     MAX_STATES,
@@ -31,35 +33,36 @@ from quad_gym.records import (
     NOISE_FIELDS,
     PARAMS_BLOCK,
     PARTS,
+    POSITION_BLOCK,
     SAMPLE,
     START,
     STEP_BLOCK,
+    VELOCITY_BLOCK,
     WORK_BLOCK,
     Aid,
     offset_of,
     room_of,
 )
 
-_TEMPLATES = Path(__file__).parent / "templates"
 _ENTRIES = tuple(f"quad_gym.kernels.exported:{n}" for n in ("predict", "update", "start", "keep"))
-_LEVEL = "quad_gym.kernels.single:start_level"
+_LEVEL = "quad_gym.kernels.exported:start_level"
+_AID_NOTES = {
+    Aid.BAROMETER: "height in I from static pressure [m]",
+    Aid.MAGNETOMETER: "magnetic field in B [T]",
+    Aid.OPTICAL_FLOW: "optical flow [rad/s], see quad_gym.OpticalFlowParams",
+    Aid.RANGE_FINDER: "range to the ground [m]",
+}
 _WINDOW = 0.5
 """Longest delay of measurements beyond the suite's `log_delays` [s], as in a replay."""
 
 
 class Sources:
-    """Contents of the files of an exported filter.
+    """Contents of the files of an exported filter of a suite, for one of TARGETS.
 
-    Args:
-        suite: Sensor suite with its filter.
-        label: Name of the suite.
-        target: One of TARGETS.
-        policy: `PolicySources` of a policy.
+    `policy` are the values of a policy for the templates (`policy_values`), or none.
     """
 
-    def __init__(
-        self, suite: SensorSuite, label: str, target: str, policy: tuple[str, ...]
-    ) -> None:
+    def __init__(self, suite: SensorSuite, label: str, target: str, policy: dict[str, Any]) -> None:
         self.suite, self.label, self.target, self.policy = suite, label, target, policy
         self.engine = Engine(suite, suite.estimator.kind)
         needed = needed_stages(self.engine.settings[0])
@@ -67,9 +70,10 @@ class Sources:
         self.slow = slow_states(suite)
         self.first = self._first()
         used = {"core", "filter", "watch"}
-        used |= ({"slow"} if self.engine.slow_states else set()) | (
-            {"aids"} if suite.aids else set()
-        )
+        if self.engine.slow_states:
+            used.add("slow")
+        if suite.aids:
+            used.add("aids")
         self.room = room_of(frozenset(used))
         self.copied = self._copied(used)
 
@@ -91,20 +95,14 @@ class Sources:
         }
 
     def texts(self, flash: int) -> dict[str, bytes]:
-        """Return header, example, CMake file and README, by name.
-
-        Args:
-            flash: Size of the library [bytes].
-        """
+        """Return header, example, CMake file and README by name, for a library's size [bytes]."""
         values = {**self._suite_values(), **self._record_values(), **self._sensor_values()}
-        names = ("POLICY_API", "POLICY_NETWORK", "POLICY_ACTION")
-        values |= dict(zip(names, self.policy, strict=True))
-        values["IMPLEMENTATION"] = _filled("implementation.c", values)
-        values["FLASH"] = f"{flash:,}"
+        values |= {"POLICY": False, **self.policy, "FLASH": f"{flash:,}"}
+        values["IMPLEMENTATION"] = filled("implementation.c", values)
         files = {HEADER: "quad_gym_filter.h"} | {
             name: name for name in ("main.c", "CMakeLists.txt", "README.md")
         }
-        return {name: _filled(source, values).encode() for name, source in files.items()}
+        return {name: filled(source, values).encode() for name, source in files.items()}
 
     # ---- numbers ------------------------------------------------------------------------------
 
@@ -223,26 +221,38 @@ class Sources:
         }
 
     def _sensor_values(self) -> dict[str, Any]:
-        suite = self.suite
-        found = inputs_of(suite)
-        ranks = [f"{given.measured} ? {given.rank}" for given in found if given.rank < LAST_RANK]
-        functions = [function for given in found for function in given.functions]
-        values = {
-            "SENSOR_MACROS": "".join(f"{line}\n" for given in found for line in given.macros),
-            "MEASUREMENT_FIELDS": "".join(
-                f"    {line}\n" for given in found for line in given.fields
-            ),
-            "UPDATE_API": "".join(function.declaration for function in functions),
-            "UPDATE_SOURCE": "\n".join(function.definition for function in functions),
-            "TAKE": "".join(given.take for given in found)
-            + f"    rank = {' : '.join([*ranks, str(LAST_RANK)])};",
-            "START_API": "",
-            "START_SOURCE": "",
+        suite, gnss = self.suite, self.suite.gnss
+        parts = ("AID_MACROS", "AID_FIELDS", "AID_TAKE", "AID_API", "AID_SOURCE")
+        texts = dict.fromkeys(parts, "")
+        for aid in suite.aids:
+            name, count, note = aid.name.lower(), AID_FREEDOMS[aid], _AID_NOTES[aid]
+            value = f"double {name}" if count == 1 else f"const double {name}[{count}]"
+            call = f"int qg_update_{name}(qg_filter *f, {value}, double time)"
+            given = {
+                **{"NAME": name, "COUNT": count, "BLOCK": AID_BLOCKS + aid, "INDEX": int(aid)},
+                **{"CALL": call, "ADDRESS": f"&{name}" if count == 1 else name},
+            }
+            texts["AID_MACROS"] += f"#define QG_{aid.name} 1\n"
+            texts["AID_FIELDS"] += f"    const double *{name}; /* {count}: {note} */\n"
+            texts["AID_FIELDS"] += f"    double {name}_sigma;\n"
+            texts["AID_API"] += f"{call}; /* {note} */\n"
+            texts["AID_TAKE"] += filled("aid_take.c", given)
+            texts["AID_SOURCE"] += filled("aid_update.c", given)
+        values: dict[str, Any] = {
+            **texts,
+            "CAMERA": suite.camera is not None,
+            "FEATURES": 0 if suite.camera is None else len(suite.camera.features_I),
+            "GNSS": gnss is not None,
+            "BASELINE": gnss is not None and gnss.has_baseline,
+            "VELOCITY": gnss is not None and gnss.velocity_sigma is not None,
+            "BAROMETER": Aid.BAROMETER in suite.aids,
+            "MAGNETOMETER": Aid.MAGNETOMETER in suite.aids,
+            "FEATURE_BLOCKS": FEATURE_BLOCKS,
+            "POSITION_BLOCK": POSITION_BLOCK,
+            "BASELINE_BLOCK": BASELINE_BLOCK,
+            "VELOCITY_BLOCK": VELOCITY_BLOCK,
         }
-        if suite.gnss is not None:
-            values["START_API"] = (_TEMPLATES / "start.h").read_text(encoding="utf-8")
-            values["START_SOURCE"] = _filled("start.c", self._start_values())
-        return values
+        return values if gnss is None else {**values, **self._start_values()}
 
     def _motion_values(self) -> dict[str, str]:
         """Return the numbers with which the example recognizes a start in motion."""
@@ -261,9 +271,7 @@ class Sources:
     def _start_values(self) -> dict[str, Any]:
         suite, compass = self.suite, self.suite.magnetometer
         assert suite.gnss is not None
-        values = {
-            **self._record_values(),
-            **self._suite_values(),
+        values: dict[str, Any] = {
             "VELOCITY_SIGMA": repr(float(suite.gnss.velocity_sigma or 0.0)),
             "LEAST_COURSE": repr(LEAST_COURSE),
             "FARTHEST": repr(FARTHEST_FIX),
@@ -297,9 +305,3 @@ def _struct(name: str, dtype: np.dtype) -> str:
         word = "double" if base.kind == "f" else "int64_t"
         lines.append(f"    {word} {field}{''.join(f'[{n}]' for n in shape)};")
     return "\n".join(["typedef struct {", *lines, f"}} {name};", ""])
-
-
-def _filled(name: str, values: dict[str, Any]) -> str:
-    """Return a template with the values of its @NAMES@."""
-    text = (_TEMPLATES / name).read_text(encoding="utf-8")
-    return re.sub(r"@([A-Z_]+)@", lambda found: str(values[found[1]]), text)

@@ -26,9 +26,6 @@ def onnx_model(controller: Controller) -> Any:
     """Convert a controller to an `onnx.ModelProto`, from `observation` (batch, n) to `action`.
 
     The metadata describe observation and action, as JSON.
-
-    Raises:
-        ImportError: If onnx is missing.
     """
     onnx = check.package("onnx", "ONNX", "export")
     from onnx import TensorProto, helper, numpy_helper
@@ -74,15 +71,10 @@ def onnx_model(controller: Controller) -> Any:
 def save_onnx(controller: Controller, file: Path) -> float:
     """Write a controller as ONNX, after a comparison with the policy in onnxruntime.
 
-    Args:
-        controller: Controller to write.
-        file: Path of the file.
-
     Returns:
         Largest difference of an action over 1,000 observations.
 
     Raises:
-        ImportError: If onnx or onnxruntime is missing.
         RuntimeError: If the actions of model and policy differ.
     """
     content = onnx_model(controller).SerializeToString()

@@ -18,6 +18,7 @@ LESSONS = (
     "look_at_markers.py",
     "filter_alone.py",
     "replay.py",
+    "foreign_policy.py",
     "deploy.py",
 )
 """The order in which to read them; others follow by name."""

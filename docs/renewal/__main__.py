@@ -3,6 +3,7 @@
     python -m docs.renewal            # all that are stale, and write the pages
     python -m docs.renewal --list     # which are, and about how long they take
     python -m docs.renewal --only circle compare
+    python -m docs.renewal --only speed_tick --again   # though it is up to date
 
 Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables go on where
 an interrupted run stopped.
@@ -56,17 +57,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make results", description=__doc__.split("\n")[0])
     parser.add_argument("--list", action="store_true", help="say what is stale, and stop")
     parser.add_argument("--only", nargs="+", choices=sorted(CATALOG), help="names of results")
+    parser.add_argument("--again", action="store_true", help="measure what is up to date, too")
     args = parser.parse_args()
     entries = {name: entry for name, entry in ledger.read().items() if name in CATALOG}
     chosen = [CATALOG[name] for name in args.only or CATALOG]
-    due = [result for result in chosen if ledger.stale(result, entries)]
+    due = [result for result in chosen if args.again or ledger.stale(result, entries)]
     for result in due:
         minutes = entries.get(result.name, {}).get("minutes")
-        print(f"{result.name}: stale{'' if minutes is None else f', {minutes:g} min last time'}")
+        last = "" if minutes is None else f", {minutes:g} min last time"
+        print(f"{result.name}: {'again' if args.again else 'stale'}{last}")
     if args.list:
         return 0
     for result in due:
         print(f"{result.name} ...", flush=True)
+        if args.again:
+            shutil.rmtree(OUTPUT / result.name, ignore_errors=True)
         entries[result.name] = measure(result)
         ledger.write(entries)
     changed = pages.write(ledger.texts(entries))

@@ -62,6 +62,12 @@ CATALOG = {
             texts=texts.policies,
         ),
         Result(
+            name="foreign_policy",
+            commands=["docs/gallery/foreign_policy.py"],
+            flights=("*, standard", "LookAround", "LookAround, truth"),
+            texts=texts.console("foreign_policy"),
+        ),
+        Result(
             name="recipes",
             commands=[
                 "sweep --engine compiled --seeds 5 --output OUT --env-ids "

@@ -9,28 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.plots import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    VERMILLION,
-    Trace,
-    draw_path,
-    house_style,
-    logarithmic,
-    panels,
-)
+from quad_gym.analysis import plots
 
 Floats = NDArray[np.float64]
 
 _STYLES: tuple[dict[str, Any], ...] = (
-    {"color": GREY, "linestyle": (0, (1, 1.2))},
-    {"color": VERMILLION, "linestyle": "solid"},
-    {"color": ORANGE, "linestyle": (0, (5, 2))},
-    {"color": BLUE, "linestyle": "solid"},
-    {"color": GREEN, "linestyle": (0, (3, 1, 1, 1))},
+    {"color": plots.GREY, "linestyle": (0, (1, 1.2))},
+    {"color": plots.VERMILLION, "linestyle": "solid"},
+    {"color": plots.ORANGE, "linestyle": (0, (5, 2))},
+    {"color": plots.BLUE, "linestyle": "solid"},
+    {"color": plots.GREEN, "linestyle": (0, (3, 1, 1, 1))},
     {"color": "#CC79A7", "linestyle": (0, (5, 1))},
     {"color": "#56B4E9", "linestyle": (0, (2, 1))},
 )
@@ -40,18 +28,18 @@ _LEVELS = ((0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 """Dash patterns of horizontal lines."""
 
 
-@house_style()
+@plots.house_style()
 def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Any:
     """Figure of errors over time by label: median over episodes, and a band from 5 to 95 %.
 
     Curves are times (k,) [s], and the 5th, 50th and 95th percentile of the errors, (3, k) [m].
     """
-    figure, ((axes,),) = panels(1, 1, (7.0, 3.8), title)
+    figure, ((axes,),) = plots.panels(1, 1, (7.0, 3.8), title)
     for k, (label, (time, (low, middle, high))) in enumerate(curves.items()):
         style = _STYLES[k % len(_STYLES)]
         axes.fill_between(time, low, high, color=style["color"], alpha=0.15, linewidth=0)
         axes.plot(time, middle, label=label, **style)
-    logarithmic(axes)
+    plots.logarithmic(axes)
     axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("position error [m]\nmedian, 5 to 95 % of episodes")
@@ -59,7 +47,7 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
     return figure
 
 
-@house_style()
+@plots.house_style()
 def learning_figure(
     curves: Mapping[str, Sequence[tuple[Floats, Floats]]],
     levels: Mapping[str, float],
@@ -73,7 +61,7 @@ def learning_figure(
     Curves are training steps (k,) and scores (k,) of each seed; the median ends with the shortest
     one. Levels are horizontal lines to compare with.
     """
-    figure, ((axes,),) = panels(1, 1, (7.0, 4.0), title)
+    figure, ((axes,),) = plots.panels(1, 1, (7.0, 4.0), title)
     for k, (label, seeds) in enumerate(curves.items(), start=1):
         style = _STYLES[k % len(_STYLES)]
         for steps, scores in seeds:
@@ -83,9 +71,9 @@ def learning_figure(
         axes.plot(seeds[0][0][:shortest] / 1e6, middle, linewidth=2.0, label=label, **style)
     for k, (label, level) in enumerate(levels.items()):
         dashes = _LEVELS[k % len(_LEVELS)]
-        axes.axhline(level, color=INK, linewidth=1.0, linestyle=dashes, label=label)
+        axes.axhline(level, color=plots.INK, linewidth=1.0, linestyle=dashes, label=label)
     if not linear:
-        logarithmic(axes)
+        plots.logarithmic(axes)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("training [million steps]")
     axes.set_ylabel(score)
@@ -93,7 +81,7 @@ def learning_figure(
     return figure
 
 
-@house_style()
+@plots.house_style()
 def matrix_figure(
     values: Floats,
     cells: Sequence[Sequence[str]],
@@ -103,12 +91,12 @@ def matrix_figure(
 ) -> Any:
     """Table of texts whose cells are colored by values (rows, columns), on a logarithmic scale."""
     size = (2.6 + 2.1 * len(columns), 1.2 + 0.55 * len(rows))
-    figure, ((axes,),) = panels(1, 1, size, title)
+    figure, ((axes,),) = plots.panels(1, 1, size, title)
     shades = np.log10(values)
     axes.imshow(shades, cmap="cividis_r", aspect="auto", alpha=0.75)
     middle = 0.5 * (np.nanmin(shades) + np.nanmax(shades))
     for (i, j), shade in np.ndenumerate(shades):
-        color = "white" if shade > middle else INK
+        color = "white" if shade > middle else plots.INK
         axes.text(j, i, cells[i][j], ha="center", va="center", color=color)
     axes.set_xticks(range(len(columns)), columns)
     axes.set_yticks(range(len(rows)), rows)
@@ -119,16 +107,16 @@ def matrix_figure(
     return figure
 
 
-@house_style()
-def paths_figure(traces: Mapping[str, Trace], title: str = "") -> Any:
+@plots.house_style()
+def paths_figure(traces: Mapping[str, plots.Trace], title: str = "") -> Any:
     """Figure of the paths of flights from above, by label, side by side on a common scale."""
     columns = 2 if len(traces) == 4 else min(len(traces), 3)
     rows = -(-len(traces) // columns)
-    figure, grid = panels(rows, columns, (3.6 * columns, 3.7 * rows))
+    figure, grid = plots.panels(rows, columns, (3.6 * columns, 3.7 * rows))
     figure.suptitle(title)
     shown = grid.ravel()[: len(traces)]
     for axes, (label, trace) in zip(shown, traces.items(), strict=True):
-        draw_path(axes, trace, legend=False)
+        plots.draw_path(axes, trace, legend=False)
         axes.set_title(label)
     for spare in grid.ravel()[len(traces) :]:
         spare.remove()

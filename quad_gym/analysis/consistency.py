@@ -19,19 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym import records
 from quad_gym.analysis.metrics import STATE_DIMENSION, mean_band, nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.records import (
-    AID_BLOCKS,
-    BASELINE_BLOCK,
-    FEATURE_BLOCKS,
-    FREEDOMS,
-    POSITION_BLOCK,
-    VELOCITY_BLOCK,
-    WIDTH,
-    Aid,
-    GateDecision,
-)
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 
 PARTS = {
@@ -43,6 +33,9 @@ PARTS = {
     "gyro_bias": slice(12, 15),
 }
 """Parts of the error state, in the order of the covariance: all of it, and blocks of three."""
+
+_FIELDS = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
+"""Fields of the true values; the fields of estimates end in `_hat`."""
 
 CONSISTENT_SHARE = 0.9
 """Share of instants that must be inside the band for a filter to be called consistent."""
@@ -61,50 +54,32 @@ Floats = NDArray[np.float64]
 
 def flight_errors(batch: FlightBatch) -> Floats:
     """Errors of a batch's filters in the coordinates of their covariances, (count, 15)."""
-    truth = {
-        "position": batch.record("r"),
-        "velocity": batch.record("v"),
-        "R_BI": quaternion_to_dcm(batch.record("q")),
-        "accel_bias": batch.record("b_a"),
-        "gyro_bias": batch.record("b_g"),
-    }
-    estimate = {
-        "position": batch.record("r_hat"),
-        "velocity": batch.record("v_hat"),
-        "R_BI": batch.record("R_hat"),
-        "accel_bias": batch.record("b_a_hat"),
-        "gyro_bias": batch.record("b_g_hat"),
-    }
-    return state_error(truth, estimate)
+    truth = {name: batch.record(field) for name, field in _FIELDS.items()}
+    estimate = {name: batch.record(f"{field}_hat") for name, field in _FIELDS.items()}
+    R_BI, R_hat = quaternion_to_dcm(batch.record("q")), batch.record("R_hat")
+    return state_error(truth | {"R_BI": R_BI}, estimate | {"R_BI": R_hat})
 
 
 def start_matched(batch: FlightBatch, seed: int) -> None:
-    """Give all filters initial errors drawn from their own covariances.
+    """Give all filters of flights that have just been reset errors drawn from their covariances.
 
     After a first fix, errors and covariance do not match: a level attitude is assumed with an
     assumed uncertainty, which matters for as long as tilt and accelerometer bias cannot be
     distinguished. Here the estimates become the truth minus errors drawn from each filter's
     covariance.
-
-    Args:
-        batch: Flights that have just been reset; only their estimates are changed.
-        seed: Seed of the draws.
     """
     flights, factor = batch.count, batch.record("L")
     draws = np.random.default_rng(seed).normal(size=(flights, STATE_DIMENSION, 1))
     errors = (factor @ draws)[..., 0]
-    R_BI = quaternion_to_dcm(batch.record("q"))
-    R_hat = np.swapaxes(euler_to_dcm(errors[:, PARTS["attitude"]]), 1, 2) @ R_BI
     estimates = {
-        "r_hat": batch.record("r") - errors[:, PARTS["position"]],
-        "v_hat": batch.record("v") - errors[:, PARTS["velocity"]],
-        "R_hat": R_hat,
-        "b_a_hat": batch.record("b_a") - errors[:, PARTS["accel_bias"]],
-        "b_g_hat": batch.record("b_g") - errors[:, PARTS["gyro_bias"]],
+        f"{field}_hat": batch.record(field) - errors[:, PARTS[name]]
+        for name, field in _FIELDS.items()
     }
+    turned = np.swapaxes(euler_to_dcm(errors[:, PARTS["attitude"]]), 1, 2)
+    estimates["R_hat"] = turned @ quaternion_to_dcm(batch.record("q"))
     blocks, flight = batch.snapshot(), np.arange(flights)
     for name, values in estimates.items():
-        blocks[name][flight // WIDTH, ..., flight % WIDTH] = values
+        blocks[name][flight // records.WIDTH, ..., flight % records.WIDTH] = values
     batch.restore(blocks)
 
 
@@ -146,11 +121,7 @@ class MeanSquare:
         return self.share_inside >= CONSISTENT_SHARE
 
     def since(self, start: float) -> "MeanSquare":
-        """Select the instants from `start` on [s].
-
-        Raises:
-            ValueError: If there are no such instants.
-        """
+        """Select the instants from `start` on [s]; a ValueError if there are none."""
         kept = self.time >= start - 1e-9
         if not kept.any():
             raise ValueError(f"start must be before the last instant, got {start}")
@@ -177,6 +148,14 @@ def verdict(part: MeanSquare) -> str:
     return f"{what}: overconfident, errors are {size} its covariance implies."
 
 
+def _mean_square(
+    name: str, dimension: int, time: Floats, means: ArrayLike, counts: ArrayLike
+) -> MeanSquare:
+    """Means over `counts` flights, with their band."""
+    low, high = mean_band(dimension, np.minimum(counts, BAND_FLIGHTS))
+    return MeanSquare(name, dimension, time, np.asarray(means, np.float64), low, high)
+
+
 class NeesRecorder:
     """Recorder of NEES, errors and standard deviations over time."""
 
@@ -188,12 +167,7 @@ class NeesRecorder:
         self._count = 0
 
     def add(self, batch: FlightBatch, time: float) -> None:
-        """Record the present instant of all flights.
-
-        Args:
-            batch: Flights, which must all have started at the same time.
-            time: Time since their start [s].
-        """
+        """Record the present instant of flights that all started `time` ago [s]."""
         errors, P = flight_errors(batch), batch.covariance()
         self._count = batch.count
         self._time.append(time)
@@ -204,12 +178,11 @@ class NeesRecorder:
 
     def nees(self) -> dict[str, MeanSquare]:
         """Mean NEES over time of each part of the state, by the names of `PARTS`."""
-        time, found = np.array(self._time), {}
-        for name, part in PARTS.items():
-            dimension = part.stop - part.start
-            low, high = mean_band(dimension, np.full(time.shape, min(self._count, BAND_FLIGHTS)))
-            found[name] = MeanSquare(name, dimension, time, np.array(self._means[name]), low, high)
-        return found
+        time, counts = np.array(self._time), np.full(len(self._time), self._count)
+        return {
+            name: _mean_square(name, part.stop - part.start, time, self._means[name], counts)
+            for name, part in PARTS.items()
+        }
 
     def errors(self) -> tuple[Floats, Floats]:
         """Root mean square of errors and of standard deviations over flights, (t, 15) each."""
@@ -217,11 +190,11 @@ class NeesRecorder:
 
 
 SENSOR_BLOCKS = {
-    "position": (POSITION_BLOCK,),
-    "baseline": (BASELINE_BLOCK,),
-    "velocity": (VELOCITY_BLOCK,),
-    "feature": tuple(range(FEATURE_BLOCKS, AID_BLOCKS)),
-    **{aid.name.lower(): (AID_BLOCKS + aid,) for aid in Aid},
+    "position": (records.POSITION_BLOCK,),
+    "baseline": (records.BASELINE_BLOCK,),
+    "velocity": (records.VELOCITY_BLOCK,),
+    "feature": tuple(range(records.FEATURE_BLOCKS, records.AID_BLOCKS)),
+    **{aid.name.lower(): (records.AID_BLOCKS + aid,) for aid in records.Aid},
 }
 """Blocks of the measurement by sensor. Errors of features in one image are correlated through
 attitude and position, so that only the first one is used: the values of an instant are independent.
@@ -265,20 +238,21 @@ class InnovationRecorder:
     ) -> None:
         self._bins, self._settle = np.asarray(bins, np.float64), settle
         size = self._bins.size - 1
-        self._sums = {name: np.zeros(size) for name in SENSOR_BLOCKS}
-        self._counts = {name: np.zeros(size) for name in SENSOR_BLOCKS}
-        shape = (lags, batch.count, 3)
-        self._past = {name: np.full(shape, np.nan) for name in SENSOR_BLOCKS}
-        self._products = {name: np.zeros(lags) for name in SENSOR_BLOCKS}
-        self._pairs = {name: np.zeros(lags) for name in SENSOR_BLOCKS}
-        self._squares = {name: np.zeros(2) for name in SENSOR_BLOCKS}
+        past = np.full((lags, batch.count, 3), np.nan)
+        self._past = {name: past.copy() for name in SENSOR_BLOCKS}
+        self._sums, self._counts, self._products, self._pairs, self._squares = (
+            {name: np.zeros(count) for name in SENSOR_BLOCKS}
+            for count in (size, size, lags, lags, 2)
+        )
 
     def add(self, batch: FlightBatch, time: float) -> None:
         """Record the measurements of the present instant, `time` after the start [s]."""
         valid = batch.record("block_valid") > 0.0
         if not valid.any():
             return
-        valid &= batch.record("gate") != GateDecision.UNSURE  # the filter does not use these
+        valid &= (
+            batch.record("gate") != records.GateDecision.UNSURE
+        )  # the filter does not use these
         nis, innovation = batch.record("block_nis"), batch.record("innovation")
         white = innovation / batch.record("innovation_sigma")
         span = min(int(np.searchsorted(self._bins, time - 1e-9, "right")), self._bins.size - 1) - 1
@@ -308,10 +282,9 @@ class InnovationRecorder:
         for name, blocks in SENSOR_BLOCKS.items():
             some = self._counts[name] > 0
             if some.any():
-                counts, dimension = self._counts[name][some], FREEDOMS[blocks[0]]
-                mean = self._sums[name][some] / counts
-                low, high = mean_band(dimension, np.minimum(counts, BAND_FLIGHTS))
-                found[name] = MeanSquare(name, dimension, middle[some], mean, low, high)
+                counts, freedoms = self._counts[name][some], records.FREEDOMS[blocks[0]]
+                means = self._sums[name][some] / counts
+                found[name] = _mean_square(name, freedoms, middle[some], means, counts)
         return found
 
     def whiteness(self) -> dict[str, Whiteness]:

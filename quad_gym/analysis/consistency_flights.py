@@ -63,8 +63,7 @@ class Findings:
     def consistent(self) -> bool:
         """True if NEES, NIS, whiteness and status are those expected of a consistent filter.
 
-        For sensors whose constant error is modeled as noise, innovations only must not be too
-        large.
+        Where a constant error is modeled as noise, innovations only must not be too large.
         """
         apart = self.counted_as_noise
         squares = [*self.nees.values(), *(p for name, p in self.nis.items() if name not in apart)]

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.analysis import plots
 from quad_gym.analysis.consistency import (
     BAND_FLIGHTS,
     NEGLIGIBLE_CORRELATION,
@@ -11,15 +12,6 @@ from quad_gym.analysis.consistency import (
     Floats,
     MeanSquare,
     Whiteness,
-)
-from quad_gym.analysis.plots import (
-    BLUE,
-    GREY,
-    INK,
-    PALE,
-    VERMILLION,
-    house_style,
-    panels,
 )
 
 _TITLES = {
@@ -44,7 +36,7 @@ def _grid(count: int, title: str, label: str = "time [s]") -> tuple[Any, Any]:
     """Make a figure with `count` axes, three in a row; four are two by two."""
     columns = 2 if count == 4 else 3
     rows = -(-count // columns)
-    figure, grid = panels(rows, columns, (10.0, 0.6 + 2.1 * rows), title)
+    figure, grid = plots.panels(rows, columns, (10.0, 0.6 + 2.1 * rows), title)
     for spare in grid.ravel()[count:]:
         spare.set_visible(False)
     for axes in grid.ravel()[max(0, count - columns) : count]:
@@ -55,16 +47,13 @@ def _grid(count: int, title: str, label: str = "time [s]") -> tuple[Any, Any]:
 def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     """Draw a mean square over time with its band; the title states the share of instants inside.
 
-    Args:
-        axes: matplotlib Axes.
-        part: Mean square.
-        settle: Time before which instants are left out of the numbers in the title [s].
+    Instants before `settle` [s] are left out of the numbers in the title.
     """
-    axes.fill_between(part.time, part.low, part.high, color=PALE, linewidth=0.0)
-    axes.axhline(part.dimension, color=GREY, linewidth=0.8)
-    axes.plot(part.time, part.mean, color=BLUE, linewidth=1.2)
+    axes.fill_between(part.time, part.low, part.high, color=plots.PALE, linewidth=0.0)
+    axes.axhline(part.dimension, color=plots.GREY, linewidth=0.8)
+    axes.plot(part.time, part.mean, color=plots.BLUE, linewidth=1.2)
     if settle > 0.0:
-        axes.axvline(settle, color=VERMILLION, linewidth=0.8, linestyle=":")
+        axes.axvline(settle, color=plots.VERMILLION, linewidth=0.8, linestyle=":")
     counted = part.since(settle)
     title = _TITLES.get(part.name, part.name)
     inside = f"{100 * counted.share_inside:.0f} % within ±{100 * counted.tolerance:.2g} %"
@@ -76,7 +65,7 @@ def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     axes.set_xlim(0.0, part.time[-1])
 
 
-@house_style()
+@plots.house_style()
 def mean_square_figure(
     quantity: str, parts: dict[str, MeanSquare], title: str, settle: float = 0.0
 ) -> Any:
@@ -88,7 +77,7 @@ def mean_square_figure(
     return figure
 
 
-@house_style()
+@plots.house_style()
 def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
     """Figure of root mean square errors and standard deviations of the filter, (t, 15) each."""
     text = (
@@ -99,29 +88,30 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
     figure, axes = _grid(len(blocks), text)
     for axis, (name, part) in zip(axes, blocks.items(), strict=True):
         unit, factor = _UNITS[name]
-        for values, color, dashes in ((errors, BLUE, "-"), (sigmas, INK, (0, (4, 3)))):
+        for values, color, dashes in ((errors, plots.BLUE, "-"), (sigmas, plots.INK, (0, (4, 3)))):
             size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
             axis.plot(time, size, color=color, linestyle=dashes, linewidth=1.3)
         axis.set_title(f"{_TITLES[name]} [{unit}]")
-        axis.set_yscale("log", subs=(2.0, 5.0))
-        axis.yaxis.set_major_formatter("{x:g}")
+        plots.logarithmic(axis, subs=(2.0, 5.0))
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(axis="y", which="minor", labelsize=7.0)
         axis.set_xlim(0.0, time[-1])
     return figure
 
 
-@house_style()
+@plots.house_style()
 def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
     """Figure of the autocorrelation of each sensor's innovations, with the band of white noise."""
     text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white noise (gray)"
     figure, axes = _grid(len(found), text, "lag [measurements]")
     for axis, part in zip(axes, found.values(), strict=True):
         lags = np.arange(1, part.correlation.size + 1)
-        axis.fill_between(lags, -part.band, part.band, color=PALE, linewidth=0.0)
-        axis.axhline(0.0, color=GREY, linewidth=0.8)
-        axis.vlines(lags, 0.0, part.correlation, color=BLUE, linewidth=1.6)
-        axis.plot(lags, part.correlation, color=BLUE, marker="o", markersize=3.0, linestyle="none")
+        axis.fill_between(lags, -part.band, part.band, color=plots.PALE, linewidth=0.0)
+        axis.axhline(0.0, color=plots.GREY, linewidth=0.8)
+        axis.vlines(lags, 0.0, part.correlation, color=plots.BLUE, linewidth=1.6)
+        axis.plot(
+            lags, part.correlation, color=plots.BLUE, marker="o", markersize=3.0, linestyle="none"
+        )
         limit = 1.2 * max(2.5 * NEGLIGIBLE_CORRELATION, np.abs(part.correlation).max())
         axis.set_ylim(-limit, limit)
         axis.set_title(f"{_TITLES.get(part.name, part.name)}: largest {part.largest:+.3f}")

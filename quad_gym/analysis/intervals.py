@@ -74,14 +74,7 @@ def worst_tenth(values: Floats) -> Floats:
 
 
 def mean_interval(values: ArrayLike) -> Interval:
-    """Student's t interval of a mean.
-
-    Args:
-        values: (n,) independent numbers, at least two.
-
-    Raises:
-        ValueError: If there are fewer than two values or one is not finite.
-    """
+    """Student's t interval of the mean of (n,) independent finite numbers, at least two."""
     x = np.asarray(values, np.float64).reshape(-1)
     if x.size < 2 or not np.isfinite(x).all():
         raise ValueError(f"values must be at least two finite numbers, got {x.size}")
@@ -95,9 +88,6 @@ def rate_interval(count: float, trials: float) -> Interval:
     Args:
         count: Events, such as crashes; not necessarily whole, see `rate_over_trainings`.
         trials: Independent episodes.
-
-    Raises:
-        ValueError: If a number is out of its range.
     """
     from scipy.special import betaincinv
 
@@ -116,11 +106,8 @@ def mean_over_trainings(values: ArrayLike, score: Score = mean) -> Estimated:
     rule, the interval covers the episodes alone.
 
     Args:
-        values: (s, e) one number for each training and episode, at least two.
+        values: (s, e) one finite number for each training and episode, at least two.
         score: Of the episodes.
-
-    Raises:
-        ValueError: If there are fewer than two values or one is not finite.
     """
     x = np.atleast_2d(np.asarray(values, np.float64))
     if x.ndim != 2 or x.size < 2 or not np.isfinite(x).all():
@@ -142,11 +129,8 @@ def rate_over_trainings(rates: ArrayLike, episodes: int) -> Estimated:
     interval of no crash in one.
 
     Args:
-        rates: (s,) the rate of each training; one for a fixed rule.
+        rates: (s,) the rate of each training, from 0 to 1; one for a fixed rule.
         episodes: Flown with each.
-
-    Raises:
-        ValueError: If there are no rates, or one is not between 0 and 1.
     """
     x = np.asarray(rates, np.float64).reshape(-1)
     if x.size == 0 or not ((x >= 0.0) & (x <= 1.0)).all():
@@ -191,12 +175,7 @@ class PairedDifference:
 def paired_difference(first: ArrayLike, second: ArrayLike) -> PairedDifference:
     """Compare two cases seed by seed, so that the effect of a seed on both cancels.
 
-    Args:
-        first: (n,) one number a seed; a seed with a NaN is left out.
-        second: (n,) one number a seed, of these seeds.
-
-    Raises:
-        ValueError: If the shapes differ.
+    Both have one number for each of these seeds, (n,); a seed with a NaN is left out.
     """
     a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
     if a.shape != b.shape or a.ndim != 1:
@@ -210,14 +189,8 @@ def probability_of_improvement(first: ArrayLike, second: ArrayLike) -> Estimated
     """Probability that a training of the first arm scores above one of the second.
 
     P = mean over pairs of 1 (above), 1/2 (equal) or 0: the Mann-Whitney statistic over the number
-    of pairs. The interval is by R. G. Newcombe, Statistics in Medicine 25, 2006 (method 5).
-
-    Args:
-        first: (s,) one score per training.
-        second: (t,) one score per training.
-
-    Raises:
-        ValueError: If there are no scores, or not all are finite.
+    of pairs. The interval is by R. G. Newcombe, Statistics in Medicine 25, 2006 (method 5). There
+    is one score per training, (s,) and (t,).
     """
     from scipy.optimize import brentq
 

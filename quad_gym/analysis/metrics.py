@@ -43,22 +43,13 @@ class TrackingSummary:
     error]"""
 
     def spreads(self, chosen: ArrayLike = True) -> "dict[str, Spread]":
-        """Distributions of both means over flights, by name.
-
-        Args:
-            chosen: True for flights to include, (...,); True: all flights.
-        """
+        """Distributions of both means over the flights for which `chosen` is True, by name."""
         parts = {"mean": self.mean, "last_half": self.last_half}
         return {name: spread(values[np.asarray(chosen)]) for name, values in parts.items()}
 
 
 class RunningSummary:
-    """Recorder for a `TrackingSummary`, which stores only sums.
-
-    Args:
-        flights: Number of flights.
-        instants: Number of instants of a complete flight.
-    """
+    """Recorder for a `TrackingSummary` of flights with some instants, which stores only sums."""
 
     def __init__(self, flights: int, instants: int) -> None:
         self._half = instants // 2
@@ -66,12 +57,7 @@ class RunningSummary:
         self._sums, self._counts = np.zeros((2, flights)), np.zeros((2, flights))
 
     def add(self, error: ArrayLike, counts: ArrayLike = True) -> None:
-        """Add the next instant.
-
-        Args:
-            error: Errors, (flights,).
-            counts: True for flights to include, (flights,); False for flights that have ended.
-        """
+        """Add the errors of the next instant, (flights,), where `counts` is True."""
         counted = np.broadcast_to(np.asarray(counts, bool), self._sums[0].shape)
         value = np.where(counted, np.asarray(error, np.float64), 0.0)
         parts = slice(0, 2 if self._instant >= self._half else 1)
@@ -104,11 +90,7 @@ class Spread:
 
 
 def spread(values: ArrayLike) -> Spread:
-    """Mean, standard deviation and percentiles of one number per seed.
-
-    Args:
-        values: One number per seed, (n,); n may be 0.
-    """
+    """Mean, standard deviation and percentiles of one number per seed, (n,); n may be 0."""
     x = np.asarray(values, np.float64).reshape(-1)
     if x.size == 0:
         return Spread(0, *[float("nan")] * 6)
@@ -122,25 +104,17 @@ def spread(values: ArrayLike) -> Spread:
 def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats:
     """Error of the filter in the coordinates of its covariance.
 
-    Args:
-        truth: True "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI"
-            (..., 3, 3); position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
-        estimate: Estimates with the same names, shapes, units and frames.
+    Truth and estimate have "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI"
+    (..., 3, 3); position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
 
     Returns:
         Truth minus estimate, (..., 15); attitude as Euler angles e [rad] with R_BI = R(e) R_hat.
-
-    Raises:
-        KeyError: If a quantity is missing.
     """
-
-    def difference(name: str) -> Floats:
-        return np.asarray(truth[name], np.float64) - np.asarray(estimate[name], np.float64)
-
+    names = ("position", "velocity", "accel_bias", "gyro_bias")
+    r, v, b_a, b_g = (np.subtract(truth[name], estimate[name]) for name in names)
     R_hat = np.asarray(estimate["R_BI"], np.float64)
     e = dcm_to_euler(np.asarray(truth["R_BI"], np.float64) @ np.swapaxes(R_hat, -1, -2))
-    parts = (difference("position"), difference("velocity"), e)
-    return np.concatenate([*parts, difference("accel_bias"), difference("gyro_bias")], axis=-1)
+    return np.concatenate([r, v, e, b_a, b_g], axis=-1, dtype=np.float64)
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
@@ -151,14 +125,10 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
         covariances: Covariances of the filter in the same coordinates, (..., n, n).
 
     Returns:
-        NEES, (...,) [-]; chi-square distributed with n degrees of freedom if the filter is
-        consistent.
+        NEES, (...,) [-]; of a consistent filter, chi-square distributed with n degrees of freedom.
 
     Raises:
         ValueError: If the shapes do not fit or a covariance is singular.
-
-    Source: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Applications to Tracking and
-    Navigation, 2001, section 5.4.
     """
     e, P = np.asarray(errors, np.float64), np.asarray(covariances, np.float64)
     if e.ndim < 1 or P.shape[-2:] != (e.shape[-1], e.shape[-1]):
@@ -185,9 +155,6 @@ def mean_band(
 
     Returns:
         Lower and upper ends, (...,) each.
-
-    Raises:
-        ValueError: If a number is out of range.
     """
     n = np.asarray(counts, np.float64)
     _require_probability(probability)
@@ -211,9 +178,6 @@ def chi_square_quantile(dimension: int, probability: float) -> float:
     Args:
         dimension: Degrees of freedom, 15 for the whole state.
         probability: Probability that the NEES is below the quantile, between 0 and 1.
-
-    Raises:
-        ValueError: If a number is out of range.
     """
     _require_probability(probability)
     if dimension < 1:

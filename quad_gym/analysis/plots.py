@@ -117,14 +117,9 @@ def house_style() -> Iterator[None]:
 def panels(
     rows: int, columns: int, size: tuple[float, float], title: str = "", **options: Any
 ) -> tuple[Any, NDArray[Any]]:
-    """Make a matplotlib Figure with axes, (rows, columns).
+    """Make a matplotlib Figure of a size [inch] with axes, (rows, columns).
 
-    Args:
-        rows: Number of rows.
-        columns: Number of columns.
-        size: Width and height [inch].
-        title: Title of the figure.
-        **options: Further options of `Figure.subplots`.
+    `options` are further options of `Figure.subplots`.
     """
     from matplotlib.figure import Figure
 
@@ -138,13 +133,9 @@ def panels(
 
 
 def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool = True) -> None:
-    """Draw a flight from above, with ticks for the heading; both axes have the same scale.
+    """Draw a flight from above, with a tick for the heading every `tick_every` seconds.
 
-    Args:
-        axes: matplotlib Axes.
-        trace: Flight.
-        tick_every: Time between heading ticks [s].
-        legend: True to add a legend.
+    Both axes have the same scale.
     """
     from matplotlib.collections import LineCollection
 
@@ -174,12 +165,7 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
 
 
 def draw_height(axes: Any, trace: Trace) -> None:
-    """Draw height over time, with the reference.
-
-    Args:
-        axes: matplotlib Axes.
-        trace: Flight.
-    """
+    """Draw height over time, with the reference."""
     axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2, label="flown")
     axes.plot(trace.time, trace.reference[:, 2], label="reference", **_REFERENCE)
     start = (trace.time[0], trace.position[0, 2])
@@ -237,14 +223,9 @@ def error_limits(traces: Sequence[Trace], bands: Sequence[Band]) -> tuple[float,
 def flight_figure(
     draw: Callable[..., None], trace: Trace, *args: Any, title: str = "", **options: Any
 ) -> Any:
-    """Make a matplotlib Figure with one drawing of a flight.
+    """Make a matplotlib Figure with a flight, drawn by `draw_path`, `draw_height` or `draw_error`.
 
-    Args:
-        draw: `draw_path`, `draw_height` or `draw_error`.
-        trace: Flight.
-        *args: Further arguments of `draw`.
-        title: Title of the figure.
-        **options: Options of `draw`.
+    It receives all further arguments and options.
     """
     size = (5.0, 5.0) if draw is draw_path else (6.0, 3.4)
     figure, ((axes,),) = panels(1, 1, size, title)
@@ -267,9 +248,6 @@ def overview_figure(
         errors: Flight and band of each plot of errors, by its title.
         title: Title of the path.
         label: Name of a flight in the legends.
-
-    Returns:
-        matplotlib Figure.
     """
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -292,12 +270,7 @@ def overview_figure(
 def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     """Write a figure as PNG and SVG; equal figures give bitwise identical files.
 
-    Args:
-        figure: matplotlib Figure.
-        stem: Path without file extension.
-
-    Returns:
-        Paths of the two files.
+    `stem` is the path without file extension; returns the paths of the two files.
     """
     files = {Path(f"{stem}.png"): {"Software": None}, Path(f"{stem}.svg"): {"Date": None}}
     for file, metadata in files.items():
@@ -305,8 +278,8 @@ def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     return list(files)
 
 
-def logarithmic(axes: Any) -> None:
+def logarithmic(axes: Any, **options: Any) -> None:
     """Scale the ordinate logarithmically, labeled with numbers such as 0.1, not powers of ten."""
-    axes.set_yscale("log")
+    axes.set_yscale("log", **options)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("")

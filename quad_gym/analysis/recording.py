@@ -69,7 +69,7 @@ def record_flights(
     steps: int,
     *,
     nees_samples: int = 20,
-    progress: Callable[[range], Iterable[int]] | None = None,
+    progress: Callable[[range], Iterable[int]] = iter,
 ) -> Recording:
     """Fly and record all flights of a batch with built-in PD control.
 
@@ -94,8 +94,7 @@ def record_flights(
     samples = np.unique(np.linspace(0, steps, nees_samples + 1).round().astype(int)[1:])
     nees_values = np.full((len(samples), count), np.nan)
 
-    instants = range(steps + 1)
-    for step in instants if progress is None else progress(instants):
+    for step in progress(range(steps + 1)):
         if step == 0:
             batch.reset(seeds=seeds)
         else:
@@ -129,8 +128,7 @@ def record_flights(
 class Tracer:
     """Recorder of the errors of all episodes over time, and of the path of the first one.
 
-    Pass its method `add` to `evaluation.roll_out` as `watch`. The environment must not use
-    same-step autoreset.
+    Its method `add` is a `watch` of `evaluation.roll_out`, without same-step autoreset.
     """
 
     def __init__(self) -> None:
@@ -140,13 +138,7 @@ class Tracer:
         self._control_rate = 0.0
 
     def add(self, step: int, batch: FlightBatch, flying: NDArray[np.bool_]) -> None:
-        """Record the present instant of episodes in progress.
-
-        Args:
-            step: Number of the step; 0 at the start.
-            batch: Flights.
-            flying: True for episodes in progress, (n,).
-        """
+        """Record the present instant; `flying` (n,) is True for episodes in progress."""
         first, errors = np.zeros(1, np.intp), batch.record("position_error")
         if step == 0:
             self._control_rate = batch.clocks.control_rate
@@ -156,10 +148,8 @@ class Tracer:
         self._percentiles.append(np.asarray(shares))
         if flying[0]:
             heading = quaternion_to_dcm(batch.record("q", first)[0])[0, :2]
-            place = batch.record("r", first)[0]
-            self._path.append(
-                (place, heading, batch.read("reference_position", first)[0], errors[0])
-            )
+            place, reference = batch.record("r", first)[0], batch.read("reference_position", first)
+            self._path.append((place, heading, reference[0], errors[0]))
 
     @property
     def time(self) -> Floats:
@@ -174,7 +164,5 @@ class Tracer:
     def trace(self) -> Trace:
         """Path of the first flight, up to its end."""
         position, heading, reference, error = map(np.array, zip(*self._path, strict=True))
-        time = self.time[: len(position)]
-        if self._gates is not None:
-            reference = self._gates
-        return Trace(time, position, heading, reference, error)
+        places = reference if self._gates is None else self._gates
+        return Trace(self.time[: len(position)], position, heading, places, error)

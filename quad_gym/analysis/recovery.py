@@ -47,12 +47,8 @@ class Recovery:
     """True while a flight has a large error, (t, flights)"""
 
     def share(self, flags: Flags, time: float) -> float:
-        """Share of flights with a flag, (t, flights), at a time [s]."""
-        return float(flags[self.index(time)].mean())
-
-    def index(self, time: float) -> int:
-        """Index of the instant nearest to `time` [s]."""
-        return int(np.abs(self.time - time).argmin())
+        """Share of flights with a flag, (t, flights), at the instant nearest to a time [s]."""
+        return float(flags[np.abs(self.time - time).argmin()].mean())
 
     @property
     def undetected(self) -> Flags:
@@ -60,13 +56,11 @@ class Recovery:
         return ~(self.consistent | self.flagged)
 
     def time_to(self, flags: Flags, since: float) -> float:
-        """Time after `since` until `flags` hold permanently for the `REQUIRED` share of flights.
+        """Time after `since` until `flags` hold permanently for a `REQUIRED` share of flights [s].
 
         Even of a consistent filter, some of a hundred flights occasionally exceed the quantile by
-        chance. Shares above 1 - 2 (1 - `REQUIRED`) therefore do not interrupt a recovery.
-
-        Returns:
-            Time [s]; infinite if the share is never reached.
+        chance. Shares above 1 - 2 (1 - `REQUIRED`) therefore do not interrupt a recovery. The time
+        is infinite if the share is never reached.
         """
         after = self.time > since + 1e-9
         share = flags[after].mean(axis=1)
@@ -77,11 +71,19 @@ class Recovery:
 
     def missed_alarms(self) -> Flags:
         """True for flights with large errors for `MISSED_AFTER` and no flag, (flights,)."""
-        return longest(self.large_error & ~self.flagged) * self._every >= MISSED_AFTER - 1e-9
+        return self._for_long(self.large_error & ~self.flagged)
 
     def long_large_error(self) -> Flags:
         """True for flights with large errors for `MISSED_AFTER`, flagged or not, (flights,)."""
-        return longest(self.large_error) * self._every >= MISSED_AFTER - 1e-9
+        return self._for_long(self.large_error)
+
+    def _for_long(self, flags: Flags) -> Flags:
+        """True for flights with flags for `MISSED_AFTER` without interruption, (flights,)."""
+        best = run = np.zeros(flags.shape[1:], np.int64)
+        for now in flags:
+            run = np.where(now, run + 1, 0)
+            best = np.maximum(best, run)
+        return np.asarray(best * self._every >= MISSED_AFTER - 1e-9)
 
     def alarms(self) -> int:
         """Number of times that a flag was newly raised, in all flights together."""
@@ -98,16 +100,6 @@ class Recovery:
         return float(self.time[1] - self.time[0])
 
 
-def longest(flags: Flags) -> NDArray[np.int64]:
-    """Longest run of instants (the first axis) at which flags hold, (n,)."""
-    best = np.zeros(flags.shape[1:], np.int64)
-    run = best.copy()
-    for now in flags:
-        run = np.where(now, run + 1, 0)
-        best = np.maximum(best, run)
-    return best
-
-
 def follow_recovery(
     batch: FlightBatch, *, seeds: Sequence[int], duration: float, every: float = 0.1
 ) -> Recovery:
@@ -116,11 +108,8 @@ def follow_recovery(
     Args:
         batch: Flights of a task without endings, whose filters monitor their innovations.
         seeds: Seeds of the flights.
-        duration: Length of the flights [s].
+        duration: Length of the flights, at least two evaluations [s].
         every: Time between two evaluations [s].
-
-    Raises:
-        ValueError: If `duration` is shorter than two evaluations.
     """
     stride = max(1, round(every * batch.sensors.imu.rate))
     looks = round(duration * batch.sensors.imu.rate) // stride

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.analysis.metrics import chi_square_quantile
-from quad_gym.analysis.plots import BLUE, GREEN, GREY, ORANGE, PALE, VERMILLION, require_matplotlib
+from quad_gym.analysis.plots import BLUE, GREEN, ORANGE, PALE, VERMILLION, house_style
 from quad_gym.estimation.results import Measured, Replay, by_sensor
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
@@ -23,14 +23,8 @@ _SENSORS = {
 
 
 def draw_states(axes: Any, result: Replay, name: str) -> None:
-    """Draw position, velocity or attitude, with bands of two standard deviations.
-
-    Args:
-        axes: matplotlib Axes.
-        result: Result of a replay.
-        name: "position", "velocity" or "attitude".
-    """
-    first = {"position": 0, "velocity": 3, "attitude": 6}[name]
+    """Draw "position", "velocity" or "attitude", with bands of two standard deviations."""
+    first, unit = {"position": (0, "m"), "velocity": (3, "m/s"), "attitude": (6, "deg")}[name]
     labels, scale = ("east", "north", "up"), 1.0
     if name == "attitude":
         angles = dcm_to_euler(quaternion_to_dcm(result.quaternion))
@@ -45,7 +39,6 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
     low, high = np.percentile(scale * values, [0.0, 100.0])
     margin = 0.1 * max(high - low, 1e-3)
     axes.set_ylim(low - margin, high + margin)
-    unit = {"position": "m", "velocity": "m/s", "attitude": "deg"}[name]
     axes.set_title(f"{name} [{unit}], with two standard deviations")
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3)
 
@@ -68,20 +61,9 @@ def draw_nis(axes: Any, measured: Measured, title: str) -> None:
     axes.set_ylim(0.0, top)
 
 
+@house_style()
 def replay_figure(result: Replay, title: str) -> Any:
-    """Make a figure of position, velocity and attitude of a replay, and the NIS of each sensor.
-
-    Args:
-        result: Result of a replay.
-        title: Title of the figure.
-
-    Returns:
-        matplotlib Figure.
-
-    Raises:
-        ImportError: If matplotlib is not installed.
-    """
-    require_matplotlib()
+    """Make a figure of position, velocity and attitude of a replay, and the NIS of each sensor."""
     from matplotlib.figure import Figure
 
     kinds = sensors_of(result)
@@ -95,10 +77,8 @@ def replay_figure(result: Replay, title: str) -> Any:
         draw_nis(figure.add_subplot(grid[3 + k // 2, k % 2]), measured, _SENSORS[name])
     for axes in figure.axes:
         axes.set_xlim(result.time[0], result.time[-1])
-        axes.tick_params(colors=GREY)
-    figure.axes[-1].set_xlabel("time [s]")
-    if len(kinds) > 1:
-        figure.axes[-2].set_xlabel("time [s]")
+    for axes in figure.axes[-min(2, len(kinds)) :]:
+        axes.set_xlabel("time [s]")
     return figure
 
 

@@ -40,15 +40,7 @@ _made: list[Path] = []
 
 
 def require_writable(option: str, folder: Path) -> None:
-    """Create a folder if it is missing, and check that files can be written in it.
-
-    Args:
-        option: Option that specified it, such as "--output", for the message.
-        folder: Path of the folder.
-
-    Raises:
-        OSError: If files cannot be written in it.
-    """
+    """Create a folder if it is missing, or raise an OSError if files cannot be written in it."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -81,11 +73,7 @@ def as_json(value: Any) -> Any:
 
 
 def write_json(file: Path, value: Any) -> Path:
-    """Write a value as indented JSON.
-
-    Returns:
-        Path of the file.
-    """
+    """Write a value as indented JSON; returns the path of the file."""
     text = json.dumps(as_json(value), indent=2, allow_nan=False, ensure_ascii=False)
     file.write_text(text + "\n", encoding="utf-8")
     return file
@@ -106,18 +94,7 @@ def stacked(tables: Iterable[Mapping[str, Iterable[Any]]]) -> dict[str, list[Any
 
 
 def write_csv(file: Path, columns: Mapping[str, Sequence[Any]]) -> Path:
-    """Write columns of equal length as CSV; NaN and None become empty cells.
-
-    Args:
-        file: Path of the file.
-        columns: Values of each column, by heading.
-
-    Returns:
-        Path of the file.
-
-    Raises:
-        ValueError: If the columns differ in length.
-    """
+    """Write columns of equal length by heading as CSV, with empty cells for NaN and None."""
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(columns)

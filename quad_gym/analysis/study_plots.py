@@ -11,23 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.plots import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PALE,
-    VERMILLION,
-    house_style,
-    panels,
-)
+from quad_gym.analysis import plots
 
 Floats = NDArray[np.float64]
 Episode = Mapping[str, Floats]
 
 
-@house_style()
+@plots.house_style()
 def glance_figure(episodes: Mapping[str, Episode], half_view: float) -> Any:
     """Figure of the headings of policies, with estimation and tracking errors.
 
@@ -38,25 +28,25 @@ def glance_figure(episodes: Mapping[str, Episode], half_view: float) -> Any:
         time, error = episode["time"], episode["position_error"]
         _draw_angles(above, episode, math.degrees(half_view))
         _draw_uncertainty(below, episode)
-        below.plot(time, error, color=VERMILLION, label="error of the position")
+        below.plot(time, error, color=plots.VERMILLION, label="error of the position")
         _mark_end(below, time, error, "crash")
     grid[0, 0].set_ylabel("body x, from the direction\nof the features [deg]")
     _finish(grid, episodes, "position_error")
     return figure
 
 
-@house_style()
+@plots.house_style()
 def pace_figure(episodes: Mapping[str, Episode]) -> Any:
     """Figure of the speeds of policies, with estimation errors and 3 sigma."""
     figure, grid = _grid(episodes, 4.6)
     for (above, below), episode in zip(grid.T, episodes.values(), strict=True):
         time = episode["time"]
-        above.plot(time, episode["speed"], color=BLUE, label="speed")
+        above.plot(time, episode["speed"], color=plots.BLUE, label="speed")
         _draw_uncertainty(below, episode)
         failed = time[np.nan_to_num(episode.get("outage", np.zeros_like(time))) > 0]
         if failed.size:
             for axes, label in ((above, "no GNSS"), (below, "_")):
-                style: dict[str, Any] = {"color": GREY, "alpha": 0.2, "linewidth": 0}
+                style: dict[str, Any] = {"color": plots.GREY, "alpha": 0.2, "linewidth": 0}
                 axes.axvspan(failed[0], failed[-1], label=label, **style)
         _mark_end(below, time, episode["speed"], "end")
     grid[0, 0].set_ylabel("[m/s]")
@@ -68,7 +58,7 @@ def pace_figure(episodes: Mapping[str, Episode]) -> Any:
 def _grid(episodes: Mapping[str, Episode], height: float, **options: Any) -> tuple[Any, Any]:
     """Make a figure with two axes for each episode, (2, episodes)."""
     size = (4.3 * len(episodes), height)
-    figure, grid = panels(2, len(episodes), size, sharex=True, sharey="row", **options)
+    figure, grid = plots.panels(2, len(episodes), size, sharex=True, sharey="row", **options)
     for axes, label in zip(grid[0], episodes, strict=True):
         axes.set_title(label)
     return figure, grid
@@ -88,12 +78,12 @@ def _finish(grid: Any, episodes: Mapping[str, Episode], column: str) -> None:
 
 def _draw_angles(axes: Any, episode: Episode, half_view: float) -> None:
     """Draw the direction of body x and the desired heading, relative to the features [deg]."""
-    view: dict[str, Any] = {"color": ORANGE, "alpha": 0.25, "linewidth": 0}
+    view: dict[str, Any] = {"color": plots.ORANGE, "alpha": 0.25, "linewidth": 0}
     axes.axhspan(-half_view, half_view, label="markers in view", **view)
     time, off = episode["time"], np.degrees(episode["off_wall"])
     rewarded = _unbroken(off - np.degrees(episode["off_reward"]))
-    axes.plot(time, rewarded, color=GREY, linestyle=(0, (4, 3)), label="rewarded")
-    axes.plot(time, _unbroken(off), color=BLUE, label="body x")
+    axes.plot(time, rewarded, color=plots.GREY, linestyle=(0, (4, 3)), label="rewarded")
+    axes.plot(time, _unbroken(off), color=plots.BLUE, label="body x")
     axes.set_ylim(-180.0, 180.0)
     axes.set_yticks([-180, -90, 0, 90, 180])
 
@@ -101,10 +91,10 @@ def _draw_angles(axes: Any, episode: Episode, half_view: float) -> None:
 def _draw_uncertainty(axes: Any, episode: Episode) -> None:
     """Draw the filter's standard deviation and the estimation error."""
     time, bound = episode["time"], 3.0 * episode["sigma"]
-    axes.plot(time, bound, color=PALE, label="_")
-    area: dict[str, Any] = {"color": GREEN, "alpha": 0.2, "linewidth": 0}
+    axes.plot(time, bound, color=plots.PALE, label="_")
+    area: dict[str, Any] = {"color": plots.GREEN, "alpha": 0.2, "linewidth": 0}
     axes.fill_between(time, 1e-3, bound, label="filter: 3 sigma", **area)
-    axes.plot(time, episode["estimation_error"], color=GREEN, label="error of the estimate")
+    axes.plot(time, episode["estimation_error"], color=plots.GREEN, label="error of the estimate")
     axes.set_yscale("log")
     axes.set_ylim(3e-3, 10.0)
     axes.set_xlabel("time [s]")
@@ -115,9 +105,9 @@ def _mark_end(axes: Any, time: Floats, values: Floats, what: str) -> None:
     over = ~np.isfinite(values)
     if over.any():
         end, place = time[int(np.argmax(over))], ("data", "axes fraction")
-        axes.axvline(end, color=INK, linewidth=1.0)
+        axes.axvline(end, color=plots.INK, linewidth=1.0)
         axes.annotate(
-            what, (end, 0.03), (4, 0), xycoords=place, textcoords="offset points", color=INK
+            what, (end, 0.03), (4, 0), xycoords=place, textcoords="offset points", color=plots.INK
         )
 
 

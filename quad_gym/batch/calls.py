@@ -1,6 +1,6 @@
 """Calls of the compiled code that flies: addresses of a batch's memory, in words.
 
-Numba needs a third of a microsecond for each array argument, longer than a stage runs.
+An array as an argument would take a third of a microsecond, longer than a stage runs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels.batch import fly
+from quad_gym.kernels.entries import fly
 from quad_gym.records import Call, Room
 
 Word = int | NDArray[Any] | Sequence[NDArray[Any]]
@@ -17,10 +17,7 @@ Word = int | NDArray[Any] | Sequence[NDArray[Any]]
 
 
 class Calls:
-    """The calls of all threads of a batch; they keep its memory alive, not the batch.
-
-    `kept` are arrays whose addresses others hold.
-    """
+    """The calls of all threads of a batch; they keep its memory and the `kept` arrays alive."""
 
     def __init__(
         self,
@@ -39,12 +36,7 @@ class Calls:
                 self._words[:, word] = [address_of(array) for array in value]
             else:
                 self._words[:, word] = value if isinstance(value, int) else address_of(value)
-        self._rows = list(self._words)
-
-    @property
-    def words(self) -> NDArray[np.int64]:
-        """Words (len(Call),) of the first thread."""
-        return self._rows[0]
+        self._rows = [address_of(row) for row in self._words]
 
     def observe_into(self, observations: NDArray[np.float32]) -> None:
         """Set the array into which the next step writes its observations."""
@@ -59,7 +51,8 @@ class Calls:
 
     def __call__(self, board: NDArray[np.int64], number: int, command: int, serving: bool) -> bool:
         """Fly blocks of a board, as the thread of this number; see `fly`."""
-        return bool(fly(self._rows[number], board, number, command, serving))
+        row, posted = self._rows[number], address_of(board)
+        return bool(fly(row, posted, board.size, number, command, serving))
 
 
 def address_of(array: NDArray[Any]) -> int:

@@ -10,18 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.calls import Calls, Word, address_of
 from quad_gym.batch.cold_start import check_cold_start
-from quad_gym.batch.following import check_reference
-from quad_gym.batch.innovations import innovations_of
 from quad_gym.batch.memory import FlightMemory, configuration_digest
 from quad_gym.batch.own_estimator import OwnFilter
-from quad_gym.batch.quantities import read
-from quad_gym.batch.standing import check_standing
+from quad_gym.batch.quantities import innovations_of, read
+from quad_gym.batch.references import check_reference, check_standing
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import pack_warm_start
 from quad_gym.estimation.own import Estimator
-from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import needed_stages, used_parts
+from quad_gym.kernels.linked import linked_table
+from quad_gym.kernels.stages import needed_stages, used_parts
 from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.packing.flight import params_block, params_record
 from quad_gym.packing.paths import pack_paths
@@ -43,11 +41,10 @@ from quad_gym.records import (
 )
 
 _GROUP_MEMORY = 1 << 23
-"""Memory of the blocks that a thread flies side by side [bytes]: less leaves gathered blocks half
-empty."""
+"""Memory of the blocks that a thread flies side by side [bytes], see `kernels/gathering.py`: less
+leaves gathered blocks half empty."""
 _NO_BOUNDS = np.zeros(0)
-_WORTH_NO_COPY = 1 << 16
-"""Size of observations [bytes] above which each step allocates memory, instead of copying."""
+_WORTH_NO_COPY = 1 << 16  # size of observations [bytes] above which a step allocates its own
 
 
 class FlightBatch(FlightMemory):
@@ -107,7 +104,10 @@ class FlightBatch(FlightMemory):
 
     def _allocate_for_threads(self) -> None:
         """Allocate the memory that each thread has for itself."""
-        self._group = self._group_of_blocks()
+        s, self._group = self._settings[0], 1  # blocks that a thread flies side by side
+        own = s["randomized"] or s["faults"] or s["features_drawn"] or s["own_estimator"]
+        if s["run_filter"] and not own and s["sensor_ticks"].max() > 1:
+            self._group = max(1, _GROUP_MEMORY // self._room.dtype.itemsize)
         self._own = [self._world.copy() for _ in range(self.threads)]
         self._believed = [self._model.copy() for _ in range(self.threads)]
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
@@ -179,17 +179,13 @@ class FlightBatch(FlightMemory):
         self._actions[: self.count] = self.record("action") if actions is None else actions
         observations = self._run(Command.STEP)
         if self.configuration.begins_after_step:
-            over = self._flights_over()
+            over = self.result("terminated") + self.result("truncated") > 0.0
             if over.any():
                 self.final_observations[over] = observations[over]
                 self._keep_innovations()
                 self._resets[:] = over
                 return self._run(Command.RESET)
         return observations
-
-    def _flights_over(self) -> NDArray[np.bool_]:
-        """(count,) which flights have ended their episode in the last step."""
-        return np.asarray(self.result("terminated") + self.result("truncated") > 0.0)
 
     def _keep_innovations(self) -> None:
         """Keep the innovations of episodes that are over, before others begin in the same step."""
@@ -244,14 +240,6 @@ class FlightBatch(FlightMemory):
         self._calls.observe_into(self._observations)
         self._crew.run(int(command))
         return self._observations
-
-    def _group_of_blocks(self) -> int:
-        """Return how many blocks a thread flies side by side, see `kernels/gathering.py`."""
-        s = self._settings[0]
-        own = s["randomized"] or s["faults"] or s["features_drawn"] or s["own_estimator"]
-        if own or not s["run_filter"] or s["sensor_ticks"].max() <= 1:
-            return 1
-        return max(1, _GROUP_MEMORY // self._room.dtype.itemsize)
 
     def _calls_of_threads(self) -> Calls:
         """Return the arguments with which the threads call the compiled code."""

@@ -31,10 +31,8 @@ Truths = NDArray[np.bool_]
 class Reading(NamedTuple):
     """Measurement of one sensor, of all flights."""
 
-    value: Floats
-    """One row per flight; NaN where no measurement arrives at this instant"""
-    new: Truths
-    """True where one arrives: (n,), for pixels (n, features)"""
+    value: Floats  #: one row per flight; NaN where no measurement arrives at this instant
+    new: Truths  #: True where one arrives: (n,), for pixels (n, features)
     age: float
     """Time since the measurement was taken, its time stamp: the latency of the sensor [s]"""
 

@@ -102,18 +102,15 @@ class FlightMemory:
         if name not in (FLIGHT_BLOCK.names or ()):
             known = check.did_you_mean(name, FLIGHT_BLOCK.names or ())
             raise ValueError(f"name must be a field of a flight's record, got {name!r}{known}")
-        if not self._room.holds(name):
-            return self._unused(name, self.count if flights is None else len(flights))
+        if not self._room.holds(name):  # this configuration does not use it
+            count = self.count if flights is None else len(flights)
+            if name == "drawn":
+                return np.tile(self._undrawn, (count, 1))
+            base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
+            return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
         if flights is None:
             return field_of_flights(self._blocks, name, self.count)
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
-
-    def _unused(self, name: str, count: int) -> NDArray[Any]:
-        """Return a field that this configuration does not use, and for which it has no room."""
-        if name == "drawn":
-            return np.tile(self._undrawn, (count, 1))
-        base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
-        return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
         """Return the drawn parameters of the present episodes by name: (count,) or (count, n)."""
@@ -128,10 +125,7 @@ class FlightMemory:
         return found
 
     def feature_places(self) -> NDArray[np.float64]:
-        """Return the features of the camera in the present episodes, (count, m, 3) in I [m].
-
-        These are the positions that the filter assumes; with `Randomization.known`, the true ones.
-        """
+        """Return the features of the camera as the filter assumes them, (count, m, 3) in I [m]."""
         count = 0 if self.sensors.camera is None else len(self.sensors.camera.features_I)
         if self._room.holds("feature_place"):
             return np.ascontiguousarray(self.record("feature_place")[:, :count])

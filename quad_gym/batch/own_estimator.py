@@ -41,13 +41,6 @@ class OwnFilter:
 
     The kernels fly tick by tick up to the measurements; the estimate is then written to the
     fields in which they expect the filter's.
-
-    Args:
-        given: The estimator.
-        count: Number of flights.
-
-    Raises:
-        ValueError: If its `state` is invalid.
     """
 
     def __init__(self, given: Estimator, count: int) -> None:
@@ -72,9 +65,7 @@ class OwnFilter:
     def run(self, batch: "FlightBatch", command: Command) -> NDArray[np.float32]:
         """Fly a control period, or begin episodes; return the observations.
 
-        Raises:
-            ValueError: If a method of the estimator returns an invalid estimate. The flights must
-                then be reset.
+        After an invalid estimate, a ValueError, the flights must be reset.
         """
         if command == Command.RESET:
             observations = batch._fly(Command.RESET)
@@ -134,11 +125,7 @@ class OwnFilter:
         measurements: Measurements,
         with_covariance: bool = True,
     ) -> None:
-        """Write an estimate to the records of flights in `mask`.
-
-        Raises:
-            ValueError: If it is invalid.
-        """
+        """Write an estimate to the records of flights in `mask`, if it is valid."""
         method, rows = f"{self.name}.{method}", mask
         try:
             found = checked_estimate(method, given, batch.count, rows)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.memory import FlightMemory
+from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
 from quad_gym.records import (
     AID_BLOCKS,
@@ -34,19 +35,14 @@ Computed = Callable[[FlightMemory, Flights], NDArray[Any]]
 class Quantity(NamedTuple):
     """One quantity of a batch of flights."""
 
-    of: str | Computed
-    """the field of the records, or a function that computes it"""
-    shape: tuple[int | str, ...]
-    """for one flight; a word: as many as there are of these"""
+    of: str | Computed  # the field of the records, or a function that computes it
+    shape: tuple[int | str, ...]  # for one flight; a word: as many as there are of these
     unit: str
-    frame: str
-    """I: inertial (east, north, up), B: body, C: image; "-": none"""
+    frame: str  # I: inertial (east, north, up), B: body, C: image; "-": none
     meaning: str
     kind: type = float
-    filtered: bool = False
-    """True if only flights have it in which a filter, and so sensors, run"""
-    builtin: bool = False
-    """True if only the built-in filter has it: NaN with a user's estimator"""
+    filtered: bool = False  # True if only flights have it in which a filter, and so sensors, run
+    builtin: bool = False  # True if only the built-in filter has it: NaN with a user's estimator
 
 
 def read(batch: FlightMemory, name: str, flights: Flights) -> NDArray[Any]:
@@ -255,3 +251,24 @@ QUANTITIES = {
 }
 """Every quantity that `FlightBatch.read` returns, by its name."""
 # fmt: on
+
+
+def innovations_of(batch: FlightMemory) -> dict[str, NDArray[Any]]:
+    """Return the last innovations of all flights, block by block.
+
+    The blocks are position, baseline, velocity and features, followed by barometer and magnetometer
+    if the suite has them.
+
+    Returns:
+        Arrays (n, blocks, ...): "measured" (True if measured since the last step); "innovation" and
+        "sigma" (its standard deviation predicted by the filter), three numbers each, of which a
+        direction uses two; "nis"; "gate", see `quad_gym.records.GateDecision`; "rejections" in this
+        episode. NaN: not measured yet.
+    """
+    blocks = list(blocks_of(batch.sensors))
+    fields = ("block_fresh", "innovation", "innovation_sigma", "block_nis", "gate", "rejections")
+    fresh, innovation, sigma, nis, gate, rejections = (batch.record(f)[:, blocks] for f in fields)
+    return {
+        **{"measured": fresh > 0.0, "innovation": innovation, "sigma": sigma, "nis": nis},
+        **{"gate": gate.astype(np.int64), "rejections": rejections.astype(np.int64)},
+    }

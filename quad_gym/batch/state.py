@@ -88,15 +88,9 @@ class State:
     def flights_of(
         self, snapshot: NDArray[Any], flights: np.dtype[Any], owner: str
     ) -> NDArray[Any]:
-        """Return the flights of a snapshot that `kept_with` has joined with a state.
+        """Return the flights of a snapshot that `kept_with` has joined with a state like this one.
 
-        Args:
-            snapshot: Snapshot.
-            flights: Data type of the flights.
-            owner: Task or estimator that needs the state, for the message.
-
-        Raises:
-            ValueError: If it has no state like this one.
+        `flights` is their data type, `owner` the task or estimator that needs the state.
         """
         if not self.names:
             return snapshot

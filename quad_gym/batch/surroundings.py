@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels import single
+from quad_gym.kernels import entries
 from quad_gym.packing.world import pack_obstacles
 from quad_gym.params.obstacles import Obstacle
 from quad_gym.params.world import WorldParams
@@ -22,11 +22,11 @@ def nearest_obstacle(
     """Return distances (n,) of points (n, 3) in I from the nearest obstacle's surface [m].
 
     They are negative inside, and infinite without obstacles. The second array (n, 3) holds vectors
-    to the nearest points, in I [m]; `centers` (n, obstacles, 3) are those of the obstacles.
+    to the nearest points, in I [m]; `centers` (n, obstacles, 3) belong to the obstacles.
     """
     distances, vectors = np.full(len(points), np.inf), np.zeros((len(points), 3))
     given = (np.ascontiguousarray(array, np.float64) for array in (points, centers))
-    single.nearest_obstacles(*given, _settings(tuple(obstacles)), distances, vectors)
+    entries.nearest_obstacles(*given, _settings(tuple(obstacles)), distances, vectors)
     return distances, vectors
 
 
@@ -40,7 +40,7 @@ def hidden_points(
     each = np.broadcast_to(points, (len(eyes), *points.shape[-2:]))
     hidden = np.zeros(each.shape[:2], bool)
     given = (np.ascontiguousarray(array, np.float64) for array in (eyes, each, centers))
-    single.hide_points(*given, _settings(tuple(obstacles)), hidden)
+    entries.hide_points(*given, _settings(tuple(obstacles)), hidden)
     return hidden
 
 

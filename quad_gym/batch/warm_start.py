@@ -29,8 +29,7 @@ WARM_UP = 10.0
 """Time for which a filter has been running at a warm start [s]: several correlation times of its
 velocity and attitude, as between switching a vehicle on and its take-off."""
 
-FLIGHTS = 8
-"""Flights whose covariances are averaged."""
+FLIGHTS = 8  # flights whose covariances are averaged
 
 LOST = 0.35
 """Attitude error above which a filter has diverged, whatever its covariance [rad]: the linear model
@@ -94,7 +93,8 @@ def converged_covariance(
             f"filter_start must be 'cold' for these sensors: the filter fails within {WARM_UP:g} s "
             "of hovering"
         )
-    angle = float(np.abs(_attitude_errors(batch)).max())
+    R_error = quaternion_to_dcm(batch.record("q")) @ batch.record("R_hat").transpose(0, 2, 1)
+    angle = float(np.abs(dcm_to_euler(R_error)).max())
     if angle > LOST:
         raise ValueError(
             f"filter_start must be 'cold' for these sensors: after {WARM_UP:g} s of hovering the "
@@ -102,24 +102,13 @@ def converged_covariance(
             "heading, such as a level baseline or the heading of `initial_pose`?"
         )
     states = 15 + len(slow_states(sensors).errors)
+    factors = np.zeros((batch.count, MAX_STATES, MAX_STATES))
+    factors[:, :15, :15], factors[:, 15:] = batch.record("L"), batch.record("L_slow")
     mean = np.zeros((states, states))
-    for q, L in zip(batch.record("q"), _factors(batch), strict=True):
+    for q, L in zip(batch.record("q"), factors, strict=True):
         root = portable.product(_turned_east(q, sensors).T[:states, :states], L[:states, :states])
         mean += portable.product(root, root.T) / FLIGHTS
     return mean
-
-
-def _attitude_errors(batch: Any) -> Floats:
-    """(n, 3) Euler angles from the estimated to the true attitude [rad]."""
-    R_hat = batch.record("R_hat")
-    return dcm_to_euler(quaternion_to_dcm(batch.record("q")) @ R_hat.transpose(0, 2, 1))
-
-
-def _factors(batch: Any) -> Floats:
-    """(n, 24, 24) factors of the joint covariances."""
-    factors = np.zeros((batch.count, MAX_STATES, MAX_STATES))
-    factors[:, :15, :15], factors[:, 15:] = batch.record("L"), batch.record("L_slow")
-    return factors
 
 
 def _turned_east(q: Floats, sensors: SensorSuite) -> Floats:

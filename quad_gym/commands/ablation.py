@@ -19,13 +19,7 @@ from quad_gym import sensor_suite
 from quad_gym.analysis.consistency_flights import ASTRAY
 from quad_gym.analysis.reports import require_writable, versions, write_json
 from quad_gym.commands.options import SuiteName, Threads, require_at_least, usage_errors
-from quad_gym.experiments.consistency.ablation import (
-    SETTLED,
-    as_fields,
-    cases_of,
-    run_ablation,
-    table_of,
-)
+from quad_gym.experiments.consistency import ablation
 from quad_gym.experiments.consistency.cases import CaseFlights
 
 
@@ -51,7 +45,7 @@ class AblationArgs:
     def __post_init__(self) -> None:
         """Check the numbers."""
         require_at_least(self, episodes=2, seed=0, threads=1)
-        least = SETTLED + 0.1
+        least = ablation.SETTLED + 0.1
         if not (math.isfinite(self.duration) and self.duration >= least):
             raise ValueError(f"--duration must be at least {least:g} s, got {self.duration:g}")
 
@@ -59,22 +53,24 @@ class AblationArgs:
 def main(args: AblationArgs) -> None:
     """Fly all cases, and print and write the table."""
     with usage_errors():
-        cases = cases_of(args.table, sensor_suite(args.sensors), args.filter_start)
+        cases = ablation.cases_of(args.table, sensor_suite(args.sensors), args.filter_start)
         for case in cases:
             case.batch(8, 1)  # rejects invalid cases before any flight
         require_writable("--output", args.output)
     flights = CaseFlights(args.episodes, args.seed, args.duration, args.threads)
-    rows = run_ablation(args.table, cases, flights)
+    rows = ablation.run_ablation(args.table, cases, flights)
     print(
         f"{args.episodes:,} flights of {args.duration:g} s on random trajectories, suite "
         f"{args.sensors}, {args.filter_start} start.\n"
     )
-    print(table_of(args.table, rows))
-    print(f"\nErrors are root mean squares after {SETTLED:g} s; a flight {ASTRAY:g} m off its")
-    print("reference is astray, and its tracking error does not count.")
+    print(ablation.table_of(args.table, rows))
+    print(
+        f"\nErrors are root mean squares after {ablation.SETTLED:g} s; a flight {ASTRAY:g} m off "
+        "its\nreference is astray, and its tracking error does not count."
+    )
     found = {
         "rows": rows,
-        "cases": [as_fields(case) for case in cases],
+        "cases": [ablation.as_fields(case) for case in cases],
         "configuration": args,
         "seeds": flights.seed_limits,
         "versions": versions("numpy", "numba", "scipy"),

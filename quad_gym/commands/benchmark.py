@@ -32,7 +32,7 @@ from quad_gym.experiments.benchmark import (
     stages,
 )
 from quad_gym.experiments.benchmark.timing import Effort, Row, Scope
-from quad_gym.kernels.compiling.cores import available_cores
+from quad_gym.kernels.cores import available_cores
 from quad_gym.records import WIDTH
 
 ALONE = ("compile", "learning")

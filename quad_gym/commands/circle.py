@@ -23,17 +23,7 @@ from quad_gym import TaskParams, pd_gains, sensor_suite
 from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import Threads, require_at_least, usage_errors
-from quad_gym.experiments.circle import (
-    ESTIMATE,
-    NO_CAMERA,
-    TRUTH,
-    Setup,
-    consistency_table,
-    error_table,
-    in_words,
-    write_figures,
-    write_numbers,
-)
+from quad_gym.experiments import circle
 from quad_gym.records import Source
 
 
@@ -82,7 +72,7 @@ class CircleArgs:
     report, makes it overconfident; predicted hardly does"""
 
 
-def configure(args: CircleArgs) -> Setup:
+def configure(args: CircleArgs) -> circle.Setup:
     """Check all options before the flights."""
     require_at_least(args, episodes=1, seed=0, threads=1)
     if args.camera_rate is not None and not args.camera:
@@ -105,10 +95,10 @@ def configure(args: CircleArgs) -> Setup:
     )
     estimator = suite.estimator.replace(bearing_noise_at=args.bearing_noise_at)
     suite = suite.replace(estimator=estimator)
-    cases = {TRUTH: (Source.TRUTH, suite)}
+    cases = {circle.TRUTH: (Source.TRUTH, suite)}
     if args.camera:
-        cases[ESTIMATE] = (Source.ESTIMATE, suite)
-    cases[NO_CAMERA] = (Source.ESTIMATE, suite.replace(camera=None))
+        cases[circle.ESTIMATE] = (Source.ESTIMATE, suite)
+    cases[circle.NO_CAMERA] = (Source.ESTIMATE, suite.replace(camera=None))
     if not (math.isfinite(args.duration) and args.duration * suite.imu.rate >= 2.0):
         raise ValueError(
             f"--duration must be at least {2.0 / suite.imu.rate:g} s, two IMU samples, "
@@ -116,7 +106,7 @@ def configure(args: CircleArgs) -> Setup:
         )
     require_matplotlib()
     require_writable("--output", args.output)
-    return Setup(
+    return circle.Setup(
         cases=cases,
         gains=gains,
         task=task,
@@ -138,9 +128,10 @@ def main(args: CircleArgs) -> None:
     began = time.perf_counter()
     results = {case: setup.fly(case) for case in setup.cases}
     seconds = time.perf_counter() - began
-    print(error_table(results))
+    print(circle.error_table(results))
     print("Mean ± standard deviation over the flights that did not end early.\n")
-    print(consistency_table(results), end="\n\n")
-    print(in_words(results, setup.cases[TRUTH][1]), end="\n\n")
-    written = write_numbers(results, setup, seconds, args) + write_figures(results, setup)
+    print(circle.consistency_table(results), end="\n\n")
+    print(circle.in_words(results, setup.cases[circle.TRUTH][1]), end="\n\n")
+    written = circle.write_numbers(results, setup, seconds, args)
+    written += circle.write_figures(results, setup)
     print(f"Wrote {len(written)} files to {setup.output} after {seconds:.1f} s.")

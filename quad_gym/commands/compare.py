@@ -25,24 +25,8 @@ from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.threads import resolve_threads
-from quad_gym.commands.options import (
-    TRACKING,
-    Engine,
-    Keywords,
-    SuiteNames,
-    TrackingId,
-    leave,
-    require_at_least,
-    usage_errors,
-    with_full_id,
-)
-from quad_gym.experiments.compare import (
-    Comparison,
-    ComparisonResults,
-    conclusions,
-    matrix_text,
-    write_report,
-)
+from quad_gym.commands import options
+from quad_gym.experiments import compare
 from quad_gym.experiments.driver import train_all
 from quad_gym.experiments.executors import make_executor
 from quad_gym.params import checks as check
@@ -58,8 +42,8 @@ SOURCES: tuple[Source, ...] = ("truth", "noisy", "estimate")
 class CompareArgs:
     """Options of the comparison."""
 
-    env_id: TrackingId = "QuadGym/Circle-v0"
-    sensors: SuiteNames = ("standard",)
+    env_id: options.TrackingId = "QuadGym/Circle-v0"
+    sensors: options.SuiteNames = ("standard",)
     train_on: tuple[Source, ...] = SOURCES
     """observations in training"""
     seeds: int = 5
@@ -70,10 +54,10 @@ class CompareArgs:
 
     algorithm: Literal["ppo", "sac", "td3", "tqc"] = "ppo"
     """reinforcement learning algorithm"""
-    engine: Engine = "sb3"
+    engine: options.Engine = "sb3"
     steps: int | None = None
     """number of environment steps of each training; if not given, the recipe's"""
-    env: Keywords = field(default_factory=dict)
+    env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as control_rate=100"""
     jobs: int | None = None
     """number of simultaneous trainings, each with one thread; if not given, one per core"""
@@ -86,24 +70,23 @@ class CompareArgs:
     """folder; if not given, results/compare/TASK (with --quick, .../TASK_quick)"""
 
 
-def configure(args: CompareArgs) -> Comparison:
+def configure(args: CompareArgs) -> compare.Comparison:
     """Check all options before training."""
     plots.require_matplotlib()
-    args = with_full_id(args, TRACKING)
-    require_at_least(args, seeds=1, episodes=2, seed=0, jobs=1)
+    args = options.with_full_id(args, options.TRACKING)
+    options.require_at_least(args, seeds=1, episodes=2, seed=0, jobs=1)
     for source in args.train_on:
         check.choice("--train-on", source, SOURCES)
     labels = [suite_label(suite) for suite in args.sensors]
     if len(set(labels)) < len(labels):
         raise ValueError(f"--sensors must have different names, got {' '.join(labels)}")
-    leave(args.env, {"observation": "--train-on", "sensors": "--sensors", "threads": "--jobs"})
+    options.leave(args.env, "sensors", observation="--train-on", threads="--jobs")
     chosen = recipe(args.env_id, args.algorithm)
     if args.steps is not None:
         chosen = chosen.replace(steps=args.steps)
-    seeds = QUICK_SEEDS if args.quick else args.seeds
-    episodes = QUICK_EPISODES if args.quick else args.episodes
+    seeds, episodes = (QUICK_SEEDS, QUICK_EPISODES) if args.quick else (args.seeds, args.episodes)
     name = IDS[args.env_id] + ("_quick" if args.quick else "")
-    comparison = Comparison(
+    comparison = compare.Comparison(
         env_id=args.env_id,
         suites=args.sensors,
         sources=args.train_on,
@@ -123,7 +106,7 @@ def configure(args: CompareArgs) -> Comparison:
 def main(args: CompareArgs) -> int:
     """Compare."""
     began = time.perf_counter()
-    with usage_errors():
+    with options.usage_errors():
         comparison = configure(args)
     print(
         f"{comparison.env_id}: {len(comparison.trainings)} trainings of "
@@ -134,11 +117,11 @@ def main(args: CompareArgs) -> int:
     driver = train_all(comparison.trainings, executor, args.jobs or resolve_threads(None))
     if code := driver.exit_code():
         return code
-    matrix = ComparisonResults(comparison, comparison.fly())
+    matrix = compare.ComparisonResults(comparison, comparison.fly())
     for suite in comparison.suites:
-        print(f"\nSensors {suite}\n\n{matrix_text(matrix, suite)}")
-    print("\n" + "\n".join(conclusions(matrix)))
-    written = write_report(matrix)
+        print(f"\nSensors {suite}\n\n{compare.matrix_text(matrix, suite)}")
+    print("\n" + "\n".join(compare.conclusions(matrix)))
+    written = compare.write_report(matrix)
     print(
         f"\nWrote {len(written)} files to {comparison.folder} after "
         f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."

@@ -27,30 +27,20 @@ filters are consistent 10 s later, how many flag their divergence, and the rate 
 interrupted run of either continues when it is started again.
 """
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
 from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable
-from quad_gym.commands.options import (
-    TRACKING,
-    EstimatorName,
-    SuiteName,
-    Threads,
-    TrackingId,
-    known_id,
-    option_name,
-    require_at_least,
-    usage_errors,
-)
+from quad_gym.commands import options
 from quad_gym.envs import IDS
 from quad_gym.envs.configuration import own_estimator
 from quad_gym.experiments.consistency import matrix, recovery
 from quad_gym.experiments.consistency.cases import Case, CaseFlights, run_cases, unexpected
 from quad_gym.experiments.consistency.single import run_single
+from quad_gym.params import checks as check
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
 
@@ -59,7 +49,7 @@ from quad_gym.records import Source
 class ConsistencyArgs:
     """Options of the experiment."""
 
-    env_id: TrackingId = "QuadGym/RandomTrajectory-v0"
+    env_id: options.TrackingId = "QuadGym/RandomTrajectory-v0"
 
     episodes: int | None = None
     """number of flights; if not given, 4000, or 400 in each cell of a table"""
@@ -87,9 +77,9 @@ class ConsistencyArgs:
     threads"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """with --matrix: the suites on all tasks, other conditions on one task, or both"""
-    threads: Threads = None
+    threads: options.Threads = None
 
-    sensors: SuiteName = "standard"
+    sensors: options.SuiteName = "standard"
     form: Literal["suite", "report", "corrected"] = "suite"
     """form of filter and IMU: the suite's, the report's, or the one with all corrections"""
     samples: Literal["instant", "average"] | None = None
@@ -101,7 +91,7 @@ class ConsistencyArgs:
     bearing_noise_at: Literal["measured", "predicted", "pinhole"] | None = None
     """direction to which the filter assumes camera noise is perpendicular; if not given, the
     form's"""
-    estimator: EstimatorName = None
+    estimator: options.EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
     imu_rate: float | None = None
@@ -126,36 +116,21 @@ class ConsistencyArgs:
         """Check the numbers."""
         if self.matrix and self.recovery:
             raise ValueError("--matrix and --recovery must not be given together")
-        table = "matrix" if self.matrix else "recovery" if self.recovery else ""
-        if self.episodes is None:
-            object.__setattr__(self, "episodes", 400 if table else 4000)
-        if self.output is None:
-            folder = f"consistency_{table}" if table else "consistency"
-            object.__setattr__(self, "output", Path("results") / folder)
-        require_at_least(self, episodes=2, seed=0, threads=1)
-        object.__setattr__(self, "env_id", known_id("ENV_ID", self.env_id, TRACKING))
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
+        options.require_at_least(self, episodes=2, seed=0, threads=1)
+        full_id = options.known_id("ENV_ID", self.env_id, options.TRACKING)
+        object.__setattr__(self, "env_id", full_id)
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{option_name(name)} must be above 0, got {value}")
+            check.positive(options.option_name(name), getattr(self, name))
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
-
         if self.own_estimator is not None:
-            for name in (
-                "form",
-                "filter_start",
-                "integration",
-                "attitude_reset",
-                "bearing_noise_at",
-            ):
-                value = getattr(self, name)
-                if value not in ("suite", "cold", "warm", None):
+            for name in ("form", "filter_start", *_CHOICES):
+                if (value := getattr(self, name)) not in ("suite", "cold", "warm", None):
                     raise ValueError(
-                        f"{option_name(name)} {value} has no effect with an own --estimator, and "
-                        "must not be given"
+                        f"{options.option_name(name)} {value} has no effect with an own "
+                        "--estimator, and must not be given"
                     )
 
     @property
@@ -166,14 +141,18 @@ class ConsistencyArgs:
     @property
     def flights(self) -> CaseFlights:
         """Number, seeds and length of the flights."""
-        assert self.episodes is not None
-        return CaseFlights(self.episodes, self.seed, self.duration, self.threads)
+        count = self.episodes or (400 if self.matrix or self.recovery else 4000)
+        return CaseFlights(count, self.seed, self.duration, self.threads)
 
     @property
     def folder(self) -> Path:
         """Output folder."""
-        assert self.output is not None
-        return self.output
+        table = "_matrix" if self.matrix else "_recovery" if self.recovery else ""
+        return self.output or Path("results") / f"consistency{table}"
+
+
+_CHOICES = ("integration", "attitude_reset", "bearing_noise_at")
+"""Options of filters that a suite has under these names."""
 
 
 def suite_of(args: ConsistencyArgs) -> SensorSuite:
@@ -181,19 +160,16 @@ def suite_of(args: ConsistencyArgs) -> SensorSuite:
     suite = sensor_suite(args.sensors)
     if not args.camera:
         suite = suite.replace(camera=None)
-    samples = suite.imu.samples
-    if args.form != "suite":
-        samples = "instant" if args.form == "report" else "average"
-        form = FilterParams() if args.form == "report" else FIELD_FILTER
-        suite = suite.replace(estimator=form)
-    own = args.own_estimator
-    chosen = {"kind": args.estimator} if args.estimator is not None and own is None else {}
-    for name in ("integration", "attitude_reset", "bearing_noise_at"):
-        if getattr(args, name) is not None:
-            chosen[name] = getattr(args, name)
+    samples, form = {
+        "suite": (suite.imu.samples, suite.estimator),
+        "report": ("instant", FilterParams()),
+        "corrected": ("average", FIELD_FILTER),
+    }[args.form]
+    chosen = {name: getattr(args, name) for name in _CHOICES}
+    chosen["kind"] = args.estimator if args.own_estimator is None else None
     suite = suite.replace(
         imu=suite.imu.replace(samples=args.samples or samples),
-        estimator=suite.estimator.replace(**chosen),
+        estimator=form.replace(**{k: v for k, v in chosen.items() if v is not None}),
     )
     camera_rate = args.camera_rate if args.camera else None
     return suite.with_rates(imu=args.imu_rate, gnss=args.gnss_rate, camera=camera_rate)
@@ -240,7 +216,7 @@ def main(args: ConsistencyArgs) -> None:
     if args.matrix or args.recovery:
         fly_table(args)
         return
-    with usage_errors():
+    with options.usage_errors():
         require_matplotlib()
         case = case_of(args)
         case.batch(8, 1)  # rejects an invalid configuration
@@ -252,13 +228,13 @@ def main(args: ConsistencyArgs) -> None:
         every=args.every,
         settle=args.settle,
         matched=args.filter_start == "matched",
-        configuration=args,
+        configuration=replace(args, episodes=args.flights.count, output=args.folder),
     )
 
 
 def fly_table(args: ConsistencyArgs) -> None:
     """Fly the cases of a table, and print where it is."""
-    with usage_errors():
+    with options.usage_errors():
         require_writable("--output", args.folder)
     table, name = (matrix, "matrix") if args.matrix else (recovery, "recovery")
     files, duration = args.folder / name, {"duration": args.duration} if args.matrix else {}

@@ -22,21 +22,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable, short_name
-from quad_gym.commands.options import (
-    EnvId,
-    EstimatorName,
-    Keywords,
-    OwnSuite,
-    Threads,
-    free_folder,
-    leave,
-    refuse_overwriting,
-    require_at_least,
-    sensors_of,
-    usage_errors,
-    with_estimator,
-    with_full_id,
-)
+from quad_gym.commands import options
 from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Policy
 from quad_gym.experiments.evaluated import evaluation_table, write_evaluation
@@ -49,7 +35,7 @@ from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 class EvaluateArgs:
     """Options of the evaluation."""
 
-    env_id: EnvId = "QuadGym/Circle-v0"
+    env_id: options.EnvId = "QuadGym/Circle-v0"
     policy: tuple[str, ...] | None = None
     """policies: pd (tuned gains), pd:lab (gains of the report), pd:FILE.json (gains of quad-gym
     tune), pretrained (the included policy for the task), or files of quad-gym train (.zip or .npz);
@@ -57,15 +43,15 @@ class EvaluateArgs:
     observation: tuple[str, ...] = ("truth", "estimate")
     """observations on which the policies fly: truth, estimate, noisy, or measurements (for policies
     trained on raw measurements)"""
-    sensors: OwnSuite = None
-    estimator: EstimatorName = None
-    env: Keywords = field(default_factory=dict)
+    sensors: options.OwnSuite = None
+    estimator: options.EstimatorName = None
+    env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
     """number of episodes of each policy on each observation"""
     seed: int = 0
     """seed of the first episode; the others have consecutive seeds; trainings use different ones"""
-    threads: Threads = None
+    threads: options.Threads = None
     video: Literal["none", "mp4", "gif", "webp"] = "none"
     """format of a video of the first episode of each case; none: no video"""
     output: Path | None = None
@@ -81,8 +67,8 @@ Pairing = tuple[str, str]
 
 def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:
     """Check all options, and make every policy with its environment."""
-    args = with_full_id(args)
-    require_at_least(args, episodes=1, seed=0, threads=1)
+    args = options.with_full_id(args)
+    options.require_at_least(args, episodes=1, seed=0, threads=1)
     if not args.observation:
         raise ValueError("--observation must have at least one value, got none")
     if args.policy == ():
@@ -96,8 +82,8 @@ def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Pa
     require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     if args.output is None and not args.overwrite:
-        folder = free_folder(folder, "summary.json")
-    refuse_overwriting(folder / "summary.json", args.overwrite)
+        folder = options.free_folder(folder, "summary.json")
+    options.refuse_overwriting(folder / "summary.json", args.overwrite)
     policies = args.policy or default_policies(args)
     cases: dict[Pairing, tuple[Policy, Any]] = {}
     for observation, name in itertools.product(args.observation, policies):
@@ -122,12 +108,12 @@ def default_policies(args: EvaluateArgs) -> tuple[str, ...]:
 
 def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) -> Any:
     """Make the environment with an observation, for a policy."""
-    given = leave(args.env, {name: f"--{name}" for name in ("observation", "sensors", "threads")})
+    given = options.leave(args.env, "observation", "sensors", "threads")
     keywords = {
         **keywords_of_policy(policy, args.env_id),
-        **with_estimator(given, args.estimator),
+        **options.with_estimator(given, args.estimator),
         "observation": observation,
-        "sensors": sensors_of(args.env_id, args.sensors),
+        "sensors": options.sensors_of(args.env_id, args.sensors),
     }
     return gymnasium.make_vec(
         args.env_id, num_envs=count, threads=args.threads, **with_effect(keywords)
@@ -151,14 +137,14 @@ def write_videos(
 
 def main(args: EvaluateArgs) -> None:
     """Evaluate."""
-    with usage_errors():
-        args = with_full_id(args)
+    with options.usage_errors():
+        args = options.with_full_id(args)
         cases, folder = configure(args)
     began = time.perf_counter()
     bar = tqdm(cases.items(), desc="flying", unit=" cases")
     results = {case: fly(policy, env, args.seed) for case, (policy, env) in bar}
     print(
-        f"\n{args.env_id}, sensors {sensors_of(args.env_id, args.sensors)}; "
+        f"\n{args.env_id}, sensors {options.sensors_of(args.env_id, args.sensors)}; "
         f"{args.episodes:,} episodes in each case, from seed {args.seed}.\n"
     )
     print(evaluation_table(results, next(iter(cases.values()))[1]))

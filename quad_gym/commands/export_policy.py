@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from quad_gym.commands.options import Keywords, full_id, usage_errors, writable_file
+from quad_gym.commands.options import Keywords, full_id, refuse_overwriting, usage_errors
 
 _SUFFIXES = {"c": ".c", "onnx": ".onnx"}
 
@@ -60,14 +60,21 @@ class ExportPolicyArgs:
     """replace an existing file"""
 
 
-def _name(args: ExportPolicyArgs) -> str:
-    """Default name of the file, without extension."""
+def _file(args: ExportPolicyArgs) -> Path:
+    """File to write, in a writable folder."""
     from quad_gym import IDS
+    from quad_gym.analysis.reports import require_writable
 
+    suffix, path = _SUFFIXES[args.to], Path(args.policy).with_suffix("")
+    name = "_".join(part for part in path.parts[-3:] if part not in ("/", "..", "."))
     if args.policy == "pretrained":
-        return IDS.get(full_id(args.env_id or ""), "policy")
-    path = Path(args.policy).with_suffix("")
-    return "_".join(part for part in path.parts[-3:] if part not in ("/", "..", "."))
+        name = IDS.get(full_id(args.env_id or ""), "policy")
+    file = args.output or Path("results/export") / (name + suffix)
+    if file.suffix != suffix:
+        raise ValueError(f"--output must end in {suffix}, got {file}")
+    refuse_overwriting(file, args.overwrite)
+    require_writable("--output", file.parent)
+    return file
 
 
 def function_name(file: Path) -> str:
@@ -96,6 +103,6 @@ def export(args: ExportPolicyArgs, file: Path) -> str:
 def main(args: ExportPolicyArgs) -> None:
     """Export a policy."""
     with usage_errors():
-        file = writable_file(args.output, _name(args), _SUFFIXES[args.to], args.overwrite)
+        file = _file(args)
         message = export(args, file)
     print(f"Wrote {file}. {message}")

@@ -29,18 +29,7 @@ from baselines.policies import keywords_of_policy, load_policy
 from quad_gym import IDS, Flight, SensorSuite, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import (
-    EnvId,
-    EstimatorName,
-    Keywords,
-    OwnSuite,
-    leave,
-    require_at_least,
-    sensors_of,
-    usage_errors,
-    with_estimator,
-    with_full_id,
-)
+from quad_gym.commands import options
 from quad_gym.evaluation import Policy
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import PRESETS, faults_of
@@ -58,7 +47,7 @@ OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 class FlyArgs:
     """Options of the flight."""
 
-    env_id: EnvId = "QuadGym/Circle-v0"
+    env_id: options.EnvId = "QuadGym/Circle-v0"
     policy: str = "pd"
     """policy: pd (tuned gains), pd:lab (gains of the report), pretrained (the included policy for
     the task), or a file of quad-gym train (.zip or .npz)"""
@@ -70,11 +59,11 @@ class FlyArgs:
     """seed of the episode; in the window, the next episodes have consecutive seeds"""
     duration: float | None = None
     """time limit [s]; if not given, the task's default"""
-    env: Keywords = field(default_factory=dict)
+    env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as control_rate=100 world=breeze"""
 
-    sensors: OwnSuite = None
-    estimator: EstimatorName = None
+    sensors: options.OwnSuite = None
+    estimator: options.EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
     gnss_rate: float | None = None
@@ -85,7 +74,7 @@ class FlyArgs:
         tuple[str, ...],
         arg(
             help="faults, one or several (also joined by +), which replace the task's own: "
-            f"{', '.join(FAULTS)}; or none",
+            f"{', '.join(FAULTS)}; or none"
         ),
     ] = ()
     fault_time: tuple[float, float] | None = None
@@ -130,7 +119,7 @@ class Switches:
 
 def check_options(args: FlyArgs) -> None:
     """Check the options before the flight."""
-    require_at_least(args, seed=0)
+    options.require_at_least(args, seed=0)
     for name in ("speed", "fps"):
         check.positive(f"--{name}", getattr(args, name))
     if args.fault_time is not None:
@@ -140,7 +129,7 @@ def check_options(args: FlyArgs) -> None:
         if not args.faults:
             raise ValueError("--fault-time needs --faults")
     if args.replay is None:
-        sensor_suite(sensors_of(args.env_id, args.sensors))  # before missing packages
+        sensor_suite(options.sensors_of(args.env_id, args.sensors))  # before missing packages
     ending = None if args.output is None else args.output.suffix.lower()
     if args.output is not None:
         if ending not in VIDEO_ENDINGS + OTHER_ENDINGS:
@@ -166,10 +155,10 @@ def faults_of_args(args: FlyArgs, sensors: SensorSuite) -> tuple[Fault, ...]:
 
 def make_env(args: FlyArgs) -> Any:
     """Make an environment with one flight."""
-    args = with_full_id(args)
-    names = ("observation", "action", "sensors", "camera", "duration", "faults")
-    given = with_estimator(leave(args.env, {name: f"--{name}" for name in names}), args.estimator)
-    suite = sensor_suite(sensors_of(args.env_id, args.sensors))
+    args = options.with_full_id(args)
+    options.leave(args.env, "observation", "action", "sensors", "camera", "duration", "faults")
+    given = options.with_estimator(args.env, args.estimator)
+    suite = sensor_suite(options.sensors_of(args.env_id, args.sensors))
     keywords: dict[str, Any] = {**keywords_of_policy(args.policy, args.env_id), **given}
     if not args.camera:
         keywords["camera"] = False
@@ -266,7 +255,7 @@ def flights_of(args: FlyArgs) -> Callable[[int, Switches], Iterator[Flight]]:
     env = make_env(args)
     if args.output and not env.unwrapped.flights.batch.max_steps:
         raise ValueError("--output needs a flight with a time limit: a --duration above 0")
-    policy, sensors = load_policy(args.policy, env), sensors_of(args.env_id, args.sensors)
+    policy, sensors = load_policy(args.policy, env), options.sensors_of(args.env_id, args.sensors)
     about: dict[str, Any] = {"task": IDS[args.env_id], "policy": args.policy, "sensors": sensors}
     about["faults"] = args.faults
     return lambda seed, switches: fly(env, policy, seed, switches, about)
@@ -274,15 +263,15 @@ def flights_of(args: FlyArgs) -> Callable[[int, Switches], Iterator[Flight]]:
 
 def main(args: FlyArgs) -> None:
     """Fly or replay, and show or write."""
-    with usage_errors():
-        args = with_full_id(args)
+    with options.usage_errors():
+        args = options.with_full_id(args)
         flights = flights_of(args)
     if args.output:
         *_, flight = flights(args.seed, Switches())
         for file in write(flight, args.output, args):
             print(f"Wrote {file} ({file.stat().st_size / 1e6:.1f} MB).")
         return
-    with usage_errors():
+    with options.usage_errors():
         try:
             window = Window(args.size, f"quad_gym: {IDS[args.env_id]}")
         except RuntimeError as error:

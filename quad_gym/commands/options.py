@@ -106,9 +106,12 @@ def usage_errors(
         raise SystemExit(USAGE_ERROR) from None
 
 
-def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[str, Any]:
-    """Check that `--env` contains no keyword for which there is a separate option."""
-    for name, instead in options.items():
+def leave(keywords: Mapping[str, Any], *names: str, **others: str) -> Mapping[str, Any]:
+    """Check that `--env` contains no keyword for which there is an option, of this name or another.
+
+    `others` has options with other names than their keywords.
+    """
+    for name, instead in {**{name: option_name(name) for name in names}, **others}.items():
         if name in keywords:
             raise ValueError(f"--env must not contain {name}: use {instead} instead")
     return keywords
@@ -118,25 +121,13 @@ def with_estimator(keywords: Mapping[str, Any], estimator: str | None) -> dict[s
     """Add the option `--estimator` to the keywords of an environment."""
     if estimator is None:
         return dict(keywords)
-    return {**leave(keywords, {"estimator": "--estimator"}), "estimator": estimator}
+    return {**leave(keywords, "estimator"), "estimator": estimator}
 
 
 def refuse_overwriting(file: Path, overwrite: bool) -> None:
     """Reject replacing the results of an earlier run without `--overwrite`."""
     if file.exists() and not overwrite:
         raise ValueError(f"{file} exists: use --overwrite to replace it, or another --output")
-
-
-def writable_file(output: Path | None, name: str, suffix: str, overwrite: bool) -> Path:
-    """File that an export writes, in a writable folder."""
-    from quad_gym.analysis.reports import require_writable
-
-    file = output or Path("results/export") / (name + suffix)
-    if file.suffix != suffix:
-        raise ValueError(f"--output must end in {suffix}, got {file}")
-    refuse_overwriting(file, overwrite)
-    require_writable("--output", file.parent)
-    return file
 
 
 def sensors_of(env_id: str, given: str | None) -> str:

@@ -28,17 +28,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
-from quad_gym.commands.options import (
-    EnvId,
-    Keywords,
-    Parameters,
-    Threads,
-    leave,
-    one_of,
-    require_at_least,
-    usage_errors,
-    with_full_id,
-)
+from quad_gym.commands import options
 from quad_gym.experiments.arms import Arm, chosen_arms, read_arms
 from quad_gym.experiments.driver import train_here
 from quad_gym.experiments.study import Study
@@ -56,7 +46,9 @@ QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
 class StudyArgs:
     """Options of the study."""
 
-    env_id: Annotated[EnvId, arg(help=one_of(STUDIED_IDS))] = "QuadGym/LookAround-v0"
+    env_id: Annotated[options.EnvId, arg(help=options.one_of(STUDIED_IDS))] = (
+        "QuadGym/LookAround-v0"
+    )
     arms: tuple[str, ...] = ()
     """names of arms; if not given, the arms behind the conclusions, or all of --arms-file"""
     arms_file: Path | None = None
@@ -65,8 +57,8 @@ class StudyArgs:
     """number of training seeds"""
     steps: int | None = None
     """number of environment steps of each training; if not given, the recipe's"""
-    set: Parameters = field(default_factory=dict)
-    env: Keywords = field(default_factory=dict)
+    set: options.Parameters = field(default_factory=dict)
+    env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as duration=30.0"""
     quick: bool = False
     """two seeds of 300,000 steps and 100 episodes: a check that it works, not a result"""
@@ -81,7 +73,7 @@ class StudyArgs:
     success_within: float | None = None
     """for LookAround: largest mean position error in the second half of a successful episode [m];
     if not given, 0.5"""
-    threads: Threads = None
+    threads: options.Threads = None
     video: Literal["none", "webp", "gif", "mp4"] = "none"
     """also write a film of this kind: policies trained on truth and on the estimate, side by side
     in the same episode"""
@@ -91,7 +83,7 @@ class StudyArgs:
 
 def studied(args: StudyArgs) -> StudiedTask:
     """Definition of the task, with the options that change it."""
-    args = with_full_id(args, STUDIED_IDS)
+    args = options.with_full_id(args, STUDIED_IDS)
     about = STUDIED[IDS[args.env_id]]
     if args.success_within is None:
         return about
@@ -114,9 +106,9 @@ def arms_of(args: StudyArgs) -> tuple[Arm, ...]:
 def configure(args: StudyArgs) -> Study:
     """Check all options before training."""
     plots.require_matplotlib()
-    args = with_full_id(args, STUDIED_IDS)
-    require_at_least(args, seeds=1, episodes=2, seed=0, first_episode=0, threads=1)
-    leave(args.env, {"observation": "--arms", "threads": "--threads"})
+    args = options.with_full_id(args, STUDIED_IDS)
+    options.require_at_least(args, seeds=1, episodes=2, seed=0, first_episode=0, threads=1)
+    options.leave(args.env, "threads", observation="--arms")
     arms = arms_of(args)
     name = IDS[args.env_id] + ("_quick" if args.quick else "")
     study = Study(
@@ -148,14 +140,14 @@ def _recipe(args: StudyArgs, algorithm: str) -> Recipe:
 def main(args: StudyArgs) -> None:
     """Study."""
     began = time.perf_counter()
-    with usage_errors():
+    with options.usage_errors():
         study = configure(args)
     counted = f"{len(study.trainings)} trainings of {study.steps()}, " if study.trainings else ""
     print(
         f"{study.env_id}: {len(study.arms)} arms, {counted}"
         f"{study.episodes:,} episodes with each policy; into {study.folder}."
     )
-    with usage_errors((RunError,)):
+    with options.usage_errors((RunError,)):
         train_here(study.trainings)
     results = study.results()
     print(f"\n{table_text(results)}\n")

@@ -94,7 +94,7 @@ def configure(args: SweepArgs) -> tuple[list[Training], Path]:
     """Check all options, and expand them to trainings."""
     require_at_least(args, seeds=1, evaluations=1, episodes=1, jobs=1, threads=1, retries=0)
     given = _given(args, {} if args.file is None else read(args.file))
-    leave(given["env"], {"threads": "--threads"})
+    leave(given["env"], "threads")
     given["env_ids"] = [known_id("env_ids", name) for name in given.get("env_ids", ["circle"])]
     name = IDS[given["env_ids"][0]] if args.file is None else args.file.stem
     folder = args.output or Path("results/sweep") / name

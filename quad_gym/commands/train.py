@@ -20,39 +20,26 @@ from pathlib import Path
 from typing import Any, Literal
 
 from quad_gym import IDS
-from quad_gym.commands.options import (
-    Engine,
-    EnvId,
-    EstimatorName,
-    Keywords,
-    OwnSuite,
-    Parameters,
-    Threads,
-    flying_options,
-    require_at_least,
-    usage_errors,
-    with_estimator,
-    with_full_id,
-)
+from quad_gym.commands import options
 
 
 @dataclass(frozen=True)
 class TrainArgs:
     """Options of the training."""
 
-    env_id: EnvId = "QuadGym/Circle-v0"
+    env_id: options.EnvId = "QuadGym/Circle-v0"
     algorithm: Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"] = "ppo"
     """reinforcement learning algorithm"""
-    engine: Engine = "sb3"
-    sensors: OwnSuite = None
-    estimator: EstimatorName = None
-    env: Keywords = field(default_factory=dict)
+    engine: options.Engine = "sb3"
+    sensors: options.OwnSuite = None
+    estimator: options.EstimatorName = None
+    env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth action=motor camera=false"""
     steps: int | None = None
     """number of environment steps; if not given, the recipe's"""
     n_envs: int | None = None
     """number of parallel flights; if not given, the recipe's"""
-    set: Parameters = field(default_factory=dict)
+    set: options.Parameters = field(default_factory=dict)
     seed: int = 0
     """seed of the networks, and of the flights in training and its evaluations; other seeds use
     different flights, and so does quad-gym evaluate"""
@@ -66,7 +53,7 @@ class TrainArgs:
     """number of evaluations and checkpoints during the run"""
     episodes: int = 100
     """number of episodes in each evaluation"""
-    threads: Threads = None
+    threads: options.Threads = None
     tensorboard: bool = True
     """write files for TensorBoard, if it is installed"""
     progress: bool = True
@@ -82,13 +69,13 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     from baselines.training import require_model, run_in
     from quad_gym.analysis.reports import require_writable
 
-    args = with_full_id(args)
-    environment = with_estimator(args.env, args.estimator)
+    args = options.with_full_id(args)
+    environment = options.with_estimator(args.env, args.estimator)
     if args.sensors is not None:
         if "sensors" in environment:
             raise ValueError("--sensors must not be given with --env sensors=...")
         environment["sensors"] = args.sensors
-    require_at_least(args, steps=1, n_envs=1, evaluations=1, episodes=1, threads=1, seed=0)
+    options.require_at_least(args, steps=1, n_envs=1, evaluations=1, episodes=1, threads=1, seed=0)
     chosen = recipe(args.env_id, args.algorithm)
     given = {"steps": args.steps, "n_envs": args.n_envs}
     chosen = chosen.replace(**{k: v for k, v in given.items() if v is not None})
@@ -120,7 +107,7 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
 def main(args: TrainArgs) -> None:
     """Train."""
     from_start = time.perf_counter()
-    with usage_errors():
+    with options.usage_errors():
         plan, folder = configure(args)
     from baselines.keeping import RunError, has_checkpoint
     from baselines.training import export, train
@@ -134,13 +121,9 @@ def main(args: TrainArgs) -> None:
     tensorboard = args.tensorboard and importlib.util.find_spec("tensorboard") is not None
     if args.tensorboard and not tensorboard:
         print("TensorBoard is not installed; evaluations.csv contains the errors.")
-    with usage_errors((RunError,)):
+    with options.usage_errors((RunError,)):
         done = train(
-            plan,
-            folder,
-            resume=args.resume,
-            tensorboard=tensorboard,
-            quiet=not args.progress,
+            plan, folder, resume=args.resume, tensorboard=tensorboard, quiet=not args.progress
         )
     total = time.perf_counter() - from_start
     print(
@@ -155,7 +138,7 @@ def main(args: TrainArgs) -> None:
     if args.export is not None:
         export(done, args.export)
         print(f"Wrote {args.export}.")
-    policy = f"--policy {done.best_policy}{flying_options(plan.environment)}"
+    policy = f"--policy {done.best_policy}{options.flying_options(plan.environment)}"
     print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")
     if plan.recipe.algorithm != "recurrent_ppo":
         print(f"Export it: quad-gym export policy {done.best_policy} --to c")

@@ -23,21 +23,11 @@ from baselines.pd import PDPolicy
 from baselines.seeds import first_seed
 from quad_gym import pd_gains
 from quad_gym.analysis.reports import columns_of, require_writable, versions, write_csv, write_json
-from quad_gym.commands.options import (
-    TRACKING,
-    Keywords,
-    SuiteName,
-    Threads,
-    flying_options,
-    full_id,
-    known_id,
-    leave,
-    one_of,
-    refuse_overwriting,
-    require_at_least,
-    usage_errors,
-)
+from quad_gym.commands import options
 from quad_gym.experiments.tuning import Search, compare_gains, flat
+
+SEPARATE = ("observation", "sensors", "threads")
+"""Keywords of environments with separate options."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +36,15 @@ class TuneArgs:
 
     env_ids: Annotated[
         tuple[str, ...],
-        arg(help=f"{one_of(TRACKING)}; if not given, all of them", help_behavior_hint=""),
-    ] = TRACKING
+        arg(
+            help=f"{options.one_of(options.TRACKING)}; if not given, all of them",
+            help_behavior_hint="",
+        ),
+    ] = options.TRACKING
     observation: Literal["estimate", "truth", "noisy"] = "estimate"
     """observation of the controller"""
-    sensors: SuiteName = "standard"
-    env: Keywords = field(default_factory=dict)
+    sensors: options.SuiteName = "standard"
+    env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as action=wrench control_rate=200"""
     gains: Literal["lab", "tuned"] = "lab"
     """gains to start from"""
@@ -63,7 +56,7 @@ class TuneArgs:
     """number of episodes at the end, with seeds that the search does not use"""
     seed: int = 0
     """seed of the search, which determines its episodes, and of the first fresh episode"""
-    threads: Threads = None
+    threads: options.Threads = None
     output: Path = Path("results/tune")
     """folder for gains and numbers"""
     overwrite: bool = False
@@ -72,21 +65,20 @@ class TuneArgs:
 
 def make_envs(args: TuneArgs, episodes: int) -> dict[str, Any]:
     """Environment of each task."""
-    names = ("observation", "sensors", "threads")
-    options: dict[str, Any] = {name: getattr(args, name) for name in names}
+    given: dict[str, Any] = {name: getattr(args, name) for name in SEPARATE}
     return {
-        env_id: gymnasium.make_vec(env_id, num_envs=episodes, **options, **args.env)
-        for env_id in map(full_id, args.env_ids)
+        env_id: gymnasium.make_vec(env_id, num_envs=episodes, **given, **args.env)
+        for env_id in map(options.full_id, args.env_ids)
     }
 
 
 def configure(args: TuneArgs) -> Search:
     """Check all options before the search."""
     for env_id in args.env_ids:
-        known_id("--env-ids", env_id, TRACKING)
-    require_at_least(args, candidates=1, episodes=1, fresh_episodes=2, seed=0, threads=1)
-    leave(args.env, {name: f"--{name}" for name in ("observation", "sensors", "threads")})
-    refuse_overwriting(args.output / "gains.json", args.overwrite)
+        options.known_id("--env-ids", env_id, options.TRACKING)
+    options.require_at_least(args, candidates=1, episodes=1, fresh_episodes=2, seed=0, threads=1)
+    options.leave(args.env, *SEPARATE)
+    options.refuse_overwriting(args.output / "gains.json", args.overwrite)
     first_seed("test", args.seed, args.fresh_episodes)  # rejects seeds that are too large
     envs = make_envs(args, args.episodes)
     for env in envs.values():
@@ -100,7 +92,7 @@ def configure(args: TuneArgs) -> Search:
 def main(args: TuneArgs) -> None:
     """Tune."""
     began = time.perf_counter()
-    with usage_errors():
+    with options.usage_errors():
         search = configure(args)
     tuned = search.run(args.candidates, args.seed)
     gains = {f"gains at the start ({args.gains})": search.start, "tuned gains": tuned}
@@ -127,5 +119,5 @@ def main(args: TuneArgs) -> None:
     ]
     seconds = time.perf_counter() - began
     print(f"\nWrote {len(written)} files to {args.output} after {seconds:.0f} s; fly them with")
-    same = flying_options({"sensors": args.sensors, **args.env})
-    print(f"quad-gym evaluate {full_id(args.env_ids[0])} --policy pd pd:{written[0]}{same}")
+    same = options.flying_options({"sensors": args.sensors, **args.env})
+    print(f"quad-gym evaluate {options.full_id(args.env_ids[0])} --policy pd pd:{written[0]}{same}")

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.batch.beginnings import check_in_bounds
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.batch.standing import check_pad
+from quad_gym.batch.references import check_in_bounds, check_pad
 from quad_gym.batch.starts import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.effects import require_effect, require_own_task, runs_no_sensor
@@ -60,11 +59,8 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
 }
 """Defaults of each task, which keywords override."""
 
-SLOWEST = 1.0
-"""Least control rate [Hz]: smaller ones are periods."""
-
-MAX_STEPS = 10**9
-"""Longest time limit in steps; a duration of 0 has none."""
+SLOWEST = 1.0  # least control rate [Hz]: smaller ones are periods
+MAX_STEPS = 10**9  # longest time limit in steps; a duration of 0 has none
 
 
 def kind_and_task(
@@ -238,7 +234,7 @@ def own_estimator(given: Any) -> Any:
 
 
 def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...]:
-    """Return the faults that can occur; refuse those of sensors if none runs."""
+    """Return the faults that can occur; refuse faults of sensors if none runs."""
     true = keywords["true_sensors"]
     if true is not None:
         check.instance("true_sensors", true, SensorSuite)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.batch.innovations import innovations_of
+from quad_gym.batch.quantities import innovations_of
 from quad_gym.faults.presets import named_faults
 from quad_gym.records import Ending
 

@@ -62,7 +62,7 @@ class Rendered:
             self._spec.max_episode_steps = self.flights.batch.max_steps or None
 
     def _open_rendering(self, make: str) -> "Rendering | None":
-        """Return the renderer of flights that have begun, or warn that there is none."""
+        """Return the renderer of flights that have begun, or warn if it is missing."""
         if self.rendering is None:
             gymnasium.logger.warn(
                 f"render() needs a render_mode: {make}(..., render_mode='rgb_array')"

@@ -85,7 +85,10 @@ class QuadSB3VecEnv(Rendered, VecEnv):
             observations = batch.reset(**start)
         if self.rendering is not None:
             self.rendering.observe(reset=True)
-        self.reset_infos = self._infos_of_start()
+        infos = start_info(batch)
+        for name in ("ending", "filter_status", "filter_diverged", "gates_passed"):
+            del infos[name]
+        self.reset_infos = [info_of_flight(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return self.flights.split(observations)
@@ -189,14 +192,10 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(
-        self,
-        method_name: str,
-        *method_args: Any,
-        indices: VecEnvIndices = None,
-        **method_kwargs: Any,
+        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **keywords: Any
     ) -> list[Any]:
         """Call a method of this environment once, and return its result once per index."""
-        result = getattr(self, method_name)(*method_args, **method_kwargs)
+        result = getattr(self, method_name)(*args, **keywords)
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(
@@ -225,9 +224,3 @@ class QuadSB3VecEnv(Rendered, VecEnv):
             raise ValueError("options must hold the same names for every environment")
         start = {name: np.array([options[name] for options in chosen]) for name in names}
         return self.flights.start(start)
-
-    def _infos_of_start(self) -> list[dict[str, Any]]:
-        infos = start_info(self.flights.batch)
-        for name in ("ending", "filter_status", "filter_diverged", "gates_passed"):
-            del infos[name]
-        return [info_of_flight(infos, i) for i in range(self.num_envs)]

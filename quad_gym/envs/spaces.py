@@ -34,18 +34,12 @@ STATE_NAMES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 class ObservationField(NamedTuple):
     """One named part of an observation."""
 
-    name: str
-    """name of the part"""
-    slice: slice
-    """elements of the flat observation"""
-    unit: str
-    """unit of the elements, "-" without one"""
-    frame: str
-    """frame of the elements: I: inertial, B: body, C: image, "-": none"""
-    low: float
-    """lower bound, to which observations are clipped"""
-    high: float
-    """upper bound, to which observations are clipped"""
+    name: str  #: name of the part
+    slice: slice  #: elements of the flat observation
+    unit: str  #: unit of the elements, "-" without one
+    frame: str  #: frame of the elements: I: inertial, B: body, C: image, "-": none
+    low: float  #: lower bound, to which observations are clipped
+    high: float  #: upper bound, to which observations are clipped
 
 
 _RELATIVE: tuple[Part, ...] = (
@@ -89,8 +83,7 @@ PRIVILEGED_NAMES = frozenset(name for name, *_ in _PRIVILEGED)
 """Names by which the privileged part of a table is recognized; parts of a user's task must not have
 them."""
 _LAST_ACTION: Part = ("last_action", 4, "-", "-", 1.0)
-_FLAG = 0.0
-"""Bound that marks a flag, in [0, 1]."""
+_FLAG = 0.0  # bound that marks a flag, in [0, 1]
 
 
 def _sensor_fields(
@@ -124,23 +117,9 @@ def _world_fields(drawn: Sequence[str], feature_count: int) -> tuple[Part, ...]:
         check.choice("drawn", name, tuple(COLUMNS))
     sizes = {name: columns.stop - columns.start for name, columns in COLUMNS.items()}
     sizes["feature_offsets_I"] = 3 * feature_count
-    return (
-        ("wind", 3, "m/s", "B", 100.0),
-        *(
-            (f"drawn_{n}", size, "of its spread", "-", 10.0)
-            for n, size in sizes.items()
-            if n in drawn
-        ),
-    )
-
-
-def _table(parts: tuple[Part, ...], first: int) -> list[ObservationField]:
-    table = []
-    for name, size, unit, frame, bound in parts:
-        low, high = (0.0, 1.0) if bound == _FLAG else (-bound, bound)
-        table.append(ObservationField(name, slice(first, first + size), unit, frame, low, high))
-        first += size
-    return table
+    drawn_sizes = ((name, size) for name, size in sizes.items() if name in drawn)
+    parts = ((f"drawn_{name}", size, "of its spread", "-", 10.0) for name, size in drawn_sizes)
+    return (("wind", 3, "m/s", "B", 100.0), *parts)
 
 
 def observation_layout(
@@ -181,14 +160,14 @@ def observation_layout(
     check.choice("observation", observation, tuple(OBSERVATIONS))
     check.choice("layout", "relative" if layout is None else layout, tuple(LAYOUTS))
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
-    if observation == "measurements":
-        parts = _sensor_fields(_or(feature_count, 2), bool(gnss_velocity), aids or ())
-    drawn_features = privileged and drawn is not None
+    raw, features = observation == "measurements", 2 if feature_count is None else feature_count
+    if raw:
+        parts = _sensor_fields(features, bool(gnss_velocity), aids or ())
     for name, value, counts in (
-        ("layout", layout, observation != "measurements"),
-        ("feature_count", feature_count, observation == "measurements" or drawn_features),
-        ("gnss_velocity", gnss_velocity, observation == "measurements"),
-        ("aids", aids, observation == "measurements"),
+        ("layout", layout, not raw),
+        ("feature_count", feature_count, raw or (privileged and drawn is not None)),
+        ("gnss_velocity", gnss_velocity, raw),
+        ("aids", aids, raw),
         ("drawn", drawn, privileged),
     ):
         if value is not None and not counts:
@@ -205,13 +184,13 @@ def observation_layout(
             for name, unit, frame in zip(STATE_NAMES, units, frames, strict=True)
         )
     if privileged:
-        features = _or(feature_count, 2)
         parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn, features))
-    return tuple(_table(parts, 0))
-
-
-def _or(value: int | None, otherwise: int) -> int:
-    return otherwise if value is None else value
+    table, first = [], 0
+    for name, size, unit, frame, bound in parts:
+        low, high = (0.0, 1.0) if bound == _FLAG else (-bound, bound)
+        table.append(ObservationField(name, slice(first, first + size), unit, frame, low, high))
+        first += size
+    return tuple(table)
 
 
 def layout_of_suite(
@@ -242,12 +221,10 @@ def layout_bounds(
     table: tuple[ObservationField, ...],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the bounds (low, high) of every number of an observation, (n,) each."""
-    if table[-1].slice.stop > MAX_OBSERVATION:
-        raise ValueError(
-            f"an observation must have at most {MAX_OBSERVATION} numbers, got "
-            f"{table[-1].slice.stop}"
-        )
-    low, high = np.empty(table[-1].slice.stop), np.empty(table[-1].slice.stop)
+    size = table[-1].slice.stop
+    if size > MAX_OBSERVATION:
+        raise ValueError(f"an observation must have at most {MAX_OBSERVATION} numbers, got {size}")
+    low, high = np.empty((2, size))
     for field in table:
         low[field.slice], high[field.slice] = field.low, field.high
     return low, high

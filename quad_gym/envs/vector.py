@@ -238,8 +238,8 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         final_obs = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(over):
             final_obs[i] = self.flights.split(finals[i].copy())
-        final_info = {
-            name: np.where(over, values, _blank(values))
+        final_info: dict[str, Any] = {
+            name: np.where(over, values, None if values.dtype == object else values.dtype.type(0))
             for name, values in infos.items()
             if not (name.startswith("_") or isinstance(values, dict))
         }
@@ -270,10 +270,6 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         if not mask.any():
             raise ValueError("options['reset_mask'] must choose at least one environment")
         return mask
-
-
-def _blank(values: NDArray[Any]) -> Any:
-    return None if values.dtype == object else values.dtype.type(0)
 
 
 def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:

@@ -41,8 +41,9 @@ _COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
 """Noise that the search begins with twice: as large as the samples admit, and at its prior."""
 _FEW_STEPS, _STEPS = 8, 25
 """Steps of the search from each beginning, and after."""
-_CLUSTER = 5.0
-"""Length of the parts of a log that are independent of each other [s]."""
+_CLUSTER, _CLUSTERS = 5.0, 20
+"""Length of the parts of a log that are independent of each other [s], shorter in short logs: their
+least number."""
 _COARSE, _FINE = np.arange(-1.0, 1.01, 0.1), np.arange(-0.1, 0.11, 0.05)
 _DELAY_SPREAD = 0.3
 """Standard deviation of the prior of a delay [s]."""
@@ -248,11 +249,6 @@ class _Search:
             found = number.put(found, number.value(value, float(place)))
         return found
 
-    def likelihood(self, delays: Mapping[str, float]) -> Likelihood:
-        """Return the likelihood of the log with delays."""
-        log = self.log.without_delays(delays)
-        return Likelihood(log, self.prior, self.start)
-
     def find_delays(self, coarse: bool) -> None:
         """Find the delay of each sensor, with the others as they are."""
         for name in self.delays:
@@ -267,9 +263,12 @@ class _Search:
         Delays have a normal prior about zero. A delay that hardly changes the loss stays.
         """
         delays = self.delays[name] + steps
-        likelihoods = (self.likelihood(self.delays | {name: float(d)}) for d in delays)
-        suite = self.suite(gate=False)
-        total = np.array([float(found.losses([suite]).sum()) for found in likelihoods])
+        margin, suites = max(0.0, -float(delays.min())), [self.suite(gate=False)]
+        total = np.empty(len(delays))
+        for k, delay in enumerate(delays):
+            log = self.log.without_delays(self.delays | {name: float(delay)})
+            found = Likelihood(log, self.prior, self.start, fewer=False, margin=margin)
+            total[k] = found.losses(suites).sum()
         loss = total + 0.5 * (delays / _DELAY_SPREAD) ** 2
         k = int(np.clip(np.argmin(loss), 2, len(loss) - 3))
         near = slice(k - 2, k + 3)
@@ -288,7 +287,8 @@ class _Search:
                 both explain large innovations; begin with much and with little of the first.
         """
         self.progress(f"Search for {len(self.numbers)} numbers")
-        self._current = self.likelihood(self.delays)
+        log = self.log.without_delays(self.delays)
+        self._current = Likelihood(log, self.prior, self.start)
         if first:
             little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
             tried = [self._minimize(x, _FEW_STEPS) for x in (self.x, little)]
@@ -350,7 +350,8 @@ class _Search:
         H /= _STEP**2
         slopes = (losses[:, 1 : 2 * n : 2] - losses[:, 2 : 2 * n + 1 : 2]) / (2.0 * _STEP)
         times = self._current.times
-        parts = ((times - times[0]) // _CLUSTER).astype(int)
+        length = min(_CLUSTER, (times.max() - times.min()) / _CLUSTERS)
+        parts = ((times - times.min()) // length).astype(int)
         sums = np.array([slopes[parts == part].sum(axis=0) for part in np.unique(parts)])
         J = sums.T @ sums
         values, vectors = np.linalg.eigh(H)
@@ -375,12 +376,16 @@ def _lowest(number: Number) -> float:
 
 
 def correlation_time(values: Floats) -> float:
-    """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white."""
-    centered = values - values.mean()
+    """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white.
+
+    The sum ends with the first correlation that white noise would also have, to two standard
+    deviations.
+    """
+    centered, least = values - values.mean(), max(0.05, 2.0 / math.sqrt(len(values)))
     variance, tau = float((centered**2).mean()), 1.0
     for lag in range(1, len(values) // 4):
         rho = float((centered[:-lag] * centered[lag:]).mean()) / variance
-        if rho < 0.05:
+        if rho < least:
             break
         tau += 2.0 * rho
     return tau

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from quad_gym.estimation.samples import Measurement, Sample
 from quad_gym.estimation.tape import BLANK, ONE_PREDICTION, ONE_UPDATE, Tape, write_measurement
-from quad_gym.kernels import single
-from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import needed_stages
-from quad_gym.kernels.tape import run_tape
+from quad_gym.kernels import entries
+from quad_gym.kernels.linked import linked_table
+from quad_gym.kernels.stages import needed_stages
 from quad_gym.packing.aids import blocks_of, pack_sensors
 from quad_gym.packing.flight import (
     form_of,
@@ -76,7 +75,7 @@ class Engine:
         self.settings["form"] = int(self.form)
         pack_sensors(self.settings[0], sensors)
         needed = needed_stages(self.settings[0])
-        self._stages = {stage: needed[stage] for stage in single.FILTER_STAGES if stage in needed}
+        self._stages = {stage: needed[stage] for stage in entries.FILTER_STAGES if stage in needed}
         self._room = room_of(_PARTS)
         self._work = aligned_zeros(1, WORK_BLOCK)
         self._work["mask"] = 1.0
@@ -164,7 +163,7 @@ class Engine:
         self.blocks["tick"], self.blocks["w_before"] = 0.0, np.nan
         for k in range(len(self.blocks)):
             block = self.blocks[k : k + 1]
-            single.start_filter(block, self.params, self.settings, self._work, x_I)
+            entries.start_filter(block, self.params, self.settings, self._work, x_I)
 
     def predict(self, sample: Sample) -> None:
         """Propagate the estimate over the time of a sample."""
@@ -183,7 +182,9 @@ class Engine:
         numbers = (self.params, self._ticks, self.steps, self.settings, self._work, self._table())
         for k in range(len(self.blocks)):
             block = self.blocks[k : k + 1]
-            run_tape(block, *numbers, self._sample, self._measurement, operation, *_NO_RESULTS)
+            entries.run_tape(
+                block, *numbers, self._sample, self._measurement, operation, *_NO_RESULTS
+            )
 
     def run(self, tape: Tape, slots: NDArray[Any] | None = None) -> tuple[Floats, Floats]:
         """Run the operations of a tape.
@@ -221,7 +222,7 @@ class Engine:
         measured = np.array(blocks_of(self.sensors), np.int64)
         kept = np.empty((tape.kept, KEPT, WIDTH))
         reported = np.empty((tape.reported, len(measured), REPORTED, WIDTH))
-        run_tape(
+        entries.run_tape(
             *(block, params, ticks, steps, self.settings, self._work.copy(), self._table()),
             *(tape.samples, tape.measurements, tape.operations, measured),
             *(self._words_of(block)[0].reshape(-1), slots),
@@ -244,5 +245,5 @@ class Engine:
     def _table(self) -> NDArray[Any]:
         """Return the table of the stages that the filter runs."""
         if self._linked is None:
-            self._linked = linked_table(self._stages, single.FILTER_ENTRIES)
+            self._linked = linked_table(self._stages, entries.FILTER_ENTRIES)
         return self._linked

@@ -84,19 +84,30 @@ class Likelihood:
         log: The log.
         suite: Its suite.
         start: Keywords of `initialize`.
+        fewer: False: only the losses of all measurements, which determine delays.
+        margin: Time before the end of the log whose measurements do not count [s], so that losses
+            of logs with different delays contain the same measurements.
     """
 
-    def __init__(self, log: Log, suite: SensorSuite, start: dict[str, Any]) -> None:
-        whole, fewer = (_Part(each, suite, start) for each in (log, thinned(log)))
-        count = whole.counts.sum()
-        if count < _FEWEST:
+    def __init__(
+        self,
+        log: Log,
+        suite: SensorSuite,
+        start: dict[str, Any],
+        *,
+        fewer: bool = True,
+        margin: float = 0.0,
+    ) -> None:
+        logs = (log, thinned(log)) if fewer else (log,)
+        self._parts = [_Part(each, suite, start, margin) for each in logs]
+        counts = [int(part.counts.sum()) for part in self._parts]
+        if counts[0] < _FEWEST:
             raise ValueError(
                 f"a calibration must have at least {_FEWEST} measurements in flight, from "
-                f"{SETTLING:g} s after the start on, got {count}: use a longer part of the log "
+                f"{SETTLING:g} s after the start on, got {counts[0]}: use a longer part of the log "
                 "(share=, --share)"
             )
-        whole.weight = fewer.counts.sum() / count
-        self._parts = (whole, fewer)
+        self._parts[0].weight = counts[-1] / counts[0]
         self.times = np.concatenate([part.times[part.counts] for part in self._parts])
 
     def losses(self, suites: Sequence[SensorSuite]) -> Floats:
@@ -107,7 +118,7 @@ class Likelihood:
 class _Part:
     """Losses of the innovations of one log."""
 
-    def __init__(self, log: Log, suite: SensorSuite, start: dict[str, Any]) -> None:
+    def __init__(self, log: Log, suite: SensorSuite, start: dict[str, Any], margin: float) -> None:
         self.suite, self.weight = suite, 1.0
         player = Player(log, suite, "ukf", start, False, _REACH)
         player.write_tape()
@@ -117,9 +128,10 @@ class _Part:
                 "(--heading, --course), or use a suite and log with a magnetometer or baseline"
             )
         self._player, self._tape = player, player.writer.tape()
-        self.times = np.array(player.stamps).reshape(-1, 2)[:, 0]
-        self.counts = in_flight(log, self.times)
-        self.counts &= self.times > self.times[0] + SETTLING
+        self.times = np.array(player.stamps).reshape(-1, 2)[:, 1]  # of arrival: without delays
+        first = (log.imu if log.gnss is None else log.gnss).received[0]
+        self.counts = in_flight(log, self.times) & (self.times > first + SETTLING)
+        self.counts &= self.times <= log.imu.time[-1] - margin
         self._valid = self._tape.valid
 
     def losses(self, suites: Sequence[SensorSuite]) -> Floats:

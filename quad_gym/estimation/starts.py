@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.kernels.single import start_level
+from quad_gym.kernels.entries import start_level
 from quad_gym.packing.aids import slow_states
 from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
@@ -240,8 +240,8 @@ def still_start(
     record["slow_sigma"][0, : len(slow)] = slow
     for place, gain in heading.of_slow.items():
         record["heading_of_slow"][0, place] = gain
+    start_level(record)
     found, n = record[0], _D + len(slow)
-    start_level(found)
     factor = found["factor"][:n, :n].copy()
     return FirstEstimate(found["position"].copy(), velocity, found["R_BI"].copy(), factor)
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.kernels import single
+from quad_gym.kernels import entries
 from quad_gym.params import checks as check
 
 
@@ -32,7 +32,7 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
     if (a < 0.0).any() or not (a > 0.0).any():
         raise ValueError(f"weights must be at least 0 and not all zero, got {a}")
     R_BI = np.empty((3, 3))
-    uniqueness = single.wahba_of_vectors(a, vectors_I, vectors_B, R_BI)
+    uniqueness = entries.wahba_of_vectors(a, vectors_I, vectors_B, R_BI)
     if not uniqueness > 1e-10:
         raise ValueError(
             "v_I and v_B must determine a rotation: at least two directions must differ"

@@ -6,51 +6,52 @@ episodes. To define your own arms, write a file like this one with a tuple `ARMS
 """
 
 import runpy
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
-from baselines.recipes import ALGORITHMS
+from baselines.recipes import ALGORITHMS, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
 
-@dataclass(frozen=True, kw_only=True)
+def _word(name: str, value: Any) -> str:
+    if not (isinstance(value, str) and value.isidentifier()):
+        raise ValueError(f"{name} must be a word of letters and digits, got {value!r}")
+    return value
+
+
+@dataclass(frozen=True)
 class Arm(Checked):
     """Arm of a study: the training and the test of one kind of controller."""
 
-    name: str
+    name: Annotated[str, _word]
     """Short name, for folders"""
-    label: str
+    label: Annotated[str, partial(check.instance, kind=str)]
     """Label for tables and figures"""
+    _: KW_ONLY
     policy: str | None = None
     """Name of a policy that needs no training (`baselines.policies.load_policy`); None: trained"""
     flies: str | None = None
     """Name of a trained arm whose policies this arm tests in another environment, as a control"""
-    environment: Mapping[str, Any] = field(default_factory=dict)
+    environment: ReadOnly = field(default_factory=dict)
     """Keywords of the environment in the test, such as the observation"""
-    training: Mapping[str, Any] = field(default_factory=dict)
+    training: ReadOnly = field(default_factory=dict)
     """Keywords that override `environment` in training and in the selection of the best policy"""
-    learning: Mapping[str, Any] = field(default_factory=dict)
+    learning: ReadOnly = field(default_factory=dict)
     """Keywords that override both in training, but not in the selection of the best policy, such as
     another reward"""
-    algorithm: str = "ppo"
+    algorithm: Annotated[str, partial(check.choice, choices=ALGORITHMS)] = "ppo"
     """Algorithm, one of `baselines.recipes.ALGORITHMS`; PPO is trained with the compiled engine,
     the others with Stable-Baselines3"""
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: ReadOnly = field(default_factory=dict)
     """Parameters of the algorithm that override the recipe's"""
 
     def __post_init__(self) -> None:
-        self._check(check.choice, "algorithm", choices=ALGORITHMS)
-        if not (isinstance(self.name, str) and self.name.isidentifier()):
-            raise ValueError(f"Arm.name must be a word of letters and digits, got {self.name!r}")
-        check.instance("Arm.label", self.label, str)
-        for name in ("environment", "training", "learning", "parameters"):
-            check.instance(f"Arm.{name}", getattr(self, name), Mapping)
-            self._set(name, MappingProxyType(dict(getattr(self, name))))
+        super().__post_init__()
         given = self.policy if self.flies is None else f"taken from {self.flies}"
         learns = self.training or self.learning or self.parameters or self.algorithm != "ppo"
         if given is not None and learns:
@@ -89,48 +90,39 @@ the size of the errors of a filter that always has features in view."""
 _WITH_STD = _task("WithStd")
 
 ARMS = (
-    Arm(name="pd_reference", label="PD, facing as rewarded", policy="pd"),
-    Arm(name="pd_features", label="PD, facing the features", policy="pd:features"),
+    Arm("pd_reference", "PD, facing as rewarded", policy="pd"),
+    Arm("pd_features", "PD, facing the features", policy="pd:features"),
     Arm(
-        name="pd_features_when_uncertain",
-        label="PD, facing the features when uncertain",
+        "pd_features_when_uncertain",
+        "PD, facing the features when uncertain",
         policy="pd:features_when_uncertain",
         environment={"include_std": True},
     ),
-    Arm(name="truth", label="truth", training={"observation": "truth"}),
-    Arm(name="noisy", label="truth + independent noise", training={"observation": "noisy"}),
+    Arm("truth", "truth", training={"observation": "truth"}),
+    Arm("noisy", "truth + independent noise", training={"observation": "noisy"}),
     Arm(
-        name="noisier",
-        label="truth + independent noise as large as the errors met",
+        "noisier",
+        "truth + independent noise as large as the errors met",
         training={"observation": "noisy", "sensors": _NOISIER},
     ),
-    Arm(name="estimate", label="estimate", parameters=_FAR_SIGHTED),
+    Arm("estimate", "estimate", parameters=_FAR_SIGHTED),
+    Arm("std", "estimate + standard deviation", environment=_WITH_STD, parameters=_FAR_SIGHTED),
     Arm(
-        name="std",
-        label="estimate + standard deviation",
-        environment=_WITH_STD,
-        parameters=_FAR_SIGHTED,
-    ),
-    Arm(
-        name="std_history",
-        label="estimate + standard deviation + history",
+        "std_history",
+        "estimate + standard deviation + history",
         environment=_task("WithStdHistory"),
         parameters=_FAR_SIGHTED,
     ),
+    Arm("certainty", "estimate, reward for certainty", learning=_task("CertaintyReward")),
     Arm(
-        name="certainty",
-        label="estimate, reward for certainty",
-        learning=_task("CertaintyReward"),
-    ),
-    Arm(
-        name="std_certainty",
-        label="estimate + standard deviation, reward for certainty",
+        "std_certainty",
+        "estimate + standard deviation, reward for certainty",
         environment=_WITH_STD,
         learning=_task("WithStdCertaintyReward"),
     ),
     Arm(
-        name="std_certainty_privileged",
-        label="estimate + standard deviation, reward for certainty, privileged critic",
+        "std_certainty_privileged",
+        "estimate + standard deviation, reward for certainty, privileged critic",
         environment=_WITH_STD,
         learning=_task("WithStdCertaintyRewardForCritic", "arm_critics"),
         parameters={"critic_only": 15},
@@ -138,8 +130,8 @@ ARMS = (
     # rewarded for certainty like `certainty` and `std_certainty`, so that they differ only in the
     # information available to the policy
     Arm(
-        name="recurrent",
-        label="estimate, LSTM, reward for certainty",
+        "recurrent",
+        "estimate, LSTM, reward for certainty",
         learning=_task("CertaintyReward"),
         algorithm="recurrent_ppo",
     ),
@@ -156,32 +148,26 @@ _COMPENSATED = {
 _WITH_HISTORY = {**_task("RaceWithHistory"), **_STD}
 
 STALE_RACE = (
-    Arm(name="pd", label="PD", policy="pd"),
-    Arm(name="truth", label="truth", training=_TRUTH),
-    Arm(name="std", label="estimate + 15 standard deviations", environment=_STD),
+    Arm("pd", "PD", policy="pd"),
+    Arm("truth", "truth", training=_TRUTH),
+    Arm("std", "estimate + 15 standard deviations", environment=_STD),
+    Arm("std_history", "estimate + 15 standard deviations + history", environment=_WITH_HISTORY),
     Arm(
-        name="std_history",
-        label="estimate + 15 standard deviations + history",
-        environment=_WITH_HISTORY,
-    ),
-    Arm(
-        name="residual",
-        label="truth + residual model",
+        "residual",
+        "truth + residual model",
         environment=_task("ObservedRace"),
         training={**_task("ResidualRace"), **_TRUTH},
     ),
+    Arm("truth_on_truth", "truth, tested on the truth", flies="truth", environment=_TRUTH),
     Arm(
-        name="truth_on_truth", label="truth, tested on the truth", flies="truth", environment=_TRUTH
-    ),
-    Arm(
-        name="truth_delay_compensated",
-        label="truth, tested with delay compensation",
+        "truth_delay_compensated",
+        "truth, tested with delay compensation",
         flies="truth",
         environment=_COMPENSATED,
     ),
     Arm(
-        name="std_delay_compensated",
-        label="estimate + 15 standard deviations, tested with delay compensation",
+        "std_delay_compensated",
+        "estimate + 15 standard deviations, tested with delay compensation",
         flies="std",
         environment={**_STD, **_COMPENSATED},
     ),
@@ -193,38 +179,27 @@ _WITH_UNCERTAINTY = _task("WithUncertainty")
 _CONSTANT_CRASH_COST = _task("ConstantCrashCost")
 
 OUTAGE_DASH = (
-    Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
-    Arm(name="pd_slow", label="PD at 2.4 m/s", policy="pd:slow"),
+    Arm("pd", "PD at 4.7 m/s", policy="pd"),
+    Arm("pd_slow", "PD at 2.4 m/s", policy="pd:slow"),
+    Arm("pd_waiting", "PD that waits when uncertain", policy="pd:waiting", environment=_STD),
+    Arm("truth", "truth", environment=_SCALED, training=_TRUTH, learning=_CONSTANT_CRASH_COST),
+    Arm("estimate", "estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
     Arm(
-        name="pd_waiting",
-        label="PD that waits when uncertain",
-        policy="pd:waiting",
-        environment=_STD,
-    ),
-    Arm(
-        name="truth",
-        label="truth",
-        environment=_SCALED,
-        training=_TRUTH,
-        learning=_CONSTANT_CRASH_COST,
-    ),
-    Arm(name="estimate", label="estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
-    Arm(
-        name="std",
-        label="estimate + normalized uncertainty",
+        "std",
+        "estimate + normalized uncertainty",
         environment=_WITH_UNCERTAINTY,
         learning=_task("ConstantCrashCostWithUncertainty"),
     ),
     Arm(
-        name="std_privileged",
-        label="estimate + normalized uncertainty, privileged critic",
+        "std_privileged",
+        "estimate + normalized uncertainty, privileged critic",
         environment=_WITH_UNCERTAINTY,
         learning=_task("ConstantCrashCostWithUncertaintyForCritic", "arm_critics"),
         parameters={"critic_only": 16},
     ),
     Arm(
-        name="truth_on_truth",
-        label="truth, tested on the truth",
+        "truth_on_truth",
+        "truth, tested on the truth",
         flies="truth",
         environment={**_SCALED, **_TRUTH},
     ),

@@ -20,8 +20,8 @@ _BLOCKS = {
 
 def _flown(task: str, label: str) -> Arm:
     return Arm(
-        name=task.lower(),
-        label=label,
+        task.lower(),
+        label,
         policy="pretrained",
         environment={"task": f"baselines.arm_tasks:{task}"},
     )

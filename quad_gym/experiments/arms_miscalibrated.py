@@ -26,12 +26,7 @@ _FACTORS = {"1_4": "1/4", "1_2": "1/2", "2": "2", "4": "4"}
 
 
 def _flown(name: str, label: str, task: str = _WITH_STD, **environment: Any) -> Arm:
-    return Arm(
-        name=name,
-        label=label,
-        policy="pretrained",
-        environment={"task": task, **environment},
-    )
+    return Arm(name, label, policy="pretrained", environment={"task": task, **environment})
 
 
 def _assuming(name: str, label: str, factor: float) -> Arm:

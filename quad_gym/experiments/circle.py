@@ -13,12 +13,7 @@ from tqdm import tqdm
 from quad_gym import PDGains, SensorSuite, TaskParams, vehicle_params
 from quad_gym.analysis import plots
 from quad_gym.analysis.intervals import PairedDifference, paired_difference
-from quad_gym.analysis.metrics import (
-    STATE_DIMENSION,
-    TrackingSummary,
-    chi_square_quantile,
-    spread,
-)
+from quad_gym.analysis.metrics import STATE_DIMENSION, TrackingSummary, chi_square_quantile, spread
 from quad_gym.analysis.recording import Recording, record_flights
 from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
 from quad_gym.batch.flight_batch import FlightBatch

@@ -10,12 +10,7 @@ import numpy as np
 
 from baselines.plans import Plan
 from baselines.recipes import Recipe
-from quad_gym.analysis.comparison_plots import (
-    error_over_time_figure,
-    learning_figure,
-    matrix_figure,
-    paths_figure,
-)
+from quad_gym.analysis import comparison_plots
 from quad_gym.analysis.intervals import in_brackets, mean_interval, paired_difference
 from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import columns_of, text_table, versions, write_csv, write_json
@@ -299,7 +294,7 @@ def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
         curves[NAMES[source]] = [(steps[1:], errors[1:]) for steps, errors in each]
     report.add_figure(
         f"learning_{label}",
-        learning_figure(
+        comparison_plots.learning_figure(
             curves,
             {"PD, tuned, on the estimate": float(cells["PD"][1].errors[0])},
             f"Evaluated on what is trained on, sensors {suite}",
@@ -308,7 +303,7 @@ def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
     )
     report.add_figure(
         f"matrix_{label}",
-        matrix_figure(
+        comparison_plots.matrix_figure(
             np.array([[float(np.mean(cell.errors)) for cell in row] for row in cells.values()]),
             [[cell.texts()[0] for cell in row] for row in cells.values()],
             [NAMES[source] for source in cells],
@@ -321,7 +316,7 @@ def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
     first = {NAMES[s]: matrix.flown[case_of(suite, s, "estimate")][0] for s in comparison.rows}
     report.add_figure(
         f"errors_{label}",
-        error_over_time_figure(
+        comparison_plots.error_over_time_figure(
             {name: (f.recorded["time"], f.recorded["percentiles"]) for name, f in first.items()},
             f"Flown on the estimate, first training seed, sensors {suite}",
         ),
@@ -329,7 +324,7 @@ def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
     )
     report.add_figure(
         f"paths_{label}",
-        paths_figure(
+        comparison_plots.paths_figure(
             {name: path_of(flown) for name, flown in first.items()},
             f"From above, flown on the estimate, sensors {suite}",
         ),

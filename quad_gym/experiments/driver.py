@@ -1,15 +1,14 @@
 """Driver of trainings: starts them, notices how each ends, and restarts those that died."""
 
-import signal
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 from tqdm import tqdm
 
+from baselines.keeping import signals_to
 from baselines.locks import holder, is_locked
 from baselines.training import train
 from quad_gym.experiments.executors import Ended, Executor, Job
@@ -84,22 +83,22 @@ class Driver:
         self._running: dict[Training, Job] = {}
         self._elsewhere: dict[Training, str] = {}
         self._deaths: Counter[Training] = Counter()
-        self._steps = {
-            training: training.steps_done()
-            if training in self._waiting
-            else training.plan.recipe.steps
-            for training in trainings
-        }
+        self._steps = {training: training.plan.recipe.steps for training in trainings}
+        self._steps |= {training: training.steps_done() for training in self._waiting}
         self._shown = 0.0
 
     def run(self) -> None:
         """Train, until all trainings are completed or SIGINT or SIGTERM has stopped them."""
         forwarded = 0
-        with _collected_signals() as signals:
+        signals: list[int] = []
+        with signals_to(signals.append):
             try:
                 while self._running or self._waiting:
                     self.stopped = bool(signals)
-                    self._collect()
+                    for training, job in list(self._running.items()):
+                        if (ended := job.ended()) is not None:
+                            del self._running[training]
+                            self._settle(training, ended)
                     if self.stopped:
                         self._waiting.clear()
                     self._start()
@@ -124,12 +123,6 @@ class Driver:
         """Ask all trainings to stop; one that is asked twice stops without a checkpoint."""
         for job in self._running.values():
             job.stop()
-
-    def _collect(self) -> None:
-        for training, job in list(self._running.items()):
-            if (ended := job.ended()) is not None:
-                del self._running[training]
-                self._settle(training, ended)
 
     def _settle(self, training: Training, ended: Ended) -> None:
         if ended.kind == "finished":
@@ -195,18 +188,3 @@ class Driver:
 def _progress(done: int, trainings: Sequence[Training], latest: Training) -> str:
     seconds = latest.record().get("training_seconds", 0.0)
     return f"[{done}/{len(trainings)}] {latest.name}: {seconds:.0f} s"
-
-
-@contextmanager
-def _collected_signals() -> Iterator[list[int]]:
-    """Context in which SIGINT and SIGTERM are only appended to a list."""
-    arrived: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, _: arrived.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield arrived
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

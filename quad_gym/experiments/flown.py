@@ -18,7 +18,7 @@ from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import as_json
 from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Episodes, Policy, roll_out
-from quad_gym.kernels.compiling.digest import flights_digest
+from quad_gym.kernels.digest import flights_digest
 from quad_gym.params.suites import contents_of_suite_files
 
 Floats = NDArray[np.float64]
@@ -101,13 +101,9 @@ class Trial:
 
 
 def fly(policy: Policy, env: Any, seed: int, traced: Sequence[str] = ()) -> Flown:
-    """Fly one episode in every flight of an environment; episode i has seed + i.
+    """Fly one episode in every flight of a vector environment; episode i has seed + i.
 
-    Args:
-        policy: Policy.
-        env: Vector environment; with `traced`, one whose task has a `View`.
-        seed: Seed of the first episode.
-        traced: Names from `TRACES` to record; empty: see `PathRecorder`.
+    Traces named in `traced`, of `TRACES`, need a task with a `View`; without, see `PathRecorder`.
     """
     recorder = ViewRecorder(traced) if traced else PathRecorder()
     episodes = roll_out(policy, env, seed=seed, watch=recorder.add)
@@ -129,13 +125,10 @@ def path_of(flown: Flown) -> Trace:
 
 
 class ViewRecorder:
-    """Recorder of "in_view" and "mean_speed", (e,) each, and of traces (t, k) of k episodes.
+    """Recorder of "in_view" and "mean_speed", (e,), and of `TRACES` (t, k) of k episodes by name.
 
     `in_view` is the share of time in which the camera faces at least `MARKERS` features,
     `mean_speed` the mean true speed [m/s]. Traces are NaN after the end of an episode.
-
-    Args:
-        traced: Names from `TRACES`.
     """
 
     def __init__(self, traced: Sequence[str]) -> None:

@@ -22,12 +22,7 @@ figure {{ margin: 1.5rem 0; }} img, video {{ max-width: 100%; }} figcaption {{ c
 
 
 class Report:
-    """Report in a folder: its page grows by one element with each call.
-
-    Args:
-        folder: Folder of the report.
-        title: Title of the page.
-    """
+    """Report in a folder, with a title: its page grows by one element with each call."""
 
     def __init__(self, folder: Path, title: str) -> None:
         self.folder, self._title = folder, title

@@ -62,11 +62,7 @@ def expand(
 ) -> list[Training]:
     """All trainings of a sweep, the first seed of every combination first.
 
-    Args:
-        given: Keys of `DEFAULTS`, with their values.
-        arms: Arms in `given`, by name.
-        folder: Folder of the sweep.
-        threads: Number of threads of each training.
+    `given` has keys of `DEFAULTS`, and `arms` the arms in it by name.
     """
     spec = {**DEFAULTS, **given}
     axes: dict[Axis, Any] = {(table, k): v for table in TABLES for k, v in spec[table].items()}

@@ -32,11 +32,8 @@ class _AllFlownError(Exception):
 class Search:
     """Search by differential evolution for the logarithms of factors on the initial gains.
 
-    Args:
-        envs: Environment of each task.
-        start: Initial gains.
-        torques: True if Kd has a separate effect; with commands of rates or tilt, only K / Kd has.
-        seed: Seed of the first episode that every candidate flies.
+    `torques` is True if Kd has a separate effect; with commands of rates or tilt, only K / Kd has.
+    Every candidate flies the same episodes, from `seed` on.
     """
 
     def __init__(self, envs: Mapping[str, Any], start: PDGains, torques: bool, seed: int) -> None:

@@ -16,8 +16,7 @@ from quad_gym.records import FaultKind
 
 __all__ = ["Fault", "Span", "ends"]
 
-_SENSORS = {"gnss": "GNSS"}
-"""Parts of a suite that are named without an article."""
+_SENSORS = {"gnss": "GNSS"}  # parts of a suite that are named without an article
 
 Span = float | tuple[float, float]
 """A number, or a range (low, high) from which it is drawn uniformly at each onset of a fault."""
@@ -28,16 +27,16 @@ def ends(value: Span) -> tuple[float, float]:
     return value if isinstance(value, tuple) else (value, value)
 
 
-def span(name: str, value: Any, *, least: float = 0.0, open_end: bool = False) -> Span:
-    """Return `value` as a finite number of at least `least`, or as a range (low, high)."""
-    if isinstance(value, (tuple, list, np.ndarray)):
-        if len(value) != 2:
-            raise ValueError(f"{name} must be a number or (low, high), got {value!r}")
-        low, high = (check.number(name, end, least=least, open_end=open_end) for end in value)
-        if low > high:
-            raise ValueError(f"{name} must be (low, high) in this order, got {value!r}")
-        return low, high
-    return check.number(name, value, least=least, open_end=open_end)
+def span(name: str, value: Any, *, open_end: bool = False) -> Span:
+    """Return `value` as a finite number of at least 0, or as a range (low, high)."""
+    if not isinstance(value, (tuple, list, np.ndarray)):
+        return check.number(name, value, least=0.0, open_end=open_end)
+    if len(value) != 2:
+        raise ValueError(f"{name} must be a number or (low, high), got {value!r}")
+    low, high = (check.number(name, end, least=0.0, open_end=open_end) for end in value)
+    if low > high:
+        raise ValueError(f"{name} must be (low, high) in this order, got {value!r}")
+    return low, high
 
 
 def _duration(name: str, value: Any) -> Span:

@@ -6,22 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.faults import (
-    AccelBiasStep,
-    BaselineLoss,
-    CameraOcclusion,
-    Fault,
-    GnssJump,
-    GnssOutage,
-    GnssOutliers,
-    GnssRamp,
-    GyroBiasStep,
-    ImuSaturation,
-    PositionJump,
-    RotorLoss,
-    SensorLoss,
-    WrongAssociations,
-)
+from quad_gym import faults as kinds
+from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import AID_PARAMS, SensorSuite
 from quad_gym.records import FAULT_KINDS
@@ -36,19 +22,19 @@ _A_WHILE = (2.0, 5.0)
 
 PRESETS: dict[str, tuple[Fault, ...]] = {
     "none": (),
-    "gnss_outage": (GnssOutage(start=_SOON, duration=_A_WHILE),),
-    "gnss_outliers": (GnssOutliers(),),
-    "gnss_ramp": (GnssRamp(start=_SOON),),
-    "gnss_jump": (GnssJump(start=_SOON, duration=_A_WHILE),),
-    "baseline_loss": (BaselineLoss(start=_SOON, duration=_A_WHILE),),
-    "position_jump": (PositionJump(start=_SOON),),
-    "camera_occlusion": (CameraOcclusion(start=_SOON, duration=_A_WHILE),),
-    "wrong_associations": (WrongAssociations(),),
-    "imu_bias_step": (AccelBiasStep(start=_SOON), GyroBiasStep(start=_SOON)),
-    "imu_saturation": (ImuSaturation(),),
-    "rotor_loss": (RotorLoss(start=_SOON),),
+    "gnss_outage": (kinds.GnssOutage(start=_SOON, duration=_A_WHILE),),
+    "gnss_outliers": (kinds.GnssOutliers(),),
+    "gnss_ramp": (kinds.GnssRamp(start=_SOON),),
+    "gnss_jump": (kinds.GnssJump(start=_SOON, duration=_A_WHILE),),
+    "baseline_loss": (kinds.BaselineLoss(start=_SOON, duration=_A_WHILE),),
+    "position_jump": (kinds.PositionJump(start=_SOON),),
+    "camera_occlusion": (kinds.CameraOcclusion(start=_SOON, duration=_A_WHILE),),
+    "wrong_associations": (kinds.WrongAssociations(),),
+    "imu_bias_step": (kinds.AccelBiasStep(start=_SOON), kinds.GyroBiasStep(start=_SOON)),
+    "imu_saturation": (kinds.ImuSaturation(),),
+    "rotor_loss": (kinds.RotorLoss(start=_SOON),),
     **{
-        f"{sensor}_loss": (SensorLoss(sensor=sensor, start=_SOON, duration=_A_WHILE),)
+        f"{sensor}_loss": (kinds.SensorLoss(sensor=sensor, start=_SOON, duration=_A_WHILE),)
         for sensor in AID_PARAMS
     },
 }
@@ -64,14 +50,11 @@ def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
     "all" stands for every preset that the suite can have. At most one fault of each kind is
     accepted, and only faults of sensors in the suite.
     """
-    if isinstance(given, (str, Fault)) or given is None:
-        given = () if given is None else (given,)
-    try:
-        parts = list(given)
-    except TypeError:
-        raise ValueError(f"faults must be faults or names of presets, got {given!r}") from None
+    given = () if given is None else (given,) if isinstance(given, (str, Fault)) else given
+    if not isinstance(given, Iterable):
+        raise ValueError(f"faults must be faults or names of presets, got {given!r}")
     found: list[Fault | None] = [None] * FAULT_KINDS
-    for part in parts:
+    for part in given:
         for fault in _named(part, sensors) if isinstance(part, str) else (part,):
             if not isinstance(fault, Fault):
                 raise ValueError(f"faults must be faults or names of presets, got {fault!r}")
@@ -87,7 +70,7 @@ def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
 
 def needs_sensors(fault: Fault) -> bool:
     """Return True for a fault of measurements, without effect where no sensors run."""
-    return not isinstance(fault, (PositionJump, RotorLoss))
+    return not isinstance(fault, (kinds.PositionJump, kinds.RotorLoss))
 
 
 def felt_without_sensors(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:

@@ -1,11 +1,11 @@
 """Compiled entry that steps or resets the blocks of a batch."""
 
 import numpy as np
-from numba import types
 
-from quad_gym.kernels.board import COMMAND, FINISHED, TICKET, comes, finished, post, take
+from quad_gym.kernels import entries
+from quad_gym.kernels.board import comes, finished, post, take
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
-from quad_gym.kernels.compiling.stages import STAGE_TABLE
+from quad_gym.kernels.compiling.signatures import signature_of
 from quad_gym.kernels.flight import begin_episode, look, move_and_measure, run, update
 from quad_gym.kernels.gathering import block_address, update_soon, update_waiting
 from quad_gym.kernels.simd.addresses import (
@@ -18,6 +18,7 @@ from quad_gym.kernels.simd.addresses import (
 )
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
 from quad_gym.kernels.simd.lanes import all_of, any_of, select
+from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.records import (
     EXCHANGE_BLOCK,
     FIRST_BLOCK,
@@ -36,8 +37,10 @@ from quad_gym.records import (
     RewardTerm,
     offset_of,
 )
+from quad_gym.records.board import COMMAND, FINISHED, TICKET
 
 _TERMS, _FIRST_TERM, _EXCHANGE_PITCH = len(RewardTerm), len(Result), EXCHANGE_BLOCK.itemsize
+_CALL_WORDS = len(Call)
 _CORE = offset_of(FLIGHT_BLOCK, "r")
 _TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
 """Bytes of the fields that every step needs, which come first in a record's core."""
@@ -47,6 +50,7 @@ _exchange_at, _params_at = lanes_at(EXCHANGE_BLOCK), lanes_at(PARAMS_BLOCK)
 _work_at, _plain_work_at = lanes_at(WORK_BLOCK), record_at(WORK_BLOCK)
 _settings_at, _stages_at = record_at(SETTINGS), record_at(STAGE_TABLE)
 _floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u1")
+_words_at = array_at("i8")
 
 
 @kernel
@@ -313,16 +317,14 @@ def _fly_group(call, first, last, command, nominal, true, believed, settings, wo
         _end_block(call, index, command, nominal, true, believed, settings, work, stages)
 
 
-_WORDS = types.Array(types.int64, 1, "C")
-
-
-@entry(signature=types.boolean(_WORDS, _WORDS, types.int64, types.int64, types.boolean))
-def fly(call, board, number, command, serving):
+@entry(signature=signature_of(entries.fly))
+def fly(call_at, board_at, size, number, command, serving):
     """Step or reset the flights of a batch, together with the other threads of a board.
 
     Args:
-        call: (len(Call),) arguments of this thread; their memory outlives the call.
-        board: Words that the threads share, see `board.py`.
+        call_at: Address of the (len(Call),) arguments of this thread.
+        board_at: Address of the words that the threads share, see `board.py`.
+        size: Number of these words.
         number: Index of this thread; thread 0 posts steps.
         command: A `Command` to post (TICK: plus a number), unless `serving`; if negative, nothing
             is posted, and the thread waits for the last command.
@@ -331,6 +333,7 @@ def fly(call, board, number, command, serving):
     Returns:
         True if all blocks are finished; False if another thread is still flying.
     """
+    call, board = _words_at(call_at, _CALL_WORDS), _words_at(board_at, size)
     settings, work = _settings_at(call[Call.SETTINGS]), _work_at(call[Call.WORK])
     stages, nominal = _stages_at(call[Call.STAGES]), _params_at(call[Call.WORLD])
     differ = settings.randomized > 0 or settings.faults > 0

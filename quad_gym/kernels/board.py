@@ -14,13 +14,20 @@ sees them.
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.simd.atomics import add_shared, pause, read_shared, write_shared
+from quad_gym.records.board import (
+    CHUNK,
+    COMMAND,
+    FINISHED,
+    FIRST,
+    LAST,
+    NEXT,
+    PRESENT,
+    RANGES,
+    STOP,
+    TICKET,
+    WORDS_OF_RANGE,
+)
 
-LINE = 8
-"""Words in a cache line; words that different threads write are in different lines."""
-TICKET, FINISHED, COMMAND, STOP, CHUNK = 0, LINE, 2 * LINE, 3 * LINE, 3 * LINE + 1
-RANGES, WORDS_OF_RANGE = 4 * LINE, 2 * LINE
-NEXT, FIRST, LAST, PRESENT = 0, 1, 2, LINE
-"""Words of a range: the next block to take, the first block, the end, and 1 if its thread polls."""
 WATCH = 4_000
 """Polls of the board before a helper sleeps, about 100 us."""
 PATIENCE = 100 * WATCH

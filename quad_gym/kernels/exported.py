@@ -7,10 +7,11 @@ from numba import types
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.compiling.stages import STAGE_TABLE
+from quad_gym.kernels.filter.still import start_still
 from quad_gym.kernels.maths.linalg import load3
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.single import begin_filter
+from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.kernels.tape import keep_estimate, predict_sample, update_with
 from quad_gym.records import (
     FLIGHT_BLOCK,
@@ -51,6 +52,12 @@ def update(flight, params, ticks, steps, settings, work, table, measurement):
 def start(flight, params, settings, work, first):
     """Start the filter from its first fix."""
     begin_filter(flight, params, settings, work, load3(first.x_I))
+
+
+@entry(signature=types.none(_START))
+def start_level(first):
+    """Compute the first estimate of a vehicle of known tilt."""
+    start_still(first)
 
 
 @entry(signature=types.none(_FLIGHT, types.int64))

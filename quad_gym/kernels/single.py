@@ -3,16 +3,12 @@
 A filter instead runs the stages of flights on its own block, as scalar instances of these would
 take even longer to compile.
 
-Each entry has a signature, so that it can be compiled in advance; arrays in another memory order
-are accepted, too, and cause a compilation on their first use.
+Python calls them through `entries.py`, which has their arguments.
 """
 
-import numpy as np
-from numba import types
-from numba.np.numpy_support import from_dtype
-
-from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
-from quad_gym.kernels.compiling.stages import STAGE_TABLE
+from quad_gym.kernels import entries
+from quad_gym.kernels.compiling import call_stage, entry, kernel
+from quad_gym.kernels.compiling.signatures import signature_of
 from quad_gym.kernels.filter.align import initialize
 from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
@@ -36,51 +32,13 @@ from quad_gym.kernels.simd.addresses import lanes_at
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.air import accelerations_in_air
 from quad_gym.kernels.vehicle.dynamics import accelerations, integrate, load_state
-from quad_gym.records import (
-    FLIGHT,
-    FLIGHT_BLOCK,
-    PARAMS,
-    PARAMS_BLOCK,
-    SETTINGS,
-    START,
-    WORK_BLOCK,
-    Sensor,
-)
+from quad_gym.records import FLIGHT_BLOCK
 
-FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
-"""Stages that a filter runs, as far as it needs them."""
-FILTER_ENTRIES = (f"{__name__}:start_filter", "quad_gym.kernels.tape:run_tape")
-"""Names of the entries that a filter calls, the slowest to compile first."""
-SENSORS_AND_VEHICLE = tuple(
-    f"{__name__}:{name}"
-    for name in (
-        *("sense_features", "sense_gnss", "body_accelerations_in_air", "integrate_flight"),
-        *("sense_imu_average", "sense_imu", "body_accelerations", "start_level"),
-        *("wahba_of_vectors", "step_biases", "step_gnss_drift", "draw_sensor_errors"),
-        *(
-            "disturb_imu",
-            "turn_gnss_baseline",
-            "limit_features",
-            "nearest_obstacles",
-            "hide_points",
-        ),
-    )
-)
-"""Names of the other entries of this module, the slowest to compile first."""
-
-
-def _array(kind, dimensions=1):
-    return types.Array(from_dtype(np.dtype(kind)), dimensions, "C")
-
-
-_FLIGHT, _PARAMS, _SETTINGS = map(_array, (FLIGHT, PARAMS, SETTINGS))
-_BLOCK, _BLOCK_PARAMS, _BLOCK_WORK = map(_array, (FLIGHT_BLOCK, PARAMS_BLOCK, WORK_BLOCK))
-_VECTOR, _MATRIX, _CUBE = (_array(np.float64, n) for n in (1, 2, 3))
 _flight_at = lanes_at(FLIGHT_BLOCK)
 
 
-def _entry(*arguments, returns=types.none):
-    return lambda function: entry(function, returns(*arguments))
+def _entry(function):
+    return entry(function, signature_of(getattr(entries, function.__name__)))
 
 
 @kernel
@@ -92,7 +50,7 @@ def begin_filter(block, params, settings, work, x_I):
     begin_slow(flight, lanes_of(params), settings, mask)
 
 
-@_entry(_BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
+@_entry
 def start_filter(blocks, params, settings, work, x_I):
     """Start the filters of blocks[0] from their first fixes, where `work.mask`.
 
@@ -101,17 +59,13 @@ def start_filter(blocks, params, settings, work, x_I):
     begin_filter(blocks[0], params[0], settings[0], work[0], load3(x_I))
 
 
-@_entry(from_dtype(START))
-def start_level(start):
-    """Compute the first estimate of a vehicle of known tilt, from a START record."""
-    start_still(start)
+@_entry
+def start_level(starts):
+    """Compute the first estimate of a vehicle of known tilt, from starts[0]."""
+    start_still(starts[0])
 
 
-@_entry(
-    *[types.int64] * 4,
-    *map(_array, (PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)),
-    types.int64,
-)
+@_entry
 def run_stage(address, pitch, count, number, world, model, settings, work, table, flag):
     """Run a stage of the table, its number, once for every block, where `work.mask`.
 
@@ -126,75 +80,75 @@ def run_stage(address, pitch, count, number, world, model, settings, work, table
         call_stage(table[0], number, flight, true, believed, settings[0], scratch, flag)
 
 
-@_entry(_FLIGHT, _PARAMS)
+@_entry
 def sense_imu(flights, params):
     """Sample the IMU of flights[0]."""
     measure_imu(flights[0], params[0], True)
 
 
-@_entry(_FLIGHT, _PARAMS, _FLIGHT)
+@_entry
 def sense_imu_average(flights, params, starts):
     """Sample the averaging IMU of flights[0] over a tick from the true state of starts[0]."""
     measure_imu_average(flights[0], params[0], load_state(starts[0]), True)
 
 
-@_entry(_FLIGHT, _PARAMS, types.boolean)
+@_entry
 def sense_gnss(flights, params, paired):
     """Measure flights[0] by GNSS, including the baseline if `paired`."""
     measure_gnss(flights[0], params[0], paired, True)
 
 
-@_entry(_FLIGHT, _PARAMS)
+@_entry
 def draw_sensor_errors(flights, params):
     """Draw the constant errors of the sensors of flights[0]."""
     draw_imu_errors(flights[0], params[0], True)
     draw_heading_error(flights[0], params[0], True)
 
 
-@_entry(_FLIGHT, _PARAMS)
+@_entry
 def disturb_imu(flights, params):
     """Add errors and vibration to the last IMU sample of flights[0]."""
     err_imu(flights[0], params[0], True)
     vibrate_imu(flights[0], params[0], True)
 
 
-@_entry(_FLIGHT, _PARAMS)
+@_entry
 def turn_gnss_baseline(flights, params):
     """Add the constant error to the last measured baseline of flights[0]."""
     turn_baseline(flights[0], params[0], True)
 
 
-@_entry(_FLIGHT, _PARAMS, types.boolean, types.boolean, types.int64)
+@_entry
 def limit_features(flights, params, blurs, ground_hides, feature_count):
     """Blur the last image of flights[0], and drop features out of range or behind the ground."""
     limit_camera(flights[0], params[0], blurs, ground_hides, feature_count, True)
 
 
-@_entry(_FLIGHT, _PARAMS)
+@_entry
 def step_gnss_drift(flights, params):
     """Advance the slow position error of flights[0] to the next measurement."""
     drift_gnss(flights[0], params[0], True, 1.0)
 
 
-@_entry(_FLIGHT, _PARAMS, types.int64)
+@_entry
 def sense_features(flights, params, feature_count):
     """Measure the features that the camera of flights[0] sees."""
     camera.measure(flights[0], params[0], feature_count, True)
 
 
-@_entry(_FLIGHT, _PARAMS)
+@_entry
 def step_biases(flights, params):
     """Advance the IMU biases of flights[0] by one tick."""
     drift_biases(flights[0], params[0])
 
 
-@_entry(_FLIGHT, _PARAMS, types.int64)
+@_entry
 def integrate_flight(flights, params, substeps):
     """Integrate the true state of flights[0] over one tick."""
     integrate(flights[0], params[0], substeps)
 
 
-@_entry(_MATRIX, *[_VECTOR] * 4, _PARAMS, _VECTOR, _VECTOR)
+@_entry
 def body_accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, params, a_I, dw_B):
     """Write the acceleration in I and the angular acceleration in B."""
     R, W = load33(R_BI), load4(rotor_speeds)
@@ -203,7 +157,7 @@ def body_accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, params, a_I, dw_B):
     store(dw_B, dw)
 
 
-@_entry(_VECTOR, _MATRIX, *[_VECTOR] * 4, _PARAMS, _SETTINGS, _VECTOR, _VECTOR)
+@_entry
 def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, settings, a_I, dw_B):
     """Write the acceleration in I and the angular acceleration in B in moving air."""
     r, R, v, w, W = load3(r_I), load33(R_BI), load3(v_I), load3(w_B), load4(rotor_speeds)
@@ -213,7 +167,7 @@ def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, se
     store(dw_B, dw)
 
 
-@_entry(_MATRIX, _CUBE, _SETTINGS, _VECTOR, _MATRIX)
+@_entry
 def nearest_obstacles(points, centers, settings, distances, vectors):
     """Write distances (n,) of points (n, 3) from obstacles at (n, k, 3), and vectors to them."""
     for i in range(len(points)):
@@ -224,7 +178,7 @@ def nearest_obstacles(points, centers, settings, distances, vectors):
                 store(vectors[i], vector)
 
 
-@_entry(_MATRIX, _CUBE, _CUBE, _SETTINGS, _array(np.bool_, 2))
+@_entry
 def hide_points(eyes, points, centers, settings, hidden):
     """Write which points (n, m, 3) are behind an obstacle, as seen from eyes (n, 3)."""
     for i in range(len(eyes)):
@@ -234,7 +188,7 @@ def hide_points(eyes, points, centers, settings, hidden):
                 hidden[i, j] |= crosses(*line, settings[0], k)
 
 
-@_entry(_VECTOR, _MATRIX, _MATRIX, _MATRIX, returns=types.float64)
+@_entry
 def wahba_of_vectors(weights, v_I, v_B, R_BI):
     """Write the solution of Wahba's problem for (n, 3) vectors; return its uniqueness."""
     profile = diagonal((0.0, 0.0, 0.0))

@@ -5,13 +5,9 @@ Every lane is a filter of its own, with its own parameters, on the same measurem
 
 import math
 
-import numpy as np
-from numba import types
-from numba.core.types import Array
-from numba.np.numpy_support import from_dtype
-
+from quad_gym.kernels import entries
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
-from quad_gym.kernels.compiling.stages import STAGE_TABLE
+from quad_gym.kernels.compiling.signatures import signature_of
 from quad_gym.kernels.maths.elementary import exp
 from quad_gym.kernels.simd.addresses import store_lanes
 from quad_gym.kernels.simd.blocks import lanes_of
@@ -21,23 +17,15 @@ from quad_gym.records import (
     AIDS,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
-    FLIGHT_BLOCK,
     MAX_BLOCKS,
-    PARAMS_BLOCK,
     POSITION_BLOCK,
-    SETTINGS,
     VELOCITY_BLOCK,
     WIDTH,
-    WORK_BLOCK,
     Aid,
 )
 from quad_gym.records.tape import (
     KEPT,
-    MEASUREMENT,
-    OPERATION,
     REPORTED,
-    SAMPLE,
-    STEP_BLOCK,
     Operation,
 )
 
@@ -45,16 +33,6 @@ _PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
 _PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
 _BAROMETER = int(Aid.BAROMETER)
 _LANES = 8 * WIDTH  # bytes
-
-
-def _arrays(*dtypes):
-    return [Array(from_dtype(np.dtype(kind)), 1, "C") for kind in dtypes]
-
-
-_RECORDS = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, STEP_BLOCK)
-_OTHERS = (SETTINGS, WORK_BLOCK, STAGE_TABLE, SAMPLE, MEASUREMENT, OPERATION, np.int64)
-_WORDS = Array(types.uint64, 1, "C")
-_SLOTS = Array(types.uint64, 2, "C")
 
 
 @kernel
@@ -226,12 +204,7 @@ def _report(flight, blocks, address):
         place += 2
 
 
-def _signature():
-    records = _arrays(*_RECORDS, *_OTHERS)
-    return types.none(*records, _WORDS, _SLOTS, types.int64, types.int64)
-
-
-@entry(signature=_signature())
+@entry(signature=signature_of(entries.run_tape))
 def run_tape(
     flights,
     params,

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.packing.gates import gate_limit
 from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import LEAST_DRIFT
 from quad_gym.params.sensors import SensorSuite
@@ -26,8 +25,7 @@ class SlowStates(NamedTuple):
 
     errors: tuple[SlowError, ...]
     """slow errors, padded to a multiple of three by constants with standard deviation one"""
-    estimated: int
-    """number of slow errors without the padding"""
+    estimated: int  # number of slow errors without the padding
     drifts: bool
     """True if the first three are the drift of GNSS positions, which is zero at the start"""
     vectors: tuple[int, ...]
@@ -73,6 +71,15 @@ def decay_and_drive(error: SlowError, time: float) -> tuple[float, float]:
     """Return the decay of a slow error over a time [s], and its driving noise's sigma."""
     decay = math.exp(-time / error.tau)
     return decay, error.sigma * math.sqrt(-math.expm1(-2.0 * time / error.tau))
+
+
+def gate_limit(freedoms: int, false_alarm: float) -> float:
+    """Return the NIS above which a measurement is rejected, a quantile of chi-square."""
+    if false_alarm == 0.0:
+        return float("inf")
+    from scipy.special import chdtri  # takes 0.1 s, needed with gates only
+
+    return float(chdtri(freedoms, false_alarm))
 
 
 def pack_aids(p: Any, sensors: SensorSuite) -> None:

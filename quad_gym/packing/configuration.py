@@ -29,11 +29,8 @@ from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layo
 if TYPE_CHECKING:
     from quad_gym.estimation.own import Estimator
 
-MOST_FLIGHTS = 10**7
-"""Largest number of flights in a batch."""
-
-FILTER_STARTS = ("cold", "warm")
-"""Values of the keyword `filter_start`."""
+MOST_FLIGHTS = 10**7  # largest number of flights in a batch
+FILTER_STARTS = ("cold", "warm")  # values of the keyword `filter_start`
 
 _WITHOUT = {
     "gains": tuple(control for control in Control if control is not Control.PD),

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from quad_gym.faults import Fault, Span, ends
-from quad_gym.kernels.sensors.faults import NEVER
+from quad_gym.records import NEVER
 
 
 def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
@@ -19,16 +19,12 @@ def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
         s["fault_probability"][k] = fault.probability
         for name, value in fault.numbers.items():
             if name == "size":
-                s["fault_size"][k] = _low_and_range(value)
+                low, high = ends(value)
+                s["fault_size"][k] = low, high - low
             elif name in ("share", "direction"):
                 s[f"fault_{name}"][k] = value
             else:
                 s[name] = value
-
-
-def _low_and_range(value: Span) -> tuple[float, float]:
-    low, high = ends(value)
-    return low, high - low
 
 
 def _ticks(value: Span, dt: float, least: float = 0.0) -> tuple[float, float]:

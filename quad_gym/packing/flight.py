@@ -8,12 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.frames import ecef_to_enu
-from quad_gym.packing.aids import (
-    decay_and_drive,
-    pack_aids,
-    slow_states,
-)
-from quad_gym.packing.gates import gate_limit
+from quad_gym.packing.aids import decay_and_drive, gate_limit, pack_aids, slow_states
 from quad_gym.params import portable
 from quad_gym.params.aids import SlowError
 from quad_gym.params.control import ActionParams, PDGains
@@ -58,13 +53,8 @@ def params_record(
     p = record[0]
     world = WorldParams() if world is None else world
     _copy(p, sensors.estimator)
-    for part in (
-        vehicle,
-        world,
-        action_params or ActionParams(),
-        sensors.imu,
-        sensors.initial_pose,
-    ):
+    actions = action_params or ActionParams()
+    for part in (vehicle, world, actions, sensors.imu, sensors.initial_pose):
         _copy(p, part)
     _copy(p, world.ground or GroundParams())
     _copy(p, world.battery or BatteryParams(), "battery_")
@@ -175,18 +165,15 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
 
 def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
     """Return the options of a filter as flags; it may store innovations, and model a lever arm."""
-    form = FilterForm.INNOVATIONS if innovations else FilterForm(0)
-    if estimator.kind == "ekf":
-        form |= FilterForm.EKF
-    if estimator.integration == "midpoint":
-        form |= FilterForm.MIDPOINT
-    if estimator.attitude_reset:
-        form |= FilterForm.TURN
-    if estimator.false_alarm_probability > 0.0:
-        form |= FilterForm.GATE
-    if estimator.recursive_update_threshold is not None:
-        form |= FilterForm.GRADUAL
-    return FilterForm(form | lever_arm)
+    options = {
+        FilterForm.INNOVATIONS: innovations,
+        FilterForm.EKF: estimator.kind == "ekf",
+        FilterForm.MIDPOINT: estimator.integration == "midpoint",
+        FilterForm.TURN: estimator.attitude_reset,
+        FilterForm.GATE: estimator.false_alarm_probability > 0.0,
+        FilterForm.GRADUAL: estimator.recursive_update_threshold is not None,
+    }
+    return FilterForm(sum(flag for flag, on in options.items() if on) | lever_arm)
 
 
 def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:

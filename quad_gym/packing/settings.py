@@ -12,7 +12,7 @@ from quad_gym.packing.faults import pack_faults
 from quad_gym.packing.flight import form_of, lever_form
 from quad_gym.packing.world import pack_options, pack_places
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import SensorSuite, delay_ticks
+from quad_gym.params.sensors import delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.records import (
     FOLLOWED,
@@ -51,18 +51,12 @@ def settings_record(c: FlightConfiguration) -> NDArray[Any]:
     _pack_task(s, task)
     s["reward_scale"] = c.clocks.control_rate if task.reward_per == "step" else 1.0
     s["max_steps"] = round(task.duration * c.clocks.control_rate)
-    pack_options(
-        s,
-        c.world,
-        c.draws,
-        known=c.randomization.known,
-        limited=c.flown_vehicle.max_voltage < c.vehicle.max_voltage,
-    )
+    limited = c.flown_vehicle.max_voltage < c.vehicle.max_voltage
+    pack_options(s, c.world, c.draws, known=c.randomization.known, limited=limited)
     s["action_delays"] = c.longest_delay
     pack_places(s, c.draws, c.flown_sensors, assumed)
     pack_faults(s, c.possible_faults, assumed.imu.dt)
     _pack_sensors(s, c)
-    _pack_imperfections(s, c.flown_sensors)
     return record
 
 
@@ -101,20 +95,13 @@ def _pack_sensors(s: Any, c: FlightConfiguration) -> None:
         place, label = Sensor[name.upper()], type(sensor).__name__
         ticks = check.ticks(f"{label}.rate", sensor.rate, true.imu.rate)
         s["sensor_ticks"][place] = ticks
-        s["sensor_phase"][place] = _phase_ticks(sensor.phase, ticks)
+        phase = sensor.phase  # in ticks, fewer than a period; -1: drawn in each episode
+        s["sensor_phase"][place] = -1 if phase is None else min(round(phase * ticks), ticks - 1)
         delay = delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, true.imu.rate)
         s["sensor_delay"][place], s["under_way"][place] = delay, -(-delay // ticks)
     s["late"] = s["sensor_delay"].max() > 0
     s["rewinds"] = assumed.estimator.delay_compensation == "retrodict"
-
-
-def _phase_ticks(phase: float | None, period: int) -> int:
-    """Return the ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
-    return -1 if phase is None else min(round(phase * period), period - 1)
-
-
-def _pack_imperfections(s: Any, true: SensorSuite) -> None:
-    """Write which errors the true sensors have."""
+    # the errors that the true sensors have
     imu, gnss, camera = true.imu, true.gnss, true.camera
     s["imu_errs"], s["imu_vibrates"] = imu.errs, imu.vibrates
     s["heading_errs"] = gnss is not None and gnss.heading_errs

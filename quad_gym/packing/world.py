@@ -14,8 +14,7 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, MAX_START_VELOCITY, SETTINGS, Start, Supply
 
-FALLEN_THROUGH = 0.5
-"""Depth below ground that supports vehicles at which an episode ends [m]."""
+FALLEN_THROUGH = 0.5  # depth below ground that supports vehicles at which an episode ends [m]
 
 
 def pack_options(
@@ -28,13 +27,10 @@ def pack_options(
 
     winds = [present(f"wind_{part}") for part in ("east", "north", "up", "speed", "direction")]
     s["gusts"] = present("gust_wind_speed", world.gust_wind_speed)
-    s["linear_drag"] = present("linear_drag_B", *world.linear_drag_B) or present(
-        "rotor_drag_B", *world.rotor_drag_B
-    )
-    s["ground_effect"] = world.ground_effect
-    s["air"] = (
-        any(world.wind_I) or any(winds) or s["gusts"] or s["linear_drag"] or s["ground_effect"]
-    )
+    drags = (present(name, *getattr(world, name)) for name in ("linear_drag_B", "rotor_drag_B"))
+    s["linear_drag"], s["ground_effect"] = any(drags), world.ground_effect
+    s["air"] = any(world.wind_I) or any(winds)
+    s["air"] |= s["gusts"] | s["linear_drag"] | s["ground_effect"]
     s["supply"] = Supply.LIMIT if limited or present("max_voltage") else Supply.NOMINAL
     if world.battery is not None:
         s["supply"] = Supply.BATTERY

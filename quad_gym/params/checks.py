@@ -16,18 +16,14 @@ T = TypeVar("T")
 Vector = tuple[float, ...]
 Matrix = tuple[tuple[float, ...], ...]
 
-MOST_TICKS = 10**5
-"""Largest number of ticks between two events of a clock; 500 s at 200 Hz."""
-
-LARGEST = 1e15
-"""Largest magnitude of any quantity in SI units; its square is far from overflow."""
+MOST_TICKS = 10**5  # largest number of ticks between two events of a clock; 500 s at 200 Hz
+LARGEST = 1e15  # largest magnitude of any quantity in SI units; its square is far from overflow
 
 SMALLEST = 1e-15
 """Smallest value of a quantity that has to be positive; its square is far from underflow."""
 
 
-FARTHEST_ON_VEHICLE = 100.0
-"""No part of a vehicle is farther from its center of mass [m]."""
+FARTHEST_ON_VEHICLE = 100.0  # no part of a vehicle is farther from its center of mass [m]
 
 
 def package(module: str, what: str, extra: str) -> Any:
@@ -250,11 +246,11 @@ def choice(name: str, value: Any, choices: Sequence[str]) -> str:
 def array(
     name: str, value: ArrayLike, shape: tuple[int | None, ...], *, allow_nan: bool = False
 ) -> NDArray[np.float64]:
-    """`value` as a new float64 array of `shape` (None: any length), finite or NaN if allowed."""
+    """`value` as a new float64 array in C order, of `shape` (None: any length), finite or NaN."""
     try:
         if _holds_no_numbers(value):
             raise TypeError
-        result = np.array(value, dtype=np.float64)
+        result = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be an array of numbers, got {value!r}") from None
     fits = result.ndim == len(shape) and all(

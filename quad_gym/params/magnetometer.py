@@ -8,8 +8,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams, SlowError
 from quad_gym.records import Aid
 
-MICROTESLA = 1e-6
-"""One microtesla [T]."""
+MICROTESLA = 1e-6  # one microtesla [T]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,7 @@ from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suite_files import SUFFIX, text_of
 from quad_gym.records import MAX_UNDER_WAY, Aid
 
-SensorParams = GnssParams | CameraParams | AidParams
-"""Parameters of a sensor other than the IMU."""
+SensorParams = GnssParams | CameraParams | AidParams  # parameters of a sensor other than the IMU
 
 AID_PARAMS: dict[str, type[AidParams]] = {
     "barometer": BarometerParams,
@@ -41,8 +40,7 @@ SENSOR_PARAMS: dict[str, type[SensorParams]] = {
 }
 """Parameters of all sensors but the IMU by their fields in `SensorSuite`."""
 
-_WORDS = {"gnss": "GNSS"}
-"""Sensors in messages, where the name of the field is none."""
+_WORDS = {"gnss": "GNSS"}  # sensors in messages, where the name of the field is none
 
 
 @dataclass(frozen=True, kw_only=True)

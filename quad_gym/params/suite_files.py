@@ -23,8 +23,7 @@ from typing import Any
 
 from quad_gym.params import checks as check
 
-SUFFIX = ".toml"
-"""Ending of the names of such files."""
+SUFFIX = ".toml"  # ending of the names of such files
 
 _NONE = "none"
 _HEAD = "# Sensor suite of quad_gym; units are SI, angles in rad.\n\n"

@@ -53,12 +53,10 @@ from quad_gym.params.suite_files import SUFFIX, read_suite
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
 
-_GNSS_LATENCY = 0.1
-"""[s]; PX4 assumes 0.11 s (EKF2_GPS_DELAY)"""
+_GNSS_LATENCY = 0.1  # [s]; PX4 assumes 0.11 s (EKF2_GPS_DELAY)
 _CAMERA_LATENCY = 0.04
 """[s]; exposure, transfer and search for markers; typical of small computers, 30 to 60 ms"""
-_EXPOSURE = 0.003
-"""[s]; daylight, or a well-lit hall; our judgment"""
+_EXPOSURE = 0.003  # [s]; daylight, or a well-lit hall; our judgment
 _MARKER_RANGE = 13.0
 """[m]; there a marker of 0.2 m subtends 25 pixels of the laboratory's camera; our judgment"""
 
@@ -326,8 +324,7 @@ _SUITES = {
     "indoor": INDOOR,
 }
 
-SUITES = tuple(_SUITES)
-"""Names of the sensor suites for all tasks."""
+SUITES = tuple(_SUITES)  # names of the sensor suites for all tasks
 
 _ALL = {
     **_SUITES,
@@ -337,8 +334,7 @@ _ALL = {
     "flown": FLOWN,
 }
 
-ALL_SUITES = tuple(_ALL)
-"""Names of all sensor suites."""
+ALL_SUITES = tuple(_ALL)  # names of all sensor suites
 
 
 def sensor_suite(name: str | Path) -> SensorSuite:

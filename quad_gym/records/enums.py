@@ -15,67 +15,48 @@ class FilterStatus(IntFlag):
 class FilterForm(IntFlag):
     """Options of a filter as flags; 0 is the UKF of the report."""
 
-    EKF = 1
-    """extended Kalman filter: derivatives of the models instead of sigma points"""
+    EKF = 1  #: extended Kalman filter: derivatives of the models instead of sigma points
     MIDPOINT = 2
     """midpoint rule: exact rotation over a tick, and force rotated by the attitude at mid-tick"""
-    TURN = 4
-    """rotation of the covariance when the error angles are reset to zero"""
+    TURN = 4  #: rotation of the covariance when the error angles are reset to zero
     INNOVATIONS = 8
     """innovations, their predicted standard deviations and their NIS are stored for each block"""
-    GATE = 16
-    """blocks whose NIS exceeds the gate are rejected; innovations are stored, too"""
+    GATE = 16  #: blocks whose NIS exceeds the gate are rejected; innovations are stored, too
     LEVER_AVERAGES = 64
     """the accelerometer is off the center of mass, and a sample is the mean over a tick"""
     LEVER_SAMPLES = 128
     """the accelerometer is off the center of mass, and a sample is the value at a tick's start"""
-    GRADUAL = 32
-    """images are processed in several steps while the attitude is uncertain"""
+    GRADUAL = 32  #: images are processed in several steps while the attitude is uncertain
 
 
 class GateDecision(IntEnum):
     """Decision of the innovation gate on a block of the last measurement."""
 
-    NONE = 0
-    """not measured since the start of the episode"""
-    ACCEPTED = 1
-    """used in the update"""
-    REJECTED = 2
-    """excluded from the update, as the innovation exceeds the gate"""
-    FAILED = 3
-    """part of an update that failed as a whole, see `FilterStatus`"""
-    UNSURE = 4
-    """excluded feature, with a predicted direction too uncertain for a linear model"""
+    NONE = 0  #: not measured since the start of the episode
+    ACCEPTED = 1  #: used in the update
+    REJECTED = 2  #: excluded from the update, as the innovation exceeds the gate
+    FAILED = 3  #: part of an update that failed as a whole, see `FilterStatus`
+    UNSURE = 4  #: excluded feature, with a predicted direction too uncertain for a linear model
 
 
 class Source(IntEnum):
     """Source of the state that the controller observes."""
 
-    TRUTH = 0
-    """the true state"""
-    ESTIMATE = 1
-    """the filter's estimate"""
-    NOISY = 2
-    """the true state with independent noise"""
-    MEASUREMENTS = 3
-    """the raw measurements"""
+    TRUTH = 0  #: the true state
+    ESTIMATE = 1  #: the filter's estimate
+    NOISY = 2  #: the true state with independent noise
+    MEASUREMENTS = 3  #: the raw measurements
 
 
 class Control(IntEnum):
     """Meaning of the four numbers of an action."""
 
-    MOTOR = 0
-    """Voltages of the four motors."""
-    WRENCH = 1
-    """Thrust and torque."""
-    CTBR = 2
-    """Collective thrust and body rates."""
-    ATTITUDE = 3
-    """Thrust, roll, pitch and yaw rate."""
-    VELOCITY = 4
-    """Velocity ahead, to the left and up, and yaw rate."""
-    PD = 5
-    """None: the report's PD controller follows the reference at every tick."""
+    MOTOR = 0  #: voltages of the four motors
+    WRENCH = 1  #: thrust and torque
+    CTBR = 2  #: collective thrust and body rates
+    ATTITUDE = 3  #: thrust, roll, pitch and yaw rate
+    VELOCITY = 4  #: velocity ahead, to the left and up, and yaw rate
+    PD = 5  #: none: the report's PD controller follows the reference at every tick
 
 
 class Sensor(IntEnum):
@@ -129,18 +110,12 @@ AID_FREEDOMS = (1, 3, 2, 1)
 class Act(IntEnum):
     """Tasks of a sensor's stage."""
 
-    BEGIN = 0
-    """begin an episode: draw constant errors, set the clock"""
-    SAMPLE = 1
-    """measure when due, queue delayed measurements, and deliver the ones that arrive"""
-    EXPECT = 2
-    """predict the measurement: its value at the estimate, its noise and its columns"""
-    GATE = 3
-    """store the innovation, and mask it if it exceeds the gate"""
-    INFLATE = 4
-    """inflate the variances of states that may be wrong after an alarm"""
-    ALIGN = 5
-    """initialize the heading, if the sensor is the `heading_sensor` of the settings"""
+    BEGIN = 0  #: begin an episode: draw constant errors, set the clock
+    SAMPLE = 1  #: measure when due, queue delayed measurements, and deliver the ones that arrive
+    EXPECT = 2  #: predict the measurement: its value at the estimate, its noise and its columns
+    GATE = 3  #: store the innovation, and mask it if it exceeds the gate
+    INFLATE = 4  #: inflate the variances of states that may be wrong after an alarm
+    ALIGN = 5  #: initialize the heading, if the sensor is the `heading_sensor` of the settings
 
 
 class TaskKind(IntEnum):
@@ -159,13 +134,11 @@ class Start(IntEnum):
 
     GROUND = 0
     """At rest below the reference at height 0, with the rotors stopped: the start of the report."""
-    HOVER = 1
-    """Hovering nearly at rest, within some decimeters of the reference."""
+    HOVER = 1  #: hovering nearly at rest, within some decimeters of the reference
     MIXED = 2
     """GROUND or HOVER, each with probability 0.5: a policy in training learns to hover and, once it
     can, to take off."""
-    MOVING = 3
-    """HOVER with an additional velocity and body rates, as after a disturbance."""
+    MOVING = 3  #: HOVER with an additional velocity and body rates, as after a disturbance
 
 
 class Layout(IntEnum):
@@ -191,28 +164,17 @@ class Ending(IntEnum):
     lower case and compares equal to it: `Ending.COLLISION == "collision"`.
     """
 
-    NONE = 0
-    """the episode has not ended"""
-    TIME_LIMIT = 1
-    """the time limit was reached"""
-    OUT_OF_BOUNDS = 2
-    """the vehicle was too far from the reference, or its state was not finite"""
-    TIPPED_OVER = 3
-    """the vehicle was tilted too far"""
-    BELOW_MIN_HEIGHT = 4
-    """the vehicle was too low, or crashed into ground that supports vehicles"""
-    LAST_GATE = 5
-    """the last gate was passed"""
-    FILTER_FAILED = 6
-    """the filter failed numerically, see `FilterStatus`"""
-    FILTER_DIVERGED = 7
-    """the filter's consistency monitor flagged divergence"""
-    TASK = 8
-    """a user-defined task ended the episode, see `quad_gym.Task`"""
-    COLLISION = 9
-    """the vehicle touched an obstacle"""
-    LEFT_GEOFENCE = 10
-    """the vehicle left the geofence"""
+    NONE = 0  #: the episode has not ended
+    TIME_LIMIT = 1  #: the time limit was reached
+    OUT_OF_BOUNDS = 2  #: the vehicle was too far from the reference, or its state was not finite
+    TIPPED_OVER = 3  #: the vehicle was tilted too far
+    BELOW_MIN_HEIGHT = 4  #: the vehicle was too low, or crashed into ground that supports vehicles
+    LAST_GATE = 5  #: the last gate was passed
+    FILTER_FAILED = 6  #: the filter failed numerically, see `FilterStatus`
+    FILTER_DIVERGED = 7  #: the filter's consistency monitor flagged divergence
+    TASK = 8  #: a user-defined task ended the episode, see `quad_gym.Task`
+    COLLISION = 9  #: the vehicle touched an obstacle
+    LEFT_GEOFENCE = 10  #: the vehicle left the geofence
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -234,27 +196,20 @@ class Shape(IntEnum):
 class Command(IntEnum):
     """Operation of a call of the batch kernel."""
 
-    STEP = 0
-    """fly a control period"""
-    RESET = 1
-    """begin episodes"""
+    STEP = 0  #: fly a control period
+    RESET = 1  #: begin episodes
     FINISH = 2
     """end a control period flown by TICK: observe the user's estimate, set results, observe"""
-    LOOK = 3
-    """observe again, after a user's estimator has begun episodes"""
-    TICK = 4
-    """fly one tick up to its measurements; TICK + k: k more follow in the control period"""
+    LOOK = 3  #: observe again, after a user's estimator has begun episodes
+    TICK = 4  #: fly one tick up to its measurements; TICK + k: k more follow in the control period
 
 
 class Supply(IntEnum):
     """Limit of the motor voltages in addition to the controller's."""
 
-    NOMINAL = 0
-    """none: the controller assumes the true largest voltage"""
-    LIMIT = 1
-    """a largest voltage that is unknown to the controller"""
-    BATTERY = 2
-    """a battery, see `quad_gym.BatteryParams`"""
+    NOMINAL = 0  #: none: the controller assumes the true largest voltage
+    LIMIT = 1  #: a largest voltage that is unknown to the controller
+    BATTERY = 2  #: a battery, see `quad_gym.BatteryParams`
 
 
 class FaultKind(IntEnum):

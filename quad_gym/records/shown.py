@@ -22,10 +22,8 @@ SHOWN_FIELDS = (
     ),
 )
 
-SHOWN: dict[str, slice] = {}
-"""Rows of each field, by its name."""
-SHOWN_SIZE = 0
-"""Number of rows."""
+SHOWN: dict[str, slice] = {}  # rows of each field, by its name
+SHOWN_SIZE = 0  # number of rows
 for _field in SHOWN_FIELDS:
     SHOWN[_field.name] = slice(SHOWN_SIZE, SHOWN_SIZE + prod(_field.shape))
     SHOWN_SIZE = SHOWN[_field.name].stop

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from quad_gym.params import checks as check
 from quad_gym.rendering import colors
 from quad_gym.rendering.colors import Color
-from quad_gym.rendering.shrink import halve
 
 Floats = NDArray[np.float64]
-Label = tuple[str, Floats, Color]
-"""Text, its place (2,) [pixels], and its color."""
+Label = tuple[str, Floats, Color]  # text, its place (2,) [pixels], and its color
 
 OVERSAMPLING = 2
 _RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
@@ -28,9 +26,7 @@ _RGBA = (0xFF, 0xFF00, 0xFF0000, 0xFF000000)
 """Bytes of a pixel in memory: red, green, blue, and an unused one, or the opacity. Pygame blends
 surfaces thirty times as fast if their bytes have the same order."""
 _CROSS = np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]])
-_FAR = 20000.0
-"""Limit of coordinates [pixels], to which points beyond are moved, because pygame's integers
-overflow."""
+_FAR = 20000.0  # limit of coordinates [pixels]: pygame's integers overflow
 
 
 def load_pygame() -> Any:
@@ -42,20 +38,14 @@ def load_pygame() -> Any:
 
 
 class Canvas:
-    """Picture to draw on.
-
-    Args:
-        width: Width [pixels].
-        height: Height [pixels].
-    """
+    """Picture to draw on, of a width and a height [pixels]."""
 
     def __init__(self, width: int, height: int) -> None:
         self._pygame = load_pygame()
         self._pygame.font.init()
         self.width, self.height = width, height
-        n = OVERSAMPLING
-        self._large = self._pygame.Surface((n * width, n * height), 0, 32, _RGBX)
-        size = (n * width, n * height)
+        size = (OVERSAMPLING * width, OVERSAMPLING * height)
+        self._large = self._pygame.Surface(size, 0, 32, _RGBX)
         self._layer = self._pygame.Surface(size, self._pygame.SRCALPHA, 32, _RGBA)
         self.surface = self._pygame.Surface((width, height), 0, 32, _RGBX)
         self._packed = self._pygame.Surface((width, height), 0, 24, _RGBX)
@@ -70,9 +60,8 @@ class Canvas:
 
     def clear(self, color: Color, top: float = 0.0, bottom: float = np.inf) -> None:
         """Clear the picture within `inside`, between two heights [pixels]."""
-        n = OVERSAMPLING
-        first, last = (round(n * min(max(y, 0.0), self.height)) for y in (top, bottom))
-        self._large.fill(color, (0, first, n * self.width, last - first))
+        top, bottom = np.clip((top, bottom), 0.0, self.height)
+        self.box(0.0, top, self.width, bottom - top, color)
 
     def keep_background(self) -> None:
         """Store the picture so far, as the background of later pictures."""
@@ -165,7 +154,7 @@ class Canvas:
 
     def finish(self) -> None:
         """Halve the picture; only text can be drawn after this."""
-        halve(_words(self._large), _words(self.surface))
+        self._pygame.transform.smoothscale(self._large, (self.width, self.height), self.surface)
 
     def veil(self, left: float, top: float, width: float, height: float) -> None:
         """Brighten a rectangle of the finished picture, for text to stand out."""
@@ -183,38 +172,26 @@ class Canvas:
         color: Color = colors.INK,
         anchor: float = 0.0,
     ) -> int:
-        """Write a text with its upper left corner at x and y, shifted left by `anchor` widths.
-
-        Returns:
-            Width of the text [pixels].
-        """
+        """Write a text at x, y, shifted left by `anchor` widths; return its width [pixels]."""
         image = self._word(words, size, color)
         if np.isfinite(x) and np.isfinite(y):
             left = min(max(x - anchor * image.get_width(), -_FAR), _FAR)
             self.surface.blit(image, (round(left), round(min(max(y, -_FAR), _FAR))))
         return int(image.get_width())
 
-    def write_labels(
-        self, labels: Sequence[Label], size: int, bottom: float, top: float = -np.inf
-    ) -> None:
-        """Write labels centered at their places, between two heights [pixels]."""
+    def write_labels(self, labels: Sequence[Label], size: int, bottom: float) -> None:
+        """Write labels centered at their places, above a height [pixels]."""
         for words, at, color in labels:
-            if np.isfinite(at).all() and top < at[1] < bottom - self.line_height(size):
+            if np.isfinite(at).all() and at[1] < bottom - self.line_height(size):
                 self.text(words, at[0], at[1], size, color, 0.5)
 
-    def write_legend(
-        self, entries: Sequence[tuple[str, Color]], x: float, y: float, size: int
-    ) -> float:
-        """Write a legend of lines, and of crosses (purple); returns the height below it."""
-        step = self.line_height(size) + 2
-        for words, color in entries:
-            if color == colors.PURPLE:
-                self.text("x", x + 1, y - 1, size, color)
-            else:
-                self.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
-            self.text(words, x + 15, y, size)
-            y += step
-        return y
+    def mark(self, color: Color, x: float, y: float, size: int) -> None:
+        """Draw the mark of a line in a legend; purple: of crosses."""
+        if color == colors.PURPLE:
+            self.text("x", x + 1, y - 1, size, color)
+        else:
+            step = self.line_height(size) + 2
+            self.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
 
     def width_of(self, words: str, size: int) -> int:
         """Width of a text [pixels]."""
@@ -249,12 +226,6 @@ class Canvas:
         raw = np.frombuffer(self._packed.get_buffer(), np.uint8)
         rows = raw.reshape(self.height, self._packed.get_pitch())[:, : 3 * self.width]
         return rows.reshape(self.height, self.width, 3).copy()
-
-
-def _words(surface: Any) -> NDArray[np.uint32]:
-    """Pixels of a surface as words of four bytes, (height, width), without a copy."""
-    words = np.frombuffer(surface.get_view("0"), np.uint32)
-    return words.reshape(surface.get_height(), surface.get_width())
 
 
 def _large(points: Floats) -> Any:

@@ -14,26 +14,18 @@ from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]
 
-NEAR = 0.05
-"""Distance from the viewing camera below which objects are not drawn [m]."""
-
-
-AROUND = 6.0
-"""Distance from reference and start within which a fixed view must show obstacles [m]."""
+NEAR = 0.05  # distance from the viewing camera below which objects are not drawn [m]
+AROUND = 6.0  # distance from reference and start within which a fixed view shows obstacles [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Perspective:
     """Perspective view of the inertial frame."""
 
-    eye: Floats
-    """Position of the viewer, (3,) in I [m]"""
-    R_VI: Floats
-    """Rotation from I to viewing axes, (3, 3); rows: right, down, into the picture, in I"""
-    focal: float
-    """Focal length [pixels]"""
-    center: Floats
-    """Pixel of the optical axis, (2,)"""
+    eye: Floats  # position of the viewer, (3,) in I [m]
+    R_VI: Floats  # rotation from I to viewing axes, (3, 3); rows: right, down, into the picture
+    focal: float  # focal length [pixels]
+    center: Floats  # pixel of the optical axis, (2,)
 
     def in_view(self, points: Floats) -> Floats:
         """Transform points (..., 3) from I to viewing axes [m]."""
@@ -51,8 +43,9 @@ class Perspective:
         return self.flatten(safe), depth
 
     def segments(self, starts: Floats, ends: Floats) -> Floats:
-        """Pixels (m, 2, 2) of line segments (n, 3), clipped where they are too near."""
-        both = self.in_view(np.stack([starts, ends], axis=1))
+        """Pixels (m, 2, 2) of line segments, (n, 3) or (3,) each, clipped where too near."""
+        pairs = np.broadcast_arrays(np.atleast_2d(starts), np.atleast_2d(ends))
+        both = self.in_view(np.stack(pairs, axis=1))
         in_front = both[..., 2] > NEAR
         if in_front.all():
             return self.flatten(both)
@@ -102,15 +95,9 @@ def look_at(eye: Floats, target: Floats, focal: float, center: Floats) -> Perspe
 def fit_view(
     points: Floats, azimuth: float, elevation: float, focal: float, low: Floats, high: Floats
 ) -> Perspective:
-    """Closest view from a given direction that shows all points within a rectangle of pixels.
+    """Closest view of all points (n, 3) within a rectangle of pixels, from its corner low to high.
 
-    Args:
-        points: Points to show, (n, 3) in I [m].
-        azimuth: Direction from the points to the eye, from east toward north [rad].
-        elevation: Elevation of this direction above the horizon [rad].
-        focal: Focal length [pixels].
-        low: Upper left corner of the rectangle, (2,) [pixels].
-        high: Lower right corner of the rectangle, (2,) [pixels].
+    The direction from the points to the eye is given by azimuth and elevation [rad].
     """
     c = np.cos(elevation)
     backward = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
@@ -129,17 +116,8 @@ def fit_view(
     return Perspective(eye @ axes, axes, focal, center)
 
 
-def fixed_view(
-    flight: Flight, width: float, height: float, also: Floats | None = None
-) -> Perspective:
-    """View that shows the whole reference, the start, and the markers for the camera.
-
-    Args:
-        flight: Flight to show.
-        width: Width of the picture [pixels].
-        height: Height of the picture [pixels].
-        also: Further points to show, (n, 3) in I [m].
-    """
+def fixed_view(flight: Flight, width: float, height: float) -> Perspective:
+    """View (width, height) [pixels] of the whole reference, the start, and the markers."""
     scene, start = flight.scene, flight["position"][0]
     times = np.linspace(0.0, scene.reference_period or 1.0, max(64, scene.pieces // 4))
     around = [scene.reference(times), start[np.newaxis], scene.gates_I, scene.features_I]
@@ -150,8 +128,6 @@ def fixed_view(
         low, high = scene.geofence_I if len(scene.geofence_I) else (low, high)
         places = np.clip(scene.obstacles[:, 1:4], low, high)
         points = np.concatenate([points, places * (1.0, 1.0, 0.0), places])
-    if also is not None:
-        points = np.concatenate([points, also])
     pad = 0.45 * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (0, 1)])
     corners = (points[:, np.newaxis] + pad).reshape(-1, 3)
     low = np.array([0.03 * width, 0.24 * height])  # legend and inset fill the upper corners
@@ -186,33 +162,22 @@ def course_view(flight: Flight, width: float, height: float) -> Perspective:
     ahead = flight.scene.obstacles[:, 1:4].mean(axis=0) * (1.0, 1.0, 0.0) - start
     ahead = ahead / np.linalg.norm(ahead)
     here = start + ((flight["position"][-1] - start) @ ahead) * ahead
-    eye = here - 15.0 * ahead + (0.0, 0.0, 25.0)
-    target = here + 4.5 * ahead + (0.0, 0.0, 3.0)
+    eye, target = here - 15.0 * ahead + (0.0, 0.0, 25.0), here + 4.5 * ahead + (0.0, 0.0, 3.0)
     return look_at(eye, target, 1.15 * width, np.array([0.5 * width, 0.5 * height]))
 
 
 def ellipsoid_axes(covariance: Floats, sigmas: float) -> Floats:
-    """Half-axes of the ellipsoid of a (3, 3) covariance: eigenvectors times sigmas sqrt(value).
-
-    Returns:
-        Half-axes in rows, the shortest first, (3, 3) [square root of the covariance's unit].
-    """
+    """Half-axes in rows of the ellipsoid of a (3, 3) covariance, the shortest first."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((sigmas * np.sqrt(np.maximum(values, 0.0)) * vectors).T)
 
 
 def ellipsoid_outline(center: Floats, axes: Floats, view: Perspective, count: int = 48) -> Floats:
-    """Outline of an ellipsoid in perspective, (count, 2) pixels; (0, 2) if it is too near.
+    """Outline of an ellipsoid with half-axes in rows, (count, 2) pixels; (0, 2) if it is too near.
 
     In dual form the ellipsoid is [[A - c c^T, -c], [-c^T, -1]], where A is the sum of the outer
     products of its half-axes; the camera matrix maps it to the dual conic of its outline (R.
     Hartley, A. Zisserman, Multiple View Geometry, 2003, section 8.3).
-
-    Args:
-        center: Center, (3,) in I [m].
-        axes: Half-axes in rows, (3, 3) in I [m].
-        view: Perspective to project to.
-        count: Number of points on the outline.
     """
     c = view.in_view(center)
     half = axes @ view.R_VI.T

@@ -15,14 +15,9 @@ Floats = NDArray[np.float64]
 
 
 def place_in_inset(pixels: Floats, scene: FlightScene, box: Box) -> Floats:
-    """Convert image coordinates of the camera to pixels of the inset.
+    """Convert image coordinates of the camera (..., 2) to pixels of the inset.
 
     The image is shown upright: it is turned by half a turn if the camera's y axis points up.
-
-    Args:
-        pixels: Image coordinates relative to the image center, (..., 2) [pixels].
-        scene: Scene of the flight.
-        box: Inset, with the proportions of the image.
     """
     turn = -1.0 if scene.R_CB[1, 2] > 0.0 else 1.0
     center = np.array([box.left + box.width / 2, box.top + box.height / 2])
@@ -48,26 +43,17 @@ def last_image(flight: Flight) -> NDArray[np.void]:
     return rows[seen[-1] if seen.size else -1]
 
 
-def rejected_features(row: NDArray[np.void]) -> NDArray[np.bool_]:
-    """True for features of a row that the innovation gate has rejected, (n,)."""
-    return np.asarray(row["feature_decision"] == GateDecision.REJECTED)
-
-
 class Inset:
-    """Image of the camera for the last row of a flight.
+    """Image of the camera for the last row of a flight, in a box, with text of a size [pixels]."""
 
-    Args:
-        canvas: Canvas to draw on.
-        box: Rectangle of the inset.
-        size: Size of the text [pixels].
-    """
+    def __init__(self, canvas: Canvas, flight: Flight, box: Box, size: int) -> None:
+        self._canvas, self._scene, self._box, self._size = canvas, flight.scene, box, size
+        self._image = last_image(flight)
+        self._refused = self._image["feature_decision"] == GateDecision.REJECTED
 
-    def __init__(self, canvas: Canvas, box: Box, size: int) -> None:
-        self._canvas, self._box, self._size = canvas, box, size
-
-    def draw(self, flight: Flight) -> None:
+    def draw(self) -> None:
         """Draw measured features as crosses, and features predicted from the estimate as rings."""
-        canvas, box, scene, image = self._canvas, self._box, flight.scene, last_image(flight)
+        canvas, box, scene, image = self._canvas, self._box, self._scene, self._image
         canvas.box(box.left, box.top, box.width, box.height, colors.WHITE)
         x, y = box.left + box.width / 2, box.top + box.height / 2
         canvas.line(np.array([[box.left, y], [box.left + box.width, y]]), colors.PALE)
@@ -78,27 +64,26 @@ class Inset:
             predicted = scene.project_features(image["estimated_position"], quaternion_to_dcm(q))
             for at in place_in_inset(predicted, scene, box):
                 canvas.disc(at, 6.0, colors.VERMILLION, 1.5)
-        places, refused = place_in_inset(image["pixels"], scene, box), rejected_features(image)
+        places, refused = place_in_inset(image["pixels"], scene, box), self._refused
         canvas.crosses(places[~refused], 3.2, colors.INK, 1.6)
         canvas.crosses(places[refused], 3.2, colors.GREY, 1.6)
         canvas.inside(None)
         canvas.box(box.left, box.top, box.width, box.height, colors.GREY, 1.0)
 
-    def write(self, flight: Flight) -> None:
+    def write(self) -> None:
         """Write a title and the numbers of the features."""
-        canvas, box, image = self._canvas, self._box, last_image(flight)
+        canvas, box, image = self._canvas, self._box, self._image
         seen = np.isfinite(image["pixels"]).all(axis=1)
         wordings = ["camera"] if seen.any() else ["camera: no feature in view", "no feature"]
-        if (count := rejected_features(image).sum()) > 0:
+        if (count := self._refused.sum()) > 0:
             wordings = [f"camera: {count} rejected (gray)", f"{count} rejected"]
         top, size = box.top + box.height + 2.0, self._size
         words = canvas.fitting(wordings, size, box.width - 4.0)
         width = canvas.width_of(words, size)
         canvas.veil(box.left, top, width + 8, canvas.line_height(size))
-        canvas.text(
-            words, box.left + 4.0, top + 1.0, size, colors.INK if seen.any() else colors.GREY
-        )
+        ink = colors.INK if seen.any() else colors.GREY
+        canvas.text(words, box.left + 4.0, top + 1.0, size, ink)
         if len(seen) <= 4:
             for k in np.flatnonzero(seen):
-                x, y = place_in_inset(image["pixels"][k], flight.scene, box)
+                x, y = place_in_inset(image["pixels"][k], self._scene, box)
                 canvas.text(str(k + 1), x + 8.0, y - 6.0, self._size - 2)

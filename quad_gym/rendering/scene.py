@@ -7,6 +7,7 @@ from quad_gym.flights.record import Flight
 from quad_gym.records import GateDecision
 from quad_gym.rendering import colors
 from quad_gym.rendering.canvas import Canvas, Label
+from quad_gym.rendering.colors import Color
 from quad_gym.rendering.geometry import Perspective, ellipsoid_axes, ellipsoid_outline
 from quad_gym.rendering.inset import last_image
 from quad_gym.rendering.solids import faces_of
@@ -18,15 +19,9 @@ TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
 """Durations of trails, of fixes, and of the part of the reference ahead that is drawn bold [s]."""
 TRAIL_POINTS = 180
 SIGMAS = 3.0
-ELLIPSOID_SCALES = (50.0, 20.0, 10.0, 5.0, 2.0, 1.0)
-"""Factors by which an ellipsoid may be magnified."""
-ELLIPSOID_LIMIT, SCALE_SECONDS = 0.5, 3.0
-"""Largest half-axis of a magnified ellipsoid [m], over this duration of the past [s]."""
-ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
-"""[m]"""
-
-GRID_HALF_SIZE = 9
-"""[m]"""
+ELLIPSOID_SCALES = (50.0, 20.0, 10.0, 5.0, 2.0, 1.0)  # by which an ellipsoid may be magnified
+ELLIPSOID_LIMIT, SCALE_SECONDS = 0.5, 3.0  # largest half-axis then [m], over the past [s]
+ROTOR_RADIUS, FRUSTUM_DEPTH, GRID_HALF_SIZE = 0.13, 0.55, 9  # [m]
 
 _LINES = np.arange(-GRID_HALF_SIZE, GRID_HALF_SIZE + 1.0)
 _NORTHWARD = [
@@ -38,8 +33,8 @@ _GRID = np.stack([np.concatenate([ends, ends[:, [1, 0, 2]]]) for ends in _NORTHW
 _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
 _RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
 
-SOLID, GLASS = 0.55, 0.12
-"""Opacity of obstacles behind the vehicle, and in front of it."""
+HARDLY_VISIBLE = 30.0  # scale below which a vehicle is marked by a disc [pixels/m]
+SOLID, GLASS = 0.55, 0.12  # opacity of obstacles behind the vehicle, and in front of it
 EDGES = (
     *((0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3)),
     *((2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7)),
@@ -61,28 +56,16 @@ def ellipsoid_scale(flight: Flight) -> float:
 
 
 class Scene:
-    """Drawing of the last row of a flight in a view.
+    """Drawing of the last row of a flight in a view, which may be moving with the vehicle.
 
-    Args:
-        canvas: Canvas to draw on.
-        flight: Flight whose last row is the present.
-        view: Perspective to draw.
-        moving: True if the view follows the vehicle, so that the grid on the ground must, too.
-        magnified: True to magnify small ellipsoids, see `ellipsoid_scale`.
-        spacing: Distance between the grid lines on the ground [m].
+    The lines on the ground have a `spacing` [m].
     """
 
     def __init__(
-        self,
-        canvas: Canvas,
-        flight: Flight,
-        view: Perspective,
-        moving: bool,
-        magnified: bool = True,
-        spacing: float = 1.0,
+        self, canvas: Canvas, flight: Flight, view: Perspective, moving: bool, spacing: float
     ) -> None:
         self._canvas, self._flight, self._view, self._moving = canvas, flight, view, moving
-        self._magnified, self._spacing = magnified, spacing
+        self._spacing = spacing
         self._scene, self._now = flight.scene, flight.rows[-1]
         self._R_BI = self._attitude("quaternion")
         self.labels: list[Label] = []
@@ -107,10 +90,14 @@ class Scene:
         self._camera()
         self._fixes()
         self._estimate()
-        self._vehicle()
+        self._body(np.array(self._now["position"]), self._R_BI, ghost=False)
         self._axes()
         self._obstacles(before_vehicle=True)
         return self.labels
+
+    def _lines(self, starts: Floats, ends: Floats, color: Color, width: float = 1.0) -> None:
+        """Draw line segments between points (n, 3) or (3,) in I."""
+        self._canvas.segments(self._view.segments(starts, ends), color, width)
 
     # ---- the world ----------------------------------------------------------------------------
 
@@ -129,10 +116,8 @@ class Scene:
             border = view.segments(corners, np.roll(corners, -1, axis=0))
             canvas.polygon(border.reshape(-1, 2), colors.GROUND)
         starts, ends = self._spacing * _GRID + shift
-        canvas.segments(view.segments(starts, ends), colors.GRID)
-        origin = np.zeros((2, 3))
-        tips = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        canvas.segments(view.segments(origin, tips), colors.GREY, 1.6)
+        self._lines(starts, ends, colors.GRID)
+        self._lines(np.zeros(3), np.eye(3)[:2], colors.GREY, 1.6)
 
     def _reference(self) -> None:
         scene, view, canvas = self._scene, self._view, self._canvas
@@ -158,9 +143,8 @@ class Scene:
             color = colors.PALE if k < passed else colors.GREEN if k == passed else colors.GREY
             sphere = self._scene.gate_radius * np.eye(3)
             outline = ellipsoid_outline(gate, sphere, view)
-            foot = np.array([[gate[0], gate[1], 0.0]])
-            top = (gate - (0.0, 0.0, self._scene.gate_radius))[np.newaxis]
-            canvas.segments(view.segments(foot, top), color)
+            bottom = gate - (0.0, 0.0, self._scene.gate_radius)
+            self._lines(gate * (1.0, 1.0, 0.0), bottom, color)
             if k == passed:
                 canvas.polygon(outline, color, 0.15)
             canvas.line(outline, color, 2.5 if k == passed else 1.5, closed=True)
@@ -168,10 +152,7 @@ class Scene:
             self.labels.append((str(k + 1), view.project(gate)[0] - (0.0, 6.0), ink))
 
     def _obstacles(self, before_vehicle: bool) -> None:
-        """Draw the obstacles in front of the vehicle, or the obstacles behind it.
-
-        Obstacles in front are nearly transparent, so that they do not hide the vehicle.
-        """
+        """Draw the obstacles behind the vehicle, or those in front, nearly transparent."""
         view, canvas = self._view, self._canvas
         far = np.linalg.norm(self._now["position"] - view.eye)
         chosen = []
@@ -196,16 +177,14 @@ class Scene:
             corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
             places = np.where(corners == 0, fence[0], fence[1])
             a, b = np.array(EDGES).T
-            self._canvas.segments(self._view.segments(places[a], places[b]), colors.PALE, 1.0)
+            self._lines(places[a], places[b], colors.PALE)
 
     def _shadow(self) -> None:
         r_I = np.array(self._now["position"])
         foot = r_I * (1.0, 1.0, 0.0)
         if r_I[2] > 0.0:
             self._canvas.polygon(self._view.project(foot + 0.22 * _RING)[0], colors.GREY, 0.35)
-            self._canvas.segments(
-                self._view.segments(foot[np.newaxis], r_I[np.newaxis]), colors.GREY, 0.7
-            )
+            self._lines(foot, r_I, colors.GREY, 0.7)
 
     def _trail(self, column: str) -> Floats:
         """Pixels of a position over the last seconds, evenly subsampled."""
@@ -232,17 +211,14 @@ class Scene:
             return
         r_I = self._now["position"]
         corners = scene.frustum_corners(r_I, self._R_BI, FRUSTUM_DEPTH)
-        apex = np.repeat(corners[:1], 4, axis=0)
         image = view.segments(corners[1:], np.roll(corners[1:], -1, axis=0))
         if len(image) == 4 and not self._moving:  # from near it would hide too much
             canvas.polygon(image[:, 0], colors.LIGHT_BLUE, 0.14)
-        canvas.segments(view.segments(apex, corners[1:]), colors.LIGHT_BLUE)
+        self._lines(corners[0], corners[1:], colors.LIGHT_BLUE)
         canvas.segments(image, colors.LIGHT_BLUE, 1.3)
         seen = np.isfinite(last_image(self._flight)["pixels"]).all(axis=1)
-        features = scene.features_I
         if seen.any():
-            eye = np.repeat(corners[:1], seen.sum(), axis=0)
-            canvas.segments(view.segments(eye, features[seen]), colors.LIGHT_BLUE, 1.4)
+            self._lines(corners[0], scene.features_I[seen], colors.LIGHT_BLUE, 1.4)
         self._features(seen)
 
     def _features(self, seen: NDArray[np.bool_]) -> None:
@@ -265,12 +241,11 @@ class Scene:
         refused = rows["gnss_decision"][measured, 0] == GateDecision.REJECTED
         stride = -(-len(places) // 40)
         old = ages > 0.5 * FIX_SECONDS
-        for color, which in (
-            (colors.PALE_PURPLE, old),
-            (colors.PURPLE, ~old),
+        for color, chosen in (
+            (colors.PALE_PURPLE, old & ~refused),
+            (colors.PURPLE, ~old & ~refused),
             (colors.GREY, refused),
         ):
-            chosen = which if color == colors.GREY else which & ~refused
             self._canvas.crosses(places[chosen][::stride], 2.6, color, 1.3)
         color = colors.GREY if refused[-1] else colors.PURPLE
         self._canvas.crosses(places[-1:], 4.0, color, 2.0)
@@ -296,23 +271,20 @@ class Scene:
         view, canvas = self._view, self._canvas
         covariance, scale = self._now["covariance"][:3, :3], 1.0
         if self._flight.estimated and np.isfinite(covariance).all():  # estimators may have none
-            scale = ellipsoid_scale(self._flight) if self._magnified else 1.0
+            scale = ellipsoid_scale(self._flight)
             axes = scale * ellipsoid_axes(covariance, SIGMAS)
             outline = ellipsoid_outline(believed, axes, view)
             canvas.polygon(outline, colors.VERMILLION, 0.16)
             canvas.line(outline, colors.VERMILLION, 1.2, closed=True)
-            canvas.segments(view.segments(believed - axes, believed + axes), colors.VERMILLION, 0.8)
+            self._lines(believed - axes, believed + axes, colors.VERMILLION, 0.8)
         self._body(np.array(believed), self._attitude(attitude), ghost=True)
         if self._flight.estimated and scale > 1.0:
             # the error has the scale of the ellipsoid, which shows if the truth is inside
             error = believed + scale * (self._now["position"] - believed)
-            canvas.segments(view.segments(believed[np.newaxis], error[np.newaxis]), colors.INK, 1.4)
+            self._lines(believed, error, colors.INK, 1.4)
             at = view.project(error)[0]
             canvas.disc(at, 4.0, colors.WHITE)
             canvas.disc(at, 2.8, colors.INK)
-
-    def _vehicle(self) -> None:
-        self._body(np.array(self._now["position"]), self._R_BI, ghost=False)
 
     def _body(self, r_I: Floats, R_BI: Floats, ghost: bool) -> None:
         """Draw arms and rotors; a ghost is drawn in outline."""
@@ -321,12 +293,9 @@ class Scene:
         hubs = r_I + hubs_B @ R_BI
         thickness = float(np.clip(0.035 * view.scale_at(r_I), 1.6, 6.0))
         color = colors.VERMILLION if ghost else colors.BLUE
-        middle = np.repeat(r_I[np.newaxis], len(hubs), axis=0)
-        arms = view.segments(middle, hubs)
-        if ghost:
-            canvas.segments(arms, color, 1.2)
-        else:
-            canvas.segments(arms, colors.INK, thickness)
+        if view.scale_at(r_I) < HARDLY_VISIBLE:
+            canvas.disc(view.project(r_I)[0], 6.0 if ghost else 4.0, color, 2.0 if ghost else 0.0)
+        self._lines(r_I, hubs, color if ghost else colors.INK, 1.2 if ghost else thickness)
         speeds = np.nan_to_num(self._now["rotor_speeds"]) / scene.max_rotor_speed
         discs = view.project(hubs[:, np.newaxis] + (ROTOR_RADIUS * _RING) @ R_BI)[0]
         for disc, hub_B, speed in zip(discs, hubs_B, speeds, strict=True):
@@ -339,8 +308,7 @@ class Scene:
         r_I, view = self._now["position"], self._view
         near = view.scale_at(np.array(r_I)) > 120.0
         tips = r_I + 0.42 * self._R_BI
-        origin = np.repeat(r_I[np.newaxis], 3, axis=0)
-        self._canvas.segments(view.segments(origin, tips), colors.INK, 1.5)
+        self._lines(r_I, tips, colors.INK, 1.5)
         places = view.project(r_I + 0.5 * self._R_BI)[0] - (0.0, 5.0)
         for name, at in zip("xyz", places, strict=True):
             if near or name == "x":

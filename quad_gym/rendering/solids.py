@@ -7,19 +7,13 @@ from quad_gym.records import Shape
 
 Floats = NDArray[np.float64]
 
-SIDES = 20
-"""Number of sides of the prism that represents a cylinder."""
+SIDES = 20  # of the prism that represents a cylinder
 
 
 def faces_of(obstacle: Floats, eye: Floats) -> list[Floats]:
-    """Faces of an obstacle that are turned to the eye.
+    """Polygons (corners, 3) of a row of `FlightScene.obstacles` turned to the eye, in I [m].
 
-    Args:
-        obstacle: Row of `FlightScene.obstacles`, (9,).
-        eye: Position of the viewer, (3,) in I [m].
-
-    Returns:
-        Polygons, (corners, 3) each, in I [m]; all faces if the eye is inside.
+    All faces are returned if the eye is inside.
     """
     shape, center, half, (c, s) = obstacle[0], obstacle[1:4], obstacle[4:7], obstacle[7:]
     if shape == Shape.CYLINDER:

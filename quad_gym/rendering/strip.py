@@ -1,12 +1,11 @@
 """Strip below the scene: errors, filter consistency and rotor speeds over time."""
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.metrics import STATE_DIMENSION, Interval, chi_square_band
+from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
 from quad_gym.flights.record import Flight
 from quad_gym.rendering import colors
 from quad_gym.rendering.canvas import Canvas
@@ -14,8 +13,7 @@ from quad_gym.rendering.colors import Color
 
 Floats = NDArray[np.float64]
 
-WINDOW_SECONDS = 10.0
-"""Duration of the past that a plot shows [s]."""
+WINDOW_SECONDS = 10.0  # duration of the past that a plot shows [s]
 
 
 @dataclass(frozen=True)
@@ -32,13 +30,11 @@ class Box:
 class Plot:
     """Plot of columns over time, on a logarithmic scale."""
 
-    curves: tuple[tuple[str, str, Color], ...]
-    """Column, name and color of each curve"""
+    curves: tuple[tuple[str, str, Color], ...]  # column, name and color of each
     low: float
     high: float
     ticks: dict[float, str]
-    share: float
-    """Share of the strip's width"""
+    share: float  # of the strip's width
 
 
 ERRORS = Plot(
@@ -59,12 +55,6 @@ CONSISTENCY = Plot(
     share=0.34,
 )
 PLOTS = (ERRORS, CONSISTENCY)
-
-
-@cache
-def nees_band() -> Interval:
-    """95 % band of the NEES of a consistent filter."""
-    return chi_square_band(STATE_DIMENSION)
 
 
 def format_length(meters: float) -> str:
@@ -92,39 +82,11 @@ def shows(flight: Flight, column: str) -> bool:
     return column != "estimation_error" or flight.scene.observation != "truth"
 
 
-def draw_axes(canvas: Canvas, plot: Plot, place: Box) -> None:
-    """Draw the lines of the ticks, and the axes to the left and below."""
-    right, bottom = place.left + place.width, place.top + place.height
-    for tick in plot.ticks:
-        y = height_on(plot, tick, place)
-        canvas.line(np.array([[place.left, y], [right, y]]), colors.PALE, 0.6)
-    corners = [[place.left, place.top], [place.left, bottom], [right, bottom]]
-    canvas.line(np.array(corners), colors.GREY, 0.8)
-
-
-def write_axes(
-    canvas: Canvas, plot: Plot, place: Box, span: tuple[float, float], size: int
-) -> None:
-    """Write the ticks, and the first and last time [s] below."""
-    for tick, words in plot.ticks.items():
-        y = float(height_on(plot, tick, place)) - 0.45 * canvas.line_height(size)
-        canvas.text(words, place.left - 4.0, y, size, colors.GREY, 1.0)
-    y = place.top + place.height + 1.0
-    canvas.text(f"{span[0]:.0f} s", place.left, y, size, colors.GREY)
-    canvas.text(f"{span[1]:.0f} s", place.left + place.width, y, size, colors.GREY, 1.0)
-
-
 class Strip:
-    """Strip for the last row of a flight.
+    """Strip in a box for the last row of a flight; plots show the past of a duration [s]."""
 
-    Args:
-        canvas: Canvas to draw on.
-        box: Rectangle of the strip.
-        size: Size of the text [pixels].
-    """
-
-    def __init__(self, canvas: Canvas, box: Box, size: int) -> None:
-        self._canvas, self._box, self._size = canvas, box, size
+    def __init__(self, canvas: Canvas, box: Box, size: int, seconds: float) -> None:
+        self._canvas, self._box, self._size, self._seconds = canvas, box, size, seconds
         pad, title = 0.012 * box.width, 1.1 * canvas.line_height(size)
         self._title_y = box.top + 0.06 * box.height
         top = self._title_y + title
@@ -155,7 +117,7 @@ class Strip:
 
     def draw(self, flight: Flight) -> None:
         """Draw the curves and the rotors."""
-        rows = flight.rows[-max(2, round(WINDOW_SECONDS * flight.scene.control_rate)) :]
+        rows = flight.rows[-max(2, round(self._seconds * flight.scene.control_rate)) :]
         for plot, place in zip(PLOTS, self._boxes, strict=True):
             self._draw_curves(plot, place, flight, rows)
         canvas, place = self._canvas, self._rotors
@@ -181,8 +143,14 @@ class Strip:
                 words = f"({STATE_DIMENSION} if consistent)"
                 if x + canvas.width_of(words, small) < place.left + place.width:
                     canvas.text(words, x, self._title_y + 1, small, colors.GREY)
-            begin = max(0.0, now["time"] - WINDOW_SECONDS)
-            write_axes(canvas, plot, place, (begin, begin + WINDOW_SECONDS), small)
+            for tick, words in plot.ticks.items():
+                y = float(height_on(plot, tick, place)) - 0.45 * canvas.line_height(small)
+                canvas.text(words, place.left - 4.0, y, small, colors.GREY, 1.0)
+            begin, y = max(0.0, now["time"] - self._seconds), place.top + place.height + 1.0
+            for share in (0.0, 1.0):
+                words = f"{begin + share * self._seconds:.0f} s"
+                x = place.left + share * place.width
+                canvas.text(words, x, y, small, colors.GREY, share)
         place = self._rotors
         words = canvas.fitting(("rotor speeds", "rotors"), self._size, place.width)
         canvas.text(words, place.left, self._title_y, self._size)
@@ -212,17 +180,23 @@ class Strip:
         canvas = self._canvas
         if plot is CONSISTENCY:
             across = np.array([place.left, place.left + place.width])
-            low, high = (float(height_on(plot, x, place)) for x in nees_band())
+            band = chi_square_band(STATE_DIMENSION)
+            low, high = (float(height_on(plot, x, place)) for x in band)
             canvas.box(place.left, high, place.width, low - high, (214, 236, 229))
             middle = height_on(plot, float(STATE_DIMENSION), place)
             canvas.dashes(np.stack([across, np.full(2, middle)], axis=1), colors.GREEN, 0.8)
-        draw_axes(canvas, plot, place)
+        right, bottom = place.left + place.width, place.top + place.height
+        for tick in plot.ticks:
+            y = height_on(plot, tick, place)
+            canvas.line(np.array([[place.left, y], [right, y]]), colors.PALE, 0.6)
+        corners = [[place.left, place.top], [place.left, bottom], [right, bottom]]
+        canvas.line(np.array(corners), colors.GREY, 0.8)
 
     def _draw_curves(self, plot: Plot, place: Box, flight: Flight, rows: NDArray[np.void]) -> None:
-        begin = max(0.0, float(rows["time"][-1]) - WINDOW_SECONDS)
+        begin = max(0.0, float(rows["time"][-1]) - self._seconds)
         stride = -(-len(rows) // 240)
         shown = rows[(len(rows) - 1) % stride :: stride]
-        x = place.left + place.width * (shown["time"] - begin) / WINDOW_SECONDS
+        x = place.left + place.width * (shown["time"] - begin) / self._seconds
         for column, _, color in reversed(plot.curves):
             if shows(flight, column):
                 values = shown[column]

@@ -73,12 +73,12 @@ def quantity(name: str, shown: str | None = None) -> GroupField[NDArray[Any]]:
 
 
 def record(name: str, shape: str, unit: str, frame: str, meaning: str) -> GroupField[NDArray[Any]]:
-    """Make a field of the flights' records that is no quantity of its own."""
+    """Make a field of the flights' records that is not among QUANTITIES."""
     return GroupField(lambda group: group._flights.rows(name), shape, unit, frame, meaning)
 
 
 def shown(name: str, shape: str, unit: str, frame: str, meaning: str) -> GroupField[Floats]:
-    """Make a field of `quad_gym.records.SHOWN` that is no quantity of its own."""
+    """Make a field of `quad_gym.records.SHOWN` that is not among QUANTITIES."""
     return GroupField(lambda group: group._flights.shown(name), shape, unit, frame, meaning)
 
 

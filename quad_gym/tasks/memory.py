@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.kernels.stages import needed_stages
 from quad_gym.records import SHOWN, SHOWN_SHAPES, SHOWN_SIZE, WIDTH, Command, Result
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
-_GAP = 8
-"""Padding between two rows of the memory: a cache line."""
+_GAP = 8  # padding between two rows of the memory: a cache line
 _JUDGED = slice(int(Result.REWARD), int(Result.ENDING) + 1)
 
 

@@ -53,7 +53,7 @@ class Joiner:
     def join(self, flights: ReadableBatch, task: Task, value: Any, builtin: Singles) -> Singles:
         """Assemble observations from the return value of `observe` and the built-in ones, (n, k).
 
-        Sizes must be those of the first call, and values finite, except for flights whose state is
+        Sizes must be as in the first call, and values finite, except for flights whose state is
         not finite: finite numbers replace theirs.
         """
         parts = answers.parts(task, value, self._count)

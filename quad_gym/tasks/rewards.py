@@ -67,8 +67,7 @@ Weighted = tuple[float, Term]
 class Sum(Term):
     """Weighted sum of terms."""
 
-    terms: tuple[Weighted, ...]
-    """Pairs of a weight and a term"""
+    terms: tuple[Weighted, ...]  # pairs of a weight and a term
 
     def __call__(self, view: "View") -> Floats:
         """Return the weighted sum, (n,)."""
@@ -83,8 +82,7 @@ class Sum(Term):
 class Constant(Term):
     """Constant term; numbers in sums are converted to it."""
 
-    value: float = 1.0
-    """Value in every step"""
+    value: float = 1.0  # value in every step
 
     def __call__(self, view: "View") -> Floats:
         """Return the constant, (n,)."""
@@ -95,8 +93,7 @@ class Constant(Term):
 class FunctionTerm(Term):
     """Term computed by a function of a view; functions in sums are converted to it."""
 
-    function: "Callable[[View], Floats]"
-    """Function that takes a `View` and returns (n,)"""
+    function: "Callable[[View], Floats]"  # function that takes a `View` and returns (n,)
 
     def __call__(self, view: "View") -> Floats:
         """Return the values of the function, (n,)."""
@@ -118,8 +115,7 @@ def _terms(value: Any) -> tuple[Weighted, ...]:
 class Tracking(Term):
     """exp(-rate e) of the true position error e: 1 on the reference, decreasing with distance."""
 
-    rate: float = 2.0
-    """Rate of decay with distance [1/m]"""
+    rate: float = 2.0  # rate of decay with distance [1/m]
 
     def __call__(self, view: "View") -> Floats:
         """Return values in [0, 1], (n,)."""
@@ -188,8 +184,7 @@ class Crash(Term):
 class Uncertainty(Term):
     """Uncertainty of a block of the filter's state, computed from its covariance."""
 
-    of: str = "position"
-    """Block of the state, one of `BLOCKS`"""
+    of: str = "position"  # block of the state, one of `BLOCKS`
     measure: str = "trace"
     """Measure of uncertainty. "trace": trace of the covariance, the sum of variances; "log_det":
     logarithm of its determinant, which is proportional to the squared volume of the covariance

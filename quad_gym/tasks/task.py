@@ -30,14 +30,10 @@ class TaskError(RuntimeError):
 class ObservationSpec(NamedTuple):
     """Unit, frame and bounds of an array that `observe` returns."""
 
-    unit: str = "-"
-    """Unit as listed in the table of observations; "-": dimensionless"""
-    frame: str = "-"
-    """Frame of the components. I: inertial, B: body, "-": none"""
-    low: float = -BOUND
-    """Lower bound; smaller values are clipped"""
-    high: float = BOUND
-    """Upper bound; larger values are clipped"""
+    unit: str = "-"  #: unit as listed in the table of observations; "-": dimensionless
+    frame: str = "-"  #: Frame of the components. I: inertial, B: body, "-": none
+    low: float = -BOUND  #: lower bound; smaller values are clipped
+    high: float = BOUND  #: upper bound; larger values are clipped
 
 
 class Task:

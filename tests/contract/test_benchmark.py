@@ -13,8 +13,7 @@ from quad_gym.experiments.benchmark import learning, stages
 from quad_gym.experiments.benchmark.filter import repeated
 from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.experiments.benchmark.timing import Timing, by_turns
-from quad_gym.kernels.compiling import Stage
-from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.params.suites import SUITES
 from quad_gym.records import POSITION_BLOCK, WIDTH
 

@@ -24,7 +24,7 @@ def run(folder, line=""):
 @pytest.fixture
 def no_figures(monkeypatch):
     """Leave out the figures, which take most of the time of a short run."""
-    monkeypatch.setattr(script, "write_figures", lambda results, setup: [])
+    monkeypatch.setattr(script.circle, "write_figures", lambda results, setup: [])
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.kernels.compiling import cores
+from quad_gym.kernels import cores
 from tests.builders import actions_of, vec_env
 from tests.contract.comparing import assert_same
 from tests.contract.hovering import SHORT, further, hover

@@ -13,8 +13,8 @@ from quad_gym.commands.main import main
 from quad_gym.kernels.compiling import cache as caches
 from quad_gym.kernels.compiling import workers
 from quad_gym.kernels.compiling.decorators import EntryDispatcher
-from quad_gym.kernels.compiling.stages import SOURCES, Stage
 from quad_gym.kernels.compiling.workers import dispatcher_of
+from quad_gym.kernels.stages import SOURCES, Stage
 
 ROOT = Path(__file__).parents[2]
 FIRST_RESET = """

@@ -61,3 +61,9 @@ def test_looking_at_markers_pays():
     names = run("look_at_markers.py")
     toward, away = (line.get_ydata() for line in names["of_reward"].lines)
     assert toward[:20].mean() > away[:20].mean() + 0.2
+
+
+def test_a_foreign_policy_adapts_to_a_mass_that_it_is_not_given():
+    pytest.importorskip("foundation_policy")
+    names = run("foreign_policy.py")
+    assert max(names["errors"][:5]) < 40.0  # mm, half to twice the assumed mass

@@ -71,14 +71,6 @@ def test_a_magnetometer_measures_the_field_with_its_errors():
     np.testing.assert_array_equal(batch.record("aid_scalar")[:, MAGNETOMETER], declination)
 
 
-def test_the_default_field_is_the_models_at_the_laboratory():
-    """East, north and down of the World Magnetic Model 2025 at 2026.0, to 0.1 microtesla."""
-    east, north, up = MagnetometerParams().field_I
-    assert np.hypot(east, north) == pytest.approx(24.06e-6, abs=1e-7)
-    assert up == pytest.approx(-39.53e-6, abs=1e-7)
-    assert east / north == pytest.approx(np.tan(np.radians(3.13)), rel=1e-6)
-
-
 @pytest.mark.parametrize("phase", [0.0, 0.5, None])
 def test_sensors_measure_at_their_rates_and_phases(phase):
     suite = LAB.replace(

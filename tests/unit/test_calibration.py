@@ -52,16 +52,16 @@ def found(table):
 def test_noise_of_a_simulated_log_is_found(found, name, true):
     """Within the interval widened by a half: errors that are no white noise count as noise, too.
 
-    Vibration and density are one white noise, which seven seconds hardly determine.
+    Vibration and density of the IMU are one white noise, which seven seconds hardly determine.
     """
     (number,) = (n for n in found.numbers if n.number.name == name)
-    assert number.determined or name == "imu.accel_noise_density"
+    assert number.determined or name.startswith("imu")
     assert number.low / 1.5 < true < 1.5 * number.high, number
 
 
 def test_late_stamps_of_a_simulated_log_are_found(found):
-    """To 0.08 s: seven seconds of a search with GNSS noise of 0.2 m and 0.3 m/s show no more."""
-    assert found.delays["gnss"] == pytest.approx(DELAY, abs=0.08)
+    """To twice the standard deviation for seven seconds of GNSS with 0.3 m/s of noise."""
+    assert found.delays["gnss"] == pytest.approx(DELAY, abs=0.05)
     assert found.suite.log_delays.gnss == found.delays["gnss"]
 
 

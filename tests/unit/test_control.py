@@ -96,11 +96,6 @@ def test_torque_is_scaled_by_the_largest_factor_rotors_allow(thrust, torque):
     assert allocated(thrust, torque).max() <= FMAX * (1.0 + 1e-12)
 
 
-def test_pure_thrust_beyond_the_limit_is_nine_tenths_of_it_all():
-    np.testing.assert_allclose(allocated(1e3, np.zeros(3)), 0.9 * FMAX, rtol=1e-13)
-    np.testing.assert_array_equal(allocated(-1.0, np.zeros(3)), 0.0)
-
-
 @pytest.mark.parametrize("thrust", [5.0, 20.0, 1e3])
 def test_rotors_on_unequal_arms_stay_within_their_limit(thrust):
     front, rear = 0.1, -0.3

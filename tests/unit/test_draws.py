@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.kernels.single import sense_features, sense_gnss, sense_imu, step_biases
+from quad_gym.kernels.entries import sense_features, sense_gnss, sense_imu, step_biases
 from quad_gym.packing.flight import params_record
 from quad_gym.records import FEATURE_SLICE, FLIGHT
 from tests.unit.alarms import alarm_score

@@ -82,6 +82,11 @@ def test_it_measures_what_a_plain_loop_measures(task, size, kind, mode):
             np.testing.assert_allclose(values, wanted, rtol=1e-9, err_msg=name)
     if task == "hover":
         assert 0 < episodes.crashed.sum() < 24
+    summary = episodes.summary()
+    assert summary["episodes"] == 24
+    assert summary["return"] == pytest.approx(episodes.returns.mean())
+    assert summary["crash_rate"] == pytest.approx(episodes.crashed.sum() / 24)
+    assert summary["late_error"] == pytest.approx(np.nanmean(episodes.late_error))
 
 
 def test_a_course_that_is_finished_is_no_crash():
@@ -90,16 +95,6 @@ def test_a_course_that_is_finished_is_no_crash():
     assert (episodes.ending == "last_gate").all()
     assert not episodes.crashed.any()
     assert (episodes.gates_passed == 1).all()
-
-
-def test_the_summary_holds_means_and_the_share_that_crashed():
-    env = QuadVectorEnv(24, "hover", max_episode_steps=LIMIT, max_tilt=0.9)
-    episodes = roll_out(Wobbly(0.8), env, seed=100)
-    summary = episodes.summary()
-    assert summary["episodes"] == 24
-    assert summary["return"] == pytest.approx(episodes.returns.mean())
-    assert summary["crash_rate"] == pytest.approx(episodes.crashed.sum() / 24)
-    assert summary["late_error"] == pytest.approx(np.nanmean(episodes.late_error))
 
 
 def test_evaluate_is_a_roll_out_of_an_environment_made_for_it():

@@ -338,23 +338,3 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
     dw = torque / np.diag(vehicle.inertia)[:2] * DT
     measured = (faulty.record("w") - calm.record("w"))[:, :2]
     np.testing.assert_allclose(measured, dw, rtol=0.05, atol=5e-3)
-
-
-# ---- the filter and the gate -------------------------------------------------------------------
-
-
-def test_the_gate_rejects_most_outliers_and_says_so():
-    batch = fly(RTK, 100, faults=GnssOutliers(share=0.2), threads=1)
-    caught = sound = outliers = fixes = 0
-    for tick in range(800):
-        batch.step()
-        if tick < 400:
-            continue
-        now = batch.record("block_valid")[:, POSITION_BLOCK] > 0.0
-        wild = batch.record("outlier") > 0.0
-        rejected = batch.record("gate")[:, POSITION_BLOCK] == 2.0
-        outliers, fixes = outliers + (now & wild).sum(), fixes + (now & ~wild).sum()
-        caught += (now & wild & rejected).sum()
-        sound += (now & ~wild & rejected).sum()
-    assert caught / outliers > 0.99
-    assert sound / fixes < 0.01

@@ -20,7 +20,7 @@ from quad_gym.estimation.starts import state_at_rest
 from tests.logged_flights import Recorded, flown
 
 FOLDER = Path(tempfile.mkdtemp(prefix="quad_gym_filters_"))
-CROSS = "aarch64-linux-gnu-gcc"
+AARCH64, ARM = "aarch64-linux-gnu", "arm-linux-gnueabihf"
 needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler (cc)")
 needs_wasm = pytest.mark.skipif(
     not (shutil.which("clang") and shutil.which("node") and Path("/usr/lib/wasm32-wasi").exists()),
@@ -28,8 +28,12 @@ needs_wasm = pytest.mark.skipif(
 )
 needs_cmake = pytest.mark.skipif(not shutil.which("cmake"), reason="no CMake")
 needs_aarch64 = pytest.mark.skipif(
-    not (shutil.which(CROSS) and shutil.which("qemu-aarch64-static")),
+    not (shutil.which(f"{AARCH64}-gcc") and shutil.which("qemu-aarch64-static")),
     reason="no gcc-aarch64-linux-gnu, or no qemu-user-static",
+)
+needs_arm = pytest.mark.skipif(
+    not (shutil.which(f"{ARM}-gcc") and shutil.which("qemu-arm-static")),
+    reason="no gcc-arm-linux-gnueabihf, or no qemu-user-static",
 )
 FROM_REST = ("--start-position", "0", "0", "1.5", "--heading", "20")
 REST = {"position": (0.0, 0.0, 1.5), "heading": math.radians(20.0)}
@@ -49,16 +53,16 @@ def exported(name, target="x86-64", policy=None):
 
 
 @functools.cache
-def logged(name):
+def logged(name, seconds=3.0, most_ticks=3):
     """A log with delays, jitter and losses, without columns of sensors that the suite lacks."""
     suite = quad_gym.sensor_suite(name)
-    recorded = Recorded(flown(suite, 3.0), suite)
+    recorded = Recorded(flown(suite, seconds), suite, most_ticks=most_ticks)
     table = recorded.table()
     absent = [k for k, v in table.items() if "gnss" in k and np.isnan(v).all()]
     absent += [k for k in table if k.startswith("pixel") and suite.camera is None]
     recorded.table = lambda: {k: v for k, v in table.items() if k not in absent}
-    recorded.write_csv(FOLDER / f"{name}.csv")
-    return FOLDER / f"{name}.csv"
+    recorded.write_csv(FOLDER / f"{name}_{seconds:g}.csv")
+    return FOLDER / f"{name}_{seconds:g}.csv"
 
 
 def example(name, target, *flags, compiler="cc"):
@@ -107,12 +111,45 @@ def test_example_starts_as_a_replay_does(option, tmp_path):
     require_equal(found, log, quad_gym.sensor_suite("consumer"), start)
 
 
-@needs_aarch64
+def on_aarch64(name, log):
+    program = example(name, "aarch64", "-static", compiler=f"{AARCH64}-gcc")
+    return estimates("qemu-aarch64-static", program, log)
+
+
+def on_arm(name, log):
+    """The code for Cortex-M7, without the attributes that forbid its use in a program of Linux."""
+    folder = exported(name, "cortex-m7")
+    program, flat = folder / "example", folder / "without_attributes.a"
+    if not program.exists():
+        strip = [f"{ARM}-objcopy", "--remove-section", ".ARM.attributes", folder / LIBRARY, flat]
+        subprocess.run(strip, check=True)
+        line = [f"{ARM}-gcc", "-O2", "-static", "-mthumb", folder / "main.c", flat, "-lm"]
+        subprocess.run([*line, "-o", program], check=True)
+    return estimates("qemu-arm-static", "-cpu", "max", program, log)
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        pytest.param(on_aarch64, id="aarch64", marks=needs_aarch64),
+        pytest.param(on_arm, id="cortex-m7", marks=needs_arm),
+    ],
+)
 @pytest.mark.parametrize("name", ["rtk", "consumer"])
-def test_example_on_aarch64_prints_what_a_replay_computes_here(name):
-    program = example(name, "aarch64", "-static", compiler=CROSS)
-    found = estimates("qemu-aarch64-static", program, logged(name))
-    require_equal(found, logged(name), quad_gym.sensor_suite(name), {})
+def test_example_on_a_foreign_processor_prints_what_a_replay_computes_here(run, name):
+    require_equal(run(name, logged(name)), logged(name), quad_gym.sensor_suite(name), {})
+
+
+@pytest.mark.slow  # two minutes to fly, three to filter
+@needs_compiler
+@needs_aarch64
+@needs_arm
+def test_examples_print_a_replay_of_1e5_samples():
+    suite, log = quad_gym.sensor_suite("rtk"), logged("rtk", 510.0, 1)
+    for run in (lambda *_: estimates(example("rtk", "x86-64"), log), on_aarch64, on_arm):
+        found = run("rtk", log)
+        assert len(found[1]) > 100_000
+        require_equal(found, log, suite, {})
 
 
 @needs_wasm

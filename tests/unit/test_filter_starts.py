@@ -10,6 +10,7 @@ import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.records import Aid
 from tests.field_flights import fly
+from tests.filter_states import set_at_rest
 from tests.level_flights import MAGNETIC, R_IG, LevelFlight
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
@@ -68,42 +69,6 @@ def test_errors_at_the_start_are_as_large_as_the_covariance_says(how):
     for part in parts:
         assert low < part < high
     assert kf.heading_known == (how != "nothing")
-
-
-def test_the_magnetic_heading_hangs_on_tilt_and_iron():
-    """The joint covariance: its errors follow from the same draws, by finite differences."""
-    flight = LevelFlight(MAGNETIC, np.random.default_rng(3))
-    kf = start(flight, UnscentedKalmanFilter(MAGNETIC), "magnetometer")
-    L = kf._engine.read("L")[0]
-    rows = kf._engine.read("L_slow")[0][:, :21]
-    joint = np.vstack([np.hstack([L, np.zeros((15, 6))]), rows[:6]])
-    P = joint @ joint.T
-    tilt, yaw = P[6:8, 6:8], P[8, 6:8]
-    m = MAGNETIC.magnetometer
-
-    def heading(roll=0.0, pitch=0.0, iron=(0.0, 0.0), turn=0.0):
-        field = np.array([*kf.R_BI @ np.array(m.field_I)])
-        c, s = math.cos(turn), math.sin(turn)
-        e, n, u = m.field_I
-        field = kf.R_BI @ np.array([c * e + s * n, c * n - s * e, u])
-        # a small rotation R(e) = 1 - [e x] of what is measured
-        field = field + np.cross(field, [roll, pitch, 0.0]) + np.array([*iron, 0.0])
-        level = kf.R_BI @ np.array(m.field_I)
-        # by how much the level filter then errs: the true less the estimated angle
-        return math.atan2(field[1], field[0]) - math.atan2(level[1], level[0])
-
-    d = 1e-6
-    by_tilt = np.array([heading(roll=d), heading(pitch=d)]) / d
-    np.testing.assert_allclose(yaw, by_tilt @ tilt, rtol=1e-4)
-    by_iron = np.array([heading(iron=(1e-12, 0.0)), heading(iron=(0.0, 1e-12))]) / 1e-12
-    np.testing.assert_allclose(P[8, 15:17], by_iron * m.hard_iron_sigma**2, rtol=1e-3)
-    by_turn = heading(turn=d) / d
-    order = kf._engine.settings["aid_scalar"][0, 1]
-    np.testing.assert_allclose(P[8, 15 + order], by_turn * m.declination_sigma**2, rtol=1e-3)
-    variance = by_tilt @ tilt @ by_tilt + (by_iron @ by_iron) * m.hard_iron_sigma**2
-    variance += (by_turn * m.declination_sigma) ** 2
-    variance += (m.noise_sigma / math.hypot(*m.field_I[:2])) ** 2
-    np.testing.assert_allclose(P[8, 8], variance, rtol=1e-3)
 
 
 @pytest.mark.parametrize("suite", [ONE_ANTENNA, quad_gym.sensor_suite("consumer")])
@@ -256,3 +221,12 @@ def test_suites_without_the_sensor_are_refused():
         lab.initialize(FIX, gnss_velocity_G=SPEED)
     lab.initialize(FIX, gnss_velocity_G=SPEED, velocity_sigma=0.1, heading=0.0)
     np.testing.assert_allclose(np.sqrt(np.diag(lab.covariance))[6:9], [0.03, 0.03, 0.05])
+    indoor = UnscentedKalmanFilter(quad_gym.sensor_suite("indoor"))
+    set_at_rest(indoor, np.eye(15) * 1e-2)
+    for kf, sensor, given in (
+        (lab, "barometer", {"barometer": 1.0}),
+        (lab, "magnetometer", {"magnetometer": SPEED}),
+        (indoor, "GNSS", {"gnss_position_G": FIX}),
+    ):
+        with pytest.raises(ValueError, match=sensor):
+            kf.update(**given)

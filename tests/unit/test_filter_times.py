@@ -294,10 +294,12 @@ def test_a_covariance_is_what_a_plain_update_makes_of_it(kind, suite):
         ({"gnss_sigma": math.nan}, "gnss_sigma"),
         ({"velocity_sigma": 0.1}, "velocity_sigma must come with"),
         ({"barometer": 0.1, "barometer_sigma": -1.0}, "barometer_sigma"),
+        ({"barometer": math.nan}, "barometer"),
+        ({"magnetometer": np.ones(2)}, "magnetometer"),
         ({"sigma": 1.0}, "sigma is not a keyword of update"),
     ],
 )
-def test_bad_noise_raises_and_changes_nothing(given, message):
+def test_bad_measurements_and_noise_raise_and_change_nothing(given, message):
     kf, same = started(), started()
     with pytest.raises((ValueError, TypeError), match=message):
         kf.update(np.zeros(3), **given)

@@ -28,15 +28,9 @@ def test_start_in_motion_is_uncertain(speed, turning):
     assert form.initial_velocity_variance == pytest.approx((1.0 + speed) ** 2)
 
 
-def test_start_at_rest_stays_as_it_is():
-    assert with_wide_start(RTK, log()) is RTK
-
-
-def test_noise_of_positions_is_no_motion():
-    suite = quad_gym.sensor_suite("consumer")
-    assert with_wide_start(suite, log(noise=0.2)) is suite
-
-
-def test_a_filter_that_solves_wahbas_problem_keeps_its_start():
-    lab = quad_gym.sensor_suite("lab")
-    assert with_wide_start(lab, log(speed=3.0)) is lab
+@pytest.mark.parametrize(
+    ("name", "motion"), [("rtk", {}), ("consumer", {"noise": 0.2}), ("lab", {"speed": 3.0})]
+)
+def test_rest_noise_and_wahbas_problem_leave_the_start(name, motion):
+    suite = quad_gym.sensor_suite(name)
+    assert with_wide_start(suite, log(**motion)) is suite

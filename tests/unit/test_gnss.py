@@ -35,60 +35,25 @@ kernels = Compiled(
 )
 
 
-def noise_map(r_b, sigma_b, floor):
-    """The Jacobian of the measured baseline with respect to the three normals, at zero noise."""
-    h = 1e-6 / max(sigma_b, np.sqrt(floor) / np.linalg.norm(r_b))
-    normals = h * np.concatenate([np.eye(3), -np.eye(3)])
-    measured = kernels.on_lanes(
-        r_b=np.tile(r_b, (6, 1)),
-        normals=normals,
-        sigma_b=np.full(6, sigma_b),
-        floor=np.full(6, floor),
-        length=np.full(6, np.linalg.norm(r_b)),
-    )["measured"]
-    return (measured[:3] - measured[3:]).T / (2.0 * h)
-
-
-@given(directions, st.floats(0.05, 5.0), st.floats(0.005, 0.2))
-def test_noise_of_a_baseline_has_a_covariance_of_rank_two(u, length, sigma_b):
-    R_bG = noise_map(length * u, sigma_b, 0.0)
-    R_bG = R_bG @ R_bG.T
-    unit = (length * sigma_b) ** 2
-    np.testing.assert_allclose(R_bG, unit * (np.eye(3) - np.outer(u, u)), rtol=0, atol=1e-8 * unit)
-    eigenvalues = np.linalg.eigvalsh(R_bG) / unit
-    np.testing.assert_allclose(eigenvalues, [0.0, 1.0, 1.0], rtol=0.0, atol=1e-8)
-    assert eigenvalues.min() > -1e-15  # positive semidefinite
-    assert np.linalg.matrix_rank(R_bG, tol=1e-6 * unit) == 2
-
-
-@given(directions, st.floats(0.05, 5.0))
-def test_the_floor_adds_to_the_variance_across_the_baseline(u, length):
-    noise = noise_map(length * u, 0.05, FLOOR)
-    across = (length * 0.05) ** 2 + FLOOR
-    expected = across * (np.eye(3) - np.outer(u, u))
-    np.testing.assert_allclose(noise @ noise.T, expected, rtol=0.0, atol=1e-8 * across)
-
-
-@given(directions, st.tuples(*[st.floats(-8.0, 8.0)] * 3), st.floats(0.1, 3.0))
-def test_the_measured_baseline_has_its_known_length(u, normals, length):
+@given(
+    directions,
+    st.tuples(*[st.floats(-8.0, 8.0)] * 3),
+    st.floats(0.005, 0.5),
+    st.sampled_from([0.0, FLOOR, 1e-4]),
+    st.floats(0.05, 5.0),
+)
+def test_noisy_baseline_has_the_reports_covariance_and_its_length(u, normals, sigma_b, floor, l_b):
+    """Drawn by the symmetric root of the covariance, before it is scaled to the known length."""
+    R_bG = (l_b * sigma_b) ** 2 * (np.eye(3) - np.outer(u, u)) + floor * np.eye(3)
+    values, vectors = np.linalg.eigh(R_bG)
+    noisy = l_b * u + vectors @ (np.sqrt(values.clip(0.0)) * (vectors.T @ normals))
+    expected = l_b * noisy / np.linalg.norm(noisy)
     for run in (kernels.on_floats, kernels.on_lanes):
         measured = run(
-            r_b=[length * u], normals=[normals], sigma_b=[0.05], floor=[FLOOR], length=[length]
+            r_b=[l_b * u], normals=[normals], sigma_b=[sigma_b], floor=[floor], length=[l_b]
         )["measured"][0]
-        assert np.linalg.norm(measured) == pytest.approx(length, rel=1e-15)
-
-
-@given(directions, st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.floats(0.1, 0.5))
-def test_large_noise_is_drawn_before_scaling(u, normals, sigma_b):
-    length, floor = 0.19, 1e-4
-    R_bG = (length * sigma_b) ** 2 * (np.eye(3) - np.outer(u, u)) + floor * np.eye(3)
-    values, vectors = np.linalg.eigh(R_bG)
-    noisy = length * u + vectors @ (np.sqrt(values) * (vectors.T @ normals))
-    measured = kernels.on_floats(
-        r_b=[length * u], normals=[normals], sigma_b=[sigma_b], floor=[floor], length=[length]
-    )["measured"][0]
-    expected = length * noisy / np.linalg.norm(noisy)
-    np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-7 * l_b)
+        assert np.linalg.norm(measured) == pytest.approx(l_b, rel=1e-15)
 
 
 def measurements(params, position, R_BI, count=SAMPLES):
@@ -125,15 +90,6 @@ def test_sampled_baselines_have_the_reports_covariance(flight):
     np.testing.assert_allclose(np.linalg.norm(baselines, axis=1), length, rtol=1e-14)
 
 
-def test_position_and_baseline_noise_are_independent(flight):
-    *_, positions, baselines = flight
-    noise = np.concatenate([positions - positions.mean(0), baselines - baselines.mean(0)], axis=1)
-    correlation = np.corrcoef(noise.T)[:3, 3:]
-    assert np.abs(correlation).max() < 5.5 / np.sqrt(SAMPLES)
-    serial = (noise[1:] * noise[:-1]).mean(axis=0) / noise.var(axis=0)
-    assert np.abs(serial).max() < 5.5 / np.sqrt(SAMPLES)
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_without_noise_the_geometry_is_exact(seed):
     rng = np.random.default_rng(seed)
@@ -165,14 +121,5 @@ def test_without_noise_the_geometry_is_exact(seed):
 def test_bad_input_is_refused_by_name(name, position, R_BI):
     with pytest.raises(ValueError, match=f"^{name} must"):
         GnssReceiver(LAB, np.random.default_rng(1)).measure(position, R_BI)
-
-
-def test_equal_generators_give_equal_measurements():
-    first, again, other = (
-        GnssReceiver(LAB, np.random.default_rng(seed)).measure(np.zeros(3), np.eye(3))[0]
-        for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).all()
     with pytest.raises(ValueError, match=r"^rng must"):
         GnssReceiver(LAB, 1)

@@ -1,79 +1,20 @@
 """The slow error of GNSS positions among the filter's states."""
 
-import decimal
-from decimal import Decimal
-
 import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import GnssJump, GnssOutliers
 from quad_gym.records import POSITION_BLOCK
-from tests.circle_flight import record_circle
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.reference_late import Rewinding
-from tests.reference_ukf import TOLERANCES, PlainEKF, PlainUKF, array_of
+from tests.reference_ukf import PlainUKF
 
 CONSUMER, LAB = quad_gym.sensor_suite("consumer").simplified(), quad_gym.sensor_suite("lab")
-DRIFTING = LAB.replace(gnss=LAB.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=20.0))
 
 
 def with_filter(suite, **choices):
     return suite.replace(estimator=suite.estimator.replace(**choices))
-
-
-@pytest.mark.parametrize(
-    "kinds", [(UnscentedKalmanFilter, PlainUKF), (ExtendedKalmanFilter, PlainEKF)]
-)
-@pytest.mark.parametrize(
-    "suite",
-    [
-        DRIFTING,
-        DRIFTING.replace(camera=None),
-        with_filter(DRIFTING, integration="midpoint", attitude_reset=True, alpha=0.7),
-        with_filter(DRIFTING, attitude_reset=True),
-    ],
-    ids=["with camera", "GNSS alone", "field filter", "Euler and turn"],
-)
-def test_filter_equals_a_plain_one_with_the_drift_in_its_state(suite, kinds):
-    """The plain one computes in 45 digits; measurements come and go."""
-    ours_class, plain_class = kinds
-    ticks, seed = 14, 3
-    recording = record_circle(suite, ticks, seed)
-    recording.gnss_position += np.linspace(0.0, 0.3, ticks)[:, np.newaxis]
-    has = np.random.default_rng(seed).random((ticks, 2)) < 0.7
-    with decimal.localcontext() as context:
-        context.prec = 45
-        ours, plain = ours_class(suite), plain_class(suite, Decimal)
-        for one in (ours, plain):
-            one.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
-        for k in range(ticks):
-            for one in (ours, plain):
-                one.update(
-                    recording.gnss_position[k] if has[k, 0] else None,
-                    recording.gnss_baseline[k] if has[k, 1] else None,
-                    recording.pixels[k],
-                )
-                one.predict(recording.gyro[k], recording.accel[k])
-        for name, tolerance in (TOLERANCES | {"gnss_drift": 1e-9}).items():
-            gap = abs(array_of(Decimal, getattr(ours, name)) - getattr(plain, name)).max()
-            assert float(gap) < tolerance, name
-        P = plain.P.astype(float)
-    sigma = np.sqrt(np.diag(P))
-    relative = np.outer(sigma, sigma)
-    assert abs((ours.covariance - P[:15, :15]) / relative[:15, :15]).max() < 1e-7
-    assert abs((ours.gnss_drift_covariance - P[15:, 15:]) / relative[15:, 15:]).max() < 1e-7
-    assert abs(ours.gnss_drift).max() > 0.01  # there was something to find
-    assert ours.status == 0
-
-
-def test_a_filter_without_a_slow_error_has_none():
-    ours = UnscentedKalmanFilter(LAB)
-    ours.initialize(np.ones(3), np.array([0.1, 0.0, 0.0]))
-    ours.update(gnss_position_G=np.ones(3))
-    np.testing.assert_array_equal(ours.gnss_drift, 0.0)
-    np.testing.assert_array_equal(ours.gnss_drift_covariance, 0.0)
 
 
 def test_a_slow_error_in_one_axis_leaves_the_others_without():

@@ -17,7 +17,9 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import FEATURE_SLICE, Autoreset, Control, Source
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
+from quad_gym.sensors import Camera, GnssReceiver, Imu
 from quad_gym.vehicle import state_derivative
+from tests.body_states import random_state
 from tests.builders import batch as flights_of
 from tests.filter_states import set_at_rest
 
@@ -278,3 +280,41 @@ def test_errors_of_scale_and_alignment_add_noise_in_a_maneuver(kind):
     np.testing.assert_allclose(scaled, noisy, rtol=1e-12, atol=1e-18)
     grown = np.diag(aligned - exact)[3:6]
     np.testing.assert_allclose(grown, dt * (error * excess) ** 2 / 3.0, rtol=1e-6)
+
+
+# ---- sensors of one vehicle -------------------------------------------------------------------
+
+
+def test_classes_of_one_vehicle_have_every_effect():
+    """Two sensors of the same seed differ by the effect alone; its size is tested above."""
+
+    def pair(kind, plain, **changes):
+        both = plain, plain.replace(**changes)
+        return [kind(params, np.random.default_rng(1)) for params in both]
+
+    place, R_BI = np.array([0.0, 0.0, 6.0]), np.eye(3)
+    true, turned = pair(GnssReceiver, LAB.gnss, heading_error_sigma=0.05)
+    (fix, baseline), (same, other) = (gnss.measure(place, R_BI) for gnss in (true, turned))
+    np.testing.assert_array_equal(fix, same)
+    assert (baseline != other).any()
+    camera, state = quad_gym.sensor_suite("rtk").camera, random_state(1)
+    free, near = pair(Camera, camera.replace(max_range=math.inf), max_range=7.7)
+    seen = np.isfinite(free.measure(place, R_BI)).sum()
+    assert 0 < np.isfinite(near.measure(place, R_BI)).sum() < seen
+    below, upward = np.array([0.0, 0.0, -6.0]), np.diag([1.0, -1.0, -1.0])
+    free, hidden = pair(Camera, camera.replace(ground_hides=False), ground_hides=True)
+    assert np.isfinite(free.measure(below, upward)).any()
+    assert np.isnan(hidden.measure(below, upward)).all()
+    sharp, blurred = pair(Camera, camera.replace(exposure=0.0), exposure=0.01)
+    rates = np.array([0.0, 2.0, 1.0])
+    gap = blurred.measure(place, R_BI, rates) - sharp.measure(place, R_BI)
+    assert 0.0 < np.nanmax(abs(gap)) <= 0.005 * camera.focal_length * np.linalg.norm(rates)
+    with pytest.raises(ValueError, match="body_rates must have shape"):
+        blurred.measure(place, R_BI, np.zeros(2))
+    for samples, since in (("instant", {}), ("average", {"since": state})):
+        imu = LAB.imu.replace(samples=samples)
+        for name, size in {**ERRORS, "accel_vibration": 0.2, "gyro_vibration": 0.01}.items():
+            exact, erring = (one.measure(state, **since) for one in pair(Imu, imu, **{name: size}))
+            concerned = name.startswith("accel")
+            assert (exact[concerned] != erring[concerned]).all()
+            np.testing.assert_array_equal(exact[not concerned], erring[not concerned])

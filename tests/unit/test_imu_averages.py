@@ -9,13 +9,10 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.single import integrate_flight
-from quad_gym.packing.flight import params_record
-from quad_gym.records import FLIGHT, Source
+from quad_gym.records import Source
 from quad_gym.sensors import Imu
 from quad_gym.vehicle import state_derivative
-from tests.body_states import put_state, random_state, state_of
-from tests.unit.alarms import assert_normal
+from tests.body_states import random_state, state_of
 from tests.unit.test_imu import QUIET
 
 LAB = quad_gym.sensor_suite("lab")
@@ -93,36 +90,6 @@ def test_a_sample_is_the_mean_of_what_is_felt_over_the_tick(seed):
     np.testing.assert_allclose(accel, mean, rtol=0.0, atol=1e-7)
 
 
-def test_sample_differs_from_the_plain_mean_by_coning():
-    """They fall with the square of the tick."""
-    gaps = {}
-    for dt in (0.004, 0.001):
-        total = np.zeros(2)
-        for seed in range(10):
-            start, rng = random_state(seed), np.random.default_rng(seed)
-            states, weights, end = fly_finely(start, rng.uniform(3.0, 9.0, 4), np.zeros(3), dt)
-            gyro, accel = average_sample(start, end, LEVER, dt)
-            felt = [instant_force(s, np.zeros(3), LEVER) for s in states]
-            rates = [s["body_rates"] for s in states]
-            total += [abs(gyro - weights @ rates).max(), abs(accel - weights @ felt).max()]
-        gaps[dt] = total
-    assert (gaps[0.001] > 1e-6).all()
-    assert (gaps[0.001] < gaps[0.004] / 14.0).all()
-
-
-def test_noise_and_bias_of_a_sample_are_those_of_an_instant():
-    params = LAB.imu.replace(samples="average")
-    hover = random_state(1) | {"body_rates": np.zeros(3), "velocity": np.zeros(3)}
-    imu = Imu(params, np.random.default_rng(2))
-    rows = [(imu.gyro_bias, imu.accel_bias, *imu.measure(hover, since=hover)) for _ in range(4000)]
-    gyro_bias, accel_bias, gyro, accel = (np.array(column) for column in zip(*rows, strict=True))
-    up_B = hover["R_BI"] @ [0.0, 0.0, 9.8]
-    noise = np.concatenate([gyro - gyro_bias, accel - up_B - accel_bias], axis=1)
-    gyro_variance = (np.pi / 180.0 * 0.05) ** 2 * 200.0
-    accel_variance = (9.8e-3 * 0.1) ** 2 * 200.0
-    assert_normal(noise, np.zeros(6), np.diag([gyro_variance] * 3 + [accel_variance] * 3))
-
-
 def test_a_batch_samples_the_tick_that_it_flew():
     """Its samples are those of the friendly class between its states, noise and bias apart."""
     quiet = AVERAGE.replace(imu=QUIET.replace(samples="average", lever_arm_B=LEVER))
@@ -155,21 +122,6 @@ def test_inner_loops_read_the_gyro_now_and_the_filter_the_mean():
         assert abs(batch.record("gyro") - bias - noise - middle).max() < 0.3 * spread + 1e-6
 
 
-def test_the_estimate_follows_without_a_bias_of_half_a_tick():
-    """Where the rotors speed up, averages know the mean thrust, and instants lag behind it."""
-    lags = {}
-    for suite in (LAB, AVERAGE):
-        suite = suite.replace(camera=None).scaled_noise(0.01)
-        batch = FlightBatch(200, sensors=suite, source=Source.TRUTH, run_filter=True)
-        batch.reset(seeds=range(200))
-        worst = 0.0
-        for _ in range(100):
-            batch.step()
-            worst = max(worst, abs((batch.record("v_hat") - batch.record("v"))[:, 2].mean()))
-        lags[suite.imu.samples] = worst
-    assert lags["average"] < 0.5 * lags["instant"]
-
-
 @pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-3, 1.0, 3.1])
 def test_the_turn_of_a_tick_may_be_small_or_large(turn):
     rng = np.random.default_rng(4)
@@ -179,22 +131,6 @@ def test_the_turn_of_a_tick_may_be_small_or_large(turn):
     end = start | {"R_BI": Rotation.from_rotvec(-turn * axis).as_matrix() @ start["R_BI"]}
     gyro, _ = average_sample(start, end, (0.0, 0.0, 0.0), 0.005)
     np.testing.assert_allclose(gyro * 0.005, turn * axis, rtol=0.0, atol=1e-13)
-
-
-def test_the_integrator_of_the_batch_is_the_one_that_is_sampled():
-    """A whole tick of the package's own integrator gives the same sample as SciPy's."""
-    start, dt = random_state(8), 0.005
-    voltages = np.full(4, 6.0)
-    flight, params = np.zeros(1, FLIGHT), params_record(VEHICLE, LAB)
-    put_state(flight, start)
-    flight["voltages"] = voltages
-    integrate_flight(flight, params, 1)
-    ours = state_of(flight.__getitem__, 0)
-    _, _, end = fly_finely(start, voltages, np.zeros(3), dt)
-    for one, other in zip(
-        average_sample(start, ours, LEVER, dt), average_sample(start, end, LEVER, dt), strict=True
-    ):
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-4)
 
 
 def test_samples_must_be_understood_the_same_by_all():

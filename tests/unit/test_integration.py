@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import quad_gym
-from quad_gym.kernels.single import integrate_flight
+from quad_gym.kernels.entries import integrate_flight
 from quad_gym.kernels.vehicle.dynamics import integrate
 from quad_gym.packing.flight import params_record
 from quad_gym.records import FLIGHT
@@ -107,28 +107,6 @@ def test_free_body_keeps_its_energy_and_angular_momentum(inertia):
         turned.T @ J @ end["w"], R_BI.T @ J @ w, rtol=0.0, atol=1e-9 * np.linalg.norm(J @ w)
     )
     assert np.linalg.norm(end["q"]) == pytest.approx(1.0, abs=1e-15)
-
-
-def test_steady_spin_turns_by_rate_times_time():
-    end = flown(LAB, 2.0, 4_000, w=(0.0, 0.0, 3.0))
-    expected = Rotation.from_rotvec([0.0, 0.0, 6.0]).as_matrix().T
-    np.testing.assert_allclose(quaternion_to_dcm(end["q"]), expected, rtol=0.0, atol=1e-11)
-
-
-def test_a_fall_in_vacuum_is_a_parabola():
-    r, v = np.array([1.0, -2.0, 3.0]), np.array([4.0, 5.0, 6.0])
-    end = flown(LAB.replace(disc_area=0.0), 1.5, 10, r=r, v=v, w=(1.0, 2.0, 3.0))
-    g = np.array([0.0, 0.0, -9.8])
-    np.testing.assert_allclose(end["r"], r + 1.5 * v + 0.5 * 1.5**2 * g, rtol=0.0, atol=1e-13)
-    np.testing.assert_allclose(end["v"], v + 1.5 * g, rtol=0.0, atol=1e-13)
-
-
-def test_rotors_approach_their_speed_exponentially():
-    speeds, voltages = np.array([0.0, 500.0, 2400.0, 100.0]), np.array([12.0, 1.0, 0.0, 3.0])
-    end = flown(LAB, 0.12, 200, rotor_speeds=speeds, voltages=voltages)
-    target = LAB.motor_speed_per_volt * voltages
-    expected = target + (speeds - target) * np.exp(-0.12 / LAB.motor_time_constant)
-    np.testing.assert_allclose(end["rotor_speeds"], expected, rtol=1e-9)
 
 
 STATE = {"r": (3,), "v": (3,), "q": (4,), "w": (3,), "rotor_speeds": (4,)}

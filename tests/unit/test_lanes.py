@@ -37,8 +37,6 @@ def arithmetic(f, option):
     total = x
     total += y
     f.out[16] = total
-    # a chain, which the compiler may contract to fused multiply-adds
-    f.out[17] = x * y + x * (y - 0.5) - y / (1.0 + x * x)
 
 
 def truth_of_arithmetic(x, y, option):
@@ -104,7 +102,7 @@ def bits(f, option):
     f.x = one_to_two(a)
 
 
-arithmetic_on = Compiled(arithmetic, x=(), y=(), out=(18,))
+arithmetic_on = Compiled(arithmetic, x=(), y=(), out=(17,))
 asking_on = Compiled(asking, x=(), y=(), out=(18,), any_less=(), all_less=())
 bits_on = Compiled(bits, word_a=(), word_b=(), word_out=(9,), x=())
 INSTANCES = ("on_floats", "on_lanes")
@@ -176,17 +174,6 @@ def test_words_are_added_and_turned_modulo_two_to_the_sixty_four(instance):
     ]
     np.testing.assert_array_equal(got["word_out"], np.array(expected, np.uint64))
     np.testing.assert_array_equal(got["x"], [1.0 + (i >> 12) / 2**52 for i, _ in pairs])
-
-
-@given(st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_size=1, max_size=20))
-def test_floats_and_lanes_agree_to_the_last_bits(pairs):
-    x, y = np.array(pairs).T
-    with np.errstate(all="ignore"):
-        size = np.abs(x * y) + np.abs(x * (y - 0.5)) + np.abs(y)
-    plain = arithmetic_on.on_floats(x=x, y=y)["out"]
-    lanes = arithmetic_on.on_lanes(x=x, y=y)["out"]
-    np.testing.assert_array_equal(plain[:, :17], lanes[:, :17])
-    assert (np.abs(plain[:, 17] - lanes[:, 17]) <= 4e-16 * size).all()
 
 
 @given(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from quad_gym.analysis import metrics
 from quad_gym.rotations import euler_to_dcm
@@ -80,46 +81,29 @@ def test_invalid_numbers_are_refused(function, arguments, message):
         function(*arguments)
 
 
-class TestStateError:
-    names = ("position", "velocity", "accel_bias", "gyro_bias")
-
-    def states(self, shape=()):
-        rng = np.random.default_rng(3)
-        truth = {name: rng.normal(size=(*shape, 3)) for name in self.names}
-        estimate = {name: rng.normal(size=(*shape, 3)) for name in self.names}
-        truth["R_BI"] = euler_to_dcm(rng.uniform(-1, 1, size=(*shape, 3)))
-        estimate["R_BI"] = euler_to_dcm(rng.uniform(-1, 1, size=(*shape, 3)))
-        return truth, estimate
-
-    @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
-    def test_estimate_and_error_make_the_truth(self, shape):
-        truth, estimate = self.states(shape)
-        x = metrics.state_error(truth, estimate)
-        assert x.shape == (*shape, 15)
-        for name, first in zip(self.names, (0, 3, 9, 12), strict=True):
-            error = x[..., first : first + 3]
-            np.testing.assert_allclose(estimate[name] + error, truth[name], atol=1e-15)
-        R_BI = euler_to_dcm(x[..., 6:9]) @ estimate["R_BI"]
-        np.testing.assert_allclose(R_BI, truth["R_BI"], atol=1e-14)
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+def test_estimate_and_error_make_the_truth(shape):
+    names, rng = ("position", "velocity", "accel_bias", "gyro_bias"), np.random.default_rng(3)
+    truth, estimate = (
+        {name: rng.normal(size=(*shape, 3)) for name in names}
+        | {"R_BI": euler_to_dcm(rng.uniform(-1, 1, size=(*shape, 3)))}
+        for _ in range(2)
+    )
+    x = metrics.state_error(truth, estimate)
+    assert x.shape == (*shape, 15)
+    for name, first in zip(names, (0, 3, 9, 12), strict=True):
+        error = x[..., first : first + 3]
+        np.testing.assert_allclose(estimate[name] + error, truth[name], atol=1e-15)
+    R_BI = euler_to_dcm(x[..., 6:9]) @ estimate["R_BI"]
+    np.testing.assert_allclose(R_BI, truth["R_BI"], atol=1e-14)
 
 
-class TestNees:
-    def test_of_a_diagonal_covariance_is_a_sum_of_squares(self):
-        assert metrics.nees([2.0, 3.0], np.diag([4.0, 0.25])) == pytest.approx(1.0 + 36.0)
-
-    def test_does_not_depend_on_coordinates(self):
-        rng = np.random.default_rng(1)
-        B, e, A = rng.normal(size=(6, 9)), rng.normal(size=6), rng.normal(size=(6, 6))
-        P = B @ B.T
-        assert metrics.nees(A @ e, A @ P @ A.T) == pytest.approx(metrics.nees(e, P), rel=1e-9)
-
-    def test_of_consistent_errors_is_chi_square(self):
-        from scipy.stats import kstest
-
-        rng = np.random.default_rng(2)
-        P = random_covariance(rng, 15)
-        errors = rng.normal(size=(4000, 15)) @ np.linalg.cholesky(P).T
-        values = metrics.nees(errors, np.broadcast_to(P, (4000, 15, 15)))
-        assert values.shape == (4000,)
-        assert kstest(values, "chi2", args=(15,)).pvalue > 0.01
-        assert metrics.chi_square_band(15, 4000, 0.999).holds(values.mean())
+def test_nees_of_consistent_errors_is_chi_square():
+    rng = np.random.default_rng(2)
+    P = random_covariance(rng, 15)
+    errors = rng.normal(size=(4000, 15)) @ np.linalg.cholesky(P).T
+    values = metrics.nees(errors, np.broadcast_to(P, (4000, 15, 15)))
+    assert values.shape == (4000,)
+    assert kstest(values, "chi2", args=(15,)).pvalue > 0.01
+    assert metrics.chi_square_band(15, 4000, 0.999).holds(values.mean())
+    assert metrics.nees([2.0, 3.0], np.diag([4.0, 0.25])) == pytest.approx(1.0 + 36.0)

@@ -49,12 +49,6 @@ def test_motion_is_uniform_within_its_bounds(moving, hovering):
             assert stats.kstest(column, stats.uniform(-most, 2.0 * most).cdf).pvalue > 1e-4, name
 
 
-def test_components_of_the_motion_are_independent(moving):
-    found = np.corrcoef(np.hstack([moving.record(n) for n in ("r", "v", "w")]), rowvar=False)
-    found[np.diag_indices(9)] = 0.0
-    assert np.abs(found).max() < 5.0 / np.sqrt(FLIGHTS)
-
-
 @pytest.mark.parametrize("name", ["standard", "rtk", "consumer", "indoor"])
 def test_the_filter_is_consistent_after_a_moving_start(name):
     """Mean NEES at the start and in the second after it may be too small, but not too large."""

@@ -102,9 +102,9 @@ def test_usage_errors_end_with_one_line(error, capsys):
 
 def test_keywords_with_an_option_of_their_own_are_refused():
     keywords = {"radius": 2.0, "sensors": "rtk"}
-    assert leave(keywords, {"faults": "--fault"}) == keywords
+    assert leave(keywords, faults="--fault") == keywords
     with pytest.raises(ValueError, match=r"^--env must not contain sensors: use --sensors"):
-        leave(keywords, {"faults": "--fault", "sensors": "--sensors"})
+        leave(keywords, "sensors", faults="--fault")
 
 
 def test_keywords_become_options_that_are_parsed_as_they_were():

@@ -12,17 +12,11 @@ from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Control, Source
 
-GRAVITY = 9.8
-
 
 def batch(count=3, task=None, **options):
     task = {"start": "ground", "duration": 0.0, "out_of_bounds": 1e3} | (task or {})
     made = {"sensors": "lab", "source": Source.TRUTH, "control": Control.MOTOR} | options
     return FlightBatch(count, task=TaskParams(**task), control_rate=200.0, **made)
-
-
-def stopped(count):
-    return np.full((count, 4), -1.0)  # voltage 0
 
 
 def test_thrust_below_the_weight_does_not_lift_it():
@@ -31,16 +25,6 @@ def test_thrust_below_the_weight_does_not_lift_it():
     for _ in range(2000):
         flights.step(np.full((1, 4), -1e-6))
     assert flights.record("on_pad")[0] == 1.0
-
-
-def test_without_a_pad_it_falls_as_free_bodies_do():
-    flights = batch(1, task={"pad": False})
-    flights.reset(seeds=[0])
-    for _ in range(20):
-        flights.step(stopped(1))
-    # drag of the disc at 1 m/s is below 1 % of the weight
-    assert flights.record("v")[0, 2] == pytest.approx(-GRAVITY * 0.1, rel=0.01)
-    assert flights.record("r")[0, 2] == pytest.approx(-GRAVITY * 0.1**2 / 2, rel=0.01)
 
 
 def test_a_start_with_a_velocity_is_not_on_the_pad():

@@ -11,9 +11,8 @@ from scipy import special, stats
 import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
 from quad_gym.kernels.task.draws import normal_quantile
-from quad_gym.packing.flight import params_record
 from quad_gym.params.randomization import nominal_values
-from quad_gym.records import COLUMNS, DRAWABLES, FEATURE_SLICE, PARAMETERS_DRAWN, Control, Source
+from quad_gym.records import COLUMNS, DRAWABLES, FEATURE_SLICE, Control, Source
 from quad_gym.rotations import euler_to_dcm
 from tests.builders import batch, flown_batch
 from tests.unit.alarms import ALARM, alarm_score
@@ -293,18 +292,3 @@ def test_the_start_is_spread_as_told():
     np.testing.assert_allclose(turned, 0.0, atol=1e-9)
     spread.reset(seeds=range(20), position=(0.5, 0.6, 0.7))  # what a caller gives stays
     np.testing.assert_array_equal(spread.record("r"), [[0.5, 0.6, 0.7]] * 20)
-
-
-def test_parameter_record_begins_with_the_columns_of_draws():
-    record = params_record(LAB, SUITE, world=WORLD)
-    columns = record.view(np.float64)[:PARAMETERS_DRAWN]
-    nominal = nominal_values(LAB, SUITE, WORLD)[:PARAMETERS_DRAWN]
-    second = COLUMNS["secondary_antenna_B"]  # the sum of antenna and baseline
-    np.testing.assert_allclose(columns[second], nominal[second], rtol=0.0, atol=1e-15)
-    columns[second] = nominal[second]
-    np.testing.assert_array_equal(columns, nominal)
-    for drawable in DRAWABLES:
-        if COLUMNS[drawable.name].stop <= PARAMETERS_DRAWN and drawable.name != "inertia":
-            np.testing.assert_array_equal(
-                np.ravel(record[drawable.name]), columns[COLUMNS[drawable.name]]
-            )

@@ -9,7 +9,6 @@ from quad_gym.records import GateDecision
 from quad_gym.rendering import Renderer, colors, record_flight, save_video, tile
 from quad_gym.rendering.geometry import fixed_view
 from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
-from quad_gym.rendering.shrink import halve
 
 pygame = pytest.importorskip("pygame")
 
@@ -93,16 +92,6 @@ def test_a_replay_shows_what_was_seen_live(flight):
             time = flight["time"][k]
             np.testing.assert_array_equal(replayed.draw(flight.until(time)), live)
             env.step(np.zeros((1, 4)))
-
-
-def test_shrinking_takes_the_mean_of_two_by_two_pixels():
-    rng = np.random.default_rng(0)
-    large = rng.integers(0, 256, (6, 10, 4), dtype=np.uint8)
-    large[:2, :2] = 255
-    small = np.zeros((3, 5, 4), np.uint8)
-    halve(large.view(np.uint32)[..., 0], small.view(np.uint32)[..., 0])
-    mean = large.astype(float).reshape(3, 2, 5, 2, 4).mean(axis=(1, 3))
-    np.testing.assert_array_equal(small, np.floor(mean + 0.5))
 
 
 def test_tiles_fill_a_grid():

@@ -10,7 +10,6 @@ from quad_gym.params.suites import SUITES
 from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK, VELOCITY_BLOCK
 from quad_gym.sensors import GnssReceiver
 from tests.field_flights import attitudes, fly, state_errors, steps
-from tests.filter_states import set_at_rest
 from tests.reference_ukf import east_north_up
 from tests.unit.alarms import ALARM, assert_normal
 
@@ -27,22 +26,6 @@ def test_errors_at_a_level_start_are_as_claimed(suite):
     batch = fly(suite, 4000)
     errors, L = state_errors(batch), batch.record("L")
     assert_normal(np.linalg.solve(L, errors[..., np.newaxis])[..., 0], np.zeros(15), np.eye(15))
-
-
-def test_a_level_start_ties_the_position_to_the_attitude():
-    """P_re = R^T [l x] P_ee, and P_rr as much more than the fix's."""
-    ukf = quad_gym.UnscentedKalmanFilter(RTK)
-    east, up = RTK.gnss.baseline_B @ [-1.0, 0.0, 0.0], RTK.gnss.baseline_B[2]
-    R_IG = east_north_up(RTK.gnss.reference_antenna_G)
-    ukf.initialize((0.0, 0.0, 0.0), R_IG.T @ (0.0, -east, up))  # looking north
-    lever = np.array(RTK.gnss.primary_antenna_B)
-    J = ukf.R_BI.T @ np.cross(np.eye(3), lever)
-    P_ee = np.diag([0.03**2, 0.03**2, RTK.gnss.baseline_sigma**2])
-    np.testing.assert_allclose(ukf.R_BI[0], (0.0, 1.0, 0.0), atol=1e-12)
-    np.testing.assert_allclose(ukf.covariance[6:9, 6:9], P_ee, atol=1e-15)
-    np.testing.assert_allclose(ukf.covariance[0:3, 6:9], J @ P_ee, atol=1e-15)
-    P_rr = np.diag(np.square(RTK.gnss.position_sigma_I)) + J @ P_ee @ J.T
-    np.testing.assert_allclose(ukf.covariance[0:3, 0:3], P_rr, atol=1e-15)
 
 
 def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
@@ -179,15 +162,6 @@ def test_indoor_filter_starts_from_its_mark_without_fixes():
         assert not batch.record("block_valid")[:, BASELINE_BLOCK].any()
 
 
-def test_the_friendly_filter_takes_no_fix_without_gnss():
-    ukf = quad_gym.UnscentedKalmanFilter(quad_gym.sensor_suite("indoor").simplified())
-    with pytest.raises(ValueError, match="set_state"):
-        ukf.initialize((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
-    set_at_rest(ukf, np.eye(15) * 1e-2)
-    with pytest.raises(ValueError, match="GNSS"):
-        ukf.update(gnss_position_G=(0.0, 0.0, 0.0))
-
-
 def test_velocity_is_observed_together_with_the_position():
     env = quad_gym.QuadEnv("hover", observation="measurements", sensors=RTK, control_rate=100.0)
     env.reset(seed=3)
@@ -264,24 +238,19 @@ def test_fixes_come_from_the_true_antenna_with_its_true_noise():
 
 @pytest.mark.parametrize("name", ["rtk", "consumer", "indoor"])
 def test_field_suites_measure_late_and_imperfectly_by_default(name):
-    suite = quad_gym.sensor_suite(name)
-    assert suite.imu.errs
-    assert suite.imu.vibrates
-    assert 0.0 < suite.estimator.false_alarm_probability < 0.01
-    assert quad_gym.sensor_suite("lab").simplified() == quad_gym.sensor_suite("lab")
-    if suite.gnss is not None:
-        assert suite.gnss.latency == 0.1
-        assert suite.gnss.heading_error_sigma > 0.0 or not suite.gnss.has_baseline
-    if suite.camera is not None:
-        assert suite.camera.latency == 0.04
-        assert suite.camera.limited
-    plain = suite.simplified()
-    assert not plain.imu.errs
-    assert not plain.imu.vibrates
+    suite, plain = quad_gym.sensor_suite(name), quad_gym.sensor_suite(name).simplified()
+    for one, real in ((suite, True), (plain, False)):
+        assert one.imu.errs is one.imu.vibrates is real
+        if one.gnss is not None:
+            assert one.gnss.latency == 0.1 * real
+            assert (one.gnss.heading_error_sigma > 0.0) == (real and one.gnss.has_baseline)
+            assert one.gnss.drift_sigma_I == suite.gnss.drift_sigma_I
+        if one.camera is not None:
+            assert one.camera.latency == 0.04 * real
+            assert one.camera.limited is real
     assert plain.estimator == suite.estimator
-    if plain.gnss is not None:
-        assert plain.gnss.latency == plain.gnss.heading_error_sigma == 0.0
-        assert plain.gnss.drift_sigma_I == suite.gnss.drift_sigma_I
-    if plain.camera is not None:
-        assert plain.camera.latency == 0.0
-        assert not plain.camera.limited
+    assert 0.0 < suite.estimator.false_alarm_probability < 0.01
+    lab = quad_gym.sensor_suite("lab")
+    assert lab.simplified() == lab == quad_gym.SensorSuite()
+    env = quad_gym.QuadEnv("hover", sensors="lab")
+    assert env.flights.batch.sensors == lab  # by name and by object

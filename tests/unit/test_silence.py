@@ -109,15 +109,6 @@ def test_corrections_of_the_drift_have_their_variance():
     assert np.median(level) == pytest.approx(driven, rel=0.05)
 
 
-@pytest.mark.parametrize("size", [1.0, 1.5])
-def test_a_jump_of_the_vehicle_is_not_taken_for_drift_of_gnss(size):
-    fault = PositionJump(start=2.0, size=size, direction=(1.0, -1.0, 0.0))
-    batch = fly(quad_gym.sensor_suite("consumer"), 128, filter_start="warm", faults=fault)
-    steps(batch, 2.0)
-    # all else that is seen of it are ten fixes or so
-    assert share_silent(batch, times=5, every=2.0) <= 0.1
-
-
 def test_few_jumps_of_the_vehicle_go_undetected():
     """Some six of a hundred were, as their doubts fell short of the jump; 0.75 % are.
 

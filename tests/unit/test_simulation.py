@@ -81,12 +81,6 @@ def test_every_field_is_readable_as_a_copy(hundred):
         hundred.record("altitude")
 
 
-@pytest.mark.parametrize("count", [1, 8, 9, 20])
-def test_the_lanes_that_pad_the_last_block_are_idle(count):
-    idle = new_batch(count).snapshot()["idle"].ravel()
-    np.testing.assert_array_equal(idle, np.arange(idle.size) >= count)
-
-
 def test_the_covariance_is_that_of_the_factor(hundred):
     P, L = hundred.covariance(), hundred.record("L")
     assert P.shape == (100, 15, 15)

@@ -5,6 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import LogUniform, Normal, Uniform
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.randomization import DrawingTable, Randomization
 from tests.field_flights import fly, nees, steps
 
@@ -38,6 +39,17 @@ def test_a_start_that_is_drawn_leaves_the_filter_consistent(name, drawn):
     batch = fly(suite, FLIGHTS, task="circle", start="hover", randomization=DRAWS[drawn])
     assert worst(batch) < 15.0 + BAND
     assert not (batch.record("diverged") > 0.0).any()
+
+
+@pytest.mark.parametrize("filter_start", ["cold", "warm"])
+@pytest.mark.parametrize("task", TASK_DEFAULTS)
+def test_filter_of_the_default_suite_is_consistent_on_every_task(task, filter_start):
+    suite = quad_gym.QuadEnv("hover").flights.batch.sensors
+    batch = fly(suite, FLIGHTS, task=task, filter_start=filter_start)
+    steps(batch, 0.5)  # from the ground it is cautious at first
+    for _ in range(4):
+        steps(batch, 0.5)
+        assert abs(nees(batch).mean() - 15.0) < BAND
 
 
 @pytest.mark.parametrize("name", SUITES)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
-from quad_gym.kernels import board
-from quad_gym.records import WIDTH, Control, Source
+from quad_gym.records import WIDTH, Control, Source, board
 from tests.builders import batch
 
 COUNT = 3 * MIN_BLOCKS_PER_THREAD * WIDTH + 3

@@ -116,10 +116,3 @@ def test_filter_of_many_features_equals_the_plain_filter():
     worst, cases = compare(sensors, 12, seed=9)
     assert_equal(worst)
     assert max(features for *_, features in cases) > 8
-
-
-def test_usual_weights_in_float64_are_less_accurate():
-    ours, _ = compare(LAB, 30, seed=3)
-    plain, _ = compare(LAB, 30, seed=3, filter_class=PlainUKF)
-    assert plain["position"] > 1000 * ours["position"]
-    assert plain["position"] < 1e-4

@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.records import FEATURE_BLOCKS, FLIGHT, MAX_BLOCKS, FilterStatus
+from quad_gym.records import FEATURE_BLOCKS, MAX_BLOCKS
 from tests.circle_flight import record_circle
 from tests.lane_filter import EIGHT, STATE, LaneFilter
 
@@ -92,33 +92,6 @@ def test_eight_different_flights_are_what_each_is_by_itself():
             assert_equal(filters, lane, ukf)
 
 
-@pytest.mark.parametrize("position", [True, False])
-@pytest.mark.parametrize("baseline", [True, False])
-def test_lane_that_misses_a_measurement_updates_without_it(position, baseline):
-    """Exactly that of a filter none of whose lanes has it, which leaves it out."""
-    filters, ukf = LaneFilter(LAB), alone(3)
-    measure_all(filters, 0, np.ones((1, EIGHT, 3), bool))
-    filters.initialize()
-    for lane in range(EIGHT):
-        filters.measure(lane, RECORDINGS[lane], 1)
-    filters.measure(3, RECORDINGS[3], 1, position=position, baseline=baseline, camera=False)
-    before = {name: filters.get(name)[3] for name in STATE}
-    filters.update()
-    measure_alone(ukf, 3, 1, position, baseline, False)
-    assert_equal(filters, 3, ukf)
-    if not (position or baseline):
-        for name, value in before.items():
-            np.testing.assert_array_equal(filters.get(name)[3], value)
-
-
-def test_missing_measurements_of_neighbors_do_not_move_a_lane(calm):
-    def without_neighbors(filters, k):
-        for lane in range(1, EIGHT):
-            filters.measure(lane, RECORDINGS[lane], k, position=False, camera=lane > 4)
-
-    assert_lane_is_unmoved(calm, fly(LaneFilter(LAB), upset=without_neighbors), 0)
-
-
 MEASURED = ("gnss_position", "gnss_baseline", "pixels", "gyro", "accel")
 WILD = [(name, value) for name in MEASURED for value in (np.nan, np.inf, -np.inf, 1e300, -1e300)]
 STATES = ("L", "r_hat", "R_hat", "b_a_hat")
@@ -150,18 +123,6 @@ def started():
     return filters
 
 
-def test_lost_covariance_fails_the_prediction_and_stays():
-    filters = started()
-    filters.put(1, L=np.nan)
-    filters.predict()
-    status = filters.get("filter_status")
-    assert status[1] == FilterStatus.PREDICTION_FAILED
-    filters.measure(1, RECORDINGS[1], 2)
-    filters.update()
-    assert filters.get("filter_status")[1] == 3
-    assert (np.delete(filters.get("filter_status"), 1) == 0).all()
-
-
 def test_masked_update_and_initialization_touch_chosen_lanes():
     filters = started()
     chosen = np.array([True, False] * 4)
@@ -176,19 +137,3 @@ def test_masked_update_and_initialization_touch_chosen_lanes():
     fresh.initialize()
     for field in STATE:
         np.testing.assert_array_equal(filters.get(field)[chosen], fresh.get(field)[chosen])
-
-
-def test_results_do_not_depend_on_the_lane():
-    filters = LaneFilter(LAB)
-    for lane in range(EIGHT):
-        filters.measure(lane, RECORDINGS[0], 0)
-    filters.initialize()
-    for k in range(100):
-        for lane in range(EIGHT):
-            filters.measure(lane, RECORDINGS[0], k)
-        filters.update()
-        filters.predict()
-    for name in FLIGHT.names:
-        values = filters.get(name)
-        for lane in range(1, EIGHT):
-            np.testing.assert_array_equal(values[lane], values[0], err_msg=name)

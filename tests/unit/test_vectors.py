@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from quad_gym.kernels.maths import linalg
 from quad_gym.kernels.maths.linalg import load3, load4, load33, load44, store
 from quad_gym.kernels.maths.matrices import store_column3
 from quad_gym.kernels.maths.vectors import outer, rounded, vector
@@ -23,14 +24,18 @@ def combine(f, option):
     for axis in (u, v):  # as other tuples, vectors are iterated over, indexed and unpacked
         x, y, z = axis
         store(f.vectors[5], load3(f.vectors[5]) + vector(x, y, axis[2] + 0.0 * z))
+    store(f.vectors[6], linalg.cross(u, v))
+    store(f.vectors[7], linalg.unit_or(u, v))
     store(f.matrices[0], m @ m.T - f.s * m)
     rows = (u, v, (0.0, 1.0, f.s))
     store(f.matrices[1], outer(u, v) + rows)
     store(f.matrices[2], -m)
     store_column3(f.matrices[2], 0, option, u)
+    store(f.matrices[3], linalg.add_to_diagonal(2.0 * m, 3.0))
     q, w = load4(f.q), load44(f.w)
     store(f.fours[0], w @ q + f.s * q)
     store(f.fours[1], (w @ w.T) @ q)
+    f.dot, f.norm = linalg.dot(u, v), linalg.norm(u)
 
 
 def add_products(f, option):
@@ -45,8 +50,8 @@ def add_products(f, option):
     store(f.outers[1], outer(a, b) + m)
 
 
-threes = {"u": (3,), "v": (3,), "vectors": (6, 3), "m": (3, 3), "matrices": (3, 3, 3)}
-combined = Compiled(combine, s=(), q=(4,), w=(4, 4), fours=(2, 4), **threes)
+threes = {"u": (3,), "v": (3,), "vectors": (8, 3), "m": (3, 3), "matrices": (4, 3, 3)}
+combined = Compiled(combine, s=(), q=(4,), w=(4, 4), fours=(2, 4), dot=(), norm=(), **threes)
 summed = Compiled(add_products, a=(3,), b=(3,), s=(), sums=(5, 3), outers=(2, 3, 3))
 
 
@@ -61,10 +66,21 @@ def test_operators_agree_with_numpy(instance):
         changed = -m
         changed[:, 1] = u
         vectors = [2 * u - s * v, m @ u, -m.T @ u, (1.0, 2.0, s) - u, (s, s, 1.0), u + v]
+        vectors += [np.cross(u, v), u / np.linalg.norm(u)]
         matrices = [m @ m.T - s * m, np.outer(u, v) + np.array([u, v, (0.0, 1.0, s)]), changed]
+        matrices.append(2.0 * m + 3.0 * np.eye(3))
         np.testing.assert_allclose(got["vectors"][k], vectors, rtol=0.0, atol=1e-14)
         np.testing.assert_allclose(got["matrices"][k], matrices, rtol=0.0, atol=1e-14)
         np.testing.assert_allclose(got["fours"][k], [w @ q + s * q, w @ w.T @ q], atol=3e-14)
+        np.testing.assert_allclose(got["dot"][k], u @ v, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(got["norm"][k], np.linalg.norm(u), rtol=1e-15)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+def test_a_vector_without_direction_takes_the_fallback(instance):
+    u = np.array([[0.0, 0.0, 0.0], [1e-31, 0.0, 0.0], [0.0, 1e-20, 0.0]])
+    got = getattr(combined, instance)(u=u, v=np.array([[1.0, 2.0, 3.0]] * 3))["vectors"][:, 7]
+    np.testing.assert_allclose(got, [[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 1.0, 0.0]], rtol=1e-15)
 
 
 @pytest.mark.parametrize("instance", INSTANCES)

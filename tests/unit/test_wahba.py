@@ -91,12 +91,6 @@ def test_the_size_of_the_weights_and_vectors_does_not_matter(scale):
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13)
 
 
-def test_a_vector_without_weight_is_ignored():
-    weights, v_I, v_B, R_BI = noisy_problem(4, 4, 0.0)
-    weights[2], v_B[2] = 0.0, [100.0, -50.0, 7.0]
-    np.testing.assert_allclose(solve_wahba(weights, v_I, v_B), R_BI, rtol=0.0, atol=1e-13)
-
-
 X, Y, Z = np.eye(3)
 OPEN = "v_I and v_B"
 

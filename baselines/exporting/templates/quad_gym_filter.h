@@ -53,12 +53,45 @@ enum qg_result {
 #define QG_WAITING 16 /* measurements that may wait for later samples */
 #define QG_COPIES (QG_EVENTS / QG_COPY_EVERY + 2)
 
-@SENSOR_MACROS@
+@AID_MACROS@@IF CAMERA@
+#define QG_FEATURES @FEATURES@ /* features of the camera */
+@END@
+@IF GNSS@
+#define QG_GNSS 1
+@END@
+@IF BASELINE@
+#define QG_GNSS_BASELINE 1
+@END@
+@IF VELOCITY@
+#define QG_GNSS_VELOCITY 1
+@END@
+
 typedef struct qg_filter qg_filter; /* see the end of this header */
 
 /* ---- start ---- */
 
-@START_API@/* A level vehicle at rest at a known place: position in I [m], heading of body x, from east toward
+@IF GNSS@
+/* A first fix; NULL: not measured. Without a baseline the vehicle is assumed level, and its heading
+ * comes from exactly one of heading, magnetometer and course. */
+typedef struct {
+    double time;                 /* its time stamp [s] */
+    const double *gnss_position; /* primary antenna minus reference antenna, in G [m] */
+    const double *gnss_sigma;    /* 3 standard deviations of it in I [m]; NULL: the suite's */
+    const double *gnss_baseline; /* primary to secondary antenna, in G [m] */
+    const double *gnss_velocity; /* in G [m/s]; NULL: at rest */
+    double velocity_sigma;       /* [m/s]; 0: the suite's */
+    const double *heading;       /* of body x, from east toward north [rad] */
+    const double *magnetometer;  /* magnetic field in B [T] */
+    double magnetometer_sigma;   /* [T]; 0: the suite's */
+    int course;                  /* 1: the vehicle flies nose first, along gnss_velocity */
+    double tilt_sigma;           /* of roll and pitch [rad]; 0: the suite's */
+    double rest_sigma;           /* of each axis of an unmeasured velocity [m/s]; 0: the suite's */
+} qg_start;
+
+int qg_init(qg_filter *filter, const qg_start *start);
+
+@END@
+/* A level vehicle at rest at a known place: position in I [m], heading of body x, from east toward
  * north [rad]; with the errors of the suite's initial pose. */
 int qg_init_at_rest(qg_filter *filter, const double position[3], double heading, double time);
 
@@ -71,7 +104,23 @@ int qg_predict(qg_filter *filter, const double gyro[3], const double accel[3], d
 /* Measurements of one instant, for one joint update. NULL: not measured. Standard deviations are
  * per axis; 0 or NULL: the suite's. */
 typedef struct {
-@MEASUREMENT_FIELDS@} qg_measurements;
+@AID_FIELDS@@IF CAMERA@
+    const double *pixels; /* [QG_FEATURES][2] from the image's center; NaN: not seen */
+    double pixel_sigma;   /* [pixels] */
+@END@
+@IF GNSS@
+    const double *gnss_position; /* primary antenna minus reference antenna, in G [m] */
+    const double *gnss_sigma;    /* 3 standard deviations of it: east, north, up [m] */
+@END@
+@IF BASELINE@
+    const double *gnss_baseline; /* primary to secondary antenna, in G [m] */
+    double baseline_sigma;       /* of its direction [rad] */
+@END@
+@IF VELOCITY@
+    const double *gnss_velocity; /* of the primary antenna, in G [m/s] */
+    double velocity_sigma;       /* [m/s] */
+@END@
+} qg_measurements;
 
 /* Update the estimate. A time stamp may be late, back to qg_oldest_time: everything since then is
  * filtered again, with bitwise the result of timely arrival. It may also be later than the filter:
@@ -79,7 +128,21 @@ typedef struct {
 int qg_update(qg_filter *filter, const qg_measurements *measured, double time);
 
 /* The same for one measurement alone. */
-@UPDATE_API@
+@AID_API@@IF CAMERA@
+int qg_update_pixels(qg_filter *f, const double *pixels, double time);
+@END@
+@IF GNSS@
+int qg_update_gnss_position(qg_filter *f, const double position[3], const double *sigma,
+                            double time); /* in G [m]; sigma: 3, or NULL */
+@END@
+@IF BASELINE@
+int qg_update_gnss_baseline(qg_filter *f, const double baseline[3], double time); /* in G [m] */
+@END@
+@IF VELOCITY@
+int qg_update_gnss_velocity(qg_filter *f, const double velocity[3], double sigma,
+                            double time); /* in G [m/s]; sigma: 0: the suite's */
+@END@
+
 /* ---- outputs ---- */
 
 typedef struct {
@@ -107,7 +170,27 @@ unsigned qg_status(const qg_filter *filter);
 
 double qg_time(const qg_filter *filter);        /* up to which it has predicted [s] */
 double qg_oldest_time(const qg_filter *filter); /* oldest time stamp that qg_update accepts [s] */
-@POLICY_API@
+@IF POLICY@
+
+/* ---- policy: @ABOUT@ ---- */
+
+typedef struct {
+    double position[3], velocity[3], acceleration[3]; /* of the reference, in I */
+    double heading[3];    /* level unit vector in I along which body x is to point */
+    double preview[2][3]; /* positions 0.2 s and 0.4 s later, in I; on a course: the next gates */
+} qg_reference;
+
+/* Action of the policy for the present estimate, @RATE@ times per second. Observation:
+@LINES@
+ *
+ * Action, each component a in [-1, 1]:
+@ACTIONS@ */
+int qg_action(qg_filter *filter, const qg_reference *reference, float action[4]);
+
+/* The network alone: 0, or 1 with an action of zeros if the observation is not finite. */
+int qg_policy(const float observation[@SIZE@], float action[4]);
+@END@
+
 /* ---- memory: use the functions above ---- */
 
 @STRUCTS@
@@ -146,6 +229,8 @@ struct qg_filter {
 
 #if defined(QUAD_GYM_FILTER_IMPLEMENTATION) && !defined(QUAD_GYM_FILTER_IMPLEMENTED)
 #define QUAD_GYM_FILTER_IMPLEMENTED
-@POLICY_NETWORK@
+@IF POLICY@
+@NETWORK@
+@END@
 @IMPLEMENTATION@
 #endif

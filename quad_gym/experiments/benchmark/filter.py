@@ -10,7 +10,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.peers import MeasuredTick, peers
 from quad_gym.experiments.benchmark.stages import Staged, hovering
-from quad_gym.kernels.compiling import Stage
+from quad_gym.kernels.stages import Stage
 from quad_gym.records import FEATURE_SLICE, WIDTH, aligned_zeros
 
 

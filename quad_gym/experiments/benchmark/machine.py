@@ -4,7 +4,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
-from quad_gym.kernels.compiling.cores import available_cores
+from quad_gym.kernels.cores import available_cores
 
 
 def processor() -> dict[str, Any]:

@@ -11,10 +11,9 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.experiments.benchmark import timing
-from quad_gym.kernels.compiling import Stage
-from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import needed_stages
-from quad_gym.kernels.single import run_stage
+from quad_gym.kernels.entries import run_stage
+from quad_gym.kernels.linked import linked_table
+from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.params.suites import SUITES as ALL_SUITES
 from quad_gym.records import Act, Sensor
 

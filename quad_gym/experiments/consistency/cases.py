@@ -12,7 +12,7 @@ from quad_gym.analysis.consistency_flights import Findings, endless, measure_con
 from quad_gym.analysis.reports import as_json, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.kernels.compiling.digest import flights_digest
+from quad_gym.kernels.digest import flights_digest
 from quad_gym.params.sensors import SensorSuite
 
 CaseResults = dict[str, dict[str, Any]]
@@ -116,12 +116,7 @@ def case_table(
 ) -> list[str]:
     """Lines of a table in Markdown: misses bold, or in italics if there is a reason.
 
-    Args:
-        first: Heading of the first column.
-        columns: Headings by name of the column.
-        cells: Results of the cases.
-        text: Format of a value.
-        *head: Rows above the cases.
+    `columns` are headings by name of the column, and rows in `head` are above the cases.
     """
     rows = [[first, *columns.values(), "remarks"], *head]
     for label, cell in cells.items():

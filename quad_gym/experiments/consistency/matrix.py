@@ -14,13 +14,7 @@ from typing import Any, Literal
 from quad_gym.analysis.consistency import PARTS, SENSOR_BLOCKS
 from quad_gym.analysis.metrics import chi_square_band
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.experiments.consistency.cases import (
-    Case,
-    CaseFlights,
-    CaseResults,
-    case_table,
-    fly,
-)
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, CaseResults, case_table, fly
 from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.distributions import Uniform
 from quad_gym.params.randomization import Randomization
@@ -48,17 +42,7 @@ def case_of(
     sensors: SensorSuite | None = None,
     **keywords: Any,
 ) -> Case:
-    """One configuration.
-
-    Args:
-        suite: Name of the sensor suite.
-        task: Name of the task.
-        start: Start of the filter.
-        condition: Name of the difference from the suite and the task.
-        wrong: Difference between the filter's model and the simulation; empty: none.
-        sensors: Sensor suite that flies; None: the one named `suite`.
-        **keywords: Further keywords of `FlightBatch`.
-    """
+    """One configuration; `wrong` is a difference between the filter's model and the simulation."""
     flown = sensors or sensor_suite(suite)
     expected = {}
     if suite == "lab":

@@ -11,12 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from quad_gym.analysis.recovery import REQUIRED, Recovery, follow_recovery
-from quad_gym.experiments.consistency.cases import (
-    Case,
-    CaseFlights,
-    CaseResults,
-    case_table,
-)
+from quad_gym.experiments.consistency.cases import Case, CaseFlights, CaseResults, case_table
 from quad_gym.faults import AccelBiasStep, Fault, GnssOutage, GyroBiasStep, PositionJump
 from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.suites import SUITES, sensor_suite

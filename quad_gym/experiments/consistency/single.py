@@ -8,11 +8,7 @@ from tqdm import tqdm
 
 from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSquare
 from quad_gym.analysis.consistency_flights import Findings
-from quad_gym.analysis.consistency_plots import (
-    errors_figure,
-    mean_square_figure,
-    whiteness_figure,
-)
+from quad_gym.analysis.consistency_plots import errors_figure, mean_square_figure, whiteness_figure
 from quad_gym.analysis.plots import save_figure
 from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.experiments.consistency.cases import Case, CaseFlights, fly

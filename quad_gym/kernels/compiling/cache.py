@@ -23,7 +23,7 @@ from numba.core import caching, compiler, config
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
-from quad_gym.kernels.compiling.digest import digest_of_function
+from quad_gym.kernels.digest import digest_of_function
 from quad_gym.records import WIDTH
 
 _FORM = 4

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from quad_gym.kernels.compiling.cache import CodeCache, locked, say, where_cached
-from quad_gym.kernels.compiling.cores import available_cores
+from quad_gym.kernels.cores import available_cores
 
 MOST_WORKERS = 8
 _START = (

@@ -21,12 +21,11 @@ from quad_gym.records import (
     DRAWS_OF_FAULT,
     FAULT_KINDS,
     FEATURE_BLOCKS,
+    NEVER,
     FaultKind,
 )
 
 _FIRST, _FIRST_HIDDEN = np.uint64(DRAW_FAULTS), np.uint64(DRAW_HIDDEN)
-NEVER = 1e18
-"""A tick that no flight reaches."""
 
 
 @kernel

@@ -16,17 +16,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Function = Callable[[float], Any]
 
-FEWEST, MOST = 16, 8192
-"""Segments that are tried, each time twice as many."""
-
-STEP = 1e-3
-"""Step of the differences that check derivatives, as a fraction of the duration."""
-
-SLACK = 1e-3
-"""Largest difference between derivatives and differences, as a fraction of their size."""
-
-LOOSER = 1e3
-"""Factor on the tolerance for derivatives [1/s, 1/s^2]."""
+FEWEST, MOST = 16, 8192  # segments that are tried, each time twice as many
+STEP = 1e-3  # step of the differences that check derivatives, as a fraction of the duration
+SLACK = 1e-3  # largest difference between derivatives and differences, as a fraction of their size
+LOOSER = 1e3  # factor on the tolerance for derivatives [1/s, 1/s^2]
 
 
 def fit(

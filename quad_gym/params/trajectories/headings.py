@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 HeadingRule = Literal["given", "along", "toward"]
 
-LEAST_SPEED = 1e-3
-"""Horizontal speed below which a heading along the path is held [m/s]."""
+LEAST_SPEED = 1e-3  # horizontal speed below which a heading along the path is held [m/s]
 
 
 def heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, float], Any]:

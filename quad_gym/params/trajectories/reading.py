@@ -11,8 +11,7 @@ from quad_gym.params import checks as check
 if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory
 
-COLUMNS = ("time", "x", "y", "z")
-"""Columns that a table must have; "yaw" is optional."""
+COLUMNS = ("time", "x", "y", "z")  # columns that a table must have; "yaw" is optional
 
 OPTIONS = ("closed", "minimize", "at_rest", "yaw", "look_at")
 """Keywords of `Trajectory.through` that do not contradict a table."""

@@ -21,17 +21,13 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-ORDERS = {"snap": 4, "jerk": 3}
-"""Order of the derivative that is minimized, by name."""
+ORDERS = {"snap": 4, "jerk": 3}  # order of the derivative that is minimized, by name
 
 MAX_SPEED, MAX_ACCELERATION = 2.5, 3.0
 """Bounds where none are given [m/s], [m/s^2], as in the task of random trajectories."""
 
-PADDING = 6
-"""Points before and after one round of a closed path, where it is approximated."""
-
-SHORTEST = 1e-6
-"""Time between two points, and distance where times are chosen, at least [s], [m]."""
+PADDING = 6  # points before and after one round of a closed path, where it is approximated
+SHORTEST = 1e-6  # time between two points, and distance where times are chosen, at least [s], [m]
 
 
 def through(

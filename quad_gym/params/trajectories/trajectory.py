@@ -24,11 +24,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-TERMS = 8
-"""Coefficients of a polynomial of degree 7, as minimum snap requires."""
-
-EARLY = 1e-3
-"""Fraction of a trajectory after which a start from rest has a direction."""
+TERMS = 8  # coefficients of a polynomial of degree 7, as minimum snap requires
+EARLY = 1e-3  # fraction of a trajectory after which a start from rest has a direction
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

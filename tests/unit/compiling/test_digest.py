@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.compiling.digest import digest_of_function
+from quad_gym.kernels.digest import digest_of_function
 
 ROOT = Path(__file__).parents[3]
 SCRIPT = """
 import importlib, json, sys
 from pathlib import Path
-from quad_gym.kernels.compiling import digest
-from quad_gym.kernels.compiling.digest import digest_of
+from quad_gym.kernels import digest
+from quad_gym.kernels.digest import digest_of
 
 root = Path.cwd()
 modules = [name.removesuffix(".py").replace("/", ".") for name in json.loads(sys.argv[1])]

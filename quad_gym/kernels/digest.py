@@ -20,10 +20,12 @@ from types import CodeType, FunctionType
 from typing import Any
 
 import numpy as np
-from numba.core import config
 
 PACKAGE = __package__.partition(".")[0]
-_NO_CODE = {f"{__package__}.{name}" for name in ("cache", "cores", "digest", "workers")}
+_NO_CODE = {
+    f"{__package__}.{name}"
+    for name in ("compiling.cache", "compiling.workers", "cores", "digest", "linked")
+}
 """Modules that determine when code is compiled, but do not change the code."""
 
 
@@ -50,7 +52,7 @@ def flights_digest() -> str:
     of commands and pictures does not count.
     """
     apart = {"commands", "experiments", "rendering", "compiling"}
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[1]
     files = {str(file.relative_to(root)): file for file in root.rglob("*.py")}
     return _combined(
         {
@@ -108,7 +110,7 @@ def _is_string(statement: ast.AST) -> bool:
 @functools.cache
 def _known_sources() -> dict[str, tuple[str, list[str]]]:
     """Earlier results of `_parsed`, stored when a process ends: parsing takes over a second."""
-    folder = Path(config.CACHE_DIR or Path(__file__).with_name("__pycache__"))
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).with_name("__pycache__"))
     file = folder / f"quad_gym_digests.{sys.implementation.cache_tag}.json"
     known: dict[str, tuple[str, list[str]]] = {}
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):  # none, or damaged

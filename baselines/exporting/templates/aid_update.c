@@ -1,0 +1,8 @@
+@CALL@
+{
+    qg_measurements m;
+    memset(&m, 0, sizeof m);
+    m.@NAME@ = @ADDRESS@;
+    return qg_update(f, &m, time);
+}
+

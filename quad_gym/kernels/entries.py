@@ -1,0 +1,145 @@
+"""Compiled functions that Python calls: their names and arguments, without the code.
+
+Numba compiles a function on its first call, or loads it from its cache. Arrays are passed in C
+order and with the data type of the catalog; a call writes results into arrays of the caller.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.kernels.stages import STAGE_TABLE, Stage
+from quad_gym.records import (
+    FLIGHT,
+    FLIGHT_BLOCK,
+    MEASUREMENT,
+    OPERATION,
+    PARAMS,
+    PARAMS_BLOCK,
+    SAMPLE,
+    SETTINGS,
+    START,
+    STEP_BLOCK,
+    WORK_BLOCK,
+    Sensor,
+)
+
+
+class Rows(NamedTuple):
+    """An argument that is an array."""
+
+    dtype: np.dtype[Any]
+    axes: int = 1
+
+
+class Entry:
+    """A compiled function, to be called.
+
+    Args:
+        name: "module:function" within `quad_gym.kernels`.
+        arguments: An array, `int` or `bool` for each argument.
+        returns: Type of the result; None: there is none.
+    """
+
+    def __init__(
+        self, name: str, *arguments: Rows | type, returns: type[float] | None = None
+    ) -> None:
+        self.name = f"quad_gym.kernels.{name}"
+        self.arguments, self.returns = arguments, returns
+
+    def __call__(self, *given: Any) -> Any:
+        """Call it.
+
+        Raises:
+            TypeError: If an array has another data type, number of axes or order.
+        """
+        for wanted, value in zip(self.arguments, given, strict=True):
+            if isinstance(wanted, Rows):
+                _check(self.name, wanted, value)
+        return self._function(*given)
+
+    @functools.cached_property
+    def _function(self) -> Callable[..., Any]:
+        from quad_gym.kernels.compiling.workers import dispatcher_of  # importing Numba takes 1 s
+
+        function: Callable[..., Any] = dispatcher_of(self.name)
+        return function
+
+
+def _check(name: str, wanted: Rows, array: NDArray[Any]) -> None:
+    """Refuse an array for which a function has no code."""
+    same = array.dtype is wanted.dtype or array.dtype == wanted.dtype
+    if not same or array.ndim != wanted.axes or not array.flags.c_contiguous:
+        raise TypeError(
+            f"{name} takes an array of {wanted.axes} axes in C order, got {array.ndim} axes "
+            f"with strides {array.strides}{'' if same else f' of {array.dtype}'}"
+        )
+
+
+_FLIGHT, _PARAMS, _SETTINGS, _START = map(Rows, (FLIGHT, PARAMS, SETTINGS, START))
+_BLOCK, _BLOCK_PARAMS, _STEPS = map(Rows, (FLIGHT_BLOCK, PARAMS_BLOCK, STEP_BLOCK))
+_BLOCK_WORK, _TABLE = Rows(WORK_BLOCK), Rows(STAGE_TABLE)
+_TAPE = (Rows(SAMPLE), Rows(MEASUREMENT), Rows(OPERATION))
+_VECTOR, _MATRIX, _CUBE = (Rows(np.dtype(np.float64), axes) for axes in (1, 2, 3))
+_INDICES, _MASK = Rows(np.dtype(np.int64)), Rows(np.dtype(np.bool_), 2)
+_WORDS, _SLOTS = Rows(np.dtype(np.uint64)), Rows(np.dtype(np.uint64), 2)
+
+fly = Entry("batch:fly", int, int, int, int, int, bool, returns=bool)
+run_tape = Entry(
+    "tape:run_tape",
+    *(_BLOCK, _BLOCK_PARAMS, _BLOCK_PARAMS, _STEPS, _SETTINGS, _BLOCK_WORK, _TABLE),
+    *_TAPE,
+    *(_INDICES, _WORDS, _SLOTS),
+    *(int, int),
+)
+start_filter = Entry("single:start_filter", _BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
+run_stage = Entry(
+    "single:run_stage",
+    *[int] * 4,
+    *(_BLOCK_PARAMS, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _TABLE),
+    int,
+)
+sense_features = Entry("single:sense_features", _FLIGHT, _PARAMS, int)
+sense_gnss = Entry("single:sense_gnss", _FLIGHT, _PARAMS, bool)
+body_accelerations_in_air = Entry(
+    "single:body_accelerations_in_air",
+    *(_VECTOR, _MATRIX, *[_VECTOR] * 4, _PARAMS, _SETTINGS, _VECTOR, _VECTOR),
+)
+integrate_flight = Entry("single:integrate_flight", _FLIGHT, _PARAMS, int)
+sense_imu_average = Entry("single:sense_imu_average", _FLIGHT, _PARAMS, _FLIGHT)
+sense_imu = Entry("single:sense_imu", _FLIGHT, _PARAMS)
+body_accelerations = Entry(
+    "single:body_accelerations", _MATRIX, *[_VECTOR] * 4, _PARAMS, _VECTOR, _VECTOR
+)
+start_level = Entry("single:start_level", _START)
+wahba_of_vectors = Entry(
+    "single:wahba_of_vectors", _VECTOR, _MATRIX, _MATRIX, _MATRIX, returns=float
+)
+step_biases = Entry("single:step_biases", _FLIGHT, _PARAMS)
+step_gnss_drift = Entry("single:step_gnss_drift", _FLIGHT, _PARAMS)
+draw_sensor_errors = Entry("single:draw_sensor_errors", _FLIGHT, _PARAMS)
+disturb_imu = Entry("single:disturb_imu", _FLIGHT, _PARAMS)
+turn_gnss_baseline = Entry("single:turn_gnss_baseline", _FLIGHT, _PARAMS)
+limit_features = Entry("single:limit_features", _FLIGHT, _PARAMS, bool, bool, int)
+nearest_obstacles = Entry("single:nearest_obstacles", _MATRIX, _CUBE, _SETTINGS, _VECTOR, _MATRIX)
+hide_points = Entry("single:hide_points", _MATRIX, _CUBE, _CUBE, _SETTINGS, _MASK)
+
+FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
+"""Stages that a filter runs, as far as it needs them."""
+FILTER_ENTRIES = (start_filter.name, run_tape.name)
+"""Names of the entries that a filter calls, the slowest to compile first."""
+SENSORS_AND_VEHICLE = tuple(
+    entry.name
+    for entry in (
+        *(sense_features, sense_gnss, body_accelerations_in_air, integrate_flight),
+        *(sense_imu_average, sense_imu, body_accelerations, start_level),
+        *(wahba_of_vectors, step_biases, step_gnss_drift, draw_sensor_errors),
+        *(disturb_imu, turn_gnss_baseline, limit_features, nearest_obstacles, hide_points),
+    )
+)
+"""Names of the entries for sensors and vehicles, the slowest to compile first."""
+ENTRIES = {entry.name: entry for entry in tuple(globals().values()) if isinstance(entry, Entry)}
+"""All entries by their names."""
