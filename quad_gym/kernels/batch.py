@@ -203,12 +203,6 @@ def _copy_estimate(of, to):
 
 
 @kernel
-def _give_estimate(call, index, flight):
-    """Copy the estimate of a block for the user's estimator, which begins some of its episodes."""
-    _copy_estimate(flight, _exchange_at(call[Call.EXCHANGE] + index * _EXCHANGE_PITCH))
-
-
-@kernel
 def _take_estimate(call, index, flight):
     """Copy the estimate of a block from the user's estimator."""
     _copy_estimate(_exchange_at(call[Call.EXCHANGE] + index * _EXCHANGE_PITCH), flight)
@@ -284,7 +278,9 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
         begin_episode(flight, nominal, true, believed, settings, work, stages, begins)
         if settings.own_estimator:
             _give_samples(call, index, flight)
-            _give_estimate(call, index, flight)
+            # the user's estimator begins some of its episodes with the built-in estimate
+            exchange = _exchange_at(call[Call.EXCHANGE] + index * _EXCHANGE_PITCH)
+            _copy_estimate(flight, exchange)
     if command != Command.RESET and command != Command.LOOK and not written:
         _write_results(call, flight, work, index)
     if observing:
