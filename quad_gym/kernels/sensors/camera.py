@@ -51,6 +51,7 @@ from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import DRAW_FEATURE, DRAW_PHASE, FEATURE_BLOCKS, FilterForm, Sensor
 
+_CAMERA = int(Sensor.CAMERA)
 _PIXEL = 2e-6  # [m]; it cancels, so it is no parameter: the report writes rays in meters
 
 
@@ -84,15 +85,15 @@ def measure(flight, p, feature_count, mask):
 @kernel
 def _begin(flight, p, settings, mask):
     _, share = uniform_pair(stream_of(flight), DRAW_PHASE)
-    begin_clock(flight, settings, Sensor.CAMERA, share, mask)
+    begin_clock(flight, settings, _CAMERA, share, mask)
 
 
 @kernel
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Take an image when due, with limits of range, blur, ground, obstacles, and faults."""
-    due = tick_clock(flight, settings, Sensor.CAMERA, mask)
-    delayed, count = settings.sensor_delay[Sensor.CAMERA] > 0, settings.feature_count
-    arrives = find_arrivals(flight, work, settings, Sensor.CAMERA, mask)
+    due = tick_clock(flight, settings, _CAMERA, mask)
+    delayed, count = settings.sensor_delay[_CAMERA] > 0, settings.feature_count
+    arrives = find_arrivals(flight, work, settings, _CAMERA, mask)
     for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + count):
         flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
     if not any_of(due | arrives):
@@ -107,8 +108,8 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
         call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
     if delayed:
-        taken = stamp(flight, settings, Sensor.CAMERA, mask)
-        under_way = settings.under_way[Sensor.CAMERA]
+        taken = stamp(flight, settings, _CAMERA, mask)
+        under_way = settings.under_way[_CAMERA]
         for i in range(count):
             block, pixels = FEATURE_BLOCKS + i, flight.pixels[i]
             exchange(flight, work, block, pixels, 2, under_way, mask, taken)

@@ -28,13 +28,14 @@ from quad_gym.records import (
     Sensor,
 )
 
+_GNSS = int(Sensor.GNSS)
 _BLOCKS = (POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK)
 
 
 @kernel
 def _begin(flight, p, settings, mask):
     share, _ = uniform_pair(stream_of(flight), DRAW_PHASE)
-    begin_clock(flight, settings, Sensor.GNSS, share, mask)
+    begin_clock(flight, settings, _GNSS, share, mask)
     keep(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
 
 
@@ -72,9 +73,9 @@ def _flag(flags, mask, position, baseline, settings):
 @kernel
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Measure when due, and at the start for the initialization of the filter."""
-    due = tick_clock(flight, settings, Sensor.GNSS, mask)
-    delayed, period = settings.sensor_delay[Sensor.GNSS] > 0, settings.sensor_ticks[Sensor.GNSS]
-    arrives = find_arrivals(flight, work, settings, Sensor.GNSS, mask)
+    due = tick_clock(flight, settings, _GNSS, mask)
+    delayed, period = settings.sensor_delay[_GNSS] > 0, settings.sensor_ticks[_GNSS]
+    arrives = find_arrivals(flight, work, settings, _GNSS, mask)
     if not starting and not any_of(due | arrives):
         nothing = 0.0 * flight.tick
         _flag(flight.block_valid, mask, nothing, nothing, settings)
@@ -114,7 +115,7 @@ def _deliver_delayed(flight, work, settings, mask, starting):
 
     At the start of an episode the fix stays in the record, for the initialization of the filter.
     """
-    taken, n = stamp(flight, settings, Sensor.GNSS, mask), settings.under_way[Sensor.GNSS]
+    taken, n = stamp(flight, settings, _GNSS, mask), settings.under_way[_GNSS]
     exchange(flight, work, POSITION_BLOCK, flight.gnss_position, 3, n, mask, taken)
     exchange(flight, work, BASELINE_BLOCK, flight.gnss_baseline, 3, n, mask, taken)
     exchange(flight, work, VELOCITY_BLOCK, flight.gnss_velocity, 3, n, mask, taken)
