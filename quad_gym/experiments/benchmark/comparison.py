@@ -14,9 +14,12 @@ import quad_gym
 from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.filter import record_one
 from quad_gym.experiments.benchmark.interfaces import time_batch, time_env, time_single
-from quad_gym.experiments.benchmark.peers import Estimate, peers
+from quad_gym.experiments.benchmark.peers import Estimate, MeasuredTick, peers
 from quad_gym.experiments.benchmark.stages import hovering
+from quad_gym.records import WIDTH
 
+TICKS = 200
+"""Ticks of a flight on which filters are compared; the first half is not counted."""
 Make = Callable[[int], Any]
 SIMULATORS: dict[str, tuple[str, Make]] = {
     "PyFlyt": ("PyFlyt.gym_envs", lambda _: gymnasium.make("PyFlyt/QuadX-Hover")),
@@ -55,31 +58,30 @@ def _time_simulators(scope: timing.Scope) -> list[timing.Row]:
     return [row | {"position": None, "attitude": None} for row in rows]
 
 
-def _error(found: list[Estimate], truth: list[Estimate]) -> dict[str, float]:
-    """Root mean square errors of the second half: position [m], attitude [rad]."""
-    half = len(found) // 2
-    r_hat, R_hat = (np.array([each[k] for each in found[half:]]) for k in range(2))
-    r, R = (np.array([each[k] for each in truth[half:]]) for k in range(2))
-    cosine = (np.einsum("nij,nij->n", R_hat, R) - 1.0) / 2.0
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    position = np.linalg.norm(r_hat - r, axis=1)
-    return {
-        "position": float(np.sqrt(np.mean(position**2))),
-        "attitude": float(np.sqrt(np.mean(angle**2))),
-    }
+def _error(found: list[Estimate], flight: list[MeasuredTick]) -> tuple[float, float]:
+    """Root mean square errors in the second half of a flight: position [m], attitude [rad]."""
+    squares = []
+    for estimate, now in list(zip(found, flight, strict=True))[TICKS // 2 :]:
+        r, R = now.truth
+        cosine = (np.sum(estimate.R_BI * R) - 1.0) / 2.0
+        distance = np.linalg.norm(estimate.position - r)
+        squares.append((distance**2, np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2))
+    position, attitude = np.sqrt(np.mean(squares, axis=0)).tolist()
+    return position, attitude
 
 
 def _time_filters(scope: timing.Scope) -> list[timing.Row]:
-    """Time cycles of filters on the measurements of one flight, and compare them with its truth."""
-    sensors, rows = quad_gym.sensor_suite("lab"), list[timing.Row]()
-    flight = record_one(hovering(8, sensors=sensors), 0, 20 if scope.quick else 200)
-    fewest = min(len(now.pixels) for now in flight)
-    flight = [now._replace(pixels=now.pixels[:fewest]) for now in flight]
-    for name, run in peers(sensors, flight).items():
-        found = run()
-        timed = timing.measure(run, scope.effort).per(len(flight))
-        errors = _error(found, [now.truth for now in flight])
-        rows.append(timing.report(f"filter cycle, {name}", timed, envs=1, **errors))
+    """Time cycles of filters on fixes and baselines, and compare estimates with the truth."""
+    sensors, rows = quad_gym.sensor_suite("lab").replace(camera=None), list[timing.Row]()
+    batch = hovering(WIDTH, sensors=sensors)
+    flights = [record_one(batch, k, TICKS) for k in range(1 if scope.quick else 4)]
+    runs = [peers(sensors, flight) for flight in flights]
+    for name in runs[0]:
+        found = [_error(run[name](), flight) for run, flight in zip(runs, flights, strict=True)]
+        position, attitude = np.sqrt(np.mean(np.square(found), axis=0)).tolist()
+        timed = timing.measure(runs[0][name], scope.effort).per(TICKS)
+        what = {"envs": 1, "position": position, "attitude": attitude}
+        rows.append(timing.report(f"filter cycle, {name}", timed, **what))
     return rows
 
 
