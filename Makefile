@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
-.PHONY: setup demo circle results test test-oldest test-clients test-slow soak golden lint benchmark docs reference wheel clean
+.PHONY: setup demo circle results test test-oldest test-clients test-slow soak golden lint benchmark docs reference kernels wheel clean
 
 setup: $(VENV)/.developer
 
@@ -90,12 +90,18 @@ docs: $(VENV)/.writer  ## the site in docs/_build/html/index.html; runs the tuto
 reference: setup  ## the tables of docs/reference, from the code
 	$(BIN)/python -m docs.extensions.environment_pages
 
-wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they hold
+kernels: $(VENV)/.user  ## libraries of compiled kernels for this checkout, which then needs no Numba
+	$(BIN)/quad-gym compile --library
+
+wheel: kernels  ## build sdist and a wheel with the libraries into dist, and check what they hold
 	rm -rf dist
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt build twine check-wheel-contents
-	$(BIN)/python -m build --installer pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt build twine check-wheel-contents auditwheel
+	$(BIN)/python -m build --installer pip --sdist
+	QUAD_GYM_WHEEL=$$(uname -m) $(BIN)/python -m build --installer pip --wheel
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
+	$(BIN)/auditwheel show dist/*.whl | tee /dev/stderr | grep -q '"manylinux_2_'
 
 clean:
+	rm -rf quad_gym/kernels/libraries
 	rm -rf $(VENV) $(OLDEST) .venv-clients build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -26,16 +26,12 @@ TYPICAL = 0.03
 REMEMBERED = 4
 """Number of instants in a history."""
 
-_SCALES = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "next_gap": 12.0}
-"""Divisors of parts of the observation of `OutageDash`, in their units."""
-
-_MIDDLE_WIDTH, _HALF_RANGE = 4.5, 1.5
-"""Center and half range of the widths of gaps of `OutageDash` [m]."""
-
-_WIDTHS = ("gap_width", "next_width")
-
-_ACTUAL = "actual_"
-"""Prefix of the names of parts that contain the truth, with the same scales."""
+_SCALES = {
+    **{"position_error": (0.0, 6.0), "velocity_error": (0.0, 4.0), "body_rates": (0.0, 2.0)},
+    **{"next_gap": (0.0, 12.0), "gap_width": (4.5, 1.5), "next_width": (4.5, 1.5)},
+}
+"""Centers and half ranges of parts of the observation of `OutageDash`, in their units; parts that
+contain the truth, `actual_NAME`, have these scales, too."""
 
 RACE_STD = {
     "position_sigma": ("m", "I", 0.008),
@@ -53,6 +49,14 @@ CONSTANT_CRASH_COST = 100.0
 _CRASH = Crash()
 
 Parts = dict[str, NDArray[np.float64]]
+
+
+def _sigma(view: "View") -> NDArray[np.float64]:
+    """Largest standard deviation of the position along an axis, (n,) [m]; 0 without a filter."""
+    try:
+        return np.asarray(view.estimate.position_sigma.max(axis=1))
+    except ValueError:  # no filter runs with observation="truth"
+        return np.zeros(view.count)
 
 
 class WithStd(LookAround):
@@ -76,10 +80,7 @@ class WithStd(LookAround):
 
     def observe(self, view: "View") -> Parts:
         """Return `features_direction` (n, 3) and `log_sigma` (n,)."""
-        try:
-            sigma = self._factor * view.estimate.position_sigma.max(axis=1)
-        except ValueError:  # no filter runs with observation="truth"
-            sigma = np.zeros(view.count)
+        sigma = self._factor * _sigma(view)
         return {**super().observe(view), "log_sigma": np.log10(np.maximum(sigma, 1e-9) / TYPICAL)}
 
 
@@ -223,28 +224,25 @@ class ResidualRace(ObservedRace):
         return view.state.residual
 
 
-def _scaled(name: str, value: Any) -> Any:
-    """Scale a value of a part of `OutageDash` for `Scaled`."""
-    if name in _WIDTHS:
-        return (value - _MIDDLE_WIDTH) / _HALF_RANGE
-    return value / _SCALES.get(name.removeprefix(_ACTUAL), 1.0)
+def scaled_parts(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert parts of an observation of `OutageDash`, or their bounds, to those of `Scaled`."""
+    found = {}
+    for name, part in parts.items():
+        middle, half = _SCALES.get(name.removeprefix("actual_"), (0.0, 0.0))
+        found[f"{name}_scaled" if half else name] = (part - middle) / half if half else part
+    return found
 
 
-def _shown_as(name: str) -> str:
-    """Name in `Scaled` of a part of `OutageDash`."""
-    return f"{name}_scaled" if name.removeprefix(_ACTUAL) in (*_SCALES, *_WIDTHS) else name
-
-
-def scaled_parts(parts: Parts) -> Parts:
-    """Convert parts of an observation of `OutageDash` to the names and units of `Scaled`."""
-    return {_shown_as(name): _scaled(name, part) for name, part in parts.items()}
-
-
-def _in_numbers(name: str, part: ObservationSpec) -> ObservationSpec:
-    """Specification in `Scaled` of a part of `OutageDash`: dimensionless, with scaled bounds."""
-    if _shown_as(name) == name:
-        return part
-    return ObservationSpec("-", part.frame, _scaled(name, part.low), _scaled(name, part.high))
+def _scaled_specs(specs: Mapping[str, ObservationSpec]) -> dict[str, ObservationSpec]:
+    """Specifications of `OutageDash` in `Scaled`: scaled parts are dimensionless."""
+    low = scaled_parts({name: spec.low for name, spec in specs.items()})
+    high = scaled_parts({name: spec.high for name, spec in specs.items()})
+    return {
+        shown: spec._replace(
+            unit=spec.unit if shown in specs else "-", low=low[shown], high=high[shown]
+        )
+        for shown, spec in zip(low, specs.values(), strict=True)
+    }
 
 
 class Scaled(OutageDash):
@@ -257,9 +255,7 @@ class Scaled(OutageDash):
     policies for `OutageDash` are rejected in this task, and vice versa.
     """
 
-    observes: Mapping[str, ObservationSpec] = {
-        _shown_as(name): _in_numbers(name, part) for name, part in OutageDash.observes.items()
-    }
+    observes: Mapping[str, ObservationSpec] = _scaled_specs(OutageDash.observes)
 
     def observe(self, view: "View") -> Parts:
         """Return the observation of `OutageDash`, scaled."""
@@ -282,11 +278,10 @@ class WithUncertainty(Scaled):
     def observe(self, view: "View") -> Parts:
         """Return the observation of `Scaled`, and `uncertainty` (n, 2)."""
         parts = super().observe(view)
-        scaled = np.stack([parts[f"{name}_scaled"] for name in _WIDTHS], axis=1)
-        return {
-            **parts,
-            "uncertainty": normalized_uncertainty(view, _HALF_RANGE * scaled + _MIDDLE_WIDTH),
-        }
+        scaled = np.stack([parts["gap_width_scaled"], parts["next_width_scaled"]], axis=1)
+        middle, half = _SCALES["gap_width"]
+        ratio = SIGMAS * _sigma(view)[:, np.newaxis] / (0.5 * (half * scaled + middle) - MARGIN)
+        return {**parts, "uncertainty": np.asarray(0.5 * np.log2(np.maximum(ratio, 2.0**-8)))}
 
 
 class ConstantCrashCost(Scaled):
@@ -316,16 +311,6 @@ class ConstantCrashCost(Scaled):
 
 class ConstantCrashCostWithUncertainty(ConstantCrashCost, WithUncertainty):
     """`WithUncertainty` for training, with the changes of `ConstantCrashCost`."""
-
-
-def normalized_uncertainty(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """log4(2 sigma / clearance) for gaps of widths (n, k) [m], (n, k); see `WithUncertainty`."""
-    try:
-        sigma = view.estimate.position_sigma.max(axis=1)
-    except ValueError:  # no filter runs with observation="truth"
-        sigma = np.zeros(view.count)
-    ratio = SIGMAS * sigma[:, np.newaxis] / (0.5 * widths - MARGIN)
-    return np.asarray(0.5 * np.log2(np.maximum(ratio, 2.0**-8)))
 
 
 class MaskedStd(StaleRace):

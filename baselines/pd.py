@@ -69,21 +69,22 @@ _ABSOLUTE_FIELDS = (
 
 def _require_plain_observations(env: Any) -> None:
     """Reject environments with wrappers that change observations or their space."""
+    kinds = (gymnasium.ObservationWrapper, gymnasium.vector.VectorObservationWrapper)
     layer = env
-    while True:
-        inner = getattr(layer, "env", None) or getattr(layer, "venv", None)
-        if inner is None:
-            return
-        changes = isinstance(
-            layer, (gymnasium.ObservationWrapper, gymnasium.vector.VectorObservationWrapper)
-        )
+    while inner := getattr(layer, "env", None) or getattr(layer, "venv", None):
         normalizes = getattr(layer, "norm_obs", False)  # VecNormalize of Stable-Baselines3
-        if changes or normalizes or layer.observation_space != inner.observation_space:
+        same = layer.observation_space == inner.observation_space
+        if isinstance(layer, kinds) or normalizes or not same:
             raise ValueError(
                 "env must return its original observations, in meters and radians: "
                 f"{type(layer).__name__} changes them"
             )
         layer = inner
+
+
+def _unit(vectors: Array) -> Array:
+    """Vectors (n, 3) divided by their lengths."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
 
 
 class PDPolicy:
@@ -145,9 +146,9 @@ class PDPolicy:
         self._faces = check.choice("faces", faces, FACES)
         self._waits = check.choice("pace", pace, PACES) == "waiting"
         shown = {field.name for field in flights.table}
-        for mode, names in _REQUIRED.items():
-            for name in names:
-                if mode in (f'faces="{faces}"', f'pace="{pace}"') and name not in shown:
+        for mode in (f'faces="{faces}"', f'pace="{pace}"'):
+            for name in _REQUIRED.get(mode, ()):
+                if name not in shown:
                     how = ": make it with include_std=True" if "sigma" in name else ""
                     raise ValueError(f"env must observe {name} for {mode}{how}")
         # observations of tasks with a reference at rest may lack its acceleration
@@ -166,8 +167,7 @@ class PDPolicy:
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
         if flights.action in ("motor", "wrench"):
             self._warn_if_too_slow(flights.control_rate, flights.batch.vehicle.inertia)
-        self._vehicle = flights.batch.vehicle
-        self._scales = flights.batch.action_params
+        self._vehicle, self._scales = flights.batch.vehicle, flights.batch.action_params
         self._action, self._absolute = flights.action, flights.layout == "absolute"
         self._slices = {field.name: field.slice for field in flights.table}
         self._widths = policy_size(flights.table), flights.table[-1].slice.stop
@@ -231,8 +231,7 @@ class PDPolicy:
         if self._faces == "reference":
             return seen
         toward = part["features_direction"]
-        toward = toward - (toward * seen.up).sum(axis=1, keepdims=True) * seen.up
-        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+        toward = _unit(toward - (toward * seen.up).sum(axis=1, keepdims=True) * seen.up)
         if self._faces == "features":
             return seen._replace(heading=toward)
         unsure = part["position_sigma"].max(axis=1, keepdims=True) > UNSURE
@@ -280,8 +279,7 @@ class PDPolicy:
     @staticmethod
     def _attitude_error(z_wanted: Array, heading: Array) -> Array:
         """Return e (n, 3), `[e x] = R_E^T - R_E`: twice the rotation vector of small errors [-]."""
-        b = np.cross(z_wanted, heading)
-        b /= np.maximum(np.linalg.norm(b, axis=1, keepdims=True), 1e-9)
+        b = _unit(np.cross(z_wanted, heading))
         a = np.cross(b, z_wanted)
         return np.stack(
             [b[:, 2] - z_wanted[:, 1], z_wanted[:, 0] - a[:, 2], a[:, 1] - b[:, 0]], axis=1
@@ -293,7 +291,7 @@ class PDPolicy:
         vehicle, g = self._vehicle, self.gains
         weight = vehicle.mass * vehicle.gravity
         F = self._force(seen)
-        z_wanted = F / np.maximum(np.linalg.norm(F, axis=1, keepdims=True), 1e-9)
+        z_wanted = _unit(F)
         e = self._attitude_error(z_wanted, seen.heading)
         thrust = F[:, 2]
         rates = np.array(g.attitude) / np.maximum(g.body_rates, 1e-9) * e
@@ -318,8 +316,7 @@ class PDPolicy:
     @staticmethod
     def _level_axes(up: Array) -> tuple[Array, Array]:
         """Horizontal unit vectors ahead and to the left, in B."""
-        ahead = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
-        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+        ahead = _unit(np.array([1.0, 0.0, 0.0]) - up[:, :1] * up)
         return ahead, np.cross(up, ahead)
 
     def _tilt(self, z_wanted: Array, up: Array) -> Array:

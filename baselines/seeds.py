@@ -28,7 +28,7 @@ TEST_END = 10**9
 MAX_SEED = 99_999
 """Largest seed of a training, for which the blocks of training and validation do not overlap."""
 
-_FIRST = {"training": TEST_END, "validation": 10**12, "test": 0}
+_FIRST = {"training": TEST_END, "validation": 10**12}
 
 
 def flight_seeds(purpose: str, seed: int, count: int) -> range:
@@ -38,20 +38,10 @@ def flight_seeds(purpose: str, seed: int, count: int) -> range:
     the seeds are outside the block of the purpose.
     """
     check.choice("purpose", purpose, PURPOSES)
-    check.whole("seed", seed, least=0)
-    check.whole("count", count)
-    if purpose == "test":
-        if seed + count > TEST_END:
-            raise ValueError(
-                f"seed must be at most {TEST_END - count}, because seeds from {TEST_END} on are "
-                f"for training, got {seed}"
-            )
-        return range(seed, seed + count)
-    if seed > MAX_SEED:
-        raise ValueError(f"seed must be at most {MAX_SEED}, got {seed}")
-    if count > BLOCK:
-        raise ValueError(f"count must be at most {BLOCK} flights, got {count}")
-    first = _FIRST[purpose] + BLOCK * seed
+    testing = purpose == "test"  # from TEST_END on, seeds are for training
+    check.whole("count", count, most=TEST_END if testing else BLOCK)
+    check.whole("seed", seed, least=0, most=TEST_END - count if testing else MAX_SEED)
+    first = seed if testing else _FIRST[purpose] + BLOCK * seed
     return range(first, first + count)
 
 

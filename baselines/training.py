@@ -27,6 +27,7 @@ from baselines.plans import Plan, description
 from baselines.policies import interface_of
 from quad_gym.analysis.reports import versions, write_json
 from quad_gym.batch.threads import resolve_threads
+from quad_gym.params import checks as check
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def train(
 def require_model(plan: Plan) -> None:
     """Make the untrained model once, to check a plan, and that its engine is installed."""
     if plan.engine == "compiled":
+        check.package("numba", "the compiled engine", "compile")
         from baselines.compiled_ppo.run import make_compiled
 
         make_compiled(plan).env.close()

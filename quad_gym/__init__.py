@@ -17,14 +17,18 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.params.log_delays import LogDelays
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.obstacles import Cylinder, Wall
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.reward import RewardParams
-from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
+from quad_gym.params.sensors import (
+    InitialPoseParams,
+    LogDelays,
+    NoisyObservationParams,
+    SensorSuite,
+)
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.trajectories import Trajectory

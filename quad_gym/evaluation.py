@@ -129,14 +129,7 @@ def roll_out(
     complete = (lengths == limit) & ~crashed
     late_error = np.where(complete, late / np.maximum(late_steps, 1), np.nan)
     return Episodes(
-        returns,
-        lengths,
-        errors / lengths,
-        late_error,
-        estimation / lengths,
-        crashed,
-        gates,
-        ending,
+        returns, lengths, errors / lengths, late_error, estimation / lengths, crashed, gates, ending
     )
 
 
@@ -166,7 +159,7 @@ def evaluate(
         env_id: Id from `quad_gym.IDS`, or one registered with `quad_gym.register_task`.
         episodes: Number of episodes.
         seed: Seed of the first episode; episode i has seed + i.
-        watch: Function called at the start and after every step, such as `recording.Tracer.add`.
+        watch: As in `roll_out`.
         keywords: Keywords of the environment.
 
     Returns:

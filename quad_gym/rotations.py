@@ -76,9 +76,7 @@ def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
     locked = cos_roll < 1e-12
     pitch = np.where(locked, 0.0, np.arctan2(-R[..., 0, 2], R[..., 2, 2]))
     yaw = np.where(
-        locked,
-        np.arctan2(R[..., 0, 1], R[..., 0, 0]),
-        np.arctan2(-R[..., 1, 0], R[..., 1, 1]),
+        locked, np.arctan2(R[..., 0, 1], R[..., 0, 0]), np.arctan2(-R[..., 1, 0], R[..., 1, 1])
     )
     return np.stack([roll, pitch, yaw], axis=-1)
 

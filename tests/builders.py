@@ -117,10 +117,8 @@ def _columns(rows):
 
 
 def together(base, flights, *, mode="NextStep", threads=1, **keywords):
-    """Fly several flights in one batch: observations, rewards, terminated, truncated.
-
-    Arrays of all steps, (steps, n, ...) each.
-    """
+    """Fly several flights in one batch: observations, rewards, terminated, truncated. Arrays of all
+    steps, (steps, n, ...) each."""
     count = len(flights)
     made = {**SHORT, "base": base, "autoreset_mode": mode, **keywords}
     env = QuadVectorEnv(count, threads=threads, **made)

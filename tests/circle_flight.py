@@ -1,8 +1,6 @@
-"""What the sensors of a vehicle on a circle measure, in closed form and with NumPy alone.
-
-The vehicle circles the origin while it heaves and swings its heading, so that features leave the
-image and come back.
-"""
+"""What the sensors of a vehicle on a circle measure, in closed form and with NumPy alone. The
+vehicle circles the origin while it heaves and swings its heading, so that features leave the image
+and come back."""
 
 from dataclasses import dataclass
 

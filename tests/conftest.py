@@ -2,6 +2,8 @@
 
 import os
 
+os.environ.setdefault("QUAD_GYM_KERNELS", "numba")  # even where a library is built
+
 from hypothesis import HealthCheck, settings
 
 from quad_gym.kernels.compiling.workers import prepare

@@ -1,10 +1,9 @@
 """Commands run in the test's own process, which has imported already what each would import anew.
-
-What needs a process of its own, such as a signal, starts one by `line`.
-"""
+What needs a process of its own, such as a signal, starts one by `line`."""
 
 import contextlib
 import io
+import re
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,6 @@ from typing import NamedTuple
 import pytest
 
 from quad_gym.commands.main import main
-from tests.console import plain
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -53,3 +51,8 @@ def refused(words, capsys):
         main(words.split() if isinstance(words, str) else words)
     assert end.value.code == 2
     return plain(capsys.readouterr().err)
+
+
+def plain(text: str) -> str:
+    """The words of `text` on one line, without the frames that messages of the parser have."""
+    return " ".join(re.sub("[╭╮╰╯│─]", " ", text).split())

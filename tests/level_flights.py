@@ -1,7 +1,5 @@
-"""Closed-form flights of a vehicle that keeps its attitude, for filters that start level.
-
-It swings level, r = A (sin wt, (1 - cos wt)/2, 0): no law of a quadrotor, but a filter knows none.
-"""
+"""Closed-form flights of a vehicle that keeps its attitude, for filters that start level. It swings
+level, r = A (sin wt, (1 - cos wt)/2, 0): no law of a quadrotor, but a filter knows none."""
 
 import math
 

@@ -1,8 +1,6 @@
-"""Logs of simulated flights, as a recorder on board would have written them.
-
-IMU samples at irregular times (means over one to three ticks), some lost; measurements with their
-right time stamps, some lost, arriving with a jitter beside their latency. As CSV and as ULog.
-"""
+"""Logs of simulated flights, as a recorder on board would have written them. IMU samples at
+irregular times (means over one to three ticks), some lost; measurements with their right time
+stamps, some lost, arriving with a jitter beside their latency. As CSV and as ULog."""
 
 import csv
 import struct
@@ -27,10 +25,8 @@ AXES_OF_FIELD = [f"magnetometer_{axis}" for axis in "xyz"]
 
 
 def flown(suite=RTK, seconds=10.0, seed=5, task="circle"):
-    """A flight under PD control on the estimate, with a row per IMU sample.
-
-    Its `about` has what aiding sensors measured, (n, 2, 3), NaN where they did not.
-    """
+    """A flight under PD control on the estimate, with a row per IMU sample. Its `about` has what
+    aiding sensors measured, (n, 2, 3), NaN where they did not."""
     rate = suite.imu.rate
     env = QuadEnv(task, sensors=suite, control_rate=rate, duration=seconds)
     policy, recorder = PDPolicy(env), FlightRecorder(env.flights.batch)

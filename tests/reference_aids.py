@@ -1,11 +1,9 @@
-"""The plain filter of `reference_ukf.py` with a barometer and a magnetometer.
-
-Slow errors come behind b_g: the drift of GNSS positions, if there is one; hard iron b (three); then
-one each, the barometer's bias and the error of the declination. Where the covariance turns with the
-attitude, hard iron turns so that what the field tells of both together stays as it is. What the
-filter believes to be constant has a driving noise so small that 45 digits do not notice it. As
-there: UKF and, by numerical derivatives, EKF, in any number type.
-"""
+"""The plain filter of `reference_ukf.py` with a barometer and a magnetometer. Slow errors come
+behind b_g: the drift of GNSS positions, if there is one; hard iron b (three); then one each, the
+barometer's bias and the error of the declination. Where the covariance turns with the attitude,
+hard iron turns so that what the field tells of both together stays as it is. What the filter
+believes to be constant has a driving noise so small that 45 digits do not notice it. As there: UKF
+and, by numerical derivatives, EKF, in any number type."""
 
 import math
 

@@ -1,8 +1,6 @@
-"""A filter that meets late measurements by filtering all over again from their time stamps.
-
-It stores its state at every tick, every IMU sample and every measurement: what a measurement that
-arrives late should do to an estimate, without any approximation.
-"""
+"""A filter that meets late measurements by filtering all over again from their time stamps. It
+stores its state at every tick, every IMU sample and every measurement: what a measurement that
+arrives late should do to an estimate, without any approximation."""
 
 from collections import defaultdict
 

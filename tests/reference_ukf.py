@@ -1,16 +1,12 @@
 """A plain augmented unscented Kalman filter, written from the equations: the truth for the package.
-
 No structure is used: the noise is part of the state, every sigma point is evaluated, the weights
 are the textbook's near -1e6. Their cancellation costs some ten digits, so that neither float64 nor
 an 80-bit long double (which is off by 1e-9 m) can serve as truth; with `number=decimal.Decimal` the
 filter computes in as many digits as the decimal context has. In float64 it is the plain NumPy
-filter that speeds are compared with.
-
-State (r, v, e, b_a, b_g) with R_BI = R(e) Rbar_BI and e = 0 after each step. Prediction noise
-(v_g, v_g2, v_a, v_a2). Where GNSS positions drift, the slow error d is part of the state, after
-b_g, and its driving noise part of the noise, at the end. `PlainEKF` differentiates the same models
-numerically, which is as good as exact in that many digits.
-"""
+filter that speeds are compared with. State (r, v, e, b_a, b_g) with R_BI = R(e) Rbar_BI and e = 0
+after each step. Prediction noise (v_g, v_g2, v_a, v_a2). Where GNSS positions drift, the slow error
+d is part of the state, after b_g, and its driving noise part of the noise, at the end. `PlainEKF`
+differentiates the same models numerically, which is as good as exact in that many digits."""
 
 from decimal import Decimal
 
@@ -144,10 +140,8 @@ def block_diagonal(*blocks):
 
 
 def attitude_from_two_pairs(u_B, v_B, u_I, v_I):
-    """Wahba's problem for two pairs of unit vectors of equal weight.
-
-    The sums of both pairs are then parallel, and so are the differences.
-    """
+    """Wahba's problem for two pairs of unit vectors of equal weight. The sums of both pairs are
+    then parallel, and so are the differences."""
 
     def triad(u, v):
         s, d = unit(u + v), unit(u - v)

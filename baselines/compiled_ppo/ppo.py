@@ -19,17 +19,9 @@ from quad_gym.batch.threads import resolve_threads
 from quad_gym.params import checks as check
 
 PARAMETERS = {
-    "n_steps": 2048,
-    "batch_size": 64,
-    "n_epochs": 10,
-    "gamma": 0.99,
-    "gae_lambda": 0.95,
-    "clip_range": 0.2,
-    "normalize_advantage": True,
-    "ent_coef": 0.0,
-    "vf_coef": 0.5,
-    "max_grad_norm": 0.5,
-    "critic_only": 0,
+    **{"n_steps": 2048, "batch_size": 64, "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.95},
+    **{"clip_range": 0.2, "normalize_advantage": True, "ent_coef": 0.0, "vf_coef": 0.5},
+    **{"max_grad_norm": 0.5, "critic_only": 0},
 }
 """Parameters of a recipe, with the defaults of Stable-Baselines3, which lacks `critic_only`: the
 number of values at the end of an observation for the critic only, such as the true state."""
@@ -186,14 +178,9 @@ class CompiledPPO:
             self._finished += self._returns[self._ended[t]].tolist()
             self._returns[self._ended[t]] = 0.0
         self.num_timesteps += self._ended.size
-        self._advantages[:] = advantages(
-            self._rewards,
-            self._values,
-            self._ended,
-            self._evaluate(self._seen)[1],
-            self.parameters["gamma"],
-            self.parameters["gae_lambda"],
-        )
+        discounts = (self.parameters["gamma"], self.parameters["gae_lambda"])
+        seen_so_far = (self._rewards, self._values, self._ended, self._evaluate(self._seen)[1])
+        self._advantages[:] = advantages(*seen_so_far, *discounts)
         self._targets[:] = self._advantages + self._values
 
     def _evaluate(self, x: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

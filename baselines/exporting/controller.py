@@ -92,7 +92,11 @@ def controller_of(
         raise ValueError(f"there is no policy {file}{meant}")
     if file.suffix not in (".npz", ".zip"):
         raise ValueError(f"policy must be pretrained, or a .npz or .zip file, got {policy!r}")
-    record = _record_of(file)
+    record: dict[str, Any] = {}  # in a .npz, or next to a .zip
+    if file.suffix == ".npz":
+        record = MlpPolicy.load(file).record
+    elif (stored := file.parent / "training.json").exists():
+        record = json.loads(stored.read_text(encoding="utf-8"))
     plan = record.get("plan", {})
     if env_id is None:
         if "env_id" not in plan:
@@ -124,16 +128,6 @@ def controller_of(
         env.close()
     _require_same(controller, found, file)
     return controller
-
-
-def _record_of(file: Path) -> dict[str, Any]:
-    """Training record of a policy: in a `.npz`, next to a `.zip`; empty if there is none."""
-    if file.suffix == ".npz":
-        return MlpPolicy.load(file).record
-    record = file.parent / "training.json"
-    if file.suffix == ".zip" and record.exists():
-        return dict(json.loads(record.read_text(encoding="utf-8")))
-    return {}
 
 
 def _require_same(controller: Controller, model: Any, file: Path) -> None:

@@ -25,7 +25,7 @@ LIBRARY, HEADER = "libquad_gym_filter.a", "quad_gym_filter.h"
 class Target(NamedTuple):
     """A processor for which filters are exported."""
 
-    processor: tuple[str, ...]
+    processor: tuple[str, str, str]
     """triple of four parts, processor and relocation, in LLVM's words"""
     words: str
     """description"""
@@ -42,12 +42,12 @@ clang --target=wasm32-wasi --sysroot=/usr -std=c99 -O2 -D_WASI_EMULATED_PROCESS_
     main.c libquad_gym_filter.a -lm -lwasi-emulated-process-clocks -o example.wasm  # wasi-libc"""
 TARGETS = {
     "x86-64": Target(
-        ("x86_64-unknown-linux-gnu", "x86-64-v3"),
+        ("x86_64-unknown-linux-gnu", "x86-64-v3", "pic"),
         "Linux on x86-64 with AVX2 and FMA (since 2013)",
         _CMAKE,
     ),
     "aarch64": Target(
-        ("aarch64-unknown-linux-gnu", "generic"),
+        ("aarch64-unknown-linux-gnu", "generic", "pic"),
         "Linux on AArch64",
         _CMAKE.replace("build &&", "build -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc &&", 1),
     ),
@@ -76,10 +76,12 @@ def export_filter(
     Raises:
         ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
             observes more than the estimate.
+        ImportError: If Numba is not installed.
         RuntimeError: If the kernels cannot be emitted for the target.
     """
     check.choice("target", target, tuple(TARGETS))
     suite.require_filter()
+    check.package("numba", "exporting a filter", "compile")
     values = {} if policy is None else policy_values(policy)
     env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
@@ -110,15 +112,14 @@ def _contents(
 ) -> dict[str, bytes]:
     """Return the files by name; records must have one lane."""
     from baselines.exporting.filter_sources import Sources
-    from quad_gym.kernels.compiling.cache import say
     from quad_gym.kernels.compiling.foreign import (
         Processor,
         emitted,
         is_cached,
         loaded_size,
         object_of,
-        symbol_of,
     )
+    from quad_gym.kernels.library import core_symbol, say
 
     sources = Sources(suite, label, target, policy)
     processor = Processor(*TARGETS[target].processor)
@@ -130,7 +131,7 @@ def _contents(
             tasks = [pool.submit(object_of, name, processor) for name in missing]
             for task in tasks:
                 task.result()
-    objects = {symbol_of(name): object_of(name, processor) for name in sources.functions}
+    objects = {core_symbol(name): object_of(name, processor) for name in sources.functions}
     for symbol, numbers in sources.constants.items():
         text = "".join(f"\\{byte:02X}" for byte in numbers)
         ir = f'@{symbol} = constant [{len(numbers)} x i8] c"{text}", align 64\n'

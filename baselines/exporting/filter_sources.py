@@ -16,8 +16,8 @@ from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.first_fix import FARTHEST_FIX, LEAST_COURSE
 from quad_gym.estimation.starts import LEVEL_SIGMA, state_at_rest
-from quad_gym.kernels.compiling.foreign import symbol_of
 from quad_gym.kernels.entries import FILTER_STAGES
+from quad_gym.kernels.library import core_symbol
 from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.packing.aids import slow_states
 from quad_gym.params.sensors import SensorSuite
@@ -168,10 +168,10 @@ class Sources:
             for name, kind in (("sample", SAMPLE), ("measurement", MEASUREMENT), ("start", START))
         )
         values["STAGE_DECLARATIONS"] = "\n".join(
-            f"QGI_STAGE({symbol_of(name)});" for name in self.stages.values()
+            f"QGI_STAGE({core_symbol(name)});" for name in self.stages.values()
         )
         values["FILL_TABLE"] = "\n".join(
-            f"    f->table[{int(s)}] = (uint64_t)(uintptr_t){symbol_of(name)};"
+            f"    f->table[{int(s)}] = (uint64_t)(uintptr_t){core_symbol(name)};"
             for s, name in self.stages.items()
         )
         noise = [f"    r.{name} = NAN;" for name in NOISE_FIELDS[1:]]

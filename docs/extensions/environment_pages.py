@@ -10,11 +10,12 @@ A keyword or a part of an observation that the docstring lacks is an error.
 
 import ast
 import dataclasses
-import importlib
 import inspect
 import itertools
+import pkgutil
 import re
 import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +29,7 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
 from quad_gym.envs.keywords import TASK_KEYWORDS
 from quad_gym.envs.spaces import ObservationField
-from quad_gym.flights.record import COLUMNS, FEATURES
+from quad_gym.flights.columns import COLUMNS, FEATURES
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES
 from quad_gym.tasks.view import VIEW_FIELDS
@@ -60,21 +61,13 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def _attribute_docs(kind: type) -> dict[str, str]:
     """Docstrings below the fields of a class, in its own body."""
-    module = ast.parse(Path(inspect.getfile(kind)).read_text(encoding="utf-8"))
-    body = next(
-        node.body
-        for node in ast.walk(module)
-        if isinstance(node, ast.ClassDef) and node.name == kind.__name__
-    )
-    return {
-        part.target.id: " ".join(after.value.value.split())
-        for part, after in itertools.pairwise(body)
-        if isinstance(part, ast.AnnAssign)
-        and isinstance(part.target, ast.Name)
-        and isinstance(after, ast.Expr)
-        and isinstance(after.value, ast.Constant)
-        and isinstance(after.value.value, str)
-    }
+    (node,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    found = {}
+    for part, after in itertools.pairwise(node.body):  # type: ignore[attr-defined]
+        match part, after:
+            case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                found[name] = " ".join(text.split())
+    return found
 
 
 def _field_docs(kind: type) -> dict[str, str]:
@@ -107,10 +100,6 @@ def _value(value: Any) -> str:
     return f"`{value!r}`"
 
 
-def _range(field: ObservationField) -> str:
-    return f"{field.low:g} to {field.high:g}"
-
-
 def _observation_rows(
     table: Iterable[ObservationField], meanings: dict[str, str] | None = None
 ) -> list[tuple[str, ...]]:
@@ -118,7 +107,8 @@ def _observation_rows(
     for field in table:
         said = () if meanings is None else (meanings[field.name],)
         where = f"{field.slice.start}:{field.slice.stop}"
-        rows.append((where, f"`{field.name}`", *said, field.unit, field.frame, _range(field)))
+        bounds = f"{field.low:g} to {field.high:g}"
+        rows.append((where, f"`{field.name}`", *said, field.unit, field.frame, bounds))
     return rows
 
 
@@ -195,12 +185,6 @@ def _vehicles() -> str:
     return text + _table(("field", *vehicles, "meaning"), rows)
 
 
-def _task_class(name: str) -> type[quad_gym.Task]:
-    module, attribute = name.split(":")
-    found: type[quad_gym.Task] = getattr(importlib.import_module(module), attribute)
-    return found
-
-
 def _task_sections(task: type[quad_gym.Task]) -> dict[str, str]:
     """What the docstring of a task says, by its headings; "About" is what stands before them."""
     text = inspect.getdoc(task) or ""
@@ -216,10 +200,8 @@ SHARED = ("Observation space", "Action space", "Reward", "Episode end", "Start",
 
 def _specification_page(sections: dict[str, str]) -> str:
     """Sections of the specification that all environments share."""
-    text = (
-        "# Specification of the environments\n\nThe text of `help(quad_gym.QuadEnv)`. Keywords are "
-    )
-    text += "under [Keywords of every environment](keywords.md); each environment's page lists "
+    text = "# Specification of the environments\n\nThe text of `help(quad_gym.QuadEnv)`. Keywords "
+    text += "are under [Keywords of every environment](keywords.md); each environment's page lists "
     text += "those of its task, and the parts that differ.\n"
     return text + "".join(f"\n## {name}\n\n{sections[name]}\n" for name in SHARED)
 
@@ -233,7 +215,7 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
     reference, start, limit = (cell.strip() for cell in row[1].split("|"))
     own = BENCHMARKS.get(kind)
     defaults = TASK_DEFAULTS[kind] if own is None else own.task
-    task = None if own is None else _task_class(own.keywords["task"])
+    task = None if own is None else pkgutil.resolve_name(own.keywords["task"])
     spec = {} if task is None else _task_sections(task)
     settings = {} if own is None else dict(own.keywords)
     rows = [
@@ -243,17 +225,10 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         and key not in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ())
         and not (own is not None and key == "reward_params")
     ]
-    rows += [
-        (f"`{key}`", _value(value), "a keyword of every environment")
-        for key, value in settings.items()
-    ]
-    if task is None:
-        different = ""
-    else:
-        different = "".join(
-            f"## {heading}\n\n{spec[heading]}\n\n"
-            for heading in ("Observation", "Reward", "Endings")
-        )
+    every = "a keyword of every environment"
+    rows += [(f"`{key}`", _value(value), every) for key, value in settings.items()]
+    headings = () if task is None else ("Observation", "Reward", "Endings")
+    different = "".join(f"## {heading}\n\n{spec[heading]}\n\n" for heading in headings)
     return "\n".join(
         [
             f"# {name}\n\n`{env_id}`\n",
@@ -300,21 +275,16 @@ def _suites_page() -> str:
 
 def _fields_page() -> str:
     """What a flight's record and a recorded flight hold."""
-    fields = [
-        (f"`{name}`", "(" + ", ".join(map(str, q.shape)) + ")", q.unit, q.frame, q.meaning)
-        for name, q in QUANTITIES.items()
-    ]
-    view = [(f"`{f.name}`", f.shape, f.unit, f.frame, f.meaning) for f in VIEW_FIELDS]
-    columns = [
-        (
-            f"`{c.name}`",
-            "(" + ", ".join("features" if n == FEATURES else str(n) for n in c.shape) + ")",
-            c.unit,
-            c.frame,
-            c.meaning,
-        )
-        for c in COLUMNS
-    ]
+
+    def row(name: str, shape: Any, about: Any) -> tuple[str, ...]:
+        if not isinstance(shape, str):
+            sizes = ("features" if n == FEATURES else str(n) for n in shape)
+            shape = f"({', '.join(sizes)})"
+        return f"`{name}`", shape, about.unit, about.frame, about.meaning
+
+    fields = [row(name, quantity.shape, quantity) for name, quantity in QUANTITIES.items()]
+    view = [row(field.name, field.shape, field) for field in VIEW_FIELDS]
+    columns = [row(column.name, column.shape, column) for column in COLUMNS]
     return (
         "# Fields of flights\n\n## Columns of a recorded flight\n\nColumns of `quad_gym.Flight`, "
         "with a row for each control step.\n\n"

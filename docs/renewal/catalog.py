@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from docs.renewal import texts
 from docs.renewal.texts import SUITES, TRACKING, Texts
 
-TESTS = 100_000  # first of the test episodes of studies: nobody looked at them while choosing
-
 
 @dataclass(frozen=True, kw_only=True)
 class Result:

@@ -2,13 +2,14 @@
 
 import csv
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from docs.renewal.extracts import cell, compile_seconds, interface_speeds, study_rows
 from docs.renewal.pages import console as block
 from docs.renewal.pages import table
+from quad_gym.analysis.intervals import Estimated
+from quad_gym.experiments.study_report import number, share
 
 Texts = Callable[[Path, Sequence[str]], dict[str, str]]
 TRACKING = ("Hover", "Circle", "Lemniscate", "RandomTrajectory")
@@ -24,13 +25,16 @@ SUITES = {
 """Options of the rows of the table of consistency, by their labels."""
 
 
+HEADINGS = {"success": "success", "crashed": "crashed", "error": "position error [m]"}
+SPEEDS = {
+    "estimate": "vector, estimate, 50 Hz, standard",
+    "truth": "vector, truth, 50 Hz, standard",
+}
+"""Names of the benchmark's rows by the names of their marks."""
+
+
 def _read(file: Path) -> Any:
     return json.loads(file.read_text(encoding="utf-8"))
-
-
-def _rows(file: Path) -> list[dict[str, str]]:
-    with file.open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def _body(printed: str) -> str:
@@ -49,9 +53,9 @@ def console(name: str) -> Texts:
 
 def policies(folder: Path, _: Sequence[str]) -> dict[str, str]:
     rows, ids = [], (*TRACKING, "Waypoints")
-    for number, task in enumerate(ids):
+    for k, task in enumerate(ids):
         row = [f"`QuadGym/{task}-v0`"]
-        for case in _read(folder / f"{number}/summary.json")["cases"]:
+        for case in _read(folder / f"{k}/summary.json")["cases"]:
             if task == "Waypoints":
                 row += [f"{case['gates_passed']:.2f} of 5 gates", f"{case['crash_rate']:.1%}"]
             else:
@@ -63,21 +67,14 @@ def policies(folder: Path, _: Sequence[str]) -> dict[str, str]:
 
 def recipes(folder: Path, _: Sequence[str]) -> dict[str, str]:
     rows = []
-    for group in _rows(folder / "0/groups.csv"):
-        each = [f"{1e3 * float(group[k]):.1f}" for k in ("mean_error", *_ENDS)]
-        crashed = [f"{100 * float(group[k]):.1f}" for k in ("crash_rate", *_CRASH_ENDS)]
-        rows.append(
-            [
-                f"`{group['group'].partition(',')[0]}`",
-                "{} [{}, {}] mm".format(*each),
-                "{} [{}, {}] %".format(*crashed),
-            ]
-        )
+    with (folder / "0/groups.csv").open(encoding="utf-8", newline="") as stream:
+        for group in csv.DictReader(stream):
+            cells = []
+            for name, scale, unit in (("mean_error", 1e3, "mm"), ("crash_rate", 1e2, "%")):
+                ends = (scale * float(group[f"{name}{end}"]) for end in ("", "_low", "_high"))
+                cells.append("{:.1f} [{:.1f}, {:.1f}] {}".format(*ends, unit))
+            rows.append([f"`{group['group'].partition(',')[0]}`", *cells])
     return {"recipes": table(("trainings", "mean error", "crashed"), rows)}
-
-
-_ENDS = ("mean_error_low", "mean_error_high")
-_CRASH_ENDS = ("crash_rate_low", "crash_rate_high")
 
 
 PARTS = ("state", "position", "velocity", "attitude", "accel_bias", "gyro_bias")
@@ -94,10 +91,11 @@ def ablation(which: str) -> Texts:
         rows = []
         for case, row in _read(folder / f"0/{which}.json")["rows"].items():
             cells = [_nees(row[f"nees_{part}"]) for part in PARTS]
-            cells.append(f"{1e3 * row['rms_position']:.1f} mm")
-            cells.append(f"{1e3 * row['rms_attitude']:.1f} mrad")
-            cells.append(f"{1e3 * row['tracking_mean']:.0f} mm")
-            rows.append([case, *cells])
+            cells += [
+                f"{1e3 * row['rms_position']:.1f} mm",
+                f"{1e3 * row['rms_attitude']:.1f} mrad",
+            ]
+            rows.append([case, *cells, f"{1e3 * row['tracking_mean']:.0f} mm"])
         parts = (part.replace("_", " ") for part in PARTS)
         errors = ("position error", "attitude error", "tracking error")
         return {f"ablation_{which}": table(("case; NEES of", *parts, *errors), rows)}
@@ -107,24 +105,30 @@ def ablation(which: str) -> Texts:
 
 def consistency(folder: Path, _: Sequence[str]) -> dict[str, str]:
     rows = []
-    for number, label in enumerate(SUITES):
-        overall = _read(folder / f"{number}/consistency.json")["overall"]
+    for k, label in enumerate(SUITES):
+        overall = _read(folder / f"{k}/consistency.json")["overall"]
         rows.append([label, *(_nees(overall[part]) for part in PARTS)])
     heads = ["suite", *(part.replace("_", " ") for part in PARTS)]
     return {"consistency": table(heads, [["(consistent)", "15", *["3"] * 5], *rows])}
 
 
+def _write_cells(file: Path, first: str, cells: dict[str, Any], *, misses: bool = False) -> None:
+    """Write the values of cells as CSV, with the reasons for misses."""
+    names = list(dict.fromkeys(name for cell in cells.values() for name in cell["values"]))
+    with file.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([first, *names, *["misses"] * misses, "expected"])
+        for label, cell in cells.items():
+            values = (cell["values"].get(name) for name in names)
+            shown = ["" if value is None else f"{value:.4g}" for value in values]
+            missed = [" ".join(cell["misses"])] * misses
+            writer.writerow([label, *shown, *missed, "; ".join(cell["expected"].values())])
+
+
 def matrix(folder: Path, _: Sequence[str]) -> dict[str, str]:
     """All cells as CSV, and those that deviate, with the reason where it is known."""
     cells = _read(folder / "0/matrix.json")["cells"]
-    names = list(dict.fromkeys(name for cell in cells.values() for name in cell["values"]))
-    with (folder / "0/matrix.csv").open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["cell", *names, "misses", "expected"])
-        for label, cell in cells.items():
-            values = [f"{cell['values'][n]:.4g}" if n in cell["values"] else "" for n in names]
-            reasons = "; ".join(cell["expected"].values())
-            writer.writerow([label, *values, " ".join(cell["misses"]), reasons])
+    _write_cells(folder / "0/matrix.csv", "cell", cells, misses=True)
     rows = []
     for label, cell in cells.items():
         for name in cell["misses"]:
@@ -144,14 +148,7 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
     faulty = {label: cell for label, cell in cells.items() if "undetected" in cell["values"]}
     calm = {label: cell for label, cell in cells.items() if "undetected" not in cell["values"]}
     for name, chosen in (("faults", faulty), ("calm", calm)):
-        columns = list(next(iter(chosen.values()))["values"])
-        with (folder / f"0/{name}.csv").open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(["trial", *columns, "expected"])
-            for label, cell in chosen.items():
-                values = [cell["values"][column] for column in columns]
-                shown = ["" if value is None else f"{value:.4g}" for value in values]
-                writer.writerow([label, *shown, "; ".join(cell["expected"].values())])
+        _write_cells(folder / f"0/{name}.csv", "trial", chosen)
     rows = [
         [
             label,
@@ -169,6 +166,24 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
         "recovery.count": f"{len(faulty)}",
         "recovery.alarms": f"{alarms:.1f}",
     }
+
+
+def study_rows(
+    summary: Mapping[str, Any], head: str, arms: Sequence[str], columns: Sequence[str]
+) -> str:
+    """Some arms of a study's table, or all (empty), and columns of `HEADINGS`."""
+    labels = {arm["name"]: arm["label"] for arm in summary["study"]["arms"]}
+    rows = [
+        [labels[name], *(cell(summary["rows"][name][column], column) for column in columns)]
+        for name in arms or labels
+    ]
+    return table((head, *(HEADINGS[column] for column in columns)), rows)
+
+
+def cell(found: Mapping[str, float], column: str) -> str:
+    """A value with its 95 % interval in brackets."""
+    estimated = Estimated(*(found[name] for name in ("value", "low", "high")))
+    return number(estimated, 3) if column == "error" else share(estimated)
 
 
 def study(name: str, *arms: str) -> Texts:
@@ -197,8 +212,10 @@ def variants(name: str, head: str, *columns: str) -> Texts:
 
 
 def compiling(folder: Path, printed: Sequence[str]) -> dict[str, str]:
-    seconds = compile_seconds(_read(folder / "0/benchmark.json"))
-    return {"speed.compile": seconds, **console("speed_compile")(folder, printed)}
+    """Seconds of the first reset with the default suite, from an empty cache, and the table."""
+    rows = _read(folder / "0/benchmark.json")["sections"]["compile"]
+    row = next(r for r in rows if r["name"] == "default" and r["cache"] == "empty")
+    return {"speed.compile": f"{row['seconds']:.0f} s", **console("speed_compile")(folder, printed)}
 
 
 def film_and_figures(study: str, figure: str) -> dict[str, str]:
@@ -216,5 +233,24 @@ def defaults(_: Path, printed: Sequence[str]) -> dict[str, str]:
 
 
 def speeds(folder: Path, _: Sequence[str]) -> dict[str, str]:
-    """Steps per second of the interfaces."""
-    return interface_speeds(_read(folder / "0/benchmark.json"))
+    """Steps per second of the interfaces with the default suite at 50 Hz."""
+    rows = _read(folder / "0/benchmark.json")["sections"]["interfaces"]
+    chosen = [
+        row
+        for row in rows
+        if row["name"].startswith("Pendulum")
+        or (row["name"].endswith(", 50 Hz, standard") and row["envs"] in (1, 1024))
+    ]
+    cells = {
+        (row["name"].replace(", 50 Hz, standard", ""), f"{row['envs']:,}", str(row["threads"])): (
+            f"{1.0 / row['seconds']:,.0f}"
+        )
+        for row in chosen
+    }
+    heads = ("interface, observation", "environments", "threads", "steps per second")
+    found = {"speed_interfaces": table(heads, [[*key, value] for key, value in cells.items()])}
+    for mark, name in SPEEDS.items():
+        best = max(1.0 / r["seconds"] for r in rows if r["name"] == name and r["envs"] == 1024)
+        thousands = f"{best / 1e3:,.0f},000"
+        found[f"speed.{mark}"] = thousands if best < 1e6 else f"{best / 1e6:.1f} million"
+    return found

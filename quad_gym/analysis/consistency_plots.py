@@ -14,14 +14,6 @@ from quad_gym.analysis.consistency import (
     Whiteness,
 )
 
-_TITLES = {
-    "state": "whole state",
-    "position": "position",
-    "velocity": "velocity",
-    "attitude": "attitude",
-    "accel_bias": "accel. bias",
-    "gyro_bias": "gyro bias",
-}
 _UNITS = {
     "position": ("mm", 1e3),
     "velocity": ("mm/s", 1e3),
@@ -44,6 +36,10 @@ def _grid(count: int, title: str, label: str = "time [s]") -> tuple[Any, Any]:
     return figure, grid.ravel()[:count]
 
 
+def _title(name: str) -> str:
+    return "whole state" if name == "state" else name.replace("_", " ")
+
+
 def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     """Draw a mean square over time with its band; the title states the share of instants inside.
 
@@ -55,9 +51,8 @@ def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
     if settle > 0.0:
         axes.axvline(settle, color=plots.VERMILLION, linewidth=0.8, linestyle=":")
     counted = part.since(settle)
-    title = _TITLES.get(part.name, part.name)
     inside = f"{100 * counted.share_inside:.0f} % within ±{100 * counted.tolerance:.2g} %"
-    axes.set_title(f"{title}: {counted.overall:.2f}, {inside}")
+    axes.set_title(f"{_title(part.name)}: {counted.overall:.2f}, {inside}")
     reach = 3.0 * (part.high - part.low).max()
     gaps = np.abs(counted.mean - part.dimension)
     limit = max(reach, 1.15 * float(np.percentile(gaps, 98.0)))  # regardless of outliers
@@ -91,7 +86,7 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
         for values, color, dashes in ((errors, plots.BLUE, "-"), (sigmas, plots.INK, (0, (4, 3)))):
             size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
             axis.plot(time, size, color=color, linestyle=dashes, linewidth=1.3)
-        axis.set_title(f"{_TITLES[name]} [{unit}]")
+        axis.set_title(f"{_title(name)} [{unit}]")
         plots.logarithmic(axis, subs=(2.0, 5.0))
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(axis="y", which="minor", labelsize=7.0)
@@ -114,5 +109,5 @@ def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
         )
         limit = 1.2 * max(2.5 * NEGLIGIBLE_CORRELATION, np.abs(part.correlation).max())
         axis.set_ylim(-limit, limit)
-        axis.set_title(f"{_TITLES.get(part.name, part.name)}: largest {part.largest:+.3f}")
+        axis.set_title(f"{_title(part.name)}: largest {part.largest:+.3f}")
     return figure

@@ -10,7 +10,6 @@ import math
 import warnings
 from collections.abc import Iterator
 
-from quad_gym.params.gnss import GnssParams
 from quad_gym.params.randomization import DrawingTable
 from quad_gym.params.sensors import SensorSuite
 
@@ -61,7 +60,10 @@ def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
 def _vague(sensors: SensorSuite) -> Iterator[tuple[str, float, float, str]]:
     """Fields that exceed their bounds: name, value, bound and unit."""
     gnss, magnetometer, pose = sensors.gnss, sensors.magnetometer, sensors.initial_pose
-    share, bounds = _level_share(gnss), []
+    share, bounds = 0.0, []  # level share of the baseline of a level vehicle
+    if gnss is not None and gnss.has_baseline:
+        x, y, z = gnss.baseline_B
+        share = math.hypot(x, y) / math.hypot(x, y, z)
     if gnss is not None and share >= STEEP:
         most = MAX_BASELINE_SIGMA * share
         bounds.append(("GnssParams.baseline_sigma", gnss.baseline_sigma, most, "rad"))
@@ -76,11 +78,3 @@ def _vague(sensors: SensorSuite) -> Iterator[tuple[str, float, float, str]]:
         sigma = pose.position_sigma
         bounds.append(("InitialPoseParams.position_sigma", sigma, MAX_POSITION_SIGMA, "m"))
     return ((name, value, most, unit) for name, value, most, unit in bounds if value > most)
-
-
-def _level_share(gnss: GnssParams | None) -> float:
-    """The level share of the baseline of a level vehicle; 0 without a baseline."""
-    if gnss is None or not gnss.has_baseline:
-        return 0.0
-    x, y, z = gnss.baseline_B
-    return math.hypot(x, y) / math.hypot(x, y, z)

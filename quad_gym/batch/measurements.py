@@ -1,11 +1,12 @@
 """`Measurements` of many flights that arrive at an instant, and the `Start` of episodes."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.memory import FlightMemory
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
@@ -21,9 +22,6 @@ from quad_gym.records import (
     field_of_flights,
 )
 
-if TYPE_CHECKING:
-    from quad_gym.batch.flight_batch import FlightBatch
-
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
@@ -35,6 +33,31 @@ class Reading(NamedTuple):
     new: Truths  #: True where one arrives: (n,), for pixels (n, features)
     age: float
     """Time since the measurement was taken, its time stamp: the latency of the sensor [s]"""
+
+
+def _record(name: str, meaning: str) -> "cached_property[Floats]":
+    """Make a property of a field of the flights' records."""
+
+    def read(self: "Measurements") -> Floats:
+        return self._batch.record(name)
+
+    read.__doc__ = meaning
+    return cached_property(read)
+
+
+def _aid(aid: Aid, meaning: str) -> "cached_property[Reading | None]":
+    """Make a property of the measurement of an aiding sensor."""
+
+    def read(self: "Measurements") -> Reading | None:
+        if getattr(self.sensors, aid.name.lower()) is None:
+            return None
+        numbers = AID_FREEDOMS[aid]
+        part = (slice(None), int(aid), 0 if numbers == 1 else slice(numbers))
+        new = self._new(AID_BLOCKS + aid, 1)[:, 0]
+        return self._reading("aid_measurement", new, Sensor[aid.name], *part)
+
+    read.__doc__ = meaning
+    return cached_property(read)
 
 
 class Measurements:
@@ -50,7 +73,7 @@ class Measurements:
         vehicle: The vehicle that it may assume.
     """
 
-    def __init__(self, batch: "FlightBatch", sample: NDArray[Any]) -> None:
+    def __init__(self, batch: FlightMemory, sample: NDArray[Any]) -> None:
         self._batch, self._sample = batch, sample
         self.count, self.dt = batch.count, batch.sensors.imu.dt
         self.sensors: SensorSuite = batch.sensors
@@ -79,10 +102,7 @@ class Measurements:
         """Angular rate that the gyro measures at this instant, the end of the tick, (n, 3)."""
         return field_of_flights(self._batch._exchange, "w_meas", self.count)
 
-    @cached_property
-    def action(self) -> Floats:
-        """Action of the control period, in [-1, 1], (n, 4)."""
-        return self._batch.record("action")
+    action = _record("action", "Action of the control period, in [-1, 1], (n, 4).")
 
     @cached_property
     def features(self) -> Floats:
@@ -118,25 +138,10 @@ class Measurements:
         new = self._new(FEATURE_BLOCKS, count)
         return self._reading("pixels", new, Sensor.CAMERA, slice(None), slice(count))
 
-    @cached_property
-    def barometer(self) -> Reading | None:
-        """Altitude, (n,) [m]."""
-        return self._aid(Aid.BAROMETER)
-
-    @cached_property
-    def magnetometer(self) -> Reading | None:
-        """Magnetic field, (n, 3) in B [T]."""
-        return self._aid(Aid.MAGNETOMETER)
-
-    @cached_property
-    def optical_flow(self) -> Reading | None:
-        """Angular rate of the ground below, (n, 2) in B [rad/s]."""
-        return self._aid(Aid.OPTICAL_FLOW)
-
-    @cached_property
-    def range_finder(self) -> Reading | None:
-        """Distance to the ground along body -z, (n,) [m]."""
-        return self._aid(Aid.RANGE_FINDER)
+    barometer = _aid(Aid.BAROMETER, "Altitude, (n,) [m].")
+    magnetometer = _aid(Aid.MAGNETOMETER, "Magnetic field, (n, 3) in B [T].")
+    optical_flow = _aid(Aid.OPTICAL_FLOW, "Angular rate of the ground below, (n, 2) in B [rad/s].")
+    range_finder = _aid(Aid.RANGE_FINDER, "Distance to the ground along body -z, (n,) [m].")
 
     def _gnss(self, name: str, block: int, has: bool) -> Reading | None:
         if not has:
@@ -145,15 +150,6 @@ class Measurements:
         x, y, z = found.value.T[:, :, np.newaxis]
         R = self._batch.R_IG
         return found._replace(value=x * R[:, 0] + y * R[:, 1] + z * R[:, 2])  # as in any batch
-
-    def _aid(self, aid: Aid) -> Reading | None:
-        name = aid.name.lower()
-        if getattr(self.sensors, name) is None:
-            return None
-        numbers = AID_FREEDOMS[aid]
-        new = self._new(AID_BLOCKS + aid, 1)[:, 0]
-        part = (slice(None), int(aid), 0 if numbers == 1 else slice(numbers))
-        return self._reading("aid_measurement", new, Sensor[aid.name], *part)
 
     def _new(self, first: int, count: int) -> Truths:
         """True where one of some blocks arrives, (n, count)."""
@@ -178,37 +174,18 @@ class StartView(Measurements):
     sample of the first instant; they have no meaning with `ImuParams.samples="average"`.
     """
 
-    def __init__(self, batch: "FlightBatch", sample: NDArray[Any], mask: Truths) -> None:
+    def __init__(self, batch: FlightMemory, sample: NDArray[Any], mask: Truths) -> None:
         super().__init__(batch, sample)
         self._mask = mask
 
     def _new(self, first: int, count: int) -> Truths:
         return super()._new(first, count) & self._mask[:, np.newaxis]
 
-    @cached_property
-    def position(self) -> Floats:
-        """Position, (n, 3) in I [m]."""
-        return self._batch.record("r_hat")
-
-    @cached_property
-    def velocity(self) -> Floats:
-        """Velocity, (n, 3) in I [m/s]."""
-        return self._batch.record("v_hat")
-
-    @cached_property
-    def R_BI(self) -> Floats:
-        """Attitude, (n, 3, 3)."""
-        return self._batch.record("R_hat")
-
-    @cached_property
-    def accel_bias(self) -> Floats:
-        """Accelerometer bias, (n, 3) in B [m/s^2]."""
-        return self._batch.record("b_a_hat")
-
-    @cached_property
-    def gyro_bias(self) -> Floats:
-        """Gyro bias, (n, 3) in B [rad/s]."""
-        return self._batch.record("b_g_hat")
+    position = _record("r_hat", "Position, (n, 3) in I [m].")
+    velocity = _record("v_hat", "Velocity, (n, 3) in I [m/s].")
+    R_BI = _record("R_hat", "Attitude, (n, 3, 3).")
+    accel_bias = _record("b_a_hat", "Accelerometer bias, (n, 3) in B [m/s^2].")
+    gyro_bias = _record("b_g_hat", "Gyro bias, (n, 3) in B [rad/s].")
 
     @cached_property
     def covariance(self) -> Floats:

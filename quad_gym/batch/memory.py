@@ -11,9 +11,11 @@ from quad_gym.faults import Fault
 from quad_gym.faults.presets import named_faults
 from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import checks as check
+from quad_gym.params.clocks import Clocks
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import (
     COLUMNS,
@@ -60,8 +62,18 @@ class FlightMemory:
     sensors: SensorSuite
     faults: tuple[Fault, ...]
     randomization: Randomization
+    vehicle: VehicleParams
+    clocks: Clocks
     _model: NDArray[Any]
     _world: NDArray[Any]
+    _settings: NDArray[Any]
+    _exchange: NDArray[Any]
+    _resets: NDArray[np.uint8]
+    _results: NDArray[np.float64]
+
+    def _fly(self, command: int) -> NDArray[np.float32]:
+        """Have the threads carry out a `Command`; return the observations."""
+        raise NotImplementedError
 
     def _allocate(self, room: Room, undrawn: NDArray[np.float64], configuration: int) -> None:
         """Allocate the records of flights that have never been reset."""
@@ -149,12 +161,7 @@ class FlightMemory:
         return self._blocks.copy()
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Restore all flights from a snapshot of this batch, or of another one like it.
-
-        Raises:
-            ValueError: If the snapshot is from a batch of another size, or with other settings or
-                parameters. The time limit and the number of threads may differ.
-        """
+        """Restore all flights from a snapshot; see `FlightBatch.restore`."""
         fits = (
             isinstance(snapshot, np.ndarray)
             and snapshot.dtype == self._blocks.dtype

@@ -1,12 +1,13 @@
 """`OwnFilter`: the calls of a user's estimator by the flights that fly on it."""
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.measurements import Measurements, StartView
+from quad_gym.batch.memory import FlightMemory
 from quad_gym.batch.state import State
 from quad_gym.estimation.own import Estimator, checked_estimate, factors
 from quad_gym.params import checks as check
@@ -18,9 +19,6 @@ from quad_gym.records import (
     field_of_flights,
     put_in_flights,
 )
-
-if TYPE_CHECKING:
-    from quad_gym.batch.flight_batch import FlightBatch
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -54,7 +52,7 @@ class OwnFilter:
         self.__dict__.update(state)
         self.state.lock(False)
 
-    def restore(self, batch: "FlightBatch", snapshot: NDArray[Any]) -> None:
+    def restore(self, batch: FlightMemory, snapshot: NDArray[Any]) -> None:
         """Restore the state from a snapshot of `State.kept_with`."""
         self.state.restore(snapshot)
         self.state.lock(False)
@@ -62,7 +60,7 @@ class OwnFilter:
             put_in_flights(batch._exchange, name, batch.record(name))
         self._failed, self._has_covariance = False, True
 
-    def run(self, batch: "FlightBatch", command: Command) -> NDArray[np.float32]:
+    def run(self, batch: FlightMemory, command: Command) -> NDArray[np.float32]:
         """Fly a control period, or begin episodes; return the observations.
 
         After an invalid estimate, a ValueError, the flights must be reset.
@@ -91,7 +89,7 @@ class OwnFilter:
         self._failed = failed
         return observations
 
-    def _fly_ticks(self, batch: "FlightBatch") -> None:
+    def _fly_ticks(self, batch: FlightMemory) -> None:
         """Fly the ticks of a control period, with an update after each."""
         everyone = np.ones(batch.count, bool)
         averages = batch.sensors.imu.samples == "average"
@@ -102,7 +100,7 @@ class OwnFilter:
             estimate = self._estimator.update(measurements)
             self._write(batch, "update", estimate, everyone, measurements, with_covariance=not left)
 
-    def _begin(self, batch: "FlightBatch", mask: Truths) -> None:
+    def _begin(self, batch: FlightMemory, mask: Truths) -> None:
         """Begin the episodes of flights in `mask`."""
         others = self.state.rows()
         self.state.begin(mask)
@@ -118,7 +116,7 @@ class OwnFilter:
 
     def _write(
         self,
-        batch: "FlightBatch",
+        batch: FlightMemory,
         method: str,
         given: Any,
         mask: Truths,
@@ -161,6 +159,6 @@ class OwnFilter:
         self._has_covariance = covariance is not None
 
 
-def _sample(batch: "FlightBatch") -> NDArray[Any]:
+def _sample(batch: FlightMemory) -> NDArray[Any]:
     """Copy the last IMU sample of all flights, as blocks."""
     return np.asarray(batch._exchange[["gyro", "accel"]].copy())

@@ -96,14 +96,11 @@ def _estimated_rates(batch: FlightMemory, flights: Flights) -> Floats:
     return np.asarray(batch.record("w_meas", flights) - batch.record("b_g_hat", flights))
 
 
-def _gates(batch: FlightMemory, flights: Flights) -> Floats:
-    count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
-    return np.ascontiguousarray(batch.record("gates", flights)[:, :count])
-
-
-def _obstacles(batch: FlightMemory, flights: Flights) -> Floats:
-    count = len(batch.world.obstacles)
-    return np.ascontiguousarray(batch.record("obstacle_center", flights)[:, :count])
+def _first(field: str, count: Callable[[FlightMemory], int]) -> Computed:
+    """Rows of a field that are in use."""
+    return lambda batch, flights: np.ascontiguousarray(
+        batch.record(field, flights)[:, : count(batch)]
+    )
 
 
 def _obstacle_distance(batch: FlightMemory, flights: Flights) -> Floats:
@@ -235,7 +232,7 @@ QUANTITIES = {
     "reference_velocity": Quantity(_reference(1), (3,), "m/s", "I", "velocity of the reference"),
     "reference_acceleration": Quantity(_reference(2), (3,), "m/s^2", "I", "acceleration of the reference"),
     "reference_heading": Quantity(_reference(3), (3,), "-", "I", "horizontal direction in which body x is to point"),
-    "gates": Quantity(_gates, ("gates", 3), "m", "I", "centers of the course's gates, in order"),
+    "gates": Quantity(_first("gates", lambda b: b.task.gate_count * (b.task.kind == "waypoints")), ("gates", 3), "m", "I", "centers of the course's gates, in order"),
     "gates_passed": Quantity("gate_next", (), "-", "-", "gates passed in this episode", int),
     "reward": Quantity("reward", (), "-", "-", "reward of the last step"),
     "terminated": Quantity("terminated", (), "-", "-", "the last step ended the episode by a crash or at the goal", bool),
@@ -245,7 +242,7 @@ QUANTITIES = {
     "estimation_error": Quantity("estimation_error", (), "m", "-", "distance of the observed from the true position"),
     # the surroundings
     "features": Quantity(_features, ("features", 3), "m", "I", "features of the camera, in the filter's map of this episode"),
-    "obstacles": Quantity(_obstacles, ("obstacles", 3), "m", "I", "centers of the world's obstacles in this episode, in the order given"),
+    "obstacles": Quantity(_first("obstacle_center", lambda b: len(b.world.obstacles)), ("obstacles", 3), "m", "I", "centers of the world's obstacles in this episode, in the order given"),
     "obstacle_distance": Quantity(_obstacle_distance, (), "m", "-", "from the nearest obstacle's surface, negative inside, infinite without obstacles"),
     "on_ground": Quantity("footing", (), "-", "-", "the ground pushes a foot, in a world whose ground carries vehicles", bool),
 }

@@ -148,8 +148,7 @@ def distance_from_reference(task: TaskParams, places: Floats) -> Floats:
     """Return distances (n,) of positions (n, 3) in I from the nearest beginning of a reference."""
     radius, height = task.radius, task.height
     if task.kind == "trajectory":
-        each = [_from_trajectory(path, task, places) for path in task.trajectories]
-        return np.min(each, axis=0)
+        return np.min([_from_path(path, task, places) for path in task.trajectories], axis=0)
     if task.kind == "random_trajectory":
         return np.maximum(np.linalg.norm(places - (0.0, 0.0, height), axis=1) - radius, 0.0)
     if task.kind == "waypoints":
@@ -169,7 +168,7 @@ def _from_ring(places: Floats, radii: tuple[float, float], heights: tuple[float,
     return np.hypot(aside, np.maximum(np.maximum(heights[0] - z, z - heights[1]), 0.0))
 
 
-def _from_trajectory(path: Trajectory, task: TaskParams, places: Floats) -> Floats:
+def _from_path(path: Trajectory, task: TaskParams, places: Floats) -> Floats:
     """Return distances (n,) from the beginnings of a trajectory, at any drawn heading."""
     if not task.randomize_reference:
         return np.linalg.norm(places - path(0.0), axis=1)

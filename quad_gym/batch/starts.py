@@ -89,9 +89,8 @@ def checked_start(
     reach = 1.5 * task.radius + 1.3 * task.height  # of any reference from the origin
     reach = max((path.reach for path in task.trajectories), default=reach)
     farthest = task.out_of_bounds + reach
-    with np.errstate(over="ignore"):  # infinite lengths are refused like others
-        distance = _largest(given[:, :3])
-        speed = _largest(given[:, 3:6])
+    with np.errstate(over="ignore"):  # infinite lengths are refused like others; NaN never is
+        distance, speed = (np.linalg.norm(given[:, k : k + 3], axis=1).max() for k in (0, 3))
     if distance > farthest:
         raise ValueError(
             f"position must be within {farthest:g} m of the origin: farther, a start is beyond "
@@ -104,11 +103,6 @@ def checked_start(
     if np.abs(given[:, 6]).max() > MAX_YAW:
         raise ValueError(f"yaw must be at most {MAX_YAW:g} rad either way, got {yaw!r}")
     return given
-
-
-def _largest(rows: NDArray[np.float64]) -> float:
-    """Return the largest length of a row; NaN, which compares as false, if none is given."""
-    return float(np.linalg.norm(rows, axis=1).max())
 
 
 def checked_mask(count: int, mask: ArrayLike | None) -> NDArray[np.bool_]:

@@ -82,8 +82,7 @@ def configure(args: CompareArgs) -> compare.Comparison:
         raise ValueError(f"--sensors must have different names, got {' '.join(labels)}")
     options.leave(args.env, "sensors", observation="--train-on", threads="--jobs")
     chosen = recipe(args.env_id, args.algorithm)
-    if args.steps is not None:
-        chosen = chosen.replace(steps=args.steps)
+    chosen = chosen if args.steps is None else chosen.replace(steps=args.steps)
     seeds, episodes = (QUICK_SEEDS, QUICK_EPISODES) if args.quick else (args.seeds, args.episodes)
     name = IDS[args.env_id] + ("_quick" if args.quick else "")
     comparison = compare.Comparison(

@@ -13,6 +13,10 @@ does so beforehand starts at once:
 Functions that are in the cache are not compiled again. Cached code is valid only for the same
 processor, versions of Python and Numba, and sources; otherwise it is compiled again on first use.
 
+`--library` instead builds the libraries of compiled kernels, with which nothing is compiled and
+Numba is not even imported, for each number of lanes that processors like this one have. It takes
+minutes, and a C compiler. Libraries belong to the sources; after an edit, Numba compiles again.
+
 The exit code is 1 if code cannot be written to the cache.
 """
 
@@ -22,7 +26,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from quad_gym.commands.options import require_at_least
+from quad_gym.commands.options import require_at_least, usage_errors
+from quad_gym.kernels.library import library
+from quad_gym.params import checks as check
 
 Kind = Literal["plain", "truth", "single", "all"]
 
@@ -37,12 +43,18 @@ class CompileArgs:
     UnscentedKalmanFilter), all (these, and every option of the environments)"""
     jobs: int | None = None
     """number of processes that compile; if not given, one per core"""
+    library: bool = False
+    """build the libraries of compiled kernels"""
+    lanes: tuple[int, ...] = ()
+    """numbers of lanes of the libraries; if not given, all of this family of processors"""
 
     def __post_init__(self) -> None:
         """Check the numbers of stages and processes."""
         if not self.stages:
             raise ValueError("--stages must have at least one value, got none")
         require_at_least(self, jobs=1)
+        if self.lanes and not self.library:
+            raise ValueError("--lanes must come with --library")
 
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
@@ -73,6 +85,14 @@ def main(args: CompileArgs) -> int:
     Returns:
         Exit code.
     """
+    with usage_errors((ValueError, RuntimeError, ImportError)):
+        found = None if args.library else library()
+        if found is not None:
+            print(f"nothing to compile: {found.file.name} has all functions")
+            return 0
+        check.package("numba", "compiling", "compile")
+        if args.library:
+            return _build(args)
     from quad_gym.kernels.compiling.cache import where_cached
     from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
 
@@ -92,6 +112,15 @@ def main(args: CompileArgs) -> int:
     if lost:
         print(f"error: {len(lost)} of them could not be written to the cache", file=sys.stderr)
     return 1 if lost else 0
+
+
+def _build(args: CompileArgs) -> int:
+    """Build the libraries, and list them with their sizes."""
+    from quad_gym.kernels.compiling.building import build
+
+    for file in build(args.lanes, args.jobs):
+        print(f"{file.stat().st_size / 1e6:.1f} MB  {file}")
+    return 0
 
 
 def _is_kept(dispatcher: Any) -> bool:

@@ -69,10 +69,9 @@ def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Pa
     """Check all options, and make every policy with its environment."""
     args = options.with_full_id(args)
     options.require_at_least(args, episodes=1, seed=0, threads=1)
-    if not args.observation:
-        raise ValueError("--observation must have at least one value, got none")
-    if args.policy == ():
-        raise ValueError("--policy must have at least one value, got none")
+    for name in ("observation", "policy"):
+        if getattr(args, name) == ():
+            raise ValueError(f"--{name} must have at least one value, got none")
     if args.policy is None and "measurements" in args.observation:
         raise ValueError(
             "--observation measurements contains no state, which PD control needs: select a "

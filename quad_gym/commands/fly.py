@@ -26,12 +26,11 @@ from tqdm import tqdm
 from tyro.conf import arg
 
 from baselines.policies import keywords_of_policy, load_policy
-from quad_gym import IDS, Flight, SensorSuite, sensor_suite
+from quad_gym import IDS, Flight, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import options
 from quad_gym.evaluation import Policy
-from quad_gym.faults import Fault
 from quad_gym.faults.presets import PRESETS, faults_of
 from quad_gym.flights.rerun import load_rerun
 from quad_gym.params import checks as check
@@ -40,7 +39,7 @@ from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path, fly_steps
 
 FAULTS = tuple(name for name in PRESETS if name != "none")
-OTHER_ENDINGS = (".npz", ".csv", ".rrd")
+ENDINGS = (*VIDEO_ENDINGS, ".npz", ".csv", ".rrd")
 
 
 @dataclass(frozen=True)
@@ -132,9 +131,8 @@ def check_options(args: FlyArgs) -> None:
         sensor_suite(options.sensors_of(args.env_id, args.sensors))  # before missing packages
     ending = None if args.output is None else args.output.suffix.lower()
     if args.output is not None:
-        if ending not in VIDEO_ENDINGS + OTHER_ENDINGS:
-            endings = ", ".join(VIDEO_ENDINGS + OTHER_ENDINGS)
-            raise ValueError(f"--output must end in one of {endings}, got {args.output}")
+        if ending not in ENDINGS:
+            raise ValueError(f"--output must end in one of {', '.join(ENDINGS)}, got {args.output}")
         if ending in VIDEO_ENDINGS:
             checked_video_path(args.output)
         if ending == ".rrd":
@@ -144,15 +142,6 @@ def check_options(args: FlyArgs) -> None:
         Renderer(args.view, args.size)
 
 
-def faults_of_args(args: FlyArgs, sensors: SensorSuite) -> tuple[Fault, ...]:
-    """Faults, at their default times or at `--fault-time`."""
-    faults = faults_of(args.faults, sensors if args.camera else sensors.replace(camera=None))
-    if args.fault_time is None:
-        return faults
-    start, end = args.fault_time
-    return tuple(fault.replace(start=start, duration=end - start, rate=0.0) for fault in faults)
-
-
 def make_env(args: FlyArgs) -> Any:
     """Make an environment with one flight."""
     args = options.with_full_id(args)
@@ -160,12 +149,15 @@ def make_env(args: FlyArgs) -> Any:
     given = options.with_estimator(args.env, args.estimator)
     suite = sensor_suite(options.sensors_of(args.env_id, args.sensors))
     keywords: dict[str, Any] = {**keywords_of_policy(args.policy, args.env_id), **given}
-    if not args.camera:
-        keywords["camera"] = False
-    if args.action is not None:
-        keywords["action"] = args.action
+    keywords |= {} if args.camera else {"camera": False}
+    keywords |= {} if args.action is None else {"action": args.action}
     if args.faults:
-        keywords["faults"] = faults_of_args(args, suite)
+        faults = faults_of(args.faults, suite if args.camera else suite.replace(camera=None))
+        if args.fault_time is not None:
+            start, end = args.fault_time
+            timed = {"start": start, "duration": end - start, "rate": 0.0}
+            faults = tuple(fault.replace(**timed) for fault in faults)
+        keywords["faults"] = faults
     return gymnasium.make_vec(
         args.env_id,
         num_envs=1,
@@ -182,16 +174,11 @@ def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> 
     steps = fly_steps(policy, env, seed, about | {"seed": seed}, switches.apply)
     for flight, ending in steps:  # noqa: B007 - the last one is printed
         yield flight
-    print(f"seed {seed}: {ending.replace('_', ' ')} after {in_words(flight)}")
-
-
-def in_words(flight: Flight) -> str:
-    """Describe duration and mean errors of a flight."""
-    error = 1e3 * flight["position_error"].mean()
-    words = f"{flight['time'][-1]:.2f} s, mean tracking error {error:.1f} mm"
+    words = f"seed {seed}: {ending.replace('_', ' ')} after {flight['time'][-1]:.2f} s, "
+    words += f"mean tracking error {1e3 * flight['position_error'].mean():.1f} mm"
     if flight.scene.observation != "truth":
         words += f", mean estimation error {1e3 * flight['estimation_error'].mean():.1f} mm"
-    return words
+    print(words)
 
 
 def watch(flights: Iterator[Flight], args: FlyArgs, window: Window, switches: Switches) -> bool:
@@ -226,10 +213,8 @@ def watch(flights: Iterator[Flight], args: FlyArgs, window: Window, switches: Sw
 def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
     """Write the flight to a file, for videos together with its data; return the files."""
     ending = path.suffix.lower()
-    if ending == ".npz":
-        return [flight.save(path)]
-    if ending == ".csv":
-        return [flight.to_csv(path)]
+    if ending in (".npz", ".csv"):
+        return [flight.save(path) if ending == ".npz" else flight.to_csv(path)]
     if ending == ".rrd":
         path.parent.mkdir(parents=True, exist_ok=True)
         recording = flight.to_rerun()

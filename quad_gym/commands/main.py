@@ -26,7 +26,7 @@ COMMANDS = {
     "benchmark": "measure the speed of all parts",
     "export policy": "export a trained policy to an autopilot: C or ONNX",
     "export filter": "export a filter to an autopilot: a C library with the same estimates",
-    "compile": "compile the kernels into the cache before their first use",
+    "compile": "compile the kernels before their first use, or build libraries of them",
     "completion": "print a script for the completion of commands and options in a shell",
     "version": "print the version",
 }
@@ -37,13 +37,9 @@ INTERRUPTED, CLOSED_PIPE = 130, 141
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; Ctrl-C ends it with a message.
+    """Run a command and its options, of the process by default; returns the exit code.
 
-    Args:
-        argv: Command and its options; None: the arguments of the process.
-
-    Returns:
-        Exit code.
+    Ctrl-C ends it with a message.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:

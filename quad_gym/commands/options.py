@@ -6,6 +6,7 @@ help text. Types that several commands share are at the end of this file.
 
 import ast
 import dataclasses
+import itertools
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
+from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from quad_gym.envs import IDS
@@ -38,9 +40,6 @@ def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
         kind: Dataclass whose fields are the options, or a union of subcommands.
         argv: Arguments without the program's name; None: the arguments of the process.
         **options: Further options of `tyro.cli`.
-
-    Returns:
-        Instance of the dataclass.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     with usage_errors((ValueError,)):
@@ -57,13 +56,9 @@ def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | No
     """Rule of tyro for whole numbers, which may be written as 1e6."""
 
     def read(words: list[str]) -> int:
-        try:
-            return int(words[0])
-        except ValueError:
-            pass
         if not float(words[0]).is_integer():
             raise ValueError(f"must be a whole number, got {words[0]!r}")
-        return int(float(words[0]))
+        return int(words[0]) if words[0].lstrip("+-").isdecimal() else int(float(words[0]))
 
     if info.type is not int:
         return None
@@ -99,9 +94,8 @@ def usage_errors(
     except kinds as error:
         message = str(error)
         if isinstance(error, OSError) and error.filename is not None:
-            message = f"{error.filename}: {error.strerror}"
-            if isinstance(error, FileNotFoundError):
-                message = f"{error.filename} does not exist"
+            missing = isinstance(error, FileNotFoundError)
+            message = f"{error.filename}{' does not exist' if missing else f': {error.strerror}'}"
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
 
@@ -138,11 +132,9 @@ def sensors_of(env_id: str, given: str | None) -> str:
 
 def free_folder(folder: Path, result: str) -> Path:
     """Folder without results: this one, or else FOLDER_2, FOLDER_3, ..."""
-    number, found = 1, folder
-    while (found / result).exists():
-        number += 1
-        found = folder.with_name(f"{folder.name}_{number}")
-    return found
+    names = itertools.chain([folder.name], (f"{folder.name}_{k}" for k in itertools.count(2)))
+    found = (folder.with_name(name) for name in names)
+    return next(path for path in found if not (path / result).exists())
 
 
 def flying_options(keywords: Mapping[str, Any]) -> str:
@@ -189,27 +181,21 @@ Keywords = Annotated[
 """Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
 
 Parameters = Annotated[
-    Keywords,
-    tyro.conf.arg(
-        help="parameters of the algorithm that override the recipe's, such as gamma=0.98"
-    ),
+    Keywords, arg(help="parameters of the algorithm that override the recipe's, such as gamma=0.98")
 ]
-"""Parameters of the algorithm of a training."""
 
 Engine = Annotated[
     Literal["sb3", "compiled"],
-    tyro.conf.arg(
+    arg(
         help="training engine: Stable-Baselines3, or the compiled PPO, which is several times "
         "faster and needs no torch"
     ),
 ]
-"""Training engine."""
 
 Threads = Annotated[
     int | None,
-    tyro.conf.arg(help="number of threads; if not given, one per core; it does not affect results"),
+    arg(help="number of threads; if not given, one per core; it does not affect results"),
 ]
-"""Number of threads of the flights."""
 
 TRACKING = tuple(
     env_id for env_id, task in IDS.items() if task in TASK_DEFAULTS and task != "waypoints"
@@ -224,9 +210,8 @@ def full_id(name: str) -> str:
     return _ID_OF_TASK.get(name, name)
 
 
-def one_of(ids: Iterable[str]) -> str:
+def one_of(ids: Sequence[str]) -> str:
     """Help text of an option with a choice of ids."""
-    ids = list(ids)
     return f"task: {', '.join(IDS[env_id] for env_id in ids)}, or an id such as {ids[0]}"
 
 
@@ -248,7 +233,7 @@ def with_full_id(args: _Args, ids: Iterable[str] = IDS) -> _Args:
     return replace(args, env_id=found)  # type: ignore[type-var]
 
 
-EnvId = tyro.conf.Positional[
+EnvId = Positional[
     Annotated[
         str,
         PrimitiveConstructorSpec(
@@ -258,49 +243,41 @@ EnvId = tyro.conf.Positional[
             is_instance=lambda value: isinstance(value, str),
             str_from_instance=lambda value: [IDS.get(value, value)],
         ),
-        tyro.conf.arg(help=one_of(IDS)),
+        arg(help=one_of(tuple(IDS))),
     ]
 ]
 """Positional argument: id of an environment, or short name of its task."""
 
-TrackingId = Annotated[EnvId, tyro.conf.arg(help=one_of(TRACKING))]
+TrackingId = Annotated[EnvId, arg(help=one_of(TRACKING))]
 """Positional argument: id or short name of a task with a reference to track."""
 
 _OR_FILE = f"{', '.join(ALL_SUITES)}, or a file of SensorSuite.save (.toml)"
 
-SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {_OR_FILE}")]
-"""Name or file of a sensor suite."""
+SuiteName = Annotated[str, arg(help=f"sensor suite: {_OR_FILE}")]
 
 OwnSuite = Annotated[
     str | None,
-    tyro.conf.arg(
-        help=f"sensor suite: {_OR_FILE}; if not given, the task's default, standard for most"
-    ),
+    arg(help=f"sensor suite: {_OR_FILE}; if not given, the task's default, standard for most"),
 ]
-"""Name or file of a sensor suite; None: the task's default."""
 
 EstimatorName = Annotated[
     str | None,
-    tyro.conf.arg(
+    arg(
         help="estimator: ukf, ekf, or module:Class of a quad_gym.Estimator; if not given, the "
         "suite's"
     ),
 ]
-"""Name of a built-in filter, or of a user's estimator; None: the suite's."""
 
 SuiteNames = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(help=f"sensor suites: {', '.join(SUITES)}, or files of suites (.toml)"),
+    tuple[str, ...], arg(help=f"sensor suites: {', '.join(SUITES)}, or files of suites (.toml)")
 ]
-"""Names or files of sensor suites."""
 
-LogFile = tyro.conf.Positional[
+LogFile = Positional[
     Annotated[
         Path,
-        tyro.conf.arg(
+        arg(
             metavar="LOG",
             help="table (.csv), log of PX4 (.ulg) or ArduPilot (.bin), ROS bag, or EuRoC folder",
         ),
     ]
 ]
-"""Log of a flight."""

@@ -33,9 +33,8 @@ from quad_gym.experiments.arms import Arm, chosen_arms, read_arms
 from quad_gym.experiments.driver import train_here
 from quad_gym.experiments.study import Study
 from quad_gym.experiments.study_films import require_film, write_film
-from quad_gym.experiments.study_report import table_text, write_report
+from quad_gym.experiments.study_report import conclusions, table_text, write_report
 from quad_gym.experiments.study_tasks import STUDIED, WITHIN, StudiedTask, stays
-from quad_gym.experiments.study_words import conclusions
 from quad_gym.params import checks as check
 
 STUDIED_IDS = tuple(env_id for env_id, task in IDS.items() if task in STUDIED)

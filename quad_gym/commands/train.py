@@ -77,19 +77,14 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
         environment["sensors"] = args.sensors
     options.require_at_least(args, steps=1, n_envs=1, evaluations=1, episodes=1, threads=1, seed=0)
     chosen = recipe(args.env_id, args.algorithm)
-    given = {"steps": args.steps, "n_envs": args.n_envs}
-    chosen = chosen.replace(**{k: v for k, v in given.items() if v is not None})
-    chosen = chosen.replace(parameters={**chosen.parameters, **args.set})
-    plan = Plan(
-        env_id=args.env_id,
-        environment=environment,
-        recipe=chosen,
-        seed=args.seed,
-        threads=args.threads,
-        engine=args.engine,
-        evaluations=args.evaluations,
-        episodes=args.episodes,
+    chosen = chosen.replace(
+        steps=args.steps or chosen.steps,
+        n_envs=args.n_envs or chosen.n_envs,
+        parameters={**chosen.parameters, **args.set},
     )
+    same = ("env_id", "seed", "threads", "engine", "evaluations", "episodes")
+    values = {name: getattr(args, name) for name in same}
+    plan = Plan(environment=environment, recipe=chosen, **values)
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
     if args.export is not None and args.algorithm == "recurrent_ppo":

@@ -113,11 +113,9 @@ def main(args: TuneArgs) -> None:
         "arguments": args,
         "versions": versions("numpy", "scipy", "numba"),
     }
-    written = [
-        write_json(args.output / "gains.json", record),
-        write_csv(args.output / "search.csv", columns_of(search.rows)),
-    ]
+    gains_file = write_json(args.output / "gains.json", record)
+    write_csv(args.output / "search.csv", columns_of(search.rows))
     seconds = time.perf_counter() - began
-    print(f"\nWrote {len(written)} files to {args.output} after {seconds:.0f} s; fly them with")
+    print(f"\nWrote 2 files to {args.output} after {seconds:.0f} s; fly them with")
     same = options.flying_options({"sensors": args.sensors, **args.env})
-    print(f"quad-gym evaluate {options.full_id(args.env_ids[0])} --policy pd pd:{written[0]}{same}")
+    print(f"quad-gym evaluate {options.full_id(args.env_ids[0])} --policy pd pd:{gains_file}{same}")

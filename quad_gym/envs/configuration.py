@@ -28,6 +28,7 @@ from quad_gym.faults.presets import faults_of, needs_sensors
 from quad_gym.packing.configuration import MOST_FLIGHTS
 from quad_gym.params import checks as check
 from quad_gym.params.randomization import Randomization
+from quad_gym.params.resolved import resolving
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
@@ -132,12 +133,9 @@ class Flights:
         self, count: int, autoreset: Autoreset, asked: Collection[str], keywords: dict[str, Any]
     ) -> None:
         """Make the flights and their observation's table; `asked`: keywords given by the user."""
-        for name, known in (
-            ("observation", OBSERVATIONS),
-            ("action", ACTIONS),
-            ("layout", LAYOUTS),
-        ):
-            check.choice(name, keywords[name], tuple(known))
+        check.choice("observation", keywords["observation"], tuple(OBSERVATIONS))
+        check.choice("action", keywords["action"], tuple(ACTIONS))
+        check.choice("layout", keywords["layout"], tuple(LAYOUTS))
         for name in ("camera", "include_std", "privileged", "reward_terms"):
             check.flag(name, keywords[name])
         flown = {name: value for name, value in keywords.items() if name not in _NOT_OF_BATCH}
@@ -147,8 +145,7 @@ class Flights:
         flown["estimator"] = own_estimator(keywords["estimator"])
         flown["faults"] = _faults(keywords, suite)
         drawn = flown["randomization"] = Randomization.of(keywords["randomization"])
-        place = world_params(flown["world"]) if isinstance(flown["world"], str) else flown["world"]
-        check.instance("world", place, WorldParams)
+        place = resolving(WorldParams, world_params)("world", flown["world"])
         flown["world"], own_task = place, keywords.get("task")
         if place.ground is None and own_task is None and "start_position_I" not in drawn.names:
             check_pad(self.task)  # a user-defined task may set where vehicles start
@@ -185,9 +182,8 @@ class Flights:
         """The start values in the options of a reset, checked before anything changes."""
         chosen = start_options(options)
         position, velocity, yaw = (chosen.get(name) for name in ("position", "velocity", "yaw"))
-        given = checked_start(
-            self.batch.count, position, velocity, yaw, self.task, self.batch.world
-        )
+        count, world = self.batch.count, self.batch.world
+        given = checked_start(count, position, velocity, yaw, self.task, world)
         if given is not None and yaw is not None:
             check.angle("yaw", float(given[np.abs(given[:, 6]).argmax(), 6]))
         ends_by_itself = "terminated" in getattr(self.batch, "methods", ())  # a user's task
@@ -205,19 +201,14 @@ class Flights:
         }
 
 
-_NOT_OF_BATCH = (
-    *("observation", "action", "layout", "task"),
-    *("camera", "estimator", "reward_terms"),
-)
+_NOT_OF_BATCH = ("observation", "action", "layout", "task", "camera", "estimator", "reward_terms")
 """Keywords of environments that determine keywords of `FlightBatch`."""
 
 
 def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:
     """Return the sensor suite that the keywords `sensors`, `camera` and `estimator` select."""
     sensors, estimator = keywords["sensors"], keywords["estimator"]
-    suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
-    if not isinstance(suite, SensorSuite):
-        raise ValueError(f"sensors must be a SensorSuite or its name, got {sensors!r}")
+    suite = resolving(SensorSuite, sensor_suite)("sensors", sensors)
     if not keywords["camera"]:
         suite = suite.replace(camera=None)
     elif camera_is_wanted and suite.camera is None:

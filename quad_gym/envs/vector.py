@@ -84,10 +84,7 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         self._no_ending = np.full(self.num_envs, Ending.NONE, object)
 
     def reset(
-        self,
-        *,
-        seed: int | list[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin episodes.
 
@@ -189,7 +186,9 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         """
         rendering = self._open_rendering("make_vec")
         if rendering is not None and self.render_mode == "rgb_array_list":
-            return rendering.taken_tiles()
+            from quad_gym.rendering.renderer import tile
+
+            return [tile(list(frames)) for frames in rendering.taken_frames()]
         return rendering.frames() if rendering and self.render_mode == "rgb_array" else None
 
     close = gymnasium.vector.VectorEnv.close
@@ -220,15 +219,6 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
             infos["ending"][ended] = _ENDINGS[results[ended, Result.ENDING].astype(np.int64)]
         return infos
 
-    def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
-        """Describe the new episode instead, for the flights in which one began."""
-        for name in ("position_error", "estimation_error", "filter_status"):
-            infos[name][began] = self.flights.batch.record(name, began)
-        infos["filter_diverged"][began] = self.flights.batch.record("diverged", began) > 0.0
-        infos["ending"][began] = Ending.NONE
-        infos["gates_passed"][began] = 0
-        replace_faults(infos, self.flights.batch, began)
-
     def _with_finals(
         self, infos: dict[str, Any], flown_with: dict[str, NDArray[np.float64]]
     ) -> dict[str, Any]:
@@ -246,7 +236,12 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         final_info |= final_parts(infos, self.flights.batch, over)
         if flown_with:
             final_info["drawn"] = flown_with
-        self._replace_by_start(infos, np.flatnonzero(over))
+        batch, began = self.flights.batch, np.flatnonzero(over)  # the new episodes begin
+        for name in ("position_error", "estimation_error", "filter_status"):
+            infos[name][began] = batch.record(name, began)
+        infos["filter_diverged"][began] = batch.record("diverged", began) > 0.0
+        infos["ending"][began], infos["gates_passed"][began] = Ending.NONE, 0
+        replace_faults(infos, batch, began)
         infos |= {
             "final_obs": final_obs,
             "_final_obs": over,

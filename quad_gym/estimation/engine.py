@@ -4,6 +4,7 @@ All lanes of its block hold the same flight, or, while the heading is unknown, e
 blocks holds a flight with another heading (`headings.py`).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,7 @@ class Engine:
         self._work["mask"] = 1.0
         self.blocks = aligned_zeros(1, FLIGHT_BLOCK)
         self._linked: NDArray[Any] | None = None
+        self._calls: dict[tuple[int, int], Callable[[], Any]] = {}
         self._sample, self._measurement = np.zeros(1, SAMPLE), np.zeros(1, MEASUREMENT)
 
     # ---- memory -------------------------------------------------------------------------------
@@ -92,6 +94,7 @@ class Engine:
 
     def allocate(self, count: int) -> None:
         """Make room for flights, at least one block of them; earlier contents are lost."""
+        self._calls.clear()
         self.blocks = aligned_zeros(max(1, -(-count // WIDTH)), FLIGHT_BLOCK)
 
     def read(self, name: str) -> NDArray[Any]:
@@ -179,12 +182,20 @@ class Engine:
 
     def _run_one(self, operation: NDArray[Any]) -> None:
         """Run one operation on all blocks."""
-        numbers = (self.params, self._ticks, self.steps, self.settings, self._work, self._table())
         for k in range(len(self.blocks)):
-            block = self.blocks[k : k + 1]
-            entries.run_tape(
-                block, *numbers, self._sample, self._measurement, operation, *_NO_RESULTS
-            )
+            call = self._calls.get((k, id(operation)))
+            if call is None:
+                call = entries.run_tape.bound(
+                    *(self.blocks[k : k + 1], self.params, self._ticks, self.steps, self.settings),
+                    *(self._work, self._table(), self._sample, self._measurement, operation),
+                    *_NO_RESULTS,
+                )
+                self._calls[k, id(operation)] = call
+            call()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without addresses, which another process or copy does not share."""
+        return self.__dict__ | {"_calls": {}, "_linked": None}
 
     def run(self, tape: Tape, slots: NDArray[Any] | None = None) -> tuple[Floats, Floats]:
         """Run the operations of a tape.

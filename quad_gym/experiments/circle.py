@@ -43,14 +43,8 @@ class Setup:
     def fly(self, case: str) -> Recording:
         """Fly and record all seeds of one case."""
         source, sensors = self.cases[case]
-        batch = FlightBatch(
-            len(self.seeds),
-            sensors=sensors,
-            gains=self.gains,
-            task=self.task,
-            source=source,
-            threads=self.threads,
-        )
+        given: dict[str, Any] = {"gains": self.gains, "task": self.task, "threads": self.threads}
+        batch = FlightBatch(len(self.seeds), sensors=sensors, source=source, **given)
         bar = {"desc": f"{LABELS[case]:19}", "unit": " ticks"}
         return record_flights(batch, self.seeds, self.ticks, progress=lambda x: tqdm(x, **bar))
 

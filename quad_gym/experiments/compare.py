@@ -58,19 +58,14 @@ class Comparison(Experiment):
 
     def cases(self) -> dict[str, Plan]:
         """Plans by `case_of`."""
-        return {
-            case_of(suite, source): Plan(
-                env_id=self.env_id,
-                environment=with_effect(
-                    {**self.environment, "observation": source, "sensors": suite}
-                ),
-                recipe=self.recipe,
-                engine=self.engine,
-                threads=1,
+        fixed: dict[str, Any] = {"env_id": self.env_id, "recipe": self.recipe, "threads": 1}
+        plans = {}
+        for suite, source in product(self.suites, self.sources):
+            keywords = {**self.environment, "observation": source, "sensors": suite}
+            plans[case_of(suite, source)] = Plan(
+                environment=with_effect(keywords), engine=self.engine, **fixed
             )
-            for suite in self.suites
-            for source in self.sources
-        }
+        return plans
 
     def trials(self) -> dict[str, Trial]:
         """Test flights by `case_of`, of all rows on both observations."""
@@ -79,9 +74,7 @@ class Comparison(Experiment):
                 {"observation": observation, "sensors": suite},
                 "pd" if source == "PD" else case_of(suite, source),
             )
-            for suite in self.suites
-            for source in self.rows
-            for observation in FLOWN_ON
+            for suite, source, observation in product(self.suites, self.rows, FLOWN_ON)
         }
 
     def description(self) -> dict[str, Any]:
@@ -145,15 +138,13 @@ class ComparisonResults:
 
     def cell(self, suite: str, source: str, observation: str) -> MatrixCell:
         """Cell of the matrix."""
-        episodes = [flown.episodes for flown in self.flown[case_of(suite, source, observation)]]
-        errors = np.array([float(each.mean_error.mean()) for each in episodes])
-        sample = episodes[0].mean_error if source == "PD" else errors
-        return MatrixCell(
-            errors,
-            np.array([each.summary()["late_error"] for each in episodes]),
-            np.array([float(each.crashed.mean()) for each in episodes]),
-            mean_interval(sample) if len(sample) > 1 else None,
-        )
+        flown = self.flown[case_of(suite, source, observation)]
+        summaries = [each.episodes.summary() for each in flown]
+        names = ("mean_error", "late_error", "crash_rate")
+        errors, late, crashes = (np.array([each[name] for each in summaries]) for name in names)
+        sample = flown[0].episodes.mean_error if source == "PD" else errors
+        interval = mean_interval(sample) if len(sample) > 1 else None
+        return MatrixCell(errors, late, crashes, interval)
 
     def cells(self, suite: str) -> dict[str, list[MatrixCell]]:
         """Rows of the matrix of a suite."""
@@ -179,16 +170,15 @@ def conclusions(matrix: ComparisonResults) -> list[str]:
     """Conclusions that the intervals allow."""
     comparison, sentences = matrix.comparison, []
     for suite in comparison.suites:
-        for pair in _QUESTIONS:
-            if any(source not in comparison.rows for _, source, _ in pair):
+        for (first, *ours), (second, *other) in _QUESTIONS:
+            if {ours[0], other[0]} - set(comparison.rows):
                 continue
-            cells = [matrix.cell(suite, source, on) for _, source, on in pair]
+            cells = [matrix.cell(suite, *way) for way in (ours, other)]
             if max(float(cell.crash_rates.max()) for cell in cells) > MANY_CRASHES:
                 continue  # errors of crashed episodes end early
             # PD has no training seed: its one number is repeated
             errors = [np.resize(cell.errors, len(comparison.seeds)) for cell in cells]
-            (first, _, _), (second, _, flown_on) = pair
-            both = " Both flown on the estimate." if flown_on == "estimate" else ""
+            both = " Both flown on the estimate." if other[1] == "estimate" else ""
             sentences.append(f"Sensors {suite}: {_sentence(first, second, *errors)}{both}")
         for source in comparison.rows:
             share = float(matrix.cell(suite, source, "estimate").crash_rates.max())
@@ -292,41 +282,29 @@ def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
         trainings = comparison.trainings_of(case_of(suite, source))
         each = [training.curve("mean_error") for training in trainings]
         curves[NAMES[source]] = [(steps[1:], errors[1:]) for steps, errors in each]
-    report.add_figure(
-        f"learning_{label}",
-        comparison_plots.learning_figure(
-            curves,
-            {"PD, tuned, on the estimate": float(cells["PD"][1].errors[0])},
-            f"Evaluated on what is trained on, sensors {suite}",
-        ),
-        "Error during training; thin lines are single seeds, bold ones their median.",
+    figure = comparison_plots.learning_figure(
+        curves,
+        {"PD, tuned, on the estimate": float(cells["PD"][1].errors[0])},
+        f"Evaluated on what is trained on, sensors {suite}",
     )
-    report.add_figure(
-        f"matrix_{label}",
-        comparison_plots.matrix_figure(
-            np.array([[float(np.mean(cell.errors)) for cell in row] for row in cells.values()]),
-            [[cell.texts()[0] for cell in row] for row in cells.values()],
-            [NAMES[source] for source in cells],
-            ["flown on truth", "flown on the estimate"],
-            f"Mean position error [mm], sensors {suite}",
-        ),
-        "Mean error over whole episodes, with the 95 % interval over training seeds "
-        "(Student's t); for PD, over episodes.",
+    caption = "Error during training; thin lines are single seeds, bold ones their median."
+    report.add_figure(f"learning_{label}", figure, caption)
+    figure = comparison_plots.matrix_figure(
+        np.array([[float(np.mean(cell.errors)) for cell in row] for row in cells.values()]),
+        [[cell.texts()[0] for cell in row] for row in cells.values()],
+        [NAMES[source] for source in cells],
+        ["flown on truth", "flown on the estimate"],
+        f"Mean position error [mm], sensors {suite}",
     )
+    caption = "Mean error over whole episodes, with the 95 % interval over training seeds "
+    report.add_figure(f"matrix_{label}", figure, caption + "(Student's t); for PD, over episodes.")
     first = {NAMES[s]: matrix.flown[case_of(suite, s, "estimate")][0] for s in comparison.rows}
-    report.add_figure(
-        f"errors_{label}",
-        comparison_plots.error_over_time_figure(
-            {name: (f.recorded["time"], f.recorded["percentiles"]) for name, f in first.items()},
-            f"Flown on the estimate, first training seed, sensors {suite}",
-        ),
-        "Error over time: median and middle nine tenths of the episodes.",
-    )
-    report.add_figure(
-        f"paths_{label}",
-        comparison_plots.paths_figure(
-            {name: path_of(flown) for name, flown in first.items()},
-            f"From above, flown on the estimate, sensors {suite}",
-        ),
-        "The first episode of the first training seed.",
-    )
+    errors = {name: (f.recorded["time"], f.recorded["percentiles"]) for name, f in first.items()}
+    title = f"Flown on the estimate, first training seed, sensors {suite}"
+    figure = comparison_plots.error_over_time_figure(errors, title)
+    caption = "Error over time: median and middle nine tenths of the episodes."
+    report.add_figure(f"errors_{label}", figure, caption)
+    paths = {name: path_of(flown) for name, flown in first.items()}
+    title = f"From above, flown on the estimate, sensors {suite}"
+    figure = comparison_plots.paths_figure(paths, title)
+    report.add_figure(f"paths_{label}", figure, "The first episode of the first training seed.")

@@ -4,17 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from quad_gym.analysis import reports
 from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_interval
 from quad_gym.analysis.plots import save_figure
-from quad_gym.analysis.reports import (
-    short_name,
-    stacked,
-    text_table,
-    versions,
-    write_csv,
-    write_json,
-)
 from quad_gym.evaluation import Episodes
 from quad_gym.experiments.flown import Flown, path_of
 
@@ -28,7 +21,7 @@ def evaluation_table(results: Evaluated, env: Any) -> str:
     course = flights.name == "waypoints"
     rows = [
         [
-            f"{short_name(policy)} on {observation}",
+            f"{reports.short_name(policy)} on {observation}",
             *(_progress(flown.episodes, flights) if course else _errors(flown.episodes)),
             f"{1e3 * flown.episodes.estimation_error.mean():.1f}",
             _rate(flown.episodes.crashed),
@@ -39,7 +32,7 @@ def evaluation_table(results: Evaluated, env: Any) -> str:
     tracking = {"tracking error [mm]": ["whole episode", "second half"]}
     if course:
         tracking = {"course": ["gates passed", "time"]}
-    return text_table(
+    return reports.text_table(
         {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
     )
 
@@ -55,12 +48,9 @@ def _progress(episodes: Episodes, flights: Any) -> list[str]:
 
 def _errors(episodes: Episodes) -> list[str]:
     """Tracking error with its interval, and late error [mm]."""
-    errors, late = episodes.mean_error, episodes.summary()["late_error"]
+    errors, late = episodes.mean_error, 1e3 * episodes.summary()["late_error"]
     interval = mean_interval(errors) if len(errors) > 1 else None
-    return [
-        in_brackets(errors.mean(), interval, ".1f", 1e3),
-        f"{1e3 * late:.1f}".replace("nan", "-"),
-    ]
+    return [in_brackets(errors.mean(), interval, ".1f", 1e3), f"{late:.1f}".replace("nan", "-")]
 
 
 def _rate(happened: Any) -> str:
@@ -72,12 +62,11 @@ def write_evaluation(
     results: Evaluated, seed: int, folder: Path, about: Mapping[str, Any]
 ) -> list[Path]:
     """Write numbers and figures; the summary also contains `about`."""
+    count = len(next(iter(results.values())).episodes.returns)
     tables = (
         {
-            "policy": [policy] * len(flown.episodes.returns),
-            "observation": [observation] * len(flown.episodes.returns),
-            "seed": range(seed, seed + len(flown.episodes.returns)),
-            **flown.episodes._asdict(),
+            **{"policy": [policy] * count, "observation": [observation] * count},
+            **{"seed": range(seed, seed + count), **flown.episodes._asdict()},
         }
         for (policy, observation), flown in results.items()
     )
@@ -88,14 +77,16 @@ def write_evaluation(
         ],
         "units": {"errors": "m", "rates": "share of episodes"},
         **about,
-        "versions": versions("numpy", "numba", "torch", "stable_baselines3"),
+        "versions": reports.versions("numpy", "numba", "torch", "stable_baselines3"),
     }
-    labeled = {f"{short_name(policy)} on {seen}": f for (policy, seen), f in results.items()}
+    labeled = {
+        f"{reports.short_name(policy)} on {seen}": f for (policy, seen), f in results.items()
+    }
     curves = {k: (f.recorded["time"], f.recorded["percentiles"]) for k, f in labeled.items()}
     paths = paths_figure({label: path_of(flown) for label, flown in labeled.items()})
     return [
-        write_csv(folder / "episodes.csv", stacked(tables)),
-        write_json(folder / "summary.json", summary),
+        reports.write_csv(folder / "episodes.csv", reports.stacked(tables)),
+        reports.write_json(folder / "summary.json", summary),
         *save_figure(paths, folder / "paths"),
         *save_figure(error_over_time_figure(curves), folder / "errors"),
     ]

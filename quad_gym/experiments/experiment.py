@@ -62,10 +62,8 @@ class Training:
 def read_evaluations(folder: Path) -> list[dict[str, float]]:
     """Evaluations of the training in a folder so far."""
     file = folder / EVALUATIONS
-    if not file.exists():
-        return []
-    with file.open(encoding="utf-8", newline="") as stream:
-        return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(stream)]
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(lines)]
 
 
 def make_trainings(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path) -> list[Training]:
@@ -112,15 +110,10 @@ class Experiment(ABC):
 
     def trial(self, keywords: Mapping[str, Any], policy: str, *traced: str) -> Trial:
         """Test flights with keywords of the environment; see `Trial` for the other arguments."""
-        return Trial(
-            env_id=self.env_id,
-            keywords={**self.environment, **keywords},
-            policy=policy,
-            episodes=self.episodes,
-            first_episode=self.first_episode,
-            traced=traced,
-            threads=self.threads,
-        )
+        names = ("env_id", "episodes", "first_episode", "threads")
+        shared: dict[str, Any] = {name: getattr(self, name) for name in names}
+        keywords = {**self.environment, **keywords}
+        return Trial(keywords=keywords, policy=policy, traced=traced, **shared)
 
     @cached_property
     def trainings(self) -> list[Training]:

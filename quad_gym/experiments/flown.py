@@ -162,10 +162,6 @@ class ViewRecorder:
         }
 
 
-def _off_wall(view: Any, k: slice) -> Floats:
-    return _angle(view.features[k].mean(axis=1) - view.position[k], view.truth.forward[k])
-
-
 def _sigma(view: Any, k: slice) -> Floats:
     try:
         return np.asarray(view.estimate.position_sigma[k].max(axis=1))
@@ -179,7 +175,9 @@ def _outage(view: Any, k: slice) -> Floats:
 
 
 TRACES: Mapping[str, Callable[[Any, slice], Floats]] = {
-    "off_wall": _off_wall,
+    "off_wall": lambda view, k: _angle(
+        view.features[k].mean(axis=1) - view.position[k], view.truth.forward[k]
+    ),
     "off_reward": lambda view, k: _angle(view.reference_heading[k], view.truth.forward[k]),
     "sigma": _sigma,
     "estimation_error": lambda view, k: view.estimation_error[k].copy(),

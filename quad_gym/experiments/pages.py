@@ -4,21 +4,12 @@ import base64
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from quad_gym.analysis.plots import save_figure
 
-_PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 64rem; margin: 2rem auto;
-  padding: 0 1rem; }}
-table {{ border-collapse: collapse; margin: 1rem 0; font-size: 14px; }}
-th, td {{ padding: .3rem .7rem; text-align: right; border-bottom: 1px solid #ddd; }}
-th:first-child, td:first-child {{ text-align: left; }}
-figure {{ margin: 1.5rem 0; }} img, video {{ max-width: 100%; }} figcaption {{ color: #666; }}
-</style></head><body>
-{body}
-</body></html>
-"""
+_PAGE = Path(__file__).with_name("page.html")
 
 
 class Report:
@@ -65,8 +56,9 @@ class Report:
     def write(self) -> list[Path]:
         """Write the page, report.html; return all files, the page last."""
         page = self.folder / "report.html"
-        body = "\n".join(self._parts)
-        page.write_text(_PAGE.format(title=escape(self._title), body=body), encoding="utf-8")
+        template = Template(_PAGE.read_text(encoding="utf-8"))
+        text = template.substitute(title=escape(self._title), body="\n".join(self._parts))
+        page.write_text(text, encoding="utf-8")
         return [*self.files, page]
 
 

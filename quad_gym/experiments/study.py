@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -66,7 +68,7 @@ class Study(Experiment):
         curves = {
             case: [t.curve("return") for t in self.trainings_of(case)] for case in self.cases()
         }
-        return results_of(self, self.fly(), curves)
+        return StudyResults(self, self.fly(), curves)
 
     def steps(self) -> str:
         """Number of environment steps of the trainings, as text."""
@@ -92,8 +94,17 @@ class StudyResults:
     """Flights of each seed by arm; one entry for a fixed rule"""
     curves: Mapping[str, Sequence[tuple[Floats, Floats]]]
     """Steps and mean returns of the evaluations of each training, by arm"""
-    rows: Mapping[str, Mapping[str, Estimated]]
-    """Table by arm and column"""
+
+    @cached_property
+    def rows(self) -> dict[str, dict[str, Estimated]]:
+        """Table by arm and column."""
+        return {
+            arm.name: {
+                column: _estimated([each.of(run) for run in self.flown[arm.name]], each.score)
+                for column, each in self.study.about.table().items()
+            }
+            for arm in self.study.arms
+        }
 
     def arm(self, name: str) -> Arm:
         """Arm with a name."""
@@ -125,7 +136,6 @@ class StudyResults:
 
     def description(self) -> dict[str, Any]:
         """Numbers for JSON."""
-        trained = self.trained()
         return {
             "study": self.study.description(),
             "rows": {
@@ -135,25 +145,9 @@ class StudyResults:
             "return_of_each_seed": {name: self.mean_returns(name) for name in self.rows},
             "probability_of_improvement": {
                 f"{a} over {b}": self.improvement(a, b)._asdict()
-                for a in trained
-                for b in trained
-                if a != b
+                for a, b in permutations(self.trained(), 2)
             },
         }
-
-
-def results_of(
-    study: Study, flown: Mapping[str, Sequence[Flown]], curves: Mapping[Any, Any]
-) -> StudyResults:
-    """Compute the table of a study from its flights and the evaluations of its trainings."""
-    rows = {
-        arm.name: {
-            column: _estimated([each.of(run) for run in flown[arm.name]], each.score)
-            for column, each in study.about.table().items()
-        }
-        for arm in study.arms
-    }
-    return StudyResults(study, flown, curves, rows)
 
 
 def _estimated(values: list[NDArray[Any]], score: Score) -> Estimated:

@@ -2,13 +2,8 @@
 
 The two arms are `truth` and the other trained arm with the largest return; of each arm, the
 training with the best validation is shown, so that test episodes do not affect the choice. The
-episode is the first test episode that shows a difference:
-
-- for "glance", the first one in which the rewarded heading is on average more than 100 degrees from
-  the features; otherwise policies see the features anyway;
-- for "pace", the first one that the policy trained on the truth ends with a crash.
-
-If there is none among the first `TRACED` episodes, it is the very first.
+episode is the first one of the first `TRACED` that shows a difference, see `CHOICES`, or else the
+very first: where the rewarded heading is near the features, policies see these anyway.
 """
 
 import math
@@ -23,7 +18,6 @@ from tqdm import tqdm
 from baselines.policies import load_policy
 from quad_gym import FlightRecorder
 from quad_gym.evaluation import roll_out
-from quad_gym.experiments.flown import Flown
 from quad_gym.experiments.study import Study, StudyResults
 from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
@@ -59,23 +53,17 @@ def pair_of(results: StudyResults) -> Pair | None:
         return None
     trainings = {name: results.best_validated(name) for name in ("truth", results.best(others))}
     truth, other = (results.flown[name][k] for name, k in trainings.items())
-    looks = results.study.about.figure == "glance"
-    return Pair(trainings, _first_away(other) if looks else _first_crash(truth))
+    if results.study.about.figure == "glance":
+        off = other.recorded["off_wall"] - other.recorded["off_reward"]
+        wrapped = np.abs(np.angle(np.exp(1j * off)))
+        return Pair(trainings, int(np.argmax(np.nanmean(wrapped, axis=0) > AWAY)))
+    crashed = truth.episodes.crashed[: truth.recorded["speed"].shape[1]]
+    return Pair(trainings, int(np.argmax(crashed)))
 
 
 def label_of(results: StudyResults, name: str) -> str:
     """Label of a policy above a figure or a film."""
     return f"trained on {results.arm(name).label}"
-
-
-def _first_away(flown: Flown) -> int:
-    off = flown.recorded["off_wall"] - flown.recorded["off_reward"]
-    wrapped = np.abs(np.angle(np.exp(1j * off)))
-    return int(np.argmax(np.nanmean(wrapped, axis=0) > AWAY))
-
-
-def _first_crash(flown: Flown) -> int:
-    return int(np.argmax(flown.episodes.crashed[: flown.recorded["speed"].shape[1]]))
 
 
 def require_film(study: Study, kind: str) -> None:

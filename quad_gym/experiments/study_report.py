@@ -1,4 +1,4 @@
-"""Report of a study: tables, figures, numbers, and a page."""
+"""Report of a study: tables, conclusions, figures, numbers, and a page."""
 
 import math
 from collections.abc import Iterator
@@ -9,13 +9,105 @@ import numpy as np
 
 from quad_gym import IDS, sensor_suite
 from quad_gym.analysis.comparison_plots import learning_figure
+from quad_gym.analysis.intervals import Estimated, difference, in_brackets
 from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
 from quad_gym.analysis.study_plots import glance_figure, pace_figure
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.experiments.pages import Report
 from quad_gym.experiments.study import StudyResults
 from quad_gym.experiments.study_films import CHOICES, label_of, pair_of
-from quad_gym.experiments.study_words import conclusions, number, share
+
+FEW = 5
+"""Number of seeds below which intervals over trainings are wide."""
+
+
+def number(found: Estimated, digits: int) -> str:
+    """Number with its interval."""
+    return in_brackets(found.value, (found.low, found.high), f".{digits}f")
+
+
+def share(found: Estimated) -> str:
+    """Share with its interval, in percent."""
+    scaled = Estimated(*(100.0 * value for value in found))
+    return number(scaled, 1 if scaled.value < 10.0 else 0) + " %"
+
+
+def conclusions(results: StudyResults) -> list[str]:
+    """Conclusions that the intervals allow.
+
+    Two arms differ significantly if the 95 % interval of their difference excludes zero. For equal
+    arms the probability of this is 1 % with three trainings each, 2 % with five, and at most 5 %
+    with many; it is larger for an arm that was selected as the best of several by these numbers.
+    """
+    found, seeds, trained = [], len(results.study.seeds), results.trained()
+    learned = [name for name in trained if name != "truth"]
+    if "truth" in trained and learned:
+        found += _against_truth(results, results.best(learned))
+    if results.fixed() and trained:
+        found.append(_against_rules(results, results.best(trained)))
+    for first, second in (("std", "estimate"), ("std_history", "std")):
+        if seeds > 1 and {first, second} <= set(trained):
+            found.append(_of_pair(results, first, second))
+    if trained and seeds < FEW:
+        wide = "so few that the intervals are wide"
+        if seeds == 1:
+            wide = (
+                "so that the intervals cover the episodes alone and say nothing of other trainings"
+            )
+        found.append(f"Training seeds: {seeds}, {wide}: run with {FEW} or more.")
+    return found
+
+
+def _label(results: StudyResults, name: str) -> str:
+    arm = results.arm(name)
+    return f'the arm "{arm.label}"' if arm.trained else arm.label
+
+
+def _against_truth(results: StudyResults, best: str) -> list[str]:
+    label = _label(results, best)
+    ours, truth = results.rows[best], results.rows["truth"]
+    change = difference(ours["success"], truth["success"])
+    points = number(Estimated(*(100.0 * value for value in change)), 0)
+    verdict = f"a difference of {points} percentage points"
+    if change.holds(0.0):
+        verdict = f"no significant difference ({points} percentage points)"
+    success = [
+        f"On the estimate, {label} succeeds in {share(ours['success'])} of the episodes, and "
+        f"{_label(results, 'truth')} in {share(truth['success'])}: {verdict}."
+    ]
+    crashes = f"It crashes in {share(ours['crashed'])}, compared with {share(truth['crashed'])}"
+    telling = results.study.about.telling
+    if telling != "error":
+        column = results.study.about.columns[telling]
+        a, b = (number(row[telling], column.digits or 0) for row in (ours, truth))
+        return [*success, f"{crashes}; {column.heading}: {a}, compared with {b}."]
+    error, other = ours["error"].value, truth["error"].value
+    if other > error:
+        smaller = f"{error:.3f} m, compared with {other:.3f} m ({other / error:.1f} times smaller)."
+        return [*success, f"{crashes}, and its mean position error is {smaller}"]
+    return [*success, f"Its mean position error is {error:.3f} m, not smaller than {other:.3f} m."]
+
+
+def _against_rules(results: StudyResults, best: str) -> str:
+    rule = results.best(results.fixed())
+    a, b = results.rows[best]["return"], results.rows[rule]["return"]
+    change, label = difference(a, b), _label(results, best)
+    verdict = "significantly above" if change.value > 0.0 else "significantly below"
+    if change.holds(0.0):
+        verdict = "not significantly different from"
+    return (
+        f"{label[0].upper()}{label[1:]} returns {number(a, 1)}, {verdict} the best fixed rule "
+        f"({_label(results, rule)}, {number(b, 1)}): a difference of {number(change, 1)}."
+    )
+
+
+def _of_pair(results: StudyResults, first: str, second: str) -> str:
+    chance = results.improvement(first, second)
+    a, b = _label(results, first), _label(results, second)
+    return (
+        f"A training of {a} returns more than one of {b} with probability {number(chance, 2)}"
+        + (", which is not significant." if chance.low <= 0.5 <= chance.high else ".")
+    )
 
 
 def _table(results: StudyResults) -> tuple[tuple[str, ...], list[list[str]]]:
@@ -40,36 +132,21 @@ def table_text(results: StudyResults) -> str:
     return text_table({"": heads[:1], flown: heads[1:]}, rows)
 
 
-def page_text(results: StudyResults) -> str:
-    """Setting, table and conclusions, in Markdown."""
-    study, (heads, rows) = results.study, _table(results)
-    lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *rows]
-    return "\n".join(
-        [
-            f"{_trainings(results)}{study.episodes:,} test episodes with each policy. Success: "
-            f"{study.about.meaning}.",
-            "",
-            *("| " + " | ".join(line) + " |" for line in lines),
-            "",
-            *(f"- {sentence}" for sentence in conclusions(results)),
-            "",
-        ]
-    )
-
-
-def _trainings(results: StudyResults) -> str:
-    """Number of trainings, if there are any."""
-    study = results.study
-    if not results.trained():
-        return ""
-    return f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
-
-
 def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
     """Write figures, numbers and pages; the last file is the page, which also shows the film."""
-    study, folder = results.study, results.study.folder
+    study, folder, (heads, rows) = results.study, results.study.folder, _table(results)
+    trainings = f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
+    flown = f"{trainings if results.trained() else ''}{study.episodes:,}"
+    lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *rows]
+    text = [
+        f"{flown} test episodes with each policy. Success: {study.about.meaning}.",
+        "",
+        *("| " + " | ".join(line) + " |" for line in lines),
+        "",
+        *(f"- {sentence}" for sentence in conclusions(results)),
+    ]
     table = folder / "table.md"
-    table.write_text(page_text(results), encoding="utf-8")
+    table.write_text("\n".join([*text, ""]), encoding="utf-8")
     summary = {
         **results.description(),
         "conclusions": conclusions(results),
@@ -83,12 +160,12 @@ def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
     ]
     report.add(
         "p",
-        f"{_trainings(results)}{study.episodes:,} episodes with each policy, flown on the "
+        f"{flown} episodes with each policy, flown on the "
         "estimate unless the arm says otherwise. Means over seeds; in brackets 95 % "
         "intervals over seeds and episodes (quad_gym.analysis.intervals). Success: "
         f"{study.about.meaning}.",
     )
-    report.add_table(*_table(results))
+    report.add_table(heads, rows)
     report.add_bullets(conclusions(results))
     _add_figures(report, results)
     if film is not None:
@@ -145,7 +222,10 @@ def _add_figures(report: Report, results: StudyResults) -> None:
         label = label_of(results, name).replace(", ", ",\n")
         episodes[label] = {"time": recorded["time"], **traces}
     if kind == "glance":
-        figure, above = glance_figure(episodes, _half_view(study.env_id)), "where the vehicle looks"
+        camera = sensor_suite(BENCHMARKS[IDS[study.env_id]].keywords["sensors"]).camera
+        assert camera is not None
+        half_view = math.atan(0.5 * camera.image_size[0] / camera.focal_length)
+        figure, above = glance_figure(episodes, half_view), "where the vehicle looks"
     else:
         figure, above = pace_figure(episodes), "the speed of the vehicle"
     report.add_figure(
@@ -154,10 +234,3 @@ def _add_figures(report: Report, results: StudyResults) -> None:
         f"The same episode, flown on the estimate. Above, {above}; below, "
         f"standard deviation of the filter, and errors. {CHOICES[kind]}",
     )
-
-
-def _half_view(env_id: str) -> float:
-    """Half of the horizontal field of view of a task's camera [rad]."""
-    camera = sensor_suite(BENCHMARKS[IDS[env_id]].keywords["sensors"]).camera
-    assert camera is not None
-    return math.atan(0.5 * camera.image_size[0] / camera.focal_length)

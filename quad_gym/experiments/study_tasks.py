@@ -12,7 +12,7 @@ from quad_gym.experiments.arms import ARMS_OF, Arm
 from quad_gym.experiments.flown import Flown
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class StudyColumn:
     """Column of the table: one number per episode, and their score."""
 
@@ -55,12 +55,12 @@ class StudiedTask:
 
     def table(self) -> dict[str, StudyColumn]:
         """Columns of the table by name, in their order."""
-        returns = StudyColumn(heading="return", of=lambda run: run.episodes.returns, digits=1)
+        returns = StudyColumn("return", lambda run: run.episodes.returns, digits=1)
         return {
             "return": returns,
             "worst": replace(returns, heading="worst tenth", score=worst_tenth),
-            "success": StudyColumn(heading="success", of=self.success),
-            "crashed": StudyColumn(heading="crashed", of=lambda run: run.episodes.crashed),
+            "success": StudyColumn("success", self.success),
+            "crashed": StudyColumn("crashed", lambda run: run.episodes.crashed),
             **self.columns,
         }
 
@@ -79,30 +79,29 @@ def passes(run: Flown, gates: int) -> NDArray[np.bool_]:
     return ~run.episodes.crashed & (run.episodes.gates_passed >= gates)
 
 
-_SPEED = StudyColumn(
-    heading="mean speed [m/s]", of=lambda run: run.recorded["mean_speed"], digits=2
-)
+def _gates(heading: str) -> dict[str, StudyColumn]:
+    """Columns of a course."""
+    return {
+        "gates": StudyColumn(heading, lambda run: run.episodes.gates_passed, digits=2),
+        "speed": StudyColumn("mean speed [m/s]", lambda run: run.recorded["mean_speed"], digits=2),
+    }
+
 
 STUDIED: Mapping[str, StudiedTask] = {
     "look_around": StudiedTask(
         arms=ARMS_OF["look_around"],
         carrying=(
-            "pd_reference",
-            "pd_features",
-            "pd_features_when_uncertain",
-            "truth",
-            "std_certainty",
+            *("pd_reference", "pd_features", "pd_features_when_uncertain"),
+            *("truth", "std_certainty"),
         ),
         success=stays,
         meaning="flown to the end, with a mean position error below "
         f"{WITHIN:g} m in the second half",
         columns={
             "error": StudyColumn(
-                heading="position error [m]", of=lambda run: run.episodes.mean_error, digits=3
+                "position error [m]", lambda run: run.episodes.mean_error, digits=3
             ),
-            "in_view": StudyColumn(
-                heading="features in view", of=lambda run: run.recorded["in_view"]
-            ),
+            "in_view": StudyColumn("features in view", lambda run: run.recorded["in_view"]),
         },
         telling="error",
         traced=("off_wall", "off_reward", "sigma", "estimation_error", "position_error"),
@@ -117,12 +116,7 @@ STUDIED: Mapping[str, StudiedTask] = {
         evaluations=8,
         success=lambda run: passes(run, 8),
         meaning="all eight gates passed",
-        columns={
-            "gates": StudyColumn(
-                heading="gates passed, of 8", of=lambda run: run.episodes.gates_passed, digits=2
-            ),
-            "speed": _SPEED,
-        },
+        columns=_gates("gates passed, of 8"),
         telling="gates",
         traced=("speed", "sigma", "estimation_error"),
         figure="pace",
@@ -130,16 +124,11 @@ STUDIED: Mapping[str, StudiedTask] = {
     ),
     "outage_dash": StudiedTask(
         arms=ARMS_OF["outage_dash"],
-        carrying=(*("pd", "pd_slow", "pd_waiting", "truth", "estimate", "std", "truth_on_truth"),),
+        carrying=("pd", "pd_slow", "pd_waiting", "truth", "estimate", "std", "truth_on_truth"),
         evaluations=12,
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",
-        columns={
-            "gates": StudyColumn(
-                heading="gaps passed, of 10", of=lambda run: run.episodes.gates_passed, digits=2
-            ),
-            "speed": _SPEED,
-        },
+        columns=_gates("gaps passed, of 10"),
         telling="gates",
         traced=("speed", "sigma", "estimation_error", "outage"),
         figure="pace",

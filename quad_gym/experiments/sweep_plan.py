@@ -76,8 +76,15 @@ def expand(
         spec["env_ids"], spec["arms"] or [None], itertools.product(*tried)
     ):
         chosen = dict(zip(axes, values, strict=True))
-        listed = {axis: chosen[axis] for axis in axes if isinstance(axes[axis], list)}
-        name = _name(spec, env_id, arm, chosen["", "algorithm"], listed)
+        compiled = spec["engine"] == "compiled"
+        words = [IDS[env_id], "compiled_ppo" if compiled else chosen["", "algorithm"]]
+        words += [] if arm is None else [arm]
+        words += [  # values from lists, so that further values do not change it
+            f"{axis[1]}={_word(value)}"
+            for axis, value in chosen.items()
+            if isinstance(axes[axis], list) and axis[1] != "algorithm"
+        ]
+        name = ",".join(words)
         if name in cases:
             raise ValueError(f"every value of a sweep must be given once, got {name} twice")
         cases[name] = _plan(spec, env_id, arms.get(arm), chosen, threads)
@@ -121,20 +128,6 @@ def _plan(
 def _frozen(value: Any) -> Any:
     """Convert lists to tuples, as keywords and recipes require."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
-
-
-def _name(
-    spec: Mapping[str, Any],
-    env_id: str,
-    arm: str | None,
-    algorithm: str,
-    listed: Mapping[Axis, Any],
-) -> str:
-    """Task, algorithm, arm, and each value from a list, so that further values do not change it."""
-    words = [IDS[env_id], "compiled_ppo" if spec["engine"] == "compiled" else algorithm]
-    words += [] if arm is None else [arm]
-    words += [f"{key}={_word(value)}" for (_, key), value in listed.items() if key != "algorithm"]
-    return ",".join(words)
 
 
 def _word(value: Any) -> str:

@@ -44,11 +44,8 @@ def groups_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     for group in dict.fromkeys(row["group"] for row in rows):
         those = [row for row in rows if row["group"] == group]
-        summary = {
-            "group": group,
-            "trainings": len(those),
-            "finished": sum(row["finished"] for row in those),
-        }
+        finished = sum(row["finished"] for row in those)
+        summary = {"group": group, "trainings": len(those), "finished": finished}
         for name in SCORES:
             values = np.array([row[name] for row in those if row[name] is not None])
             low = high = None
@@ -81,23 +78,15 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
         [row["group"], f"{row['finished']}/{row['trainings']}", *cells(row)]
         for row in groups_of(rows)
     ]
-    single = [
-        [
-            f"{row['group']}/seed_{row['seed']}",
-            "yes" if row["finished"] else "no",
-            f"{row['steps']:,}",
-            *cells(row),
-        ]
-        for row in rows
-    ]
+    single = []
+    for row in rows:
+        finished = "yes" if row["finished"] else "no"
+        name = f"{row['group']}/seed_{row['seed']}"
+        single.append([name, finished, f"{row['steps']:,}", *cells(row)])
     mean = "best evaluation: mean over finished seeds [95 % interval, Student's t]"
-    return "\n\n".join(
-        [
-            text_table({"": ("group", "finished"), mean: headings}, groups),
-            text_table({"": ("training", "finished", "steps"), "best evaluation": headings}, single)
-            + "\n",
-        ]
-    )
+    first = text_table({"": ("group", "finished"), mean: headings}, groups)
+    heads = {"": ("training", "finished", "steps"), "best evaluation": headings}
+    return f"{first}\n\n{text_table(heads, single)}\n"
 
 
 def write_tables(rows: Sequence[dict[str, Any]], folder: Path) -> None:

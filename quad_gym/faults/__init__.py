@@ -20,15 +20,8 @@ and in fields of a flight's record for `FlightBatch.record`, such as "fault_acti
 "feature_mistaken". They are hidden from filter and controller.
 """
 
-from quad_gym.faults import aids, base, camera, gnss, imu, vehicle
-from quad_gym.faults.aids import *
+from quad_gym.faults import base, kinds
 from quad_gym.faults.base import *
-from quad_gym.faults.camera import *
-from quad_gym.faults.gnss import *
-from quad_gym.faults.imu import *
-from quad_gym.faults.vehicle import *
+from quad_gym.faults.kinds import *
 
-# each file lists its public names
-__all__ = (
-    aids.__all__ + base.__all__ + camera.__all__ + gnss.__all__ + imu.__all__ + vehicle.__all__
-)
+__all__ = base.__all__ + kinds.__all__

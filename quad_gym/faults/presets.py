@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import faults as kinds
+from quad_gym.faults import kinds
 from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import AID_PARAMS, SensorSuite

@@ -5,7 +5,7 @@ The archive (`.npz`, readable by `numpy.load` alone) holds
 | entry | contents |
 |---|---|
 | `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and the scalars of the scene |
-| `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flights.record.COLUMNS` |
+| `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flights.columns.COLUMNS` |
 | `scene/NAME` | one float64 array per array of `quad_gym.flights.flight_scene.FlightScene` |
 
 A table has one number per column: vectors as `_x`, `_y`, `_z` (quaternions as `_w`, `_x`, `_y`,
@@ -20,37 +20,26 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.flights.columns import COLUMNS, Column, row_dtype
 from quad_gym.flights.flight_scene import FlightScene
-from quad_gym.flights.record import COLUMNS, Column, Flight, row_dtype
-from quad_gym.params import checks as check
-
-if TYPE_CHECKING:
-    import pandas
 
 FORMAT, VERSION = "quad_gym flight", 1
 _STATES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 
 
-def save_flight(flight: Flight, path: Path) -> Path:
-    """Write the archive; the file appears only when it is complete.
-
-    Returns:
-        The file.
-
-    Raises:
-        TypeError: If `about` holds a value without a JSON type.
-    """
-    header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "about": flight.about}
+def save_flight(rows: NDArray[Any], scene: FlightScene, about: dict[str, Any], path: Path) -> Path:
+    """Write the archive; the file appears only when it is complete."""
+    header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "about": about}
     arrays: dict[str, Any] = {
-        f"columns/{c.name}": np.ascontiguousarray(flight[c.name]) for c in COLUMNS
+        f"columns/{c.name}": np.ascontiguousarray(rows[c.name]) for c in COLUMNS
     }
     for field in dataclasses.fields(FlightScene):
-        value = getattr(flight.scene, field.name)
+        value = getattr(scene, field.name)
         if isinstance(value, np.ndarray):
             arrays[f"scene/{field.name}"] = value
         else:
@@ -66,13 +55,8 @@ def save_flight(flight: Flight, path: Path) -> Path:
     return path
 
 
-def load_flight(path: Path) -> Flight:
-    """Read an archive.
-
-    Raises:
-        FileNotFoundError: If there is no file.
-        ValueError: If it is damaged, of another kind, or of an unknown version.
-    """
+def load_flight(path: Path) -> tuple[NDArray[Any], FlightScene, dict[str, Any]]:
+    """Read rows, scene and further information from an archive; refuse damaged and other files."""
     try:
         archive = np.load(path, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -89,9 +73,16 @@ def load_flight(path: Path) -> Flight:
         raise ValueError(f"{path} is not a flight, or damaged: {error}") from None
     header = _header(path, entries)
     try:
-        scene = _scene(header, entries)
+        found: dict[str, Any] = {}
+        for field in dataclasses.fields(FlightScene):
+            value = entries.get(f"scene/{field.name}", header.get(field.name))
+            if value is not None:
+                found[field.name] = value
+            elif field.default is field.default_factory is dataclasses.MISSING:
+                raise ValueError(f"it lacks {field.name}")  # older files lack optional fields
+        scene = FlightScene(**found)
         rows = _rows(entries, len(scene.features_I))
-        return Flight(rows, scene, dict(header["about"]))
+        return rows, scene, dict(header["about"])
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path} is not a complete flight: {error}") from None
 
@@ -112,17 +103,6 @@ def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
     return dict(header)
 
 
-def _scene(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> FlightScene:
-    found: dict[str, Any] = {}
-    for field in dataclasses.fields(FlightScene):
-        value = entries.get(f"scene/{field.name}", header.get(field.name))
-        if value is not None:
-            found[field.name] = value
-        elif field.default is field.default_factory is dataclasses.MISSING:
-            raise ValueError(f"it lacks {field.name}")  # older files lack optional fields
-    return FlightScene(**found)
-
-
 def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
     count = len(entries.get("columns/time", ()))
     if not count:
@@ -141,11 +121,11 @@ def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
     return rows
 
 
-def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
+def table(rows: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
     """Return the columns of a flight's table, with one number per row, by name."""
     found: dict[str, NDArray[np.float64]] = {}
     for column in COLUMNS:
-        values = flight[column.name]
+        values = rows[column.name]
         if column.name == "covariance":
             sigmas = np.sqrt(np.maximum(np.diagonal(values, axis1=1, axis2=2), 0.0))
             names = [f"sigma_{state}_{axis}" for state in _STATES for axis in "xyz"]
@@ -170,13 +150,9 @@ def _parts(column: Column, count: int) -> Sequence[str]:
     return "wxyz" if column.name.endswith("quaternion") else "xyz"
 
 
-def write_flight_csv(flight: Flight, path: Path) -> Path:
-    """Write the table as CSV, with all digits; missing values are empty cells.
-
-    Returns:
-        The file.
-    """
-    columns = table(flight)
+def write_flight_csv(rows: NDArray[Any], path: Path) -> Path:
+    """Write the table as CSV, with all digits; missing values are empty cells."""
+    columns = table(rows)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
@@ -184,13 +160,3 @@ def write_flight_csv(flight: Flight, path: Path) -> Path:
         for row in zip(*(values.tolist() for values in columns.values()), strict=True):
             writer.writerow(["" if cell != cell else repr(cell) for cell in row])
     return path
-
-
-def flight_frame(flight: Flight) -> "pandas.DataFrame":
-    """Return the table as a pandas DataFrame, indexed by time.
-
-    Raises:
-        ImportError: If pandas is not installed.
-    """
-    pandas = check.package("pandas", "to_pandas", "pandas")
-    return pandas.DataFrame(table(flight)).set_index("time")

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
-from quad_gym.flights.record import Flight
 from quad_gym.params import checks as check
 from quad_gym.records import GateDecision, Shape
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
@@ -40,18 +39,8 @@ TRUTH, ESTIMATE, REFERENCE = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 FIX, RAY, NEUTRAL = (204, 121, 167), (86, 180, 233), (130, 130, 130)
 
 
-def rerun_recording(flight: Flight) -> Any:
-    """Return the recording of a flight.
-
-    Args:
-        flight: The flight.
-
-    Returns:
-        The `rerun.RecordingStream`.
-
-    Raises:
-        ImportError: If rerun-sdk is not installed.
-    """
+def rerun_recording(flight: Any) -> Any:
+    """Return the `rerun.RecordingStream` of a `Flight`."""
     rr = load_rerun()
     recording = rr.RecordingStream("quad_gym")
     log = _Log(flight, rr, recording)
@@ -76,7 +65,7 @@ def load_rerun() -> Any:
 class _Log:
     """Sender of the columns of a flight to a recording, entity by entity."""
 
-    def __init__(self, flight: Flight, rr: Any, recording: Any) -> None:
+    def __init__(self, flight: Any, rr: Any, recording: Any) -> None:
         self._flight, self._scene, self._rr, self._recording = flight, flight.scene, rr, recording
 
     def _static(self, entity: str, what: Any) -> None:
@@ -97,56 +86,32 @@ class _Log:
         if scene.reference_period and not len(scene.gates_I):
             path = scene.reference(np.linspace(0.0, scene.reference_period, 81 + scene.pieces))
             self._static("world/reference/path", rr.LineStrips3D([path], colors=[NEUTRAL]))
-        if len(scene.gates_I):
-            self._static(
-                "world/gates",
-                rr.Ellipsoids3D(
-                    centers=scene.gates_I,
-                    half_sizes=np.full((len(scene.gates_I), 3), scene.gate_radius),
-                    colors=[REFERENCE],
-                    labels=_numbers(len(scene.gates_I)),
-                ),
-            )
+        if count := len(scene.gates_I):
+            sizes, labels = np.full((count, 3), scene.gate_radius), _numbers(count)
+            style = {"colors": [REFERENCE], "labels": labels}
+            gates = rr.Ellipsoids3D(centers=scene.gates_I, half_sizes=sizes, **style)
+            self._static("world/gates", gates)
         self._obstacles()
         if scene.has_camera:
-            self._static(
-                "world/features",
-                rr.Points3D(
-                    scene.features_I,
-                    radii=0.04,
-                    colors=[NEUTRAL],
-                    labels=_numbers(len(scene.features_I)),
-                ),
-            )
+            style = {"colors": [NEUTRAL], "labels": _numbers(len(scene.features_I))}
+            self._static("world/features", rr.Points3D(scene.features_I, radii=0.04, **style))
 
     def _obstacles(self) -> None:
         """Log walls as boxes, cylinders as cylinders, and the geofence as edges."""
         rr, scene = self._rr, self._scene
+        solid = {"colors": [NEUTRAL], "fill_mode": "solid"}
         is_wall = scene.obstacles[:, 0] == Shape.WALL
         walls, cylinders = scene.obstacles[is_wall], scene.obstacles[~is_wall]
         if len(walls):
             yaw = np.arctan2(walls[:, 8], walls[:, 7])
             zero = np.zeros_like(yaw)
             turns = np.stack([zero, zero, np.sin(yaw / 2.0), np.cos(yaw / 2.0)], axis=1)
-            boxes = rr.Boxes3D(
-                centers=walls[:, 1:4],
-                half_sizes=walls[:, 4:7],
-                quaternions=turns,
-                colors=[NEUTRAL],
-                fill_mode="solid",
-            )
-            self._static("world/walls", boxes)
+            sizes = {"centers": walls[:, 1:4], "half_sizes": walls[:, 4:7], "quaternions": turns}
+            self._static("world/walls", rr.Boxes3D(**sizes, **solid))
         if len(cylinders):
-            self._static(
-                "world/cylinders",
-                rr.Cylinders3D(
-                    lengths=2.0 * cylinders[:, 6],
-                    radii=cylinders[:, 4],
-                    centers=cylinders[:, 1:4],
-                    colors=[NEUTRAL],
-                    fill_mode="solid",
-                ),
-            )
+            sizes = {"lengths": 2.0 * cylinders[:, 6], "radii": cylinders[:, 4]}
+            shapes = rr.Cylinders3D(centers=cylinders[:, 1:4], **sizes, **solid)
+            self._static("world/cylinders", shapes)
         if len(scene.geofence_I):
             low, high = scene.geofence_I
             box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[NEUTRAL])
@@ -241,16 +206,14 @@ class _Log:
         turn = _xyzw(dcm_to_quaternion(scene.R_CB))
         camera = "world/truth/camera"
         self._static(camera, rr.Transform3D(translation=scene.camera_B, quaternion=turn))
-        self._static(
-            f"{camera}/image",
-            rr.Pinhole(
-                resolution=2.0 * scene.half_image,
-                focal_length=scene.focal_length,
-                principal_point=scene.half_image,
-                image_plane_distance=FRUSTUM_DEPTH,
-                color=RAY,
-            ),
+        pinhole = rr.Pinhole(
+            resolution=2.0 * scene.half_image,
+            focal_length=scene.focal_length,
+            principal_point=scene.half_image,
+            image_plane_distance=FRUSTUM_DEPTH,
+            color=RAY,
         )
+        self._static(f"{camera}/image", pinhole)
         size = float(scene.half_image[0]) / 60.0
         R_BI = quaternion_to_dcm(np.nan_to_num(flight["estimated_quaternion"], nan=1.0))
         predicted = scene.project_features(flight["estimated_position"], R_BI)
@@ -312,7 +275,7 @@ class _Log:
             self._send(entity, rr.Scalars.columns(scalars=values[good]), good)
 
 
-def _blueprint(flight: Flight) -> Any:
+def _blueprint(flight: Any) -> Any:
     """Return the layout of the viewer: 3D on the left, camera and plots on the right."""
     import rerun.blueprint as rrb
 

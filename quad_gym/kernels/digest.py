@@ -23,8 +23,8 @@ import numpy as np
 
 PACKAGE = __package__.partition(".")[0]
 _NO_CODE = {
-    f"{__package__}.{name}"
-    for name in ("compiling.cache", "compiling.workers", "cores", "digest", "linked")
+    *(f"{__package__}.compiling.{name}" for name in ("building", "cache", "workers")),
+    *(f"{__package__}.{name}" for name in ("cores", "digest", "library", "linked", "sources")),
 }
 """Modules that determine when code is compiled, but do not change the code."""
 

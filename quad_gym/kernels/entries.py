@@ -1,7 +1,8 @@
 """Compiled functions that Python calls: their names and arguments, without the code.
 
-Numba compiles a function on its first call, or loads it from its cache. Arrays are passed in C
-order and with the data type of the catalog; a call writes results into arrays of the caller.
+A call goes to the library of compiled kernels, if there is one (`library.py`); otherwise Numba
+compiles the function on its first call, or loads it from its cache. Arrays are passed in C order
+and with the data type of the catalog; a call writes results into arrays of the caller.
 """
 
 import functools
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.kernels.library import library
 from quad_gym.kernels.stages import STAGE_TABLE, Stage
 from quad_gym.records import (
     FLIGHT,
@@ -49,6 +51,7 @@ class Entry:
     ) -> None:
         self.name = f"quad_gym.kernels.{name}"
         self.arguments, self.returns = arguments, returns
+        self._arrays = [(k, a) for k, a in enumerate(arguments) if isinstance(a, Rows)]
 
     def __call__(self, *given: Any) -> Any:
         """Call it.
@@ -56,17 +59,48 @@ class Entry:
         Raises:
             TypeError: If an array has another data type, number of axes or order.
         """
-        for wanted, value in zip(self.arguments, given, strict=True):
-            if isinstance(wanted, Rows):
-                _check(self.name, wanted, value)
-        return self._function(*given)
+        return self.bound(*given)() if self._arrays else self._function(*given)
+
+    def bound(self, *given: Any) -> Callable[[], Any]:
+        """Return a function that makes this call again and again, with the same memory.
+
+        Raises:
+            TypeError: If an array has another data type, number of axes or order.
+        """
+        for k, wanted in self._arrays:
+            _check(self.name, wanted, given[k])
+        if library() is None:
+            return functools.partial(self._function, *given)
+        words: list[int] = []
+        for value in given:
+            if isinstance(value, np.ndarray):
+                words += (value.ctypes.data, *value.shape)
+            else:
+                words.append(int(value))
+        return _Call(self._function, words, given)
 
     @functools.cached_property
     def _function(self) -> Callable[..., Any]:
-        from quad_gym.kernels.compiling.workers import dispatcher_of  # importing Numba takes 1 s
+        found = library()
+        if found is None:
+            from quad_gym.kernels.compiling.workers import dispatcher_of  # importing it takes 1 s
 
-        function: Callable[..., Any] = dispatcher_of(self.name)
-        return function
+            compiled: Callable[..., Any] = dispatcher_of(self.name)
+            return compiled
+        words = len(self.arguments) + sum(wanted.axes for _, wanted in self._arrays)
+        return found.function_of(self.name, words, self.returns)
+
+
+class _Call:
+    """A call of the library, with addresses and shapes in place of arrays, which it keeps alive."""
+
+    def __init__(
+        self, function: Callable[..., Any], words: list[int], kept: tuple[Any, ...]
+    ) -> None:
+        self._function, self._words, self._kept = function, words, kept
+
+    def __call__(self) -> Any:
+        return self._function(*self._words)
 
 
 def _check(name: str, wanted: Rows, array: NDArray[Any]) -> None:

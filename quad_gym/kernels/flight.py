@@ -5,7 +5,7 @@ the tick's sample (taken at its start or, if samples are averages, over the tick
 biases, then measurements and the update at its end.
 
 The lists name slots of the table of stages. The settings determine the function in each slot, or
-leave it empty, see `SOURCES` in `kernels/compiling/stages.py`.
+leave it empty, see `SOURCES` in `kernels/stages.py`.
 """
 
 import numpy as np

@@ -1,4 +1,7 @@
-"""The stages of this process, compiled or loaded on demand, and a table of those a batch needs."""
+"""The stages of this process, and a table of those that a batch needs.
+
+They are in the library of compiled kernels, or Numba compiles or loads them on demand.
+"""
 
 import threading
 from collections.abc import Collection, Mapping, Sequence
@@ -8,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.kernels.entries import fly
+from quad_gym.kernels.library import library
 from quad_gym.kernels.stages import SOURCES, STAGE_TABLE, Stage
 
 _addresses: dict[str, int] = {}
@@ -30,10 +34,13 @@ def linked_table(needed: Mapping[Stage, str], entries: Sequence[str] = (fly.name
     with _lock:
         missing = set(needed.values()) - _addresses.keys()
         if missing:
-            from quad_gym.kernels.compiling.workers import prepare  # importing Numba takes 1 s
+            found = library()
+            if found is None:
+                from quad_gym.kernels.compiling.workers import prepare  # importing it takes 1 s
 
-            prepare(names_of(set(needed.values()), entries))
-            _addresses.update((name, _compiled(name)) for name in missing)
+                prepare(names_of(set(needed.values()), entries))
+            address = _compiled if found is None else found.address_of
+            _addresses.update((name, address(name)) for name in missing)
     table = np.zeros(1, STAGE_TABLE)
     for stage, name in needed.items():
         table["address"][0, stage] = _addresses[name]

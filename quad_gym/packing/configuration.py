@@ -43,6 +43,9 @@ _WITHOUT = {
 class FlightConfiguration:
     """Arguments of `FlightBatch`: number of flights, and everything that they have in common.
 
+    `quad_gym.QuadEnv` explains the fields that are keywords of environments, too. See
+    `quad_gym.batch.cold_start` and `warm_start` for the bounds and the details of `filter_start`.
+
     Raises:
         ValueError: If a value is invalid, or has no effect with the others.
     """
@@ -53,15 +56,12 @@ class FlightConfiguration:
     vehicle: Resolved[VehicleParams | str, VehicleParams] = Resolved(
         resolving(VehicleParams, vehicle_params), "lab"
     )
-    """vehicle, or the name of a preset"""
     sensors: Resolved[SensorSuite | str, SensorSuite] = Resolved(
         resolving(SensorSuite, sensor_suite), "standard"
     )
-    """sensor suite, or the name of a preset"""
     gains: PDGains | str | None = None
     """gains of `Control.PD`, or the name of a preset; None: "lab\""""
     action_params: ActionParams | None = None
-    """scales of the actions, and bandwidths of the inner loops"""
     task: Resolved[TaskParams | None, TaskParams] = Resolved(resolving(TaskParams), None)
     """reference, start and termination"""
     source: Source = Source.ESTIMATE
@@ -71,16 +71,11 @@ class FlightConfiguration:
     control_rate: float | None = None
     """actions per second, which must divide the IMU rate; None: the IMU rate [Hz]"""
     substeps: int = 1
-    """Runge-Kutta steps per tick"""
     action_delay: float = 0.0
-    """delay from the command of an action to its execution, rounded to whole ticks, at most
-    MAX_ACTION_DELAY [control steps]. Before the first action arrives, the vehicle hovers"""
     layout: Layout = Layout.RELATIVE
     """layout of the observations"""
     include_std: bool = False
-    """True: append the filter's standard deviations to the observations"""
     privileged: bool = False
-    """True: append the truth to the observations"""
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     """(low, high) of the observations, each (n,); None: no observations"""
     autoreset: Autoreset = Autoreset.DISABLED
@@ -88,34 +83,21 @@ class FlightConfiguration:
     run_filter: bool | None = None
     """True: sensors and filter run; None: they run if another argument needs them"""
     estimator: "Estimator | type[Estimator] | str | None" = None
-    """a user's `quad_gym.Estimator` in place of the filter of the sensors, its class, or
-    "module:Class" of either; see `quad_gym.estimation.own`"""
     filter_start: str = "cold"
-    """"cold": the filter starts from its first fix; "warm": it has converged in
-    `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn from
-    the covariance that it has reached. See `quad_gym.batch.cold_start` for the bounds"""
     innovations: bool = False
     """True: keep innovations and NIS block by block, for `record`: "innovation",
     "innovation_sigma", "block_nis". Filters with an innovation gate, with `faults`, or with
     `truncate_when_diverged` in their task always keep them"""
     threads: int | None = None
-    """number of threads; None: one per core"""
     true_vehicle: VehicleParams | None = None
-    """true parameters of the vehicle, if they differ from `vehicle`, which the controller
-    assumes"""
     true_sensors: SensorSuite | None = None
-    """true parameters of the sensors, if they differ from `sensors`, which the filter assumes"""
     world: Resolved[WorldParams | str, WorldParams] = Resolved(
         resolving(WorldParams, world_params), "calm"
     )
-    """wind, gusts, drag, ground, battery, obstacles and geofence, or the name of a preset"""
     randomization: Resolved[Randomization | Mapping[str, Drawn] | None, Randomization] = Resolved(
         lambda _, given: Randomization.of(given), None
     )
-    """parameters drawn in every episode, relative to `true_vehicle`, `true_sensors` and `world`: a
-    `Randomization`, or distributions by name"""
     faults: FaultsGiven = None
-    """faults of sensors and rotors, or names of presets, see `quad_gym.faults`"""
 
     def __post_init__(self) -> None:
         check.whole("count", self.count, most=MOST_FLIGHTS)

@@ -1,8 +1,9 @@
 """Parameters that all aiding sensors share: rate, phase, latency, noise, time-correlated errors."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
@@ -16,8 +17,29 @@ class SlowError(NamedTuple):
     tau: float = math.inf  # correlation time [s]; infinite: the error is constant during a flight
 
 
+class SensorBase(Checked):
+    """Base of the parameters of all sensors."""
+
+    _white_noise: ClassVar[tuple[str, ...]] = ()
+    _ideal: ClassVar[Mapping[str, Any]] = {}
+    """Values without latency and without errors that the filter does not model."""
+
+    def simplified(self) -> Self:
+        """Return a copy without latency and without errors that the filter does not model."""
+        return self.replace(**self._ideal)
+
+    def scaled_noise(self, factor: float) -> Self:
+        """Return a copy with the white noise multiplied by `factor`."""
+        scaled: dict[str, Any] = {}
+        for name in self._white_noise:
+            sigma = getattr(self, name)
+            each = tuple(factor * s for s in sigma) if isinstance(sigma, tuple) else None
+            scaled[name] = each or (sigma and factor * sigma)
+        return self.replace(**scaled)
+
+
 @dataclass(frozen=True, kw_only=True)
-class AidParams(Checked):
+class AidParams(SensorBase):
     """An aiding sensor other than IMU, GNSS and camera."""
 
     rate: check.Positive = 50.0
@@ -31,6 +53,8 @@ class AidParams(Checked):
     noise_sigma: float
     """standard deviation of the white noise, per component"""
 
+    _white_noise = ("noise_sigma",)
+    _ideal: ClassVar = {"latency": 0.0}
     aid: ClassVar[Aid]
     raw: ClassVar[tuple[str, str, float]]
     """unit, frame and bound of the measurement in raw observations"""
@@ -64,11 +88,3 @@ class AidParams(Checked):
     def numbers(self) -> tuple[float, float, float]:
         """Three further parameters of the sensor's kernel."""
         return (0.0, 0.0, 0.0)
-
-    def simplified(self) -> "AidParams":
-        """Return a copy without latency and without errors that the filter does not model."""
-        return self.replace(latency=0.0)
-
-    def scaled_noise(self, factor: float) -> "AidParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(noise_sigma=factor * self.noise_sigma)

@@ -3,12 +3,12 @@
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.aids import SensorBase
 from quad_gym.params.checks import Matrix, Vector
 from quad_gym.records import MAX_FEATURES
 
@@ -26,12 +26,11 @@ def _features(name: str, value: Any) -> Matrix:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraParams(Checked):
+class CameraParams(SensorBase):
     """A pinhole camera that measures the image coordinates of known features."""
 
     rate: check.Positive = 200.0
-    """frame rate [Hz]; the IMU rate must be a whole multiple of it; laboratory: an image at every
-    tick"""
+    """frame rate [Hz], which must divide the IMU rate; laboratory: an image at every tick"""
     position_B: check.Place = (0.1159, -0.0004, -0.0435)
     """(3,) projection center in B [m]; laboratory vehicle"""
     attitude: check.Vector3 = (math.radians(120.0), 0.0, math.radians(90.0))
@@ -39,10 +38,7 @@ class CameraParams(Checked):
     axis along the optical axis [rad]; laboratory"""
     focal_length: check.Positive = 1657.72
     """focal length [pixels]; laboratory"""
-    image_size: Positive2 = (
-        3840.0,
-        2160.0,
-    )
+    image_size: Positive2 = (3840.0, 2160.0)
     """(2,) width and height of the image, with the origin of image coordinates at its center
     [pixels]; laboratory"""
     pixel_sigma: check.Positive = 20.0
@@ -59,19 +55,19 @@ class CameraParams(Checked):
     """distance beyond which a feature is too small to be detected [m]"""
     exposure: Annotated[float, check.between(0.0, 1.0)] = 0.0
     """exposure time of an image [s]: a body rate w smears a feature over `focal_length w exposure`
-    pixels, and the measured position is uniformly distributed along the smear; the filter inflates
-    the pixel noise in proportion to the measured body rate"""
+    pixels, on which its measured position is uniformly distributed; the filter inflates the pixel
+    noise accordingly"""
     ground_hides: bool = False
     """True: the ground (`WorldParams.ground_height`) occludes features below it, and all features
     if the camera is below it"""
 
-    def simplified(self) -> "CameraParams":
-        """Return a copy without latency, motion blur, and limits of range and ground."""
-        return self.replace(latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False)
-
-    def scaled_noise(self, factor: float) -> "CameraParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(pixel_sigma=factor * self.pixel_sigma)
+    _white_noise = ("pixel_sigma",)
+    _ideal: ClassVar = {
+        "latency": 0.0,
+        "max_range": math.inf,
+        "exposure": 0.0,
+        "ground_hides": False,
+    }
 
     @property
     def limited(self) -> bool:

@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 from functools import partial
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, Self, Union, get_args, get_origin
 
 from quad_gym.params.checks import Rule, choice, flag, instance, keywords, number
 
@@ -74,10 +74,10 @@ class Checked:
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
 
-    def _check(self, rule: Any, *names: str, **options: Any) -> None:
-        for name in names:
-            label = f"{type(self).__name__}.{name}"
-            self._set(name, rule(label, getattr(self, name), **options))
+    def _refuse(self, name: str, must: str, got: Any = ...) -> NoReturn:
+        """Raise a ValueError for a field that must be otherwise."""
+        value = getattr(self, name) if got is ... else got
+        raise ValueError(f"{type(self).__name__}.{name} must {must}, got {value}")
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; all values are checked again."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 T = TypeVar("T")
+_NO_NUMBERS = (str, bytes, bytearray, bool, np.bool_)
 Vector = tuple[float, ...]
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -60,14 +61,18 @@ def closest(name: Any, known: Iterable[str]) -> str | None:
     """
     if not isinstance(name, str):
         return None
+
+    def likeness(word: str) -> float:
+        return difflib.SequenceMatcher(None, name.lower(), word.lower()).ratio()
+
     best, found = _RESEMBLES, None
     for word in known:
-        whole = _likeness(name, word)
+        whole = likeness(word)
         parts = [part for part in word.split("_") if len(part) > 2]
-        part = max((_likeness(name, part) for part in parts), default=0.0)
-        likeness = max(whole, _PART * part if part >= _PART else 0.0)
-        if likeness > best:
-            best, found = likeness, word
+        part = max(map(likeness, parts), default=0.0)
+        best_of_word = max(whole, _PART * part if part >= _PART else 0.0)
+        if best_of_word > best:
+            best, found = best_of_word, word
     return found
 
 
@@ -75,20 +80,10 @@ _RESEMBLES, _PART = 0.6, 0.8
 """Likeness above which a word may be meant, and at which a part of it may; a part counts less."""
 
 
-def _likeness(a: str, b: str) -> float:
-    """The likeness of two words, whatever their case: from 0 to 1, the same."""
-    return difflib.SequenceMatcher(None, a.lower(), b.lower()).ratio()
-
-
 def did_you_mean(name: Any, known: Iterable[str]) -> str:
     """Return the end of a message that refuses a name: the one that may be meant, if any."""
     close = closest(name, known)
     return f"; did you mean {close}?" if close else ""
-
-
-def _no_number(value: Any) -> bool:
-    """Return True for a value that Python converts to a float, but is none: text, bool, array."""
-    return isinstance(value, (str, bytes, bytearray, bool, np.bool_)) or np.ndim(value) > 0
 
 
 def number(
@@ -101,7 +96,7 @@ def number(
 ) -> float:
     """`value` as a finite float in [least, most] (above `least`, with `open_end`)."""
     try:
-        if _no_number(value):
+        if isinstance(value, _NO_NUMBERS) or np.ndim(value) > 0:  # which float would convert
             raise TypeError
         result = float(value)
     except OverflowError:
@@ -192,14 +187,8 @@ _Kind = TypeVar("_Kind")
 def own(name: str, given: Any, kind: type[_Kind]) -> _Kind:
     """Return an object of a class that users extend.
 
-    Args:
-        name: Name of the argument.
-        given: An instance; a subclass, which is instantiated without arguments; or "module:name" of
-            either. Modules in the working directory are found, too.
-        kind: The class.
-
-    Raises:
-        ValueError: If it is none of these.
+    `given` is an instance; a subclass, which is instantiated without arguments; or "module:name" of
+    either. Modules in the working directory are found, too.
     """
     found = _named(name, given, kind.__name__) if isinstance(given, str) else given
     if isinstance(found, type) and issubclass(found, kind):
@@ -212,13 +201,9 @@ def own(name: str, given: Any, kind: type[_Kind]) -> _Kind:
 
 
 def _named(argument: str, name: str, kind: str) -> Any:
-    """Return the object specified by "module:name".
-
-    Raises:
-        ValueError: If the module or the name in it does not exist.
-    """
-    module, colon, attribute = name.partition(":")
-    if not (colon and module and attribute):
+    """Return the object specified by "module:name"."""
+    module, _, attribute = name.partition(":")
+    if not (module and attribute):
         raise ValueError(f'{argument} must be "module:name" of a quad_gym.{kind}, got {name!r}')
     here = os.getcwd()
     added = here not in sys.path and "" not in sys.path
@@ -271,7 +256,7 @@ def _holds_no_numbers(value: Any) -> bool:
         return value.dtype.kind not in "iuf"
     if isinstance(value, (list, tuple)):
         return any(_holds_no_numbers(part) for part in value)
-    return value is None or isinstance(value, (str, bytes, bytearray, bool, np.bool_))
+    return value is None or isinstance(value, _NO_NUMBERS)
 
 
 def vector(

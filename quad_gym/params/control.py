@@ -41,9 +41,7 @@ class ActionParams(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.tilt_scale >= math.pi / 2:
-            raise ValueError(
-                f"ActionParams.tilt_scale must be less than pi/2, got {self.tilt_scale}"
-            )
+            self._refuse("tilt_scale", "be less than pi/2")
 
 
 _GAINS = {

@@ -53,28 +53,28 @@ class Distribution(Checked):
         low, high = self.support
         return 0.5 * (low + high), 0.5 * (high - low)
 
-    def _check_order(self, low: float, high: float) -> None:
-        if low > high:
-            raise ValueError(
-                f"{type(self).__name__}.low must be at most its high, got {low:g} and {high:g}"
-            )
-
 
 @dataclass(frozen=True)
-class Uniform(Distribution):
-    """Uniform distribution on [low, high]."""
+class _Between(Distribution):
+    """Distribution on [low, high]."""
 
     low: float
     high: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_order(self.low, self.high)
+        if self.low > self.high:
+            self._refuse("low", "be at most its high", f"{self.low:g} and {self.high:g}")
 
     @property
     def support(self) -> tuple[float, float]:
         """Bounds of the distribution."""
         return self.low, self.high
+
+
+@dataclass(frozen=True)
+class Uniform(_Between):
+    """Uniform distribution on [low, high]."""
 
     def placed(self, factor: float, shift: float) -> Affine:
         """Return the uniform distribution between the transformed bounds."""
@@ -82,7 +82,7 @@ class Uniform(Distribution):
 
 
 @dataclass(frozen=True)
-class LogUniform(Distribution):
+class LogUniform(_Between):
     """Log-uniform distribution on [low, high], above 0: for scales that are known to a factor."""
 
     low: check.Positive
@@ -90,14 +90,8 @@ class LogUniform(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_order(self.low, self.high)
         if self.offset:
             raise ValueError("LogUniform.offset must be False: log-uniform draws are factors")
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Bounds of the distribution."""
-        return self.low, self.high
 
     def placed(self, factor: float, shift: float) -> Affine:
         """Return the log-uniform distribution between the multiplied bounds."""
@@ -122,7 +116,6 @@ class Normal(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_order(self.low, self.high)
         if self._probabilities[1] < 1e-6:
             raise ValueError(
                 "Normal.low and Normal.high must enclose a probability of at least 1e-6, got "

@@ -16,7 +16,7 @@ from quad_gym.params.vehicle import (
     check_lag,
     check_moments,
 )
-from quad_gym.params.world import BatteryParams, WorldParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, Drawable
 
 FAST = 100.0  # speed that no vehicle reaches [m/s]
@@ -54,8 +54,11 @@ def check_bounds(table: Ranges, parts: Mapping[str, Any]) -> None:
     if "inertia" in table.names:
         _check_inertia(table)
     antennas = {"primary_antenna_B", "secondary_antenna_B"} & set(table.names)
-    if antennas and parts["antennas"] is not None:
-        _check_antennas(table)
+    if antennas and parts["antennas"] is not None:  # whose draws may coincide
+        one, other = COLUMNS["primary_antenna_B"], COLUMNS["secondary_antenna_B"]
+        gap = np.maximum(table.low[one] - table.high[other], table.low[other] - table.high[one])
+        name = "randomization of 'primary_antenna_B' and 'secondary_antenna_B'"
+        check_baseline(name, np.maximum(gap, 0.0))
 
 
 def _check_values(
@@ -95,22 +98,13 @@ def _check_center(place: NDArray[np.float64], vehicle: VehicleParams) -> None:
         )
 
 
-def _check_antennas(table: Ranges) -> None:
-    """Refuse antennas whose draws may coincide."""
-    one, other = COLUMNS["primary_antenna_B"], COLUMNS["secondary_antenna_B"]
-    gap = np.maximum(table.low[one] - table.high[other], table.low[other] - table.high[one])
-    check_baseline(
-        "randomization of 'primary_antenna_B' and 'secondary_antenna_B'", np.maximum(gap, 0.0)
-    )
-
-
 def check_hovering(table: Ranges, vehicle: VehicleParams, world: WorldParams) -> None:
     """Refuse draws whose worst case lacks the thrust or the power to hover."""
     least, most = table.least, table.most
-    mass = most("mass")
-    full = least("max_voltage")
+    mass, full = most("mass"), least("max_voltage")
     if world.battery is not None:
-        full *= _open_circuit(world.battery, least("battery_charge"))
+        empty = world.battery.empty_voltage
+        full *= empty + (1.0 - empty) * least("battery_charge")
     speed = least("motor_speed_per_volt") * full
     lift = 4.0 * least("thrust_coefficient") * least("rotor_efficiency")
     thrust = lift * speed**2
@@ -140,11 +134,10 @@ def check_hovering(table: Ranges, vehicle: VehicleParams, world: WorldParams) ->
 def check_draws(table: Ranges, vehicle: VehicleParams, world: WorldParams, clocks: Clocks) -> None:
     """Refuse rotors that are too fast, or drag that is too large, for the integration."""
     _check_drag(table, vehicle, world, clocks)
-    name = "motor_time_constant"
+    name = label = "motor_time_constant"
     if name in table.names:
-        check_lag(f"randomization of {name!r} at its smallest draw", table.least(name), clocks)
-    else:
-        check_lag(name, vehicle.motor_time_constant, clocks)
+        label = f"randomization of {name!r} at its smallest draw"
+    check_lag(label, table.least(name), clocks)
 
 
 def _check_drag(table: Ranges, vehicle: VehicleParams, world: WorldParams, clocks: Clocks) -> None:
@@ -158,8 +151,7 @@ def _check_drag(table: Ranges, vehicle: VehicleParams, world: WorldParams, clock
     disc = most("drag_coefficient") * vehicle.disc_area * vehicle.air_density * speed
     rotor_speeds = 4.0 * most("motor_speed_per_volt") * most("max_voltage")
     drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds
-    mass = table.least("mass")
-    step = clocks.step
+    mass, step = table.least("mass"), clocks.step
     if step * drag > RK4_LIMIT * mass:
         raise ValueError(
             f"drag must slow the vehicle down by less than {RK4_LIMIT * mass / step:.3g} N s/m, "
@@ -182,8 +174,3 @@ def _check_inertia(table: Ranges) -> None:
         most = np.where(np.arange(3) == k, low, high)  # the others as large as they can be
         if 2.0 * low[k] > most.sum() * (1.0 + 1e-9):
             check_moments("randomization of 'inertia' at its most favorable draw", most)
-
-
-def _open_circuit(battery: BatteryParams, charge: float) -> float:
-    """Return the voltage of an unloaded battery as a fraction of a full battery's."""
-    return battery.empty_voltage + (1.0 - battery.empty_voltage) * charge

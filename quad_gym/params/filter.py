@@ -16,23 +16,19 @@ class FilterParams(Checked):
 
     kind: Literal["ukf", "ekf"] = "ukf"
     """"ukf", the unscented filter of the report, or "ekf", an error-state extended Kalman filter
-    with the same state, models and noise, which has no use for the parameters of the unscented
-    transform"""
+    with the same state, models and noise"""
     integration: Literal["euler", "midpoint"] = "euler"
     """integration of the prediction over a tick: "euler" holds the sample at the start of the tick
     (report); "midpoint" integrates the attitude exactly and rotates the specific force with the
     attitude halfway through the tick, as `ImuParams.samples="average"` requires"""
     attitude_reset: bool = False
     """True: transform the covariance, S^-1 P S^-T, when the mean error angles are added to the
-    attitude, because error angles then refer to the new attitude; False: leave the covariance as it
-    is (report). The choice distinguishes the two forms of the filter and is not a tuning parameter:
-    with suites other than "lab" it changes the NEES by less than its sampling error, and errors by
-    at most 1 %"""
+    attitude, to which error angles then refer; False: leave it as it is (report). With suites other
+    than "lab" this changes the NEES by less than its sampling error, and errors by at most 1 %"""
     alpha: check.Positive = 1e-3
     """alpha of the unscented transform, the spread of the sigma points; laboratory"""
     beta: check.NonNegative = 2.0
-    """beta of the unscented transform, the additional covariance weight of the central sigma point;
-    2 for Gaussian distributions; laboratory"""
+    """beta of the unscented transform, 2 for Gaussian distributions; laboratory"""
     kappa: Annotated[float, partial(check.number, least=-14.0)] = 0.0
     """kappa of the unscented transform, its secondary scaling parameter; laboratory"""
     direction_variance_floor: check.Positive = 1e-8
@@ -42,27 +38,24 @@ class FilterParams(Checked):
     """direction u at which the bearing noise of a feature, sigma^2 (I - u u^T), is evaluated: the
     "measured" direction (report) or the "predicted" one, as for the baseline. With the first, the
     filter interprets the angle between the two, tens of milliradians in the first second, as
-    information with 0.1 mrad accuracy. "pinhole": the predicted direction, with less noise in the
-    radial direction of the image, along which pixels far from its center subtend smaller angles;
-    the report assumes equal noise about both axes"""
+    information with 0.1 mrad accuracy. "pinhole": the predicted direction, with less noise along
+    the radius of the image, where pixels far from its center subtend smaller angles"""
     initial_velocity_variance: check.Positive = 1e-3
     """initial variance of each velocity component [m^2/s^2]; laboratory"""
     initial_covariance_scale: check.Positive = 2.0
     """factor on the covariance of the first fix, from which the filter starts; laboratory"""
     initial_tilt_sigma: Annotated[float, partial(check.positive, most=math.pi)] | None = None
-    """initial standard deviation of roll and pitch of a filter that starts level, with the heading
-    of the baseline [rad]; None: the initial attitude solves Wahba's problem for the baseline and
-    the vertical, with the baseline's noise about every axis (laboratory)"""
+    """initial standard deviation of roll and pitch of a filter that starts level [rad]; None: the
+    initial attitude solves Wahba's problem for the baseline and the vertical (laboratory)"""
     reuse_first_fix: bool = True
     """True: the fix that starts the filter is also its first measurement (laboratory). The fix is
     then counted twice, so suites other than "lab" have False"""
     recursive_update_threshold: check.Positive | None = None
     """standard deviation of a feature's predicted direction above which an image is processed in
-    several steps, each linearized about the estimate that the step before has left [rad]; None:
-    always in a single update (report). The linearization error of pixels grows with the square of
-    the direction error, and exceeds a precise camera's noise at an uncertain start or after an
-    outage. Without an innovation gate, features beyond `max_direction_sigma` are then ignored where
-    there is GNSS, as a gate would"""
+    several steps, each linearized about the estimate after the step before [rad]; None: always in a
+    single update (report). The linearization error of pixels grows with the square of the direction
+    error, and exceeds a precise camera's noise at an uncertain start or after an outage. With GNSS,
+    features beyond `max_direction_sigma` are then ignored even without a gate"""
     false_alarm_probability: check.NonNegative = 0.0
     """probability that the innovation gate rejects a valid measurement: a position, baseline,
     velocity or feature, or a measurement of an aiding sensor, is left out of the update if its
@@ -71,17 +64,15 @@ class FilterParams(Checked):
     Navigation, section 5.4); 0: no gate"""
     max_rejections: Annotated[int, check.whole] = 10
     """number of consecutive rejections of a sensor's measurements after which the estimate is
-    assumed to be wrong instead: the variances of the states that the sensor measures are raised to
-    the square of the innovation (not increased by it), and the next measurement is accepted"""
+    assumed to be wrong instead: the variances of the measured states are raised to the square of
+    the innovation, and the next measurement is accepted"""
     max_direction_sigma: check.Positive = 0.2
     """standard deviation of a feature's predicted direction above which a filter with an innovation
-    gate ignores the feature, as after a long outage [rad]; half the square of this angle, which a
-    linear model neglects, is then ten times the noise of a good camera. GNSS has to reduce the
-    uncertainty first; a filter without GNSS uses all features"""
+    gate ignores the feature [rad]; half the square of this angle, which a linear model neglects, is
+    then ten times the noise of a good camera. A filter without GNSS uses all features"""
     delay_compensation: Literal["retrodict", "none"] = "retrodict"
-    """processing of delayed measurements: "retrodict" takes the estimate back to the time stamp
-    over the IMU samples since then, updates it there, and propagates it forward again; "none"
-    ignores the time stamp"""
+    """processing of delayed measurements: "retrodict" takes the estimate back to the time stamp,
+    updates it there, and propagates it forward again; "none" ignores the time stamp"""
     gravity: check.Positive = GRAVITY
     """gravitational acceleration in the prediction of a filter on its own [m/s^2]; in flights the
     vehicle's value is used"""
@@ -89,7 +80,4 @@ class FilterParams(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.false_alarm_probability >= 0.5:
-            raise ValueError(
-                "FilterParams.false_alarm_probability must be below 0.5, got "
-                f"{self.false_alarm_probability}"
-            )
+            self._refuse("false_alarm_probability", "be below 0.5")

@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.aids import SensorBase
 
 LEAST_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so
@@ -27,7 +27,7 @@ def check_baseline(name: str, baseline: np.ndarray) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GnssParams(Checked):
+class GnssParams(SensorBase):
     """GNSS: position of the primary antenna and, with a second antenna, the baseline between them.
 
     With one antenna, the initial heading of the filter is measured by the magnetometer or, without
@@ -50,9 +50,8 @@ class GnssParams(Checked):
     baseline_sigma: check.Positive = 0.05
     """standard deviation of the white noise of the baseline's direction [rad]; laboratory"""
     heading_error_sigma: Annotated[float, check.between(0.0, 1.0)] = 0.0
-    """standard deviation of the heading error that all baselines of an episode have in common, a
-    rotation about the body z axis [rad]; causes are unequal antennas, their mounting or, for a
-    compass, iron nearby"""
+    """standard deviation of the heading error that all baselines of an episode have in common, due
+    to unequal antennas and their mounting, a rotation about the body z axis [rad]"""
     velocity_sigma: check.Positive | None = None
     """standard deviation of the velocity from Doppler shifts, per axis [m/s]; None: velocity is not
     measured (laboratory)"""
@@ -60,46 +59,30 @@ class GnssParams(Checked):
     """time of the first measurement after the start as a fraction of the measurement period, in [0,
     1), rounded to whole ticks; None: drawn at random in each episode"""
     drift_sigma_I: check.NonNegative3 = (0.0, 0.0, 0.0)
-    """(3,) stationary standard deviation of the time-correlated position error (drift) east, north,
-    up, in addition to the white noise [m]. The drift is a first-order Gauss-Markov process that is
-    zero at the start of an episode, because positions are relative to the place of the start"""
+    """(3,) stationary standard deviation of the drift of positions east, north, up [m], a
+    first-order Gauss-Markov process that is zero at the start of an episode, because positions are
+    relative to the place of the start"""
     drift_tau: check.Positive = 60.0
-    """correlation time of the position drift [s]; the filter estimates the drift in three augmented
-    states"""
+    """correlation time of the drift [s]; the filter estimates it in three augmented states"""
     latency: check.NonNegative = 0.0
     """delay from a measurement to its arrival at the filter, which receives it with its time stamp
     [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods. Receivers take about 0.1
     s: the autopilot PX4 assumes 0.11 s (parameter EKF2_GPS_DELAY)"""
+
+    _white_noise = ("position_sigma_I", "baseline_sigma", "velocity_sigma")
+    _ideal: ClassVar = {"latency": 0.0, "heading_error_sigma": 0.0}
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.has_baseline:
             check_baseline("GnssParams.secondary_antenna_B and primary_antenna_B", self.baseline_B)
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
-            raise ValueError(
-                "GnssParams.reference_antenna_G must be a place on the Earth in ECEF meters, "
-                f"got {self.reference_antenna_G}"
-            )
-
-    def simplified(self) -> "GnssParams":
-        """Return a copy without latency and constant heading error."""
-        return self.replace(latency=0.0, heading_error_sigma=0.0)
-
-    def scaled_noise(self, factor: float) -> "GnssParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(
-            position_sigma_I=tuple(factor * sigma for sigma in self.position_sigma_I),
-            baseline_sigma=factor * self.baseline_sigma,
-            velocity_sigma=self.velocity_sigma and factor * self.velocity_sigma,
-        )
+            self._refuse("reference_antenna_G", "be a place on the Earth in ECEF meters")
 
     def require_filter(self) -> None:
         """Refuse positions with hardly any noise, by the square of which a filter divides."""
         if min(self.position_sigma_I) < 1e-9:
-            raise ValueError(
-                "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "
-                f"{self.position_sigma_I}"
-            )
+            self._refuse("position_sigma_I", "be at least 1e-9 m for a filter")
 
     @property
     def has_baseline(self) -> bool:

@@ -34,8 +34,7 @@ class GroundParams(Checked):
         (-0.15, -0.15, -0.1),
     )
     """(4, 3) positions of the soles of the feet relative to the center of mass, in B [m], in a
-    level plane below all rotor hubs; default: legs 0.1 m long under the arms of the laboratory
-    vehicle, whose hubs are 0.21 m from the center of mass along both axes"""
+    level plane below all rotor hubs; default: legs of 0.1 m under the laboratory vehicle's arms"""
     friction: Annotated[float, check.between(0.0, 100.0)] = 0.6
     """Coulomb friction coefficient, for sticking and sliding; rubber on concrete has 0.6 to 0.85;
     0: no friction"""
@@ -50,13 +49,9 @@ class GroundParams(Checked):
         super().__post_init__()
         feet = np.array(self.feet_B)
         if np.abs(feet).max() > FARTHEST_FOOT:
-            raise ValueError(
-                f"GroundParams.feet_B must be within {FARTHEST_FOOT:g} m, got {self.feet_B}"
-            )
+            self._refuse("feet_B", f"be within {FARTHEST_FOOT:g} m")
         if np.linalg.svd(feet[:, :2] - feet[:, :2].mean(axis=0))[1][1] < 1e-3 or not (
             np.ptp(feet[:, 2]) <= 1e-9 and feet[0, 2] < 0.0
         ):
-            raise ValueError(
-                "GroundParams.feet_B must be four points of a level plane below the center of "
-                f"mass, not all on one line, got {self.feet_B}"
-            )
+            must = "be four points of a level plane below the center of mass, not all on one line"
+            self._refuse("feet_B", must)

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.aids import SensorBase
 
 MANEUVER = 0.5
 """Typical time for which a quadrotor accelerates in one direction [s]; engineering judgment,
@@ -21,7 +21,7 @@ _ERRORS = tuple(
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImuParams(Checked):
+class ImuParams(SensorBase):
     """Accelerometer and gyro, with white noise and Gauss-Markov biases (report eqs. 4, 6, 7)."""
 
     rate: Annotated[float, partial(check.positive, least=1.0, most=1e6)] = 200.0
@@ -31,9 +31,8 @@ class ImuParams(Checked):
     samples: Literal["instant", "average"] = "instant"
     """samples with which the filter predicts a tick: "instant", a sample of the motion at the start
     of the tick (report), or "average", the mean over the tick, as real IMUs provide by delta angles
-    and delta velocities with coning and sculling corrections. In both cases the inner loops read
-    the gyro at the present instant, with the noise of the last sample: a mean lags by half a tick,
-    too much for a tight rate loop"""
+    and delta velocities. In both cases the inner loops read the gyro at the present instant: a mean
+    lags by half a tick, too much for a tight rate loop"""
     accel_noise_density: check.Positive = 9.8e-3 * 0.1
     """noise density of the accelerometer [m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
     gyro_noise_density: check.Positive = math.radians(0.05)
@@ -65,21 +64,10 @@ class ImuParams(Checked):
     hover, per axis, after the IMU's own filters [m/s^2]. The noise is white, and proportional to
     the square of the rotor speeds, as the forces of unbalanced masses are"""
     gyro_vibration: check.NonNegative = 0.0
-    """standard deviation of the noise that rotor vibration adds to a gyro sample in hover, per
-    axis, after the IMU's own filters [rad/s]. The noise is white, and proportional to the square of
-    the rotor speeds"""
+    """standard deviation of this noise in a gyro sample [rad/s]"""
 
-    def simplified(self) -> "ImuParams":
-        """Return a copy without errors of scale and alignment, and without vibration."""
-        none = dict.fromkeys(_ERRORS, 0.0)
-        return self.replace(accel_vibration=0.0, gyro_vibration=0.0, **none)
-
-    def scaled_noise(self, factor: float) -> "ImuParams":
-        """Return a copy with the white noise multiplied by `factor`."""
-        return self.replace(
-            accel_noise_density=factor * self.accel_noise_density,
-            gyro_noise_density=factor * self.gyro_noise_density,
-        )
+    _white_noise = ("accel_noise_density", "gyro_noise_density")
+    _ideal = dict.fromkeys((*_ERRORS, "accel_vibration", "gyro_vibration"), 0.0)
 
     @property
     def dt(self) -> float:

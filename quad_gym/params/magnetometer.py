@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams, SlowError
@@ -44,16 +44,15 @@ class MagnetometerParams(AidParams):
     World Magnetic Model's error model, hypot(0.26, 5417 nT / horizontal field) degrees. The filter
     estimates the error in an augmented state"""
 
+    _ideal: ClassVar = {"latency": 0.0, "soft_iron_sigma": 0.0}
     aid = Aid.MAGNETOMETER
     raw = ("of the field", "B", 10.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if math.cos(self.inclination) < 0.01:
-            raise ValueError(
-                "MagnetometerParams.inclination must leave a horizontal field, from which the "
-                f"heading follows: at least 0.6 degrees from the vertical, got {self.inclination}"
-            )
+            must = "leave a horizontal field, from which the heading follows: at least 0.6 degrees "
+            self._refuse("inclination", must + "from the vertical")
 
     @property
     def field_I(self) -> tuple[float, float, float]:
@@ -95,7 +94,3 @@ class MagnetometerParams(AidParams):
     def numbers(self) -> tuple[float, float, float]:
         """The Earth's field east, north, up [T]."""
         return self.field_I
-
-    def simplified(self) -> "MagnetometerParams":
-        """Return a copy without latency and soft iron."""
-        return self.replace(latency=0.0, soft_iron_sigma=0.0)

@@ -7,7 +7,7 @@ to one than its radius collides with it, and the camera cannot see features behi
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
@@ -34,6 +34,8 @@ class Obstacle(Checked):
     """index of an earlier obstacle in `WorldParams.obstacles` whose shift is added to this
     obstacle's own shift, as for the two sides of a gap; None: its own shift only"""
 
+    shape: ClassVar[Shape]
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for field in ("center_I", "shift_I"):
@@ -50,11 +52,6 @@ class Obstacle(Checked):
         """Horizontal direction (2,) of the length, east and north [-]."""
         return (1.0, 0.0)
 
-    @property
-    def shape(self) -> Shape:
-        """Shape of the obstacle."""
-        raise NotImplementedError
-
 
 @dataclass(frozen=True, kw_only=True)
 class Wall(Obstacle):
@@ -64,6 +61,8 @@ class Wall(Obstacle):
     """(3,) length, thickness and height [m]"""
     yaw: Annotated[float, check.between(-FARTHEST_OBSTACLE, FARTHEST_OBSTACLE)] = 0.0
     """direction of the length, from east toward north [rad]"""
+
+    shape = Shape.WALL
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,11 +80,6 @@ class Wall(Obstacle):
         """Horizontal direction (2,) of the length, east and north [-]."""
         return (math.cos(self.yaw), math.sin(self.yaw))
 
-    @property
-    def shape(self) -> Shape:
-        """Shape of a wall."""
-        return Shape.WALL
-
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Obstacle):
@@ -96,15 +90,12 @@ class Cylinder(Obstacle):
     height: Size = 3.0
     """height of the cylinder [m]"""
 
+    shape = Shape.CYLINDER
+
     @property
     def half_size(self) -> Vector:
         """Radius, radius and half height (3,) [m]."""
         return (self.radius, self.radius, 0.5 * self.height)
-
-    @property
-    def shape(self) -> Shape:
-        """Shape of a cylinder."""
-        return Shape.CYLINDER
 
 
 def check_obstacles(name: str, obstacles: tuple[Obstacle, ...]) -> None:

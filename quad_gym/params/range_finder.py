@@ -32,10 +32,8 @@ class RangeFinderParams(AidParams):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.max_range <= self.min_range:
-            raise ValueError(
-                "RangeFinderParams.max_range must be more than min_range, got "
-                f"{self.max_range:g} m and {self.min_range:g} m"
-            )
+            got = f"{self.max_range:g} m and {self.min_range:g} m"
+            self._refuse("max_range", "be more than min_range", got)
 
     @property
     def numbers(self) -> tuple[float, float, float]:

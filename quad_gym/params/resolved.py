@@ -49,14 +49,13 @@ def resolving(
 
 def taking(
     kind: Callable[Arguments, Value], name: str
-) -> Callable[
-    [Callable[[Owner, Value], None]],
-    Callable[Concatenate[Owner, Arguments], None],
-]:
+) -> Callable[[Callable[[Owner, Value], None]], Callable[Concatenate[Owner, Arguments], None]]:
     """Return a decorator for a method of a dataclass, which then takes the fields as arguments."""
     make: Callable[..., Value] = kind
     fields = {
-        name: parameter.replace(annotation=_given_type(parameter.annotation))
+        name: parameter.replace(annotation=get_args(hint)[0])
+        if get_origin(hint := parameter.annotation) is Resolved  # the type in which it is given
+        else parameter
         for name, parameter in inspect.signature(kind).parameters.items()
     }
 
@@ -66,15 +65,9 @@ def taking(
             check.keywords(given, tuple(fields), name)
             method(self, make(*values, **given))
 
-        itself = next(iter(inspect.signature(method).parameters.values()))
-        take.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-            [itself, *fields.values()]
-        )
+        itself, *_ = inspect.signature(method).parameters.values()
+        shown = inspect.Signature([itself, *fields.values()])
+        take.__signature__ = shown  # type: ignore[attr-defined]
         return take
 
     return decorate
-
-
-def _given_type(annotation: Any) -> Any:
-    """Return the type in which a field is given."""
-    return get_args(annotation)[0] if get_origin(annotation) is Resolved else annotation

@@ -4,9 +4,9 @@ As everywhere in `params`: SI units, body frame B with x forward and z up along 
 laboratory's numbers from the Aerial Robotics course (ASE 479W, The University of Texas at Austin).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
@@ -16,7 +16,6 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.params.log_delays import LogDelays
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
@@ -40,6 +39,7 @@ SENSOR_PARAMS: dict[str, type[SensorParams]] = {
 }
 """Parameters of all sensors but the IMU by their fields in `SensorSuite`."""
 
+Delay = Annotated[float, check.between(-2.0, 2.0)]
 _WORDS = {"gnss": "GNSS"}  # sensors in messages, where the name of the field is none
 
 
@@ -76,6 +76,24 @@ class NoisyObservationParams(Checked):
     """standard deviation of the attitude, per axis [rad]; measured on the laboratory's circle"""
     body_rates: check.NonNegative = 0.0123
     """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogDelays(Checked):
+    """Times by which the stamps of a vehicle's logs are later than the measurements themselves.
+
+    Autopilots often stamp a measurement when they receive it. A replay subtracts these delays; in
+    simulated flights time stamps are exact.
+    """
+
+    gnss: Delay = 0.0
+    """of GNSS, relative to the IMU [s]"""
+    camera: Delay = 0.0
+    """of images [s]"""
+    magnetometer: Delay = 0.0
+    """of the magnetometer [s]"""
+    barometer: Delay = 0.0
+    """of the barometer [s]"""
 
 
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
@@ -166,12 +184,7 @@ class SensorSuite(Checked):
         return self.gnss is not None and self.gnss.drifts
 
     def require_filter(self) -> None:
-        """Refuse a suite whose filter misinterprets the IMU samples, or would overflow.
-
-        Raises:
-            ValueError: If the filter would use means over a tick as samples at its start, or divide
-                by the square of almost no noise.
-        """
+        """Refuse a suite whose filter misinterprets the IMU samples, or would overflow."""
         if self.gnss is not None:
             self.gnss.require_filter()
         if self.imu.samples == "average" and self.estimator.integration == "euler":
@@ -186,9 +199,6 @@ class SensorSuite(Checked):
         Noise, biases, drift, latency, initial pose, mounting and feature positions may differ. The
         set of sensors, their schedules and their measured quantities must not: both sides share a
         clock and the measurements that the filter expects.
-
-        Raises:
-            ValueError: If the ticks differ, or sensors are missing or additional.
         """
         if true_sensors.imu.rate != self.imu.rate:
             raise ValueError("true_sensors must have the IMU rate of sensors, as it is the tick")
@@ -200,27 +210,27 @@ class SensorSuite(Checked):
         for name in SENSOR_PARAMS:
             if (getattr(true_sensors, name) is None) != (getattr(self, name) is None):
                 raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
-        for what, true, believed in self._schedule(true_sensors):
-            if true != believed:
+        true = true_sensors._schedule
+        for what, believed in self._schedule.items():
+            if true[what] != believed:
                 raise ValueError(
-                    f"true_sensors must have the {what} of sensors, {believed}, got {true}"
+                    f"true_sensors must have the {what} of sensors, {believed}, got {true[what]}"
                 )
 
-    def _schedule(self, true: "SensorSuite") -> Iterator[tuple[str, object, object]]:
-        """Yield the rates, phases and measured quantities of sensors: name, in `true`, here."""
+    @property
+    def _schedule(self) -> dict[str, object]:
+        """Rates, phases and measured quantities of the sensors."""
+        found: dict[str, object] = {}
         for name, sensor in self.sensors.items():
             word = _WORDS.get(name, name)
-            yield f"{word} rate [Hz]", true.sensors[name].rate, sensor.rate
-            yield f"{word} phase", true.sensors[name].phase, sensor.phase
-        if self.gnss is not None and true.gnss is not None:
-            gnss = (true.gnss, self.gnss)
-            paired, other_paired = (p.has_baseline for p in gnss)
-            yield "presence of a GNSS baseline (secondary_antenna_B)", paired, other_paired
-            gives, other_gives = (p.velocity_sigma is not None for p in gnss)
-            yield "presence of GNSS velocities (velocity_sigma)", gives, other_gives
-        if self.camera is not None and true.camera is not None:
-            counts = [len(p.features_I) for p in (true.camera, self.camera)]
-            yield "number of camera features", counts[0], counts[1]
+            found |= {f"{word} rate [Hz]": sensor.rate, f"{word} phase": sensor.phase}
+        if (gnss := self.gnss) is not None:
+            found["presence of a GNSS baseline (secondary_antenna_B)"] = gnss.has_baseline
+            gives = gnss.velocity_sigma is not None
+            found["presence of GNSS velocities (velocity_sigma)"] = gives
+        if self.camera is not None:
+            found["number of camera features"] = len(self.camera.features_I)
+        return found
 
     def with_rates(
         self,
@@ -239,26 +249,20 @@ class SensorSuite(Checked):
                 lacks the sensor whose rate is given.
         """
         check.keywords(aids, tuple(AID_PARAMS), "with_rates")
-        imu_rate = self.imu.rate
-        if imu is not None:
-            imu_rate = check.positive("imu_rate", imu, least=1.0, most=1e6)
-
-        def rate_of(name: str, wanted: float | None, current: float) -> float:
-            follows = current == self.imu.rate or imu_rate < current
-            rate = wanted if wanted is not None else (imu_rate if follows else current)
-            check.ticks(name, rate, imu_rate)
-            return rate
-
-        changed = {}
-        for name, wanted in {"gnss": gnss, "camera": camera, **aids}.items():
-            if wanted is not None and getattr(self, name) is None:
+        imu_rate = self.imu.rate if imu is None else imu
+        check.positive("imu_rate", imu_rate, least=1.0, most=1e6)
+        given = {"gnss": gnss, "camera": camera, **aids}
+        rates = {name: rate for name, rate in given.items() if rate is not None}
+        for name, rate in rates.items():
+            if getattr(self, name) is None:
                 lacking = _WORDS.get(name, f"a {name}")
-                raise ValueError(
-                    f"{name}_rate must not be given without {lacking}, got {wanted} Hz"
-                )
+                raise ValueError(f"{name}_rate must not be given without {lacking}, got {rate} Hz")
+        changed = {}
         for name, sensor in self.sensors.items():
-            wanted = {"gnss": gnss, "camera": camera, **aids}.get(name)
-            changed[name] = sensor.replace(rate=rate_of(f"{name}_rate", wanted, sensor.rate))
+            follows = sensor.rate == self.imu.rate or imu_rate < sensor.rate
+            rate = rates.get(name, imu_rate if follows else sensor.rate)
+            check.ticks(f"{name}_rate", rate, imu_rate)
+            changed[name] = sensor.replace(rate=rate)
         return self.replace(imu=self.imu.replace(rate=imu_rate), **changed)
 
     def simplified(self) -> "SensorSuite":

@@ -41,35 +41,21 @@ def text_of(suite: Any) -> str:
 
 
 def read_suite(file: Path, kind: type, base_of: Callable[[Any], Any]) -> Any:
-    """The suite in a file.
-
-    Args:
-        file: A path.
-        kind: `SensorSuite`.
-        base_of: From the value of `base` to a suite.
-
-    Raises:
-        ValueError: If the file is no TOML, or a name or value in it is invalid.
-        OSError: If it cannot be read.
-    """
+    """The suite, a `SensorSuite`, in a file; `base_of` makes one of the value of `base`."""
     try:
         given = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} must be a file of TOML: {error}") from None
     try:
         base = base_of(given.pop("base")) if "base" in given else None
-        if base is None:
-            _require_tables(kind, given)
+        for field in dataclasses.fields(kind):
+            if base is None and field.default is not None and field.name not in given:
+                raise ValueError(
+                    f'there must be a table [{field.name}], or base = "NAME" of a suite'
+                )
         return _built(kind, given, base, "")
     except (ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from None
-
-
-def _require_tables(kind: type, given: Mapping[str, Any]) -> None:
-    """Refuse a file without a base that leaves out a table whose default is not None."""
-    for field in dataclasses.fields(kind):
-        if field.default is not None and field.name not in given:
-            raise ValueError(f'there must be a table [{field.name}], or base = "NAME" of a suite')
 
 
 def _built(kind: Any, given: Mapping[str, Any], base: Any, where: str) -> Any:
@@ -80,8 +66,10 @@ def _built(kind: Any, given: Mapping[str, Any], base: Any, where: str) -> Any:
         if name not in names:
             meant = check.did_you_mean(name, names) or f"; it has {', '.join(names)}"
             raise ValueError(f"{where}{name} is not a field of {kind.__name__}{meant}")
-        inner, optional = _type_of(hints[name])
-        if optional and value == _NONE:
+        inner = hints[name]
+        if isinstance(inner, types.UnionType):  # with None
+            (inner,) = (part for part in inner.__args__ if part is not types.NoneType)
+        if inner is not hints[name] and value == _NONE:
             changes[name] = None
         elif dataclasses.is_dataclass(inner):
             if not isinstance(value, dict):
@@ -90,14 +78,6 @@ def _built(kind: Any, given: Mapping[str, Any], base: Any, where: str) -> Any:
         else:
             changes[name] = value
     return kind(**changes) if base is None else base.replace(**changes)
-
-
-def _type_of(hint: Any) -> tuple[Any, bool]:
-    """The type of a field, and True if it may also be None."""
-    if isinstance(hint, types.UnionType):
-        (inner,) = (part for part in hint.__args__ if part is not types.NoneType)
-        return inner, True
-    return hint, False
 
 
 def _lines(values: Mapping[str, Any]) -> str:

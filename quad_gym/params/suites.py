@@ -47,18 +47,28 @@ from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
-from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
+from quad_gym.params.sensors import NoisyObservationParams, SensorSuite
 from quad_gym.params.suite_files import SUFFIX, read_suite
 
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
 
 _GNSS_LATENCY = 0.1  # [s]; PX4 assumes 0.11 s (EKF2_GPS_DELAY)
-_CAMERA_LATENCY = 0.04
-"""[s]; exposure, transfer and search for markers; typical of small computers, 30 to 60 ms"""
-_EXPOSURE = 0.003  # [s]; daylight, or a well-lit hall; our judgment
-_MARKER_RANGE = 13.0
-"""[m]; there a marker of 0.2 m subtends 25 pixels of the laboratory's camera; our judgment"""
+# time constants of MEMS biases, hundreds of seconds: N. El-Sheimy, H. Hou and X. Niu, IEEE Trans.
+# Instrumentation and Measurement 57(1), 2008
+_MEMS = ImuParams(samples="average", gyro_bias_tau=300.0, accel_bias_tau=300.0)
+_CAMERA = CameraParams(
+    rate=25.0,
+    # markers are found within a pixel (S. Garrido-Jurado and others, Pattern Recognition 47(6),
+    # 2014), a calibration of lens and mounting leaves one or two; our judgment
+    pixel_sigma=2.5,
+    # exposure, transfer and search for markers; typical of small computers, 30 to 60 ms
+    latency=0.04,
+    exposure=0.003,  # daylight, or a well-lit hall; our judgment
+    max_range=13.0,  # where a marker of 0.2 m subtends 25 pixels; our judgment
+    ground_hides=True,
+    phase=None,
+)
 
 FIELD_FILTER = FilterParams(
     integration="midpoint",
@@ -73,9 +83,18 @@ FIELD_FILTER = FilterParams(
 )
 """The filter of all suites except `lab`: consistent from its start, with an innovation gate."""
 
+
+def _noise(
+    position: float, velocity: float, attitude: float, body_rates: float
+) -> NoisyObservationParams:
+    """Return the measured noise of noisy observations, see above."""
+    return NoisyObservationParams(
+        position=position, velocity=velocity, attitude=attitude, body_rates=body_rates
+    )
+
+
 RTK = SensorSuite(
-    imu=ImuParams(
-        samples="average",
+    imu=_MEMS.replace(
         # Analog Devices ADIS16470 data sheet: rate noise density 0.008 deg/s/sqrt(Hz), noise
         # density 100 ug/sqrt(Hz), in-run bias stability 8 deg/h and 13 ug
         gyro_noise_density=math.radians(0.008),
@@ -85,10 +104,6 @@ RTK = SensorSuite(
         # accelerometer
         gyro_bias_sigma=80.0 * _DEG_PER_HOUR,
         accel_bias_sigma=2.0 * _MILLI_G,
-        # time constants of MEMS biases, hundreds of seconds: N. El-Sheimy, H. Hou and X. Niu, IEEE
-        # Trans. Instrumentation and Measurement 57(1), 2008
-        gyro_bias_tau=300.0,
-        accel_bias_tau=300.0,
         # what its factory calibration leaves, 0.1 % and 0.03 deg; our judgment
         accel_scale_sigma=0.001,
         accel_misalignment_sigma=0.0005,
@@ -109,29 +124,17 @@ RTK = SensorSuite(
         velocity_sigma=0.05,  # the same
         phase=None,
     ),
-    camera=CameraParams(
-        rate=25.0,
-        # markers are found within a pixel (S. Garrido-Jurado and others, Pattern Recognition 47(6),
-        # 2014), a calibration of lens and mounting leaves one or two; our judgment
-        pixel_sigma=2.5,
-        latency=_CAMERA_LATENCY,
-        exposure=_EXPOSURE,
-        max_range=_MARKER_RANGE,
-        ground_hides=True,
+    camera=_CAMERA.replace(
         # three rows of four markers on the ground of the flying field
-        features_I=tuple((x, y, 0.0) for x in (-4.5, -1.5, 1.5, 4.5) for y in (-3.0, 0.0, 3.0)),
-        phase=None,
+        features_I=tuple((x, y, 0.0) for x in (-4.5, -1.5, 1.5, 4.5) for y in (-3.0, 0.0, 3.0))
     ),
     estimator=FIELD_FILTER,
-    noisy=NoisyObservationParams(
-        position=0.00135, velocity=0.0032, attitude=0.00021, body_rates=0.0028
-    ),  # measured, see above
+    noisy=_noise(0.00135, 0.0032, 0.00021, 0.0028),
 )
 """A survey vehicle: real-time kinematic GNSS with two antennas, and markers on the ground."""
 
 CONSUMER = SensorSuite(
-    imu=ImuParams(
-        samples="average",
+    imu=_MEMS.replace(
         # TDK InvenSense ICM-20948 data sheet: 0.015 deg/s/sqrt(Hz), 230 ug/sqrt(Hz), zero-g
         # tolerance +-50 mg on the board, taken for two sigma
         gyro_noise_density=math.radians(0.015),
@@ -139,8 +142,6 @@ CONSUMER = SensorSuite(
         accel_bias_sigma=25.0 * _MILLI_G,
         # what zeroing the gyro at rest before each flight leaves, 0.1 deg/s; our judgment
         gyro_bias_sigma=math.radians(0.1),
-        gyro_bias_tau=300.0,
-        accel_bias_tau=300.0,
         # the same data sheet: scale +-0.5 %, taken for two sigma, and cross-axis sensitivity +-2 %,
         # of which a calibration in six orientations leaves a quarter; our judgment
         accel_scale_sigma=0.0025,
@@ -174,9 +175,7 @@ CONSUMER = SensorSuite(
         hard_iron_sigma=1.5 * MICROTESLA,
     ),
     estimator=FIELD_FILTER,  # with the GNSS drift among its states
-    noisy=NoisyObservationParams(
-        position=0.123, velocity=0.024, attitude=0.0040, body_rates=0.011
-    ),  # measured, see above
+    noisy=_noise(0.123, 0.024, 0.0040, 0.011),
 )
 """A hobby vehicle: a single-frequency receiver, barometer, magnetometer, a cheap IMU, no camera."""
 
@@ -193,16 +192,13 @@ def _on_walls(distance: float, low: float, high: float) -> tuple[tuple[float, ..
 
 
 INDOOR = SensorSuite(
-    imu=ImuParams(
-        samples="average",
+    imu=_MEMS.replace(
         # Bosch BMI088 data sheet: 0.014 deg/s/sqrt(Hz), 175 ug/sqrt(Hz), zero-g offset 20 mg
         gyro_noise_density=math.radians(0.014),
         accel_noise_density=0.175 * _MILLI_G,
         accel_bias_sigma=20.0 * _MILLI_G,
         # what zeroing at rest leaves; our judgment
         gyro_bias_sigma=math.radians(0.05),
-        gyro_bias_tau=300.0,
-        accel_bias_tau=300.0,
         # typical of consumer MEMS, of the order of the ICM-20948's; our judgment
         accel_scale_sigma=0.0025,
         accel_misalignment_sigma=0.005,
@@ -211,22 +207,12 @@ INDOOR = SensorSuite(
         gyro_vibration=0.005,
     ),
     gnss=None,
-    initial_pose=InitialPoseParams(position_sigma=0.05, heading_sigma=0.05),
-    camera=CameraParams(
-        rate=25.0,
+    camera=_CAMERA.replace(
         attitude=(math.radians(90.0), 0.0, math.radians(90.0)),  # looking level ahead
-        pixel_sigma=2.5,  # as in `rtk`, like what follows
-        latency=_CAMERA_LATENCY,
-        exposure=_EXPOSURE,
-        max_range=_MARKER_RANGE,
-        ground_hides=True,
         features_I=_on_walls(distance=8.0, low=0.5, high=3.0),  # a hall of 16 m by 16 m
-        phase=None,
     ),
     estimator=FIELD_FILTER,
-    noisy=NoisyObservationParams(
-        position=0.0077, velocity=0.0128, attitude=0.00056, body_rates=0.0061
-    ),  # measured, see above
+    noisy=_noise(0.0077, 0.0128, 0.00056, 0.0061),
 )
 """A hall without GNSS, with markers on all walls in the view of the camera."""
 
@@ -244,9 +230,7 @@ ONE_WALL = _changed(
     },
 ).replace(
     # as above, but of LookAround with PD control that faces the wall, 127 flights
-    noisy=NoisyObservationParams(
-        position=0.0079, velocity=0.0139, attitude=0.00089, body_rates=0.0107
-    ),
+    noisy=_noise(0.0079, 0.0139, 0.00089, 0.0107)
 )
 """The suite of `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west
 wall."""
@@ -266,9 +250,7 @@ STANDARD = SensorSuite(
     # the laboratory's pixels are coarse, so that images need be processed in steps after outages
     # alone, and no measurement of it is corrupted, so that none has to be rejected
     estimator=FIELD_FILTER.replace(recursive_update_threshold=0.1, false_alarm_probability=0.0),
-    noisy=NoisyObservationParams(
-        position=0.0020, velocity=0.0150, attitude=0.0011, body_rates=0.0124
-    ),
+    noisy=_noise(0.0020, 0.0150, 0.0011, 0.0124),
 )
 """The environments' default: the laboratory's sensors with a consistent filter."""
 
@@ -279,11 +261,8 @@ CRAZYFLIE = SensorSuite(
     # the Flow deck v2: PMW3901 and VL53L1X
     optical_flow=OpticalFlowParams(phase=None),
     range_finder=RangeFinderParams(phase=None),
-    initial_pose=InitialPoseParams(position_sigma=0.05, heading_sigma=0.05),
     estimator=FIELD_FILTER,
-    noisy=NoisyObservationParams(
-        position=0.2, velocity=0.08, attitude=0.031, body_rates=0.0061
-    ),  # measured, see above
+    noisy=_noise(0.2, 0.08, 0.031, 0.0061),
 )
 """A small vehicle indoors that navigates by optical flow and a range finder: nothing observes its
 heading and horizontal position, whose errors grow."""
@@ -310,31 +289,17 @@ FLOWN = _changed(
         hard_iron_sigma=2.4 * MICROTESLA,
         hard_iron_tau=30.0,  # currents of the motors change
     ),
-    noisy=NoisyObservationParams(
-        position=0.572, velocity=0.136, attitude=0.0087, body_rates=0.0176
-    ),  # measured, see above
+    noisy=_noise(0.572, 0.136, 0.0087, 0.0176),
 )
 """A hobby vehicle as it flies: `consumer` with noise that explains the log of a real flight."""
 
-_SUITES = {
-    "standard": STANDARD,
-    "lab": SensorSuite(),
-    "rtk": RTK,
-    "consumer": CONSUMER,
-    "indoor": INDOOR,
-}
-
-SUITES = tuple(_SUITES)  # names of the sensor suites for all tasks
-
 _ALL = {
-    **_SUITES,
-    "one_wall": ONE_WALL,
-    "stale": STALE,
-    "crazyflie": CRAZYFLIE,
+    **{"standard": STANDARD, "lab": SensorSuite(), "rtk": RTK, "consumer": CONSUMER},
+    **{"indoor": INDOOR, "one_wall": ONE_WALL, "stale": STALE, "crazyflie": CRAZYFLIE},
     "flown": FLOWN,
 }
-
 ALL_SUITES = tuple(_ALL)  # names of all sensor suites
+SUITES = ALL_SUITES[:5]  # names of the sensor suites for all tasks
 
 
 def sensor_suite(name: str | Path) -> SensorSuite:
@@ -349,7 +314,9 @@ def sensor_suite(name: str | Path) -> SensorSuite:
         OSError: If the file cannot be read.
     """
     if is_suite_file(name):
-        return read_suite(Path(name), SensorSuite, _base)
+        return read_suite(
+            Path(name), SensorSuite, lambda base: _ALL[check.choice("base", base, ALL_SUITES)]
+        )
     if not isinstance(name, str) or name not in _ALL:
         raise ValueError(
             f"sensors must be one of {', '.join(ALL_SUITES)}, or a file of a suite (.toml), got "
@@ -372,7 +339,3 @@ def contents_of_suite_files(*names: Any) -> dict[str, Any]:
     """Suites in files among the names, as an entry of a record of results: files may change."""
     found = {str(name): sensor_suite(name) for name in names if is_suite_file(name)}
     return {"suite_files": found} if found else {}
-
-
-def _base(name: Any) -> SensorSuite:
-    return _ALL[check.choice("base", name, ALL_SUITES)]

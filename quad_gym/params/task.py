@@ -45,8 +45,7 @@ class TaskParams(Checked):
     """start of an episode. "ground": at rest below the reference at height 0, with stopped rotors
     (report section 4.2); "hover": hovering at rest within some decimeters of the reference;
     "mixed": one of these two, each with probability 0.5; "moving": as "hover", with uniformly drawn
-    velocities of up to 1.5 m/s and body rates of up to 2 rad/s on each axis, as after a
-    disturbance"""
+    velocities of up to 1.5 m/s and body rates of up to 2 rad/s on each axis"""
     pad: bool = True
     """True: a launch pad supports a vehicle that starts on the ground until its thrust lifts it;
     False: it sinks while its rotors spin up, as in the report. Ground that supports vehicles
@@ -94,7 +93,7 @@ class TaskParams(Checked):
         self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
         self.reward_params.require_effect(self.kind)
         if not 0.0 < self.max_tilt <= math.pi:
-            raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
+            self._refuse("max_tilt", "be in (0, pi]")
 
     @property
     def may_start_on_ground(self) -> bool:

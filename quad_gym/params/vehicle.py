@@ -41,6 +41,8 @@ RK4_LIMIT = 2.78
 """Largest step of the classic Runge-Kutta method over the time constant of a decay, beyond which
 its solution grows: the root of |1 - z + z^2/2 - z^3/6 + z^4/24| = 1 is 2.785."""
 
+_LIFTING = "thrust_coefficient, motor_speed_per_volt and max_voltage"
+
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleParams(Checked):
@@ -48,11 +50,7 @@ class VehicleParams(Checked):
 
     mass: Annotated[float, partial(check.positive, least=1e-3)] = 0.78
     """mass [kg]; laboratory vehicle"""
-    inertia: check.Matrix33 = (
-        (1.7565e-3, 0.0, 0.0),
-        (0.0, 3.5723e-3, 0.0),
-        (0.0, 0.0, 4.7134e-3),
-    )
+    inertia: check.Matrix33 = ((1.7565e-3, 0.0, 0.0), (0.0, 3.5723e-3, 0.0), (0.0, 0.0, 4.7134e-3))
     """(3, 3) inertia about the center of mass, in B [kg m^2]; laboratory vehicle"""
     rotor_positions_B: check.Matrix43 = (
         (0.21, -0.21, 0.0),
@@ -92,32 +90,23 @@ class VehicleParams(Checked):
             raise ValueError("VehicleParams.inertia must be symmetric")
         moments = np.linalg.eigvalsh(inertia)
         if moments[0] <= 1e-9 * abs(inertia).max():
-            raise ValueError(
-                "VehicleParams.inertia must be positive definite, got a smallest eigenvalue of "
-                f"{moments[0]:g}"
-            )
+            got = f"a smallest eigenvalue of {moments[0]:g}"
+            self._refuse("inertia", "be positive definite", got)
         check_moments("VehicleParams.inertia", moments)
         if self.hover_voltage >= self.max_voltage:
-            raise ValueError(
-                f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: that takes "
-                f"{self.hover_voltage:.3g} V of {self.max_voltage:g} V (by mass, gravity, "
-                "thrust_coefficient, motor_speed_per_volt and max_voltage)"
-            )
+            takes = f"that takes {self.hover_voltage:.3g} V of {self.max_voltage:g} V"
+            got = f"{self.mass} kg: {takes} (by mass, gravity, {_LIFTING})"
+            self._refuse("mass", "be light enough to hover", got)
         check_gyration("VehicleParams.inertia", moments, self.mass, self.rotor_positions_B)
         if 4.0 * self.max_rotor_force > MAX_LIFT * self.mass * self.gravity:
-            raise ValueError(
-                f"VehicleParams.thrust_coefficient must lift at most {MAX_LIFT:g} times the weight "
-                f"at full voltage, got {4.0 * self.max_rotor_force:g} N and "
-                f"{self.mass * self.gravity:g} N (by mass, gravity, thrust_coefficient, "
-                "motor_speed_per_volt and max_voltage)"
-            )
+            must = f"lift at most {MAX_LIFT:g} times the weight at full voltage"
+            got = f"{4.0 * self.max_rotor_force:g} N and {self.mass * self.gravity:g} N"
+            self._refuse("thrust_coefficient", must, f"{got} (by mass, gravity, {_LIFTING})")
         if self.torque_coefficient > MAX_TORQUE_ARM * self.thrust_coefficient:
-            raise ValueError(
-                f"VehicleParams.torque_coefficient must be at most {MAX_TORQUE_ARM:g} m times "
-                f"thrust_coefficient, got {self.torque_coefficient:g}"
-            )
+            must = f"be at most {MAX_TORQUE_ARM:g} m times thrust_coefficient"
+            self._refuse("torque_coefficient", must)
         if any(abs(spin) != 1.0 for spin in self.rotor_spins):
-            raise ValueError(f"VehicleParams.rotor_spins must be +1 or -1, got {self.rotor_spins}")
+            self._refuse("rotor_spins", "be +1 or -1")
         if abs(np.linalg.det(self.effectiveness)) < 1e-12:
             raise ValueError(
                 "VehicleParams.rotor_positions_B must let the rotors turn the body about all axes "

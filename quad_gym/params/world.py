@@ -101,26 +101,15 @@ class WorldParams(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if np.linalg.norm(self.wind_I) > MAX_WIND:
-            raise ValueError(
-                f"WorldParams.wind_I must be at most {MAX_WIND:g} m/s, got {self.wind_I}"
-            )
+            self._refuse("wind_I", f"be at most {MAX_WIND:g} m/s")
         if not isinstance(self.obstacles, (tuple, list)):
-            raise ValueError(
-                "WorldParams.obstacles must be a tuple of Wall and Cylinder, got "
-                f"{self.obstacles!r}"
-            )
+            self._refuse("obstacles", "be a tuple of Wall and Cylinder", repr(self.obstacles))
         self._set("obstacles", tuple(self.obstacles))
         check_obstacles("WorldParams.obstacles", self.obstacles)
         if len(self.obstacles) > MAX_OBSTACLES:
-            raise ValueError(
-                f"WorldParams.obstacles must be at most {MAX_OBSTACLES}, got {len(self.obstacles)}"
-            )
-        if self.geofence is not None:
-            low, high = self.geofence
-            if not all(a < b for a, b in zip(low, high, strict=True)):
-                raise ValueError(
-                    f"WorldParams.geofence must be a lower and an upper corner, got {self.geofence}"
-                )
+            self._refuse("obstacles", f"be at most {MAX_OBSTACLES}", len(self.obstacles))
+        if not all(low < high for low, high in zip(*(self.geofence or ()), strict=True)):
+            self._refuse("geofence", "be a lower and an upper corner")
 
 
 def _slalom(first: float = 48.0, spacing: float = 12.0, gaps: int = 10) -> tuple[Wall, ...]:
@@ -132,33 +121,29 @@ def _slalom(first: float = 48.0, spacing: float = 12.0, gaps: int = 10) -> tuple
     walls, size = [], (0.3, 30.0, 12.0)
     for k in range(gaps):
         x, edge = first - spacing * k, (3.75 if k % 2 else 0.75)
-        north = Wall(center_I=(x, edge + 15.0, 6.0), size=size, shift_I=(0.0, 1.5, 0.0))
-        south = (x, edge - 4.5 - 15.0, 6.0)
-        walls.append(north)
+        north, south = (x, edge + 15.0, 6.0), (x, edge - 4.5 - 15.0, 6.0)
+        walls.append(Wall(center_I=north, size=size, shift_I=(0.0, 1.5, 0.0)))
         walls.append(Wall(center_I=south, size=size, shift_I=(0.0, 1.5, 0.0), follows=2 * k))
     return tuple(walls)
 
 
-_LAB_ROTOR_DRAG = (0.78 * 0.544, 0.78 * 0.386, 0.0)  # Faessler et al., for the laboratory's mass
+def _windy(speed: float) -> WorldParams:
+    """Return a world with an east wind and gusts of a speed [m/s]."""
+    return WorldParams(
+        wind_I=(speed, 0.0, 0.0),
+        gust_wind_speed=speed,
+        linear_drag_B=(0.78 * 0.544, 0.78 * 0.386, 0.0),  # Faessler et al., the laboratory's mass
+        ground_effect=True,
+        battery=BatteryParams(),
+    )
+
 
 _WORLDS = {
     "calm": WorldParams(),
     # a gentle breeze (Beaufort 3) that an outdoor flight meets on most days
-    "breeze": WorldParams(
-        wind_I=(4.0, 0.0, 0.0),
-        gust_wind_speed=4.0,
-        linear_drag_B=_LAB_ROTOR_DRAG,
-        ground_effect=True,
-        battery=BatteryParams(),
-    ),
+    "breeze": _windy(4.0),
     # a fresh breeze (Beaufort 5), near the limit of small vehicles
-    "fresh_breeze": WorldParams(
-        wind_I=(8.0, 0.0, 0.0),
-        gust_wind_speed=8.0,
-        linear_drag_B=_LAB_ROTOR_DRAG,
-        ground_effect=True,
-        battery=BatteryParams(),
-    ),
+    "fresh_breeze": _windy(8.0),
     # for OutageDash: ten walls, 12 m apart, from east to west, each with a gap somewhere else
     "slalom": WorldParams(
         obstacles=_slalom(), geofence=((-200.0, -14.0, -1.0), (72.0, 14.0, 12.0))
@@ -167,9 +152,5 @@ _WORLDS = {
 
 
 def world_params(name: str) -> WorldParams:
-    """Return the world called `name`.
-
-    "calm" is the world of the laboratory report, "breeze" has wind of 4 m/s, "fresh_breeze" of 8
-    m/s, and "slalom" walls with gaps.
-    """
+    """Return a world: "calm" as in the report, "breeze", "fresh_breeze", or "slalom" with walls."""
     return _WORLDS[check.choice("world", name, tuple(_WORLDS))]

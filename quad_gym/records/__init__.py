@@ -7,7 +7,6 @@ array copies.
 from quad_gym.records.call import *
 from quad_gym.records.draws import *
 from quad_gym.records.enums import *
-from quad_gym.records.exchange import *
 from quad_gym.records.flight import *
 from quad_gym.records.gathered import *
 from quad_gym.records.layout import *
@@ -15,7 +14,6 @@ from quad_gym.records.params import *
 from quad_gym.records.path import *
 from quad_gym.records.results import *
 from quad_gym.records.settings import *
-from quad_gym.records.shown import *
 from quad_gym.records.sizes import *
 from quad_gym.records.starts import *
 from quad_gym.records.streams import *

@@ -1,244 +1,212 @@
 """Fields of a flight: true state, measurements, filter, clocks, reference, task and faults."""
 
 from quad_gym.records.draws import DRAWN_SIZE
-from quad_gym.records.sizes import (
-    AIDS,
-    DELAY_SLOTS,
-    FAULT_KINDS,
-    MAX_ACTION_DELAY,
-    MAX_BLOCKS,
-    MAX_FEATURES,
-    MAX_GATES,
-    MAX_HARMONICS,
-    MAX_OBSTACLES,
-    MAX_SLOW,
-    MAX_STATES,
-    SENSOR_GROUPS,
-    SENSORS,
-    STAMP,
-    Field,
-)
+from quad_gym.records.sizes import *
 
 # fmt: off
-_CONTACT_FIELDS = (
-    # obstacles and the geofence
-    Field("obstacle_center", (MAX_OBSTACLES, 3), "m", "centers of the obstacles in I"),
-    Field("obstacle_distance", (), "m", "from the center of mass to the nearest surface of an obstacle, negative inside; infinite: there is none"),
-    Field("obstacle_vector", (3,), "m", "from the center of mass to that surface's nearest point, in I"),
-    Field("collided", (), "0 or 1", "whether the vehicle has touched an obstacle in this episode"),
-    Field("left_fence", (), "0 or 1", "whether it has left the geofence in this episode"),
-)
-_GROUND_FIELDS = (
-    # contact with the ground
-    Field("ground_push", (3,), "m/s^2", "specific force of the ground at the accelerometer, in B, over the last tick"),
-    Field("footing", (), "-", "how many feet the ground pushes"),
-    Field("crashed", (), "0 or 1", "whether the vehicle has crashed into the ground in this episode"),
-)
-_PATH_FIELDS = (
-    # the trajectory of this episode, and its values at the present instant
-    Field("path", (), "-", "which one, in the order in which they were given"),
-    Field("path_share", (), "-", "share of the round at which the episode begins, if it is closed"),
-    Field("path_turn", (2,), "-", "cosine and sine of the angle by which it is turned about the vertical"),
-    Field("path_r", (3,), "m", "reference position in I"),
-    Field("path_v", (3,), "m/s", "reference velocity in I"),
-    Field("path_a", (3,), "m/s^2", "reference acceleration in I"),
-    Field("path_x", (3,), "-", "reference heading in I"),
-    Field("path_ahead", (2, 3), "m", "reference position in I a little later: the preview"),
-)
-_FAULT_FIELDS = (
-    # faults
-    Field("fault_active", (FAULT_KINDS,), "0 or 1", "the same, kind by kind"),
-    Field("fault_count", (FAULT_KINDS,), "-", "times that a fault has come in this episode"),
-    Field("fault_from", (FAULT_KINDS,), "ticks", "since the start of the episode, when it comes (next)"),
-    Field("fault_until", (FAULT_KINDS,), "ticks", "likewise, when it goes"),
-    Field("fault_news", (FAULT_KINDS,), "-1, 0 or 1", "whether it goes or comes at the present instant"),
-    Field("fault_size", (FAULT_KINDS,), "mixed", "drawn when it comes"),
-    Field("fault_vector", (FAULT_KINDS, 3), "mixed", "likewise: its size along its direction"),
-    Field("fault_pick", (FAULT_KINDS,), "-", "likewise: which rotor, as a share of four"),
-    Field("outlier", (), "0 or 1", "whether the last GNSS position is an outlier"),
-    Field("feature_hidden", (MAX_FEATURES,), "0 or 1", "whether an occlusion hides a feature"),
-    Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "whether a feature of the last image is another one"),
-    Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a working one; only where rotors can fail"),
-)
-_PLACE_FIELDS = (
-    # where the features are in this episode
-    Field("feature_place", (MAX_FEATURES, 3), "m", "places of the features in I, as the filter believes"),
-)
-_DRAW_FIELDS = (
-    # parameters
-    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
-)
-_ACTION_FIELDS = (
-    # actions under way
-    Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "the present action and those before it, the latest first"),
-    Field("delayed_action", (4,), "-", "the action that the vehicle carries out"),
-)
-_RAW_FIELDS = (
-    # raw measurements as observations
-    Field("gyro_sum", (3,), "rad/s", "gyro, summed over the samples since the last step"),
-    Field("accel_sum", (3,), "m/s^2", "accel, likewise"),
-)
-_OWN_FIELDS = (
-    # a user's estimator
-    Field("w_hat", (3,), "rad/s", "its body rates in B"),
-)
-_CORE_FIELDS = (
-    # read and written at every tick: the truth, clocks, the random stream
-    Field("r", (3,), "m", "position r_I of the center of mass"),
-    Field("v", (3,), "m/s", "velocity v_I"),
-    Field("q", (4,), "-", "attitude, unit quaternion (w, x, y, z), body to inertial"),
-    Field("w", (3,), "rad/s", "body rates w_B"),
-    Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
-    Field("voltages", (4,), "V", "motor voltages over the present tick"),
-    Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
-    Field("disturbance", (3,), "N", "external force d_I on the body"),
-    Field("tick", (), "ticks", "since the start of the episode"),
-    Field("instant", (), "-", "instants drawn so far", "u8"),
-    Field("key", (2,), "-", "key of the stream", "u8"),
-    Field("action", (4,), "-", "the present action, in [-1, 1]"),
-    Field("last_action", (4,), "-", "the action before it"),
-    # the state that the controller observes
-    Field("w_seen", (3,), "rad/s", "body rates in B from the controller's source"),
-    Field("R_seen", (3, 3), "-", "attitude R_BI from the controller's source"),
-    Field("v_seen", (3,), "m/s", "velocity in I from the controller's source"),
-    Field("r_seen", (3,), "m", "position in I from the controller's source"),
-    # read and written at every step: the task
-    Field("needs_reset", (), "0 or 1", "the episode is over; the next step begins a new one"),
-    Field("idle", (), "0 or 1", "a lane that only pads the last block"),
-    Field("step", (), "steps", "control steps since the start of the episode"),
-    Field("gate_next", (), "-", "gates passed so far"),
-    Field("reward", (), "-", "of the last step"),
-    Field("terminated", (), "0 or 1", "the last step ended the episode by a crash or at the goal"),
-    Field("truncated", (), "0 or 1", "the last step ended the episode by its time limit or a failed filter"),
-    Field("ending", (), "-", "why the episode ended, see Ending"),
-    Field("position_error", (), "m", "distance of the true position from the reference"),
-    Field("estimation_error", (), "m", "distance of the seen from the true position"),
-    Field("episode_return", (), "-", "sum of rewards in this episode"),
-    Field("episode_error", (), "m", "sum over steps of the position error in this episode"),
-    Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
-    Field("diverged", (), "0 or 1", "whether the covariance does not explain the last innovations"),
-    Field("faults", (), "bits", "active at the present instant: the sum of 2^FaultKind"),
-    # the reference: r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)
-    Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
-    Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
-    Field("ref_omega", (), "rad/s", "fundamental frequency w"),
-    Field("ref_center", (3,), "m", "constant term c in I"),
-    Field("ref_cos", (MAX_HARMONICS, 3), "m", "cosine coefficients a_k in I"),
-    Field("ref_sin", (MAX_HARMONICS, 3), "m", "sine coefficients b_k in I"),
-    # the course of gates
-    Field("gates", (MAX_GATES, 3), "m", "gate centers in I"),
-    # episodes
-    Field("episode", (), "-", "episodes begun since seeding"),
-    Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
-    # the air
-    Field("wind", (3,), "m/s", "velocity of the air in I"),
-    Field("air_force", (3,), "N", "force of the air in I, less thrust and disc drag"),
-    Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
-    Field("gust", (5,), "-", "states of the Dryden gusts u, v, w, see `kernels.vehicle.gusts`"),
-    Field("charge", (), "-", "charge of the battery, 1: full"),
-    # slow errors and clocks of the sensors
-    Field("b_a", (3,), "m/s^2", "accelerometer bias"),
-    Field("b_g", (3,), "rad/s", "gyro bias"),
-    Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
-    Field("wait", (SENSORS,), "ticks", "until each sensor measures next"),
-    Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement has arrived since the last step"),
-    # the batches that a snapshot fits
-    Field("configuration", (), "-", "digest of settings and parameters, see `quad_gym.batch.memory`", "u8"),
-)
-_FILTER_FIELDS = (
-    # the last measurements
-    Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
-    Field("w_before", (3,), "rad/s", "w_meas one sample before"),
-    Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
-    Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
-    Field("block_valid", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement reaches the filter at the present instant"),
-    Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
-    Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
-    Field("gnss_velocity", (3,), "m/s", "of the primary antenna, in G"),
-    Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
-    # the filter
-    Field("r_hat", (3,), "m", "estimated position in I"),
-    Field("v_hat", (3,), "m/s", "estimated velocity in I"),
-    Field("R_hat", (3, 3), "-", "estimated attitude R_BI"),
-    Field("b_a_hat", (3,), "m/s^2", "estimated accelerometer bias"),
-    Field("b_g_hat", (3,), "rad/s", "estimated gyro bias"),
-    Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
-    Field("update_failures", (), "-", "updates that failed since the filter's start"),
-    Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
-    Field("nis_dimension", (), "-", "measurements in the last update"),
-    Field("rejected_in_row", (SENSOR_GROUPS,), "-", "positions, baselines, velocities, images wholly rejected, other sensors, since the last accepted one"),
-    Field("reopened", (SENSOR_GROUPS,), "-", "times that the gate of each of these was reopened in this episode"),
-    Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
-    Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
-    Field("corrected", (6,), "m/s^2, rad/s", "sum of the last corrections of the biases"),
-    Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
-    Field("corrected_tick", (), "ticks", "when the last of them was"),
-    Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
-    Field("alarm_tick", (), "ticks", "of the last inconsistency alarm; without a gate, later by the time that biases take to be corrected"),
-    Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
-    Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
-)
-_ERROR_FIELDS = (
-    # errors of sensors that are constant over an episode
-    Field("accel_error", (3, 3), "-", "errors of scale and alignment of the accelerometer"),
-    Field("gyro_error", (3, 3), "-", "likewise of the gyro"),
-    Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
-)
-_WATCH_FIELDS = (
-    # the innovations of the last measurements, one by one: position, baseline, velocity, features, other sensors
-    Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
-    Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
-    Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
-    Field("gate", (MAX_BLOCKS,), "-", "what became of it, see GateDecision"),
-    Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
-    Field("corrected_long", (6,), "m/s^2, rad/s", "as corrected, over a longer time"),
-    Field("corrected_long_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
-)
-_LATE_FIELDS = (
-    # sums of the IMU's samples since the start of the episode, biases and gravity included
-    Field("imu_turn", (3, 3), "-", "C, from the body frame of the start to the present one"),
-    Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of the start"),
-    Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
-    Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
-    # these sums at the time stamps of the measurements in transit, the latest first
-    Field("stamps", (SENSORS, DELAY_SLOTS, STAMP), "mixed", "the tick (NaN: none), C, V, X, B, w_meas"),
-    # the measurements in transit
-    Field("waiting", (MAX_BLOCKS, DELAY_SLOTS, 3), "mixed", "measurements, block by block"),
-    Field("waiting_valid", (MAX_BLOCKS, DELAY_SLOTS), "0 or 1", "whether these were measured"),
-)
-_SLOW_FIELDS = (
-    # slow errors of sensors, where the filter estimates them
-    Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
-    Field("drift_corrected", (3,), "m", "sum of the last corrections of the drift of GNSS positions, where that is estimated"),
-    Field("drift_corrected_variance", (3,), "m^2", "its variance in a filter that is right"),
-    Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
-)
-_AID_FIELDS = (
-    # sensors other than GNSS and camera, in the order of Aid
-    Field("aid_measurement", (AIDS, 3), "m; T; rad/s", "altitude, then zeros; magnetic field in B; flow, then zero; distance, then zeros"),
-    Field("aid_vector", (AIDS, 3), "T", "true slow error in B, if it has one of three numbers: hard iron"),
-    Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination less the believed one"),
-    Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),
+PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
+    ("ground", (
+        # contact with the ground
+        Field("ground_push", (3,), "m/s^2", "specific force of the ground at the accelerometer, in B, over the last tick"),
+        Field("footing", (), "-", "how many feet the ground pushes"),
+        Field("crashed", (), "0 or 1", "whether the vehicle has crashed into the ground in this episode"),
+    )),
+    ("contacts", (
+        # obstacles and the geofence
+        Field("obstacle_center", (MAX_OBSTACLES, 3), "m", "centers of the obstacles in I"),
+        Field("obstacle_distance", (), "m", "from the center of mass to the nearest surface of an obstacle, negative inside; infinite: there is none"),
+        Field("obstacle_vector", (3,), "m", "from the center of mass to that surface's nearest point, in I"),
+        Field("collided", (), "0 or 1", "whether the vehicle has touched an obstacle in this episode"),
+        Field("left_fence", (), "0 or 1", "whether it has left the geofence in this episode"),
+    )),
+    ("path", (
+        # the trajectory of this episode, and its values at the present instant
+        Field("path", (), "-", "which one, in the order in which they were given"),
+        Field("path_share", (), "-", "share of the round at which the episode begins, if it is closed"),
+        Field("path_turn", (2,), "-", "cosine and sine of the angle by which it is turned about the vertical"),
+        Field("path_r", (3,), "m", "reference position in I"),
+        Field("path_v", (3,), "m/s", "reference velocity in I"),
+        Field("path_a", (3,), "m/s^2", "reference acceleration in I"),
+        Field("path_x", (3,), "-", "reference heading in I"),
+        Field("path_ahead", (2, 3), "m", "reference position in I a little later: the preview"),
+    )),
+    ("faults", (
+        # faults
+        Field("fault_active", (FAULT_KINDS,), "0 or 1", "the same, kind by kind"),
+        Field("fault_count", (FAULT_KINDS,), "-", "times that a fault has come in this episode"),
+        Field("fault_from", (FAULT_KINDS,), "ticks", "since the start of the episode, when it comes (next)"),
+        Field("fault_until", (FAULT_KINDS,), "ticks", "likewise, when it goes"),
+        Field("fault_news", (FAULT_KINDS,), "-1, 0 or 1", "whether it goes or comes at the present instant"),
+        Field("fault_size", (FAULT_KINDS,), "mixed", "drawn when it comes"),
+        Field("fault_vector", (FAULT_KINDS, 3), "mixed", "likewise: its size along its direction"),
+        Field("fault_pick", (FAULT_KINDS,), "-", "likewise: which rotor, as a share of four"),
+        Field("outlier", (), "0 or 1", "whether the last GNSS position is an outlier"),
+        Field("feature_hidden", (MAX_FEATURES,), "0 or 1", "whether an occlusion hides a feature"),
+        Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "whether a feature of the last image is another one"),
+        Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a working one; only where rotors can fail"),
+    )),
+    ("places", (
+        # where the features are in this episode
+        Field("feature_place", (MAX_FEATURES, 3), "m", "places of the features in I, as the filter believes"),
+    )),
+    ("draws", (
+        # parameters
+        Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
+    )),
+    ("actions", (
+        # actions under way
+        Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "the present action and those before it, the latest first"),
+        Field("delayed_action", (4,), "-", "the action that the vehicle carries out"),
+    )),
+    ("raw", (
+        # raw measurements as observations
+        Field("gyro_sum", (3,), "rad/s", "gyro, summed over the samples since the last step"),
+        Field("accel_sum", (3,), "m/s^2", "accel, likewise"),
+    )),
+    ("own", (
+        # a user's estimator
+        Field("w_hat", (3,), "rad/s", "its body rates in B"),
+    )),
+    ("core", (
+        # read and written at every tick: the truth, clocks, the random stream
+        Field("r", (3,), "m", "position r_I of the center of mass"),
+        Field("v", (3,), "m/s", "velocity v_I"),
+        Field("q", (4,), "-", "attitude, unit quaternion (w, x, y, z), body to inertial"),
+        Field("w", (3,), "rad/s", "body rates w_B"),
+        Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
+        Field("voltages", (4,), "V", "motor voltages over the present tick"),
+        Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
+        Field("disturbance", (3,), "N", "external force d_I on the body"),
+        Field("tick", (), "ticks", "since the start of the episode"),
+        Field("instant", (), "-", "instants drawn so far", "u8"),
+        Field("key", (2,), "-", "key of the stream", "u8"),
+        Field("action", (4,), "-", "the present action, in [-1, 1]"),
+        Field("last_action", (4,), "-", "the action before it"),
+        # the state that the controller observes
+        Field("w_seen", (3,), "rad/s", "body rates in B from the controller's source"),
+        Field("R_seen", (3, 3), "-", "attitude R_BI from the controller's source"),
+        Field("v_seen", (3,), "m/s", "velocity in I from the controller's source"),
+        Field("r_seen", (3,), "m", "position in I from the controller's source"),
+        # read and written at every step: the task
+        Field("needs_reset", (), "0 or 1", "the episode is over; the next step begins a new one"),
+        Field("idle", (), "0 or 1", "a lane that only pads the last block"),
+        Field("step", (), "steps", "control steps since the start of the episode"),
+        Field("gate_next", (), "-", "gates passed so far"),
+        Field("reward", (), "-", "of the last step"),
+        Field("terminated", (), "0 or 1", "the last step ended the episode by a crash or at the goal"),
+        Field("truncated", (), "0 or 1", "the last step ended the episode by its time limit or a failed filter"),
+        Field("ending", (), "-", "why the episode ended, see Ending"),
+        Field("position_error", (), "m", "distance of the true position from the reference"),
+        Field("estimation_error", (), "m", "distance of the seen from the true position"),
+        Field("episode_return", (), "-", "sum of rewards in this episode"),
+        Field("episode_error", (), "m", "sum over steps of the position error in this episode"),
+        Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
+        Field("diverged", (), "0 or 1", "whether the covariance does not explain the last innovations"),
+        Field("faults", (), "bits", "active at the present instant: the sum of 2^FaultKind"),
+        # the reference: r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)
+        Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
+        Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
+        Field("ref_omega", (), "rad/s", "fundamental frequency w"),
+        Field("ref_center", (3,), "m", "constant term c in I"),
+        Field("ref_cos", (MAX_HARMONICS, 3), "m", "cosine coefficients a_k in I"),
+        Field("ref_sin", (MAX_HARMONICS, 3), "m", "sine coefficients b_k in I"),
+        # the course of gates
+        Field("gates", (MAX_GATES, 3), "m", "gate centers in I"),
+        # episodes
+        Field("episode", (), "-", "episodes begun since seeding"),
+        Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
+        # the air
+        Field("wind", (3,), "m/s", "velocity of the air in I"),
+        Field("air_force", (3,), "N", "force of the air in I, less thrust and disc drag"),
+        Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
+        Field("gust", (5,), "-", "states of the Dryden gusts u, v, w, see `kernels.vehicle.gusts`"),
+        Field("charge", (), "-", "charge of the battery, 1: full"),
+        # slow errors and clocks of the sensors
+        Field("b_a", (3,), "m/s^2", "accelerometer bias"),
+        Field("b_g", (3,), "rad/s", "gyro bias"),
+        Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
+        Field("wait", (SENSORS,), "ticks", "until each sensor measures next"),
+        Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement has arrived since the last step"),
+        # the batches that a snapshot fits
+        Field("configuration", (), "-", "digest of settings and parameters, see `quad_gym.batch.memory`", "u8"),
+    )),
+    ("filter", (
+        # the last measurements
+        Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
+        Field("w_before", (3,), "rad/s", "w_meas one sample before"),
+        Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
+        Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
+        Field("block_valid", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement reaches the filter at the present instant"),
+        Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
+        Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
+        Field("gnss_velocity", (3,), "m/s", "of the primary antenna, in G"),
+        Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
+        # the filter
+        Field("r_hat", (3,), "m", "estimated position in I"),
+        Field("v_hat", (3,), "m/s", "estimated velocity in I"),
+        Field("R_hat", (3, 3), "-", "estimated attitude R_BI"),
+        Field("b_a_hat", (3,), "m/s^2", "estimated accelerometer bias"),
+        Field("b_g_hat", (3,), "rad/s", "estimated gyro bias"),
+        Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
+        Field("update_failures", (), "-", "updates that failed since the filter's start"),
+        Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
+        Field("nis_dimension", (), "-", "measurements in the last update"),
+        Field("rejected_in_row", (SENSOR_GROUPS,), "-", "positions, baselines, velocities, images wholly rejected, other sensors, since the last accepted one"),
+        Field("reopened", (SENSOR_GROUPS,), "-", "times that the gate of each of these was reopened in this episode"),
+        Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
+        Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
+        Field("corrected", (6,), "m/s^2, rad/s", "sum of the last corrections of the biases"),
+        Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
+        Field("corrected_tick", (), "ticks", "when the last of them was"),
+        Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
+        Field("alarm_tick", (), "ticks", "of the last inconsistency alarm; without a gate, later by the time that biases take to be corrected"),
+        Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
+        Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
+    )),
+    ("errors", (
+        # errors of sensors that are constant over an episode
+        Field("accel_error", (3, 3), "-", "errors of scale and alignment of the accelerometer"),
+        Field("gyro_error", (3, 3), "-", "likewise of the gyro"),
+        Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
+    )),
+    ("watch", (
+        # the innovations of the last measurements, one by one: position, baseline, velocity, features, other sensors
+        Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
+        Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
+        Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
+        Field("gate", (MAX_BLOCKS,), "-", "what became of it, see GateDecision"),
+        Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
+        Field("corrected_long", (6,), "m/s^2, rad/s", "as corrected, over a longer time"),
+        Field("corrected_long_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
+    )),
+    ("late", (
+        # sums of the IMU's samples since the start of the episode, biases and gravity included
+        Field("imu_turn", (3, 3), "-", "C, from the body frame of the start to the present one"),
+        Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of the start"),
+        Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
+        Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
+        # these sums at the time stamps of the measurements in transit, the latest first
+        Field("stamps", (SENSORS, DELAY_SLOTS, STAMP), "mixed", "the tick (NaN: none), C, V, X, B, w_meas"),
+        # the measurements in transit
+        Field("waiting", (MAX_BLOCKS, DELAY_SLOTS, 3), "mixed", "measurements, block by block"),
+        Field("waiting_valid", (MAX_BLOCKS, DELAY_SLOTS), "0 or 1", "whether these were measured"),
+    )),
+    ("slow", (
+        # slow errors of sensors, where the filter estimates them
+        Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
+        Field("drift_corrected", (3,), "m", "sum of the last corrections of the drift of GNSS positions, where that is estimated"),
+        Field("drift_corrected_variance", (3,), "m^2", "its variance in a filter that is right"),
+        Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
+    )),
+    ("aids", (
+        # sensors other than GNSS and camera, in the order of Aid
+        Field("aid_measurement", (AIDS, 3), "m; T; rad/s", "altitude, then zeros; magnetic field in B; flow, then zero; distance, then zeros"),
+        Field("aid_vector", (AIDS, 3), "T", "true slow error in B, if it has one of three numbers: hard iron"),
+        Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination less the believed one"),
+        Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),
+    )),
 )
 # fmt: on
-PARTS = (
-    ("ground", _GROUND_FIELDS),
-    ("contacts", _CONTACT_FIELDS),
-    ("path", _PATH_FIELDS),
-    ("faults", _FAULT_FIELDS),
-    ("places", _PLACE_FIELDS),
-    ("draws", _DRAW_FIELDS),
-    ("actions", _ACTION_FIELDS),
-    ("raw", _RAW_FIELDS),
-    ("own", _OWN_FIELDS),
-    ("core", _CORE_FIELDS),
-    ("filter", _FILTER_FIELDS),
-    ("errors", _ERROR_FIELDS),
-    ("watch", _WATCH_FIELDS),
-    ("late", _LATE_FIELDS),
-    ("slow", _SLOW_FIELDS),
-    ("aids", _AID_FIELDS),
-)
 """The parts of a record, in their order in memory. All flights have the core. Parts that batches
 often use are next to it, as the memory of a flight cannot have gaps: see `Room`."""
 

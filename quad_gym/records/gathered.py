@@ -17,14 +17,8 @@ _NOT_READ = {
 }
 _NOT_WRITTEN = {
     *("tick", "w_meas", "w_before", "gyro", "accel"),
-    *(
-        "block_valid",
-        "gnss_position",
-        "gnss_baseline",
-        "gnss_velocity",
-        "pixels",
-        "aid_measurement",
-    ),
+    *("block_valid", "gnss_position", "gnss_baseline", "gnss_velocity"),
+    *("pixels", "aid_measurement"),
     *("imu_turn", "imu_velocity", "imu_position", "imu_bias_gain"),
 }
 

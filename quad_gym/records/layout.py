@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.records.exchange import EXCHANGE_FIELDS
 from quad_gym.records.flight import FLIGHT_FIELDS, PARTS
 from quad_gym.records.params import PARAMS_FIELDS
 from quad_gym.records.settings import SETTINGS_FIELDS
@@ -30,7 +29,17 @@ def block_dtype(fields: tuple[Field, ...]) -> np.dtype:
 FLIGHT, FLIGHT_BLOCK = scalar_dtype(FLIGHT_FIELDS), block_dtype(FLIGHT_FIELDS)
 PARAMS, PARAMS_BLOCK = scalar_dtype(PARAMS_FIELDS), block_dtype(PARAMS_FIELDS)
 WORK, WORK_BLOCK = scalar_dtype(WORK_FIELDS), block_dtype(WORK_FIELDS)
-EXCHANGE_BLOCK = block_dtype(EXCHANGE_FIELDS)
+
+SAMPLES = ("gyro", "accel", "w_meas")
+ESTIMATED = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "w_hat")
+"""Fields of flights that kernels exchange with a user's estimator: after a tick they write samples,
+and read the estimate before they observe it. Flights are larger than what most ticks need."""
+EXCHANGE_BLOCK = block_dtype(
+    tuple(
+        Field(name, (3, 3) if name == "R_hat" else (3,), "mixed", "as in a flight")
+        for name in (*SAMPLES, *ESTIMATED)
+    )
+)
 SETTINGS = scalar_dtype(SETTINGS_FIELDS)
 
 

@@ -2,17 +2,7 @@
 
 from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.enums import RewardTerm
-from quad_gym.records.sizes import (
-    AIDS,
-    FAULT_KINDS,
-    MAX_FEATURES,
-    MAX_OBSTACLES,
-    MAX_STATES,
-    SENSORS,
-    WARM_DRAWS,
-    WARM_SLOW_DRAWS,
-    Field,
-)
+from quad_gym.records.sizes import *
 
 # fmt: off
 SETTINGS_FIELDS = (

@@ -7,15 +7,7 @@ the instant and n. Each quantity has a range of indices. A draw yields two rando
 from typing import NamedTuple
 
 from quad_gym.records.draws import DRAWN_SIZE
-from quad_gym.records.sizes import (
-    AIDS,
-    FAULT_KINDS,
-    MAX_FEATURES,
-    MAX_GATES,
-    MAX_HARMONICS,
-    MAX_OBSTACLES,
-    MAX_SLOW,
-)
+from quad_gym.records.sizes import *
 
 DRAWS_OF_FAULT = 8
 """Draws for a kind of fault: its times (2), size and direction (2), effect on one sample (4)."""

@@ -4,6 +4,11 @@ import os
 
 WIDTHS = (1, 2, 4, 8)
 """Supported numbers of lanes; 1 is for filters on other processors."""
+_NEEDED = {
+    8: {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"},
+    4: {"avx2"},
+}
+"""Features of a processor of the x86 family with as many lanes in a register."""
 
 
 def lanes_of_machine() -> int:
@@ -14,9 +19,12 @@ def lanes_of_machine() -> int:
             raise ValueError(f"QUAD_GYM_LANES must be 2, 4 or 8, got {wanted!r}")
         return int(wanted)
     features = _features()
-    if "avx512f" in features:
-        return 8
-    return 4 if "avx2" in features else 2
+    return next((lanes for lanes, needed in _NEEDED.items() if needed <= features), 2)
+
+
+def runs_lanes(lanes: int) -> bool:
+    """Return True if registers of this processor hold as many lanes."""
+    return _NEEDED.get(lanes, set()) <= _features()
 
 
 def _features() -> set[str]:

@@ -1,19 +1,7 @@
 """Fields of a thread's workspace, whose contents do not outlast a step."""
 
 from quad_gym.records.enums import RewardTerm
-from quad_gym.records.sizes import (
-    DELAY_SLOTS,
-    KINDS,
-    MAX_BLOCKS,
-    MAX_FEATURES,
-    MAX_MEASUREMENTS,
-    MAX_OBSERVATION,
-    MAX_SLOW,
-    MAX_STATES,
-    SENSOR_GROUPS,
-    TERMS,
-    Field,
-)
+from quad_gym.records.sizes import *
 
 # fmt: off
 WORK_FIELDS = (

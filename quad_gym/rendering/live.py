@@ -25,14 +25,9 @@ _INVISIBLE = ("offscreen", "dummy")
 class Window:
     """Window on the screen that shows frames in real time.
 
-    Args:
-        size: Width and height [pixels].
-        title: Title of the window.
-
     Raises:
         RuntimeError: If there is no display to open a window on. A driver without a display, such
             as "dummy", is used only if the environment variable SDL_VIDEODRIVER names it.
-        ImportError: If pygame is not installed.
     """
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
@@ -124,11 +119,7 @@ class Rendering:
         self._title = f"quad_gym: {batch.task.kind}"
 
     def observe(self, *, reset: bool = False) -> None:
-        """Record the present instant; to be called after every reset and every step.
-
-        Args:
-            reset: True after a reset of the environment.
-        """
+        """Record the present instant; to be called after every reset and every step."""
         for recorder in self._recorders:
             recorder.keep()
         if self.mode == "rgb_array_list":
@@ -139,12 +130,7 @@ class Rendering:
             self._show(at_once=reset)
 
     def frames(self) -> tuple[NDArray[np.uint8], ...]:
-        """Return pictures of the present instant, one per shown flight.
-
-        Raises:
-            ValueError: If there is no flight yet.
-            ImportError: If pygame is not installed.
-        """
+        """Return pictures of the present instant, one per shown flight."""
         if not self._renderers:
             self._renderers = [Renderer(*self._look) for _ in self._recorders]
         pairs = zip(self._renderers, self._recorders, strict=True)
@@ -154,10 +140,6 @@ class Rendering:
         """Return pictures of all instants since the last call or reset, for "rgb_array_list"."""
         frames, self._frames = self._frames, []
         return frames
-
-    def taken_tiles(self) -> list[NDArray[np.uint8]]:
-        """Return the pictures of `taken_frames`, tiled to one picture per instant."""
-        return [tile(list(frames)) for frames in self.taken_frames()]
 
     @property
     def flights(self) -> list[Flight]:

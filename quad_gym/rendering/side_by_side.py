@@ -114,17 +114,9 @@ def save_side_by_side(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write flights of one episode as a video, side by side; it ends with the longest flight.
+    """Write flights of one episode as a video, from left to right; it ends with the longest flight.
 
-    Args:
-        sides: Flights, from left to right.
-        path: Path of the file, as in `save_video`.
-        fps: Pictures per second.
-        speed: Seconds of flight per second of video.
-        progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
-
-    Returns:
-        Path of the file.
+    Other arguments and the result are as in `save_video`.
 
     Raises:
         ValueError: If an argument is invalid.

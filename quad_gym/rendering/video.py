@@ -18,12 +18,7 @@ Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 
 def record_flight(
-    policy: Any,
-    env_id: str,
-    *,
-    seed: int = 0,
-    about: dict[str, Any] | None = None,
-    **keywords: Any,
+    policy: Any, env_id: str, *, seed: int = 0, about: dict[str, Any] | None = None, **keywords: Any
 ) -> Flight:
     """Run a policy for one episode and return the flight.
 
@@ -75,12 +70,7 @@ def fly_steps(
 ) -> Iterator[tuple[Flight, str]]:
     """Run an episode; yield the flight so far, at the start and after each step, and its ending.
 
-    Args:
-        policy: Policy, as in `record_flight`.
-        env: Vector environment of one flight.
-        seed: Seed of the episode.
-        about: Information to be stored with the flight.
-        before_step: Function called with the batch before each step.
+    Arguments are as in `flight_of`; `before_step` is called with the batch before each step.
     """
     batch = env.unwrapped.flights.batch
     recorder = FlightRecorder(batch, about=about)
@@ -102,11 +92,7 @@ def fly_steps(
 def times_of(
     end: float, fps: float, speed: float, progress: Progress | None = None
 ) -> Iterable[float]:
-    """Return the times of the pictures of a video [s], the end included.
-
-    Raises:
-        ValueError: If `fps` or `speed` is not positive.
-    """
+    """Return the times of the pictures of a video [s], the end included."""
     check.positive("fps", fps)
     check.positive("speed", speed)
     times = np.append(np.arange(0.0, end - 1e-9, speed / fps), end)
@@ -164,17 +150,7 @@ def record_video(
 ) -> Flight:
     """Run a policy for one episode and write a video of it: `record_flight`, then `save_video`.
 
-    Args:
-        policy: Policy, as in `record_flight`.
-        env_id: Id from `quad_gym.IDS`.
-        path: Path of the video (.mp4, .gif or .webp).
-        seed: Seed of the episode.
-        view: "fixed" or "chase".
-        size: Width and height [pixels].
-        fps: Pictures per second.
-        speed: Seconds of flight per second of video.
-        progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
-        keywords: Keywords of the environment.
+    These explain the arguments.
 
     Returns:
         The flight, to be saved or inspected.
@@ -190,12 +166,7 @@ def record_video(
 
 
 def checked_video_path(path: Path | str) -> Path:
-    """Return the path of a video that can be written here.
-
-    Raises:
-        ValueError: If its ending is unknown.
-        ImportError: If the library that writes it is not installed.
-    """
+    """Return the path of a video, if its ending is known and its library installed."""
     target = Path(path)
     check.choice("the ending of the video's path", target.suffix.lower(), VIDEO_ENDINGS)
     module = "imageio_ffmpeg" if target.suffix.lower() == ".mp4" else "PIL.Image"
@@ -209,13 +180,7 @@ def write_frames(
     """Write pictures (height, width, 3) as a video in the format of the file name's extension.
 
     The file is renamed when it is complete: an interrupted run leaves an earlier file unchanged.
-
-    Args:
-        frames: Pictures of equal size.
-        path: Path of the file; missing folders are created.
-        fps: Pictures per second.
-        lossless: Lossless compression (WebP only), which gives smaller files if most of the picture
-            does not change.
+    Lossless compression (WebP only) makes files smaller if most of the picture does not change.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.stem}.part{path.suffix}")

@@ -13,10 +13,10 @@ from quad_gym.batch.state import State
 from quad_gym.params import checks as check
 from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
 from quad_gym.tasks import answers
+from quad_gym.tasks.answers import Start
 from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.observing import Joiner, Part
-from quad_gym.tasks.starts import Start, starts
 from quad_gym.tasks.task import METHODS, Task, label
 from quad_gym.tasks.view import View
 
@@ -84,12 +84,7 @@ class TaskBatch(ReadableBatch):
         velocity: ArrayLike | None = None,
         yaw: ArrayLike | None = None,
     ) -> Singles:
-        """Begin new episodes; see `FlightBatch.reset`.
-
-        Raises:
-            ValueError: If the arguments do not fit the number of flights; nothing is changed.
-            TaskError: If a method of the task fails; the flights must be reset again.
-        """
+        """Begin new episodes; see `FlightBatch.reset`. After a TaskError, they must begin again."""
         given: Start = {"position": position, "velocity": velocity, "yaw": yaw}
         chosen = checked_mask(self.count, mask)
         builtin = super().reset(seeds=seeds, keys=keys, mask=mask, **given)
@@ -101,10 +96,8 @@ class TaskBatch(ReadableBatch):
     def step(self, actions: NDArray[Any] | None = None) -> Singles:
         """Fly one control period; see `FlightBatch.step`.
 
-        Raises:
-            ValueError: If flights have never been reset; it is also a RuntimeError.
-            TaskError: If a method of the task fails. The vehicles have moved, but the step has no
-                results; all flights must be reset.
+        After a TaskError, the vehicles have moved, but the step has no results; all flights must be
+        reset.
         """
         if self._failed.any():
             raise check.NotResetError(
@@ -158,7 +151,7 @@ class TaskBatch(ReadableBatch):
             start = answers.ask(self.own_task, "reset", self.view, rng)
         if start is not None:
             builtin = self._begin_again(
-                chosen, starts(self.own_task, start, chosen, given, self.task, self.world)
+                chosen, answers.starts(self.own_task, start, chosen, given, self.task, self.world)
             )
         return builtin
 
@@ -219,7 +212,10 @@ class TaskBatch(ReadableBatch):
         over = ends | truncates
         changed = np.flatnonzero(over | crashed | cut)
         if changed.size:
-            why = np.where(truncates & cut, self._reasons_of_cuts(), Ending.TASK)
+            lost = (self.result("filter_diverged") > 0.0) & self.task.truncate_when_diverged
+            why = np.where(lost, Ending.FILTER_DIVERGED, Ending.TIME_LIMIT)
+            why = np.where(self.result("filter_status") > 0.0, Ending.FILTER_FAILED, why)
+            why = np.where(truncates & cut, why, Ending.TASK)
             why = np.where(ends, np.where(crashed, self.judged[3], Ending.TASK), why)
             self._write(
                 changed,
@@ -229,13 +225,6 @@ class TaskBatch(ReadableBatch):
                 needs_reset=over[changed],
             )
         return over
-
-    def _reasons_of_cuts(self) -> NDArray[np.int64]:
-        """Reasons for which the built-in task truncates an episode, (n,)."""
-        failed, diverged = self.result("filter_status") > 0.0, self.result("filter_diverged") > 0.0
-        lost = diverged & self.task.truncate_when_diverged
-        cause = np.where(lost, Ending.FILTER_DIVERGED, Ending.TIME_LIMIT)
-        return np.where(failed, Ending.FILTER_FAILED, cause)
 
     def _write(self, flights: NDArray[np.intp] | slice, **values: NDArray[Any]) -> None:
         """Write values of some flights to records, and to results that have their names."""

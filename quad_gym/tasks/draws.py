@@ -38,11 +38,7 @@ class FlightRandom:
 
     Its methods correspond to NumPy's generator. Row i of every result is drawn from the stream of
     flight i at its present instant, so the numbers of a flight do not depend on the batch size.
-
-    Args:
-        keys: Keys of the flights, (n, 2).
-        instants: Instants of the flights' streams, (n,).
-        method: Number of the task's method that draws; different methods draw different numbers.
+    Each method of a task, by its number, draws other numbers.
     """
 
     def __init__(self, keys: Words, instants: Words, method: int) -> None:
@@ -75,10 +71,7 @@ class FlightRandom:
         return np.ascontiguousarray((a >> np.uint64(11)) * 2.0**-53).reshape(shape)
 
     def uniform(
-        self,
-        low: ArrayLike = 0.0,
-        high: ArrayLike = 1.0,
-        size: int | tuple[int, ...] | None = None,
+        self, low: ArrayLike = 0.0, high: ArrayLike = 1.0, size: int | tuple[int, ...] | None = None
     ) -> NDArray[np.float64]:
         """Draw uniform numbers in [low, high); see `random` for `size`."""
         floor = np.asarray(low, np.float64)
@@ -90,13 +83,7 @@ class FlightRandom:
         scale: ArrayLike = 1.0,
         size: int | tuple[int, ...] | None = None,
     ) -> NDArray[np.float64]:
-        """Draw normally distributed numbers (Box-Muller); see `random` for `size`.
-
-        Args:
-            loc: Mean.
-            scale: Standard deviation.
-            size: Shape of the result.
-        """
+        """Draw normal numbers with mean `loc` and standard deviation `scale`, as `random` does."""
         radius = np.sqrt(-2.0 * np.log(1.0 - self.random(size)))
         mean, sigma = np.asarray(loc, np.float64), np.asarray(scale, np.float64)
         return np.asarray(mean + sigma * (radius * np.cos(2.0 * np.pi * self.random(size))))

@@ -65,9 +65,7 @@ class Joiner:
             )
         own = [parts[name] for name in self._sizes]
         joined = np.concatenate(
-            [builtin[:, self._kept], *own, builtin[:, self._split :]],
-            axis=1,
-            dtype=np.float32,
+            [builtin[:, self._kept], *own, builtin[:, self._split :]], axis=1, dtype=np.float32
         )
         ours = joined[:, self._own]
         if ours.min(initial=0.0) >= self._least and ours.max(initial=0.0) <= self._most:

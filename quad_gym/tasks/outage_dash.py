@@ -172,6 +172,7 @@ class OutageDash(Task):
         every, last = np.arange(view.count), gaps.widths.shape[1] - 1
         after = np.minimum(through + 1, last)
         here, there = gaps.centers[every, through], gaps.centers[every, after]
+        start, finish = view.reference_position[:, 0], gaps.centers[:, -1, 0]
 
         def in_body(vectors: Floats) -> Floats:
             return np.ascontiguousarray((seen.R_BI @ vectors[:, :, np.newaxis])[:, :, 0])
@@ -185,7 +186,7 @@ class OutageDash(Task):
             "gap_width": gaps.widths[every, through],
             "next_gap": in_body(there - here),
             "next_width": gaps.widths[every, after],
-            "course_share": _share(view, gaps),
+            "course_share": np.asarray((start - seen.position[:, 0]) / (start - finish)),
         }
 
 
@@ -207,12 +208,6 @@ def gaps_of(view: "View") -> Gaps:
 def gaps_behind(gaps: Gaps, position: Floats) -> NDArray[np.intp]:
     """Number of gaps behind a vehicle at a position (n, 3) in I, (n,)."""
     return (position[:, :1] < gaps.centers[:, :-1, 0] - PAST).sum(axis=1)
-
-
-def _share(view: "View", gaps: Gaps) -> Floats:
-    """Share of the course that is behind the observed position, (n,)."""
-    start, finish = view.reference_position[:, 0], gaps.centers[:, -1, 0]
-    return np.asarray((start - view.observed.position[:, 0]) / (start - finish))
 
 
 def westward(view: "View") -> Floats:

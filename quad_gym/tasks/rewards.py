@@ -70,7 +70,6 @@ class Sum(Term):
     terms: tuple[Weighted, ...]  # pairs of a weight and a term
 
     def __call__(self, view: "View") -> Floats:
-        """Return the weighted sum, (n,)."""
         (weight, piece), *rest = self.terms
         total = weight * piece(view)
         for weight, piece in rest:
@@ -85,7 +84,6 @@ class Constant(Term):
     value: float = 1.0  # value in every step
 
     def __call__(self, view: "View") -> Floats:
-        """Return the constant, (n,)."""
         return np.full(view.count, self.value)
 
 
@@ -96,7 +94,6 @@ class FunctionTerm(Term):
     function: "Callable[[View], Floats]"  # function that takes a `View` and returns (n,)
 
     def __call__(self, view: "View") -> Floats:
-        """Return the values of the function, (n,)."""
         return self.function(view)
 
 
@@ -118,7 +115,6 @@ class Tracking(Term):
     rate: float = 2.0  # rate of decay with distance [1/m]
 
     def __call__(self, view: "View") -> Floats:
-        """Return values in [0, 1], (n,)."""
         return np.exp(-self.rate * view.position_error)
 
 
@@ -127,7 +123,6 @@ class Heading(Term):
     """Alignment of body x with the desired heading, x_B . x*: 1 if aligned, -1 if opposite."""
 
     def __call__(self, view: "View") -> Floats:
-        """Return values in [-1, 1], (n,)."""
         return _dot(view.truth.forward, view.reference_heading)
 
 
@@ -136,7 +131,6 @@ class ActionRate(Term):
     """Squared change of the action, `|a - a_last|^2`."""
 
     def __call__(self, view: "View") -> Floats:
-        """Return non-negative values, (n,)."""
         change = view.action - view.last_action
         return _dot(change, change)
 
@@ -146,7 +140,6 @@ class BodyRates(Term):
     """Squared norm of the true body rates, `|w|^2` [rad^2/s^2]."""
 
     def __call__(self, view: "View") -> Floats:
-        """Return non-negative values [rad^2/s^2], (n,)."""
         return _dot(view.body_rates, view.body_rates)
 
 
@@ -155,7 +148,6 @@ class Progress(Term):
     """True speed toward the reference; on a course, toward the gate that was next [m/s]."""
 
     def __call__(self, view: "View") -> Floats:
-        """Return speeds [m/s], (n,)."""
         return view.truth.progress * 1.0
 
 
@@ -167,7 +159,6 @@ class GatePassed(Term):
     """
 
     def __call__(self, view: "View") -> Floats:
-        """Return values [1/s], (n,)."""
         return view.gate_passed / view.period
 
 
@@ -176,7 +167,6 @@ class Crash(Term):
     """1 in a step in which the built-in task ends the episode with a crash, else 0."""
 
     def __call__(self, view: "View") -> Floats:
-        """Return 0 or 1, (n,)."""
         return _CRASHED[view.builtin.ending]
 
 
@@ -211,7 +201,6 @@ class Visibility(Term):
     """Number of features in the camera's field of view that no obstacle hides."""
 
     def __call__(self, view: "View") -> Floats:
-        """Return counts, (n,)."""
         return view.truth.features_in_view.sum(axis=1).astype(np.float64)
 
 

@@ -98,14 +98,8 @@ class Task:
     ) -> "Task":
         """Make a task of plain functions, with the arguments of the methods: `Task.of(reward=f)`.
 
-        Args:
-            state: Variables for each flight, see the class attribute `state`.
-            observes: Units, frames and bounds, see the class attribute `observes`.
-            replaces_observation: True to replace the built-in observation instead of extending it.
-            keeps: Names of parts of the built-in observation to keep if it is replaced.
-            privileged: True if `observe` may read the true state.
-            methods: Functions by name of the method (`reset`, `update`, `reward`, `terminated`,
-                `truncated`, `observe`).
+        Other arguments are the attributes of the class. `methods` are `reset`, `update`, `reward`,
+        `terminated`, `truncated` and `observe`.
 
         Raises:
             TypeError: If a name is not a method of `Task`, or a value is not callable.

@@ -157,18 +157,13 @@ GROUPS: dict[str, type[Group]] = {
 """Groups of a view by their prefixes."""
 
 
-def _short(prefix: str, name: str) -> str:
-    """The shorter name of a field of `view.truth`, where it has one."""
-    has_one = prefix == "truth." and isinstance(vars(View).get(name), Short)
-    return f"; short: `view.{name}`" if has_one else ""
-
-
+_SHORT = {
+    f"truth.{n}": f"; short: `view.{n}`" for n, v in vars(View).items() if isinstance(v, Short)
+}
 VIEW_FIELDS = tuple(
-    ViewField(
-        prefix + name, value.shape, value.unit, value.frame, value.meaning + _short(prefix, name)
-    )
+    ViewField(name, v.shape, v.unit, v.frame, v.meaning + _SHORT.get(name, ""))
     for prefix, group in GROUPS.items()
-    for name, value in vars(group).items()
-    if isinstance(value, GroupField)
+    for name, v in ((prefix + n, v) for n, v in vars(group).items())
+    if isinstance(v, GroupField)
 )
 """All fields of a view; for `quad_gym.tasks.fields.GroupField`, see the meaning of shapes and frames."""

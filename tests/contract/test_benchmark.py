@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 
 import quad_gym
@@ -10,10 +9,8 @@ from quad_gym.commands import benchmark as script
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import learning, stages
-from quad_gym.experiments.benchmark.filter import repeated
-from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.experiments.benchmark.timing import Timing, by_turns
-from quad_gym.kernels.stages import Stage, needed_stages
+from quad_gym.kernels.stages import needed_stages
 from quad_gym.records import POSITION_BLOCK, WIDTH
 
 
@@ -78,10 +75,9 @@ def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_p
         "filter cycle, UnscentedKalmanFilter",
         "filter cycle, plain NumPy",
     )
-    for quantity, most in (("position", 0.05), ("attitude", 0.3)):
-        assert plain[quantity] == pytest.approx(ours[quantity], rel=0.01)
-        for row in (ours, *others):
-            assert 0.0 < row[quantity] < most
+    for row in (plain, *others):
+        assert row["position"] == pytest.approx(ours["position"], rel=0.01)
+        assert row["attitude"] == pytest.approx(ours["attitude"], rel=0.01)
 
 
 def test_options_section_compares_each_with_everything_off(tmp_path):
@@ -119,11 +115,3 @@ def test_what_takes_turns_is_timed_by_turns():
     timings = by_turns(jobs, 3)
     assert order == ["slow", "fast"] * 3
     assert timings == [Timing(2.0, 0.5), Timing(1.0, 0.0)]
-
-
-def test_update_of_repeated_flights_shrinks_each_covariance():
-    batch = hovering(16)
-    blocks = repeated(batch, np.array([3, 5]), 32)
-    before = np.abs(blocks["L"]).sum(axis=(1, 2))
-    Staged(batch, Stage.UPDATE)(blocks)
-    assert (np.abs(blocks["L"]).sum(axis=(1, 2)) < before).all()

@@ -3,8 +3,6 @@
 import functools
 import os
 import pickle
-import select
-import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -83,42 +81,6 @@ def test_environments_may_be_stepped_from_several_threads():
         runs = [pool.submit(run, seed=seed) for seed in (1, 2, 3)]
         for seed, flown in zip((1, 2, 3), runs, strict=True):
             assert_same(flown.result(PATIENCE), run(seed=seed))
-
-
-def in_a_fork(work):
-    """What `work()` returns in a forked child; fails if the child hangs or dies."""
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(read)
-        try:
-            payload = pickle.dumps(work())
-            with os.fdopen(write, "wb") as pipe:
-                pipe.write(payload)
-        finally:
-            os._exit(0)
-    os.close(write)
-    with os.fdopen(read, "rb") as pipe:
-        ready, _, _ = select.select([pipe], [], [], PATIENCE)
-        if not ready:
-            os.kill(child, signal.SIGKILL)
-        payload = pipe.read()
-    os.waitpid(child, 0)
-    assert payload, "the child hung or died"
-    return pickle.loads(payload)
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_forked_environment_starts_its_own_threads():
-    env = vec_env("circle", 128, seed=3, threads=2, **SHORT)
-    env.step(np.zeros((128, 4)))
-
-    def fly_on():
-        return [env.step(actions_at(128, k, 30))[:4] for k in range(30)]
-
-    in_child = in_a_fork(fly_on)
-    assert_same(in_child, fly_on())
-    assert_same(in_a_fork(fly_on), in_a_fork(fly_on))
 
 
 def test_an_environment_travels_to_a_worker_in_mid_episode():

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from quad_gym.commands import evaluate
-from tests.console_commands import run
+from quad_gym.commands.main import main
+from tests.console_commands import refused, run
 
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
@@ -90,3 +91,20 @@ def test_compare_writes_report_and_continues(tmp_path):
     other = compare(tmp_path, "--env", "duration=0.5")
     assert other.returncode == 2
     assert "contains a run of another plan (different: environment)" in other.stderr
+
+
+def test_evaluate_replaces_results_only_when_told(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    few = "--policy pd --observation truth --episodes 2 --env duration=0.4"
+    line = ["evaluate", "hover", *few.split()]
+    main(line)
+    folder = tmp_path / "results" / "evaluate"
+    file = folder / "hover" / "summary.json"
+    before = file.read_text()
+    main([*line, "--seed", "5"])
+    assert (folder / "hover_2" / "summary.json").exists()
+    assert "--overwrite" in refused([*line, "--output", str(file.parent)], capsys)
+    assert file.read_text() == before
+    main([*line, "--seed", "5", "--overwrite"])
+    assert file.read_text() != before
+    assert not (folder / "hover_3").exists()

@@ -178,16 +178,20 @@ class SameDraws:
         return step * self.flights + flight
 
 
-def test_training_with_the_same_draws_equals_stable_baselines():
-    """Rollouts, episodes that end and are cut off, rewards, epochs, learning rate, all together."""
+@pytest.mark.parametrize("normalize", [True, False])
+@pytest.mark.parametrize("activation", ["relu", "tanh", "elu"])
+def test_training_with_the_same_draws_equals_stable_baselines(activation, normalize):
+    """Rollouts, episodes that end and are cut off, advantages, gradients, epochs, learning rate."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("stable_baselines3")
     from baselines.compiled_ppo.run import make_compiled
     from baselines.models import make_model
 
     parameters = {**recipe(CIRCLE).parameters, "n_steps": 64, "batch_size": 256}
+    parameters |= {"normalize_advantage": normalize, "ent_coef": 0.02, "vf_coef": 0.7}
+    changes = {"activation": activation, "parameters": parameters, "n_envs": 16}
     steps = 3 * 16 * 64
-    plan = small_plan(recipe=recipe(CIRCLE).replace(steps=steps, n_envs=16, parameters=parameters))
+    plan = small_plan(recipe=recipe(CIRCLE).replace(steps=steps, **changes))
     ours, theirs = make_compiled(plan), make_model(plan, plan.make_flights())
     nets, networks = theirs.policy.mlp_extractor, ours.networks
     pairs = [(theirs.policy.log_std, networks.log_std)]
@@ -253,3 +257,18 @@ def test_a_policy_that_ships_has_the_record_of_its_training(file):
     record = MlpPolicy.load(file).record
     assert record["finished"]
     assert {"plan", "steps", "best", "versions"} <= set(record)
+
+
+def test_the_compiled_engine_writes_files_for_tensorboard(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    from baselines.compiled_ppo.events import Events
+
+    events = Events(tmp_path / "run")
+    for step in (0, 100):
+        events.add(step, {"evaluation/mean_error": 0.5 + step, "train/loss": 0.25})
+    events.close()
+    found = accumulator.EventAccumulator(str(tmp_path / "run"))
+    found.Reload()
+    assert sorted(found.Tags()["scalars"]) == ["evaluation/mean_error", "train/loss"]
+    errors = found.Scalars("evaluation/mean_error")
+    assert [(e.step, e.value) for e in errors] == [(0, 0.5), (100, 100.5)]

@@ -94,10 +94,8 @@ def test_every_note_is_understood():
 
 
 def commands_of(text):
-    """Command lines `quad-gym ...` in a shell block, a Makefile or a docstring.
-
-    Docstrings explain them behind three spaces.
-    """
+    """Command lines `quad-gym ...` in a shell block, a Makefile or a docstring. Docstrings explain
+    them behind three spaces."""
     text = text.replace("\\\n", " ")
     for found in re.finditer(r"^\s*(?:[$@] ?)?(?:\$\(BIN\)/)?quad-gym +(.*)$", text, re.MULTILINE):
         yield re.split(r" {3,}", found[1])[0]

@@ -20,9 +20,6 @@ from tests.contract.test_sweep import SMALL, TRUTH, pretend
 GROUP = "circle,compiled_ppo,gamma={}"
 
 
-# ---- scripted jobs -------------------------------------------------------------------------------
-
-
 class Bar:
     """Progress bar that stores its messages."""
 
@@ -140,9 +137,6 @@ def test_locked_folder_is_busy(tmp_path):
 def small(tmp_path):
     (tmp_path / "small.toml").write_text(SMALL)
     return expand(read(tmp_path / "small.toml"), {}, tmp_path / "out")
-
-
-# ---- processes that are killed -------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

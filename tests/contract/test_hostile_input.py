@@ -1,8 +1,7 @@
 """Hostile values for every keyword: refused by name, or flown without a number that is not finite.
-
 A table: every keyword of every interface, of flights, filters, parameters, draws and faults, with
-values that are not numbers, not finite, too large, too small, of another kind, or of another shape.
-"""
+values that are not numbers, not finite, too large, too small, of another kind, or of another
+shape."""
 
 import dataclasses
 import inspect
@@ -16,7 +15,7 @@ import quad_gym
 from quad_gym import BarometerParams, FlightBatch, TaskParams, WorldParams
 from quad_gym import faults as fault_kinds
 from quad_gym.faults.base import DirectedFault
-from quad_gym.records import Autoreset, Control
+from quad_gym.records import Control
 from tests.builders import flat
 from tests.filter_states import at_rest
 
@@ -44,8 +43,6 @@ def assert_refused_or_flown(call, name, value):
     for array in seen:
         assert np.isfinite(array).all(), f"{name}={value!r}"
 
-
-# ---- environments --------------------------------------------------------------------------------
 
 ONE_TASK = {
     "gate_count": "Waypoints",
@@ -119,8 +116,6 @@ def test_arguments_of_reset(name):
         assert_refused_or_flown(reset, name, value)
 
 
-# ---- flights -------------------------------------------------------------------------------------
-
 FIELDS = ("r", "v", "q", "w", "rotor_speeds", "r_hat", "v_hat", "R_hat", "b_a_hat", "L", "reward")
 
 
@@ -165,9 +160,6 @@ def test_arguments_of_a_batch_that_is_reset(name):
 
     for value in [*NUMBERS, *OTHERS, *vectors(3)]:
         assert_refused_or_flown(reset, name, value)
-
-
-# ---- parameters ----------------------------------------------------------------------------------
 
 
 def suite_of(**parts):
@@ -264,9 +256,6 @@ def test_fields_of_faults(kind, name):
         )
 
 
-# ---- filters -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", [quad_gym.UnscentedKalmanFilter, quad_gym.ExtendedKalmanFilter])
 @pytest.mark.parametrize(
     ("method", "name"),
@@ -305,8 +294,3 @@ def test_arguments_of_filters(kind, method, name):
     more += [(np.nan, 0.0, 1.0), (0.0, np.inf, 1.0), np.zeros((3, 2)), [[0, np.inf], [0, 0]]]
     for value in [*NUMBERS, *OTHERS, *vectors(3), *more]:
         assert_refused_or_flown(use, name, value)
-
-
-def test_kinds_of_autoreset_are_listed_by_their_enumeration():
-    with pytest.raises(ValueError, match="Autoreset"):
-        Autoreset("sometimes")

@@ -1,5 +1,6 @@
 """The public interface: names, signatures and types; inputs without effect are refused."""
 
+import ast
 import dataclasses
 import inspect
 import re
@@ -10,6 +11,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
+import baselines
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import evaluate
@@ -226,3 +228,15 @@ def test_a_kind_of_task_is_refused_beside_an_id():
     assert quad_gym.QuadEnv(base="hover").flights.name == "hover"
     assert quad_gym.QuadEnv().flights.name == "circle"
     assert quad_gym.QuadEnv(quad_gym.Task()).flights.name == "circle"
+
+
+def test_packages_and_names_imported_on_first_use_have_types():
+    """A type checker does not run `__getattr__`: it reads the imports that are for it alone."""
+    for package in (quad_gym, baselines):
+        assert (Path(package.__file__).parent / "py.typed").exists()
+    tree = ast.parse(Path(quad_gym.__file__).read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    assert ast.unparse(block.test) == "TYPE_CHECKING"
+    told = {name.name: statement.module for statement in block.body for name in statement.names}
+    assert told == quad_gym._LAZY
+    assert set(told) <= set(quad_gym.__all__)  # exported, so that type checkers admit them

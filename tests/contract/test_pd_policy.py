@@ -137,23 +137,15 @@ def test_single_and_batched_predictions_agree(action, privileged):
         observation, *_ = env.step(together)
 
 
-def test_policy_accepts_wrappers_and_all_interfaces():
-    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=2)
-    single = gymnasium.make("QuadGym/Hover-v0")
-    observation, _ = single.reset(seed=2)
-    one, _ = PDPolicy(single).predict(observation)
-    many, _ = PDPolicy(sb3).predict(sb3.reset())
-    np.testing.assert_allclose(many[0], one, atol=1e-6)
-
-
-def test_included_policy_acts_the_same_in_every_interface():
+@pytest.mark.parametrize("policy", ["pd", "pretrained"])
+def test_policy_acts_the_same_in_every_interface(policy):
     env_id, actions = "QuadGym/Circle-v0", []
     single = gymnasium.make(env_id)
-    actions.append(load_policy("pretrained", single).predict(single.reset(seed=5)[0])[0])
+    actions.append(load_policy(policy, single).predict(single.reset(seed=5)[0])[0])
     vector = gymnasium.make_vec(env_id, num_envs=2)
-    actions.append(load_policy("pretrained", vector).predict(vector.reset(seed=5)[0])[0][0])
+    actions.append(load_policy(policy, vector).predict(vector.reset(seed=5)[0])[0][0])
     sb3 = quad_gym.make_sb3_vec_env(env_id, 2, seed=5)
-    actions.append(load_policy("pretrained", sb3).predict(sb3.reset())[0][0])
+    actions.append(load_policy(policy, sb3).predict(sb3.reset())[0][0])
     np.testing.assert_allclose(actions, [actions[0]] * 3, atol=1e-6)
 
 

@@ -12,7 +12,7 @@ import pytest
 from quad_gym.commands import circle
 from quad_gym.commands.main import COMMANDS, main
 from tests import console_commands
-from tests.console import plain
+from tests.console_commands import plain
 
 NEEDS = {"compare": "stable_baselines3", "evaluate": "matplotlib", "fly": "pygame"}
 NEEDS |= {"circle": "matplotlib", "study": "matplotlib", "train": "stable_baselines3"}

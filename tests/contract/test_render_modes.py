@@ -110,9 +110,6 @@ def test_rendering_options_need_a_mode(name, value):
         QuadVectorEnv(2, "hover", **{name: value})
 
 
-# ---- a flight does not notice --------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("env_id", IDS)
 def test_rendering_never_changes_a_flight(env_id):
     plain = gymnasium.make(env_id)
@@ -122,9 +119,6 @@ def test_rendering_never_changes_a_flight(env_id):
         assert_same(plain.step(action), rendered.step(action))
         rendered.render()
     assert state_of(plain) == state_of(rendered)
-
-
-# ---- many flights --------------------------------------------------------------------------------
 
 
 def test_a_vector_environment_renders_what_single_ones_do():
@@ -175,9 +169,6 @@ def test_gymnasium_records_videos(tmp_path):
         env.close()
         (video,) = (tmp_path / f"{k}").glob("*.mp4")
         assert video.stat().st_size > 2000
-
-
-# ---- the company of other software ---------------------------------------------------------------
 
 
 def run_python(code, **environment):

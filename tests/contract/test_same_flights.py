@@ -29,14 +29,6 @@ def test_size_order_and_threads_do_not_change_flights(name):
     assert_same(few, chosen(many, order))
 
 
-def test_flights_do_not_depend_on_the_size_of_a_large_batch():
-    many = together("hover", range(1000), threads=2)
-    for count in (1, 2, 7, 64):
-        assert_same(together("hover", range(count)), chosen(many, range(count)))
-    order = np.random.default_rng(1).permutation(1000)[:100]
-    assert_same(together("hover", order.tolist(), threads=3), chosen(many, order))
-
-
 def test_actions_of_one_flight_do_not_change_others():
     env, twin = (vec_env("circle", 8, seed=2, out_of_bounds=50.0) for _ in range(2))
     calm = 0.1 * actions_for(range(8), 50)

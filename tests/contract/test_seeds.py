@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from baselines.seeds import BLOCK, MAX_SEED, PURPOSES, TEST_END, first_seed, flight_seeds
-from quad_gym import TaskParams
-from quad_gym.records import Control
-from tests.builders import batch, vec_env
+from tests.builders import vec_env
 
 SEEDS, COUNT = range(10), 256
 
@@ -92,32 +90,6 @@ def test_trainings_are_judged_on_flights_of_their_own_block():
         assert judged == keys_of(flight_seeds("validation", seed, 8))
         flown += [trained, judged]
     assert_disjoint([*flown, keys_of(range(1000))])
-
-
-START = ("r", "v", "q", "w", "b_a", "b_g", "ref_cos", "ref_sin", "key")
-
-
-def starts_of(rng, episodes, count=11):
-    """Starts of episodes with random actions and lengths."""
-    endless = {"start": "hover", "randomize_reference": True, "duration": 0.0}
-    task = TaskParams(kind="random_trajectory", **endless)
-    made = {"task": task, "sensors": "rtk", "control": Control.CTBR, "control_rate": 50.0}
-    flights = batch(count, seed=300, **made)
-    found = [{name: flights.record(name) for name in START}]
-    for _ in range(episodes - 1):
-        for _ in range(int(rng.integers(1, 30))):
-            flights.step(rng.uniform(-1.0, 1.0, (count, 4)))
-        flights.reset()
-        found.append({name: flights.record(name) for name in START})
-    return found
-
-
-def test_flights_of_equal_seeds_have_equal_starts():
-    first, second = (starts_of(np.random.default_rng(seed), 10) for seed in (1, 2))
-    for episode, (one, other) in enumerate(zip(first, second, strict=True)):
-        for name in START:
-            np.testing.assert_array_equal(one[name], other[name], err_msg=f"{name} in {episode}")
-    assert len({start["r"].tobytes() for start in first}) == 10
 
 
 def test_equal_seeds_with_autoreset_have_equal_starts():

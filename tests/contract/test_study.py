@@ -41,7 +41,6 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     assert len(summary["return_of_each_seed"]["mine"]) == 2
     for name in ("learning.png", "glance.png", "report.html", "episodes.csv", "table.md"):
         assert (folder / name).stat().st_size > 100
-
     kept = folder / "runs/truth/seed_1/best.npz"
     gone = folder / "runs/mine/seed_0"
     before = kept.stat().st_mtime_ns, (gone / "best.npz").read_bytes()

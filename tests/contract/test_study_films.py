@@ -5,13 +5,8 @@ import pytest
 
 from quad_gym.commands import study as command
 from quad_gym.commands.main import main
-from quad_gym.experiments.arms import chosen_arms
-from quad_gym.experiments.flown import Flown
-from quad_gym.experiments.study import results_of
 from quad_gym.experiments.study_films import RATE, pair_of, side_of
-from quad_gym.experiments.study_tasks import STUDIED
 from quad_gym.rendering.side_by_side import HOLD, SIDE
-from tests.contract import test_study
 
 pytest.importorskip("pygame")
 Image = pytest.importorskip("PIL.Image")
@@ -72,45 +67,3 @@ def test_film_shows_the_episode_of_the_test(filmed):
             np.testing.assert_array_equal(side.flight["time"][:count], time[:count])
             np.testing.assert_array_equal(side.flight["estimation_error"][:count], kept[:count])
             assert side.crashed == crashed
-
-
-def study_of(task, names, tmp_path):
-    arms = chosen_arms(STUDIED[task].arms, names)
-    return test_study.study_of(task, arms, tmp_path, seeds=(0, 1, 2))
-
-
-def flown(returns, crashed, traces):
-    tested = test_study.flown(np.full(4, returns), crashed, 0.1)
-    return Flown(tested.episodes, {**tested.recorded, **traces})
-
-
-def curves(*tops):
-    """Evaluations of three seeds with these largest returns."""
-    steps = np.array([1.0, 2.0, 3.0])
-    return [(steps, np.array([0.0, top, -1.0])) for top in tops]
-
-
-def test_pace_shows_best_trainings_and_first_crash_on_truth(tmp_path):
-    study = study_of("stale_race", ("truth", "std"), tmp_path)
-    speed = {"speed": np.ones((2, 4))}
-    crashes = [[True] * 4, [True] * 4, [False, False, True, True]]
-    found = {
-        "truth": [flown(1.0, each, speed) for each in crashes],
-        "std": 3 * [flown(3.0, [True] * 4, speed)],
-    }
-    seen = {"truth": curves(5.0, 6.0, 7.0), "std": curves(2.0, 4.0, 3.0)}
-    pair = pair_of(results_of(study, found, seen))
-    assert pair.trainings == {"truth": 2, "std": 1}
-    assert pair.episode == 2
-
-
-def test_glance_shows_the_first_episode_with_a_far_heading(tmp_path):
-    study = study_of("look_around", ("truth", "std"), tmp_path)
-    off = np.radians([30.0, -99.0, 179.0, 150.0])
-    traces = {"off_wall": np.tile(off, (2, 1)), "off_reward": np.zeros((2, 4))}
-    traces["off_wall"][1, 0] = np.nan  # the episode has ended
-    found = dict.fromkeys(("truth", "std"), 3 * [flown(1.0, [False] * 4, traces)])
-    seen = dict.fromkeys(found, curves(1.0, 1.0, 0.0))
-    pair = pair_of(results_of(study, found, seen))
-    assert pair.trainings == {"truth": 0, "std": 0}
-    assert pair.episode == 2

@@ -254,7 +254,6 @@ def test_a_policy_with_a_memory_begins_each_episode_without_one(tmp_path):
     np.testing.assert_array_equal(together.returns, again.returns)
     alone = [roll_out(policy, one, seed=7 + i).returns[0] for i in range(4)]
     np.testing.assert_allclose(together.returns, alone, rtol=1e-4)
-
     env = gymnasium.make_vec(CIRCLE, num_envs=1, duration=1.0)
     observation, _ = env.reset(seed=7)
     total, state, over = 0.0, None, False

@@ -212,23 +212,3 @@ def test_invalid_number_of_environments_is_refused(count):
     for make in (gymnasium.make_vec, quad_gym.make_sb3_vec_env):
         with pytest.raises(ValueError, match=r"^num_envs must be"):
             make("QuadGym/Hover-v0", count)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"positon": [0, 0, 0]},
-        {"position": [0, 0]},
-        {"position": [0, 0, np.nan]},
-        {"velocity": np.zeros((2, 3))},
-        {"yaw": np.inf},
-        {"yaw": "north"},
-        {"position": None, "velocity": "fast"},
-    ],
-)
-def test_options_that_make_no_sense_change_nothing(options):
-    env = vec_env(count=3, seed=1)
-    before = state_of(env)
-    with pytest.raises(ValueError, match=next(iter(set(options) - {"position"}), "position")):
-        env.reset(seed=5, options=options)
-    assert state_of(env) == before

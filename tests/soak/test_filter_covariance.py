@@ -1,9 +1,7 @@
 """Millions of filter updates, all suites and faults: sound covariances, every failure counted.
-
 QUAD_GYM_SOAK_UPDATES sets how many updates are made in all, by default 10^6; `make soak` makes
 10^7. After every update the covariance is factored anew by LAPACK, and an update without effect
-must be one that the filter has told of: by its gate, or as a failure.
-"""
+must be one that the filter has told of: by its gate, or as a failure."""
 
 import os
 
@@ -41,10 +39,8 @@ def tally():
 
 
 def assert_positive_definite(L):
-    """Factors L (n, 15, 15) are lower triangular, and LAPACK factors L L^T anew.
-
-    A column of L may have either sign: the large turn of a reset can change it, and not L L^T.
-    """
+    """Factors L (n, 15, 15) are lower triangular, and LAPACK factors L L^T anew. A column of L may
+    have either sign: the large turn of a reset can change it, and not L L^T."""
     assert np.isfinite(L).all()
     assert not np.triu(L, 1).any()
     assert (np.diagonal(L, axis1=1, axis2=2) != 0.0).all()
@@ -97,7 +93,6 @@ def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fa
         looked_at = np.flatnonzero(made | (ticks % 20 == 0))
         if looked_at.size:
             assert_positive_definite(batch.record("L", looked_at))
-
         # a crashed vehicle, or one long in the air, begins anew
         lost = ~(np.abs(batch.record("r")).max(axis=1) < 1e3) | (ticks % 4000 == 0)
         if lost.any():

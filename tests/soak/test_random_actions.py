@@ -1,8 +1,6 @@
 """Random actions for a long time, over all tasks and actions: every number stays finite.
-
 QUAD_GYM_SOAK_STEPS sets how many steps of single flights are flown in all, by default 10^6; the
-full soak flies 10^8.
-"""
+full soak flies 10^8."""
 
 import os
 

@@ -1,7 +1,5 @@
-"""What holds of vague starts: the table in docs/sensors-and-filter.md, section Starts.
-
-`pytest tests/statistical/test_vague_starts.py -m slow -s` prints it.
-"""
+"""What holds of vague starts: the table in docs/sensors-and-filter.md, section Starts. `pytest
+tests/statistical/test_vague_starts.py -m slow -s` prints it."""
 
 import pytest
 

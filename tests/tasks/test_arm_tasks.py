@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from baselines import PDPolicy
 from baselines.arm_tasks import CONSTANT_CRASH_COST, RACE_STD
 from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
@@ -177,21 +176,6 @@ def test_scaled_observations_are_divided_by_their_scales():
         action = np.full((6, 4), 0.2, np.float32)
         seen, scaled = plain.step(action)[0], env.step(action)[0]
     assert np.abs(part(plain, seen, "body_rates")).max() > 0.1
-
-
-@pytest.mark.parametrize(
-    "name", ["Scaled", "WithUncertainty", "ConstantCrashCost", "ConstantCrashCostWithUncertainty"]
-)
-def test_scaled_parts_have_their_own_names_and_no_unit(name):
-    env, _ = make(name, count=1, env_id="QuadGym/OutageDash-v0", include_std=True)
-    table = {field.name: field for field in env.unwrapped.flights.table}
-    scaled = ["position_error", "velocity_error", "body_rates"]
-    scaled += ["next_gap", "gap_width", "next_width"]
-    assert not table.keys() & set(scaled)
-    assert all(table[f"{part}_scaled"].unit == "-" for part in scaled)
-    for pace in ("steady", "waiting"):
-        with pytest.raises(ValueError, match="env must observe"):
-            PDPolicy(env, pace=pace)
 
 
 def test_control_rate_in_training_is_lower_than_in_evaluation():

@@ -132,15 +132,6 @@ def test_a_lone_array_needs_no_name():
     np.testing.assert_array_equal(observation[28:], seen)
 
 
-def test_reward_per_second_multiplies_the_reward_of_the_task():
-    task, rewards = quad_gym.Task.of(reward=lambda view: np.full(view.count, 3.0)), []
-    for per in ("step", "second"):
-        env = gymnasium.make("QuadGym/Hover-v0", task=task, reward_per=per, control_rate=40)
-        env.reset(seed=0)
-        rewards.append(env.step(np.zeros(4))[1])
-    assert rewards == pytest.approx([3.0, 3.0 / 40.0], rel=1e-15)
-
-
 def test_a_task_is_named_by_its_module():
     named = gymnasium.make_vec(
         "QuadGym/Hover-v0", num_envs=2, task="tests.tasks.tasks:Chase"

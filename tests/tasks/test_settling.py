@@ -6,8 +6,6 @@ import pytest
 import quad_gym
 from quad_gym.records import Ending
 from tests.builders import vec_env
-from tests.contract.comparing import assert_same
-from tests.tasks.tasks import Same
 
 FLIGHTS, STEPS, LIMIT = 13, 60, 40
 
@@ -91,32 +89,3 @@ def test_returns_after_a_restore_continue():
     batch.reset(mask=mask)
     batch.step(actions)
     np.testing.assert_array_equal(batch.record("episode_return")[mask], said.reward[mask])
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-@pytest.mark.parametrize(
-    ("task", "sensors", "faults"), [("hover", "rtk", "all"), ("waypoints", "standard", "gnss_jump")]
-)
-def test_task_with_builtin_judgment_changes_no_ending(task, sensors, faults, mode):
-    keywords = {"sensors": sensors, "faults": faults, "truncate_when_diverged": True}
-    keywords |= {"reward_per": "step", "autoreset_mode": mode}
-    keywords |= {"max_episode_steps": 90, "max_tilt": 0.25}
-    plain, same = (vec_env(task, FLIGHTS, task=own, **keywords) for own in (None, Same()))
-    rng, seen = np.random.default_rng(3), set()
-    assert_same(plain.reset(seed=3), same.reset(seed=3))
-    for env in (plain, same):
-        env.flights.batch.switch_faults(True)
-    for _ in range(140):
-        actions = rng.uniform(-0.12, 0.12, (FLIGHTS, 4)).astype(np.float32)
-        step = plain.step(actions)
-        assert_same(step, same.step(actions))
-        batch, other = plain.flights.batch, same.flights.batch
-        np.testing.assert_array_equal(other.results, batch.results)
-        for name in ("reward", "terminated", "truncated", "ending", "episode_return"):
-            np.testing.assert_array_equal(other.record(name), batch.record(name), name)
-        seen |= {Ending(code) for code in batch.result("ending").astype(int)}
-        over = step[2] | step[3]
-        if mode == "Disabled" and over.any():
-            options = {"reset_mask": over}
-            assert_same(plain.reset(options=options), same.reset(options=options))
-    assert seen >= {Ending.TIME_LIMIT, Ending.FILTER_DIVERGED}, seen

@@ -215,18 +215,6 @@ def test_view_at_an_autoreset_shows_the_episode_of_the_step():
         assert rewards == ([1.0, 2.0, 3.0, 1.0, 2.0] if not began else [1.0, 2.0, 3.0, 0.0, 1.0])
 
 
-def test_progress_after_a_restore_repeats():
-    env = begun()
-    batch, actions = env.flights.batch, np.full((FLIGHTS, 4), 0.1)
-    instant, progress = batch.snapshot(), []
-    for _ in range(2):
-        for _ in range(3):
-            batch.step(actions)
-            progress.append(batch.view.truth.progress)
-        batch.restore(instant)
-    np.testing.assert_array_equal(progress[:3], progress[3:])
-
-
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize("task", ["circle", "waypoints"])
 def test_view_after_a_restore_shows_the_restored_instant(task, mode):

@@ -8,7 +8,6 @@ import quad_gym
 from quad_gym import BarometerParams, MagnetometerParams
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults import SensorLoss
-from quad_gym.packing.aids import slow_states
 from quad_gym.records import AID_BLOCKS, Aid
 from tests.field_flights import attitudes, fly, steps
 
@@ -176,15 +175,3 @@ def test_observation_and_info_have_what_was_measured():
     assert found["nis"][3] == pytest.approx(ratio**2, rel=1e-9)
     assert np.isfinite(found["innovation"][4]).all()
     env.close()
-
-
-def test_estimated_slow_errors_come_near_the_true_ones():
-    """GNSS tells the height, so that the barometer's bias is known to some centimeters."""
-    batch = fly(AIDED, 200, task="hover")
-    steps(batch, 3.0)
-    place = slow_states(AIDED).scalars[BAROMETER]
-    error = batch.record("slow_hat")[:, place] - batch.record("aid_scalar")[:, BAROMETER]
-    assert np.sqrt(np.mean(error**2)) < 0.05
-    L = batch.record("L_slow")[:, place]
-    claimed = np.sqrt((L**2).sum(axis=1))
-    assert np.mean((error / claimed) ** 2) == pytest.approx(1.0, abs=0.4)  # 4 sigma

@@ -51,9 +51,7 @@ def found(table):
 )
 def test_noise_of_a_simulated_log_is_found(found, name, true):
     """Within the interval widened by a half: errors that are no white noise count as noise, too.
-
-    Vibration and density of the IMU are one white noise, which seven seconds hardly determine.
-    """
+    Vibration and density of the IMU are one white noise, which seven seconds hardly determine."""
     (number,) = (n for n in found.numbers if n.number.name == name)
     assert number.determined or name.startswith("imu")
     assert number.low / 1.5 < true < 1.5 * number.high, number

@@ -1,14 +1,20 @@
-"""The matrix of consistency: its cells, a small slice of it, what it marks, and how it resumes."""
+"""Tables of consistency and of recovery: their cells, what they mark, and how they resume."""
 
 import json
+import math
 
+import numpy as np
 import pytest
+from scipy import stats
 
 import quad_gym
+from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery
 from quad_gym.experiments.consistency import cases as runs
-from quad_gym.experiments.consistency import matrix
+from quad_gym.experiments.consistency import matrix, recovery
 from quad_gym.experiments.consistency.cases import CaseFlights, run_cases
+from quad_gym.faults import GyroBiasStep
 from quad_gym.params.suites import SUITES
+from tests.field_flights import fly, nees
 
 SMALL = CaseFlights(64, duration=1.0)
 
@@ -94,3 +100,74 @@ def test_default_filter_is_consistent_without_sensors(fault, start):
     cell = matrix.case_of("standard", "random_trajectory", start, faults=fault)
     found = matrix.measure(cell, CaseFlights(400))
     assert 14.2 < found["values"]["state"] < 15.8
+
+
+def flights_of(consistent, flagged, large_error, every=0.5):
+    time = every * np.arange(1, len(consistent) + 1)
+    return Recovery(time, *(np.array(flags, bool) for flags in (consistent, flagged, large_error)))
+
+
+def test_long_large_errors_without_a_flag_are_missed_alarms():
+    large_error = [[1, 1, 1]] * 4 + [[0, 0, 1]]  # for 2 s, 2 s and 2.5 s
+    flagged = [[0, 0, 0]] * 3 + [[0, 1, 0]] + [[0, 0, 0]]
+    found = flights_of(np.zeros((5, 3)), flagged, large_error)
+    assert found.long_large_error().tolist() == [True, True, True]
+    assert found.missed_alarms().tolist() == [True, False, True]
+    assert found.alarms() == 1
+    assert found.hours == pytest.approx(5 * 3 * 0.5 / 3600.0)
+
+
+def test_the_time_to_recover_is_until_nearly_all_are_consistent():
+    consistent = np.ones((8, 100), bool)
+    consistent[:3] = consistent[4, 0] = consistent[5, :2] = False  # 1 in 100 is allowed
+    found = flights_of(consistent, np.zeros_like(consistent), ~consistent)
+    assert found.time_to(found.consistent, 1.0) == pytest.approx(1.0)
+    assert found.time_to(found.consistent, 2.5) == pytest.approx(1.0)
+    assert found.time_to(found.flagged, 1.0) == math.inf
+    assert found.share(found.undetected, 3.0) == pytest.approx(0.02)
+
+
+def test_flights_that_go_wrong_later_had_not_recovered():
+    """As after a step of a bias: the errors need seconds to grow."""
+    consistent = np.ones((8, 100), bool)
+    consistent[3:6, :20] = False
+    found = flights_of(consistent, np.zeros_like(consistent), ~consistent)
+    assert found.time_to(found.consistent, 0.0) == pytest.approx(3.5)
+    consistent[-1, :20] = False
+    assert flights_of(consistent, ~consistent, ~consistent).time_to(consistent, 0.0) == math.inf
+
+
+def test_consistent_flights_and_flags_equal_a_plain_computation():
+    batch = fly(
+        quad_gym.sensor_suite("rtk"), 64, filter_start="warm", faults=GyroBiasStep(start=0.3)
+    )
+    found = follow_recovery(batch, seeds=range(64), duration=1.5, every=0.5)
+    square = nees(batch, slice(0, 9))
+    np.testing.assert_array_equal(found.consistent[-1], square < stats.chi2.ppf(CONSISTENT, 9))
+    assert 0.0 < found.share(found.consistent, 1.5) < 1.0
+    np.testing.assert_array_equal(found.flagged[-1], batch.record("diverged") > 0.0)
+    assert found.time.tolist() == pytest.approx([0.5, 1.0, 1.5])
+    with pytest.raises(ValueError, match="at least twice every"):
+        follow_recovery(batch, seeds=range(64), duration=0.1, every=0.1)
+
+
+def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
+    chosen = [t for t in recovery.cases() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
+    chosen = [t for t in chosen if t.keywords]  # hovering takes a minute
+    how = (recovery.measure, recovery.table_of)
+    cells = run_cases(chosen, tmp_path / "recovery", CaseFlights(32), *how)
+    values = cells["rtk, camera_occlusion"]["values"]
+    assert values["consistent"] >= 90.0
+    assert set(values) == set(recovery.COLUMNS)
+    assert "| rtk, camera_occlusion | " in (tmp_path / "recovery.md").read_text()
+    calm = {"values": {"alarms_per_hour": 0.25, "flagged": 0.01, "hours": 6.0}, "misses": []}
+    calm |= {"expected": {}, "filters_failed": 0}
+    lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "misses": ["undetected"]}
+    lost |= {"expected": {}, "filters_failed": 1}
+    rows = {"a": lost, "b": lost | {"expected": {"": "why"}}, "c": calm}
+    text = recovery.table_of(rows, CaseFlights(32))
+    assert "| **5.0** |" in text.splitlines()[4]
+    assert "**1 filters failed**" in text
+    assert "| *5.0* |" in text
+    assert "| why" in text
+    assert "| c | 0.2 | 0.0 | 6.0 |" in text

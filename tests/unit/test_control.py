@@ -105,9 +105,6 @@ def test_rotors_on_unequal_arms_stay_within_their_limit(thrust):
     assert forces.max() <= vehicle.max_rotor_force * (1.0 + 1e-12)
 
 
-# ---- what an action means ----------------------------------------------------------------------
-
-
 def seen_state(seed):
     """A random view of the state, a reference and an action."""
     rng = np.random.default_rng(seed)

@@ -14,7 +14,7 @@ from quad_gym.kernels.vehicle.gusts import (
     second_order,
 )
 from quad_gym.records import Control, Source
-from tests.unit.alarms import alarm_score, assert_normal
+from tests.unit.alarms import assert_normal
 from tests.unit.compiled import Compiled
 
 FOOT = 0.3048
@@ -129,10 +129,3 @@ def test_across_and_along_follow_the_wind():
         (turned.record("wind") - turned.world.wind_I)[:, 0], -(still.record("wind")[:, 1] - WIND)
     )
     np.testing.assert_allclose(turned.record("wind")[:, 1], still.record("wind")[:, 0])
-
-
-def test_different_flights_and_axes_meet_different_gusts(history):
-    scores = np.corrcoef(history[4000].T)[np.triu_indices(3, 1)] * np.sqrt(4000)
-    assert np.abs(scores).max() < alarm_score(3)
-    neighbors = (history[0][1:] * history[0][:-1]).mean(axis=0) * np.sqrt(3999)
-    assert np.abs(neighbors).max() < alarm_score(3)

@@ -113,7 +113,6 @@ def test_midpoint_prediction_is_the_linearized_exact_motion(seed, kind):
     ]
     drive = np.diag(np.repeat([0.0, 0.0, 0.0, *drives], 3)) ** 2
     expected = J @ block_diag(P, np.diag(sigmas**2)) @ J.T + drive
-
     ukf.predict(gyro, accel)
     sd = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(

@@ -104,7 +104,6 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
         assert (
             np.delete(filters.get("gate")[:, taken], BAD, axis=0) == GateDecision.ACCEPTED
         ).all()
-
     # with a sound measurement the filter goes on as if nothing had been
     if how in ("nan", "infinity"):
         filters.put(BAD, **{VALUES[last]: filters.get(VALUES[last])[0]})

@@ -1,8 +1,6 @@
-"""Faults: when they come and go, and what they do, against the same flights without them.
-
-A fault changes no other draw, so on the true state a flight with faults is the flight without, but
-for what the fault does: differences show that alone.
-"""
+"""Faults: when they come and go, and what they do, against the same flights without them. A fault
+changes no other draw, so on the true state a flight with faults is the flight without, but for what
+the fault does: differences show that alone."""
 
 import math
 
@@ -54,9 +52,6 @@ def step(*batches):
 
 def at(kind, batch, name="fault_active"):
     return batch.record(name)[:, kind]
-
-
-# ---- when --------------------------------------------------------------------------------------
 
 
 def test_a_scheduled_fault_is_there_from_its_start_until_its_end():
@@ -135,9 +130,6 @@ def test_a_new_episode_begins_without_the_faults_of_the_last():
     np.testing.assert_array_equal(batch.record("rotor_gain").min(axis=1), [1.0, 0.5, 1.0, 0.5])
 
 
-# ---- GNSS --------------------------------------------------------------------------------------
-
-
 def test_an_outage_takes_the_fixes_away_and_changes_nothing_else():
     faults = (GnssOutage(start=0.1, duration=0.1), BaselineLoss(start=0.15, duration=0.1))
     calm, faulty = both(BLIND, faults, count=3)
@@ -200,9 +192,6 @@ def test_a_ramp_grows_with_time_and_a_jump_stays():
         np.testing.assert_allclose(quiet, 0.0, atol=1e-8)
 
 
-# ---- camera ------------------------------------------------------------------------------------
-
-
 def test_occlusion_hides_the_same_features_while_it_lasts():
     suite = quad_gym.sensor_suite("indoor").simplified().with_rates(camera=200.0)
     calm, faulty = both(suite, CameraOcclusion(start=0.1, duration=0.1, share=0.4), count=300)
@@ -252,9 +241,6 @@ def test_wrong_associations_take_one_seen_feature_for_another(how):
         assert stats.chisquare(np.bincount(three, minlength=3)).pvalue > ALARM
 
 
-# ---- IMU ---------------------------------------------------------------------------------------
-
-
 def test_a_bias_step_is_part_of_the_true_bias_while_it_lasts():
     steps = (
         AccelBiasStep(start=0.1, duration=0.3, size=(0.05, 0.2)),
@@ -290,9 +276,6 @@ def test_saturated_samples_end_at_the_ranges(sensors):
     assert clipped > 50
 
 
-# ---- the vehicle -------------------------------------------------------------------------------
-
-
 def test_a_position_jump_displaces_the_vehicle_once():
     jump = PositionJump(start=0.1, size=(1.0, 2.0))
     calm, faulty = both(BLIND, jump, count=200)
@@ -319,7 +302,6 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
     np.testing.assert_array_equal(calm.record("w"), faulty.record("w"))
     speeds, z_I = calm.record("rotor_speeds"), quaternion_to_dcm(calm.record("q"))[:, 2]
     step(calm, faulty)
-
     vehicle, gain = calm.vehicle, faulty.record("rotor_gain")
     which, lost = gain.argmin(axis=1), 1.0 - gain.min(axis=1)
     assert (gain.max(axis=1) == 1.0).all()

@@ -187,9 +187,6 @@ def test_example_refuses_wrong_options(words):
     assert done.stderr.startswith("error: ")
 
 
-# ---- the interface, call by call -------------------------------------------------------------
-
-
 class Estimate(ctypes.Structure):
     _fields_ = (
         *(("time", ctypes.c_double), ("numbers", ctypes.c_double * (3 + 3 + 9 + 4 + 3 + 3 + 15))),
@@ -343,9 +340,6 @@ def test_full_memory_shortens_the_window_only():
     assert ukf.oldest_time < c._c.qg_oldest_time(c.memory) < ukf.time
 
 
-# ---- with a policy ---------------------------------------------------------------------------
-
-
 @needs_compiler
 def test_policy_acts_on_the_estimate_as_its_network_does():
     controller = controller_of("pretrained", "QuadGym/Circle-v0")
@@ -380,9 +374,6 @@ def test_policy_that_observes_more_than_the_estimate_is_refused(tmp_path):
     controller = dataclasses.replace(controller, table=(field, *controller.table[1:]))
     with pytest.raises(ValueError, match="true_position_error"):
         export_filter(quad_gym.sensor_suite("rtk"), "rtk", "x86-64", tmp_path, controller)
-
-
-# ---- files -----------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(not shutil.which("ar"), reason="no ar")

@@ -9,7 +9,6 @@ import quad_gym
 from quad_gym.estimation import LONGEST_STEP, ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.packing.flight import params_record
 from quad_gym.params.vehicle import VehicleParams
-from tests.filter_states import set_like
 from tests.level_flights import R_IG
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
@@ -52,21 +51,6 @@ def estimate(kf):
 def assert_same(one, other):
     for name, value in estimate(one).items():
         np.testing.assert_array_equal(value, estimate(other)[name], err_msg=name)
-
-
-# ---- how long a sample is ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_tick_by_name_is_a_tick(kind):
-    plain, named = started(kind), started(kind)
-    for gyro, accel in samples(20):
-        plain.predict(gyro, accel)
-        named.predict(gyro, accel, dt=TICK)
-        named.predict(gyro, accel, dt=2.0 * TICK)  # and back
-        set_like(named, plain)
-        set_like(plain, plain)
-        assert_same(plain, named)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -116,9 +100,6 @@ def test_bad_lengths_raise_and_change_nothing(dt):
     assert np.isfinite(kf.covariance).all()
 
 
-# ---- late measurements ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_late_measurements_in_any_order_count_as_if_in_time(kind):
     in_time, late = started(kind), started(kind)
@@ -153,7 +134,6 @@ def test_a_stamp_within_a_sample_splits_it(samples_of):
     late.update(np.zeros(3), gnss_sigma=wide, time=0.153)
     np.testing.assert_allclose(late.velocity, whole.velocity, atol=0.02)
     np.testing.assert_allclose(late.position, whole.position, atol=0.005)
-
     in_parts, late = started(suite=SUITE), started(suite=SUITE)
     given = samples(30)
     for k, (gyro, accel) in enumerate(given):
@@ -212,9 +192,6 @@ def test_the_last_update_is_of_what_was_given_even_late():
     assert np.isfinite(on_time.nis).tolist() == [True, False, False, False, False]
     assert np.isfinite(report.nis).tolist() == [False, False, False, True, False]
     assert report.nis[3] == pytest.approx((report.innovation[3, 0] / report.sigma[3, 0]) ** 2)
-
-
-# ---- noise ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -15,10 +15,9 @@ from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, GnssOutliers
+from quad_gym.flights.columns import COLUMNS
 from quad_gym.flights.files import table
 from quad_gym.flights.flight_scene import FlightScene
-from quad_gym.flights.record import COLUMNS
-from quad_gym.frames import ecef_to_enu
 from quad_gym.records import FaultKind, GateDecision
 from quad_gym.rendering import record_flight
 from quad_gym.rotations import quaternion_to_dcm
@@ -37,9 +36,6 @@ def assert_same_flights(ours, theirs):
         a, b = getattr(ours.scene, field.name), getattr(theirs.scene, field.name)
         np.testing.assert_array_equal(a, b)
     assert ours.about == theirs.about
-
-
-# ---- what is kept --------------------------------------------------------------------------------
 
 
 def test_rows_are_control_steps_from_the_start():
@@ -77,36 +73,6 @@ def test_errors_are_distances_between_columns(task):
     start = flight["position"][0] - flight.scene.reference(np.zeros(1))[0]
     if task != "waypoints":
         assert np.linalg.norm(start) == pytest.approx(flight["position_error"][0])
-
-
-def test_nees_is_that_of_the_error_and_the_covariance():
-    _, flight, _ = recorded_flight("hover", steps=25)
-    row = flight.rows[-1]
-    P = row["covariance"]
-    error = np.zeros(15)
-    for k, word in enumerate(("position", "velocity", None, "accel_bias", "gyro_bias")):
-        if word is not None:
-            error[3 * k : 3 * k + 3] = row[word] - row[f"estimated_{word}"]
-    # small angles: R(e) is nearly I - [e x]
-    R = quaternion_to_dcm(row["quaternion"]) @ quaternion_to_dcm(row["estimated_quaternion"]).T
-    error[6:9] = (R[1, 2] - R[2, 1]) / 2, (R[2, 0] - R[0, 2]) / 2, (R[0, 1] - R[1, 0]) / 2
-    assert row["nees"] == pytest.approx(error @ np.linalg.solve(P, error), rel=0.02)
-    np.testing.assert_array_equal(P, P.T)
-    assert (np.linalg.eigvalsh(P) > 0.0).all()
-
-
-def test_fixes_are_kept_in_the_inertial_frame():
-    keywords = {"sensors": at_rates(gnss=5.0), "control_rate": 50.0, "out_of_bounds": 50.0}
-    env, flight, _ = recorded_flight("hover", steps=100, **keywords)
-    measured = np.isfinite(flight["gnss_position"]).all(axis=1)
-    np.testing.assert_array_equal(np.flatnonzero(measured), np.arange(0, 101, 10))
-    lever = quad_gym.sensor_suite("lab").gnss.primary_antenna_B
-    antenna = flight["position"] + lever @ quaternion_to_dcm(flight["quaternion"])
-    miss = flight["gnss_position"][measured] - antenna[measured]
-    assert (abs(miss) < 6 * np.array([0.006, 0.006, 0.012])).all()
-    G = env.flights.batch.record("gnss_position")[0]
-    enu = ecef_to_enu(quad_gym.sensor_suite("lab").gnss.reference_antenna_G) @ G
-    np.testing.assert_allclose(enu, flight["gnss_position"][-1], atol=1e-9)
 
 
 def test_what_the_gate_made_of_measurements_is_kept():
@@ -218,9 +184,6 @@ def test_a_recorded_policy_flies_what_it_flies_unrecorded():
         record_flight(policy, "QuadGym/Waypoints-v0", duration=0.0)
 
 
-# ---- files ---------------------------------------------------------------------------------------
-
-
 SAVED = [{}, {"task": "waypoints"}, {"observation": "truth"}, {"camera": False}]
 SAVED += [{"sensors": at_rates(gnss=10.0, camera=20.0)}]
 
@@ -291,7 +254,7 @@ def test_csv_keeps_every_number(tmp_path):
     with flight.to_csv(tmp_path / "flight.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(flight)
-    for name, values in table(flight).items():
+    for name, values in table(flight.rows).items():
         read = np.array([float(row[name] or "nan") for row in rows])
         np.testing.assert_array_equal(read, values, err_msg=name)
     assert rows[1]["gnss_position_x"] == ""
@@ -299,7 +262,7 @@ def test_csv_keeps_every_number(tmp_path):
 
 def test_the_table_names_every_number_once():
     _, flight, _ = recorded_flight()
-    columns = table(flight)
+    columns = table(flight.rows)
     numbers = sum(int(np.prod(flight[c.name].shape[1:])) for c in COLUMNS)
     assert len(columns) == numbers - 225 + 15  # the covariance has its standard deviations
     np.testing.assert_array_equal(columns["quaternion_w"], flight["quaternion"][:, 0])
@@ -317,7 +280,7 @@ def test_pandas_gets_the_same_table(monkeypatch):
     frame = flight.to_pandas()
     assert frame.index.name == "time"
     np.testing.assert_array_equal(frame.index, flight["time"])
-    for name, values in table(flight).items():
+    for name, values in table(flight.rows).items():
         if name != "time":
             np.testing.assert_array_equal(frame[name], values)
     monkeypatch.setitem(sys.modules, "pandas", None)

@@ -64,56 +64,31 @@ def test_what_a_motion_takes_is_what_makes_it(options, closed):
     assert demand.speed == pytest.approx(speed, rel=1e-3)
     assert demand.acceleration == pytest.approx(acceleration, rel=1e-3)
     assert demand.thrust == pytest.approx((force.min(), force.max()), rel=1e-3)
+    rates = np.abs(motion_of(path, VEHICLE, fine).body_rates).max(axis=0)
+    assert demand.body_rates == pytest.approx(rates, rel=1e-3)
     assert demand.tilt == pytest.approx(np.arccos(attitudes(path, fine)[:, 2, 2]).max(), rel=1e-3)
-
-
-def test_a_circle_takes_what_books_say():
-    """At 5 m and 4 m/s: tilt atan(v^2 / r g), thrust m sqrt(g^2 + (v^2/r)^2), yaw rate v / r."""
-    rate = 4.0 / 5.0
-    path = Trajectory.of(
-        lambda t: (5.0 * math.cos(rate * t), 5.0 * math.sin(rate * t), 1.0),
-        2.0 * math.pi / rate,
-        closed=True,
-        yaw="along",
-    )
-    inward, g = 16.0 / 5.0, VEHICLE.gravity
-    demand, tilt = path.check(VEHICLE), math.atan(inward / g)
-    assert demand.tilt == pytest.approx(tilt, rel=1e-4)
-    assert demand.thrust == pytest.approx([VEHICLE.mass * math.hypot(g, inward)] * 2, rel=1e-4)
-    assert demand.body_rates[2] == pytest.approx(rate * math.cos(tilt), rel=1e-3)
-    assert demand.body_rates[0] == pytest.approx(0.0, abs=1e-3)
-    assert demand.body_rates[1] == pytest.approx(rate * math.sin(tilt), rel=1e-3)
 
 
 def test_what_cannot_be_flown_is_refused_with_its_place_and_size():
     path = Trajectory.through(FIVE, max_speed=9.0, max_acceleration=7.0)
-    motion = motion_of(path, VEHICLE, sampling_times(path))
-    times, rates = sampling_times(path), np.abs(motion.body_rates)
-    segments = len(path.times) - 1
-
-    def where(k):
+    times, segments = sampling_times(path), len(path.times) - 1
+    motion, weak = motion_of(path, VEHICLE, times), 1.03 * VEHICLE.hover_voltage
+    forces, rates = motion.rotor_forces, np.abs(motion.body_rates)
+    rotor = forces.max(axis=0).argmax()
+    for values, what, options in (
+        (motion.thrust, "thrust of {:.4g} N", {"max_thrust": 8.5}),
+        (motion.tilt, "a tilt of .* degrees", {"max_tilt": math.radians(20.0)}),
+        (rates[:, 0], "body rate about x of {:.4g} rad/s", {"max_body_rates": (0.1, 6.0, 6.0)}),
+        (forces[:, rotor], f"force of rotor {rotor + 1} of {{:.4g}} N", {"max_thrust": 1e3}),
+    ):
+        k = int(values.argmax())
         segment = np.searchsorted(path.times, times[k], side="right")
-        return f"at {times[k]:.3f} s .segment {segment} of {segments}."
-
-    k = int(motion.thrust.argmax())
-    excess = round(100 * (motion.thrust[k] / 8.5 - 1.0))
-    assert excess > 1
-    message = f"thrust of {motion.thrust[k]:.4g} N {where(k)}, {excess} %"
-    with pytest.raises(ValueError, match=message):
-        path.check(VEHICLE, max_thrust=8.5)
-    k = int(motion.tilt.argmax())
-    with pytest.raises(ValueError, match=f"a tilt of .* degrees {where(k)}, .* 20 degrees"):
-        path.check(VEHICLE, max_tilt=math.radians(20.0))
-    k = int(rates[:, 0].argmax())
-    message = f"body rate about x of {rates[k, 0]:.4g} rad/s {where(k)}"
-    with pytest.raises(ValueError, match=message):
-        path.check(VEHICLE, max_body_rates=(0.1, 6.0, 6.0))
+        where = f"at {times[k]:.3f} s .segment {segment} of {segments}."
+        vehicle = VEHICLE.replace(max_voltage=weak) if options == {"max_thrust": 1e3} else VEHICLE
+        with pytest.raises(ValueError, match=f"{what.format(values[k])} {where}"):
+            path.check(vehicle, **options)
     with pytest.raises(ValueError, match=r"a speed of .* m/s"):
         path.check(VEHICLE, max_speed=1.0)
-    weak = VEHICLE.replace(max_voltage=1.03 * VEHICLE.hover_voltage)
-    k = np.unravel_index(motion.rotor_forces.argmax(), motion.rotor_forces.shape)
-    with pytest.raises(ValueError, match=f"force of rotor {k[1] + 1} of .* N {where(k[0])}"):
-        path.check(weak, max_thrust=1e3)
     path.check(VEHICLE)
     with pytest.raises(ValueError, match="vehicle must be a VehicleParams"):
         path.check("lab")

@@ -290,9 +290,7 @@ def test_a_start_in_the_ground_is_lifted_and_one_on_it_stands():
 @pytest.mark.parametrize("suite", ["standard", "indoor"])
 def test_the_filter_is_consistent_while_the_vehicle_stands(suite):
     """NEES of 15 degrees of freedom, mean over 256 flights: 15 +- 0.34, of which 5 deviations.
-
-    Filters of suites with several errors believe in somewhat larger ones than there are.
-    """
+    Filters of suites with several errors believe in somewhat larger ones than there are."""
     flights = batch(256, sensors=suite, source=Source.ESTIMATE, task={"start": "ground"})
     flights.reset(seeds=range(256))
     for _ in range(5 * 200):

@@ -60,19 +60,6 @@ def test_sliding_under_thrust_keeps_its_height(friction):
     np.testing.assert_allclose(flights.record("v")[:, 0], 1.0 - slower, atol=5e-3)
 
 
-def test_rest_in_wind_and_drag_is_no_gain_either():
-    """Pushed along by wind, and lifted by it: no part of the weight presses the feet in."""
-    for wind in ((30.0, 0.0, 0.0), (0.0, 0.0, 5.0)):
-        world = {"wind_I": wind, "linear_drag_B": (0.2, 0.2, 0.4)}
-        flights = batch(2, world=world, ground={"friction": 0.1})
-        flights.reset(seeds=range(2))
-        actions = level(flights, [0.0, 0.5], np.full(2, 1e-3), np.tile([0.1, 0.0, -0.1], (2, 1)))
-        for _ in range(100):
-            flights.step(actions)
-        assert np.abs(feet(flights)).max() < STILL_GAP
-        assert (np.abs(flights.record("v")[:, 0]) > 1.0).all() == (wind[0] > 0.0)
-
-
 def test_who_tumbles_under_thrust_does_not_sink_in():
     flights = batch(96, ground=TOUGH)
     flights.reset(seeds=range(96))

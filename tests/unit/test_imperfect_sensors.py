@@ -1,8 +1,6 @@
 """Errors of scale and alignment, vibration, constant heading errors, and what limits a camera.
-
 Flights on the true state fly alike whatever measures them, so that samples with an effect and
-without it, of the same seeds, differ by the effect alone.
-"""
+without it, of the same seeds, differ by the effect alone."""
 
 import itertools
 import math
@@ -12,6 +10,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
@@ -21,6 +20,7 @@ from quad_gym.sensors import Camera, GnssReceiver, Imu
 from quad_gym.vehicle import state_derivative
 from tests.body_states import random_state
 from tests.builders import batch as flights_of
+from tests.field_flights import fly, nees, steps
 from tests.filter_states import set_at_rest
 
 LAB, STANDARD = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("standard")
@@ -52,7 +52,7 @@ def with_camera(**changes):
     return LAB.replace(camera=LAB.camera.replace(features_I=tuple(places), **changes))
 
 
-def fly(flights, actions, fields):
+def flown(flights, actions, fields):
     """(steps, flights, ...) of each field."""
     found = [[] for _ in fields]
     for action in actions:
@@ -84,7 +84,7 @@ def test_regression_recovers_errors_of_scale_and_alignment(lever):
     fast = {"start_velocity_I": quad_gym.Uniform(-5.0, 5.0)}  # so that there is drag
     flights = batch(suite, count, randomization=fast)
     names = ("r", "v", "q", "w", "rotor_speeds", "accel", "gyro")
-    r, v, q, w, speeds, accel, gyro = fly(flights, shaking(count), names)
+    r, v, q, w, speeds, accel, gyro = flown(flights, shaking(count), names)
     accel_errors, gyro_errors = np.empty((2, count, 3, 3))
     for k in range(count):
         R_BI, force = quaternion_to_dcm(q[:, k]), np.empty((len(r), 3))
@@ -110,7 +110,7 @@ def test_averaged_samples_err_in_what_differs_from_rest():
     """The mean over a tick with errors is (I + D) that without, about (0, 0, g)."""
     plain, erring = batch(STANDARD), batch(with_imu(STANDARD, **ERRORS))
     names = ("accel", "gyro", "w_meas", "r", "q")
-    without, found = (fly(b, shaking(64, 20), names) for b in (plain, erring))
+    without, found = (flown(b, shaking(64, 20), names) for b in (plain, erring))
     D_a, D_g = erring.record("accel_error"), erring.record("gyro_error")
     excess = without[0] - [0.0, 0.0, VehicleParams().gravity]
     np.testing.assert_allclose(
@@ -143,7 +143,7 @@ def test_vibration_grows_with_the_square_of_the_rotor_speeds(suite):
         # rotors settle in ten time constants; what a wild attitude does to means does not matter
         actions = np.broadcast_to(np.array(level), (130, count, 4))
         names = ("accel", "gyro", "w_meas", "rotor_speeds")
-        without, found = (fly(batch(s, count), actions, names) for s in (suite, shaken))
+        without, found = (flown(batch(s, count), actions, names) for s in (suite, shaken))
         speeds = found[3][100:]
         expected = np.mean(speeds**4, axis=-1) / hover**4
         if not any(level):
@@ -169,15 +169,12 @@ def test_filter_counts_the_vibration_of_the_measured_thrust(lift):
     np.testing.assert_allclose(added[6:9], gyro, rtol=1e-6)
 
 
-# ---- headings ---------------------------------------------------------------------------------
-
-
 def test_baselines_of_an_episode_share_a_turn_about_body_z():
     sigma, count = 0.1, 400
     erring = LAB.replace(gnss=LAB.gnss.replace(heading_error_sigma=sigma))
     plain, turned = batch(LAB, count), batch(erring, count)
     actions = shaking(count, 10)
-    (without, q), (found, _) = (fly(b, actions, ("gnss_baseline", "q")) for b in (plain, turned))
+    (without, q), (found, _) = (flown(b, actions, ("gnss_baseline", "q")) for b in (plain, turned))
     R_IG = quad_gym.frames.ecef_to_enu(LAB.gnss.reference_antenna_G)
     error = turned.record("heading_error")
     for t in range(10):
@@ -189,9 +186,6 @@ def test_baselines_of_an_episode_share_a_turn_about_body_z():
         np.testing.assert_allclose(after[:, 2], before[:, 2], atol=1e-9)
     low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], count)
     assert low < np.sum(np.square(error / sigma)) < high
-
-
-# ---- the camera -------------------------------------------------------------------------------
 
 
 def seen_by_projection(flights, camera, ground=None):
@@ -253,10 +247,8 @@ def test_blur_grows_with_the_body_rate(rate):
 
 @pytest.mark.parametrize("kind", [quad_gym.UnscentedKalmanFilter, quad_gym.ExtendedKalmanFilter])
 def test_errors_of_scale_and_alignment_add_noise_in_a_maneuver(kind):
-    """As so much more white noise: by that of half a second of the same force.
-
-    An axis errs by its own scale and by its alignment to two others: the mean over the axes counts.
-    """
+    """As so much more white noise: by that of half a second of the same force. An axis errs by its
+    own scale and by its alignment to two others: the mean over the axes counts."""
     accel, error = np.array([1.5, -0.7, 11.0]), 0.004
     plain, dt = with_imu(STANDARD, accel_misalignment_sigma=0.0), STANDARD.imu.dt
     excess = np.linalg.norm(accel - [0.0, 0.0, 9.8])
@@ -280,9 +272,6 @@ def test_errors_of_scale_and_alignment_add_noise_in_a_maneuver(kind):
     np.testing.assert_allclose(scaled, noisy, rtol=1e-12, atol=1e-18)
     grown = np.diag(aligned - exact)[3:6]
     np.testing.assert_allclose(grown, dt * (error * excess) ** 2 / 3.0, rtol=1e-6)
-
-
-# ---- sensors of one vehicle -------------------------------------------------------------------
 
 
 def test_classes_of_one_vehicle_have_every_effect():
@@ -318,3 +307,67 @@ def test_classes_of_one_vehicle_have_every_effect():
             concerned = name.startswith("accel")
             assert (exact[concerned] != erring[concerned]).all()
             np.testing.assert_array_equal(exact[not concerned], erring[not concerned])
+
+
+FLIGHTS = 400
+BAND = 5 * np.sqrt(2 * 15 / FLIGHTS)
+"""Five deviations of the mean of that many NEES of 15 degrees of freedom."""
+
+
+def mounted(name, lever_arm, **choices):
+    suite = quad_gym.sensor_suite(name)
+    estimator = suite.estimator.replace(**choices)
+    return suite.replace(imu=suite.imu.replace(lever_arm_B=lever_arm), estimator=estimator)
+
+
+def late_arm(**latencies):
+    suite = mounted("rtk", (0.05, 0.05, -0.05))
+    changes = {name: getattr(suite, name).replace(latency=t) for name, t in latencies.items()}
+    return suite.replace(**changes)
+
+
+CENTER = {"center_of_mass_B": quad_gym.Uniform(-0.03, 0.03)}
+MOUNTED = {
+    **{
+        f"{name}, {kind}": (mounted(name, (0.05, -0.05, 0.05), kind=kind), {})
+        for name in ("rtk", "indoor")
+        for kind in ("ukf", "ekf")
+    },
+    "late": (late_arm(gnss=0.1), {"filter_start": "warm"}),
+    "latest": (late_arm(gnss=0.2, camera=0.08), {"filter_start": "warm"}),
+    "known drawn center of mass": (
+        quad_gym.sensor_suite("rtk").simplified(),
+        {"randomization": quad_gym.Randomization(CENTER, known=True)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MOUNTED)
+def test_a_known_lever_arm_leaves_the_filter_consistent(name):
+    suite, options = MOUNTED[name]
+    batch = fly(suite, FLIGHTS, start="hover", **options)
+    for _ in range(3):
+        steps(batch, 1.0)
+        assert abs(nees(batch).mean() - 15.0) < BAND
+
+
+@pytest.mark.parametrize(
+    ("kind", "tolerance"), [(ExtendedKalmanFilter, 1e-9), (UnscentedKalmanFilter, 1e-5)]
+)
+def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind, tolerance):
+    """The closed form: f = dw x l + w x (w x l) + g e3, with w = (0, 0, a t) about the vertical.
+    The UKF's mean has a second order: the gyro's noise makes the force point up a little less."""
+    arm, rate = np.array([0.3, -0.2, 0.1]), 4.0
+    suite = mounted("lab", tuple(arm))
+    kalman = kind(sensors=suite)
+    set_at_rest(kalman, 1e-14 * np.eye(15))
+    w_before = None
+    for tick in range(200):
+        w = np.array([0.0, 0.0, rate * tick * suite.imu.dt])
+        dw = np.array([0.0, 0.0, rate if tick else 0.0])
+        force = np.cross(dw, arm) + np.cross(w, np.cross(w, arm)) + [0.0, 0.0, 9.8]
+        kalman.predict(w, force)
+        w_before = w
+    assert w_before[2] > 3.9
+    np.testing.assert_allclose(kalman.velocity, 0.0, atol=tolerance)
+    np.testing.assert_allclose(kalman.position, 0.0, atol=tolerance)

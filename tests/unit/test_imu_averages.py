@@ -79,7 +79,6 @@ def test_a_sample_is_the_mean_of_what_is_felt_over_the_tick(seed):
     voltages, force = rng.uniform(3.0, 9.0, 4), rng.normal(size=3)
     states, weights, end = fly_finely(start, voltages, force, dt)
     gyro, accel = average_sample(start, end, LEVER, dt)
-
     turn = Rotation.from_matrix(orthonormal(end["R_BI"]) @ start["R_BI"].T)
     np.testing.assert_allclose(gyro * dt, -turn.as_rotvec(), rtol=0.0, atol=1e-11)
     half = Rotation.from_rotvec(turn.as_rotvec() / 2.0).as_matrix() @ start["R_BI"]

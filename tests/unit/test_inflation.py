@@ -110,10 +110,8 @@ def test_repeated_alarms_leave_unmeasured_states_bounded():
 
 
 def test_a_sensor_that_no_longer_measures_raises_no_more_alarms():
-    """Without a gate nothing begins its mean anew; the camera goes on.
-
-    The filter stays lost for as long as biases may err, but from the last fix on.
-    """
+    """Without a gate nothing begins its mean anew; the camera goes on. The filter stays lost for as
+    long as biases may err, but from the last fix on."""
     batch = fly("standard", 8, task="hover", filter_start="warm")
     steps(batch, 1.0)
     assert not batch.record("diverged").any()

@@ -1,11 +1,9 @@
 """Confidence intervals: their coverage by simulation, and closed forms and SciPy's where there are.
-
-A coverage of 95 % over 2,000 draws has a standard deviation of 0.5 %.
-"""
+A coverage of 95 % over 2,000 draws has a standard deviation of 0.5 %."""
 
 import numpy as np
 import pytest
-from scipy.stats import binom, binomtest, mannwhitneyu, norm, ttest_1samp
+from scipy.stats import binomtest, mannwhitneyu, norm, ttest_1samp
 
 from quad_gym.analysis.intervals import (
     Estimated,
@@ -26,12 +24,6 @@ def estimate_of(sample):
     return Estimated(sample.mean(), *mean_interval(sample))
 
 
-@pytest.mark.parametrize("count", [2, 3, 5, 10, 20, 100, 1000])
-def test_interval_of_a_mean_covers_95_percent_of_normal_values(count):
-    samples = np.random.default_rng(count).normal(3.0, 2.0, (DRAWS, count))
-    assert 0.93 < np.mean([mean_interval(x).holds(3.0) for x in samples]) < 0.97
-
-
 @pytest.mark.parametrize(
     ("count", "stated"), [(2, 0.89), (5, 0.82), (10, 0.84), (100, 0.92), (1000, 0.95)]
 )
@@ -39,14 +31,6 @@ def test_interval_of_a_mean_covers_lognormal_values_as_stated(count, stated):
     samples = np.random.default_rng(count).lognormal(size=(DRAWS, count))
     covered = np.mean([mean_interval(x).holds(np.exp(0.5)) for x in samples])
     assert covered == pytest.approx(stated, abs=0.03)
-
-
-@pytest.mark.parametrize("rate", [0.002, 0.05, 0.3, 0.5, 0.98])
-@pytest.mark.parametrize("episodes", [5, 20, 100])
-def test_interval_of_a_rate_covers_at_least_95_percent(rate, episodes):
-    counts = np.arange(episodes + 1)
-    held = [rate_interval(k, episodes).holds(rate) for k in counts]
-    assert binom.pmf(counts, episodes, rate)[held].sum() >= 0.95
 
 
 @pytest.mark.parametrize("seeds", [2, 3, 5, 10])

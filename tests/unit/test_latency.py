@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 import quad_gym
 from quad_gym.records import POSITION_BLOCK, WIDTH, FilterStatus, Source
@@ -23,21 +24,21 @@ def late(suite, gnss=None, camera=None, **choices):
     return suite.replace(**changes)
 
 
-def corrected_lab(kind="ukf", quiet=False, **latencies):
+def corrected_lab(kind="ukf", quiet=False, drift=False, **latencies):
     """The laboratory's sensors at rates of the field, with the corrected filter, without a gate."""
     lab = quad_gym.sensor_suite("lab").with_rates(gnss=10.0, camera=25.0)
     imu = lab.imu.replace(samples="average")
     if quiet:
         noise = dict.fromkeys(("accel_noise_density", "gyro_noise_density"), 1e-7)
         imu = imu.replace(**noise, accel_bias_tau=1e7, gyro_bias_tau=1e7)
-    camera = lab.camera.replace(phase=0.5, pixel_sigma=3.0)
-    suite = lab.replace(imu=imu, gnss=lab.gnss.replace(phase=0.15), camera=camera)
+    gnss, camera = lab.gnss.replace(phase=0.15), lab.camera.replace(phase=0.5, pixel_sigma=3.0)
+    if drift:
+        slow = {"drift_sigma_I": (0.6, 0.6, 1.0), "position_sigma_I": (0.2, 0.2, 0.4)}
+        gnss, camera = gnss.replace(**slow), None
+    suite = lab.replace(imu=imu, gnss=gnss, camera=camera)
     choices = {"kind": kind, "integration": "midpoint", "attitude_reset": True}
     choices |= {"bearing_noise_at": "pinhole", "reuse_first_fix": False}
     return late(suite, **latencies, **choices)
-
-
-# ---- when measurements arrive ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -71,21 +72,20 @@ def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
     assert images > 20 * 10
 
 
-# ---- what they do to the estimate ------------------------------------------------------------
-
-
 def deviations_from_the_reference(suite, plain, seconds=1.0):
-    """Worst deviation of the means in claimed deviations, and of the covariances' entries.
-
-    Of a circle, against a filter that filters all over again.
-    """
-    batch = fly(suite, 1, task="circle", start="hover", filter_start="warm")
-    start = plain(suite)
+    """Worst deviation of the means in claimed deviations, and of the covariances' entries. Of a
+    circle, against a filter that filters all over again."""
+    start_filter = "cold" if suite.drifts else "warm"
+    batch = fly(suite, 1, task="circle", start="hover", filter_start=start_filter)
+    start = plain(suite.replace(gnss=suite.gnss.replace(latency=0.0)))
     for name in ("r", "v", "R", "b_a", "b_g"):
         setattr(start, name, batch.record(f"{name}_hat")[0])
     start.P = batch.covariance()[0]
+    if suite.drifts:
+        start.d = batch.record("gnss_drift_hat")[0]
+        start.P = block_diag(start.P, 1e-20 * np.eye(3))
     reference = Rewinding(start)
-    waits = [round(sensor.latency / DT) for sensor in (suite.gnss, suite.camera)]
+    waits = [round(s.latency / DT) if s is not None else 0 for s in (suite.gnss, suite.camera)]
     worst, arrivals = np.zeros(2), 0
     for _ in range(round(seconds / DT)):
         batch.step()
@@ -104,7 +104,13 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
             vectors = ("r", "v", "b_a", "b_g")
             parts = [batch.record(f"{n}_hat")[0] - getattr(there, n) for n in vectors]
             parts.insert(2, small_euler_angles(batch.record("R_hat") @ there.R.T)[0])
-            off = np.abs(batch.covariance()[0] - there.P) / np.outer(sigma, sigma)
+            P = batch.covariance()[0]
+            if suite.drifts:
+                parts.append(batch.record("gnss_drift_hat")[0] - there.d)
+                L = np.vstack([np.pad(batch.record("L")[0], ((0, 0), (0, 3))),
+                               batch.record("L_drift")[0]])  # fmt: skip
+                P = L @ L.T
+            off = np.abs(P - there.P) / np.outer(sigma, sigma)
             found = np.abs(np.concatenate(parts) / sigma).max(), off.max()
             worst = np.maximum(worst, found)
     assert arrivals > 25
@@ -121,18 +127,18 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
         (PlainUKF, True, 0.2, 0.08, (0.15, 2e-3)),
         (PlainUKF, True, 0.2, 0.06, (0.15, 2e-3)),
         (PlainUKF, True, 0.1, 0.08, (0.15, 2e-3)),
+        (PlainUKF, False, 0.1, None, (0.15, 0.1)),  # with GNSS that drifts
     ],
 )
 def test_late_measurements_leave_what_filtering_all_over_again_does(
     plain, quiet, gnss, camera, bounds
 ):
-    """Up to the second order, and to what measurements in between tell about the IMU's noise.
-
-    At two periods one measurement is taken at the instant at which another arrives.
-    """
+    """Up to the second order, and to what measurements in between tell about the IMU's noise. At
+    two periods one measurement is taken at the instant at which another arrives."""
     kind = "ekf" if plain is PlainEKF else "ukf"
-    suite = corrected_lab(kind, quiet=quiet, gnss=gnss, camera=camera)
-    seconds = 1.5 if 0.2 in (gnss, 2.5 * camera) else 1.0
+    drift, seconds = camera is None, 1.5 if camera is None or gnss == 0.2 or camera == 0.08 else 1.0
+    seconds = 3.0 if drift else seconds
+    suite = corrected_lab(kind, quiet, drift, gnss=gnss, camera=camera)
     mean, covariance = deviations_from_the_reference(suite, plain, seconds)
     assert mean < bounds[0], mean
     assert covariance < bounds[1], covariance
@@ -173,9 +179,6 @@ def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
     assert min(means["ignorant"][-4:]) > 15.0 + 2 * bound, means
     assert not informed.record("filter_status").any()
     assert (informed.record("rejections").sum(axis=1) > 0).mean() < 0.05
-
-
-# ---- what must not change --------------------------------------------------------------------
 
 
 def test_failed_late_measurement_leaves_the_estimate():
@@ -221,9 +224,6 @@ def test_an_episode_begins_with_nothing_under_way():
         assert batch.record("block_valid")[:, POSITION_BLOCK].all()
         steps(batch, 0.7)
         batch.reset()
-
-
-# ---- nonsense --------------------------------------------------------------------------------
 
 
 def test_nonsense_is_refused():

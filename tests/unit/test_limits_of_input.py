@@ -24,9 +24,6 @@ def refused(message, make, *arguments, kind=ValueError, **keywords):
         make(*arguments, **keywords)
 
 
-# ---- sensors that are not what the filter believes -----------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("part", "changes", "message"),
     [
@@ -45,9 +42,6 @@ def test_true_sensors_that_measure_otherwise_are_refused(part, changes, message)
     message = f"true_sensors must have the .*{message}"
     refused(message, FlightBatch, 1, sensors=RTK, true_sensors=true)
     refused(message, QuadEnv, "hover", sensors=RTK, true_sensors=true)
-
-
-# ---- limits, at the limit ------------------------------------------------------------------------
 
 
 def test_a_duration_that_rounds_to_no_limit_is_refused():
@@ -81,7 +75,6 @@ def test_rotors_too_fast_for_the_integration_are_refused(substeps):
     draws = {"motor_time_constant": Uniform(fast, 0.1)}
     message = "randomization of 'motor_time_constant'"
     refused(message, QuadEnv, "hover", randomization=draws, substeps=substeps)
-
     batch = FlightBatch(1, vehicle=slow_ones, substeps=substeps, source=Source.TRUTH)
     batch.reset(seeds=[1])
     for _ in range(400):
@@ -134,9 +127,6 @@ def test_periods_that_no_thrust_allows_are_refused(task, least, options):
     message = "period must be one that the vehicle can fly"
     refused(message, QuadEnv, task, period=0.99 * least, **options)
     QuadEnv(task, period=1.01 * least, **options)
-
-
-# ---- starts and seeds ----------------------------------------------------------------------------
 
 
 def test_starts_out_of_all_bounds_change_nothing():
@@ -194,9 +184,6 @@ def test_an_absolute_position_does_not_start_a_filter():
     ukf.initialize([1.0, 2.0, 3.0], baseline)
 
 
-# ---- keywords ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("maker", MAKERS)
 def test_misplaced_keywords_are_refused_with_a_suggestion(maker):
     make = MAKERS[maker]
@@ -218,9 +205,6 @@ def test_faults_of_sensors_need_sensors(maker, observation):
     make(observation=observation, faults=(RotorLoss(), PositionJump()))
     make(observation=observation, faults="gnss_outage", innovations=True)
     make(observation="measurements", faults="gnss_outage")
-
-
-# ---- policies ------------------------------------------------------------------------------------
 
 
 def test_pd_control_is_not_shown_other_observations():
@@ -247,9 +231,6 @@ def test_pd_control_is_not_shown_other_observations():
         VecNormalize(sb3, norm_obs=False),
     ):
         PDPolicy(plain)
-
-
-# ---- time limits ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -48,8 +48,6 @@ def check_positions(log, table, atol):
     np.testing.assert_allclose(*norms, atol=atol)
 
 
-# ---- ArduPilot -----------------------------------------------------------------------------------
-
 MESSAGES = {
     "IMU": (131, "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
     "GPS": (132, "QBBIHLLeffff", "TimeUS,I,Status,GMS,GWk,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw"),
@@ -132,9 +130,6 @@ def test_files_of_another_kind_are_refused(tmp_path, name, kind, library):
         read_log(tmp_path / "none.bin")
 
 
-# ---- ROS -----------------------------------------------------------------------------------------
-
-
 def write_bag(path, recorded, version):
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
@@ -214,9 +209,6 @@ def test_missing_libraries_are_named(tmp_path, monkeypatch, file, library):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match="install it with pip install 'quad-gym"):
         read_log(tmp_path / file)
-
-
-# ---- EuRoC ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("up", ["z", "x"])

@@ -126,9 +126,6 @@ def test_marks_on_a_wall_are_hidden_from_behind():
     assert hidden[1].all()
 
 
-# ---- in the kernels -----------------------------------------------------------------------------
-
-
 TRUTH = {"source": Source.TRUTH, "threads": 1}
 
 
@@ -240,8 +237,6 @@ def test_late_images_lack_what_was_hidden_when_they_were_taken():
     assert 0.2 < np.mean(np.array(taken)[4::5, :, 0] > 0.0) < 0.9
 
 
-# ---- what each episode draws --------------------------------------------------------------------
-
 SHIFTED = WorldParams(
     obstacles=(
         Wall(center_I=(30.0, 3.0, 1.0), shift_I=(0.5, 2.0, 0.0)),
@@ -283,9 +278,6 @@ def test_a_new_episode_has_new_places_and_has_touched_nothing():
     moved = (before != after).any(axis=(1, 2))
     np.testing.assert_array_equal(moved, [True, False, True, False])
     np.testing.assert_array_equal(batch.record("collided"), [0.0, 1.0, 0.0, 1.0])
-
-
-# ---- what is refused ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from quad_gym import FlightBatch, TaskParams, sensor_suite
 from quad_gym.batch.quantities import QUANTITIES
-from quad_gym.flights.record import COLUMNS
-from quad_gym.records import FLIGHT_FIELDS, Source
+from quad_gym.flights.columns import COLUMNS
+from quad_gym.records import Source
 from quad_gym.tasks.view import VIEW_FIELDS
 from tests import builders
 
@@ -49,17 +49,6 @@ def test_every_quantity_has_the_shape_of_the_table():
         np.testing.assert_array_equal(some, values[[3, 1]], err_msg=name)
         values[:] = 0  # a copy
         np.testing.assert_array_equal(batch.read(name, np.array([3, 1])), some, err_msg=name)
-
-
-def test_fields_of_the_records_are_read_as_they_are():
-    batch, fields = flown(sensors="rtk"), {field.name for field in FLIGHT_FIELDS}
-    for name, quantity in QUANTITIES.items():
-        if isinstance(quantity.of, str) and quantity.of in fields:
-            np.testing.assert_array_equal(batch.read(name), batch.record(quantity.of), name)
-    drift = flown(sensors="consumer")
-    np.testing.assert_array_equal(
-        drift.read("estimated_gnss_drift"), drift.record("slow_hat")[:, :3]
-    )
 
 
 def test_attitudes_agree_with_scipy():

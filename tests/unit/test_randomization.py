@@ -35,9 +35,6 @@ def quantile(f, _):
 quantiles = Compiled(quantile, p=(), x=())
 
 
-# ---- distributions -------------------------------------------------------------------------------
-
-
 @given(st.floats(1e-300, 1.0 - 2.0**-53))
 def test_the_normal_quantile_is_that_of_scipy(p):
     got = quantiles.on_floats(p=[p])["x"][0]
@@ -117,9 +114,6 @@ def test_a_parameter_does_not_depend_on_which_others_are_drawn():
     np.testing.assert_array_equal(few.read("mass"), many.read("mass"))
     drawn = many.read("inertia")  # whose other components stay
     assert [len(np.unique(column)) for column in drawn.T] == [1, 12, 1]
-
-
-# ---- drawn flights are flights with these parameters ---------------------------------------------
 
 
 def told(name, value):

@@ -1,7 +1,5 @@
 """Excerpts of real flights: a suite that describes the sensors has no problems, all others do.
-
-Sources and licenses are in tests/data/flights.
-"""
+Sources and licenses are in tests/data/flights."""
 
 import gzip
 from functools import cache

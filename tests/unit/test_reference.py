@@ -100,26 +100,6 @@ def test_velocity_and_acceleration_are_the_derivatives(seed):
     np.testing.assert_allclose(acceleration[0], bend, rtol=0.0, atol=1e-8)
 
 
-def test_the_reports_circle_in_closed_form():
-    position, velocity, acceleration, heading = (x[0] for x in evaluated(drawn(1), TIMES))
-    w = 2.0 * np.pi / 10.0
-    c, s, zero = np.cos(w * TIMES), np.sin(w * TIMES), 0.0 * TIMES
-    np.testing.assert_allclose(position, np.stack([4 * c, 4 * s, 1 + zero], 1), atol=1e-13)
-    np.testing.assert_allclose(velocity, 4 * w * np.stack([-s, c, zero], 1), atol=1e-13)
-    np.testing.assert_allclose(acceleration, -4 * w**2 * np.stack([c, s, zero], 1), atol=1e-13)
-    np.testing.assert_allclose(heading, np.stack([-c, -s, zero], 1), atol=1e-13)
-
-
-def test_the_lemniscate_is_an_eight_flown_nose_first():
-    flights = drawn(1, kind="lemniscate", radius=3.0, period=8.0, height=1.5)
-    position, velocity, _, heading = (x[0] for x in evaluated(flights, TIMES))
-    w = 2.0 * np.pi / 8.0
-    eight = [3 * np.sin(w * TIMES), 1.5 * np.sin(2 * w * TIMES), 1.5 + 0 * TIMES]
-    np.testing.assert_allclose(position, np.transpose(eight), rtol=0.0, atol=1e-12)
-    along = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
-    np.testing.assert_allclose(heading, along, rtol=0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("speed", "acceleration", "radius", "period"),
     [(2.5, 3.0, 4.0, 10.0), (0.5, 100.0, 50.0, 20.0), (50.0, 0.3, 50.0, 5.0), (50, 50, 1.0, 10.0)],

@@ -1,12 +1,16 @@
 """Pictures show things where they are: hand-computed pixels, sampled surfaces, the camera model."""
 
+import itertools
+
 import numpy as np
 import pytest
 
+import quad_gym
 from quad_gym import CameraParams
 from quad_gym.envs.configuration import Flights
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import Autoreset
+from quad_gym.rendering.canvas import Canvas
 from quad_gym.rendering.geometry import (
     chase_view,
     ellipsoid_axes,
@@ -16,7 +20,6 @@ from quad_gym.rendering.geometry import (
     look_at,
 )
 from quad_gym.rendering.inset import inset_box, place_in_inset
-from quad_gym.rendering.solids import faces_of
 from quad_gym.rotations import euler_to_dcm
 from quad_gym.sensors import Camera
 
@@ -47,15 +50,6 @@ def test_known_points_land_on_the_expected_pixels():
     np.testing.assert_allclose(depth, [10.0, 10.0, 10.0, 20.0], atol=1e-12)
     expected = [[320.0, 180.0], [370.0, 180.0], [320.0, 130.0], [370.0, 230.0]]
     np.testing.assert_allclose(pixels, expected, atol=1e-9)
-
-
-def test_far_level_points_lie_on_the_horizon():
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        eye, target = rng.normal(size=3), rng.normal(size=3)
-        view = look_at(eye, target, 500.0, CENTER)
-        far = eye + 1e9 * (target - eye) * (1.0, 1.0, 0.0)
-        assert view.project(far)[0][1] == pytest.approx(view.horizon, abs=1e-3)
 
 
 def test_things_behind_the_eye_are_cut_off():
@@ -193,12 +187,26 @@ def test_polygon_behind_the_eye_is_cut_off():
     np.testing.assert_array_equal(view.outline(before), view.project(before)[0])
 
 
-def test_faces_turned_to_the_eye_are_seen():
-    wall = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 0.1, 1.0, 0.0, 1.0])  # its length points north
-    (face,) = faces_of(wall, np.array([5.0, 0.0, 1.0]))
-    np.testing.assert_allclose(face[:, 0], 0.1)
-    assert len(faces_of(wall, np.array([5.0, 9.0, 7.0]))) == 3
-    mast = np.array([1.0, 0.0, 0.0, 1.0, 0.3, 0.3, 1.0, 1.0, 0.0])
-    sides = faces_of(mast, np.array([100.0, 0.0, 1.0]))
-    assert 9 <= len(sides) <= 11  # about half of them, and no cap
-    assert len(faces_of(mast, np.array([0.0, 0.0, 1.0]))) == 22  # from within: all
+@pytest.mark.parametrize("size", [(320, 240), (480, 270), (640, 480), (1280, 720)])
+@pytest.mark.parametrize("task", ["circle", "waypoints"])
+def test_no_words_of_the_strip_cross_others(monkeypatch, size, task):
+    written = []
+
+    def text(self, words, x, y, size, color=(0, 0, 0), anchor=0.0):
+        width = self.width_of(words, size)
+        left = x - anchor * width
+        written.append((words, left, left + width, y, y + 0.6 * self.line_height(size)))
+        return width
+
+    monkeypatch.setattr(Canvas, "text", text)
+    env = quad_gym.QuadEnv(task, render_mode="rgb_array", render_size=size)
+    env.reset(seed=0)
+    for _ in range(30):
+        env.step(np.zeros(4, np.float32))
+    env.render()
+    strip = [entry for entry in written if entry[3] > 0.765 * size[1] and entry[0]]
+    assert len(strip) > 10
+    for a, b in itertools.combinations(strip, 2):
+        apart = a[2] <= b[1] or b[2] <= a[1] or a[4] <= b[3] or b[4] <= a[3]
+        assert apart, (a, b)
+    assert all(left >= 0.0 and right <= size[0] for _, left, right, _, _ in strip), strip

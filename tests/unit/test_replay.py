@@ -10,8 +10,8 @@ import pytest
 import quad_gym
 from quad_gym.analysis.replay_plots import replay_figure
 from quad_gym.estimation import LOG_COLUMNS, Stream, read_log, replay
-from quad_gym.estimation.player import Player
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
+from quad_gym.params.suites import CONSUMER
 from tests.console_commands import run
 from tests.filter_states import at_rest
 from tests.logged_flights import PX4, RTK, Recorded, errors_in_flight, errors_in_replay, flown
@@ -47,9 +47,6 @@ def compare(recorded, result, settle, boot=0.0):
     return sizes(replayed[shifted > settle]) / sizes(
         errors_in_flight(recorded, k)[shifted > settle]
     )
-
-
-# ---- errors as in flight -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("estimator", ["ukf", "ekf"])
@@ -94,10 +91,8 @@ def test_a_log_of_px4_replays_to_the_errors_of_the_flight(tmp_path):
 
 @pytest.mark.slow  # three flights of 5 s, each replayed
 def test_baselines_added_to_a_px4_log_give_the_attitude(tmp_path):
-    """With the baselines that its messages cannot hold, attitude errors are within 10 %, too.
-
-    From 1 s on, over all flights together; 6 % were seen. Without baselines it is 20 to 50 %.
-    """
+    """With the baselines that its messages cannot hold, attitude errors are within 10 %, too. From
+    1 s on, over all flights together; 6 % were seen. Without baselines it is 20 to 50 %."""
     pytest.importorskip("pyulog")
     R_GI = quad_gym.frames.ecef_to_enu(PX4.gnss.reference_antenna_G).T
     sums = np.zeros(2)
@@ -155,25 +150,6 @@ def test_late_and_unused_measurements_are_counted(table):
     assert np.isfinite(result.position).all()
     result = replay(small(barometer=np.ones(4)), sensors=RTK, start={"heading": 0.0})
     assert result.unused == ("barometer",)
-
-
-def test_memory_of_corrections_does_not_depend_on_stamps(flight):
-    """Fixes 0.1 ms after a sample split the next one: the filter ends with as many corrections."""
-    recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, most_ticks=1)
-    found = []
-    for shift in (0.0, 1e-4):
-        recorded.gnss = [
-            (stamp + shift, received + shift, v) for stamp, received, v in recorded.gnss
-        ]
-        player = Player(read_log(recorded.table()), RTK, "ukf", {}, True, 0.5)
-        player.play()
-        engine = player.filter._engine
-        found.append(engine.read("corrected_variance")[0])
-        assert engine.read("tick")[0] * RTK.imu.dt == pytest.approx(SECONDS, abs=0.02)
-    np.testing.assert_allclose(found[1], found[0], rtol=0.05)
-
-
-# ---- ways to give a log --------------------------------------------------------------------------
 
 
 def test_tables_of_any_kind_are_the_same_log(recorded, table, tmp_path):
@@ -250,9 +226,6 @@ def test_starts_may_be_told(table):
         replay(short, sensors=suite, start={"position": np.zeros(3)})
     with pytest.raises(ValueError, match="keywords of set_state"):
         replay(short, sensors=suite, start={"position": np.zeros(3), "R_BI": np.eye(3)})
-
-
-# ---- what is refused -----------------------------------------------------------------------------
 
 
 def latitude(degrees):
@@ -336,9 +309,6 @@ def test_files_that_are_none_are_refused(tmp_path):
         replay(tmp_path / "broken.ulg", sensors=RTK)
 
 
-# ---- the command ---------------------------------------------------------------------------------
-
-
 def test_command_writes_estimates_and_innovations(recorded, tmp_path):
     pytest.importorskip("matplotlib")
     recorded.write_csv(tmp_path / "flight.csv")
@@ -374,3 +344,15 @@ def test_the_figure_has_a_picture_for_each_sensor(table):
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in figure.axes]
     assert len(titles) == 7
     assert any("features" in title for title in titles)
+
+
+def test_unknown_zero_of_the_barometer_is_its_first_height():
+    """An offset of all heights changes no estimate."""
+    table = Recorded(flown(CONSUMER, 3.0), CONSUMER).table()
+    log = read_log({name: np.asarray(column, float) for name, column in table.items()})
+    coarse, found = np.round(256.0 * log.barometer.values["barometer"]) / 256.0, []
+    for offset in (0.0, 64.0):
+        barometer = dataclasses.replace(log.barometer, values={"barometer": coarse + offset})
+        shifted = dataclasses.replace(log, barometer=barometer, barometer_from_start=True)
+        found.append(replay(shifted, sensors=CONSUMER, start={"heading": 0.3}))
+    np.testing.assert_allclose(found[1].position, found[0].position, atol=1e-9)

@@ -1,68 +1,71 @@
-"""Flights take the memory that their configuration uses, and touch none beyond it."""
+"""Flights take the memory that their configuration uses, and touch nothing beyond it: neither what
+lies beside them nor the parts of a record that they lack."""
 
-import itertools
-
+import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
 import quad_gym.batch.flight_batch as flight_batch
 from quad_gym import Uniform
+from quad_gym.batch import memory
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import FLIGHT_BLOCK, FLIGHT_FIELDS, PARTS, Source, room_of
 from tests.builders import flown_batch
+from tests.golden.flights import cases
 
 EVERYTHING = frozenset(name for name, _ in PARTS)
-
-
-def late(suite):
-    suite = quad_gym.sensor_suite(suite)
-    return suite.replace(gnss=suite.gnss.replace(latency=0.005))
-
-
 TRUTH = {"source": Source.TRUTH, "run_filter": False}
-CHOICES = {
-    "truth": TRUTH,
-    "noisy": TRUTH | {"source": Source.NOISY, "world": "fresh_breeze"},
-    "lab": {"sensors": "lab"},
-    "gated": {"sensors": "rtk"},
-    "late": {"sensors": late("lab")},
-    "late and gated": {"sensors": late("rtk")},
-}
-MORE = {
-    "features": {"randomization": {"features_yaw": Uniform(-1.0, 1.0)}},
-    "ground": {"world": quad_gym.WorldParams(ground=quad_gym.GroundParams())},
-    "plain": {},
-    "trajectory": {"task": quad_gym.TaskParams(kind="trajectory", start="hover")},
-    "drawn": {"randomization": {"mass": Uniform(0.7, 0.8)}},
-    "faults": {"faults": ["rotor_loss"]},
-    "obstacles": {
-        "world": quad_gym.WorldParams(
-            obstacles=(quad_gym.Wall(center_I=(2.0, 0.5, 1.0), shift_I=(0.2, 0.0, 0.0)),),
-            geofence=((-5.0, -5.0, -1.0), (5.0, 5.0, 3.0)),
-        )
-    },
-}
-CASES = {
-    f"{name}, {more}": CHOICES[name] | MORE[more] for name, more in itertools.product(CHOICES, MORE)
-}
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_flights_touch_nothing_beyond_their_room(name, monkeypatch):
+def flown(case, steps=4):
+    """The batch of some flights of a golden case, whose episodes end and begin on the way."""
+    keywords = dict(case)
+    name = f"QuadGym/{keywords.pop('id', 'Circle')}-v0"
+    env = gymnasium.make_vec(name, num_envs=3, duration=0.06, threads=1, **keywords)
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(np.full((3, 4), 0.1))
+    return env.unwrapped.flights.batch
+
+
+@pytest.mark.parametrize("name", cases())
+def test_memory_beside_the_flights_is_neither_written_nor_read(monkeypatch, name):
+    """Room lies between guards of zeros or NaN, which stay as they are and make no difference."""
+    found, size = [], FLIGHT_BLOCK.itemsize // 64 * 64 + 64
+    for filling in (0x00, 0xFF):
+        guards = []
+
+        def guarded_zeros(count, dtype, filling=filling, guards=guards):
+            raw = np.full(count * dtype.itemsize + 2 * size + 64, filling, np.uint8)
+            first = size - (raw.ctypes.data + size) % 64 + 64
+            last = first + count * dtype.itemsize
+            raw[first:last] = 0
+            guards += [raw[:first], raw[last:]]
+            return raw[first:last].view(dtype)
+
+        monkeypatch.setattr(memory, "aligned_zeros", guarded_zeros)
+        found.append(flown(cases()[name]).snapshot().tobytes())
+        assert guards
+        assert all((guard == filling).all() for guard in guards)
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("name", cases())
+def test_parts_that_a_record_lacks_are_neither_written_nor_read(monkeypatch, name):
     """The same flights in full records, of which what there was no room for is filled before."""
-    small = flown_batch(range(11), 60, **CASES[name])
+    small = flown(cases()[name], steps=12)
     kept = set(small.snapshot().dtype.names)
     monkeypatch.setattr(flight_batch, "room_of", lambda used: room_of(EVERYTHING))
     begin = FlightBatch.reset
 
-    def fill_and_reset(batch, **options):
+    def fill_and_reset(batch, *args, **options):
         for field in set(FLIGHT_BLOCK.names) - kept:
             batch._blocks[field] = 7
-        return begin(batch, **options)
+        return begin(batch, *args, **options)
 
     monkeypatch.setattr(FlightBatch, "reset", fill_and_reset)
-    full = flown_batch(range(11), 60, **CASES[name])
+    full = flown(cases()[name], steps=12)
     assert full.snapshot().dtype == FLIGHT_BLOCK
     for field in FLIGHT_BLOCK.names:
         if field in kept:
@@ -85,11 +88,11 @@ def test_what_is_not_used_takes_no_memory():
     def size(**options):
         return FlightBatch(8, threads=1, **options).snapshot().nbytes
 
-    truth = size(**TRUTH)
+    truth, prompt = size(**TRUTH), quad_gym.sensor_suite("rtk").simplified()
     assert truth < 0.5 * size(sensors="lab")
-    prompt = quad_gym.sensor_suite("rtk").simplified()
     assert size(sensors="lab") < size(sensors=prompt) < size(sensors="rtk")
-    assert truth < size(**TRUTH | MORE["drawn"]) < size(**TRUTH | MORE["faults"])
+    drawn = size(**TRUTH, randomization={"mass": Uniform(0.7, 0.8)})
+    assert truth < drawn < size(**TRUTH, faults=["rotor_loss"])
 
 
 def test_fields_without_room_read_as_nothing():

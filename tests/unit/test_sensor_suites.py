@@ -17,9 +17,6 @@ FIELD = [name for name in SUITES if name != "lab"]
 RTK, CONSUMER = (quad_gym.sensor_suite(name).simplified() for name in ("rtk", "consumer"))
 
 
-# ---- the start ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suite", FIELD)
 def test_errors_at_a_level_start_are_as_claimed(suite):
     """All 15 together: the position depends on the attitude: the antenna's is measured."""
@@ -40,9 +37,6 @@ def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
     nis = np.concatenate(squares)
     assert len(nis) > 3000
     assert ALARM < stats.chi2.cdf(nis.sum(), 3 * len(nis)) < 1.0 - ALARM
-
-
-# ---- rates and phases ------------------------------------------------------------------------
 
 
 def ticks_of_fixes(suite, count, ticks):
@@ -79,9 +73,6 @@ def test_random_phases_are_uniform_and_new_in_each_episode():
     assert stats.chisquare(counts).pvalue > ALARM
 
 
-# ---- GNSS whose error drifts -----------------------------------------------------------------
-
-
 def test_the_slow_error_grows_as_a_gauss_markov_process():
     gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=2.0, phase=0.0)
     batch = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover")
@@ -97,16 +88,6 @@ def test_the_slow_error_grows_as_a_gauss_markov_process():
     assert_normal(np.hstack([early, late]), np.zeros(6), covariance)
 
 
-def test_drift_grows_until_the_first_fix():
-    """Half a period here; 4,000 flights tell a deviation to 3 %."""
-    gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.6, 0.6), phase=0.5)
-    batch = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover")
-    for after in (0.05, 0.15):
-        steps(batch, 0.05 if after < 0.1 else 0.1)
-        expected = 0.6 * np.sqrt(-np.expm1(-2.0 * after / 60.0))
-        np.testing.assert_allclose(batch.record("gnss_drift").std(axis=0), expected, rtol=0.06)
-
-
 def test_a_receiver_measures_white_noise_and_the_slow_error():
     gnss = CONSUMER.gnss.replace(drift_tau=1.0)
     receiver = GnssReceiver(gnss, np.random.default_rng(5))
@@ -117,9 +98,6 @@ def test_a_receiver_measures_white_noise_and_the_slow_error():
     np.testing.assert_allclose(errors[100:].std(axis=0), expected, rtol=0.1)
     lag = (errors[100:-10] * errors[110:]).mean(axis=0)  # a second later the white part is gone
     np.testing.assert_allclose(lag, np.square(gnss.drift_sigma_I) * np.exp(-1.0), rtol=0.3)
-
-
-# ---- velocity --------------------------------------------------------------------------------
 
 
 def test_gnss_velocity_is_that_of_the_antenna_with_its_noise():
@@ -149,9 +127,6 @@ def test_velocity_is_measured_by_suites_that_have_it_only():
         CONSUMER.with_rates(camera=25.0)
 
 
-# ---- flying without GNSS ---------------------------------------------------------------------
-
-
 def test_indoor_filter_starts_from_its_mark_without_fixes():
     batch = fly("indoor", 2000, task="hover")
     off = batch.record("r_hat") - batch.record("r")
@@ -179,9 +154,6 @@ def test_velocity_is_observed_together_with_the_position():
     assert fixes == 5
     without = quad_gym.QuadEnv("hover", observation="measurements", sensors="lab")
     assert "gnss_velocity" not in {field.name for field in without.flights.table}
-
-
-# ---- sensors that are not what the filter believes -------------------------------------------
 
 
 def test_errors_of_the_start_are_those_of_the_true_sensors():
@@ -231,9 +203,6 @@ def test_fixes_come_from_the_true_antenna_with_its_true_noise():
     angles = np.linalg.norm(np.cross(measured, baseline), axis=1) / size**2
     rayleigh = np.sqrt(np.pi / 2) * RTK.gnss.baseline_sigma
     np.testing.assert_allclose(angles.mean(), rayleigh, rtol=0.05)
-
-
-# ---- what real sensors do ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["rtk", "consumer", "indoor"])

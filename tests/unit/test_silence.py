@@ -97,23 +97,9 @@ def test_jump_of_gnss_does_not_go_undetected_without_a_gate():
     assert share_silent(batch, times=8, every=0.5) <= 0.01
 
 
-def test_corrections_of_the_drift_have_their_variance():
-    """Their sums over a second in deviations, 3 x 256 of them, are standard normal."""
-    batch = fly(quad_gym.sensor_suite("consumer"), 256, start="hover", filter_start="warm")
-    steps(batch, 5.0)
-    scaled = batch.record("drift_corrected") / np.sqrt(batch.record("drift_corrected_variance"))
-    assert 0.85 < (scaled**2).mean() < 1.15  # 2.9 deviations of the mean of so many
-    # what drives the drift, 2 sigma^2/T in a second, adds up with weights exp(-2 t/1.5 s)
-    driven = 0.6 * math.sqrt(2.0 / 60.0 * 1.5 / 2.0)
-    level = np.sqrt(batch.record("drift_corrected_variance"))[:, :2]
-    assert np.median(level) == pytest.approx(driven, rel=0.05)
-
-
 def test_few_jumps_of_the_vehicle_go_undetected():
-    """Some six of a hundred were, as their doubts fell short of the jump; 0.75 % are.
-
-    Of 320 flights more than eight are so with a probability of 1e-3 then.
-    """
+    """Some six of a hundred were, as their doubts fell short of the jump; 0.75 % are. Of 320
+    flights more than eight are so with a probability of 1e-3 then."""
     fault = PositionJump(start=1.0, size=(1.0, 2.0))
     batch = fly(quad_gym.sensor_suite("consumer"), 320, filter_start="warm", faults=fault)
     steps(batch, 8.0)
@@ -196,9 +182,7 @@ def test_rejected_fixes_raise_nothing_while_the_camera_fits(fits):
 
 def test_doubts_of_rejections_do_not_add_up():
     """Velocities ever farther off along x, each rejected for the last time; along y they are not.
-
-    The variance of what is doubted becomes that of the largest innovation, not the sum of all.
-    """
+    The variance of what is doubted becomes that of the largest innovation, not the sum of all."""
     ukf = started(np.repeat([0.1, 0.05, 0.02, 0.05, 0.005], 3))
     off = np.array([5.0, 1.0, 0.0])
     for _ in range(6):

@@ -13,7 +13,6 @@ from quad_gym.records import (
     FLIGHT,
     POSITION_BLOCK,
     RESULTS,
-    Autoreset,
     Control,
     Source,
 )
@@ -81,21 +80,6 @@ def test_every_field_is_readable_as_a_copy(hundred):
         hundred.record("altitude")
 
 
-def test_the_covariance_is_that_of_the_factor(hundred):
-    P, L = hundred.covariance(), hundred.record("L")
-    assert P.shape == (100, 15, 15)
-    np.testing.assert_allclose(P[42], L[42] @ L[42].T, rtol=1e-13, atol=1e-25)
-    assert (np.linalg.eigvalsh(P)[:, 0] > 0.0).all()
-    assert (np.triu(L, k=1) == 0.0).all()
-
-
-def test_results_are_those_of_the_records(hundred):
-    for name in ("position_error", "estimation_error", "reward"):
-        np.testing.assert_array_equal(hundred.result(name), hundred.record(name))
-    gap = np.linalg.norm(hundred.record("r_hat") - hundred.record("r"), axis=1)
-    np.testing.assert_allclose(hundred.result("estimation_error"), gap, rtol=1e-12)
-
-
 def test_four_thousand_flights_fit_in_two_hundred_megabytes():
     tracemalloc.start()
     try:
@@ -107,19 +91,6 @@ def test_four_thousand_flights_fit_in_two_hundred_megabytes():
         tracemalloc.stop()
     assert peak < 200e6
     assert batch.snapshot().nbytes < 100e6
-
-
-def test_step_after_the_time_limit_begins_another_episode():
-    task = TaskParams(duration=0.05, out_of_bounds=100.0)
-    batch = new_batch(9, task=task, autoreset=Autoreset.NEXT_STEP)
-    batch.reset(seeds=list(range(9)))
-    for k in range(1, 11):
-        batch.step()
-        np.testing.assert_array_equal(batch.result("truncated"), float(k == 10))
-    batch.step()
-    np.testing.assert_array_equal(batch.record("tick"), 0.0)
-    np.testing.assert_array_equal(batch.record("episode"), 2.0)
-    np.testing.assert_array_equal(batch.result("truncated"), 0.0)
 
 
 def test_sensors_that_are_switched_off_measure_nothing():

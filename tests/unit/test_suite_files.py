@@ -70,7 +70,6 @@ def test_a_base_gives_what_the_file_leaves_out(tmp_path):
         gnss=base.gnss.replace(velocity_sigma=0.4, primary_antenna_B=(0.0, 0.0, 0.1)),
         imu=base.imu.replace(rate=100.0),
     )
-
     lacked = read(tmp_path, 'base = "rtk"\n[barometer]\nnoise_sigma = 0.3').barometer
     assert lacked == quad_gym.BarometerParams(noise_sigma=0.3)
 

@@ -1,9 +1,7 @@
 """Helper threads of a batch: the same flights, awake or asleep, copied, forked and dismissed."""
 
-import copy
 import gc
 import multiprocessing
-import pickle
 import threading
 import time
 
@@ -49,14 +47,6 @@ def test_two_batches_take_turns():
         one.step(actions)
         other.step(actions)
     assert one.snapshot().tobytes() == other.snapshot().tobytes() == flown(batch_of(1))
-
-
-@pytest.mark.parametrize("twin", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
-def test_a_copy_has_threads_of_its_own(twin):
-    one = batch_of(2)
-    flown(one, 3)
-    other = twin(one)
-    assert flown(one) == flown(other)
 
 
 def child(parent, pipe):

@@ -18,9 +18,6 @@ def random_points(n, seed=0):
     return rng.normal(size=(n, 3)) * 2.0, np.cumsum(rng.uniform(0.5, 2.0, n + 1)) - 0.5
 
 
-# ---- the minimum, by a quadratic program of its own ------------------------------------------
-
-
 def row(order, x, length, degree):
     """A derivative at x in [-1, 1] of the Legendre series of a segment, as a row."""
     basis = legendre.legder(np.eye(degree + 1), order) if order else np.eye(degree + 1)
@@ -28,11 +25,9 @@ def row(order, x, length, degree):
 
 
 def minimum(points, times, order, closed, at_rest, degree=9):
-    """Positions halfway and at a third, by the KKT system of min c'Qc under Ac = b.
-
-    The basis is larger than the minimum needs, and continuity is asked for below `order` alone: the
-    rest is the minimum's own doing.
-    """
+    """Positions halfway and at a third, by the KKT system of min c'Qc under Ac = b. The basis is
+    larger than the minimum needs, and continuity is asked for below `order` alone: the rest is the
+    minimum's own doing."""
     lengths = np.diff(times)
     m, n = len(lengths), degree + 1
     x, weights = legendre.leggauss(12)
@@ -118,9 +113,6 @@ def test_it_stands_still_beyond_its_ends_or_repeats():
     assert around(np.zeros((2, 5)), 2).shape == (2, 5, 3)
 
 
-# ---- the choice of times ---------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("bounds", [(2.5, 3.0), (2.0, 50.0), (50.0, 4.0)])
 @pytest.mark.parametrize("minimize", ["snap", "jerk"])
@@ -147,19 +139,6 @@ def test_chosen_times_are_better_than_those_by_distance():
         speed, acceleration = (np.linalg.norm(plain(t, k), axis=1).max() for k in (1, 2))
         needed = plain.duration * max(speed / 2.5, np.sqrt(acceleration / 3.0))
         assert path.duration < 0.999 * needed
-
-
-def test_two_points_are_the_known_polynomial():
-    """From rest to rest: the minimum-snap polynomial 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7."""
-    path = Trajectory.through([(0, 0, 1), (2, 0, 1)], [0.0, 3.0])
-    s = np.linspace(0.0, 1.0, 50)
-    expected = 2.0 * (35 * s**4 - 84 * s**5 + 70 * s**6 - 20 * s**7)
-    np.testing.assert_allclose(path(3.0 * s)[:, 0], expected, rtol=0.0, atol=1e-12)
-    fast = Trajectory.through([(0, 0, 1), (2, 0, 1)], max_speed=1.0, max_acceleration=1e3)
-    assert fast.duration == pytest.approx(2.0 * 35 / 16, rel=1e-6)  # its largest slope
-
-
-# ---- headings --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -195,9 +174,6 @@ def test_a_heading_along_the_path_is_held_at_rest():
     assert straight.yaw([-1.0, 0.0, 1.0, 99.0]) == pytest.approx(np.pi / 2)
 
 
-# ---- functions -------------------------------------------------------------------------------
-
-
 def eight(t):
     return 3.0 * np.sin(t), 1.5 * np.sin(2.0 * t), 1.5 + 0.3 * np.cos(t)
 
@@ -224,9 +200,6 @@ def test_a_function_is_met_with_its_derivatives(closed):
     np.testing.assert_allclose(path.yaw(t), t, rtol=0.0, atol=1e-6)
     finer = Trajectory.of(eight, 2.0 * np.pi, closed=closed, tolerance=1e-9)
     np.testing.assert_allclose(finer(t), np.transpose(eight(t)), rtol=0.0, atol=2e-9)
-
-
-# ---- tables ----------------------------------------------------------------------------------
 
 
 def test_a_table_is_passed_at_its_times(tmp_path):
@@ -267,9 +240,6 @@ def test_bad_tables_are_refused(tmp_path, text, message):
     file.write_text(text)
     with pytest.raises(ValueError, match=message):
         Trajectory.from_csv(file)
-
-
-# ---- bad input -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -342,9 +312,6 @@ def test_bad_coefficients_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             path(**options)
-
-
-# ---- as values -------------------------------------------------------------------------------
 
 
 def test_trajectories_are_values():

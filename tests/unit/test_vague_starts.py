@@ -8,7 +8,6 @@ import pytest
 import quad_gym
 from quad_gym import Normal, Uniform
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.filter import update
 from quad_gym.records import Source
 from tests.field_flights import fly, steps
 from tests.vague_starts import (
@@ -121,20 +120,3 @@ def test_coarse_baselines_leave_the_filter_consistent():
         means = mean_nees(with_baseline("standard", 0.3), (0.2, 0.5))
     for found in means:
         assert BAND[0] < found < BAND[1]
-
-
-def test_flight_in_few_steps_does_not_depend_on_others():
-    suite = with_mark("indoor", heading_sigma=0.25, position_sigma=0.5)
-    batch = fly(suite, 16)
-    steps(batch, 0.3)
-    for number in (0, 5, 11):
-        alone = fly(suite, 1, seed=number)
-        steps(alone, 0.3)
-        for name in ("L", "r_hat", "R_hat"):
-            np.testing.assert_array_equal(alone.record(name)[0], batch.record(name)[number])
-
-
-def test_information_of_the_steps_of_an_image_adds_up_to_one():
-    few = (update._FIRST_OF_FEW, *update._FACTORS[update._FEW + 1 :])
-    for factors in (update._FACTORS, few):
-        assert sum(1.0 / factor for factor in factors) == pytest.approx(1.0, rel=1e-12)

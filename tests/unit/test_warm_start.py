@@ -46,7 +46,7 @@ def estimated_biases(batch):
 
 
 @pytest.mark.parametrize("name", SUITES)
-@pytest.mark.parametrize("start", ["hover", "ground"])
+@pytest.mark.parametrize("start", ["hover", "ground", "moving"])
 def test_whitened_errors_of_the_start_are_standard_normal(name, start):
     batch = fly(unmeasured(name), 4000, filter_start="warm", start=start)
     assert_normal(whitened_errors(batch), np.zeros(15), np.eye(15))
@@ -57,7 +57,6 @@ def test_covariance_of_a_start_turns_with_the_vehicle():
     suite = unmeasured("lab")  # whose camera has two features ahead: uneven in the horizontal
     batch = fly(suite, 4000, task="hover", filter_start="warm", randomization=anywhere)
     assert_normal(whitened_errors(batch), np.zeros(15), np.eye(15))
-
     ahead = attitudes(batch.record("q"))[:, 0]
     azimuth = np.arctan2(ahead[:, 1], ahead[:, 0])
     assert azimuth.min() < -3.0 < 3.0 < azimuth.max()
@@ -92,11 +91,9 @@ def test_the_estimated_biases_are_independent_of_their_errors(name):
 
 @pytest.mark.parametrize("name", SUITES)
 def test_covariance_is_that_of_a_filter_that_has_run_as_long(name):
-    """Of other flights, under another controller.
-
-    Simplified: a heading with a constant error is known better after the moves of a flight than
-    after hovering. So is hard iron, and with the heading tilt and level accelerometer bias.
-    """
+    """Of other flights, under another controller. Simplified: a heading with a constant error is
+    known better after the moves of a flight than after hovering. So is hard iron, and with the
+    heading tilt and level accelerometer bias."""
     suite = quad_gym.sensor_suite(name).simplified()
     cold = fly(suite, 40, task="hover")
     steps(cold, WARM_UP)

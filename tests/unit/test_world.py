@@ -59,9 +59,6 @@ def test_the_derivative_is_that_of_the_printed_forces(params):
             np.testing.assert_allclose(got[name], value, rtol=0.0, atol=1e-12 * scale, err_msg=name)
 
 
-# ---- flights in moving air -----------------------------------------------------------------------
-
-
 def motors_only(world, *, vehicle=LAB, voltage=0.0, speed=0.0, velocity=(0, 0, 0), yaw=0.0, **more):
     """One vehicle, level, at a steady voltage; nothing ends its episode."""
     far = {"duration": 0.0, "out_of_bounds": 1e9, "min_height": -1e9}
@@ -135,9 +132,6 @@ def test_the_accelerometer_feels_what_the_air_does():
         np.testing.assert_allclose(batch.record("gyro")[i], w, atol=1e-12)
 
 
-# ---- battery -------------------------------------------------------------------------------------
-
-
 def battery_law(charge, speeds, battery, vehicle=LAB):
     """U from U = U0 - R P / U, the larger root, or less where V I is all that there is."""
     torque = vehicle.torque_coefficient * speeds**2 / battery.motor_efficiency
@@ -198,9 +192,6 @@ def test_true_vehicles_largest_voltage_holds():
     batch, _ = motors_only("calm", true_vehicle=weak)
     batch.step(np.ones((1, 4)))
     np.testing.assert_array_equal(batch.record("voltages"), 4.0)
-
-
-# ---- off is off ----------------------------------------------------------------------------------
 
 
 def test_a_calm_world_flies_the_same_bits():

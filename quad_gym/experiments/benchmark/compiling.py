@@ -52,6 +52,7 @@ def seconds_of(folder: Path, before: str, options: str, after: str = "") -> floa
     code = CIRCLE.format(before=before, envs=ENVS, options=options, after=after)
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     environment.pop("NUMBA_CACHE_DIR", None)  # the cache is beside the kernels
+    environment["QUAD_GYM_KERNELS"] = "numba"
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=folder,

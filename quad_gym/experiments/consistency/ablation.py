@@ -13,7 +13,6 @@ from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.reports import text_table
 from quad_gym.experiments.benchmark.timing import by_turns, lasting
 from quad_gym.experiments.consistency.cases import Case, CaseFlights, CaseResults, fly
-from quad_gym.params.checks import Vector
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.vehicle import vehicle_params
@@ -58,38 +57,28 @@ def _sensors(suite: SensorSuite) -> dict[str, SensorSuite]:
     """True sensors that differ from the filter's model."""
     imu, gnss, camera = suite.imu, suite.gnss, suite.camera
     found = {
-        "IMU noise doubled": _scaled(imu, 2.0, "accel_noise_density", "gyro_noise_density"),
-        "IMU biases tripled": _scaled(imu, 3.0, "accel_bias_sigma", "gyro_bias_sigma"),
-        "IMU displaced by 5 cm": _moved(imu, (0.05, 0.0, 0.0), "lever_arm_B"),
+        "IMU noise doubled": _off(imu, "accel_noise_density", "gyro_noise_density", scale=2.0),
+        "IMU biases tripled": _off(imu, "accel_bias_sigma", "gyro_bias_sigma", scale=3.0),
+        "IMU displaced by 5 cm": _off(imu, "lever_arm_B", by=(0.05, 0.0, 0.0)),
     }
     if gnss is not None:
         sigmas = ("position_sigma_I", "baseline_sigma", "velocity_sigma")
         antennas = ("primary_antenna_B", "secondary_antenna_B")
-        found["GNSS noise doubled"] = _scaled(gnss, 2.0, *sigmas)
-        found["antennas displaced by 2 cm"] = _moved(gnss, (0.0, 0.02, 0.0), *antennas)
+        found["GNSS noise doubled"] = _off(gnss, *sigmas, scale=2.0)
+        found["antennas displaced by 2 cm"] = _off(gnss, *antennas, by=(0.0, 0.02, 0.0))
     if camera is not None:
         turn = (0.0, 0.0, math.radians(0.5))
-        found["pixel noise doubled"] = _scaled(camera, 2.0, "pixel_sigma")
-        found["camera turned by 0.5 degrees"] = _moved(camera, turn, "attitude")
+        found["pixel noise doubled"] = _off(camera, "pixel_sigma", scale=2.0)
+        found["camera turned by 0.5 degrees"] = _off(camera, "attitude", by=turn)
     kinds = {type(imu): "imu", type(gnss): "gnss", type(camera): "camera"}
     return {name: suite.replace(**{kinds[type(p)]: p}) for name, p in found.items()}
 
 
-def _scaled(params: Any, factor: float, *names: str) -> Any:
-    """Parameters of a sensor with some multiplied by a factor, as far as they are given."""
-    given = {k: getattr(params, k) for k in names if getattr(params, k) is not None}
-    return params.replace(
-        **{
-            k: tuple((factor * np.array(v)).tolist()) if np.ndim(v) else factor * v
-            for k, v in given.items()
-        }
-    )
-
-
-def _moved(params: Any, by: Vector, *names: str) -> Any:
-    """Parameters of a sensor with a vector added to some, as far as they are given."""
-    given = {k: getattr(params, k) for k in names if getattr(params, k) is not None}
-    return params.replace(**{k: tuple(np.add(v, by).tolist()) for k, v in given.items()})
+def _off(params: Any, *names: str, scale: float = 1.0, by: Any = 0.0) -> Any:
+    """Parameters of a sensor with some scaled and moved, as far as they are given."""
+    given = {name: getattr(params, name) for name in names}
+    changed = {k: (scale * np.array(v) + by).tolist() for k, v in given.items() if v is not None}
+    return params.replace(**changed)
 
 
 def _filters(suite: SensorSuite) -> Iterator[Fields]:
@@ -103,13 +92,10 @@ def _filters(suite: SensorSuite) -> Iterator[Fields]:
     }
     if suite.camera is not None:
         forms["UKF, no recursive image update"] = {"recursive_update_threshold": None}
-        across = "UKF, bearing noise at the measured direction"
-        forms[across] = {"bearing_noise_at": "measured"}
-    forms["UKF, the report's initialization"] = {
-        "initial_tilt_sigma": None,
-        "initial_covariance_scale": 2.0,
-        "reuse_first_fix": True,
-    }
+        across = {"bearing_noise_at": "measured"}
+        forms["UKF, bearing noise at the measured direction"] = across
+    start = {"initial_tilt_sigma": None, "initial_covariance_scale": 2.0, "reuse_first_fix": True}
+    forms["UKF, the report's initialization"] = start
     for name, changes in forms.items():
         imu = sampled if "integration" in changes else suite.imu
         yield name, suite.replace(imu=imu, estimator=suite.estimator.replace(**changes)), {}

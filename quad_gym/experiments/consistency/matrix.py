@@ -62,13 +62,8 @@ def _late(suite: SensorSuite, periods: int) -> SensorSuite:
     """Suite with latencies of some periods of each sensor."""
     aids = {aid.name.lower(): params for aid, params in suite.aids.items()}
     sensors = {"gnss": suite.gnss, "camera": suite.camera, **aids}
-    return suite.replace(
-        **{
-            name: params.replace(latency=periods / params.rate)
-            for name, params in sensors.items()
-            if params is not None
-        }
-    )
+    given = {name: params for name, params in sensors.items() if params is not None}
+    return suite.replace(**{k: p.replace(latency=periods / p.rate) for k, p in given.items()})
 
 
 def _draws(suite: SensorSuite) -> dict[str, Any]:
@@ -96,24 +91,19 @@ def _conditions(name: str) -> Iterator[dict[str, Any]]:
     """Arguments of `case_of` for the conditions of a suite."""
     suite = sensor_suite(name)
     for fault, parts in PRESETS.items():
-        if not parts or any(getattr(part, "duration", math.inf) == math.inf for part in parts):
-            continue  # it does not end
-        if not possible(fault, suite):
-            continue
-        corrupted = "corrupted measurements" if fault == "gnss_jump" else ""
-        yield {"condition": fault, "wrong": corrupted, "faults": fault}
+        ends = parts and all(getattr(part, "duration", math.inf) != math.inf for part in parts)
+        if ends and possible(fault, suite):
+            corrupted = "corrupted measurements" if fault == "gnss_jump" else ""
+            yield {"condition": fault, "wrong": corrupted, "faults": fault}
     for periods, text in enumerate(("no latency", "one period late", "two periods late")):
         yield {"condition": text, "sensors": _late(suite, periods)}
     arm = suite.replace(imu=suite.imu.replace(lever_arm_B=_LEVER_ARM))
     yield {"condition": "lever arm", "sensors": arm}
     for drawn, draws in (("mounting", _mounting(suite)), ("noise and mass", _draws(suite))):
-        known, unknown = Randomization(draws, known=True), Randomization(draws)
-        yield {"condition": f"{drawn} drawn, known", "randomization": known}
-        yield {
-            "condition": f"{drawn} drawn, unknown",
-            "wrong": f"unknown {drawn}",
-            "randomization": unknown,
-        }
+        for word, wrong in (("known", ""), ("unknown", f"unknown {drawn}")):
+            randomization = Randomization(draws, known=not wrong)
+            condition = f"{drawn} drawn, {word}"
+            yield {"condition": condition, "wrong": wrong, "randomization": randomization}
     starts = {name: Uniform(-0.1, 0.1) for name in ("start_roll", "start_pitch", "start_yaw")}
     starts["start_velocity_I"] = Uniform(-0.5, 0.5)
     yield {"condition": "start drawn", "randomization": Randomization(starts)}

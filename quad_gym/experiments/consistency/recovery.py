@@ -85,7 +85,11 @@ def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:
     batch = case.batch(flights.count, flights.threads)
     duration = end_of(faults) + RECOVERY_TIME if faults else CALM_DURATION
     found = follow_recovery(batch, seeds=flights.seeds, duration=duration)
-    values = _after_faults(found, end_of(faults), duration) if faults else _without_faults(found)
+    flagged = 100.0 * found.flagged.mean()
+    calm = (found.alarms() / found.hours, flagged, found.hours)
+    values: dict[str, float] = dict(zip(CALM_COLUMNS, calm, strict=True))
+    if faults:
+        values = _after_faults(found, end_of(faults), duration)
     undetected = values.get("undetected", 0.0)
     return {
         "values": values,
@@ -112,28 +116,15 @@ def _after_faults(found: Recovery, fault_end: float, end: float) -> dict[str, fl
     }
 
 
-def _without_faults(found: Recovery) -> dict[str, float]:
-    """Values of `CALM_COLUMNS`."""
-    return {
-        "alarms_per_hour": found.alarms() / found.hours,
-        "flagged": 100.0 * found.flagged.mean(),
-        "hours": found.hours,
-    }
-
-
 def table_of(cells: CaseResults, flights: CaseFlights) -> str:
     """Format two tables in Markdown: after faults, and without faults."""
     after = f"{flights.count} flights each, on random trajectories, warm start."
     calm = f"Without a fault, {flights.count} flights of {CALM_DURATION:g} s each."
     tables = {after: ("suite, fault", COLUMNS), calm: ("suite, task", CALM_COLUMNS)}
-    parts = []
+    parts, text = [], "{:.1f}".format
     for title, (first, columns) in tables.items():
         chosen = {k: cell for k, cell in cells.items() if cell["values"].keys() == columns.keys()}
         if chosen:
-            parts.append("\n".join([title, "", *case_table(first, columns, chosen, _text)]))
+            parts.append("\n".join([title, "", *case_table(first, columns, chosen, text)]))
     end = "**Bold**: more than 1 % undetected failures. *Italics*: the same, expected."
     return "\n\n".join([*parts, end]) + "\n"
-
-
-def _text(value: float) -> str:
-    return f"{value:.1f}"

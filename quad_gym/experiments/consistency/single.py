@@ -84,11 +84,8 @@ def _table(quantity: str, parts: dict[str, MeanSquare]) -> str:
     """Format mean squares for the screen."""
     rows = [
         (
-            part.name,
-            f"{part.overall:.2f}",
-            f"{part.mean[-1]:.2f}",
-            f"{part.low[-1]:.2f} to {part.high[-1]:.2f}",
-            f"{100 * part.share_inside:.0f}%",
+            *(part.name, f"{part.overall:.2f}", f"{part.mean[-1]:.2f}"),
+            *(f"{part.low[-1]:.2f} to {part.high[-1]:.2f}", f"{100 * part.share_inside:.0f}%"),
         )
         for part in parts.values()
     ]

@@ -24,9 +24,10 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from quad_gym.kernels.digest import digest_of_function
+from quad_gym.kernels.library import say
 from quad_gym.records import WIDTH
 
-_FORM = 4
+_FORM = 5
 """Version of the files' contents and of the compilation; after a change, no older file is found."""
 KEPT = 8
 """Number of files kept for a function: the latest for other sources, processors or signatures."""
@@ -35,12 +36,6 @@ _LOCATORS = (
     caching.InTreeCacheLocator,  # __pycache__ next to the kernels
     caching.UserWideCacheLocator,  # the user's cache folder, where the package is read-only
 )
-
-
-def say(text: str, end: str = "\n") -> None:
-    """Write a line to standard error, if there is one."""
-    if sys.stderr is not None:
-        print(text, file=sys.stderr, end=end, flush=True)
 
 
 def where_cached(*folders: Path | None) -> str:
@@ -80,11 +75,9 @@ def _written(arguments: tuple[Any, ...]) -> str:
 
 def _compiler(context: Any) -> str:
     """The compiler, its options, and the processor that it compiles for."""
-    from quad_gym.kernels.compiling.decorators import LEAN
-
     options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
     versions = f"{numba.__version__} {llvmlite.__version__}"
-    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {LEAN} {WIDTH} {options}"
+    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {WIDTH} {options}"
 
 
 def _needed(module: Any) -> tuple[str, ...]:

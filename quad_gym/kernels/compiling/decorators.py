@@ -5,7 +5,6 @@ No fast-math flag is set: multiply-adds are fused only where numbers are lowered
 """
 
 import functools
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -13,34 +12,19 @@ import numba
 from numba.core.registry import CPUDispatcher
 
 from quad_gym.kernels.compiling.cache import CodeCache
+from quad_gym.kernels.compiling.linking import EntryCompiler, KernelCompiler, KernelDispatcher
 
 _OPTIONS: dict[str, Any] = {"nopython": True, "boundscheck": None, "error_model": "numpy"}
-
-try:
-    if os.environ.get("QUAD_GYM_ORDINARY_NUMBA"):  # for tests of the fallback
-        raise ImportError
-    from quad_gym.kernels.compiling.linking import (
-        EntryCompiler,
-        KernelCompiler,
-        KernelDispatcher,
-    )
-except (ImportError, AttributeError):  # another Numba: slower to compile, the same flights
-    LEAN = False
-else:
-    LEAN = True
-"""Whether kernels stay IR until an entry links them."""
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile `function` as part of the code that calls it, inlined: for small functions."""
-    if LEAN:
-        return _kernel(function, forceinline=True)
-    return numba.njit(forceinline=True, error_model="numpy")(function)
+    return _kernel(function, forceinline=True)
 
 
 def routine(function: Callable[..., Any]) -> Any:
     """Compile `function` as part of the code that calls it, out of line: for large functions."""
-    return _kernel(function) if LEAN else numba.njit(error_model="numpy")(function)
+    return _kernel(function)
 
 
 def _kernel(function: Callable[..., Any], **options: Any) -> Any:
@@ -76,8 +60,8 @@ def entry(function: Callable[..., Any] | None = None, signature: Any = None) -> 
     """
     if function is None:
         return functools.partial(entry, signature=signature)
-    lean = {"pipeline_class": EntryCompiler} if LEAN else {}
-    dispatcher = EntryDispatcher(py_func=function, targetoptions=_OPTIONS | {"nogil": True}, **lean)
+    options = _OPTIONS | {"nogil": True}
+    dispatcher = EntryDispatcher(function, targetoptions=options, pipeline_class=EntryCompiler)
     dispatcher._cache = CodeCache(function)
     dispatcher.signature = signature
     return dispatcher

@@ -19,17 +19,14 @@ from numba.core.registry import cpu_target
 
 from quad_gym.kernels.compiling.linking import EntryLibrary, compiler_with
 from quad_gym.kernels.compiling.workers import dispatcher_of
+from quad_gym.kernels.library import core_symbol
 
 _OPTIONS = {"nopython": True, "boundscheck": None, "error_model": "numpy", "nogil": True}
 _KEPT = 8
 """Number of cached files of a kind for a function."""
 _FORM = 2
 """Version of the emission; after a change, no older object is found."""
-_LIBRARY = re.compile(
-    r"sin|cos|sqrt|"
-    r"llvm\.(sin|cos|sqrt|fma|fabs|copysign|floor|rint|roundeven|fsh[lr]|[su](min|max)|abs|ctpop|"
-    r"mem(cpy|set|move)|lifetime|assume|experimental|vector|is)\b.*"
-)
+_LIBRARY = re.compile(r"sin|cos|sqrt|llvm\..*")
 """Functions that emitted code may call: LLVM's, and those of a C library."""
 
 
@@ -43,6 +40,8 @@ class Processor(NamedTuple):
     triple: str
     cpu: str
     reloc: str = "pic"
+    level: int = 2
+    """level of optimization; 3 gives larger code"""
 
 
 class _ForeignLibrary(EntryLibrary):
@@ -77,11 +76,6 @@ class _ForeignLowering(typed_passes.NativeLowering):  # type: ignore[misc]
 
 
 _ForeignCompiler = compiler_with(_ForeignLowering)
-
-
-def symbol_of(name: str) -> str:
-    """Return the name of an entry's function in its object."""
-    return f"qg_core_{name.partition(':')[2]}"
 
 
 def is_cached(name: str, processor: Processor) -> bool:
@@ -161,7 +155,7 @@ def _linked(name: str) -> str:
     module = result.library._final_module
     for function in module.functions:
         if function.name == result.fndesc.llvm_func_name:
-            function.name = symbol_of(name)
+            function.name = core_symbol(name)
         elif not function.is_declaration:
             function.linkage = llvm.Linkage.internal
     return _without_python(str(module))
@@ -177,13 +171,15 @@ def emitted(text: str, processor: Processor) -> bytes:
     llvm.initialize_all_asmprinters()
     machine = llvm.Target.from_triple(processor.triple).create_target_machine(
         cpu=processor.cpu,
-        opt=2,
+        opt=processor.level,
         reloc=processor.reloc,
         codemodel="small",
     )
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = processor.triple, str(machine.target_data)
-    builder = llvm.create_pass_builder(machine, llvm.PipelineTuningOptions(speed_level=2))
+    builder = llvm.create_pass_builder(
+        machine, llvm.PipelineTuningOptions(speed_level=processor.level)
+    )
     builder.getModulePassManager().run(module, builder)
     missing = [
         function.name

@@ -8,9 +8,6 @@ calls, links each kernel that it reaches once, and is the only kind that is opti
 
 A kernel's code therefore exists inside entries only, as a symbol that is internal to the entry's
 module: a large kernel can be out of line without a second copy for other callers.
-
-Where Numba lacks the internals that this file needs, importing it fails, and `decorators.py` uses
-ordinary `numba.njit`: slower to compile, the same flights.
 """
 
 from typing import Any

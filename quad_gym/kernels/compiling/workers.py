@@ -21,8 +21,9 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from quad_gym.kernels.compiling.cache import CodeCache, locked, say, where_cached
+from quad_gym.kernels.compiling.cache import CodeCache, locked, where_cached
 from quad_gym.kernels.cores import available_cores
+from quad_gym.kernels.library import say
 
 MOST_WORKERS = 8
 _START = (

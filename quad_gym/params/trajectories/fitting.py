@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.trajectories.headings import heading_choice
-from quad_gym.params.trajectories.splines import polynomials
+from quad_gym.params.trajectories.splines import heading_choice, polynomials
 
 if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory
@@ -72,7 +71,12 @@ def fit(
         raise ValueError("yaw must be a number, 'along' or a function of time, got an array")
     _check_derivatives(given, span)
     if closed:
-        _check_return(function, span, limit)
+        begin, end = _called("function", function, [0.0, span], 3)
+        if np.abs(end - begin).max() > limit:
+            raise ValueError(
+                f"function must return to its start where closed=True, got {begin} at 0 s and "
+                f"{end} at {span:g} s"
+            )
     turns = 0.0
     if callable(angles) and closed:
         whole = _called("yaw", angles, [0.0, span], 1)[:, 0]
@@ -141,8 +145,7 @@ def _spline(times: Floats, values: Floats, closed: bool) -> Any:
 
     if closed:
         values = np.concatenate([values[:-1], values[:1]])
-        return make_interp_spline(times, values, k=7, bc_type="periodic")
-    return make_interp_spline(times, values, k=7)
+    return make_interp_spline(times, values, k=7, bc_type="periodic" if closed else None)
 
 
 def _misses(
@@ -188,12 +191,3 @@ def _check_derivatives(given: dict[str, Any], span: float) -> None:
                 f"{slope[k]}, got {said[k]}"
             )
         below = name
-
-
-def _check_return(function: Function, span: float, limit: float) -> None:
-    begin, end = _called("function", function, [0.0, span], 3)
-    if np.abs(end - begin).max() > limit:
-        raise ValueError(
-            f"function must return to its start where closed=True, got {begin} at 0 s and {end} at "
-            f"{span:g} s"
-        )

@@ -7,19 +7,19 @@ from the k-th on (natural), or repeating, SciPy's interpolating splines are that
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.trajectories.headings import heading_choice
 from quad_gym.params.trajectories.timing import choose_times
 
 if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+HeadingRule = Literal["given", "along", "toward"]
 
 ORDERS = {"snap": 4, "jerk": 3}  # order of the derivative that is minimized, by name
 
@@ -93,7 +93,9 @@ def through(
     bounds = {"max_speed": max_speed, "max_acceleration": max_acceleration}
     if times is None:
         _refuse_equal_neighbors(places, closed)
-        when = choose_times(path, rough, places, *_bounds(bounds))
+        usual = zip(bounds.items(), (MAX_SPEED, MAX_ACCELERATION), strict=True)
+        limits = [check.positive(name, other if x is None else x) for (name, x), other in usual]
+        when = choose_times(path, rough, places, *limits)
     else:
         for name, bound in bounds.items():
             if bound is not None:
@@ -108,6 +110,28 @@ def through(
     return cls(times=when, coefficients=terms, closed=closed, heading=rule, point=point)
 
 
+def heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, float], Any]:
+    """Return the rule that a heading follows, `Trajectory.heading`, and its point (2,).
+
+    The third value is the source of the angles: a number, or `yaw` itself if it is a function or an
+    array.
+    """
+    if look_at is not None:
+        if yaw is not None:
+            raise ValueError("yaw must not be given with look_at, which sets the heading")
+        size = np.size(look_at)
+        point = check.vector("look_at", look_at, length=3 if size == 3 else 2)
+        return "toward", (point[0], point[1]), 0.0
+    if isinstance(yaw, str):
+        check.choice("yaw", yaw, ("along",))
+        return "along", (0.0, 0.0), 0.0
+    if yaw is None:
+        return "given", (0.0, 0.0), 0.0
+    if callable(yaw) or np.ndim(yaw) > 0:
+        return "given", (0.0, 0.0), yaw
+    return "given", (0.0, 0.0), check.angle("yaw", yaw)
+
+
 def _places(points: ArrayLike, fewest: int) -> Floats:
     """Return the points (n, 3), at least two, and as many as open ends require."""
     places = check.array("points", points, (None, 3))
@@ -119,12 +143,6 @@ def _places(points: ArrayLike, fewest: int) -> Floats:
             f"{len(places)}"
         )
     return places
-
-
-def _bounds(given: dict[str, float | None]) -> list[float]:
-    """Return the bounds of speed and acceleration, or their defaults."""
-    defaults = zip(given.items(), (MAX_SPEED, MAX_ACCELERATION), strict=True)
-    return [check.positive(name, usual if x is None else x) for (name, x), usual in defaults]
 
 
 def _given_times(times: Any, count: int, closed: bool) -> Floats:
@@ -159,17 +177,10 @@ def _refuse_equal_neighbors(places: Floats, closed: bool) -> None:
 def coefficients(
     times: Floats, values: Floats, order: int, *, closed: bool = False, at_rest: bool = True
 ) -> Floats:
-    """Polynomials of the least integral of a squared derivative through values (m + 1, n) at times.
+    """Polynomials (8, m, n) of the least integral of a squared derivative of an order, 4 or 3.
 
-    Args:
-        times: (m + 1,) increasing.
-        values: (m + 1, n); closed: the last are the first.
-        order: Order of the derivative that is minimized: 4 or 3.
-        closed: True: the path repeats.
-        at_rest: True: derivatives below `order` are zero at both ends.
-
-    Returns:
-        (8, m, n), the highest power first, of times since the beginning of a segment.
+    They pass through values (m + 1, n) at times (m + 1,); the highest power of the time since the
+    beginning of a segment is first. At rest, derivatives below the order are zero at both ends.
     """
     from scipy.interpolate import make_interp_spline
 

@@ -40,7 +40,9 @@ def choose_times(
     def log_duration(logs: Floats, power: float | None = NORM) -> float:
         """Log of the whole time in which the bounds are met, if segments take these shares."""
         times = _times_of(logs)
-        use = _use(times, rough(times), max_speed, max_acceleration)
+        terms = rough(times)
+        speed, acceleration = (_sampled(times, terms, k).ravel() for k in (1, 2))
+        use = np.concatenate([speed / max_speed, np.sqrt(acceleration / max_acceleration)])
         worst = float(use.max())
         soft = 0.0 if power is None else float(np.log(np.mean((use / worst) ** power))) / power
         return float(np.log(worst)) + soft
@@ -62,12 +64,6 @@ def _times_of(logs: Floats) -> Floats:
     """(m + 1,) from 0 to 1, of segments whose times have these logarithms but for a factor."""
     shares = np.exp(np.clip(logs - logs.max(), -12.0, 0.0))
     return np.concatenate([[0.0], np.cumsum(shares / shares.sum())])
-
-
-def _use(times: Floats, terms: Floats, max_speed: float, max_acceleration: float) -> Floats:
-    """Factors by which the whole would have to be stretched to meet its bounds, by sample."""
-    speed, acceleration = (_sampled(times, terms, k).ravel() for k in (1, 2))
-    return np.concatenate([speed / max_speed, np.sqrt(acceleration / max_acceleration)])
 
 
 def _sampled(times: Floats, terms: Floats, order: int) -> Floats:

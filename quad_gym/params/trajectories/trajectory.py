@@ -15,9 +15,8 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
 from quad_gym.params.trajectories.feasibility import check_trajectory
 from quad_gym.params.trajectories.fitting import fit
-from quad_gym.params.trajectories.headings import HeadingRule, yaw_angles
 from quad_gym.params.trajectories.reading import from_csv
-from quad_gym.params.trajectories.splines import through
+from quad_gym.params.trajectories.splines import HeadingRule, through
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 TERMS = 8  # coefficients of a polynomial of degree 7, as minimum snap requires
+LEAST_SPEED = 1e-3  # horizontal speed below which a heading along the path is held [m/s]
 EARLY = 1e-3  # fraction of a trajectory after which a start from rest has a direction
 
 
@@ -57,15 +57,10 @@ class Trajectory(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.times) < 2 or self.times[0] != 0.0 or not (np.diff(self.times) > 0.0).all():
-            raise ValueError(
-                "Trajectory.times must begin with 0 and increase, with at least two of them, got "
-                f"{self.times}"
-            )
+            self._refuse("times", "begin with 0 and increase, with at least two of them")
         if self.coefficients.shape[1] != len(self.times) - 1:
-            raise ValueError(
-                f"Trajectory.coefficients must have {len(self.times) - 1} segments, one less than "
-                f"there are times, got {self.coefficients.shape[1]}"
-            )
+            must = f"have {len(self.times) - 1} segments, one less than there are times"
+            self._refuse("coefficients", must, self.coefficients.shape[1])
         for array in (self.times, self.coefficients):
             array.flags.writeable = False
 
@@ -108,7 +103,33 @@ class Trajectory(Checked):
             (...) [rad/s^derivative].
         """
         order = check.whole("derivative", derivative, least=0, most=2)
-        return yaw_angles(self, np.asarray(t, np.float64))[order]
+        return self._yaw_angles(np.asarray(t, np.float64))[order]
+
+    def _yaw_angles(self, times: Floats) -> tuple[Floats, Floats, Floats]:
+        """The angle of the heading [rad] and its first two derivatives, of the shape of `times`."""
+        inside, beyond = self._within(times)
+        if self.heading == "given":
+            yaw = self._polynomials(3, 4)
+            found = [np.asarray(yaw(inside, k))[..., 0] for k in range(3)]
+            if self.closed:  # each round adds the turns of one
+                turns = yaw(self.duration)[0] - yaw(0.0)[0]
+                found[0] = found[0] + np.round(turns / (2 * np.pi)) * 2 * np.pi * np.floor(
+                    times / self.duration
+                )
+            return found[0], np.where(beyond, 0.0, found[1]), np.where(beyond, 0.0, found[2])
+        if self.heading == "along":
+            d, d1, d2 = (self(times, k)[..., :2] for k in (1, 2, 3))
+            begin, end = self.end_headings
+            held = np.stack([times <= 0.0, times >= self.duration])
+            held &= not self.closed
+            d = np.where(held[0][..., np.newaxis], begin, d)
+            d = np.where(held[1][..., np.newaxis], end, d)
+            still = held.any(axis=0) | (np.hypot(d[..., 0], d[..., 1]) < LEAST_SPEED)
+        else:
+            d = np.array(self.point) - self(times)[..., :2]
+            d1, d2 = (-self(times, k)[..., :2] for k in (1, 2))
+            still = np.hypot(d[..., 0], d[..., 1]) < 1e-9
+        return _angles(d, d1, d2, still)
 
     def turned(self, angle: float) -> "Trajectory":
         """Return the trajectory rotated about the vertical through the origin.
@@ -192,3 +213,16 @@ class Trajectory(Checked):
         """Copy with new arrays, which are as immutable."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return partial(type(self), **values), ()
+
+
+def _angles(
+    d: Floats, d1: Floats, d2: Floats, still: NDArray[np.bool_]
+) -> tuple[Floats, Floats, Floats]:
+    """The angle of horizontal vectors and its derivatives, which are 0 where it stands still."""
+    square = np.where(still, 1.0, (d * d).sum(axis=-1))
+    cross = d[..., 0] * d1[..., 1] - d[..., 1] * d1[..., 0]
+    bend = d[..., 0] * d2[..., 1] - d[..., 1] * d2[..., 0]
+    rate = cross / square
+    change = (bend - 2.0 * rate * (d * d1).sum(axis=-1)) / square
+    angle = np.arctan2(d[..., 1], d[..., 0])
+    return angle, np.where(still, 0.0, rate), np.where(still, 0.0, change)

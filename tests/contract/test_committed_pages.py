@@ -1,11 +1,14 @@
-"""README and pages hold the texts of the ledger, and changed flights make results stale."""
+"""Pages are those that code, ledger and the table of words make."""
 
 import json
+from pathlib import Path
 
 import pytest
 
+from docs.extensions import environment_pages
 from docs.renewal import ledger, pages
 from docs.renewal.catalog import Result
+from tests import dialect
 
 
 @pytest.fixture(scope="module")
@@ -30,3 +33,26 @@ def test_result_of_changed_flights_or_options_is_stale(tmp_path, monkeypatch):
     assert ledger.stale(result, entries)
     entries["one"] = {"commands": ["circle --seeds 2"], "flights": ledger.digest(result)}
     assert ledger.stale(result, entries)
+
+
+def test_committed_reference_pages_equal_the_code():
+    texts = environment_pages.pages()
+    stale = [f for f, text in texts.items() if not f.exists() or f.read_text("utf-8") != text]
+    assert not stale, "make reference"
+    assert set(environment_pages.FOLDER.rglob("*.md")) <= set(texts)
+
+
+def test_the_guide_holds_the_table_of_the_default_observation():
+    assert environment_pages.observation_table() in environment_pages.GUIDE.read_text("utf-8")
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_no_text_exceeds_its_ceiling():
+    assert dialect.too_many(dialect.counts()) == []
+
+
+def test_contributing_has_the_table_of_words():
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert page.split("<!-- words -->")[1].split("<!-- /words -->")[0].strip() == dialect.table()

@@ -1,0 +1,115 @@
+"""The library of compiled kernels for this machine, without Numba.
+
+`quad-gym compile --library` makes one for each number of lanes, which wheels hold. It belongs to
+sources, whose digest it holds: with other sources it is not used. Without one, Numba compiles.
+"""
+
+import ctypes
+import functools
+import importlib.util
+import os
+import platform
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from quad_gym.kernels.sources import digest_in, sources_digest
+from quad_gym.records.width import WIDTH, runs_lanes
+
+FOLDER = Path(__file__).with_name("libraries")
+_CHOICES = ("", "library", "numba")
+
+
+def machine() -> str:
+    """Return the family of this machine's processor."""
+    name = platform.machine().lower()
+    return {"amd64": "x86_64", "arm64": "aarch64"}.get(name, name)
+
+
+def file_of(lanes: int) -> Path:
+    """Return the file of this machine's library with a number of lanes."""
+    return FOLDER / f"kernels_{machine()}_{lanes}.so"
+
+
+def core_symbol(name: str) -> str:
+    """Return the symbol of a compiled function, by its name "module:function"."""
+    return f"qg_core_{name.partition(':')[2]}"
+
+
+def entry_symbol(name: str) -> str:
+    """Return the symbol through which Python calls an entry."""
+    return f"qg_{name.partition(':')[2]}"
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Write a line to standard error, if there is one."""
+    if sys.stderr is not None:
+        print(text, file=sys.stderr, end=end, flush=True)
+
+
+class Library:
+    """A loaded library."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._loaded = ctypes.CDLL(str(file))  # which releases the GIL in calls
+
+    def address_of(self, stage: str) -> int:
+        """Return the address of a stage, by its name "module:function"."""
+        address = ctypes.cast(self._loaded[core_symbol(stage)], ctypes.c_void_p).value
+        assert address is not None
+        return address
+
+    def function_of(self, name: str, words: int, returns: type[float] | None) -> Callable[..., Any]:
+        """Return an entry that takes integers: numbers, and for an array its address and shape.
+
+        Args:
+            name: "module:function".
+            words: Number of its integers.
+            returns: Type of its result.
+        """
+        function = self._loaded[entry_symbol(name)]
+        function.argtypes = [ctypes.c_int64] * words
+        function.restype = {None: None, bool: ctypes.c_bool, float: ctypes.c_double}[returns]
+        return function
+
+
+@functools.cache
+def library() -> Library | None:
+    """Return the library for this machine and these sources; None: Numba compiles.
+
+    QUAD_GYM_KERNELS selects one of both, "library" or "numba".
+
+    Raises:
+        ImportError: If there is neither, with the reason.
+    """
+    choice = os.environ.get("QUAD_GYM_KERNELS", "")
+    if choice not in _CHOICES:
+        raise ValueError(f"QUAD_GYM_KERNELS must be library or numba, got {choice!r}")
+    if choice == "numba":
+        return None
+    file = file_of(WIDTH)
+    found = file.is_file()
+    problem = _problem(file) if found else f"there is no {file.name}"
+    if not problem:
+        return Library(file)
+    if choice == "library":
+        raise ImportError(f"the library of compiled kernels cannot be used: {problem}")
+    if importlib.util.find_spec("numba") is None:
+        raise ImportError(
+            "quad_gym has no compiled kernels for this machine, and Numba, which would compile "
+            f'them, is not installed ({problem}): pip install "quad-gym[compile]"'
+        )
+    if found:
+        say(f"quad_gym: Numba compiles, as {problem}; `quad-gym compile --library` renews it")
+    return None
+
+
+def _problem(file: Path) -> str:
+    """Return why a library cannot be used; empty: it can."""
+    if not runs_lanes(WIDTH):
+        return f"this processor does not run {file.name}"
+    if digest_in(file.read_bytes()) != sources_digest(Path(__file__).parents[1]):
+        return f"{file.name} belongs to other sources"
+    return ""

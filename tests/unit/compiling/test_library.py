@@ -1,0 +1,162 @@
+"""The library of compiled kernels: when it is used, and that it flies the same flights."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from quad_gym.kernels import library as libraries
+from quad_gym.kernels.compiling import building
+from quad_gym.kernels.library import Library, file_of, library, machine
+from quad_gym.kernels.sources import MARK, digest_in, sources_digest
+from quad_gym.records import WIDTH
+
+PACKAGE = Path(libraries.__file__).parents[1]
+HUNDRED_STEPS = """
+import sys, gymnasium, quad_gym
+env = gymnasium.make("QuadGym/Circle-v0")
+env.reset(seed=0)
+for _ in range(100):
+    if any(env.step(env.action_space.sample())[2:4]):
+        env.reset()
+assert "numba" not in sys.modules and "llvmlite" not in sys.modules
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The folder of libraries, empty, and nothing chosen by the environment."""
+    monkeypatch.setattr(libraries, "FOLDER", tmp_path)
+    monkeypatch.delenv("QUAD_GYM_KERNELS", raising=False)
+    library.cache_clear()
+    yield tmp_path
+    library.cache_clear()
+
+
+def write_stale():
+    file_of(WIDTH).write_bytes(b"code" + MARK + b"0" * 64 + b"\0code")
+
+
+def test_numba_compiles_in_silence_where_there_is_no_library(folder, capsys):
+    assert library() is None
+    assert capsys.readouterr().err == ""
+
+
+def test_library_of_other_sources_is_not_used_in_silence(folder, capsys):
+    write_stale()
+    assert library() is None
+    said = capsys.readouterr().err
+    assert f"Numba compiles, as {file_of(WIDTH).name} belongs to other sources" in said
+
+
+@pytest.mark.parametrize("stale", [False, True])
+def test_missing_or_stale_library_is_an_error_where_it_is_demanded(folder, monkeypatch, stale):
+    if stale:
+        write_stale()
+    monkeypatch.setenv("QUAD_GYM_KERNELS", "library")
+    why = "belongs to other sources" if stale else "there is no kernels_"
+    with pytest.raises(ImportError, match=f"cannot be used: .*{why}"):
+        library()
+
+
+def test_message_names_the_extra_where_numba_is_missing(folder, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"there is no kernels_.*quad-gym\[compile\]"):
+        library()
+
+
+def test_choice_of_kernels_is_checked(folder, monkeypatch):
+    monkeypatch.setenv("QUAD_GYM_KERNELS", "other")
+    with pytest.raises(ValueError, match="QUAD_GYM_KERNELS must be library or numba, got 'other'"):
+        library()
+
+
+def test_library_for_wider_registers_than_the_processor_has_is_not_used(folder, monkeypatch):
+    write_stale()
+    monkeypatch.setattr(libraries, "runs_lanes", lambda lanes: False)
+    monkeypatch.setenv("QUAD_GYM_KERNELS", "library")
+    with pytest.raises(ImportError, match="this processor does not run kernels_"):
+        library()
+
+
+def test_digest_depends_on_the_sources_of_kernels_and_records(tmp_path):
+    for name in ("kernels/a.py", "records/b.py", "params/c.py"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("x = 1\n")
+    before = sources_digest(tmp_path)
+    (tmp_path / "params/c.py").write_text("x = 2\n")
+    assert sources_digest(tmp_path) == before
+    (tmp_path / "records/b.py").write_text("x = 2\n")
+    assert sources_digest(tmp_path) != before
+    assert digest_in(b"other " + MARK + before.encode() + b"\0") == before
+    assert digest_in(b"none") == ""
+
+
+def test_numbers_of_lanes_without_a_library_are_refused():
+    with pytest.raises(ValueError, match=r"there are libraries for .* got .* with \[3\]"):
+        building.build([3])
+
+
+def test_missing_compiler_is_named(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(RuntimeError, match="there is no no-such-compiler: install one"):
+        building.require_compiler()
+
+
+@pytest.mark.parametrize("lanes", ["3", "16", "eight"])
+def test_a_number_of_lanes_that_there_is_not_is_refused(lanes):
+    done = subprocess.run(
+        [sys.executable, "-c", "import quad_gym.records"],
+        env=os.environ | {"PYTHONPATH": str(PACKAGE.parent), "QUAD_GYM_LANES": lanes},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert f"QUAD_GYM_LANES must be 2, 4 or 8, got '{lanes}'" in done.stderr
+
+
+# ---- with libraries, which take minutes to build, or seconds if most code is cached -----------
+
+
+def run(lanes, *words):
+    """Run a process with the library of a number of lanes."""
+    environment = os.environ | {"QUAD_GYM_KERNELS": "library", "QUAD_GYM_LANES": str(lanes)}
+    command = [sys.executable, *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(params=sorted(building.PROCESSORS.get(machine(), {})))
+def lanes(request):
+    """A number of lanes that this processor runs, with its library built."""
+    if not libraries.runs_lanes(request.param):
+        pytest.skip(f"this processor has no registers of {request.param} lanes")
+    (file,) = building.build([request.param])
+    assert digest_in(file.read_bytes()) == sources_digest(PACKAGE)
+    return request.param
+
+
+@pytest.mark.slow
+def test_golden_flights_are_the_same_through_the_library(lanes):
+    done = run(lanes, "-m", "tests.golden.flights")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "golden flights are as they were" in done.stdout
+
+
+@pytest.mark.slow
+def test_hundred_steps_through_the_library_import_no_numba(lanes):
+    done = run(lanes, "-c", HUNDRED_STEPS)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+
+
+@pytest.mark.slow
+def test_library_has_every_entry_and_stage(lanes):
+    from quad_gym.kernels.entries import ENTRIES
+    from quad_gym.kernels.stages import SOURCES
+
+    loaded = Library(file_of(lanes))
+    for name, entry in ENTRIES.items():
+        assert loaded.function_of(name, len(entry.arguments), entry.returns)
+    assert all(loaded.address_of(source.name) for source in SOURCES)
