@@ -1,14 +1,14 @@
-"""Measure the speed of all parts: filter, tick, options, environments, tasks, compilation.
+"""Measure the speed of all parts: filter, tick, options, environments, tasks, compilation, peers.
 
     quad-gym benchmark
     quad-gym benchmark --only interfaces --n-envs 256
     quad-gym benchmark --only compile
 
 A time is the best of several repeats, because other load on the machine can only increase it;
-"spread" is the excess of the median. All ratios are measured within one run. The sections compile,
-filters and learning take minutes and run only with `--only`. Learning trains the compiled PPO with
-ten seeds, and reports when each was first better than tuned PD control; filters compares the
-built-in filters and `--estimators` on the same flights.
+"spread" is the excess of the median. All ratios are measured within one run. The sections suites,
+compile, filters and learning take minutes and run only with `--only`. Learning trains the compiled
+PPO with ten seeds, and reports when each was first better than tuned PD control; filters compares
+the built-in filters and `--estimators` on the same flights.
 
 Progress goes to stderr, tables go to stdout, and everything goes to benchmark.json with the
 configuration, the versions and the processor. Run it on an idle machine.
@@ -25,6 +25,7 @@ from quad_gym.analysis.reports import require_writable, versions, write_json
 from quad_gym.commands.options import SuiteNames, require_at_least, usage_errors
 from quad_gym.estimation.own import Estimator
 from quad_gym.experiments.benchmark import (
+    comparison,
     compiling,
     filter,
     filters,
@@ -34,6 +35,7 @@ from quad_gym.experiments.benchmark import (
     options,
     own_task,
     stages,
+    suites,
 )
 from quad_gym.experiments.benchmark.timing import Effort, Row, Scope
 from quad_gym.kernels.cores import available_cores
@@ -41,7 +43,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import WIDTH
 
-ALONE = ("compile", "filters", "learning")
+ALONE = ("suites", "compile", "filters", "learning")
 """Sections that take minutes."""
 
 
@@ -54,17 +56,20 @@ class BenchmarkArgs:
         "filter",
         "filters",
         "tick",
+        "suites",
+        "busy",
+        "peers",
         "options",
         "interfaces",
         "tasks",
         "compile",
         "learning",
     ] = "all"
-    """section to run; all: every section but compile, filters and learning"""
+    """section to run; all: every section but suites, compile, filters and learning"""
     batch: int = 256
     """number of flights in the batches of filter, filters, tick and options, a multiple of eight"""
     n_envs: int = 1024
-    """number of environments in the batches of interfaces, of flights with each suite in tick"""
+    """number of environments in the batches of interfaces, of flights in suites and busy"""
     threads: int | None = None
     """largest number of threads; if not given, one per core"""
     seeds: int = 10
@@ -111,6 +116,9 @@ SECTIONS = {
     "filter": filter.SECTION,
     "filters": filters.SECTION,
     "tick": stages.SECTION,
+    "suites": suites.SECTION,
+    "busy": suites.BUSY,
+    "peers": comparison.SECTION,
     "options": options.SECTION,
     "interfaces": interfaces.SECTION,
     "tasks": own_task.SECTION,

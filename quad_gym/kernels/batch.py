@@ -7,7 +7,7 @@ from quad_gym.kernels.board import comes, finished, post, take
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.signatures import signature_of
 from quad_gym.kernels.flight import begin_episode, look, move_and_measure, run, update
-from quad_gym.kernels.gathering import update_group
+from quad_gym.kernels.gathering import block_address, update_soon, update_waiting
 from quad_gym.kernels.simd.addresses import (
     array_at,
     lanes_at,
@@ -39,33 +39,8 @@ from quad_gym.records import (
 )
 from quad_gym.records.board import COMMAND, FINISHED, TICKET
 
-_REWARD = int(Result.REWARD)
-_TERMINATED = int(Result.TERMINATED)
-_TRUNCATED = int(Result.TRUNCATED)
-_ENDING = int(Result.ENDING)
-_POSITION_ERROR = int(Result.POSITION_ERROR)
-_ESTIMATION_ERROR = int(Result.ESTIMATION_ERROR)
-_FILTER_STATUS = int(Result.FILTER_STATUS)
-_EPISODE_STEPS = int(Result.EPISODE_STEPS)
-_EPISODE_RETURN = int(Result.EPISODE_RETURN)
-_EPISODE_ERROR_SUM = int(Result.EPISODE_ERROR_SUM)
-_GATES_PASSED = int(Result.GATES_PASSED)
-_FAULTS = int(Result.FAULTS)
-_FILTER_DIVERGED = int(Result.FILTER_DIVERGED)
-_TERMS, _REWARD_TERMS = len(RewardTerm), len(Result)
-
+_TERMS, _FIRST_TERM, _EXCHANGE_PITCH = len(RewardTerm), len(Result), EXCHANGE_BLOCK.itemsize
 _CALL_WORDS = len(Call)
-_BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
-_RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
-_WORLD, _OWN, _MODEL = int(Call.WORLD), int(Call.OWN), int(Call.MODEL)
-_BELIEVED, _GROUP = int(Call.BELIEVED), int(Call.GROUP)
-_SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
-_SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
-_OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
-_RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
-_EXCHANGE, _EXCHANGE_PITCH = int(Call.EXCHANGE), EXCHANGE_BLOCK.itemsize
-_SHOWN, _SHOWN_PITCH = int(Call.SHOWN), int(Call.SHOWN_PITCH)
-
 _CORE = offset_of(FLIGHT_BLOCK, "r")
 _TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
 """Bytes of the fields that every step needs, which come first in a record's core."""
@@ -82,8 +57,12 @@ _words_at = array_at("i8")
 def _observe(call, flight, world, model, settings, work, stages):
     """Compute the observation of the present instant, clipped to the bounds of the space."""
     call_stage(stages, Stage.OBSERVE, flight, world, model, settings, work, 0)
-    size = call[_SIZE]
-    low, high, row = _floats_at(call[_LOW], size), _floats_at(call[_HIGH], size), work.observation
+    size = call[Call.SIZE]
+    low, high, row = (
+        _floats_at(call[Call.LOW], size),
+        _floats_at(call[Call.HIGH], size),
+        work.observation,
+    )
     for k in range(size):
         value = row[k]
         value = select(value > low[k], value, low[k])  # also where it is NaN
@@ -93,18 +72,18 @@ def _observe(call, flight, world, model, settings, work, stages):
 @kernel
 def _write_rows(call, address, index, work, chosen):
     """Copy observations from the workspace to the rows of an array, where `chosen`."""
-    size, first = call[_SIZE], index * WIDTH
+    size, first = call[Call.SIZE], index * WIDTH
     pitch = 4 * size
     address = address + first * pitch
-    if all_of(chosen) and first + WIDTH <= call[_COUNT] and size >= WIDTH:
+    if all_of(chosen) and first + WIDTH <= call[Call.COUNT] and size >= WIDTH:
         for k in range(0, size - WIDTH, WIDTH):
             store_tile(address + 4 * k, pitch, work.observation, k)
         k = size - WIDTH
         store_tile(address + 4 * k, pitch, work.observation, k)
     else:
         work.begins = select(chosen, 1.0, 0.0)
-        plain = _plain_work_at(call[_WORK])
-        for lane in range(min(WIDTH, call[_COUNT] - first)):
+        plain = _plain_work_at(call[Call.WORK])
+        for lane in range(min(WIDTH, call[Call.COUNT] - first)):
             if plain.begins[lane] > 0.0:
                 row = _singles_at(address + lane * pitch, size)
                 for k in range(size):
@@ -114,8 +93,8 @@ def _write_rows(call, address, index, work, chosen):
 @kernel
 def _load_actions(call, flight, index):
     """Store the present actions as the last ones, and the caller's actions as the present ones."""
-    block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
-    rows = _floats_at(call[_ACTIONS] + index * (32 * WIDTH), 4 * WIDTH)
+    block = _plain_flight_at(block_address(call, index))
+    rows = _floats_at(call[Call.ACTIONS] + index * (32 * WIDTH), 4 * WIDTH)
     for i in range(4):
         flight.last_action[i] = flight.action[i]
     for i in range(4):
@@ -130,23 +109,23 @@ def _write_results(call, flight, work, index):
     They belong to the episode that ends, if one ends and the next begins in this step; in a step
     that only begins an episode, to its start.
     """
-    here, pitch = call[_RESULTS] + index * (8 * WIDTH), call[_RESULT_PITCH]
-    store_lanes(here + _REWARD * pitch, flight.reward)
-    store_lanes(here + _TERMINATED * pitch, flight.terminated)
-    store_lanes(here + _TRUNCATED * pitch, flight.truncated)
-    store_lanes(here + _ENDING * pitch, flight.ending)
-    store_lanes(here + _POSITION_ERROR * pitch, flight.position_error)
-    store_lanes(here + _ESTIMATION_ERROR * pitch, flight.estimation_error)
-    store_lanes(here + _EPISODE_STEPS * pitch, flight.step)
-    store_lanes(here + _EPISODE_RETURN * pitch, flight.episode_return)
-    store_lanes(here + _EPISODE_ERROR_SUM * pitch, flight.episode_error)
-    store_lanes(here + _GATES_PASSED * pitch, flight.gate_next)
-    store_lanes(here + _FAULTS * pitch, flight.faults)
-    store_lanes(here + _FILTER_DIVERGED * pitch, flight.diverged)
+    here, pitch = call[Call.RESULTS] + index * (8 * WIDTH), call[Call.RESULT_PITCH]
+    store_lanes(here + Result.REWARD * pitch, flight.reward)
+    store_lanes(here + Result.TERMINATED * pitch, flight.terminated)
+    store_lanes(here + Result.TRUNCATED * pitch, flight.truncated)
+    store_lanes(here + Result.ENDING * pitch, flight.ending)
+    store_lanes(here + Result.POSITION_ERROR * pitch, flight.position_error)
+    store_lanes(here + Result.ESTIMATION_ERROR * pitch, flight.estimation_error)
+    store_lanes(here + Result.EPISODE_STEPS * pitch, flight.step)
+    store_lanes(here + Result.EPISODE_RETURN * pitch, flight.episode_return)
+    store_lanes(here + Result.EPISODE_ERROR_SUM * pitch, flight.episode_error)
+    store_lanes(here + Result.GATES_PASSED * pitch, flight.gate_next)
+    store_lanes(here + Result.FAULTS * pitch, flight.faults)
+    store_lanes(here + Result.FILTER_DIVERGED * pitch, flight.diverged)
     for k in range(_TERMS):
-        store_lanes(here + (_REWARD_TERMS + k) * pitch, work.reward_term[k])
-    block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
-    status = _floats_at(here + _FILTER_STATUS * pitch, WIDTH)
+        store_lanes(here + (_FIRST_TERM + k) * pitch, work.reward_term[k])
+    block = _plain_flight_at(block_address(call, index))
+    status = _floats_at(here + Result.FILTER_STATUS * pitch, WIDTH)
     for lane in range(WIDTH):
         status[lane] = block.filter_status[lane]
 
@@ -155,7 +134,7 @@ def _write_results(call, flight, work, index):
 def _show(call, index, flight, world, model, settings, work, stages):
     """Write the numbers of the present instant that a user's task reads."""
     call_stage(stages, Stage.SHOW, flight, world, model, settings, work, 0)
-    here, pitch = call[_SHOWN] + index * (8 * WIDTH), call[_SHOWN_PITCH]
+    here, pitch = call[Call.SHOWN] + index * (8 * WIDTH), call[Call.SHOWN_PITCH]
     for k in range(SHOWN_SIZE):
         store_lanes(here + k * pitch, work.observation[k])
 
@@ -165,7 +144,7 @@ def _fetch_ahead(call, index, settings, left):
     """Prefetch a tick's share of the next block, which is not in the cache in large batches."""
     ticks, line = settings.ticks_per_step, 8 * WIDTH
     share = (_TICKED // line + ticks) // ticks * line
-    begin = call[_BLOCKS] + (index + 1) * call[_PITCH] + _CORE + left * share
+    begin = block_address(call, index + 1) + _CORE + left * share
     for k in range(0, share, line):
         prefetch(begin + k)
 
@@ -173,7 +152,7 @@ def _fetch_ahead(call, index, settings, left):
 @kernel
 def _begin_step(call, index, settings):
     """Load the actions of a step, and clear the flags and sums of the last step's measurements."""
-    flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+    flight = _flight_at(block_address(call, index))
     _load_actions(call, flight, index)
     for sensor in range(SENSORS):
         for k in range(settings.sensor_blocks[sensor]):
@@ -189,31 +168,24 @@ def _fly_ticks(call, first, last, world, model, settings, work, stages):
     for left in range(settings.ticks_per_step - 1, -1, -1):
         within = min(left, 1)
         for index in range(first, last):
-            flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+            flight = _flight_at(block_address(call, index))
             _fetch_ahead(call, index, settings, left)
             move_and_measure(flight, world, model, settings, work, stages, within)
-        if call[_GROUP] > 1:
-            update_group(call, first, last, model, settings, work, stages)
-        elif settings.run_filter:
-            update(
-                (
-                    _flight_at(call[_BLOCKS] + first * call[_PITCH]),
-                    world,
-                    model,
-                    settings,
-                    work,
-                    stages,
-                )
-            )
+            if call[Call.GROUP] > 1:
+                update_soon(call, index, model, settings, work, stages)
+            elif settings.run_filter:
+                update((flight, world, model, settings, work, stages))
+        if call[Call.GROUP] > 1:
+            update_waiting(call, model, settings, work, stages)
         for index in range(first, last):
-            flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+            flight = _flight_at(block_address(call, index))
             look(flight, world, model, settings, work, stages, within)
 
 
 @kernel
 def _give_samples(call, index, flight):
     """Copy the IMU sample of a block for the user's estimator."""
-    exchange = _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH)
+    exchange = _exchange_at(call[Call.EXCHANGE] + index * _EXCHANGE_PITCH)
     for i in range(3):
         exchange.gyro[i], exchange.accel[i] = flight.gyro[i], flight.accel[i]
         exchange.w_meas[i] = flight.w_meas[i]
@@ -231,15 +203,9 @@ def _copy_estimate(of, to):
 
 
 @kernel
-def _give_estimate(call, index, flight):
-    """Copy the estimate of a block for the user's estimator, which begins some of its episodes."""
-    _copy_estimate(flight, _exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH))
-
-
-@kernel
 def _take_estimate(call, index, flight):
     """Copy the estimate of a block from the user's estimator."""
-    _copy_estimate(_exchange_at(call[_EXCHANGE] + index * _EXCHANGE_PITCH), flight)
+    _copy_estimate(_exchange_at(call[Call.EXCHANGE] + index * _EXCHANGE_PITCH), flight)
 
 
 @kernel
@@ -249,7 +215,7 @@ def _fly_tick(call, first, last, left, world, model, settings, work, stages):
     `left`: number of ticks after it in the control period.
     """
     for index in range(first, last):
-        flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+        flight = _flight_at(block_address(call, index))
         if left < settings.ticks_per_step - 1:
             _take_estimate(call, index, flight)
             look(flight, world, model, settings, work, stages, 1)
@@ -281,17 +247,20 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
 
     `Command.LOOK` only observes again.
     """
-    flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
-    observing, written = call[_SIZE] > 0, False
+    flight = _flight_at(block_address(call, index))
+    observing, written = call[Call.SIZE] > 0, False
     begins = work.mask < 0.0  # none
     if command == Command.LOOK:
         _take_estimate(call, index, flight)
         work.mask = 1.0
         run(Stage.LOOK, (flight, true, believed, settings, work, stages))
     elif command == Command.RESET:
-        resets, plain = _bytes_at(call[_RESETS], call[_COUNT]), _plain_work_at(call[_WORK])
+        resets, plain = (
+            _bytes_at(call[Call.RESETS], call[Call.COUNT]),
+            _plain_work_at(call[Call.WORK]),
+        )
         for lane in range(WIDTH):
-            known = index * WIDTH + lane < call[_COUNT]
+            known = index * WIDTH + lane < call[Call.COUNT]
             plain.begins[lane] = resets[index * WIDTH + lane] if known else 1.0
         begins = work.begins > 0.0
     else:
@@ -304,17 +273,19 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
             written = True
         if observing and any_of(begins & done):
             _observe(call, flight, true, believed, settings, work, stages)
-            _write_rows(call, call[_FINALS], index, work, begins & done)
+            _write_rows(call, call[Call.FINAL_OBSERVATIONS], index, work, begins & done)
     if any_of(begins):
         begin_episode(flight, nominal, true, believed, settings, work, stages, begins)
         if settings.own_estimator:
             _give_samples(call, index, flight)
-            _give_estimate(call, index, flight)
+            # the user's estimator begins some of its episodes with the built-in estimate
+            exchange = _exchange_at(call[Call.EXCHANGE] + index * _EXCHANGE_PITCH)
+            _copy_estimate(flight, exchange)
     if command != Command.RESET and command != Command.LOOK and not written:
         _write_results(call, flight, work, index)
     if observing:
         _observe(call, flight, true, believed, settings, work, stages)
-        _write_rows(call, call[_OBSERVATIONS], index, work, flight.tick >= 0.0)
+        _write_rows(call, call[Call.OBSERVATIONS], index, work, flight.tick >= 0.0)
     if settings.shown:
         _show(call, index, flight, true, believed, settings, work, stages)
 
@@ -327,7 +298,7 @@ def _fly_group(call, first, last, command, nominal, true, believed, settings, wo
     """
     left = command - Command.TICK
     for index in range(first, last):
-        flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+        flight = _flight_at(block_address(call, index))
         run(Stage.IMPOSE, (flight, true, nominal, settings, work, stages))
         run(Stage.PLACE_FEATURES, (flight, true, believed, settings, work, stages))
         run(Stage.MEET_ROTORS, (flight, true, believed, settings, work, stages))
@@ -359,11 +330,11 @@ def fly(call_at, board_at, size, number, command, serving):
         True if all blocks are finished; False if another thread is still flying.
     """
     call, board = _words_at(call_at, _CALL_WORDS), _words_at(board_at, size)
-    settings, work = _settings_at(call[_SETTINGS]), _work_at(call[_WORK])
-    stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
+    settings, work = _settings_at(call[Call.SETTINGS]), _work_at(call[Call.WORK])
+    stages, nominal = _stages_at(call[Call.STAGES]), _params_at(call[Call.WORLD])
     differ = settings.randomized > 0 or settings.faults > 0
-    true = _params_at(call[_OWN] if differ else call[_WORLD])
-    model = call[_BELIEVED] if settings.features_drawn else call[_MODEL]
+    true = _params_at(call[Call.OWN] if differ else call[Call.WORLD])
+    model = call[Call.BELIEVED] if settings.features_drawn else call[Call.MODEL]
     believed = true if settings.known else _params_at(model)
     if not serving and command >= 0:
         post(board, command)
@@ -374,7 +345,7 @@ def fly(call_at, board_at, size, number, command, serving):
             if first == last:
                 break
             posted = read_shared(board, COMMAND)
-            groups = (last - first - 1) // call[_GROUP] + 1
+            groups = (last - first - 1) // call[Call.GROUP] + 1
             group = (last - first - 1) // groups + 1
             for one in range(first, last, group):
                 end = min(one + group, last)

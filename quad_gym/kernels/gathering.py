@@ -33,15 +33,18 @@ from quad_gym.records import (
     Call,
 )
 
-_BLOCKS, _PITCH, _WORK = int(Call.BLOCKS), int(Call.PITCH), int(Call.WORK)
-_GATHERED, _WORDS = int(Call.GATHERED), int(Call.WORDS)
-_WORD_COUNT, _WRITTEN_COUNT = int(Call.WORD_COUNT), int(Call.WRITTEN_COUNT)
 _MANY = 6 * WIDTH // 8
 """Smallest number of lanes with a measurement for which a block is updated in place."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
 _plain_work_at = record_at(WORK_BLOCK)
 _words_at = array_at("u8")
+
+
+@kernel
+def block_address(call, index):
+    """The address of a block."""
+    return call[Call.BLOCKS] + index * call[Call.PITCH]
 
 
 @kernel
@@ -74,7 +77,7 @@ def _gather_stamps(gathered, k, flight, lane, settings):
 @routine
 def _update_gathered(call, kind, model, settings, work, stages):
     """Update the lanes of a queue, in place if all are in one block, and empty the queue."""
-    plain = _plain_work_at(call[_WORK])
+    plain = _plain_work_at(call[Call.WORK])
     source, block, count = plain.source[kind], plain.source_block[kind], plain.queued[kind, 0]
     plain.queued[kind, 0] = 0
     together = 0
@@ -86,29 +89,29 @@ def _update_gathered(call, kind, model, settings, work, stages):
             plain.mask[(source[k] - block[0]) // 8] = 1.0
         update((_flight_at(block[0]), model, model, settings, work, stages))
         return
-    words = _words_at(call[_WORDS], call[_WORD_COUNT])
-    gathered = _plain_flight_at(call[_GATHERED])
+    words = _words_at(call[Call.WORDS], call[Call.WORD_COUNT])
+    gathered = _plain_flight_at(call[Call.GATHERED])
     for k in range(WIDTH):
         if k >= count:  # copied from and to itself
-            source[k] = call[_GATHERED] + 8 * k
+            source[k] = call[Call.GATHERED] + 8 * k
             for i in range(MAX_BLOCKS):
                 gathered.block_valid[i, k] = 0.0
         elif settings.late:
             lane = (source[k] - block[k]) // 8
             _gather_stamps(gathered, k, _plain_flight_at(block[k]), lane, settings)
         plain.mask[k] = 1.0 if k < count else 0.0
-    sources, inside = work.source[kind], numbers_of(_flight_at(call[_GATHERED]))
-    for i in range(call[_WORD_COUNT]):
+    sources, inside = work.source[kind], numbers_of(_flight_at(call[Call.GATHERED]))
+    for i in range(call[Call.WORD_COUNT]):
         inside[words[i] // WIDTH] = gather_lanes(sources, 8 * words[i])
-    update((_flight_at(call[_GATHERED]), model, model, settings, work, stages))
-    for i in range(call[_WRITTEN_COUNT]):
+    update((_flight_at(call[Call.GATHERED]), model, model, settings, work, stages))
+    for i in range(call[Call.WRITTEN_COUNT]):
         scatter_lanes(sources, 8 * words[i], inside[words[i] // WIDTH])
 
 
 @kernel
 def _put(call, kind, address, block, model, settings, work, stages):
     """Append a lane to a queue, whose lanes are updated when it is full."""
-    plain = _plain_work_at(call[_WORK])
+    plain = _plain_work_at(call[Call.WORK])
     count = plain.queued[kind, 0]
     plain.source[kind, count], plain.source_block[kind, count] = address, block
     plain.queued[kind, 0] = count + 1
@@ -117,29 +120,34 @@ def _put(call, kind, address, block, model, settings, work, stages):
 
 
 @routine
-def update_group(call, first, last, model, settings, work, stages):
-    """Update the filters of the blocks from `first` to before `last`.
+def update_soon(call, index, model, settings, work, stages):
+    """Update a block that has flown a tick, or let its lanes wait until their queues are full.
 
     The cost of an update grows with the number of sensors that any of its lanes has measurements
-    from. Lanes with equal sets of sensors are therefore gathered first, then the remaining lanes.
+    from. Lanes with equal sets of sensors therefore share a queue. The blocks of a full queue have
+    flown shortly before, so that their records are still in the cache.
     """
-    plain = _plain_work_at(call[_WORK])
-    for index in range(first, last):
-        block = call[_BLOCKS] + index * call[_PITCH]
-        flight = _flight_at(block)
-        work.kind = _kind(flight, settings)
-        if any_of(work.kind > 0.0):
-            same = 0
+    plain, block = _plain_work_at(call[Call.WORK]), block_address(call, index)
+    flight = _flight_at(block)
+    work.kind = _kind(flight, settings)
+    if any_of(work.kind > 0.0):
+        same = 0
+        for lane in range(WIDTH):
+            same += int(plain.kind[lane] > 0.0)
+        if same >= _MANY:
+            work.mask = 1.0
+            update((flight, model, model, settings, work, stages))
+        else:
             for lane in range(WIDTH):
-                same += int(plain.kind[lane] > 0.0)
-            if same >= _MANY:
-                work.mask = 1.0
-                update((flight, model, model, settings, work, stages))
-            else:
-                for lane in range(WIDTH):
-                    kind = int(plain.kind[lane])
-                    if kind > 0:
-                        _put(call, kind, block + 8 * lane, block, model, settings, work, stages)
+                kind = int(plain.kind[lane])
+                if kind > 0:
+                    _put(call, kind, block + 8 * lane, block, model, settings, work, stages)
+
+
+@routine
+def update_waiting(call, model, settings, work, stages):
+    """Update the lanes that wait, those of different queues together."""
+    plain = _plain_work_at(call[Call.WORK])
     for place in range(1, KINDS):
         kind = 2 * place % KINDS + 2 * place // KINDS  # even ones first, and then those with GNSS
         for k in range(plain.queued[kind, 0]):

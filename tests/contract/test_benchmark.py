@@ -11,7 +11,6 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import learning, stages
 from quad_gym.experiments.benchmark.timing import Timing, by_turns
 from quad_gym.kernels.stages import needed_stages
-from quad_gym.params.suites import SUITES
 from quad_gym.records import POSITION_BLOCK, WIDTH
 
 
@@ -56,12 +55,9 @@ def test_filters_section_reports_an_estimator_that_fails(tmp_path, capsys):
 
 
 def test_tick_section_names_every_stage_of_a_suite(tmp_path):
-    rows = run(tmp_path, "--only", "tick", "--batch", "16", "--n-envs", "16")["sections"]["tick"]
-    assert {row["suite"] for row in rows if row["kind"] == "suite"} == set(SUITES)
+    rows = run(tmp_path, "--only", "tick", "--batch", "16")["sections"]["tick"]
     for suite in ("standard", "lab"):
-        mine = {
-            row["part"]: row for row in rows if row["kind"] != "suite" and row["suite"] == suite
-        }
+        mine = {row["part"]: row for row in rows if row["suite"] == suite}
         batch = quad_gym.FlightBatch(1, sensors=suite, task=TASK_DEFAULTS["hover"])
         stages = {stage.name.lower() for stage in needed_stages(batch._settings[0])}
         assert set(mine) == stages | {"whole tick", "filter", "sum of the tick's stages"}
@@ -69,6 +65,43 @@ def test_tick_section_names_every_stage_of_a_suite(tmp_path):
         assert mine["sum of the tick's stages"]["seconds"] == pytest.approx(sum(ticks))
         for row in mine.values():
             assert row["share"] == pytest.approx(row["seconds"] / mine["whole tick"]["seconds"])
+
+
+def test_suites_section_compares_each_with_standard_and_with_few_flights(tmp_path):
+    options = ("--only", "suites", "--n-envs", "8", "--threads", "2")
+    rows = run(tmp_path, *options)["sections"]["suites"]
+    of = {(row["suite"], row["flights"], row["threads"]): row["seconds"] for row in rows}
+    names = {"standard", "rtk", "consumer", "indoor", "flown", "crazyflie", "truth"}
+    assert of.keys() == {
+        (name, n, threads) for name in names for n in (8, 512) for threads in (1, 2)
+    }
+    for row in rows:
+        suite, flights, threads = row["suite"], row["flights"], row["threads"]
+        assert row["speed"] == of["standard", flights, threads] / row["seconds"]
+        assert row["times_few"] == row["seconds"] / of[suite, 8, threads]
+
+
+def test_busy_section_compares_threads_next_to_busy_processes(tmp_path):
+    options = ("--only", "busy", "--n-envs", "16", "--threads", "2")
+    rows = run(tmp_path, *options)["sections"]["busy"]
+    assert {(row["suite"], row["busy"]) for row in rows} == {
+        (suite, busy) for suite in ("standard", "truth") for busy in range(5)
+    }
+    for row in rows:
+        assert row["gain"] == row["seconds"] / row["all"]
+
+
+def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_path):
+    """The plain filter computes the same estimate, filterpy's one with fewer sigma points."""
+    rows = run(tmp_path, "--only", "peers", "--n-envs", "16")["sections"]["peers"]
+    ours, plain, *others = [row for row in rows if row["position"] is not None]
+    assert (ours["name"], plain["name"]) == (
+        "filter cycle, UnscentedKalmanFilter",
+        "filter cycle, plain NumPy",
+    )
+    for row in (plain, *others):
+        assert row["position"] == pytest.approx(ours["position"], rel=0.01)
+        assert row["attitude"] == pytest.approx(ours["attitude"], rel=0.01)
 
 
 def test_options_section_compares_each_with_everything_off(tmp_path):

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.peers import MeasuredTick, peers
+from quad_gym.experiments.benchmark.peers import Estimate, MeasuredTick, peers
 from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.kernels.stages import Stage
 from quad_gym.records import FEATURE_SLICE, WIDTH, aligned_zeros
+from quad_gym.rotations import quaternion_to_dcm
 
 
 def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[MeasuredTick]:
@@ -21,7 +22,8 @@ def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[MeasuredTick
         names = ("gyro", "accel", "gnss_position", "gnss_baseline", "pixels")
         gyro, accel, position, baseline, pixels = (batch.record(name)[flight] for name in names)
         features = int(batch.record("block_valid")[flight, FEATURE_SLICE].sum())
-        recorded.append(MeasuredTick(gyro, accel, position, baseline, pixels[:features]))
+        truth = Estimate(batch.record("r")[flight], quaternion_to_dcm(batch.record("q")[flight]))
+        recorded.append(MeasuredTick(gyro, accel, position, baseline, pixels[:features], truth))
         batch.step()
     return recorded
 

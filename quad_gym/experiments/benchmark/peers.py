@@ -17,14 +17,26 @@ REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "reference_ukf.py"
 """The plain filter, present in a checkout only."""
 
 
+class Estimate(NamedTuple):
+    """Position and attitude, true or estimated."""
+
+    position: NDArray[np.float64]
+    R_BI: NDArray[np.float64]
+
+
 class MeasuredTick(NamedTuple):
-    """Measurements of one flight at one instant."""
+    """Measurements of one flight at one instant, and its true state."""
 
     gyro: NDArray[np.float64]
     accel: NDArray[np.float64]
     gnss_position_G: NDArray[np.float64]
     gnss_baseline_G: NDArray[np.float64]
     pixels: NDArray[np.float64]
+    truth: Estimate
+
+
+Run = Callable[[], list[Estimate]]
+"""Function that runs a filter over a flight; the estimates after each update."""
 
 
 def load_reference() -> ModuleType | None:
@@ -37,14 +49,19 @@ def load_reference() -> ModuleType | None:
     return module
 
 
-def peers(sensors: SensorSuite, flight: list[MeasuredTick]) -> dict[str, Callable[[], None]]:
+def peers(sensors: SensorSuite, flight: list[MeasuredTick]) -> dict[str, Run]:
     """Functions that run the filters over a flight, by name, as far as they are available."""
-    found = {"UnscentedKalmanFilter": _cycles(UnscentedKalmanFilter, sensors, flight)}
+    ours = _cycles(
+        UnscentedKalmanFilter, lambda ukf: Estimate(ukf.position, ukf.R_BI), sensors, flight
+    )
+    found = {"UnscentedKalmanFilter": ours}
     module = load_reference()
     if module is None:
         print(f"  plain NumPy and filterpy: {REFERENCE} is missing", file=sys.stderr)
         return found
-    found["plain NumPy"] = _cycles(module.PlainUKF, sensors, flight)
+    found["plain NumPy"] = _cycles(
+        module.PlainUKF, lambda ukf: Estimate(ukf.r, ukf.R), sensors, flight
+    )
     try:
         from filterpy import kalman
     except ImportError as error:
@@ -54,20 +71,27 @@ def peers(sensors: SensorSuite, flight: list[MeasuredTick]) -> dict[str, Callabl
     return found
 
 
-def _cycles(kind: Any, sensors: SensorSuite, flight: list[MeasuredTick]) -> Callable[[], None]:
-    def run() -> None:
-        ukf = kind(sensors)
+def _cycles(
+    kind: Any,
+    estimate: Callable[[Any], Estimate],
+    sensors: SensorSuite,
+    flight: list[MeasuredTick],
+) -> Run:
+    def run() -> list[Estimate]:
+        ukf, found = kind(sensors), list[Estimate]()
         ukf.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
         for now in flight:
             ukf.update(now.gnss_position_G, now.gnss_baseline_G, now.pixels)
+            found.append(estimate(ukf))
             ukf.predict(now.gyro, now.accel)
+        return found
 
     return run
 
 
 def _filterpy_cycles(
     kalman: Any, module: Any, sensors: SensorSuite, flight: list[MeasuredTick]
-) -> Callable[[], None]:
+) -> Run:
     """Cycles of filterpy's filter over a flight.
 
     It has the same models and the state dimension 15, but adds the noise to the covariance instead
@@ -107,7 +131,8 @@ def _filterpy_cycles(
             noise.append(plain._direction_noise(across, variance))
         return np.concatenate(z), module.block_diagonal(*noise)
 
-    def run() -> None:
+    def run() -> list[Estimate]:
+        found = list[Estimate]()
         plain.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
         points = kalman.MerweScaledSigmaPoints(15, choice.alpha, choice.beta, choice.kappa)
         ukf = kalman.UnscentedKalmanFilter(15, 6 + 3 * features, dt, h, f, points)
@@ -123,9 +148,11 @@ def _filterpy_cycles(
             z, noise = measurement(now, R, ukf.x[:3])
             ukf.update(z, R=noise, hx=lambda x, R=R: h(x, R))
             R, ukf.x[6:9], ukf.P = rotation(ukf.x[6:9]) @ R, 0.0, (ukf.P + ukf.P.T) / 2
+            found.append(Estimate(ukf.x[:3].copy(), R))
             ukf.predict(R=R, gyro=now.gyro, accel=now.accel)
             R = rotation(ukf.x[6:9]) @ R
             ukf.sigmas_f[:, 6:9] -= ukf.x[6:9]
             ukf.x[6:9], ukf.P = 0.0, (ukf.P + ukf.P.T) / 2
+        return found
 
     return run

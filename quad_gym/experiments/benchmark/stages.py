@@ -1,7 +1,6 @@
 """Stages of a tick, one by one."""
 
 import math
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from quad_gym.experiments.benchmark import timing
 from quad_gym.kernels.entries import run_stage
 from quad_gym.kernels.linked import linked_table
 from quad_gym.kernels.stages import Stage, needed_stages
-from quad_gym.params.suites import SUITES as ALL_SUITES
 from quad_gym.records import Act, Sensor
 
 SUITES = ("standard", "lab")
@@ -85,27 +83,8 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
 
 
 def time_tick(scope: timing.Scope) -> list[timing.Row]:
-    """Time a whole tick on one core, per flight: its stages, with `SUITES`; and with all suites."""
-    rows = [row for suite in SUITES for row in _time_suite(suite, scope.batch, scope.effort)]
-    rows = [row | {"speed": None} for row in rows]
-    return rows + _time_all_suites(scope.envs, scope.effort)
-
-
-def _time_all_suites(count: int, effort: timing.Effort) -> list[timing.Row]:
-    """Time ticks at a control rate of 50 Hz with each suite, by turns."""
-    batches = {suite: hovering(count, sensors=suite, control_rate=50.0) for suite in ALL_SUITES}
-    jobs = [partial(timing.lasting, batch.step, 50) for batch in batches.values()]
-    timings = dict(zip(batches, timing.by_turns(jobs, effort.repeats), strict=True))
-    standard = timings["standard"].best
-    return [
-        timing.report(
-            f"tick at 50 Hz, {suite}",
-            timed.per(4 * count),
-            **{"part": "tick at 50 Hz", "kind": "suite", "suite": suite, "share": None},
-            speed=standard / timed.best,
-        )
-        for suite, timed in timings.items()
-    ]
+    """Time a whole tick on one core, per flight, and its stages, with `SUITES`."""
+    return [row for suite in SUITES for row in _time_suite(suite, scope.batch, scope.effort)]
 
 
 def _time_suite(suite: str, count: int, effort: timing.Effort) -> list[timing.Row]:
@@ -150,7 +129,6 @@ SECTION = timing.Section(
             "us": timing.column("seconds", ".3f", 1e6),
             "spread": timing.SPREAD,
             "of the whole": timing.percent("share"),
-            "x speed of standard": timing.column("speed", ".2f"),
         }
     },
 )

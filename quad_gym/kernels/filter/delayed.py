@@ -15,6 +15,7 @@ measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 4
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.filter.measurements import (
     choose_valid,
@@ -37,9 +38,8 @@ from quad_gym.kernels.maths.linalg import keep, load3, load33, outer, store
 from quad_gym.kernels.maths.matrices import load_column3, store_block, sum_of_outers
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import SENSORS, FilterForm, FilterStatus
+from quad_gym.records import SENSORS, FilterStatus
 
-_WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
@@ -181,7 +181,7 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
         restore_slow(flight, slow, work, old)
     store(flight.w_meas, load3(work.kept_rates))
     failed = arrived & old
-    if (settings.form & _WATCH) != 0 and any_of(failed):
+    if (settings.form & MONITORED) != 0 and any_of(failed):
         forget_corrections(flight, failed)
         if slow is not None:
             forget_drift_corrections(flight, failed)

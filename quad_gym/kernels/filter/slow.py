@@ -26,7 +26,7 @@ fifteen states, as without d, and their prediction does not depend on d. Kernels
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
-from quad_gym.kernels.maths.linalg import add_diagonal, cross, load3, load33, outer
+from quad_gym.kernels.maths.linalg import add_diagonal, cross, load3, load33
 from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
@@ -60,13 +60,7 @@ def _scale_rows(a, m):
 @kernel
 def _scale_both(a, b, m):
     """Diag(a) M diag(b)."""
-    return _times(outer(a, b), m)
-
-
-@kernel
-def _times(a, b):
-    """The products of corresponding numbers of two matrices."""
-    return (_product(a[0], b[0]), _product(a[1], b[1]), _product(a[2], b[2]))
+    return (_product(a[0] * b, m[0]), _product(a[1] * b, m[1]), _product(a[2] * b, m[2]))
 
 
 @kernel
