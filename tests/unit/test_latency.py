@@ -144,21 +144,6 @@ def test_late_measurements_leave_what_filtering_all_over_again_does(
     assert covariance < bounds[1], covariance
 
 
-@pytest.mark.parametrize(
-    "rates", [{"gnss": 20.0, "camera": 25.0}, {"gnss": 5.0, "camera": 50.0}, {"gnss": 200.0}]
-)
-def test_nees_is_right_at_the_longest_latency_of_any_rate(rates):
-    """Means over 400 flights, five deviations wide, at 4 instants."""
-    latencies = {name: 2.0 / rate for name, rate in rates.items()}
-    batch = fly(late(RTK.with_rates(**rates), **latencies), 400, filter_start="warm")
-    means = []
-    for _ in range(4):
-        steps(batch, 0.5)
-        means.append(nees(batch).mean())
-    assert np.abs(np.array(means) - 15.0).max() < 5 * np.sqrt(2 * 15 / 400), means
-    assert not batch.record("filter_status").any()
-
-
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("name", ["rtk", "indoor"])
 def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
