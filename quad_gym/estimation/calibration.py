@@ -42,8 +42,7 @@ _COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
 _FEW_STEPS, _STEPS = 8, 25
 """Steps of the search from each beginning, and after."""
 _CLUSTER, _CLUSTERS = 5.0, 20
-"""Length of the parts of a log that are independent of each other [s], shorter in short logs: their
-least number."""
+"""Length of independent parts of a log [s], shorter in short logs; their least number."""
 _FEWEST_TAILS = 30
 """Number of innovations that determines their tails."""
 _COARSE, _FINE = np.arange(-1.0, 1.01, 0.1), np.arange(-0.1, 0.11, 0.05)
