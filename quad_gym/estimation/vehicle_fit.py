@@ -84,6 +84,7 @@ def fit_vehicle(
     Raises:
         ValueError: If the log or an argument is invalid, or the commands are not during the flight.
     """
+    from scipy.linalg import solve_triangular
     from scipy.optimize import least_squares
 
     known = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
@@ -117,7 +118,9 @@ def fit_vehicle(
     errors = found.fun.reshape(-1, 3)
     tau = max(correlation_time(column) for column in errors.T)
     variance = tau * float((errors**2).sum()) / (errors.size - len(begin))
-    spread = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    factor = np.linalg.qr(found.jac, mode="r")  # (J^T J)^-1 = R^-1 R^-T
+    rows_of_inverse = solve_triangular(factor, np.eye(len(begin)))
+    spread = math.sqrt(variance) * np.linalg.norm(rows_of_inverse, axis=1)
     return _result(known, found.x, 1.96 * spread)
 
 

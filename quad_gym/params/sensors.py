@@ -5,7 +5,6 @@ laboratory's numbers from the Aerial Robotics course (ASE 479W, The University o
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 from quad_gym.params import checks as check
@@ -19,7 +18,7 @@ from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
-from quad_gym.params.suite_files import save_params
+from quad_gym.params.suite_files import Saved
 from quad_gym.records import MAX_UNDER_WAY, Aid
 
 SensorParams = GnssParams | CameraParams | AidParams  # parameters of a sensor other than the IMU
@@ -108,7 +107,7 @@ def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorSuite(Checked):
+class SensorSuite(Checked, Saved):
     """All sensors of a vehicle and the filter that fuses them."""
 
     imu: ImuParams = field(default_factory=ImuParams)
@@ -140,21 +139,6 @@ class SensorSuite(Checked):
             label = type(sensor).__name__
             check.ticks(f"{label}.rate", sensor.rate, self.imu.rate)
             delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, self.imu.rate)
-
-    def save(self, file: str | Path) -> Path:
-        """Write the suite to a file, to edit it, and to read it with `quad_gym.sensor_suite`.
-
-        Args:
-            file: A path that ends with ".toml"; replaced if it is there.
-
-        Returns:
-            The path.
-
-        Raises:
-            ValueError: If the path ends otherwise.
-            OSError: If it cannot be written.
-        """
-        return save_params(self, file)
 
     @property
     def sensors(self) -> dict[str, SensorParams]:

@@ -35,19 +35,28 @@ def is_params_file(name: Any) -> bool:
     return isinstance(name, str | Path) and Path(name).suffix == SUFFIX
 
 
-def save_params(params: Any, file: str | Path) -> Path:
-    """Write a suite or vehicle to a file; return its path.
+class Saved:
+    """Parameters that can be written to a file."""
 
-    Raises:
-        ValueError: If the path does not end with ".toml".
-        OSError: If it cannot be written.
-    """
-    path = Path(file)
-    if path.suffix != SUFFIX:
-        raise ValueError(f"file must end with {SUFFIX}, got {str(file)!r}")
-    head = f"# {_HEADS[type(params).__name__]} of quad_gym; units are SI, angles in rad.\n\n"
-    path.write_text(head + text_of(params), encoding="utf-8")
-    return path
+    def save(self, file: str | Path) -> Path:
+        """Write the parameters to a file, to edit, and to use in place of a preset's name.
+
+        Args:
+            file: A path that ends with ".toml"; replaced if it exists.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: If the path ends otherwise.
+            OSError: If it cannot be written.
+        """
+        path = Path(file)
+        if path.suffix != SUFFIX:
+            raise ValueError(f"file must end with {SUFFIX}, got {str(file)!r}")
+        head = f"# {_HEADS[type(self).__name__]} of quad_gym; units are SI, angles in rad.\n\n"
+        path.write_text(head + text_of(self), encoding="utf-8")
+        return path
 
 
 def text_of(suite: Any) -> str:

@@ -19,7 +19,7 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.gravity import GRAVITY
-from quad_gym.params.suite_files import is_params_file, read_params, save_params
+from quad_gym.params.suite_files import Saved, is_params_file, read_params
 
 LEAST_MOMENT = 1e-9
 """Moment of inertia below which numbers are mistakes; a quadrotor of 10 g has 1e-6 [kg m^2]."""
@@ -47,7 +47,7 @@ _LIFTING = "thrust_coefficient, motor_speed_per_volt and max_voltage"
 
 
 @dataclass(frozen=True, kw_only=True)
-class VehicleParams(Checked):
+class VehicleParams(Checked, Saved):
     """A quadrotor: rigid body, four rotors with first-order speed response, disc drag."""
 
     mass: Annotated[float, partial(check.positive, least=1e-3)] = 0.78
@@ -114,21 +114,6 @@ class VehicleParams(Checked):
                 "VehicleParams.rotor_positions_B must let the rotors turn the body about all axes "
                 "(and rotor_spins, with torque_coefficient over thrust_coefficient as their arm)"
             )
-
-    def save(self, file: str | Path) -> Path:
-        """Write the vehicle to a file, which `quad_gym.vehicle_params` and environments read.
-
-        Args:
-            file: A path that ends with ".toml"; replaced if it exists.
-
-        Returns:
-            The path.
-
-        Raises:
-            ValueError: If the path ends otherwise.
-            OSError: If it cannot be written.
-        """
-        return save_params(self, file)
 
     @property
     def max_rotor_force(self) -> float:

@@ -32,12 +32,12 @@ AT_THE_START = frozenset(
 """Stages of the first instant of an episode; all others belong to a tick."""
 
 
-def hovering(count: int, **options: Any) -> FlightBatch:
-    """Batch that hovers by PD control on the estimate, half a second after its start."""
+def hovering(count: int, threads: int = 1, **options: Any) -> FlightBatch:
+    """Batch that hovers by PD control, half a second after its start."""
     task = TASK_DEFAULTS["hover"].replace(duration=0.0)
-    batch = FlightBatch(count, task=task, gains="tuned", threads=1, **options)
+    batch = FlightBatch(count, task=task, gains="tuned", threads=threads, **options)
     batch.reset(seeds=range(count))
-    for _ in range(100):
+    for _ in range(round(0.5 * batch.clocks.control_rate)):
         batch.step()
     return batch
 

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from functools import partial
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import timing
+from quad_gym.experiments.benchmark.stages import hovering
 from quad_gym.records import Source
 
 SUITES = ("standard", "rtk", "consumer", "indoor", "flown", "crazyflie")
@@ -20,27 +20,15 @@ MOST_BUSY = 4
 
 
 def _flying(count: int, threads: int, suite: str) -> FlightBatch:
-    """Batch that hovers by PD control at 50 Hz, half a second after its start."""
+    """Batch that hovers at 50 Hz with a suite, or on the true state."""
     source = Source.TRUTH if suite == TRUTH else Source.ESTIMATE
     sensors = "standard" if suite == TRUTH else suite
-    batch = FlightBatch(
-        count,
-        task=TASK_DEFAULTS["hover"].replace(duration=0.0),
-        gains="tuned",
-        sensors=sensors,
-        source=source,
-        control_rate=50.0,
-        threads=threads,
-    )
-    batch.reset(seeds=range(count))
-    for _ in range(25):
-        batch.step()
-    return batch
+    return hovering(count, threads, sensors=sensors, source=source, control_rate=50.0)
 
 
 def _ticks(batch: FlightBatch) -> int:
     """Ticks of all flights in a step."""
-    return batch.count * int(batch._settings["ticks_per_step"][0])
+    return batch.count * batch.clocks.ticks_per_step
 
 
 def time_suites(scope: timing.Scope) -> list[timing.Row]:
