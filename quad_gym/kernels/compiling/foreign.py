@@ -160,7 +160,7 @@ def _linked(name: str) -> str:
             function.name = core_symbol(name)
         elif not function.is_declaration:
             function.linkage = llvm.Linkage.internal
-    return _without_python(str(module))
+    return _without_calls(str(module))
 
 
 def emitted(text: str, processor: Processor) -> bytes:
@@ -208,8 +208,14 @@ def loaded_size(made: bytes) -> int:
     return sum(s.size() for s in sections if (s.name() or b"").startswith(_LOADED))
 
 
-def _without_python(text: str) -> str:
-    """Return IR without references to Numba's run time: kernels allocate no memory."""
+def _without_calls(text: str) -> str:
+    """Return IR without calls of Numba's run time, as kernels allocate no memory, and of `sqrt`."""
     text = re.sub(r"(?m)^ *(tail )?call void @NRT_(inc|dec)ref\(.*$", "", text)
     text = re.sub(r"\buwtable\b(\(sync\))?", "", text)
+    if "@sqrt(" in text:  # which an instruction computes
+        root = "declare double @llvm.sqrt.f64(double"
+        text = re.sub(r"(?m)^declare double @sqrt\(.*$", "", text).replace(
+            "@sqrt(", "@llvm.sqrt.f64("
+        )
+        text += "" if root in text else f"\n{root})\n"
     return text.replace("= common ", "= internal ")
