@@ -38,7 +38,7 @@ PROCESSORS = {
 _GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "QUAD_GYM_KERNELS": "numba"}
 _LINK = ("-shared", "-fPIC", "-O2", "-s", "-Wl,-Bsymbolic,-z,noexecstack,--no-undefined")
 _WITH_LIBM = {("x86_64", 2)}
-"""Libraries that call the C library's `fma` and `rint`, as their processors may lack both."""
+"""Libraries that call the C library's `fma`, `rint` and `floor`, which processors may lack."""
 _TYPES = {int: "int64_t", bool: "uint8_t", float: "double"}
 
 
