@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,8 +27,7 @@ LEAST_SPEED = 1e-3  # horizontal speed below which a heading along the path is h
 EARLY = 1e-3  # fraction of a trajectory after which a start from rest has a direction
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trajectory(Checked):
+class Trajectory(Checked, eq=False):
     """Desired position and heading over time: piecewise polynomials, exact in the kernels, too.
 
     In the segment that begins at t_j, `r*(t) = sum_k c_k (t - t_j)^(7 - k)`, and the yaw has the
