@@ -19,8 +19,7 @@ ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
 environments."""
 
-ACTIVATIONS = ("relu", "tanh", "elu")
-"""Activations between the layers of a policy."""
+ACTIVATIONS = ("relu", "tanh", "elu")  #: activations between the layers of a policy
 
 
 _rates = partial(check.vector, length=2, least=0.0, open_end=True)

@@ -25,8 +25,8 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
 
-MOST_FLIGHTS = 10**7  # largest number of flights in a batch
-FILTER_STARTS = ("cold", "warm")  # values of the keyword `filter_start`
+MOST_FLIGHTS = 10**7  #: largest number of flights in a batch
+FILTER_STARTS = ("cold", "warm")  #: values of the keyword `filter_start`
 
 _WITHOUT = {
     "gains": tuple(control for control in Control if control is not Control.PD),
