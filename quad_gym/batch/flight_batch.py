@@ -44,7 +44,7 @@ _GROUP_MEMORY = 1 << 23
 """Memory of the blocks that a thread flies side by side [bytes], see `kernels/gathering.py`: less
 leaves gathered blocks half empty."""
 _NO_BOUNDS = np.zeros(0)
-_WORTH_NO_COPY = 1 << 16  # size of observations [bytes] above which a step allocates its own
+_WORTH_NO_COPY = 1 << 16  #: size of observations [bytes] above which a step allocates its own
 
 
 class FlightBatch(FlightMemory):

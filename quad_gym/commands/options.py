@@ -27,8 +27,7 @@ from quad_gym.params.suites import ALL_SUITES, SUITES
 
 _Args = TypeVar("_Args")
 
-USAGE_ERROR = 2
-"""Exit code of a program that was called with invalid options."""
+USAGE_ERROR = 2  #: exit code of a program that was called with invalid options
 
 _REGISTRY = ConstructorRegistry()
 

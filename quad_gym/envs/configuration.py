@@ -60,8 +60,8 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
 }
 """Defaults of each task, which keywords override."""
 
-SLOWEST = 1.0  # least control rate [Hz]: smaller ones are periods
-MAX_STEPS = 10**9  # longest time limit in steps; a duration of 0 has none
+SLOWEST = 1.0  #: least control rate [Hz]: smaller ones are periods
+MAX_STEPS = 10**9  #: longest time limit in steps; a duration of 0 has none
 
 
 def kind_and_task(

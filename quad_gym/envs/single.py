@@ -307,7 +307,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         return rendering.frames()[0] if rendering and self.render_mode == "rgb_array" else None
 
 
-ENTRY_POINT = "quad_gym.envs.single:QuadEnv"  # entry point of `QuadEnv` in Gymnasium's registry
+ENTRY_POINT = "quad_gym.envs.single:QuadEnv"  #: entry point of `QuadEnv` in Gymnasium's registry
 
 
 def limit_asked_of_make() -> int | None:

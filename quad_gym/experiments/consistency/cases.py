@@ -15,8 +15,7 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.kernels.digest import flights_digest
 from quad_gym.params.sensors import SensorSuite
 
-CaseResults = dict[str, dict[str, Any]]
-"""Results of cases, by name."""
+CaseResults = dict[str, dict[str, Any]]  #: results of cases, by name
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,8 @@ from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.kernels.library import core_symbol
 
 _OPTIONS = {"nopython": True, "boundscheck": None, "error_model": "numpy", "nogil": True}
-_KEPT = 8
-"""Number of cached files of a kind for a function."""
-_FORM = 2
-"""Version of the emission; after a change, no older object is found."""
+_KEPT = 8  #: number of cached files of a kind for a function
+_FORM = 2  #: version of the emission; after a change, no older object is found
 _LIBRARY = re.compile(r"sin|cos|sqrt|llvm\..*")
 """Functions that emitted code may call: LLVM's, and those of a C library."""
 
@@ -40,8 +38,7 @@ class Processor(NamedTuple):
     triple: str
     cpu: str
     reloc: str = "pic"
-    level: int = 2
-    """level of optimization; 3 gives larger code"""
+    level: int = 2  #: level of optimization; 3 gives larger code
 
 
 class _ForeignLibrary(EntryLibrary):
