@@ -22,15 +22,12 @@ from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.kernels.library import core_symbol
 
 _OPTIONS = {"nopython": True, "boundscheck": None, "error_model": "numpy", "nogil": True}
-_KEPT = 8
-"""Number of cached files of a kind for a function."""
-_FORM = 3
-"""Version of the emission; after a change, no older object is found."""
+_KEPT = 8  #: number of cached files of a kind for a function
+_FORM = 3  #: version of the emission; after a change, no older object is found
 _PAUSES = {
     "x86_64": ("declare void @llvm.x86.sse2.pause()", "call void @llvm.x86.sse2.pause()"),
     "aarch64": ("declare void @llvm.aarch64.hint(i32)", "call void @llvm.aarch64.hint(i32 1)"),
-}
-"""Hint of a waiting thread to the processor, declared and called, by the processor's family."""
+}  #: hint of a waiting thread to the processor, declared and called, by the processor's family
 
 _LOADED = (b".text", b".rodata", b".data", b"CODE", b"DATA")
 """Beginnings of the names of sections with code and constants."""
@@ -42,8 +39,7 @@ class Processor(NamedTuple):
     triple: str
     cpu: str
     reloc: str = "pic"
-    level: int = 2
-    """level of optimization; 3 gives larger code"""
+    level: int = 2  #: level of optimization; 3 gives larger code
 
 
 class _ForeignLibrary(EntryLibrary):
