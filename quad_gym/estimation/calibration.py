@@ -301,8 +301,8 @@ class _Search:
 
     def fit(self) -> None:
         """Find delays and mounting, and the numbers of the suite, in turn."""
-        delays = self.x[[number.sensor == "log_delays" for number in self.numbers]]
-        self._margin = _MARGIN + 2.0 * max(0.0, -float(min(delays, default=0.0)))
+        delays = vars(self.suite(self.x).log_delays).values()
+        self._margin = _MARGIN + max(0.0, *(-delay for delay in delays))
         self._known = {}
         for _ in range(2):
             if self.of_log.any():
@@ -416,7 +416,7 @@ def _curvature(scores: Floats, bends: Floats) -> Floats:
 
 
 def _lowest(places: Floats, losses: Floats) -> float:
-    """Return the minimum of a parabola through the lowest of losses on a grid, and its neighbors."""
+    """Return the minimum of a parabola through the lowest loss on a grid and its neighbors."""
     k = int(np.clip(np.argmin(losses), 1, len(losses) - 2))
     bend, slope, _ = np.polyfit(places[k - 1 : k + 2] - places[k], losses[k - 1 : k + 2], 2)
     reach = float(places[1] - places[0])

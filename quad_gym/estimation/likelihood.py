@@ -46,7 +46,7 @@ SPACING = 0.5
 correlated over shorter times count less in it, and noise of the IMU more."""
 PART = 0.1
 """Length of the parts of a log whose losses are told apart [s]."""
-_FEWEST = 100
+_FEWEST = 50
 _TOGETHER = 64  # suites, as their innovations take memory
 _WINDOW = 0.5  # [s]
 _AT_REST = 0.6
