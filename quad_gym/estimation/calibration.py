@@ -23,7 +23,7 @@ import numpy as np
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log
-from quad_gym.estimation.numbers import MOST, Number, has_baselines, numbers_in
+from quad_gym.estimation.numbers import MOST, Number, has, numbers_in
 from quad_gym.estimation.replaying import origin_of, replay
 from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.validation import Validation, validate
@@ -178,7 +178,7 @@ def _prior_of(suite: SensorSuite, log: Log) -> SensorSuite:
     if gnss is not None and not gnss.drifts:
         drift = tuple(_DRIFT * sigma for sigma in gnss.position_sigma_I)
         gnss = gnss.replace(drift_sigma_I=drift, drift_tau=_DRIFT_TAU)
-    if gnss is not None and has_baselines(log):
+    if gnss is not None and has(log, "baseline"):
         gnss = gnss.replace(heading_error_sigma=0.0)  # the mounting of the IMU shows it
     elif gnss is not None:
         gnss = gnss.replace(secondary_antenna_B=None)

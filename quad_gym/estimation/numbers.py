@@ -52,7 +52,7 @@ class Number:
 
     def of(self, suite: SensorSuite) -> float:
         """Return the number in a suite."""
-        value = getattr(self._part(suite), self.field)
+        value = getattr(self.part(suite), self.field)
         return float(value[self.axes[0]] if self.axes else value)
 
     def value(self, prior: float, x: float) -> float:
@@ -65,7 +65,7 @@ class Number:
 
     def put(self, suite: SensorSuite, value: float) -> SensorSuite:
         """Return a suite with another number."""
-        part, new = self._part(suite), cast("Any", value)
+        part, new = self.part(suite), cast("Any", value)
         if self.axes:
             values = list(getattr(part, self.field))
             for axis in self.axes:
@@ -74,7 +74,8 @@ class Number:
         part = part.replace(**{self.field: new})
         return suite.replace(**{self.sensor: part}) if self.sensor else part
 
-    def _part(self, suite: SensorSuite) -> Any:
+    def part(self, suite: SensorSuite) -> Any:
+        """Return the part of a suite that has the number."""
         return getattr(suite, self.sensor) if self.sensor else suite
 
 
@@ -134,30 +135,30 @@ def numbers_in(suite: SensorSuite, log: Log, delays: bool) -> list[Number]:
         delays: True: delays, too.
     """
     measured = {name for name in log.streams if getattr(suite, name, None) is not None}
-    paired = has_baselines(log) and "gnss" in measured
+    paired = "gnss" in measured and has(log, "baseline")
+    others = {
+        _MOUNTING: paired or bool(measured & {"camera", "magnetometer"}),  # with axes in B
+        "baseline_sigma": paired,
+        "velocity_sigma": has(log, "velocity"),
+        # with a baseline, its direction would change, and noise hides it
+        _LEVER: not paired
+        and suite.gnss is not None
+        and suite.gnss.position_sigma_I[0] <= _PRECISE,
+    }
     found = []
     for number in NUMBERS:
-        if number.field == _MOUNTING:  # it shows where another sensor has axes in B
-            known = paired or measured & {"camera", "magnetometer"}
-        elif number.sensor == _DELAYS:
+        known = number.sensor in measured or number.field == _MOUNTING
+        if number.sensor == _DELAYS:
             known = delays and number.field in measured
-        else:
-            known = number.sensor in measured
-        if number.field == "baseline_sigma":
-            known = paired
-        if number.field == _LEVER and known:
-            assert suite.gnss is not None  # with a baseline, its direction would change, and noise
-            known = not paired and max(suite.gnss.position_sigma_I) <= _PRECISE  # hides it
-        if not known:
-            continue
-        value = getattr(number._part(suite), number.field)
-        if value is not None and (not number.positive or np.all(np.asarray(value) != 0.0)):
-            found.append(number)
+        if known and others.get(number.field, True):
+            value = getattr(number.part(suite), number.field)
+            if value is not None and (not number.positive or np.all(np.asarray(value) != 0.0)):
+                found.append(number)
     return found
 
 
-def has_baselines(log: Log) -> bool:
-    """Return True if a log has baselines between two antennas."""
+def has(log: Log, quantity: str) -> bool:
+    """Return True if a log has a quantity of GNSS, such as "baseline"."""
     given = {} if log.gnss is None else log.gnss.values
-    baselines = [given[name] for name in ("baseline_G", "baseline_I") if name in given]
-    return any(np.isfinite(values).any() for values in baselines)
+    values = [given[name] for name in (f"{quantity}_G", f"{quantity}_I") if name in given]
+    return any(np.isfinite(value).any() for value in values)
