@@ -6,7 +6,7 @@ the flights in training, such as a start that is easier to learn from.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -19,8 +19,7 @@ ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
 environments."""
 
-ACTIVATIONS = ("relu", "tanh", "elu")
-"""Activations between the layers of a policy."""
+ACTIVATIONS = ("relu", "tanh", "elu")  #: activations between the layers of a policy
 
 
 _rates = partial(check.vector, length=2, least=0.0, open_end=True)
@@ -40,7 +39,6 @@ ReadOnly = Annotated[Mapping[str, Any], _read_only]
 """A mapping that is copied, and cannot be changed."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Recipe(Checked):
     """Hyperparameters of a training."""
 

@@ -34,8 +34,7 @@ PARAMETERS = {
 """Parameters of a recipe, with the defaults of Stable-Baselines3, which lacks `critic_only`: the
 number of values at the end of an observation for the critic only, such as the true state."""
 
-_EPISODES = 100
-"""Number of latest episodes whose mean return is `training_return`."""
+_EPISODES = 100  #: number of latest episodes whose mean return is `training_return`
 
 
 class CompiledPPO:

@@ -35,24 +35,17 @@ _SILENT = 0.8
 """Ratio of standard deviations after and before above which a log does not determine a number."""
 _COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
 """Noise that the search begins with twice: as large as the samples admit, and at its prior."""
-_FEW_STEPS, _STEPS = 4, 12
-"""Newton steps from each beginning, and after."""
+_FEW_STEPS, _STEPS = 4, 12  #: Newton steps from each beginning, and after
 _SHARES = np.array([1.0, 0.75, 0.5, 0.35, 0.2, 0.1, 0.05, 0.02])
 """Shares of a Newton step that are tried side by side."""
-_LEAST_GAIN = 0.02
-"""Drop of the log likelihood in a step with which the search ends."""
-_RIDGE = 0.1
-"""Relative increase of the diagonal of squared scores, which are estimates."""
-_SHORT = 45.0
-"""Time of flight that is enough for the first search [s]."""
+_LEAST_GAIN = 0.02  #: drop of the log likelihood in a step with which the search ends
+_RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are estimates
+_SHORT = 45.0  #: time of flight that is enough for the first search [s]
 _CLUSTER, _CLUSTERS = 5.0, 20
 """Length of independent parts of a log [s], shorter in short logs; their least number."""
-_FEWEST_TAILS = 30
-"""Number of innovations that determines their tails."""
-_COARSE = np.arange(-1.0, 1.01, 0.1)
-"""First grid of a delay [s]."""
-_MARGIN = 0.2
-"""Time at the end of the log that changes of delays may reach [s]."""
+_FEWEST_TAILS = 30  #: number of innovations that determines their tails
+_COARSE = np.arange(-1.0, 1.01, 0.1)  #: first grid of a delay [s]
+_MARGIN = 0.2  #: time at the end of the log that changes of delays may reach [s]
 _IRON_TAU = 30.0
 """Prior correlation time of hard iron that is constant in the suite [s]: currents of motors change
 in flight."""
@@ -75,11 +68,9 @@ class Calibrated(NamedTuple):
     number: Number
     prior: float
     value: float
-    low: float
-    """lower end of its 95 % interval"""
+    low: float  #: lower end of its 95 % interval
     high: float
-    determined: bool
-    """False: the log does not determine it, so that it keeps its prior value"""
+    determined: bool  #: false: the log does not determine it, so that it keeps its prior value
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,16 +39,14 @@ from quad_gym.records import FREEDOMS
 
 NU = (5.0, 8.0, 15.0, 100.0)
 """Degrees of freedom of Student's t; of 5, a tenth of its weight lies beyond two scales."""
-SETTLING = 5.0
-"""Time after the start whose measurements do not count [s]."""
+SETTLING = 5.0  #: time after the start whose measurements do not count [s]
 SPACING = 0.5
 """Time between the measurements of a sensor in the second, thinned log [s]: errors that are
 correlated over shorter times count less in it, and noise of the IMU more."""
-PART = 0.1
-"""Length of the parts of a log whose losses are told apart [s]."""
+PART = 0.1  #: length of the parts of a log whose losses are told apart [s]
 _FEWEST = 50
-_TOGETHER = 64  # suites, as their innovations take memory
-_WINDOW = 0.5  # [s]
+_TOGETHER = 64  #: suites, as their innovations take memory
+_WINDOW = 0.5  #: [s]
 _AT_REST = 0.6
 
 

@@ -80,8 +80,8 @@ class Number:
 
 
 _LEVEL, _UP = (0, 1), (2,)
-_LEVER, _PRECISE = "primary_antenna_B", 0.1  # [m]
-_WIDE, _NARROW = 1.5, 0.7  # logarithms: factors of 4.5 and 2
+_LEVER, _PRECISE = "primary_antenna_B", 0.1  #: [m]
+_WIDE, _NARROW = 1.5, 0.7  #: logarithms: factors of 4.5 and 2
 _DELAYS, _MOUNTING = "log_delays", "log_rotation"
 MOST, _LEAST = 3.0, -0.3
 """Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's."""

@@ -17,8 +17,7 @@ from quad_gym.experiments.pages import Report
 from quad_gym.experiments.study import StudyResults
 from quad_gym.experiments.study_films import CHOICES, label_of, pair_of
 
-FEW = 5
-"""Number of seeds below which intervals over trainings are wide."""
+FEW = 5  #: number of seeds below which intervals over trainings are wide
 
 
 def number(found: Estimated, digits: int) -> str:

@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar
 
@@ -16,7 +15,7 @@ from quad_gym.records import FaultKind
 
 __all__ = ["Fault", "Span", "ends"]
 
-_SENSORS = {"gnss": "GNSS"}  # parts of a suite that are named without an article
+_SENSORS = {"gnss": "GNSS"}  #: parts of a suite that are named without an article
 
 Span = float | tuple[float, float]
 """A number, or a range (low, high) from which it is drawn uniformly at each onset of a fault."""
@@ -48,7 +47,6 @@ def _duration(name: str, value: Any) -> Span:
 Size = Annotated[Span, partial(span, open_end=True)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fault(Checked):
     """Schedule of a fault; its subclasses are the kinds of faults.
 
@@ -112,7 +110,6 @@ class Fault(Checked):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
 class DirectedFault(Fault):
     """A fault with a size and a direction, drawn uniformly from all directions by default."""
 

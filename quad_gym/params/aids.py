@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
 from quad_gym.params import checks as check
@@ -13,8 +12,8 @@ from quad_gym.records import Aid
 class SlowError(NamedTuple):
     """A time-correlated or constant error, which the filter estimates in augmented states."""
 
-    sigma: float  # stationary standard deviation, in the unit of the measurement
-    tau: float = math.inf  # correlation time [s]; infinite: the error is constant during a flight
+    sigma: float  #: stationary standard deviation, in the unit of the measurement
+    tau: float = math.inf  #: correlation time [s]; infinite: the error is constant during a flight
 
 
 class SensorBase(Checked):
@@ -38,7 +37,6 @@ class SensorBase(Checked):
         return self.replace(**scaled)
 
 
-@dataclass(frozen=True, kw_only=True)
 class AidParams(SensorBase):
     """An aiding sensor other than IMU, GNSS and camera."""
 

@@ -1,11 +1,13 @@
 """Calibration finds the numbers with which a log was simulated."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym import estimation
 from quad_gym.estimation import calibrate, replay
 from quad_gym.estimation.calibration import correlation_time
 from quad_gym.estimation.likelihood import in_flight, tails
@@ -28,7 +30,7 @@ TRUE = CONSUMER.replace(
 @pytest.fixture(scope="module")
 def table():
     """A log whose GNSS stamps are late, and whose IMU is mounted askew."""
-    columns = Recorded(flown(TRUE, 24.0), TRUE, lost=0.0, jitter=0.0).table()
+    columns = Recorded(flown(TRUE, 24.0), TRUE, lost=0.0, jitter=0.0, most_ticks=9).table()
     fixes = np.isfinite(columns["gnss_east"])
     columns["time"] = columns["time"] + DELAY * fixes
     columns["received"] = np.maximum(columns["received"], columns["time"])
@@ -106,18 +108,24 @@ def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
     assert np.isfinite(env.step(env.action_space.sample())[0]).all()
 
 
-def test_command_writes_suite_page_and_summary(table, tmp_path):
-    short = {name: column[table["received"] < 15.0] for name, column in table.items()}
-    names = list(short)
-    rows = np.column_stack([short[name] for name in names])
-    lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows]
-    (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
+def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
+    asked = []
+
+    def found_before(log, **options):
+        asked.append((log, options["sensors"], options["delays"]))
+        return found
+
+    monkeypatch.setattr(estimation, "calibrate", found_before)
+    names = ["time", *(f"{name}_{axis}" for name in ("gyro", "accel") for axis in "xyz")]
+    rows = [f"0.{k},0,0,0,0,0,9.8" for k in range(3)]
+    (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *rows]))
     options = ["--no-delays", "--output", "mine", "--vehicle", "body.toml"]
     ended = run("calibrate", "flight.csv", *options, where=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert "Wrote no body.toml: the log has no motor voltages" in ended.stdout
+    assert asked == [(Path("flight.csv"), "consumer", False)]
     summary = json.loads((tmp_path / "mine/calibration.json").read_text())
-    without = ("log_delays", "camera", "gnss.baseline", "gnss.primary_antenna")
+    without = ("camera", "gnss.baseline", "gnss.primary_antenna")
     assert set(summary["numbers"]) == {n.name for n in NUMBERS if not n.name.startswith(without)}
     assert summary["after"]["measurements"]["gnss_velocity"]["mean_nis"] > 0.0
     assert (tmp_path / "mine/report.html").stat().st_size > 10_000

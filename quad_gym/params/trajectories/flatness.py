@@ -7,27 +7,24 @@ Source: Mellinger and Kumar, Minimum snap trajectory generation and control for 
 2011; axes as in the report's controller.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from quad_gym.params.trajectories.trajectory import Trajectory
-    from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.trajectories.pieces import Floats, Reference
+from quad_gym.params.vehicle import VehicleParams
 
-Floats = NDArray[np.float64]
-Jet = tuple[Floats, Floats, Floats]  # A vector (n, 3) over time with its first two derivatives
+Jet = tuple[Floats, Floats, Floats]  #: a vector (n, 3) over time with its first two derivatives
 
 
 class Motion(NamedTuple):
     """Demands of a motion at n instants."""
 
-    thrust: Floats  # (n,) total thrust of the rotors [N]
-    R_BI: Floats  # (n, 3, 3) attitude; its rows are the body axes in I
-    body_rates: Floats  # (n, 3) body rates in B [rad/s]
-    torque: Floats  # (n, 3) torque in B [N m]
-    rotor_forces: Floats  # (n, 4) thrust of each rotor [N]
+    thrust: Floats  #: (n,) total thrust of the rotors [N]
+    R_BI: Floats  #: (n, 3, 3) attitude; its rows are the body axes in I
+    body_rates: Floats  #: (n, 3) body rates in B [rad/s]
+    torque: Floats  #: (n, 3) torque in B [N m]
+    rotor_forces: Floats  #: (n, 4) thrust of each rotor [N]
 
     @property
     def tilt(self) -> Floats:
@@ -35,7 +32,7 @@ class Motion(NamedTuple):
         return np.arccos(np.clip(self.R_BI[:, 2, 2], -1.0, 1.0))
 
 
-def motion_of(trajectory: "Trajectory", vehicle: "VehicleParams", times: Floats) -> Motion:
+def motion_of(trajectory: Reference, vehicle: VehicleParams, times: Floats) -> Motion:
     """Return the demands of a trajectory on a vehicle at times (n,) [s]."""
     force = (
         trajectory(times, 2) + np.array([0.0, 0.0, vehicle.gravity]),
@@ -62,7 +59,7 @@ def motion_of(trajectory: "Trajectory", vehicle: "VehicleParams", times: Floats)
     return Motion(thrust, np.stack([x[0], y[0], z[0]], axis=1), rates, torque, forces)
 
 
-def _heading(trajectory: "Trajectory", times: Floats) -> Jet:
+def _heading(trajectory: Reference, times: Floats) -> Jet:
     """Return the desired horizontal direction of body x."""
     angle, rate, change = (trajectory.yaw(times, k)[:, np.newaxis] for k in range(3))
     zero = np.zeros_like(angle)

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from quad_gym.params.trajectories.pieces import Floats, derivative
 
 EXPONENTS = (0.5, 0.75, 1.0)
 """Exponents of the first guesses for the durations of segments: powers of their lengths."""
@@ -17,8 +16,8 @@ long and gain a few percent."""
 NORM = 20.0
 """Power of the mean that stands for the largest use in the search, which needs derivatives."""
 
-SAMPLES = 24  # samples of a segment, among which its peaks are looked for first
-MARGIN = 1e-9  # share of the bounds that is left to rounding
+SAMPLES = 24  #: samples of a segment, among which its peaks are looked for first
+MARGIN = 1e-9  #: share of the bounds that is left to rounding
 
 
 def choose_times(
@@ -73,14 +72,6 @@ def _sampled(times: Floats, terms: Floats, order: int) -> Floats:
     for row in derivative(terms, order):
         values = values * t[..., np.newaxis] + row
     return np.linalg.norm(values, axis=2)
-
-
-def derivative(terms: Floats, order: int) -> Floats:
-    """Coefficients (8 - order, ...) of a derivative of polynomials, the highest power first."""
-    for _ in range(order):
-        powers = np.arange(len(terms) - 1, 0, -1, dtype=np.float64)
-        terms = terms[:-1] * powers.reshape(-1, *[1] * (terms.ndim - 1))
-    return terms
 
 
 def peak(times: Floats, terms: Floats, order: int) -> float:
