@@ -125,7 +125,7 @@ def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
     assert "Wrote no body.toml: the log has no motor voltages" in ended.stdout
     assert asked == [(Path("flight.csv"), "consumer", False)]
     summary = json.loads((tmp_path / "mine/calibration.json").read_text())
-    without = ("camera", "gnss.baseline", "gnss.primary_antenna")
+    without = ("camera", "log_delays.camera", "gnss.baseline", "gnss.primary_antenna")
     assert set(summary["numbers"]) == {n.name for n in NUMBERS if not n.name.startswith(without)}
     assert summary["after"]["measurements"]["gnss_velocity"]["mean_nis"] > 0.0
     assert (tmp_path / "mine/report.html").stat().st_size > 10_000
