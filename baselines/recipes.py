@@ -56,6 +56,9 @@ class Recipe(Checked):
     """Number of units in each hidden layer of the policy"""
     critic_layers: Annotated[tuple[int, ...], _sizes] = (64, 64)
     """Number of units in each hidden layer of the value function, or of each critic"""
+    memory_units: Annotated[int, check.whole] = 64
+    """Number of units of the memory of recurrent PPO, for the policy and for the value function: a
+    GRU with the compiled engine, an LSTM with SB3-Contrib"""
     activation: Annotated[str, partial(check.choice, choices=ACTIVATIONS)] = "relu"
     """Activation of hidden layers, one of `ACTIVATIONS`"""
     reward_scale: check.Positive = 0.2
@@ -94,9 +97,7 @@ _PPO = Recipe(
 )
 """Result of a search over learning rates, reward scales, activations and batch sizes on Circle."""
 
-_RECURRENT_PPO = _PPO.replace(
-    algorithm="recurrent_ppo", policy={**_PPO.policy, "lstm_hidden_size": 64}
-)
+_RECURRENT_PPO = _PPO.replace(algorithm="recurrent_ppo")
 
 _OFF_POLICY = {
     **{"batch_size": 1024, "buffer_size": 500_000, "learning_starts": 5_000},

@@ -1,12 +1,10 @@
-"""Compiled parts of PPO: forward and backward passes of networks, the loss, and Adam.
+"""Compiled parts that both kinds of networks share: layers, the loss, threads, and Adam.
 
 A network is a table with one row per layer, and a part of one vector of float32 parameters: weights
 (outputs, inputs) of each layer, followed by its biases. `flipped` contains the transposed weights,
 so that BLAS computes all matrix products fast. Samples are processed in tiles of `TILE`: the data
 of a tile fit into the first-level caches, and BLAS does not distribute such small products over
-threads.
-
-All kernels are in this file, because the cache of compiled code follows only imports of `quad_gym`.
+threads. `net` is the tuple of parameters, flipped weights and activation.
 """
 
 import math
@@ -39,7 +37,7 @@ _LOG_TAU = np.float32(math.log(2.0 * math.pi))
 
 
 @kernel
-def _weights(vector, row, first, second):
+def weights(vector, row, first, second):
     """Part of a layer in a vector of weights, as a matrix of row[first] by row[second]."""
     begin, size = row[WEIGHTS], row[INPUTS] * row[OUTPUTS]
     return vector[begin : begin + size].reshape((row[first], row[second]))
@@ -82,32 +80,39 @@ def _through_activation(delta, y, activation):
             d[i] *= _ONE if v[i] > _ZERO else v[i] + _ONE
 
 
-@routine
-def _seen_by(table, x, spare):
-    """Inputs of a network in samples x: the first columns, as a contiguous array."""
-    size = table[0, INPUTS]
-    if size == x.shape[1]:
-        return x
-    seen = spare.reshape(-1)[: len(x) * size].reshape((len(x), size))
-    for i in range(len(x)):
-        for j in range(size):
-            seen[i, j] = x[i, j]
-    return seen
+@kernel
+def add_biases(y, params, row):
+    """Add the biases of a layer to its products y (rows, outputs)."""
+    b = params[row[BIASES] : row[BIASES] + row[OUTPUTS]]
+    for i in range(len(y)):
+        for j in range(b.size):
+            y[i, j] += b[j]
+
+
+@kernel
+def add_gradient(d, below, row, product, gradient):
+    """Add the gradient of a layer with inputs `below`, given the one of its outputs, d."""
+    change = product[: row[INPUTS] * row[OUTPUTS]]
+    np.dot(d.T, below, change.reshape((row[OUTPUTS], row[INPUTS])))
+    W = gradient[row[WEIGHTS] : row[WEIGHTS] + change.size]
+    for i in range(change.size):
+        W[i] += change[i]
+    b = gradient[row[BIASES] : row[BIASES] + row[OUTPUTS]]
+    for i in range(len(d)):
+        for j in range(b.size):
+            b[j] += d[i, j]
 
 
 @routine
-def _forward(x, table, model, outputs):
+def forward(x, table, net, outputs):
     """Forward pass of samples x (rows, inputs); `outputs` stores the outputs of every layer."""
-    params, flipped, _, _, activation = model
+    params, flipped, activation = net
     h = x
     for layer in range(len(table)):
         row = table[layer]
         y = _stored(outputs, row, len(x))
-        np.dot(h, _weights(flipped, row, INPUTS, OUTPUTS), y)
-        b = params[row[BIASES] : row[BIASES] + row[OUTPUTS]]
-        for i in range(len(x)):
-            for j in range(b.size):
-                y[i, j] += b[j]
+        np.dot(h, weights(flipped, row, INPUTS, OUTPUTS), y)
+        add_biases(y, params, row)
         if layer < len(table) - 1:
             _activate(y, activation)
         h = y
@@ -115,38 +120,35 @@ def _forward(x, table, model, outputs):
 
 
 @routine
-def _backward(x, table, model, room, gradient):
-    """Add the gradient of a tile; deltas[0] begins with the gradient with respect to the output."""
-    params, _, _, _, activation = model
-    _, outputs, deltas, product = room
+def backward(x, table, net, room, gradient):
+    """Add the gradient of a tile; deltas[0] begins with the gradient with respect to the output.
+
+    Returns the gradient with respect to the outputs of the first layer, without activation.
+    """
+    params, _, activation = net
+    outputs, deltas, product = room
     rows = len(x)
-    for layer in range(len(table) - 1, -1, -1):
+    d = deltas[0, : rows * table[-1, OUTPUTS]].reshape((rows, table[-1, OUTPUTS]))
+    for layer in range(len(table) - 1, 0, -1):
         row, side = table[layer], (len(table) - 1 - layer) % 2
-        below = _stored(outputs, table[layer - 1], rows) if layer > 0 else x
-        d = deltas[side, : rows * row[OUTPUTS]].reshape((rows, row[OUTPUTS]))
-        change = product[: row[INPUTS] * row[OUTPUTS]]
-        np.dot(d.T, below, change.reshape((row[OUTPUTS], row[INPUTS])))
-        W = gradient[row[WEIGHTS] : row[WEIGHTS] + change.size]
-        for i in range(change.size):
-            W[i] += change[i]
-        b = gradient[row[BIASES] : row[BIASES] + row[OUTPUTS]]
-        for i in range(rows):
-            for j in range(b.size):
-                b[j] += d[i, j]
-        if layer > 0:
-            before = deltas[1 - side, : rows * row[INPUTS]].reshape((rows, row[INPUTS]))
-            np.dot(d, _weights(params, row, OUTPUTS, INPUTS), before)
-            _through_activation(before, below, activation)
+        below = _stored(outputs, table[layer - 1], rows)
+        add_gradient(d, below, row, product, gradient)
+        before = deltas[1 - side, : rows * row[INPUTS]].reshape((rows, row[INPUTS]))
+        np.dot(d, weights(params, row, OUTPUTS, INPUTS), before)
+        _through_activation(before, below, activation)
+        d = before
+    add_gradient(d, x, table[0], product, gradient)
+    return d
 
 
 @routine
-def _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, d_log_std, sums):
+def policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, d_log_std, sums):
     """Policy loss of a tile, and its gradient with respect to means and log_std.
 
     L = -min(r A, clip(r, 1 - c, 1 + c) A) - k H, where r is the ratio of the action's present to
     its former probability, A its advantage and H the entropy (Schulman et al. 2017, eqs. 7, 9).
     """
-    _, actions, log_probs, _ = samples
+    actions, log_probs = samples[1], samples[2]
     clip, entropy_weight = np.float32(recipe[0]), np.float32(recipe[1])
     precision = np.exp(-log_std)
     for i in range(len(chosen)):
@@ -169,89 +171,82 @@ def _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, d
 
 
 @routine
-def _differentiate_tile(chosen, advantages, share, model, samples, recipe, room, gradient, sums):
-    """Add the gradient of the loss of a tile; each sample has the weight `share`."""
-    params, _, actor, critic, _ = model
-    observations, _, _, returns = samples
-    inputs, outputs, deltas, _ = room
-    x = inputs[0, : len(chosen)]
-    for i in range(len(chosen)):
-        sample = chosen[i]
-        for j in range(x.shape[1]):
-            x[i, j] = observations[sample, j]
-    seen = _seen_by(actor, x, inputs[1])
-    mean = _forward(seen, actor, model, outputs)
-    first = actor[-1, BIASES] + actor[-1, OUTPUTS]
-    log_std = params[first : first + mean.shape[1]]
-    slope = gradient[first : first + mean.shape[1]]
-    d = deltas[0, : mean.size].reshape(mean.shape)
-    _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, slope, sums)
-    _backward(seen, actor, model, room, gradient)
-    value = _forward(x, critic, model, outputs)
+def value_loss(value, chosen, returns, recipe, share, d, sums):
+    """Value loss of a tile, and its gradient with respect to the values (rows, 1)."""
     for i in range(len(chosen)):
         error = value[i, 0] - returns[chosen[i]]
-        deltas[0, i] = np.float32(2.0 * recipe[2]) * share * error
+        d[i] = np.float32(2.0 * recipe[2]) * share * error
         sums[1] += error * error
-    _backward(x, critic, model, room, gradient)
 
 
-@routine
-def _differentiate_part(part, minibatch, model, samples, recipe, rooms, written):
-    """Compute the gradient of one part of a minibatch, and its `SUMS`."""
-    span, order, advantages = minibatch
-    inputs, outputs, deltas, product = rooms
-    gradient, sums = written[0][part], written[1][part]
-    room = (inputs[part], outputs[part], deltas[part], product[part])
-    count, parts = span[1] - span[0], len(inputs)
-    share = _ONE / np.float32(count)
-    gradient[:] = _ZERO
-    sums[:] = 0.0
-    end = span[0] + count * (part + 1) // parts
-    for a in range(span[0] + count * part // parts, end, TILE):
-        b = min(a + TILE, end)
-        tile = (order[a:b], advantages[a:b], share)
-        _differentiate_tile(*tile, model, samples, recipe, room, gradient, sums)
+@kernel
+def log_std_of(vector, actor):
+    """Part of a vector of parameters with the log standard deviations of the policy."""
+    first = actor[-1, BIASES] + actor[-1, OUTPUTS]
+    return vector[first : first + actor[-1, OUTPUTS]]
 
 
-@entry
-def differentiate(
-    board, number, command, serving, minibatch, model, samples, recipe, rooms, written
-):
-    """Compute the gradient of the loss of a minibatch, in parts that threads share on a board.
+def differentiating(differentiate_tile, tile):
+    """Make the entry that computes gradients from a routine for `tile` units or fewer.
 
-    Args:
-        board: Board whose blocks are the parts, see `quad_gym.kernels.board`.
-        number: Number of this thread; 0 posts the minibatches.
-        command: 0 to post a minibatch; negative to wait for the last one that was posted.
-        serving: True to work on minibatches posted by others, until none is posted for a while.
-        minibatch: Begin and end in the order of this epoch, (2,); this order, (n,); advantages in
-            this order, normalized, (n,).
-        model: Parameters (p,), flipped weights (p,), tables of actor and critic, activation.
-        samples: Observations (n, o), of which the actor uses the first columns; actions (n, a), log
-            probabilities (n,), returns (n,).
-        recipe: Clip range, weight of the entropy, and weight of the value loss, (3,).
-        rooms: Work memory of each part: inputs (2, TILE, o), outputs, deltas (2, ...), and a matrix
-            product.
-        written: Results of each part: gradient (p,) and `SUMS` (4,).
-
-    Returns:
-        True if all parts are finished; False if another thread is still working.
+    A unit is a sample, or a sequence of samples, see `differentiate`.
     """
-    if not serving and command >= 0:
-        post(board, command)
-    while True:  # once, unless serving
-        seen = read_shared(board, TICKET)
-        while True:
-            first, last = take(board, number)
-            if first == last:
-                break
-            for part in range(first, last):
-                _differentiate_part(part, minibatch, model, samples, recipe, rooms, written)
-            add_shared(board, FINISHED, last - first)
-        if not serving:
-            return finished(board)
-        if not comes(board, number, seen):
-            return True
+
+    @routine
+    def differentiate_part(part, minibatch, model, samples, recipe, rooms, written):
+        """Compute the gradient of one part of a minibatch, and its `SUMS`."""
+        span, order, advantages = minibatch
+        gradient, sums = written[0][part], written[1][part]
+        count, parts = span[1] - span[0], len(written[0])
+        share = _ONE / np.float32(count * advantages.shape[1])
+        gradient[:] = _ZERO
+        sums[:] = 0.0
+        end = span[0] + count * (part + 1) // parts
+        for a in range(span[0] + count * part // parts, end, tile):
+            b = min(a + tile, end)
+            units = (order[a:b], advantages[a:b], share)
+            differentiate_tile(units, model, samples, recipe, rooms, part, gradient, sums)
+
+    @entry
+    def differentiate(
+        board, number, command, serving, minibatch, model, samples, recipe, rooms, written
+    ):
+        """Compute the gradient of the loss of a minibatch, in parts that threads share on a board.
+
+        Args:
+            board: Board whose blocks are the parts, see `quad_gym.kernels.board`.
+            number: Number of this thread; 0 posts the minibatches.
+            command: 0 to post a minibatch; negative to wait for the last one that was posted.
+            serving: True to work on minibatches posted by others, until none is posted for a while.
+            minibatch: Begin and end in the order of this epoch, (2,); this order: the first sample
+                of each unit, (k,); advantages in this order, normalized, (k, samples in a unit).
+            model: `net`, and the tables of actor and critic.
+            samples: Observations (n, o), of which the actor uses the first columns; actions (n, a),
+                log probabilities (n,), returns (n,), and more for networks with memory.
+            recipe: Clip range, weight of the entropy, and weight of the value loss, (3,).
+            rooms: Work memory of each part.
+            written: Results of each part: gradient (p,) and `SUMS` (4,).
+
+        Returns:
+            True if all parts are finished; False if another thread is still working.
+        """
+        if not serving and command >= 0:
+            post(board, command)
+        while True:  # once, unless serving
+            seen = read_shared(board, TICKET)
+            while True:
+                first, last = take(board, number)
+                if first == last:
+                    break
+                for part in range(first, last):
+                    differentiate_part(part, minibatch, model, samples, recipe, rooms, written)
+                add_shared(board, FINISHED, last - first)
+            if not serving:
+                return finished(board)
+            if not comes(board, number, seen):
+                return True
+
+    return differentiate
 
 
 @entry
@@ -278,20 +273,9 @@ def descend(gradients, params, moments, rate, max_norm, corrections):
 
 
 @entry
-def flip(model):
-    """Update the flipped weights from the parameters."""
-    params, flipped, actor, critic, _ = model
-    for table in (actor, critic):
-        for layer in range(len(table)):
-            W = _weights(params, table[layer], OUTPUTS, INPUTS)
-            _weights(flipped, table[layer], INPUTS, OUTPUTS)[:] = W.T
-
-
-@entry
-def evaluate(x, model, inputs, outputs, means, values):
-    """Evaluate both networks on observations x (n, o); writes means (n, a) and values (n,)."""
-    _, _, actor, critic, _ = model
-    for a in range(0, len(x), TILE):
-        b = min(a + TILE, len(x))
-        means[a:b] = _forward(_seen_by(actor, x[a:b], inputs[1]), actor, model, outputs)
-        values[a:b] = _forward(x[a:b], critic, model, outputs)[:, 0]
+def flip(net, table):
+    """Update the flipped weights of a table from the parameters."""
+    params, flipped, _ = net
+    for layer in range(len(table)):
+        W = weights(params, table[layer], OUTPUTS, INPUTS)
+        weights(flipped, table[layer], INPUTS, OUTPUTS)[:] = W.T
