@@ -19,6 +19,9 @@ ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
 environments."""
 
+COMPILED = ("ppo", "recurrent_ppo")
+"""Algorithms of the compiled engine."""
+
 ACTIVATIONS = ("relu", "tanh", "elu")
 """Activations between the layers of a policy."""
 

@@ -16,7 +16,7 @@ from baselines.compiled_ppo.networks import Networks
 from baselines.compiled_ppo.recurrent import Recurrent
 from baselines.gru import GruPolicy
 from baselines.mlp import MlpPolicy
-from baselines.recipes import Recipe
+from baselines.recipes import COMPILED, Recipe
 from quad_gym.batch.threads import resolve_threads
 from quad_gym.params import checks as check
 
@@ -268,7 +268,7 @@ def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
 
 def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:
     """Check a recipe for a number of inputs; return its parameters with defaults."""
-    check.choice("algorithm of the compiled engine", recipe.algorithm, ("ppo", "recurrent_ppo"))
+    check.choice("algorithm of the compiled engine", recipe.algorithm, COMPILED)
     known = PARAMETERS
     if recipe.algorithm == "recurrent_ppo":
         known = {**known, "sequence_length": None}

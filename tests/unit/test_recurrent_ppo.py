@@ -16,6 +16,7 @@ from quad_gym.batch.threads import board_of
 from tests.unit.sliders import sliders, small_recipe
 
 MEMORY = {"n_steps": 16, "sequence_length": 8, "batch_size": 64, "n_epochs": 2}
+LOSS = {"clip_range": 0.25, "ent_coef": 0.125, "vf_coef": 0.75}
 
 
 def recurrent(parameters=None, **changes):
@@ -41,7 +42,7 @@ def in_double(model, samples):
         (learner.span, learner.order, double(learner.normalized)),
         (net, *networks.model[1:]),
         tuple(map(double, samples)),
-        np.array([0.25, 0.125, 0.75]),
+        np.array(list(LOSS.values())),
         tuple(map(double, networks.rooms(PARTS))),
         written,
     )
@@ -101,11 +102,8 @@ def test_gradient_through_time_agrees_with_torch_to_1e_12(critic_only):
     """A tile is full, one is not; episodes end within sequences, at their ends, and twice."""
     torch = pytest.importorskip("torch")
     draw, flights = np.random.default_rng(0), 64
-    model = CompiledPPO(
-        sliders(flights),
-        recurrent(parameters={"critic_only": critic_only, "n_steps": 16}),
-        seed=3,
-    )
+    recipe = recurrent(parameters={**LOSS, "critic_only": critic_only})
+    model = CompiledPPO(sliders(flights), recipe, seed=3)
     count = 16 * flights
     model.networks.params[:] += 0.3 * draw.normal(size=model.networks.params.size).astype("f4")
     samples = (
@@ -127,20 +125,13 @@ def test_gradient_through_time_agrees_with_torch_to_1e_12(critic_only):
     np.testing.assert_allclose(found, want, rtol=0.0, atol=1e-12 * abs(want).max() + 1e-15)
     entropy = 0.125 * model.networks.log_std.astype(float).sum()
     assert (sums[0] + 0.75 * sums[1]) / count - entropy == pytest.approx(loss.item(), rel=1e-12)
-    single = model.learner
-    for kept, given in zip((model._observations, model._actions), samples, strict=False):
+    fields = (model._observations, model._actions, model._log_probs, model._targets, model._ended)
+    for kept, given in zip((*fields, model._begun), samples, strict=True):
         kept[:] = given.reshape(kept.shape)
-    model._log_probs[:], model._targets[:], model._ended[:] = (
-        each.reshape(model._ended.shape) for each in samples[2:5]
-    )
-    model._begun[:] = samples[5]
     model.networks.flip()
-    single.differentiate(0, len(order))
-    rates = (0.2, 0.0, 0.5)  # of the recipe: clipped at other ratios, so compare only the critic
-    assert rates == tuple(model.parameters[k] for k in ("clip_range", "ent_coef", "vf_coef"))
-    critic = slice(int(model.networks.critic_gru[0, 2]), None)
-    got = single.gradients.sum(axis=0)[critic] * 0.75 / 0.5
-    np.testing.assert_allclose(got, want[critic], rtol=0.0, atol=1e-5 * abs(want[critic]).max())
+    model.learner.differentiate(0, len(order))
+    single = model.learner.gradients.sum(axis=0)
+    np.testing.assert_allclose(single, want, rtol=0.0, atol=1e-5 * abs(want).max())
 
 
 def test_memory_is_empty_at_the_start_of_each_episode():
@@ -149,7 +140,7 @@ def test_memory_is_empty_at_the_start_of_each_episode():
     model.prepare()
     model._roll_out()
     policy = model.policy()
-    state = None
+    state = kept = None
     starts = np.concatenate([np.ones((1, 8), bool), model._ended[:-1]])
     assert 16 <= starts[1:].sum() < 48
     for t in range(48):
@@ -157,7 +148,7 @@ def test_memory_is_empty_at_the_start_of_each_episode():
             before = np.zeros((8, 7)) if t == 0 else state * ~starts[t, :, None]
             np.testing.assert_allclose(model._begun[t // 8, 0], before, atol=2e-6)
         action, state = policy.predict(model._observations[t], state, starts[t])
-        alone, _ = policy.predict(model._observations[t, 0], None if t == 0 else kept, starts[t, 0])
+        alone, _ = policy.predict(model._observations[t, 0], kept, starts[t, 0])
         np.testing.assert_allclose(alone, action[0], atol=2e-6)
         kept = state[0]
     noise = (model._actions - _means(model)) / np.exp(model.networks.log_std)
@@ -227,7 +218,7 @@ class Cue(gymnasium.Env):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "least", "most"), [("recurrent_ppo", 7.0, 9.0), ("ppo", -1.5, 1.5)]
+    ("algorithm", "least", "most"), [("recurrent_ppo", 7.0, 9.1), ("ppo", -1.5, 1.5)]
 )
 def test_only_a_policy_with_memory_learns_a_delayed_cue(algorithm, least, most):
     parameters = {"n_steps": 16, "batch_size": 128, "n_epochs": 5, "gamma": 0.9}
@@ -235,7 +226,7 @@ def test_only_a_policy_with_memory_learns_a_delayed_cue(algorithm, least, most):
     recipe = small_recipe(algorithm=algorithm, parameters=parameters, **rates)
     env = SyncVectorEnv([Cue] * 32, autoreset_mode=AutoresetMode.SAME_STEP)
     model = CompiledPPO(env, recipe, seed=0)
-    model.learn(25_000)
+    model.learn(12_000)
     assert least < model.training_return < most
 
 
