@@ -21,7 +21,6 @@ ENGINES = ("sb3", "compiled")
 """Training engines: Stable-Baselines3, or `baselines.compiled_ppo`."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Plan(Checked):
     """Plan of a training and its evaluations."""
 

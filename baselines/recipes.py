@@ -6,7 +6,7 @@ the flights in training, such as a start that is easier to learn from.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -43,7 +43,6 @@ ReadOnly = Annotated[Mapping[str, Any], _read_only]
 """A mapping that is copied, and cannot be changed."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Recipe(Checked):
     """Hyperparameters of a training."""
 

@@ -7,7 +7,7 @@ episodes. To define your own arms, write a file like this one with a tuple `ARMS
 
 import runpy
 from collections.abc import Collection, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,8 +24,7 @@ def _word(name: str, value: Any) -> str:
     return value
 
 
-@dataclass(frozen=True)
-class Arm(Checked):
+class Arm(Checked, kw_only=False):
     """Arm of a study: the training and the test of one kind of controller."""
 
     name: Annotated[str, _word]

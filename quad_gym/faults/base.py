@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar
 
@@ -48,7 +47,6 @@ def _duration(name: str, value: Any) -> Span:
 Size = Annotated[Span, partial(span, open_end=True)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fault(Checked):
     """Schedule of a fault; its subclasses are the kinds of faults.
 
@@ -112,7 +110,6 @@ class Fault(Checked):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
 class DirectedFault(Fault):
     """A fault with a size and a direction, drawn uniformly from all directions by default."""
 

@@ -1,7 +1,6 @@
 """Kinds of faults: of sensors, one by one, and of the vehicle."""
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -27,7 +26,6 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
 class GnssOutage(Fault):
     """Loss of all fixes, of position, velocity and baseline, as under a bridge or indoors.
 
@@ -38,7 +36,6 @@ class GnssOutage(Fault):
     needs = "gnss"
 
 
-@dataclass(frozen=True, kw_only=True)
 class GnssOutliers(Fault):
     """Positions with large, independent errors, as from signals reflected by a wall.
 
@@ -57,7 +54,6 @@ class GnssOutliers(Fault):
     needs = "gnss"
 
 
-@dataclass(frozen=True, kw_only=True)
 class GnssRamp(DirectedFault):
     """A ramp in the positions, which jump back when the fault ends; velocities stay valid.
 
@@ -77,7 +73,6 @@ class GnssRamp(DirectedFault):
         return super().numbers | {"size": self.speed}
 
 
-@dataclass(frozen=True, kw_only=True)
 class GnssJump(DirectedFault):
     """A constant position offset, as when carrier-phase ambiguities are fixed wrongly.
 
@@ -90,14 +85,12 @@ class GnssJump(DirectedFault):
     needs = "gnss"
 
 
-@dataclass(frozen=True, kw_only=True)
 class BaselineLoss(Fault):
     """Loss of the baseline while positions continue, as with a shaded secondary antenna."""
 
     needs = "gnss"
 
 
-@dataclass(frozen=True, kw_only=True)
 class CameraOcclusion(Fault):
     """Features that the camera does not see: something is in the way, or the image is dark."""
 
@@ -108,7 +101,6 @@ class CameraOcclusion(Fault):
     needs = "camera"
 
 
-@dataclass(frozen=True, kw_only=True)
 class WrongAssociations(Fault):
     """Features mistaken for others, in some of the images with two or more visible features.
 
@@ -139,7 +131,6 @@ class WrongAssociations(Fault):
         return super().numbers | {"fault_swaps": self.how == "swap"}
 
 
-@dataclass(frozen=True, kw_only=True)
 class AccelBiasStep(DirectedFault):
     """A step of the accelerometer's true bias in B, in addition to its random drift.
 
@@ -151,7 +142,6 @@ class AccelBiasStep(DirectedFault):
     """length of the step [m/s^2]"""
 
 
-@dataclass(frozen=True, kw_only=True)
 class GyroBiasStep(DirectedFault):
     """A step of the gyro's true bias in B, in addition to its random drift.
 
@@ -163,7 +153,6 @@ class GyroBiasStep(DirectedFault):
     """length of the step [rad/s]"""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ImuSaturation(Fault):
     """Saturation of samples at the IMU's ranges, by default the smallest ones of a consumer part.
 
@@ -182,7 +171,6 @@ class ImuSaturation(Fault):
         return {"imu_range": (self.accel_range, self.gyro_range)}
 
 
-@dataclass(frozen=True, kw_only=True)
 class SensorLoss(Fault):
     """Loss of all measurements of an aiding sensor, as during a bus failure.
 
@@ -203,7 +191,6 @@ class SensorLoss(Fault):
         return self.sensor
 
 
-@dataclass(frozen=True, kw_only=True)
 class PositionJump(DirectedFault):
     """Sudden displacement of the vehicle at the onset of the fault, without any acceleration.
 
@@ -217,7 +204,6 @@ class PositionJump(DirectedFault):
     """length of the displacement [m]"""
 
 
-@dataclass(frozen=True, kw_only=True)
 class RotorLoss(Fault):
     """Loss of a fraction of one rotor's thrust and torque, as with a chipped blade; 1: total loss.
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
 from quad_gym.params import checks as check
@@ -38,7 +37,6 @@ class SensorBase(Checked):
         return self.replace(**scaled)
 
 
-@dataclass(frozen=True, kw_only=True)
 class AidParams(SensorBase):
     """An aiding sensor other than IMU, GNSS and camera."""
 

@@ -1,13 +1,10 @@
 """The barometer: altitude from static pressure, and its errors."""
 
-from dataclasses import dataclass
-
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams, SlowError
 from quad_gym.records import Aid
 
 
-@dataclass(frozen=True, kw_only=True)
 class BarometerParams(AidParams):
     """A barometer: height of the vehicle in I, with white noise and a time-correlated bias."""
 

@@ -1,7 +1,6 @@
 """The camera: mounting, intrinsics, features and errors."""
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar
 
@@ -25,7 +24,6 @@ def _features(name: str, value: Any) -> Matrix:
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
 class CameraParams(SensorBase):
     """A pinhole camera that measures the image coordinates of known features."""
 

@@ -4,7 +4,18 @@ import dataclasses
 import inspect
 from functools import partial
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal, NoReturn, Self, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NoReturn,
+    Self,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+)
 
 from quad_gym.params.checks import Rule, choice, flag, instance, keywords, number
 
@@ -39,21 +50,27 @@ class _Signature:
         return inspect.Signature(parameters)
 
 
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
+)
 class Checked:
-    """A frozen dataclass whose fields are replaced by their checked form on creation.
+    """Base of frozen dataclasses whose fields are replaced by their checked form on creation.
 
-    The rule of a field is part of its type, as in `Annotated[float, rule]`, or follows from it.
+    Subclasses are dataclasses without a decorator, with keyword-only fields by default. The rule of
+    a field is part of its type, as in `Annotated[float, rule]`, or follows from it.
     """
 
     __signature__ = _Signature()
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
     _rules: ClassVar[dict[str, Rule]] = {}
 
-    def __init_subclass__(cls) -> None:
-        """Move the rules out of the types of fields, which then are plain."""
+    def __init_subclass__(cls, *, kw_only: bool = True, eq: bool = True) -> None:
+        """Move the rules out of the types of fields, which then are plain, and make a dataclass."""
         super().__init_subclass__()
         split = {name: _rule_of(hint) for name, hint in inspect.get_annotations(cls).items()}
         cls.__annotations__ = {name: plain for name, (plain, _) in split.items()}
         cls._rules = cls._rules | {name: rule for name, (_, rule) in split.items() if rule}
+        dataclasses.dataclass(frozen=True, kw_only=kw_only, eq=eq)(cls)
 
     def __post_init__(self) -> None:
         """Apply the rules of all fields."""
@@ -67,7 +84,7 @@ class Checked:
             UnknownKeywordError: If there is one.
         """
         if given:
-            fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+            fields = dataclasses.fields(cls)
             keywords(given, [field.name for field in fields if field.init], cls.__name__)
         return super().__new__(cls)
 
@@ -81,4 +98,4 @@ class Checked:
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; all values are checked again."""
-        return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+        return dataclasses.replace(self, **changes)

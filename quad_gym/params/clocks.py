@@ -1,6 +1,5 @@
 """Clocks: the rates of simulation and control."""
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
@@ -8,7 +7,6 @@ from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
 
-@dataclass(frozen=True, kw_only=True)
 class Clocks(Checked):
     """Rates of simulation and control; sensors have their own.
 

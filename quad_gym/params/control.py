@@ -1,13 +1,11 @@
 """Control: gains of the PD controller, and scales and inner loops behind the actions."""
 
 import math
-from dataclasses import dataclass
 
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
 
-@dataclass(frozen=True, kw_only=True)
 class PDGains(Checked):
     """Gains of the PD controller of position and attitude."""
 
@@ -21,7 +19,6 @@ class PDGains(Checked):
     """(3,) diagonal of the derivative gain Kd of the attitude loop [N m s]; laboratory"""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionParams(Checked):
     """Scales of the actions, and bandwidths of the inner loops that track them at every tick."""
 

@@ -1,7 +1,7 @@
 """Distributions of randomized parameters, and the form in which the kernel reads them."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -24,8 +24,7 @@ class Affine(NamedTuple):
     d: float = 1.0
 
 
-@dataclass(frozen=True)
-class Distribution(Checked):
+class Distribution(Checked, kw_only=False):
     """Distribution of a parameter, absolute or relative to its nominal value."""
 
     relative: bool = field(default=False, kw_only=True)
@@ -54,8 +53,7 @@ class Distribution(Checked):
         return 0.5 * (low + high), 0.5 * (high - low)
 
 
-@dataclass(frozen=True)
-class _Between(Distribution):
+class _Between(Distribution, kw_only=False):
     """Distribution on [low, high]."""
 
     low: float
@@ -72,8 +70,7 @@ class _Between(Distribution):
         return self.low, self.high
 
 
-@dataclass(frozen=True)
-class Uniform(_Between):
+class Uniform(_Between, kw_only=False):
     """Uniform distribution on [low, high]."""
 
     def placed(self, factor: float, shift: float) -> Affine:
@@ -81,8 +78,7 @@ class Uniform(_Between):
         return Affine(UNIFORM, factor * self.low + shift, factor * (self.high - self.low))
 
 
-@dataclass(frozen=True)
-class LogUniform(_Between):
+class LogUniform(_Between, kw_only=False):
     """Log-uniform distribution on [low, high], above 0: for scales that are known to a factor."""
 
     low: check.Positive
@@ -105,8 +101,7 @@ def _bound(name: str, value: Any) -> float:
     return float(value)
 
 
-@dataclass(frozen=True)
-class Normal(Distribution):
+class Normal(Distribution, kw_only=False):
     """Normal distribution with mean and standard deviation `sigma`, truncated to [low, high]."""
 
     mean: float

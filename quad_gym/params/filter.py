@@ -1,7 +1,6 @@
 """Parameters of the Kalman filter."""
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
 
@@ -10,7 +9,6 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.gravity import GRAVITY
 
 
-@dataclass(frozen=True, kw_only=True)
 class FilterParams(Checked):
     """Form and tuning of the Kalman filter; the defaults are the laboratory report's filter."""
 

@@ -1,7 +1,6 @@
 """GNSS: positions, velocities, the baseline between two antennas, and their errors."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -26,7 +25,6 @@ def check_baseline(name: str, baseline: np.ndarray) -> None:
         raise ValueError(f"{name} must be apart, by at least {LEAST_BASELINE:g} m")
 
 
-@dataclass(frozen=True, kw_only=True)
 class GnssParams(SensorBase):
     """GNSS: position of the primary antenna and, with a second antenna, the baseline between them.
 

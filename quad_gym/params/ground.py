@@ -1,7 +1,6 @@
 """The ground that supports vehicles: feet, friction, and limits of a safe touchdown."""
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
@@ -13,7 +12,6 @@ from quad_gym.params.checked import Checked
 FARTHEST_FOOT = 10.0  # largest distance of a foot from the center of mass [m]
 
 
-@dataclass(frozen=True, kw_only=True)
 class GroundParams(Checked):
     """A level plane at `WorldParams.ground_height` that supports a vehicle anywhere.
 

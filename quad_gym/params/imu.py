@@ -1,7 +1,6 @@
 """The IMU and its errors, with the source of every number."""
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
 
@@ -20,7 +19,6 @@ _ERRORS = tuple(
 """Errors of scale and alignment."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ImuParams(SensorBase):
     """Accelerometer and gyro, with white noise and Gauss-Markov biases (report eqs. 4, 6, 7)."""
 

@@ -1,7 +1,6 @@
 """The magnetometer: the Earth's magnetic field in body axes, and its errors."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
@@ -11,7 +10,6 @@ from quad_gym.records import Aid
 MICROTESLA = 1e-6  # one microtesla [T]
 
 
-@dataclass(frozen=True, kw_only=True)
 class MagnetometerParams(AidParams):
     """A three-axis magnetometer near the iron and the currents of a vehicle.
 

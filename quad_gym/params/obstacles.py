@@ -5,7 +5,6 @@ to one than its radius collides with it, and the camera cannot see features behi
 """
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, ClassVar
 
@@ -21,7 +20,6 @@ LEAST_SIZE = 1e-3  # smallest length, thickness, height or radius [m]
 Size = Annotated[float, partial(check.positive, least=LEAST_SIZE, most=FARTHEST_OBSTACLE)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Obstacle(Checked):
     """Base of all obstacles: a place, which can be shifted at random in each episode."""
 
@@ -53,7 +51,6 @@ class Obstacle(Checked):
         return (1.0, 0.0)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Wall(Obstacle):
     """An upright box: a wall, a pillar, a house."""
 
@@ -81,7 +78,6 @@ class Wall(Obstacle):
         return (math.cos(self.yaw), math.sin(self.yaw))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Cylinder(Obstacle):
     """An upright cylinder: a pillar, a tree, a mast."""
 

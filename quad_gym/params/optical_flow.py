@@ -1,13 +1,10 @@
 """The optical flow sensor: the angular rate at which the ground passes below, and its errors."""
 
-from dataclasses import dataclass
-
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
 from quad_gym.records import Aid
 
 
-@dataclass(frozen=True, kw_only=True)
 class OpticalFlowParams(AidParams):
     """A camera that looks down and measures the motion of the ground, such as a PMW3901.
 

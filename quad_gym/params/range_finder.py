@@ -1,13 +1,10 @@
 """The range finder: distance to the ground along the body z axis, and its errors."""
 
-from dataclasses import dataclass
-
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
 from quad_gym.records import Aid
 
 
-@dataclass(frozen=True, kw_only=True)
 class RangeFinderParams(AidParams):
     """A time-of-flight sensor that looks down, such as a VL53L1X.
 

@@ -1,6 +1,6 @@
 """Weights of the built-in rewards."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Annotated
 
 from quad_gym.params import checks as check
@@ -14,7 +14,6 @@ _TRACKING = (RewardTerm.NEAR, RewardTerm.FINE, *_COMMON)
 _COURSE = (RewardTerm.PROGRESS, RewardTerm.GATE_PASSED, *_COMMON)
 
 
-@dataclass(frozen=True, kw_only=True)
 class RewardParams(Checked):
     """Weights of the terms of the built-in rewards, per step; a weight of 0 switches a term off.
 

@@ -4,7 +4,7 @@ As everywhere in `params`: SI units, body frame B with x forward and z up along 
 laboratory's numbers from the Aerial Robotics course (ASE 479W, The University of Texas at Austin).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated
 
 from quad_gym.params import checks as check
@@ -42,7 +42,6 @@ Delay = Annotated[float, check.between(-2.0, 2.0)]
 _WORDS = {"gnss": "GNSS"}  # sensors in messages, where the name of the field is none
 
 
-@dataclass(frozen=True, kw_only=True)
 class InitialPoseParams(Checked):
     """Accuracy of the initial position and heading where there is no GNSS to measure them.
 
@@ -59,7 +58,6 @@ class InitialPoseParams(Checked):
     """standard deviation of the initial heading [rad]; a vehicle lined up by eye, some 3 degrees"""
 
 
-@dataclass(frozen=True, kw_only=True)
 class NoisyObservationParams(Checked):
     """Standard deviations of the noise of `observation="noisy"`.
 
@@ -77,7 +75,6 @@ class NoisyObservationParams(Checked):
     """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
 
 
-@dataclass(frozen=True, kw_only=True)
 class LogDelays(Checked):
     """Times by which the stamps of a vehicle's logs are later than the measurements themselves.
 
@@ -106,7 +103,6 @@ def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
     return ticks
 
 
-@dataclass(frozen=True, kw_only=True)
 class SensorSuite(Checked, Saved):
     """All sensors of a vehicle and the filter that fuses them."""
 

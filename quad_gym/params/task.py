@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,7 +26,6 @@ MIN_PERIOD = 0.01  # period of the fastest reference [s]; no vehicle can follow 
 Size = Annotated[float, partial(check.positive, most=FARTHEST)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class TaskParams(Checked):
     """Reference, start, reward scale and termination of a task."""
 

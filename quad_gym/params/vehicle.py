@@ -6,7 +6,6 @@ Texas at Austin) whose third laboratory report this package implements.
 """
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,7 +45,6 @@ its solution grows: the root of |1 - z + z^2/2 - z^3/6 + z^4/24| = 1 is 2.785.""
 _LIFTING = "thrust_coefficient, motor_speed_per_volt and max_voltage"
 
 
-@dataclass(frozen=True, kw_only=True)
 class VehicleParams(Checked, Saved):
     """A quadrotor: rigid body, four rotors with first-order speed response, disc drag."""
 

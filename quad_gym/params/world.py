@@ -5,7 +5,6 @@ still, the ground far away and the battery always full, and there are no obstacl
 laboratory's model.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
@@ -21,7 +20,6 @@ from quad_gym.records import MAX_OBSTACLES
 MAX_WIND = 200.0  # largest wind speed [m/s]; the strongest tornadoes reach some 135 m/s
 
 
-@dataclass(frozen=True, kw_only=True)
 class BatteryParams(Checked):
     """A battery whose voltage falls with the energy drawn so far and with the present power.
 
@@ -49,7 +47,6 @@ class BatteryParams(Checked):
     motors"""
 
 
-@dataclass(frozen=True, kw_only=True)
 class WorldParams(Checked):
     """Wind, drag, ground, battery and obstacles.
 

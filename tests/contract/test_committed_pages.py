@@ -49,10 +49,11 @@ def test_the_guide_holds_the_table_of_the_default_observation():
 ROOT = Path(__file__).parents[2]
 
 
-def test_no_text_exceeds_its_ceiling():
+def test_no_text_has_many_words_to_avoid():
     assert dialect.too_many(dialect.counts()) == []
 
 
 def test_contributing_has_the_table_of_words():
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    assert page.split("<!-- words -->")[1].split("<!-- /words -->")[0].strip() == dialect.table()
+    rows = page.split("<!-- words -->")[1].split("<!-- /words -->")[0].strip().split("\n")[2:]
+    assert [row.split("|")[1].strip() for row in rows] == list(dialect.WORDS)

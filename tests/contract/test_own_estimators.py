@@ -67,6 +67,12 @@ def test_updates_of_filterpy_give_the_flights_of_the_error_state_ekf():
     assert max(differences(numpy, filterpy, *compared)) < 1e-9
 
 
+def test_complementary_filter_refuses_sensors_without_gnss():
+    given = gallery("complementary").Complementary
+    with pytest.raises(ValueError, match="Complementary needs sensors with GNSS"):
+        vec_env(estimator=given, sensors="indoor", count=2, seed=0)
+
+
 @pytest.mark.parametrize("sensors", ["standard", "rtk"])
 def test_invariant_ekf_is_consistent_and_as_accurate_as_the_built_in_filter(sensors):
     """From 1 s to 2.5 s on the circle; `rtk` has a latency of 0.1 s.

@@ -2,7 +2,8 @@
 
 The IMU is integrated. Each GNSS fix pulls position and velocity toward itself; as a tilt error e
 adds R_IB (e x f) to the acceleration, it corrects the tilt, too, and the accelerometer's bias along
-the thrust. The heading follows the baseline or the magnetometer.
+the thrust. The heading follows the baseline or the magnetometer. It does not use the camera, so
+that suites without GNSS are refused.
 """
 
 import numpy as np
@@ -29,6 +30,8 @@ class Complementary(quad_gym.Estimator):
         self.bandwidth, self.heading = bandwidth, heading  # both in rad/s
 
     def reset(self, view, mask):
+        if view.sensors.gnss is None:
+            raise ValueError("Complementary needs sensors with GNSS, got a suite without")
         self.state.r, self.state.v, self.state.R = view.position, view.velocity, view.R_BI
 
     def update(self, m):

@@ -2,20 +2,15 @@
 
 import functools
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quad_gym.params import checks as check
 from quad_gym.params.trajectories.flatness import motion_of
-from quad_gym.params.trajectories.timing import derivative
+from quad_gym.params.trajectories.pieces import Floats, Reference, derivative
 from quad_gym.params.vehicle import VehicleParams
-
-if TYPE_CHECKING:
-    from quad_gym.params.trajectories.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 INTERVAL, SAMPLES, MOST_SAMPLES = 0.01, 16, 400
 """Interval of the checks [s], and their least and largest number per segment."""
@@ -47,7 +42,7 @@ class Demand(NamedTuple):
 
 
 def check_trajectory(
-    trajectory: "Trajectory",
+    trajectory: Reference,
     vehicle: VehicleParams,
     *,
     max_thrust: float | None = None,
@@ -91,7 +86,7 @@ def check_trajectory(
 
 @functools.lru_cache(maxsize=256)
 def _checked(
-    trajectory: "Trajectory",
+    trajectory: Reference,
     vehicle: VehicleParams,
     max_thrust: float | None,
     max_tilt: float,
@@ -131,7 +126,7 @@ def _checked(
 
 
 def _refuse_excess(
-    trajectory: "Trajectory",
+    trajectory: Reference,
     demands: list[tuple[str, Floats, str, float, float]],
     times: Floats,
     name: str,
@@ -162,13 +157,13 @@ def _refuse_excess(
         )
 
 
-def _where(trajectory: "Trajectory", time: float) -> str:
+def _where(trajectory: Reference, time: float) -> str:
     segments = len(trajectory.times) - 1
     segment = min(int(np.searchsorted(trajectory.times, time, side="right")), segments)
     return f"at {time:.3f} s (segment {segment} of {segments})"
 
 
-def _refuse_turnabouts(trajectory: "Trajectory", times: Floats, name: str) -> None:
+def _refuse_turnabouts(trajectory: Reference, times: Floats, name: str) -> None:
     """Refuse headings that turn about at once, as along a path that stops and comes back."""
     turns = np.diff(trajectory.yaw(times))
     turns = np.abs((turns + np.pi) % (2.0 * np.pi) - np.pi)
@@ -180,21 +175,20 @@ def _refuse_turnabouts(trajectory: "Trajectory", times: Floats, name: str) -> No
         )
 
 
-def sampling_times(trajectory: "Trajectory") -> Floats:
+def sampling_times(trajectory: Reference) -> Floats:
     """Return the times at which demands are checked [s]."""
     lengths = np.diff(trajectory.times)
     count = int(np.clip(np.ceil(lengths.max() / INTERVAL), SAMPLES, MOST_SAMPLES))
     return trajectory.instants(count)
 
 
-def _refuse_jumps(trajectory: "Trajectory", name: str) -> None:
+def _refuse_jumps(trajectory: Reference, name: str) -> None:
     """Refuse segments that do not continue each other."""
     lengths = np.diff(trajectory.times)
-    path = trajectory._polynomials(0, 3)
     for order, (what, unit) in enumerate(
         (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
     ):
-        terms = derivative(path.c, order)
+        terms = derivative(trajectory.coefficients[..., :3], order)
         ends = np.zeros(terms.shape[1:])
         for row in terms:
             ends = ends * lengths[:, np.newaxis] + row

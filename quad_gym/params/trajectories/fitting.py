@@ -1,18 +1,15 @@
 """Piecewise polynomials that approximate any smooth function of time."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quad_gym.params import checks as check
+from quad_gym.params.trajectories.pieces import Floats, Pieces
 from quad_gym.params.trajectories.splines import heading_choice, polynomials
 
-if TYPE_CHECKING:
-    from quad_gym.params.trajectories.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 Function = Callable[[float], Any]
 
 FEWEST, MOST = 16, 8192  # segments that are tried, each time twice as many
@@ -22,7 +19,6 @@ LOOSER = 1e3  # factor on the tolerance for derivatives [1/s, 1/s^2]
 
 
 def fit(
-    cls: "type[Trajectory]",
     function: Callable[[float], ArrayLike],
     duration: float,
     *,
@@ -32,7 +28,7 @@ def fit(
     tolerance: float = 1e-6,
     yaw: Callable[[float], float] | float | str | None = None,
     look_at: ArrayLike | None = None,
-) -> "Trajectory":
+) -> Pieces:
     """Return a trajectory that approximates any smooth function of time.
 
     The function is replaced by splines of degree 7, with as many segments as the tolerance
@@ -96,7 +92,7 @@ def fit(
         terms[6, :, 3] += turns
     else:
         terms[7, :, 3] = angles
-    return cls(times=times, coefficients=terms, closed=closed, heading=rule, point=point)
+    return Pieces(times, terms, closed, rule, point)
 
 
 def _fitted(

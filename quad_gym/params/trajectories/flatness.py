@@ -7,16 +7,13 @@ Source: Mellinger and Kumar, Minimum snap trajectory generation and control for 
 2011; axes as in the report's controller.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from quad_gym.params.trajectories.trajectory import Trajectory
-    from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.trajectories.pieces import Floats, Reference
+from quad_gym.params.vehicle import VehicleParams
 
-Floats = NDArray[np.float64]
 Jet = tuple[Floats, Floats, Floats]  # A vector (n, 3) over time with its first two derivatives
 
 
@@ -35,7 +32,7 @@ class Motion(NamedTuple):
         return np.arccos(np.clip(self.R_BI[:, 2, 2], -1.0, 1.0))
 
 
-def motion_of(trajectory: "Trajectory", vehicle: "VehicleParams", times: Floats) -> Motion:
+def motion_of(trajectory: Reference, vehicle: VehicleParams, times: Floats) -> Motion:
     """Return the demands of a trajectory on a vehicle at times (n,) [s]."""
     force = (
         trajectory(times, 2) + np.array([0.0, 0.0, vehicle.gravity]),
@@ -62,7 +59,7 @@ def motion_of(trajectory: "Trajectory", vehicle: "VehicleParams", times: Floats)
     return Motion(thrust, np.stack([x[0], y[0], z[0]], axis=1), rates, torque, forces)
 
 
-def _heading(trajectory: "Trajectory", times: Floats) -> Jet:
+def _heading(trajectory: Reference, times: Floats) -> Jet:
     """Return the desired horizontal direction of body x."""
     angle, rate, change = (trajectory.yaw(times, k)[:, np.newaxis] for k in range(3))
     zero = np.zeros_like(angle)

@@ -2,14 +2,13 @@
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from quad_gym.params import checks as check
-
-if TYPE_CHECKING:
-    from quad_gym.params.trajectories.trajectory import Trajectory
+from quad_gym.params.trajectories.pieces import Pieces
+from quad_gym.params.trajectories.splines import through
 
 COLUMNS = ("time", "x", "y", "z")  # columns that a table must have; "yaw" is optional
 
@@ -17,7 +16,7 @@ OPTIONS = ("closed", "minimize", "at_rest", "yaw", "look_at")
 """Keywords of `Trajectory.through` that do not contradict a table."""
 
 
-def from_csv(cls: "type[Trajectory]", /, path: Path | str, **options: Any) -> "Trajectory":
+def from_csv(path: Path | str, **options: Any) -> Pieces:
     """Return a trajectory through the rows of a table, at their times.
 
     The first line names the columns: `time` [s], `x`, `y`, `z` in I [m], and optionally `yaw`
@@ -70,7 +69,7 @@ def from_csv(cls: "type[Trajectory]", /, path: Path | str, **options: Any) -> "T
     }:
         options = options | {"yaw": table[:, 4]}
     if not options.get("closed", False):
-        return cls.through(table[:, 1:4], table[:, 0], **options)
+        return through(table[:, 1:4], table[:, 0], **options)
     if np.abs(table[-1, 1:4] - table[0, 1:4]).max() > 1e-3:
         raise ValueError(
             f"{path} must end where it begins with closed=True, got {table[0, 1:4]} and "
@@ -78,7 +77,7 @@ def from_csv(cls: "type[Trajectory]", /, path: Path | str, **options: Any) -> "T
         )
     if isinstance(options.get("yaw"), np.ndarray):
         options = options | {"yaw": options["yaw"][:-1]}
-    return cls.through(table[:-1, 1:4], table[:, 0], **options)
+    return through(table[:-1, 1:4], table[:, 0], **options)
 
 
 def _numbers(where: str, cells: list[str], places: list[int], names: list[str]) -> list[float]:

@@ -7,19 +7,14 @@ from the k-th on (natural), or repeating, SciPy's interpolating splines are that
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quad_gym.params import checks as check
+from quad_gym.params.trajectories.pieces import Floats, HeadingRule, Pieces
 from quad_gym.params.trajectories.timing import choose_times
-
-if TYPE_CHECKING:
-    from quad_gym.params.trajectories.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
-HeadingRule = Literal["given", "along", "toward"]
 
 ORDERS = {"snap": 4, "jerk": 3}  # order of the derivative that is minimized, by name
 
@@ -31,7 +26,6 @@ SHORTEST = 1e-6  # time between two points, and distance where times are chosen,
 
 
 def through(
-    cls: "type[Trajectory]",
     points: ArrayLike,
     times: ArrayLike | None = None,
     *,
@@ -42,7 +36,7 @@ def through(
     at_rest: bool = True,
     yaw: ArrayLike | str | None = None,
     look_at: ArrayLike | None = None,
-) -> "Trajectory":
+) -> Pieces:
     """Return the smoothest trajectory through points: least integral of squared snap or jerk.
 
     It is a spline of degree 7 (5) whose derivatives up to the sixth (fourth) are continuous.
@@ -107,7 +101,7 @@ def through(
         terms[..., 3] = _yaw_coefficients(when, angles, closed, at_rest)
     else:
         terms[-1, :, 3] = angles
-    return cls(times=when, coefficients=terms, closed=closed, heading=rule, point=point)
+    return Pieces(when, terms, closed, rule, point)
 
 
 def heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, float], Any]:

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from quad_gym.params.trajectories.pieces import Floats, derivative
 
 EXPONENTS = (0.5, 0.75, 1.0)
 """Exponents of the first guesses for the durations of segments: powers of their lengths."""
@@ -73,14 +72,6 @@ def _sampled(times: Floats, terms: Floats, order: int) -> Floats:
     for row in derivative(terms, order):
         values = values * t[..., np.newaxis] + row
     return np.linalg.norm(values, axis=2)
-
-
-def derivative(terms: Floats, order: int) -> Floats:
-    """Coefficients (8 - order, ...) of a derivative of polynomials, the highest power first."""
-    for _ in range(order):
-        powers = np.arange(len(terms) - 1, 0, -1, dtype=np.float64)
-        terms = terms[:-1] * powers.reshape(-1, *[1] * (terms.ndim - 1))
-    return terms
 
 
 def peak(times: Floats, terms: Floats, order: int) -> float:

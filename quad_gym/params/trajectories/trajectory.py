@@ -1,10 +1,11 @@
 """Trajectories: references as piecewise polynomials in time."""
 
 import dataclasses
+import inspect
 import math
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Callable
+from functools import cached_property, partial, wraps
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,21 +16,38 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
 from quad_gym.params.trajectories.feasibility import check_trajectory
 from quad_gym.params.trajectories.fitting import fit
+from quad_gym.params.trajectories.pieces import Floats, HeadingRule, Pieces
 from quad_gym.params.trajectories.reading import from_csv
-from quad_gym.params.trajectories.splines import HeadingRule, through
+from quad_gym.params.trajectories.splines import through
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-Floats = NDArray[np.float64]
+Arguments = ParamSpec("Arguments")
 
 TERMS = 8  # coefficients of a polynomial of degree 7, as minimum snap requires
 LEAST_SPEED = 1e-3  # horizontal speed below which a heading along the path is held [m/s]
 EARLY = 1e-3  # fraction of a trajectory after which a start from rest has a direction
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trajectory(Checked):
+def _making(
+    function: Callable[Arguments, Pieces],
+) -> "classmethod[Trajectory, Arguments, Trajectory]":
+    """Make a class method that returns an instance from a function that returns its fields."""
+
+    @wraps(function)
+    def make(
+        cls: "type[Trajectory]", /, *values: Arguments.args, **named: Arguments.kwargs
+    ) -> "Trajectory":
+        return cls(**function(*values, **named)._asdict())
+
+    own = inspect.Parameter("cls", inspect.Parameter.POSITIONAL_ONLY)
+    others = inspect.signature(function).parameters.values()
+    make.__signature__ = inspect.Signature([own, *others])  # type: ignore[attr-defined]
+    return classmethod(make)
+
+
+class Trajectory(Checked, eq=False):
     """Desired position and heading over time: piecewise polynomials, exact in the kernels, too.
 
     In the segment that begins at t_j, `r*(t) = sum_k c_k (t - t_j)^(7 - k)`, and the yaw has the
@@ -64,9 +82,9 @@ class Trajectory(Checked):
         for array in (self.times, self.coefficients):
             array.flags.writeable = False
 
-    through = classmethod(through)
-    from_csv = classmethod(from_csv)
-    of = classmethod(fit)
+    through = _making(through)
+    from_csv = _making(from_csv)
+    of = _making(fit)
     check = check_trajectory
 
     @property
