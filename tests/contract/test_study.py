@@ -73,8 +73,7 @@ def test_study_of_each_task_flies_all_arms(task, arms, tmp_path, capsys):
     assert (folder / "pace.png").stat().st_size > 1000
 
 
-def test_one_study_trains_arms_of_both_engines(tmp_path, capsys):
-    pytest.importorskip("sb3_contrib")
+def test_one_study_trains_arms_with_and_without_memory(tmp_path, capsys):
     words = [*QUICK, "--set", "n_steps=8", "batch_size=512", "n_epochs=1"]
     words += ["--arms", "std_certainty_privileged", "recurrent", "--output", str(tmp_path / "out")]
     assert main(words) == 0
@@ -85,8 +84,7 @@ def test_one_study_trains_arms_of_both_engines(tmp_path, capsys):
         for name in ("std_certainty_privileged", "recurrent")
     }
     assert plans["recurrent"]["recipe"]["algorithm"] == "recurrent_ppo"
-    assert plans["recurrent"]["engine"] == "sb3"
-    assert plans["std_certainty_privileged"]["engine"] == "compiled"
+    assert {plan["engine"] for plan in plans.values()} == {"compiled"}
 
 
 @pytest.mark.parametrize(
