@@ -100,7 +100,8 @@ class GruPolicy:
         """Read a policy; a ValueError if the file does not exist or is no policy in this format."""
         about, arrays = contents(file)
         require_format(file, about, FORMAT)
-        return cls(*(arrays[name] for name in "WbUc"), MlpPolicy.of(about, arrays))
+        W, b, U, c = (arrays[name] for name in "WbUc")
+        return cls(W, b, U, c, MlpPolicy.of(about, arrays))
 
 
 def load_network(file: str | Path) -> MlpPolicy | GruPolicy:

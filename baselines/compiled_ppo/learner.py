@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo import kernels
+from baselines.compiled_ppo.kernels import common as kernels
 from baselines.compiled_ppo.networks import Networks
 from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo.kernels import INPUTS, OUTPUTS, STORED, TILE, flip
+from baselines.compiled_ppo.kernels.common import INPUTS, OUTPUTS, STORED, TILE, flip
+from baselines.gru import GruPolicy
 from baselines.mlp import MlpPolicy
 from baselines.recipes import ACTIVATIONS, Recipe
-from quad_gym.evaluation import Policy
 
 Floats = NDArray[np.float32]
 Table = NDArray[np.int64]
@@ -67,7 +67,7 @@ class Networks(ABC):
         """
 
     @abstractmethod
-    def policy(self, record: Mapping[str, Any]) -> Policy:
+    def policy(self, record: Mapping[str, Any]) -> MlpPolicy | GruPolicy:
         """Copy the actor to a policy that requires only NumPy."""
 
     def _perceptron(self, record: Mapping[str, Any]) -> MlpPolicy:

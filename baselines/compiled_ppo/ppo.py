@@ -269,9 +269,9 @@ def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
 def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:
     """Check a recipe for a number of inputs; return its parameters with defaults."""
     check.choice("algorithm of the compiled engine", recipe.algorithm, COMPILED)
-    known = PARAMETERS
+    known: dict[str, Any] = dict(PARAMETERS)
     if recipe.algorithm == "recurrent_ppo":
-        known = {**known, "sequence_length": None}
+        known["sequence_length"] = None
     check.keywords(recipe.parameters, tuple(known), "the compiled PPO")
     check.keywords(recipe.policy, ("log_std_init",), "the policy of the compiled PPO")
     found = {**known, **recipe.parameters}

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from baselines.compiled_ppo import CompiledPPO
-from baselines.compiled_ppo.kernels import SUMS, flip
+from baselines.compiled_ppo.kernels.common import SUMS, flip
 from baselines.compiled_ppo.learner import PARTS
 from baselines.gru import GruPolicy, load_network
 from baselines.mlp import MlpPolicy
