@@ -129,13 +129,13 @@ ARMS = (
     # rewarded for certainty like `certainty` and `std_certainty`, so that they differ only in the
     # information available to the policy
     Arm(
-        "recurrent",
+        "certainty_recurrent",
         "estimate, memory, reward for certainty",
         learning=_task("CertaintyReward"),
         algorithm="recurrent_ppo",
     ),
     Arm(
-        "std_recurrent",
+        "std_certainty_recurrent",
         "estimate + standard deviation, memory, reward for certainty",
         environment=_WITH_STD,
         learning=_task("WithStdCertaintyReward"),
@@ -203,7 +203,7 @@ OUTAGE_DASH = (
         learning=_task("ConstantCrashCostWithUncertainty"),
     ),
     Arm(
-        "recurrent",
+        "estimate_recurrent",
         "estimate, memory",
         environment=_SCALED,
         learning=_CONSTANT_CRASH_COST,
