@@ -27,10 +27,9 @@ SUITES = {
 
 TASKS = {"look_around": "LookAround", "stale_race": "StaleRace", "outage_dash": "OutageDash"}
 MEMORY = {
-    "look_around --steps 2000000": "certainty certainty_recurrent std_certainty "
-    "std_certainty_recurrent",
-    "stale_race --steps 2000000": "std std_recurrent",
-    "outage_dash": "std std_recurrent",
+    "look_around --steps 1000000": "certainty certainty_recurrent",
+    "stale_race --steps 1000000": "std std_recurrent",
+    "outage_dash --steps 600000": "std std_recurrent",
 }
 """Tasks, with the budget, and arms of the comparison of policies with and without memory."""
 
@@ -246,16 +245,13 @@ def cell(found: Mapping[str, float], column: str) -> str:
 def memory(folder: Path, _: Sequence[str]) -> dict[str, str]:
     """Arms with and without memory of the three studies, and the verdicts."""
     rows, verdicts = [], []
-    for number, task in enumerate(MEMORY):
-        summary = _read(folder / f"{number}/summary.json")
-        name = task.split()[0]
+    for k, task in enumerate(MEMORY):
+        summary, name = _read(folder / f"{k}/summary.json"), TASKS[task.split()[0]]
         for arm in summary["study"]["arms"]:
             row = summary["rows"][arm["name"]]
             cells = (cell(row[column], column) for column in ("return", "success", "crashed"))
-            rows.append([TASKS[name], arm["label"], *cells])
-        verdicts += [
-            f"- {TASKS[name]}: {each}" for each in summary["conclusions"] if "emory" in each
-        ]
+            rows.append([name, arm["label"], *cells])
+        verdicts += [f"- {name}: {each}" for each in summary["conclusions"] if "emory" in each]
     text = table(("task", "policy", "return", "success", "crashed"), rows)
     return {"memory": text + "\n" + "\n".join(verdicts) + "\n"}
 
