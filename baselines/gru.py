@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from baselines.mlp import MlpPolicy, contents, require_format
 
-FORMAT = "quad_gym recurrent policy 1"
-"""Identifier of the file format."""
+FORMAT = "quad_gym recurrent policy 1"  #: identifier of the file format
 
 Floats = NDArray[np.float32]
 

@@ -14,8 +14,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT = "quad_gym policy 1"
-"""Identifier of the file format."""
+FORMAT = "quad_gym policy 1"  #: identifier of the file format
 
 _ACTIVATIONS: dict[str, Any] = {
     "relu": lambda x: np.maximum(x, 0.0),

@@ -17,8 +17,7 @@ from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
 from quad_gym.params import checks as check
 
-PRETRAINED = Path(__file__).resolve().parent / "pretrained"
-"""Folder of the included policies."""
+PRETRAINED = Path(__file__).resolve().parent / "pretrained"  #: folder of the included policies
 
 _PD: dict[str, dict[str, Any]] = {
     "pd": {},
@@ -31,8 +30,7 @@ _PD: dict[str, dict[str, Any]] = {
 }
 """Arguments of `PDPolicy` by name, see `load_policy`."""
 
-NAMES = (*_PD, "pretrained")
-"""Names of policies, see `load_policy`."""
+NAMES = (*_PD, "pretrained")  #: names of policies, see `load_policy`
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",

@@ -19,11 +19,9 @@ ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
 environments."""
 
-COMPILED = ("ppo", "recurrent_ppo")
-"""Algorithms of the compiled engine."""
+COMPILED = ("ppo", "recurrent_ppo")  #: algorithms of the compiled engine
 
-ACTIVATIONS = ("relu", "tanh", "elu")
-"""Activations between the layers of a policy."""
+ACTIVATIONS = ("relu", "tanh", "elu")  #: activations between the layers of a policy
 
 
 _rates = partial(check.vector, length=2, least=0.0, open_end=True)

@@ -40,8 +40,7 @@ SEQUENCE_LENGTH = 32
 """Default of `sequence_length`, a parameter of recurrent PPO that divides `n_steps`: the number of
 steps through which the gradient goes back. It is at most `n_steps`."""
 
-_EPISODES = 100
-"""Number of latest episodes whose mean return is `training_return`."""
+_EPISODES = 100  #: number of latest episodes whose mean return is `training_return`
 
 
 class CompiledPPO:

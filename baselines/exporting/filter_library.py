@@ -27,10 +27,8 @@ class Target(NamedTuple):
 
     processor: tuple[str, str, str]
     """triple of four parts, processor and relocation, in LLVM's words"""
-    words: str
-    """description"""
-    build: str
-    """commands that build the example"""
+    words: str  #: description
+    build: str  #: commands that build the example
 
 
 _CMAKE = "cmake -B build && cmake --build build"

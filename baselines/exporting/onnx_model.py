@@ -11,10 +11,8 @@ from baselines.exporting.controller import Controller
 from baselines.gru import GruPolicy
 from quad_gym.params import checks as check
 
-OPSET = 17
-"""Version of the operator set, old enough for runtimes on companion computers."""
-_IR_VERSION = 8
-"""Corresponding version of the file format."""
+OPSET = 17  #: version of the operator set, old enough for runtimes on companion computers
+_IR_VERSION = 8  #: corresponding version of the file format
 
 AGREEMENT = 1e-4
 """Largest difference accepted between actions of the model and of the policy; saturated actions are

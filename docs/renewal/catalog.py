@@ -209,6 +209,7 @@ CATALOG = {
                 f"benchmark --only filters --batch 64 --sensors {suite} --output OUT --estimators "
                 f"{_GALLERY}.error_state_ekf:ErrorStateEKF {_GALLERY}.invariant_ekf:InvariantEKF"
                 + ("" if suite == "indoor" else f" {_GALLERY}.complementary:Complementary")
+                + (f" {_GALLERY}.learned:Learned" if suite == "rtk" else "")
                 for suite in ("standard", "rtk", "consumer", "indoor")
             ],
             flights=("RandomTrajectory, *", "Circle, *", "fault *"),

@@ -83,7 +83,7 @@ PRIVILEGED_NAMES = frozenset(name for name, *_ in _PRIVILEGED)
 """Names by which the privileged part of a table is recognized; parts of a user's task must not have
 them."""
 _LAST_ACTION: Part = ("last_action", 4, "-", "-", 1.0)
-_FLAG = 0.0  # bound that marks a flag, in [0, 1]
+_FLAG = 0.0  #: bound that marks a flag, in [0, 1]
 
 
 def _sensor_fields(

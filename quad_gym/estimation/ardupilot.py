@@ -24,11 +24,10 @@ import numpy as np
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.frames import geodetic_to_ecef
 
-GNSS_DELAY = 0.2
-"""Delay of receivers if the log does not contain it [s]."""
+GNSS_DELAY = 0.2  #: delay of receivers if the log does not contain it [s]
 
 _LEAST_FIX = 3
-_MILLIGAUSS = 1e-7  # [T]
+_MILLIGAUSS = 1e-7  #: [T]
 _TO_FLU = np.array([1.0, -1.0, -1.0])
 _KINDS = ("IMU", "GPS", "GPA", "BARO", "MAG", "PARM")
 

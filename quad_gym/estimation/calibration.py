@@ -30,8 +30,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 
-_STEP = 0.1
-"""Step of numerical derivatives, in standard deviations of the prior."""
+_STEP = 0.1  #: step of numerical derivatives, in standard deviations of the prior
 _LARGEST, _LEAST = 3.0, -0.3
 """Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's, because a
 sensor in flight is hardly better than at rest."""
@@ -39,15 +38,12 @@ _SILENT = 0.8
 """Ratio of standard deviations after and before above which a log does not determine a number."""
 _COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
 """Noise that the search begins with twice: as large as the samples admit, and at its prior."""
-_FEW_STEPS, _STEPS = 8, 25
-"""Steps of the search from each beginning, and after."""
+_FEW_STEPS, _STEPS = 8, 25  #: steps of the search from each beginning, and after
 _CLUSTER, _CLUSTERS = 5.0, 20
 """Length of independent parts of a log [s], shorter in short logs; their least number."""
-_FEWEST_TAILS = 30
-"""Number of innovations that determines their tails."""
+_FEWEST_TAILS = 30  #: number of innovations that determines their tails
 _COARSE, _FINE = np.arange(-1.0, 1.01, 0.1), np.arange(-0.1, 0.11, 0.05)
-_DELAY_SPREAD = 0.3
-"""Standard deviation of the prior of a delay [s]."""
+_DELAY_SPREAD = 0.3  #: standard deviation of the prior of a delay [s]
 _LEAST_GAIN = 3.0
 """Drop of the log likelihood, two steps of a grid from its maximum, that determines a delay."""
 _IRON_TAU = 30.0
@@ -72,11 +68,9 @@ class Calibrated(NamedTuple):
     number: Number
     prior: float
     value: float
-    low: float
-    """lower end of its 95 % interval"""
+    low: float  #: lower end of its 95 % interval
     high: float
-    determined: bool
-    """False: the log does not determine it, so that it keeps its prior value"""
+    determined: bool  #: false: the log does not determine it, so that it keeps its prior value
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,15 +38,14 @@ from quad_gym.records import FREEDOMS
 
 NU = (5.0, 8.0, 15.0, 100.0)
 """Degrees of freedom of Student's t; of 5, a tenth of its weight lies beyond two scales."""
-SETTLING = 5.0
-"""Time after the start whose measurements do not count [s]."""
+SETTLING = 5.0  #: time after the start whose measurements do not count [s]
 SPACING = 0.5
 """Time between the measurements of a sensor in the second, thinned log [s]: errors that are
 correlated over shorter times count less in it, and noise of the IMU more."""
-_REACH = 3.0  # longest delay [s]
+_REACH = 3.0  #: longest delay [s]
 _FEWEST = 100
-_TOGETHER = 64  # suites, as their innovations take memory
-_WINDOW = 0.5  # [s]
+_TOGETHER = 64  #: suites, as their innovations take memory
+_WINDOW = 0.5  #: [s]
 _AT_REST = 0.6
 
 

@@ -19,14 +19,10 @@ Floats = NDArray[np.float64]
 class LogColumn(NamedTuple):
     """Columns of a log, one for each number of a quantity."""
 
-    names: tuple[str, ...]
-    """names of the columns"""
-    unit: str
-    """unit of the numbers"""
-    frame: str
-    """frame of the numbers; "-": none"""
-    meaning: str
-    """description of the quantity"""
+    names: tuple[str, ...]  #: names of the columns
+    unit: str  #: unit of the numbers
+    frame: str  #: frame of the numbers; "-": none
+    meaning: str  #: description of the quantity
 
 
 def _xyz(name: str) -> tuple[str, ...]:

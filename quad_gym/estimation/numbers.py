@@ -62,8 +62,8 @@ class Number:
 
 
 _LEVEL, _UP = (0, 1), (2,)
-_LEVER, _PRECISE = "primary_antenna_B", 0.1  # [m]
-_WIDE, _NARROW = 1.5, 0.7  # logarithms: factors of 4.5 and 2
+_LEVER, _PRECISE = "primary_antenna_B", 0.1  #: [m]
+_WIDE, _NARROW = 1.5, 0.7  #: logarithms: factors of 4.5 and 2
 
 # fmt: off
 NUMBERS = (

@@ -37,8 +37,7 @@ ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
 
 _OF_GNSS = ("gnss_position_G", "gnss_baseline_G", "gnss_velocity_G")
 
-PATIENCE = 2.0
-"""Time for which a start waits for the first magnetic field [s]."""
+PATIENCE = 2.0  #: time for which a start waits for the first magnetic field [s]
 
 
 class Player:

@@ -26,13 +26,11 @@ import numpy as np
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.frames import geodetic_to_ecef
 
-GNSS_DELAY = 0.11
-"""Delay of receivers if the log does not contain it [s]: PX4's default."""
+GNSS_DELAY = 0.11  #: delay of receivers if the log does not contain it [s]: PX4's default
 
-LEAST_FIX = 3
-"""Smallest `fix_type` of a three-dimensional position."""
+LEAST_FIX = 3  #: smallest `fix_type` of a three-dimensional position
 
-_GAUSS = 1e-4  # [T]
+_GAUSS = 1e-4  #: [T]
 _TO_FLU = np.array([1.0, -1.0, -1.0])
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.frames import geodetic_to_ecef
 
-_OTHER_CLOCK = 10.0  # [s]
+_OTHER_CLOCK = 10.0  #: [s]
 _SEA_LEVEL, _SCALE, _EXPONENT = 101325.0, 44330.77, 0.190263
 """Pressure [Pa], height [m] and exponent of the standard atmosphere (ISO 2533)."""
 _KINDS = ("Imu", "NavSatFix", "TwistStamped", "FluidPressure", "MagneticField")

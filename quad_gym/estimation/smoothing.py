@@ -39,10 +39,10 @@ from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import OPERATION, Operation
 from quad_gym.rotations import dcm_to_euler, dcm_to_quaternion, euler_to_dcm
 
-_AT_ONCE = 256  # operations between two readings of the filter's memory
-_LEAST_JUMP = 1e-9  # share of a variance, at least, that an inflation adds
-_LEAST_CHANGE = 1e-6  # share of a variance that smoothing must remove for the consistency test
-_LEAST_VARIANCE = 1e-14  # added to all variances, in units of these, against rounding
+_AT_ONCE = 256  #: operations between two readings of the filter's memory
+_LEAST_JUMP = 1e-9  #: share of a variance, at least, that an inflation adds
+_LEAST_CHANGE = 1e-6  #: share of a variance that smoothing must remove for the consistency test
+_LEAST_VARIANCE = 1e-14  #: added to all variances, in units of these, against rounding
 _E = slice(6, 9)
 
 

@@ -27,8 +27,7 @@ from quad_gym.params.sensors import LogDelays, SensorSuite
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.rotations import quaternion_to_dcm
 
-_SETTLING = 1.0
-"""Time after the start whose samples do not count [s]."""
+_SETTLING = 1.0  #: time after the start whose samples do not count [s]
 _FIRST_LAG, _FIRST_DRAG = 0.05, 0.01
 """Values at which the search begins: time constant of the rotors [s], drag over mass [1/m]."""
 
@@ -46,14 +45,10 @@ class FittedVehicle(NamedTuple):
 
     vehicle: VehicleParams
     """the vehicle with the thrust coefficient, drag coefficient and rotor lag that were found"""
-    thrust_over_mass: FittedNumber
-    """kF / m, thrust coefficient over mass [N/(rad/s)^2/kg]"""
-    motor_time_constant: FittedNumber
-    """time constant of the rotors [s]"""
-    drag_over_mass: FittedNumber
-    """Cd Ad rho / (2 m) [1/m]"""
-    sag: FittedNumber
-    """relative decrease of the voltage at the motors [1/s]"""
+    thrust_over_mass: FittedNumber  #: kF / m, thrust coefficient over mass [N/(rad/s)^2/kg]
+    motor_time_constant: FittedNumber  #: time constant of the rotors [s]
+    drag_over_mass: FittedNumber  #: cd Ad rho / (2 m) [1/m]
+    sag: FittedNumber  #: relative decrease of the voltage at the motors [1/s]
     hover_voltage: FittedNumber
     """voltage at which the rotors carry the weight, with a full battery [V]"""
 

@@ -20,8 +20,7 @@ from quad_gym.experiments.study_films import CHOICES, label_of, pair_of
 MEMORY = "_recurrent"
 """End of the name of an arm with memory; the rest is the name of the arm without."""
 
-FEW = 5
-"""Number of seeds below which intervals over trainings are wide."""
+FEW = 5  #: number of seeds below which intervals over trainings are wide
 
 
 def number(found: Estimated, digits: int) -> str:

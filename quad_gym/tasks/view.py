@@ -139,7 +139,7 @@ class View(Group):
 class ViewField(NamedTuple):
     """Description of one field of a view."""
 
-    name: str  # name with its group, such as "truth.position"
+    name: str  #: name with its group, such as "truth.position"
     shape: str
     unit: str
     frame: str

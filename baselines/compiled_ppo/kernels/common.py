@@ -16,8 +16,7 @@ from quad_gym.kernels.compiling import entry, kernel, routine
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
 from quad_gym.records.board import FINISHED, TICKET
 
-TILE = 64
-"""Number of samples in a tile."""
+TILE = 64  #: number of samples in a tile
 
 INPUTS, OUTPUTS, WEIGHTS, BIASES, STORED = range(5)
 """Columns of a table of layers: sizes, offsets of weights and biases in the vector of parameters,

@@ -25,8 +25,7 @@ from baselines.compiled_ppo.kernels.common import (
 )
 from quad_gym.kernels.compiling import entry, kernel, routine
 
-SEQUENCES = 16
-"""Number of sequences in a tile."""
+SEQUENCES = 16  #: number of sequences in a tile
 
 RESET, UPDATE, CANDIDATE, HIDDEN = range(4)
 """Gates of a GRU, and U_n h + c_n. Its table has six rows: W and b, then U and c, of each gate."""

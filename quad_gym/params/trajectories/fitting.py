@@ -12,10 +12,10 @@ from quad_gym.params.trajectories.splines import heading_choice, polynomials
 
 Function = Callable[[float], Any]
 
-FEWEST, MOST = 16, 8192  # segments that are tried, each time twice as many
-STEP = 1e-3  # step of the differences that check derivatives, as a fraction of the duration
-SLACK = 1e-3  # largest difference between derivatives and differences, as a fraction of their size
-LOOSER = 1e3  # factor on the tolerance for derivatives [1/s, 1/s^2]
+FEWEST, MOST = 16, 8192  #: segments that are tried, each time twice as many
+STEP = 1e-3  #: step of the differences that check derivatives, as a fraction of the duration
+SLACK = 1e-3  #: largest difference between derivatives and differences, as a fraction of their size
+LOOSER = 1e3  #: factor on the tolerance for derivatives [1/s, 1/s^2]
 
 
 def fit(

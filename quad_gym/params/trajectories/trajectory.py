@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 Arguments = ParamSpec("Arguments")
 
-TERMS = 8  # coefficients of a polynomial of degree 7, as minimum snap requires
-LEAST_SPEED = 1e-3  # horizontal speed below which a heading along the path is held [m/s]
-EARLY = 1e-3  # fraction of a trajectory after which a start from rest has a direction
+TERMS = 8  #: coefficients of a polynomial of degree 7, as minimum snap requires
+LEAST_SPEED = 1e-3  #: horizontal speed below which a heading along the path is held [m/s]
+EARLY = 1e-3  #: fraction of a trajectory after which a start from rest has a direction
 
 
 def _making(

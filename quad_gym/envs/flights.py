@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.references import check_in_bounds, check_pad
-from quad_gym.batch.starts import checked_start
+from quad_gym.batch.resets import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.effects import require_effect, require_own_task, runs_no_sensor
 from quad_gym.envs.keywords import DEFAULTS, TASK_KEYWORDS
@@ -60,8 +60,8 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
 }
 """Defaults of each task, which keywords override."""
 
-SLOWEST = 1.0  # least control rate [Hz]: smaller ones are periods
-MAX_STEPS = 10**9  # longest time limit in steps; a duration of 0 has none
+SLOWEST = 1.0  #: least control rate [Hz]: smaller ones are periods
+MAX_STEPS = 10**9  #: longest time limit in steps; a duration of 0 has none
 
 
 def kind_and_task(
