@@ -17,7 +17,7 @@ from quad_gym.tasks.stale_race import StaleRace
 from quad_gym.tasks.task import ObservationSpec
 
 if TYPE_CHECKING:
-    from quad_gym.tasks.draws import FlightRandom
+    from quad_gym.tasks.random import FlightRandom
     from quad_gym.tasks.view import View
 
 TYPICAL = 0.03  #: typical standard deviation of the position while markers are in view [m]

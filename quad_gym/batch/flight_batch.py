@@ -14,7 +14,7 @@ from quad_gym.batch.memory import FlightMemory, configuration_digest
 from quad_gym.batch.own_estimator import OwnFilter
 from quad_gym.batch.quantities import innovations_of, read
 from quad_gym.batch.references import check_reference, check_standing
-from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
+from quad_gym.batch.resets import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import pack_warm_start
 from quad_gym.estimation.own import Estimator

@@ -6,7 +6,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.batch.starts import checked_start
+from quad_gym.batch.resets import checked_start
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.task import TaskParams
 from quad_gym.params.world import WorldParams

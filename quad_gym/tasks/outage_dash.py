@@ -15,7 +15,7 @@ from quad_gym.tasks.task import ObservationSpec, Task
 if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
     from quad_gym.params.world import WorldParams
-    from quad_gym.tasks.draws import FlightRandom
+    from quad_gym.tasks.random import FlightRandom
     from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]

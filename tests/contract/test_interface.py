@@ -15,8 +15,8 @@ import baselines
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import evaluate
-from quad_gym.envs.configuration import Flights
 from quad_gym.envs.effects import with_effect
+from quad_gym.envs.flights import Flights
 from quad_gym.envs.keywords import (
     DEFAULTS,
     RENDERING_KEYWORDS,

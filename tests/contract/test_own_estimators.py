@@ -13,7 +13,7 @@ import quad_gym
 from quad_gym.analysis.consistency import flight_errors
 from quad_gym.analysis.metrics import nees
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.records import Control, Source
 from tests import console_commands
 from tests.builders import batch, single_env, vec_env
@@ -28,13 +28,14 @@ def differences(one, other, *names):
     return [np.abs(one.read(name) - other.read(name)).max() for name in names]
 
 
-def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one():
-    """A whole episode of the circle by PD control; each flies on its own filter's estimate."""
+@pytest.mark.parametrize("ticks", [500, pytest.param(2000, marks=pytest.mark.slow)])
+def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one(ticks):
+    """An episode of the circle, or a quarter, by PD control; each on its own filter's estimate."""
     built_in, own = (batch(2, 3, sensors="lab", estimator=given) for given in (None, UKF()))
     names = [
         f"{of}{name}" for of in ("", "estimated_") for name in ("position", "velocity", "R_BI")
     ]
-    for _ in range(2000):
+    for _ in range(ticks):
         built_in.step()
         own.step()
         assert max(differences(built_in, own, *names)) < 1e-9

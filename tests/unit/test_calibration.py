@@ -1,11 +1,13 @@
 """Calibration finds the numbers with which a log was simulated."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym import estimation
 from quad_gym.estimation import calibrate
 from quad_gym.estimation.calibration import correlation_time
 from quad_gym.estimation.likelihood import in_flight, tails
@@ -27,7 +29,7 @@ TRUE = CONSUMER.replace(
 @pytest.fixture(scope="module")
 def table():
     """A log whose GNSS stamps are late."""
-    columns = Recorded(flown(TRUE, 24.0), TRUE, lost=0.0, jitter=0.0).table()
+    columns = Recorded(flown(TRUE, 24.0), TRUE, lost=0.0, jitter=0.0, most_ticks=9).table()
     fixes = np.isfinite(columns["gnss_east"])
     columns["time"] = columns["time"] + DELAY * fixes
     columns["received"] = np.maximum(columns["received"], columns["time"])
@@ -81,14 +83,17 @@ def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
     assert np.isfinite(env.step(env.action_space.sample())[0]).all()
 
 
-def test_command_writes_suite_page_and_summary(table, tmp_path):
-    short = {name: column[table["received"] < 15.0] for name, column in table.items()}
-    names = list(short)
-    rows = np.column_stack([short[name] for name in names])
-    lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows]
-    (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
+def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
+    asked = []
+
+    def found_before(log, **options):
+        asked.append((log, options["sensors"], options["delays"]))
+        return found
+
+    monkeypatch.setattr(estimation, "calibrate", found_before)
     ended = run("calibrate", "flight.csv", "--no-delays", "--output", "mine", where=tmp_path)
     assert ended.returncode == 0, ended.stderr
+    assert asked == [(Path("flight.csv"), "consumer", False)]
     summary = json.loads((tmp_path / "mine/calibration.json").read_text())
     assert set(summary["numbers"]) == {n.name for n in NUMBERS if "antenna" not in n.name}
     assert summary["after"]["measurements"]["gnss_velocity"]["mean_nis"] > 0.0

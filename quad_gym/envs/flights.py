@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.references import check_in_bounds, check_pad
-from quad_gym.batch.starts import checked_start
+from quad_gym.batch.resets import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.effects import require_effect, require_own_task, runs_no_sensor
 from quad_gym.envs.keywords import DEFAULTS, TASK_KEYWORDS
