@@ -183,6 +183,15 @@ CATALOG = {
             figures=texts.film_and_figures("outage_dash", "pace"),
         ),
         Result(
+            name="memory",
+            commands=[
+                f"study {task} --output OUT --first-episode 100000 --arms {arms}"
+                for task, arms in texts.MEMORY.items()
+            ],
+            flights=("LookAround", "StaleRace", "OutageDash"),
+            texts=texts.memory,
+        ),
+        Result(
             name="sb3_defaults",
             commands=[_DEFAULTS.format(t, s) for t in ("Hover", "Circle") for s in range(3)],
             flights=("Hover, standard", "Circle, standard", "Circle, mixed"),
