@@ -90,6 +90,7 @@ def smooth(
         quaternion=dcm_to_quaternion(R_BI),
         accel_bias=x[:, 9:12],
         gyro_bias=x[:, 12:15],
+        sigma=np.sqrt(np.diagonal(P, axis1=1, axis2=2)),
         covariance=P,
         difference=difference / np.sqrt(gained),
         status=player.filter.status,
