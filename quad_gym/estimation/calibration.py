@@ -70,24 +70,19 @@ class Calibrated(NamedTuple):
     value: float
     low: float  #: lower end of its 95 % interval
     high: float
-    determined: bool  #: false: the log does not determine it, so that it keeps its prior value
+    determined: bool  #: False: the log does not determine it, so that it keeps its prior value
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Result of `calibrate`."""
 
-    suite: SensorSuite
-    """the suite with the numbers that were found"""
-    prior: SensorSuite
-    """the suite before"""
+    suite: SensorSuite  #: the suite with the numbers that were found
+    prior: SensorSuite  #: the suite before
     numbers: tuple[Calibrated, ...]
-    before: Validation
-    """the suite before, on the validation part of the log"""
-    after: Validation
-    """the suite with the numbers that were found, on this part"""
-    split: float
-    """time at which this part begins [s]"""
+    before: Validation  #: the suite before, on the validation part of the log
+    after: Validation  #: the suite with the numbers that were found, on this part
+    split: float  #: time at which this part begins [s]
 
     @property
     def delays(self) -> dict[str, float]:

@@ -24,12 +24,9 @@ _EVERY = 8  #: events between two copies of the state: a copy costs about as muc
 @dataclass(slots=True)
 class _Event:
     given: Sample | Measurement
-    time: float
-    """time after the event"""
-    start: float
-    """time at which the event begins"""
-    before: Any = None
-    """copy of the state before the event, or None"""
+    time: float  #: time after the event
+    start: float  #: time at which the event begins
+    before: Any = None  #: copy of the state before the event, or None
 
 
 class InputHistory:

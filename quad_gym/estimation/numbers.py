@@ -20,17 +20,12 @@ class Number:
 
     sensor: str
     """part of the suite, such as "imu"; empty: the suite itself"""
-    field: str
-    """field of that part"""
-    spread: float
-    """standard deviation of the prior: of the logarithm, or of the number"""
-    axes: tuple[int, ...] = ()
-    """elements of a field of several numbers; they change together"""
-    positive: bool = True
-    """False: the number may have either sign"""
+    field: str  #: field of that part
+    spread: float  #: standard deviation of the prior: of the logarithm, or of the number
+    axes: tuple[int, ...] = ()  #: elements of a field of several numbers; they change together
+    positive: bool = True  #: False: the number may have either sign
     unit: str = "-"
-    step: float = 0.1
-    """step of numerical derivatives, in coordinates"""
+    step: float = 0.1  #: step of numerical derivatives, in coordinates
 
     @property
     def of_log(self) -> bool:

@@ -23,20 +23,16 @@ SIGMAS = tuple(
 class Measured:
     """Innovations of one kind of measurement."""
 
-    time: Floats
-    """(m,) time stamps [s]"""
-    received: Floats
-    """(m,) times of arrival [s]"""
+    time: Floats  #: (m,) time stamps [s]
+    received: Floats  #: (m,) times of arrival [s]
     innovation: Floats
     """(m, d) innovations; of positions and velocities in I, of directions across the predicted
     one"""
-    sigma: Floats
-    """(m, d) standard deviations of the innovations, as predicted by the filter"""
+    sigma: Floats  #: (m, d) standard deviations of the innovations, as predicted by the filter
     nis: Floats
     """(m,) normalized innovations squared; chi-square with d degrees of freedom for a consistent
     filter"""
-    gate: Floats
-    """(m,) gate decisions, see `quad_gym.records.GateDecision`"""
+    gate: Floats  #: (m,) gate decisions, see `quad_gym.records.GateDecision`
 
     @property
     def gated(self) -> Any:
@@ -92,15 +88,13 @@ class Replay(Estimates):
     """kind of the filter: "ukf" or "ekf\", or the class of an own one"""
     heading_known: Any
     """(n,) True where the heading was known, from a measurement or from the motion"""
-    diverged: Any
-    """(n,) True where the innovations showed that the filter had diverged"""
+    diverged: Any  #: (n,) True where the innovations showed that the filter had diverged
     measured: dict[str, Measured]
     """innovations by measurement: "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0",
     ..., "barometer" and "magnetometer\""""
     too_late: int
     """number of measurements that were older than the window at their arrival, and were left out"""
-    unused: tuple[str, ...]
-    """sensors of the log that the suite does not use"""
+    unused: tuple[str, ...]  #: sensors of the log that the suite does not use
     problems: tuple[str, ...] = ()
     """sentences on implausible units and axes of the log, on divergence or failure of the filter,
     and on sensors that the suite does not describe, with likely causes; empty: no problem was

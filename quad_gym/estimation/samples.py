@@ -27,12 +27,9 @@ SIGMA_KEYWORDS = (
 class Sample:
     """An IMU sample that propagates the estimate over a time."""
 
-    gyro: Floats
-    """(3,) angular rate in B [rad/s]"""
-    accel: Floats
-    """(3,) specific force in B [m/s^2]"""
-    dt: float
-    """duration of the sample [s]"""
+    gyro: Floats  #: (3,) angular rate in B [rad/s]
+    accel: Floats  #: (3,) specific force in B [m/s^2]
+    dt: float  #: duration of the sample [s]
     gyro_before: Floats
     """(3,) angular rate of the sample before; the lever arm's acceleration follows from both
     [rad/s]"""
@@ -52,14 +49,10 @@ class Sample:
 class Measurement:
     """Measurements of one instant; None: not measured."""
 
-    position_G: Floats | None = None
-    """(3,) antenna position [m]"""
-    baseline_G: Floats | None = None
-    """(3,) baseline, scaled to a length near one [-]"""
-    velocity_G: Floats | None = None
-    """(3,) antenna velocity [m/s]"""
-    pixels: Floats | None = None
-    """(n_features, 2) image coordinates, NaN: not seen [pixels]"""
+    position_G: Floats | None = None  #: (3,) antenna position [m]
+    baseline_G: Floats | None = None  #: (3,) baseline, scaled to a length near one [-]
+    velocity_G: Floats | None = None  #: (3,) antenna velocity [m/s]
+    pixels: Floats | None = None  #: (n_features, 2) image coordinates, NaN: not seen [pixels]
     aids: dict[Aid, Floats] = field(default_factory=dict)
     noise: dict[str, Any] = field(default_factory=dict)
     """fields of the parameter record that replace the suite's for this measurement"""

@@ -34,12 +34,9 @@ class Validation:
     held_out_error: tuple[float, float] | None
     """root mean square difference of the prediction from the first fix after gaps: horizontal, and
     vertical [m]; None: no fixes"""
-    held_out_nis: float | None
-    """mean NIS of these fixes over three"""
-    diverged: float
-    """share of the samples at which the filter counts as diverged"""
-    problems: tuple[str, ...]
-    """sentences of the replay, see `Replay.problems`"""
+    held_out_nis: float | None  #: mean NIS of these fixes over three
+    diverged: float  #: share of the samples at which the filter counts as diverged
+    problems: tuple[str, ...]  #: sentences of the replay, see `Replay.problems`
     replay: Replay
 
 
