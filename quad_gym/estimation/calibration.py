@@ -381,11 +381,9 @@ class _Search:
 
 
 def _derivatives(losses: Floats, steps: Floats) -> tuple[Floats, Floats]:
-    """Return the scores (parts, n), and the second derivatives (n,) of the sum over all parts.
+    """Return scores (parts, n), and second derivatives (n,) of the sum over all parts.
 
-    Args:
-        losses: (parts, 1 + 2 n) at a point, and a step ahead and back along each axis.
-        steps: (n,) sizes of the steps.
+    The losses (parts, 1 + 2 n) are at a point, and a step (n,) ahead and back along each axis.
     """
     count = 2 * len(steps) + 1
     ahead, back = losses[:, 1:count:2], losses[:, 2:count:2]

@@ -76,12 +76,7 @@ class InputHistory:
         self._forget()
 
     def insert(self, measurement: Measurement, time: float) -> None:
-        """Insert a delayed measurement, and filter again all inputs after it.
-
-        Args:
-            measurement: The measurement.
-            time: Its time stamp, at least `oldest` and less than the present [s].
-        """
+        """Insert a measurement at an earlier time, and filter again all inputs after it."""
         events = self._events
         i = len(events) - 1  # the first event that ends later
         while i and events[i - 1].time > time + SAME_TIME:

@@ -186,13 +186,6 @@ def ecef_of(lat: Floats, lon: Floats, height: Floats) -> Floats:
 def reading(path: Path | str, kind: str, logs: str, library: str, extra: str) -> Iterator[Path]:
     """Name file and library in errors of a library that reads a log.
 
-    Args:
-        path: Path of the log.
-        kind: Description of one log, for messages.
-        logs: Description of such logs.
-        library: Name of the library.
-        extra: Extra of quad-gym that installs it.
-
     Raises:
         ImportError: If the library is not installed.
         ValueError: If it cannot read the file.

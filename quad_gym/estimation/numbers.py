@@ -122,13 +122,7 @@ sensor at rest, and vibration, airflow and motor currents multiply its noise."""
 
 
 def numbers_in(suite: SensorSuite, log: Log, delays: bool) -> list[Number]:
-    """Return the numbers of the sensors that a suite has and a log contains.
-
-    Args:
-        suite: The suite.
-        log: The log.
-        delays: True: delays, too.
-    """
+    """Return the numbers of the sensors that a suite and a log have, with or without delays."""
     measured = {name for name in log.streams if getattr(suite, name, None) is not None}
     paired = "gnss" in measured and has(log, "baseline")
     others = {

@@ -180,15 +180,7 @@ def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Flo
 
 
 def gnss_noise(name: str, value: Any) -> tuple[Floats, Floats | None]:
-    """Return the noise of a position: standard deviations (3,) in I [m], covariance or None.
-
-    Args:
-        name: Name of the argument in messages.
-        value: A standard deviation, three of them, or a (3, 3) covariance.
-
-    Raises:
-        ValueError: If it is none of these, or not positive (definite).
-    """
+    """Return sigmas (3,) in I [m], and the covariance or None, of a number, three or (3, 3)."""
     if np.ndim(value) == 0:
         return np.full(3, check.positive(name, value, least=1e-9)), None
     if np.ndim(value) == 2:

@@ -43,14 +43,7 @@ class Validation:
 def validate(
     log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
 ) -> Validation:
-    """Replay a log, and compare the part after a time with the filter's predictions.
-
-    Args:
-        log: The log.
-        suite: The suite.
-        start: Keywords of `initialize`.
-        split: Time at which the part begins [s].
-    """
+    """Replay a log, and compare the part after a time with the predictions of the filter."""
     result = replay(log, sensors=suite, start=start, reported_noise=False)
     sensors = {}
     for name, m in by_sensor(result.measured).items():
