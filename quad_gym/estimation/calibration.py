@@ -70,7 +70,7 @@ class Calibrated(NamedTuple):
     value: float
     low: float  #: lower end of its 95 % interval
     high: float
-    determined: bool  #: False: the log does not determine it, so that it keeps its prior value
+    determined: bool  #: False: the log does not determine it
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +94,9 @@ class Calibration:
     def notes(self) -> tuple[str, ...]:
         """Sentences on numbers that the log does not determine."""
         return tuple(
-            f"the log does not determine {found.number.name}: it keeps {found.value:.3g}"
-            for found in self.numbers
-            if not found.determined
+            f"the log does not determine {n.number.name} ({n.value:.3g}, {n.prior:.3g} before)"
+            for n in self.numbers
+            if not n.determined
         )
 
 
