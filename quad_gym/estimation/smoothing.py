@@ -28,7 +28,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 from quad_gym.estimation.filters import KalmanFilter
-from quad_gym.estimation.logs import Floats, Log
+from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.replaying import named_start, prepared
 from quad_gym.estimation.results import Smoothed
@@ -74,7 +74,7 @@ def smooth(
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, body)
-    player = Player(_in_order(whole), suite, estimator, named_start(start), reported_noise, 0.0)
+    player = Player(whole, suite, estimator, named_start(start), reported_noise, None)
     forward = _filter_forward(player)
     x, R_BI, P = _smooth_back(forward)
     rows = forward.rows
@@ -94,14 +94,6 @@ def smooth(
         difference=difference / np.sqrt(gained),
         status=player.filter.status,
     )
-
-
-def _in_order(log: Log) -> Log:
-    """Return the log as if each measurement had arrived at its time stamp."""
-    streams: dict[str, Any] = {
-        name: replace(stream, received=stream.time) for name, stream in log.streams.items()
-    }
-    return replace(log, **streams)
 
 
 # ---- forward -------------------------------------------------------------------------------------

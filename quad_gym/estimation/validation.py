@@ -84,13 +84,7 @@ def _held_out(
     if gnss is None or suite.gnss is None:
         return None, None
     phase = (gnss.time - split) % _PERIOD
-    rows = (gnss.time < split) | (phase >= _GAP)
-    gnss = replace(
-        gnss,
-        time=gnss.time[rows],
-        received=gnss.received[rows],
-        values={name: value[rows] for name, value in gnss.values.items()},
-    )
+    gnss = gnss.rows((gnss.time < split) | (phase >= _GAP))
     result = replay(replace(log, gnss=gnss), sensors=suite, start=start, reported_noise=False)
     fixes = result.measured.get("gnss_position")
     if fixes is None:
