@@ -17,14 +17,12 @@ from quad_gym.tasks.stale_race import StaleRace
 from quad_gym.tasks.task import ObservationSpec
 
 if TYPE_CHECKING:
-    from quad_gym.tasks.draws import FlightRandom
+    from quad_gym.tasks.random import FlightRandom
     from quad_gym.tasks.view import View
 
-TYPICAL = 0.03
-"""Typical standard deviation of the position while markers are in view [m]."""
+TYPICAL = 0.03  #: typical standard deviation of the position while markers are in view [m]
 
-REMEMBERED = 4
-"""Number of instants in a history."""
+REMEMBERED = 4  #: number of instants in a history
 
 _SCALES = {
     **{"position_error": (0.0, 6.0), "velocity_error": (0.0, 4.0), "body_rates": (0.0, 2.0)},
@@ -43,8 +41,7 @@ RACE_STD = {
 """Standard deviations in the observation of a race: unit, frame, and median in 200 episodes of the
 included policy."""
 
-CONSTANT_CRASH_COST = 100.0
-"""Cost of a crash in `ConstantCrashCost`."""
+CONSTANT_CRASH_COST = 100.0  #: cost of a crash in `ConstantCrashCost`
 
 _CRASH = Crash()
 

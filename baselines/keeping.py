@@ -28,8 +28,7 @@ _COLUMNS = (
     *("steps", "training_seconds", "mean_error", "late_error", "crash_rate", "return"),
     *("gates_passed", "training_return"),
 )
-SUFFIXES = {"sb3": ".zip", "compiled": ".npz"}
-"""Extensions of policy files, by engine."""
+SUFFIXES = {"sb3": ".zip", "compiled": ".npz"}  #: extensions of policy files, by engine
 
 
 class RunError(ValueError):
@@ -230,14 +229,11 @@ def replace_file(file: Path, content: bytes) -> None:
 # The operating system releases a lock when the process ends for any reason. Locks also work between
 # machines on a shared file system that supports them (NFS, or Lustre mounted with `flock`).
 
-LOCK = "training.lock"
-"""Name of the lock file in the folder."""
+LOCK = "training.lock"  #: name of the lock file in the folder
 
-HOLDER = "training.process"
-"""Name of the file with the process that has or had the lock."""
+HOLDER = "training.process"  #: name of the file with the process that has or had the lock
 
-PATIENCE = 0.5
-"""Time to wait for a lock [s]; checking for a lock takes it briefly."""
+PATIENCE = 0.5  #: time to wait for a lock [s]; checking for a lock takes it briefly
 
 
 class BusyError(RunError):

@@ -19,8 +19,7 @@ LEAST_LIFT, MOST_TILT = 0.3, 1.2
 horizontal to vertical part (50 degrees), so that steps of the reference do not flip the vehicle."""
 
 
-PACES = ("steady", "waiting")
-"""Modes of PD control at gaps."""
+PACES = ("steady", "waiting")  #: modes of PD control at gaps
 
 REACH_OF_GAPS = 1.5
 """Limit of position errors on courses with gaps, which gives a speed of 4.7 m/s [m]."""
@@ -56,8 +55,7 @@ class _Seen(NamedTuple):
     heading: Array
     body_rates: Array
     reference_acceleration: Array
-    velocity: Array | None
-    """Velocity; None if the observation does not contain it"""
+    velocity: Array | None  #: velocity; None if the observation does not contain it
 
 
 _RELATIVE_FIELDS = _Seen._fields[:-1]

@@ -17,8 +17,7 @@ from quad_gym.params.suites import contents_of_suite_files
 if TYPE_CHECKING:
     from baselines.scaled_reward import ScaledReward
 
-ENGINES = ("sb3", "compiled")
-"""Training engines: Stable-Baselines3, or `baselines.compiled_ppo`."""
+ENGINES = ("sb3", "compiled")  #: training engines: Stable-Baselines3, or `baselines.compiled_ppo`
 
 
 class Plan(Checked):

@@ -10,14 +10,14 @@ from typing import Any
 
 import gymnasium
 
+from baselines.gru import load_network
 from baselines.mlp import MlpPolicy
 from baselines.pd import REACH_OF_GAPS, PDPolicy
 from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
 from quad_gym.params import checks as check
 
-PRETRAINED = Path(__file__).resolve().parent / "pretrained"
-"""Folder of the included policies."""
+PRETRAINED = Path(__file__).resolve().parent / "pretrained"  #: folder of the included policies
 
 _PD: dict[str, dict[str, Any]] = {
     "pd": {},
@@ -30,8 +30,7 @@ _PD: dict[str, dict[str, Any]] = {
 }
 """Arguments of `PDPolicy` by name, see `load_policy`."""
 
-NAMES = (*_PD, "pretrained")
-"""Names of policies, see `load_policy`."""
+NAMES = (*_PD, "pretrained")  #: names of policies, see `load_policy`
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",
@@ -64,7 +63,7 @@ def load_policy(name: str, env: Any) -> Policy:
             "pd:features_when_uncertain" (tuned gains, facing the features), "pd:slow" and
             "pd:waiting" (for courses with gaps: half the speed, or waiting when uncertain),
             "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
-            the task of the environment), or a file: `.npz` written by `MlpPolicy`, or `.zip`
+            the task of the environment), or a file: `.npz` with plain arrays, or `.zip`
             written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
         env: Environment of this package: single, vector or Stable-Baselines3.
 
@@ -81,7 +80,7 @@ def load_policy(name: str, env: Any) -> Policy:
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
     if file.suffix == ".npz":
-        policy: Any = MlpPolicy.load(file)
+        policy: Any = load_network(file)
         _require_agreement(file, policy.record, env)
         _require_size(file, policy.inputs, env)
         trained_on = policy.record.get("plan", {}).get("env_id", task_of(env))

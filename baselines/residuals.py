@@ -26,11 +26,9 @@ from quad_gym.evaluation import Policy, roll_out
 
 Floats = NDArray[np.float64]
 
-SIZE = 12
-"""Number of components of an error."""
+SIZE = 12  #: number of components of an error
 
-FITTED = Path(__file__).resolve().parent / "residuals"
-"""Folder of the included models, by task."""
+FITTED = Path(__file__).resolve().parent / "residuals"  #: folder of the included models, by task
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,14 +16,11 @@ Flights for "training" are used to fit parameters, including the search of gains
 
 from quad_gym.params import checks as check
 
-PURPOSES = ("training", "validation", "test")
-"""Purposes of flights."""
+PURPOSES = ("training", "validation", "test")  #: purposes of flights
 
-BLOCK = 10**6
-"""Number of flights in the block of one seed of a training, or of its validation."""
+BLOCK = 10**6  #: number of flights in the block of one seed of a training, or of its validation
 
-TEST_END = 10**9
-"""Upper limit of the seeds of tests."""
+TEST_END = 10**9  #: upper limit of the seeds of tests
 
 MAX_SEED = 99_999
 """Largest seed of a training, for which the blocks of training and validation do not overlap."""

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.params import checks as check
 from quad_gym.params.portable import norm
 
-WGS84_SEMI_MAJOR_AXIS = 6378137.0  # semi-major axis of the WGS-84 ellipsoid [m]
+WGS84_SEMI_MAJOR_AXIS = 6378137.0  #: semi-major axis of the WGS-84 ellipsoid [m]
 WGS84_FLATTENING = 1.0 / 298.257223563
 
 

@@ -120,9 +120,11 @@ def count(text: str, where: str, first_line: int = 1) -> Count:
 
 
 def docstrings(file: Path) -> list[Count]:
-    """Counts of the docstrings of a module, those of attributes included."""
-    counts, where = [], file.relative_to(ROOT).as_posix()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    """Counts of the docstrings of a module, and of descriptions behind constants."""
+    where, text = file.relative_to(ROOT).as_posix(), file.read_text(encoding="utf-8")
+    behind = enumerate((line.partition("  #: ")[2] for line in text.split("\n")), start=1)
+    counts = [count(words, where, line) for line, words in behind if words]
+    for node in ast.walk(ast.parse(text)):
         value = getattr(node.value, "value", None) if isinstance(node, ast.Expr) else None
         if isinstance(value, str):
             text = inspect.cleandoc(value)

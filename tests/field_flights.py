@@ -3,7 +3,7 @@
 import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.records import AID_BLOCKS, Control
 
 

@@ -1,6 +1,6 @@
 """The C sources of an exported filter: numbers of its records and suite, in the templates.
 
-Records must have one lane, see `filter_library`.
+Records must have one lane, see `filter_process`.
 """
 
 import math
@@ -52,8 +52,7 @@ _AID_NOTES = {
     Aid.OPTICAL_FLOW: "optical flow [rad/s], see quad_gym.OpticalFlowParams",
     Aid.RANGE_FINDER: "range to the ground [m]",
 }
-_WINDOW = 0.5
-"""Longest delay of measurements beyond the suite's `log_delays` [s], as in a replay."""
+_WINDOW = 0.5  #: longest delay of measurements beyond the suite's `log_delays` [s], as in a replay
 
 
 class Sources:

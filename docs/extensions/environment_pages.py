@@ -25,8 +25,8 @@ import docstring_parser
 import quad_gym
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.envs.keywords import TASK_KEYWORDS
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights.columns import COLUMNS, FEATURES

@@ -190,6 +190,15 @@ CATALOG = {
             figures=texts.film_and_figures("outage_dash", "pace"),
         ),
         Result(
+            name="memory",
+            commands=[
+                f"study {task} --output OUT --first-episode 100000 --arms {arms}"
+                for task, arms in texts.MEMORY.items()
+            ],
+            flights=("LookAround", "StaleRace", "OutageDash"),
+            texts=texts.memory,
+        ),
+        Result(
             name="sb3_defaults",
             commands=[_DEFAULTS.format(t, s) for t in ("Hover", "Circle") for s in range(3)],
             flights=("Hover, standard", "Circle, standard", "Circle, mixed"),
@@ -207,6 +216,7 @@ CATALOG = {
                 f"benchmark --only filters --batch 64 --sensors {suite} --output OUT --estimators "
                 f"{_GALLERY}.error_state_ekf:ErrorStateEKF {_GALLERY}.invariant_ekf:InvariantEKF"
                 + ("" if suite == "indoor" else f" {_GALLERY}.complementary:Complementary")
+                + (f" {_GALLERY}.learned:Learned" if suite == "rtk" else "")
                 for suite in ("standard", "rtk", "consumer", "indoor")
             ],
             flights=("RandomTrajectory, *", "Circle, *", "fault *"),

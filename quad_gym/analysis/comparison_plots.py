@@ -24,8 +24,7 @@ _STYLES: tuple[dict[str, Any], ...] = (
 )
 """Colors and dash patterns of the curves, in order."""
 
-_LEVELS = ((0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
-"""Dash patterns of horizontal lines."""
+_LEVELS = ((0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))  #: dash patterns of horizontal lines
 
 
 @plots.house_style()

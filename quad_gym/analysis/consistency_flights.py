@@ -85,8 +85,7 @@ class Findings:
         return said
 
 
-ASTRAY = 5.0
-"""Distance from the reference beyond which a flight counts as lost [m]."""
+ASTRAY = 5.0  #: distance from the reference beyond which a flight counts as lost [m]
 
 
 def measure_consistency(

@@ -32,11 +32,9 @@ from quad_gym.analysis.metrics import Interval, Spread, spread
 from quad_gym.params import checks as check
 
 Floats = NDArray[np.float64]
-Score = Callable[[Floats], Floats]
-"""From numbers (..., e) of episodes to one number (...)."""
+Score = Callable[[Floats], Floats]  #: from numbers (..., e) of episodes to one number (...)
 
-TAIL = 0.025
-"""Probability beyond either end of an interval."""
+TAIL = 0.025  #: probability beyond either end of an interval
 
 
 class Estimated(NamedTuple):

@@ -27,8 +27,7 @@ from quad_gym.rotations import euler_to_dcm
 Floats = NDArray[np.float64]
 R, V, E, BA, BG = (PARTS[name] for name in list(PARTS)[1:])
 EYE = np.eye(3)
-MOVING = 24
-"""Number of states of the vehicle and its IMU."""
+MOVING = 24  #: number of states of the vehicle and its IMU
 
 
 class Truth(NamedTuple):

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.rotations import dcm_to_euler
 
-STATE_DIMENSION = 15
-"""Number of coordinates of the filter's error."""
+STATE_DIMENSION = 15  #: number of coordinates of the filter's error
 
 Floats = NDArray[np.float64]
 

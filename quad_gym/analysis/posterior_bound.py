@@ -22,8 +22,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Sensor
 
 Floats = NDArray[np.float64]
-MEMORY = 64
-"""Number of ticks after which a measurement is too late."""
+MEMORY = 64  #: number of ticks after which a measurement is too late
 
 
 class Recursion:

@@ -21,14 +21,11 @@ from quad_gym.batch.flight_batch import FlightBatch
 
 CONSISTENT = 0.9973
 """Probability of the chi-square quantile below which a flight is consistent, as for 3 sigma."""
-LARGE = 6.0
-"""Number of standard deviations beyond which an error counts as large."""
+LARGE = 6.0  #: number of standard deviations beyond which an error counts as large
 MISSED_AFTER = 2.0
 """Duration of large errors without a flag after which an alarm counts as missed [s]."""
-REQUIRED = 0.99
-"""Required share of flights that are consistent or flagged."""
-MOTION = slice(0, 9)
-"""Coordinates of position, velocity and attitude in the error state."""
+REQUIRED = 0.99  #: required share of flights that are consistent or flagged
+MOTION = slice(0, 9)  #: coordinates of position, velocity and attitude in the error state
 
 Flags = NDArray[np.bool_]
 

@@ -30,8 +30,7 @@ def short_name(policy: str) -> str:
     return f"{path.parent.name}/{path.stem}".lstrip("/") if path.suffix else policy
 
 
-_made: list[Path] = []
-"""Folders made for later output, each one before its parents."""
+_made: list[Path] = []  #: folders made for later output, each one before its parents
 
 
 def require_writable(option: str, folder: Path) -> None:

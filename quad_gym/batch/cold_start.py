@@ -19,7 +19,7 @@ MAX_START_TILT = 0.15
 No sensor measures the tilt of a start: the accelerometer of a vehicle that hovers measures its
 thrust, which is along the body z axis at any tilt."""
 
-MAX_BASELINE_SIGMA = 0.15  # standard deviation of the heading from the first baseline [rad]
+MAX_BASELINE_SIGMA = 0.15  #: standard deviation of the heading from the first baseline [rad]
 MAX_HEADING_SIGMA = 0.1
 """Standard deviation of the heading of a mark, or due to hard iron, with GNSS [rad]."""
 MAX_HEADING_SIGMA_INDOORS = 1.0

@@ -14,7 +14,7 @@ from quad_gym.batch.memory import FlightMemory, configuration_digest
 from quad_gym.batch.own_estimator import OwnFilter
 from quad_gym.batch.quantities import innovations_of, read
 from quad_gym.batch.references import check_reference, check_standing
-from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
+from quad_gym.batch.resets import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import pack_warm_start
 from quad_gym.estimation.own import Estimator
@@ -44,7 +44,7 @@ _GROUP_MEMORY = 1 << 23
 """Memory of the blocks that a thread flies side by side [bytes], see `kernels/gathering.py`: less
 leaves gathered blocks half empty."""
 _NO_BOUNDS = np.zeros(0)
-_WORTH_NO_COPY = 1 << 16  # size of observations [bytes] above which a step allocates its own
+_WORTH_NO_COPY = 1 << 16  #: size of observations [bytes] above which a step allocates its own
 
 
 class FlightBatch(FlightMemory):

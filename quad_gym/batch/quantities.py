@@ -35,14 +35,14 @@ Computed = Callable[[FlightMemory, Flights], NDArray[Any]]
 class Quantity(NamedTuple):
     """One quantity of a batch of flights."""
 
-    of: str | Computed  # the field of the records, or a function that computes it
-    shape: tuple[int | str, ...]  # for one flight; a word: as many as there are of these
+    of: str | Computed  #: the field of the records, or a function that computes it
+    shape: tuple[int | str, ...]  #: for one flight; a word: as many as there are of these
     unit: str
-    frame: str  # I: inertial (east, north, up), B: body, C: image; "-": none
+    frame: str  #: I: inertial (east, north, up), B: body, C: image; "-": none
     meaning: str
     kind: type = float
-    filtered: bool = False  # True if only flights have it in which a filter, and so sensors, run
-    builtin: bool = False  # True if only the built-in filter has it: NaN with a user's estimator
+    filtered: bool = False  #: True if only flights have it in which a filter, and so sensors, run
+    builtin: bool = False  #: True if only the built-in filter has it: NaN with a user's estimator
 
 
 def read(batch: FlightMemory, name: str, flights: Flights) -> NDArray[Any]:

@@ -18,12 +18,12 @@ from quad_gym.kernels.cores import available_cores
 from quad_gym.params import checks as check
 from quad_gym.records import board
 
-MIN_BLOCKS_PER_THREAD = 4  # smallest number of blocks that is worth a hand-over to another thread
+MIN_BLOCKS_PER_THREAD = 4  #: smallest number of blocks that is worth a hand-over to another thread
 
 CHUNKS_OF_RANGE = 16
 """Number of chunks into which a thread's range is cut: each costs some tens of nanoseconds."""
 
-MAX_THREADS = 1024  # largest number of threads: each has its own memory, so more are a mistake
+MAX_THREADS = 1024  #: largest number of threads: each has its own memory, so more are a mistake
 
 
 def resolve_threads(threads: int | None) -> int:
@@ -37,7 +37,7 @@ Fly = Callable[[NDArray[np.int64], int, int, bool], bool]
 """Function that flies blocks of a board: board, number of the thread, command, True if it
 serves."""
 
-POSTED_BEFORE = -1  # value instead of a command: wait for the command that was posted before
+POSTED_BEFORE = -1  #: value instead of a command: wait for the command that was posted before
 
 
 class Crew:

@@ -29,7 +29,7 @@ WARM_UP = 10.0
 """Time for which a filter has been running at a warm start [s]: several correlation times of its
 velocity and attitude, as between switching a vehicle on and its take-off."""
 
-FLIGHTS = 8  # flights whose covariances are averaged
+FLIGHTS = 8  #: flights whose covariances are averaged
 
 LOST = 0.35
 """Attitude error above which a filter has diverged, whatever its covariance [rad]: the linear model

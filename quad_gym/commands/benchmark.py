@@ -43,8 +43,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import WIDTH
 
-ALONE = ("suites", "compile", "filters", "learning")
-"""Sections that take minutes."""
+ALONE = ("suites", "compile", "filters", "learning")  #: sections that take minutes
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class CompileArgs:
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     """Names of the compiled functions of some kinds, slowest to compile first."""
-    from quad_gym.envs.configuration import Flights
+    from quad_gym.envs.flights import Flights
     from quad_gym.kernels.entries import FILTER_ENTRIES, FILTER_STAGES, SENSORS_AND_VEHICLE
     from quad_gym.kernels.linked import names_of
     from quad_gym.kernels.stages import SOURCES, needed_stages

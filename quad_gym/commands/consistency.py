@@ -36,7 +36,7 @@ from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.envs import IDS
-from quad_gym.envs.configuration import own_estimator
+from quad_gym.envs.flights import own_estimator
 from quad_gym.experiments.consistency import matrix, recovery
 from quad_gym.experiments.consistency.cases import Case, CaseFlights, run_cases, unexpected
 from quad_gym.experiments.consistency.single import run_single

@@ -64,8 +64,7 @@ class EvaluateArgs:
     """replace earlier results in the folder"""
 
 
-Pairing = tuple[str, str]
-"""A policy and an observation."""
+Pairing = tuple[str, str]  #: a policy and an observation
 
 
 def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Path]:

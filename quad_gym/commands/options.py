@@ -21,14 +21,13 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
 _Args = TypeVar("_Args")
 
-USAGE_ERROR = 2
-"""Exit code of a program that was called with invalid options."""
+USAGE_ERROR = 2  #: exit code of a program that was called with invalid options
 
 _REGISTRY = ConstructorRegistry()
 

@@ -26,8 +26,7 @@ from quad_gym.analysis.reports import columns_of, require_writable, versions, wr
 from quad_gym.commands import options
 from quad_gym.experiments.tuning import Search, compare_gains, flat
 
-SEPARATE = ("observation", "sensors", "threads")
-"""Keywords of environments with separate options."""
+SEPARATE = ("observation", "sensors", "threads")  #: keywords of environments with separate options
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from quad_gym.params.task import TaskParams
 class Benchmark(NamedTuple):
     """Definition of a benchmark task; keywords override it."""
 
-    task: TaskParams  # reference and bounds of the task
-    keywords: Mapping[str, Any]  # keywords of the environment
+    task: TaskParams  #: reference and bounds of the task
+    keywords: Mapping[str, Any]  #: keywords of the environment
 
 
 BENCHMARKS = {

@@ -113,7 +113,7 @@ DEFAULTS: dict[str, Any] = {
 TASK_KEYWORDS = tuple(inspect.get_annotations(TaskKeywords))
 """Names of the keywords that are fields of `TaskParams`."""
 
-RENDERING_KEYWORDS = ("render_view", "render_size")  # names of the keywords that concern pictures
+RENDERING_KEYWORDS = ("render_view", "render_size")  #: names of the keywords that concern pictures
 
 FILTER_KEYWORDS = ("estimator", "filter_start")
 """Names of the keywords that have an effect only where a filter runs."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from quad_gym.envs.configuration import Flights
+from quad_gym.envs.flights import Flights
 from quad_gym.envs.keywords import RENDERING_KEYWORDS
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import make
 
-from quad_gym.batch.starts import stream_key
-from quad_gym.envs.configuration import Flights, checked_actions
+from quad_gym.batch.resets import stream_key
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
+from quad_gym.envs.flights import Flights, checked_actions
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
@@ -307,7 +307,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         return rendering.frames()[0] if rendering and self.render_mode == "rgb_array" else None
 
 
-ENTRY_POINT = "quad_gym.envs.single:QuadEnv"  # entry point of `QuadEnv` in Gymnasium's registry
+ENTRY_POINT = "quad_gym.envs.single:QuadEnv"  #: entry point of `QuadEnv` in Gymnasium's registry
 
 
 def limit_asked_of_make() -> int | None:

@@ -1,28 +1,29 @@
 """Calibration: the numbers of a sensor suite from the log of a flight.
 
 The search maximizes the likelihood of the innovations (`likelihood.py`) in the first part of the
-log, with priors about the numbers of a suite (`numbers.py`): delays of time stamps one after the
-other on grids, all others by quasi-Newton steps, whose derivatives are differences between filters
-that run side by side.
+log, with priors about the numbers (`numbers.py`). It begins on grids of delays, in a short part of
+the flight. Newton steps follow, whose derivatives are differences between filters: side by side for
+numbers of the suite, on a log each for delays and the mounting of the IMU. Their second derivatives
+are exact on the diagonal, and otherwise as correlated as the scores of parts of the log.
 
 The likelihood alone makes noise too small where errors are correlated in time, such as errors of a
 magnetometer near motors: innovations are then as small as predicted, but not white, and the filter
-counts the same error many times. Noise of such sensors becomes larger by sqrt(tau), at most four
+counts the same error many times. Noise of such sensors becomes larger by sqrt(tau), at most two
 times, where tau is the integrated autocorrelation time of the innovations in samples, before the
 other numbers are fitted again. The rest of the log validates the result.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quad_gym.estimation.engine import Floats
-from quad_gym.estimation.likelihood import SETTLING, Likelihood, in_flight, tails
+from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log
-from quad_gym.estimation.numbers import Number, has_baselines, numbers_in
+from quad_gym.estimation.numbers import MOST, Number, has, numbers_in
 from quad_gym.estimation.replaying import origin_of, replay
 from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.validation import Validation, validate
@@ -30,26 +31,21 @@ from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 
-_STEP = 0.1
-"""Step of numerical derivatives, in standard deviations of the prior."""
-_LARGEST, _LEAST = 3.0, -0.3
-"""Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's, because a
-sensor in flight is hardly better than at rest."""
 _SILENT = 0.8
 """Ratio of standard deviations after and before above which a log does not determine a number."""
 _COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
 """Noise that the search begins with twice: as large as the samples admit, and at its prior."""
-_FEW_STEPS, _STEPS = 8, 25
-"""Steps of the search from each beginning, and after."""
+_FEW_STEPS, _STEPS = 4, 12  #: Newton steps from each beginning, and after
+_SHARES = np.array([1.0, 0.75, 0.5, 0.35, 0.2, 0.1, 0.05, 0.02])
+"""Shares of a Newton step that are tried side by side."""
+_LEAST_GAIN = 0.02  #: drop of the log likelihood in a step with which the search ends
+_RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are estimates
+_SHORT = 45.0  #: time of flight that is enough for the first search [s]
 _CLUSTER, _CLUSTERS = 5.0, 20
 """Length of independent parts of a log [s], shorter in short logs; their least number."""
-_FEWEST_TAILS = 30
-"""Number of innovations that determines their tails."""
-_COARSE, _FINE = np.arange(-1.0, 1.01, 0.1), np.arange(-0.1, 0.11, 0.05)
-_DELAY_SPREAD = 0.3
-"""Standard deviation of the prior of a delay [s]."""
-_LEAST_GAIN = 3.0
-"""Drop of the log likelihood, two steps of a grid from its maximum, that determines a delay."""
+_FEWEST_TAILS = 30  #: number of innovations that determines their tails
+_COARSE = np.arange(-1.0, 1.01, 0.1)  #: first grid of a delay [s]
+_MARGIN = 0.2  #: time at the end of the log that changes of delays may reach [s]
 _IRON_TAU = 30.0
 """Prior correlation time of hard iron that is constant in the suite [s]: currents of motors change
 in flight."""
@@ -72,11 +68,9 @@ class Calibrated(NamedTuple):
     number: Number
     prior: float
     value: float
-    low: float
-    """lower end of its 95 % interval"""
+    low: float  #: lower end of its 95 % interval
     high: float
-    determined: bool
-    """False: the log does not determine it, so that it keeps its prior value"""
+    determined: bool  #: false: the log does not determine it, so that it keeps its prior value
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +82,18 @@ class Calibration:
     prior: SensorSuite
     """the suite before"""
     numbers: tuple[Calibrated, ...]
-    delays: Mapping[str, float]
-    """times by which the stamps of sensors are late [s], also in `suite.log_delays`"""
     before: Validation
     """the suite before, on the validation part of the log"""
     after: Validation
     """the suite with the numbers that were found, on this part"""
     split: float
     """time at which this part begins [s]"""
+
+    @property
+    def delays(self) -> dict[str, float]:
+        """Times by which the stamps of sensors are late [s], as in `suite.log_delays`."""
+        numbers = [found for found in self.numbers if found.number.sensor == "log_delays"]
+        return {found.number.field: found.value for found in numbers}
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -141,20 +139,21 @@ def calibrate(
     prior = _prior_of(origin_of(whole, suite), whole)
     time = whole.imu.time
     split = float(time[0] + share * (time[-1] - time[0]))
-    search = _Search(whole.until(split), prior, dict(start or {}), progress or (lambda _: None))
-    if delays:
-        search.find_delays(coarse=True)
-    search.fit(first=True)
-    if delays:
-        search.find_delays(coarse=False)
+    report = progress or (lambda _: None)
+    search = _Search(whole.until(split), prior, dict(start or {}), delays)
+    report(f"Search for {len(search.numbers)} numbers in a part of the flight")
+    search.begin()
+    report("Search in all of the first part")
+    search.fit()
+    report("Search with the tails and correlations of the innovations")
     search.adapt()
     search.fit()
-    search.progress("Intervals")
+    report("Intervals")
     found = search.intervals()
-    search.progress("Validation")
-    new = _like_the_log(search.suite(), whole, search.delays)
+    report("Validation")
+    new = _like_the_log(search.suite(search.x, gate=True), whole)
     before, after = (validate(whole, s, start, split) for s in (prior, new))
-    return Calibration(new, prior, found, dict(search.delays), before, after, split)
+    return Calibration(new, prior, found, before, after, split)
 
 
 def _prior_of(suite: SensorSuite, log: Log) -> SensorSuite:
@@ -170,7 +169,9 @@ def _prior_of(suite: SensorSuite, log: Log) -> SensorSuite:
     if gnss is not None and not gnss.drifts:
         drift = tuple(_DRIFT * sigma for sigma in gnss.position_sigma_I)
         gnss = gnss.replace(drift_sigma_I=drift, drift_tau=_DRIFT_TAU)
-    if gnss is not None and not has_baselines(log):
+    if gnss is not None and has(log, "baseline"):
+        gnss = gnss.replace(heading_error_sigma=0.0)  # the mounting of the IMU shows it
+    elif gnss is not None:
         gnss = gnss.replace(secondary_antenna_B=None)
     suite = suite.replace(imu=imu, gnss=gnss)
     if compass is None or stream is None:
@@ -189,7 +190,7 @@ def _prior_of(suite: SensorSuite, log: Log) -> SensorSuite:
     return suite.replace(magnetometer=compass)
 
 
-def _like_the_log(suite: SensorSuite, log: Log, delays: Mapping[str, float]) -> SensorSuite:
+def _like_the_log(suite: SensorSuite, log: Log) -> SensorSuite:
     """Return the suite with rates and latencies of the log, as far as flights can have them."""
     rate, changes = suite.imu.rate, {}
     for name, stream in log.streams.items():
@@ -198,32 +199,26 @@ def _like_the_log(suite: SensorSuite, log: Log, delays: Mapping[str, float]) -> 
             continue
         measured = 1.0 / float(np.median(np.diff(stream.time)))
         ticks = max(1, round(rate / measured))
-        late = float(np.median(stream.received - stream.time)) + delays.get(name, 0.0)
+        late = float(np.median(stream.received - stream.time)) + getattr(suite.log_delays, name)
         latency = min(max(0.0, round(late * rate) / rate), 2.0 * ticks / rate)
         changes[name] = params.replace(rate=rate / ticks, latency=latency)
-    log_delays = suite.log_delays.replace(**delays)
-    return suite.replace(**changes, log_delays=log_delays)
+    return suite.replace(**changes)
 
 
 class _Search:
-    """The search for the numbers of a suite."""
+    """The search for the numbers of a suite, at coordinates x."""
 
-    def __init__(
-        self,
-        log: Log,
-        prior: SensorSuite,
-        start: dict[str, Any],
-        progress: Callable[[str], None],
-    ) -> None:
-        self.log, self.prior, self.start, self.progress = log, prior, start, progress
+    def __init__(self, log: Log, prior: SensorSuite, start: dict[str, Any], delays: bool) -> None:
+        self.log, self.prior, self.start = log, prior, start
         self.nu: dict[str, float] = {}
-        self.measured = {name for name in log.streams if getattr(prior, name, None) is not None}
-        self.numbers = numbers_in(prior, log)
+        self.numbers = numbers_in(prior, log, delays)
         self.values = np.array([number.of(prior) for number in self.numbers])
-        self.low = np.array([_lowest(number) for number in self.numbers])
-        own = vars(prior.log_delays)
-        self.delays = {name: own[name] for name in own if name in self.measured}
-        self.x = np.clip(self._first(), self.low, _LARGEST)
+        self.low = np.array([number.least for number in self.numbers])
+        self.of_log = np.array([number.of_log for number in self.numbers])
+        self.steps = np.diag([number.step for number in self.numbers])
+        self.x = np.clip(self._first(), self.low, MOST)
+        self._margin = _MARGIN
+        self._known: dict[bytes, Likelihood] = {}
 
     def _first(self) -> Floats:
         """Return where the search begins: with noise as wide as the log may need."""
@@ -242,90 +237,102 @@ class _Search:
         dt = float(np.median(np.diff(self.log.imu.time)))
         return float(np.diff(values, axis=0).std()) * math.sqrt(0.5 * dt)
 
-    def suite(self, x: Floats | None = None, gate: bool = True) -> SensorSuite:
+    def suite(self, x: Floats, gate: bool = False) -> SensorSuite:
         """Return the suite at coordinates."""
-        found, x = self.prior, self.x if x is None else x
+        found = self.prior
         if not gate:  # whose decisions are no smooth function of the numbers
             found = found.replace(estimator=found.estimator.replace(false_alarm_probability=0.0))
         for number, value, place in zip(self.numbers, self.values, x, strict=True):
             found = number.put(found, number.value(value, float(place)))
         return found
 
-    def find_delays(self, coarse: bool) -> None:
-        """Find the delay of each sensor, with the others as they are."""
-        for name in self.delays:
-            self.progress(f"Delay of {name}: {1e3 * self.delays[name]:.0f} ms so far")
-            if coarse:
-                self._scan(name, _COARSE)
-            self._scan(name, _FINE)
+    def losses(self, points: Sequence[Floats]) -> Floats:
+        """Return the losses of parts of the log, (parts, points), without priors."""
+        found = np.empty((0, 0))
+        groups: dict[bytes, list[int]] = {}  # of points with the same delays and mounting
+        for k, point in enumerate(points):
+            groups.setdefault(point[self.of_log].tobytes(), []).append(k)
+        for key, rows in groups.items():
+            suites = [self.suite(points[k]) for k in rows]
+            likelihood = self._known.get(key)
+            if likelihood is None:
+                likelihood = Likelihood(self.log, suites[0], self.start, self.nu, self._margin)
+            if key == self.x[self.of_log].tobytes():
+                self._known = {key: likelihood}
+            some = likelihood.losses(suites)
+            found = found if found.size else np.empty((len(some), len(points)))
+            found[:, rows] = some
+        return found
 
-    def _scan(self, name: str, steps: Floats) -> None:
-        """Find the delay of a sensor by a parabola through losses on a grid about the present one.
+    def total(self, points: Sequence[Floats]) -> Floats:
+        """Return the losses of the whole log, with priors."""
+        return self.losses(points).sum(axis=0) + [0.5 * float(p @ p) for p in points]
 
-        Delays have a normal prior about zero. A delay that hardly changes the loss stays.
+    def begin(self) -> None:
+        """Begin the search in a short part of the flight: delays on grids, and noise of the IMU.
+
+        The likelihood has several maxima, as noise of the IMU and drift of GNSS both explain large
+        innovations: the search begins with much and with little of the first.
         """
-        delays = self.delays[name] + steps
-        margin, suites = max(0.0, -float(delays.min())), [self.suite(gate=False)]
-        total = np.empty(len(delays))
-        for k, delay in enumerate(delays):
-            log = self.log.without_delays(self.delays | {name: float(delay)})
-            found = Likelihood(log, self.prior, self.start, fewer=False, margin=margin)
-            total[k] = found.losses(suites).sum()
-        loss = total + 0.5 * (delays / _DELAY_SPREAD) ** 2
-        k = int(np.clip(np.argmin(loss), 2, len(loss) - 3))
-        near = slice(k - 2, k + 3)
-        bend, slope, _ = np.polyfit(delays[near] - delays[k], loss[near], 2)
-        reach = float(steps[1] - steps[0])
-        if 4.0 * bend * reach**2 < _LEAST_GAIN:
-            return
-        step = float(np.clip(-0.5 * slope / bend, -2.0 * reach, 2.0 * reach))
-        self.delays[name] = float(np.clip(delays[k] + step, -2.0, 2.0))
+        whole, time = self.log, self.log.imu.time
+        flying = np.cumsum(np.diff(time, prepend=time[0]) * in_flight(whole, time))
+        last = np.searchsorted(flying, _SHORT + SETTLING)
+        self.log = whole.until(float(time[min(last, len(time) - 1)]))
+        for k, number in enumerate(self.numbers):
+            if number.sensor == "log_delays":
+                self._margin = max(0.0, -float((self.values[k] + _COARSE).min())) + _MARGIN
+                self._known = {}
+                places = self.x[k] + _COARSE / number.spread
+                points = [np.where(np.arange(len(self.x)) == k, x, self.x) for x in places]
+                self.x[k] = _lowest(places, self.total(points))
+        little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
+        tried = [self._descend(x, ~self.of_log, _FEW_STEPS) for x in (self.x, little)]
+        self.x = min(tried, key=lambda found: found[1])[0]
+        self.log, self._known = whole, {}
 
-    def fit(self, first: bool = False) -> None:
-        """Find the numbers with the delays as they are.
+    def fit(self) -> None:
+        """Find delays and mounting, and the numbers of the suite, in turn."""
+        delays = vars(self.suite(self.x).log_delays).values()
+        self._margin = _MARGIN + max(0.0, *(-delay for delay in delays))
+        self._known = {}
+        for _ in range(2):
+            if self.of_log.any():
+                self.x, _ = self._descend(self.x, self.of_log, 2)
+            self.x, _ = self._descend(self.x, ~self.of_log, _STEPS)
 
-        Args:
-            first: True: the likelihood has several maxima, as noise of the IMU and drift of GNSS
-                both explain large innovations; begin with much and with little of the first.
-        """
-        self.progress(f"Search for {len(self.numbers)} numbers")
-        log = self.log.without_delays(self.delays)
-        self._current = Likelihood(log, self.prior, self.start, self.nu)
-        if first:
-            little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
-            tried = [self._minimize(x, _FEW_STEPS) for x in (self.x, little)]
-            self.x = min(tried, key=lambda found: float(found.fun)).x
-        self.x = self._minimize(self.x, _STEPS).x
-
-    def _minimize(self, x: Floats, steps: int) -> Any:
-        """Return the result of a quasi-Newton search from coordinates."""
-        from scipy.optimize import minimize
-
-        return minimize(
-            self._loss,
-            np.clip(x, self.low, _LARGEST),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(low, _LARGEST) for low in self.low],
-            options={"maxiter": steps, "ftol": 1e-5},
-        )
-
-    def _loss(self, x: Floats) -> tuple[float, Floats]:
-        """Return the loss per thousand, with the prior, and its derivative."""
-        points = [x, *(x + s * _STEP * e for e in np.eye(len(x)) for s in (1.0, -1.0))]
-        losses = self._current.losses([self.suite(p, gate=False) for p in points])
-        total = losses.sum(axis=0) + 0.5 * np.array([p @ p for p in points])
-        return total[0] / 1e3, (total[1::2] - total[2::2]) / (2.0 * _STEP * 1e3)
+    def _descend(self, x: Floats, chosen: Any, steps: int) -> tuple[Floats, float]:
+        """Return where Newton steps over the chosen coordinates end, and the loss there."""
+        index = np.flatnonzero(chosen)
+        axes, shares = self.steps[index], _SHARES[[0, 2, 4]] if self.of_log[index[0]] else _SHARES
+        loss = math.inf
+        for _ in range(steps):
+            losses = self.losses([x, *(x + s * step for step in axes for s in (1.0, -1.0))])
+            loss = float(losses[:, 0].sum() + 0.5 * x @ x)
+            scores, bends = _derivatives(losses, np.diag(self.steps)[index])
+            slope, place = scores.sum(axis=0) + x[index], x[index]
+            H = _curvature(scores, bends) + np.eye(len(index))
+            held = ((place <= self.low[index]) & (slope > 0.0)) | ((place >= MOST) & (slope < 0.0))
+            free, step = np.flatnonzero(~held), np.zeros(len(x))
+            step[index[free]] = -np.linalg.solve(H[np.ix_(free, free)], slope[free])
+            step /= max(1.0, float(np.abs(step).max()))
+            points = [np.clip(x + share * step, self.low, MOST) for share in shares]
+            totals = self.total(points)
+            best = int(np.argmin(totals))
+            gain = loss - float(totals[best])
+            if gain > 0.0:
+                x, loss = points[best], float(totals[best])
+            if gain < _LEAST_GAIN:
+                break
+        return x, loss
 
     def adapt(self) -> None:
         """Find the tails of the innovations, and widen noise where these are correlated in time."""
-        log = self.log.without_delays(self.delays)
-        measured = replay(
-            log, sensors=self.suite(), start=self.start, reported_noise=False
-        ).measured
+        suite = self.suite(self.x, gate=True)
+        measured = replay(self.log, sensors=suite, start=self.start, reported_noise=False).measured
         scaled = {}
         for name, m in measured.items():
-            counts = in_flight(log, m.time) & (m.time > m.time[0] + SETTLING) & np.isfinite(m.nis)
+            counts = in_flight(self.log, m.time) & np.isfinite(m.nis)
+            counts &= m.time > m.time[0] + SETTLING
             scaled[name] = (m.innovation / m.sigma)[counts]
             if len(scaled[name]) > _FEWEST_TAILS:
                 self.nu[name] = tails(m.nis[counts], scaled[name].shape[1])
@@ -339,49 +346,73 @@ class _Search:
                 continue
             value = factor * number.value(self.values[k], float(self.x[k]))
             wide = number.coordinate(self.values[k], value)
-            self.low[k] = min(max(self.low[k], wide), _LARGEST - 0.1)
+            self.low[k] = min(max(self.low[k], wide), MOST - 0.1)
+        self.x = np.maximum(self.x, self.low)
 
     def intervals(self) -> tuple[Calibrated, ...]:
         """Return the numbers with 95 % intervals.
 
-        The covariance is H^-1 J H^-1 (Godambe), with the curvature H from differences of
-        derivatives and J the sum of squares of the derivatives over parts of the log.
+        The covariance is H^-1 J H^-1 (Godambe), with the curvature H from differences and J the sum
+        of squares of the scores of independent parts of the log.
         """
-        n = len(self.x)
-        axes, (row, column) = _STEP * np.eye(n), np.triu_indices(n, 1)
+        from scipy.stats import t
+
+        n, axes, h = len(self.x), self.steps, np.diag(self.steps)
+        row, column = np.triu_indices(n, 1)
         points = [self.x, *(self.x + s * e for e in axes for s in (1.0, -1.0))]
         points += [self.x + axes[i] + axes[j] for i, j in zip(row, column, strict=True)]
-        losses = self._current.losses([self.suite(p, gate=False) for p in points])
+        losses = self.losses(points)
+        scores, bends = _derivatives(losses, h)
         total = losses.sum(axis=0)
-        ahead, back, both = total[1 : 2 * n : 2], total[2 : 2 * n + 1 : 2], total[2 * n + 1 :]
-        H = np.diag(ahead + back - 2.0 * total[0])
-        H[row, column] = H[column, row] = both - ahead[row] - ahead[column] + total[0]
-        H /= _STEP**2
-        slopes = (losses[:, 1 : 2 * n : 2] - losses[:, 2 : 2 * n + 1 : 2]) / (2.0 * _STEP)
-        times = self._current.times
-        length = min(_CLUSTER, (times.max() - times.min()) / _CLUSTERS)
-        parts = ((times - times.min()) // length).astype(int)
-        sums = np.array([slopes[parts == part].sum(axis=0) for part in np.unique(parts)])
-        J = sums.T @ sums
+        ahead, both = total[1 : 2 * n : 2], total[2 * n + 1 :]
+        H = np.diag(bends)
+        H[row, column] = (both - ahead[row] - ahead[column] + total[0]) / (h[row] * h[column])
+        H[column, row] = H[row, column]
         values, vectors = np.linalg.eigh(H)
         information = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.eye(n)
-        root = np.linalg.solve(information, np.linalg.cholesky(J + np.eye(n)))
+        length = max(1, round(min(_CLUSTER / PART, len(scores) / _CLUSTERS)))
+        sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
+        root = np.linalg.solve(information, np.linalg.cholesky(sums.T @ sums + np.eye(n)))
         sigmas = np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0)
+        reach = float(t.ppf(0.975, len(sums) - 1))
         found = []
         for k, (number, prior) in enumerate(zip(self.numbers, self.values, strict=True)):
             value, low, high = (
-                number.value(prior, float(self.x[k] + s * sigmas[k])) for s in (0.0, -1.96, 1.96)
+                number.value(prior, float(self.x[k] + s * sigmas[k])) for s in (0.0, -reach, reach)
             )
             determined = bool(sigmas[k] < _SILENT)
             found.append(Calibrated(number, prior, value, low, high, determined))
         return tuple(found)
 
 
-def _lowest(number: Number) -> float:
-    """Return the lower bound of a coordinate."""
-    standard_deviation = "sigma" in number.field or "density" in number.field
-    standard_deviation &= number.field != "drift_sigma_I"
-    return _LEAST / number.spread if standard_deviation else -_LARGEST
+def _derivatives(losses: Floats, steps: Floats) -> tuple[Floats, Floats]:
+    """Return the scores (parts, n), and the second derivatives (n,) of the sum over all parts.
+
+    Args:
+        losses: (parts, 1 + 2 n) at a point, and a step ahead and back along each axis.
+        steps: (n,) sizes of the steps.
+    """
+    count = 2 * len(steps) + 1
+    ahead, back = losses[:, 1:count:2], losses[:, 2:count:2]
+    bends = (ahead + back).sum(axis=0) - 2.0 * losses[:, 0].sum()
+    return (ahead - back) / (2.0 * steps), bends / steps**2
+
+
+def _curvature(scores: Floats, bends: Floats) -> Floats:
+    """Return second derivatives with the correlations of the scores."""
+    squares = scores.T @ scores
+    squares += np.diag(_RIDGE * np.diag(squares) + 1e-9)
+    sizes = np.sqrt(np.maximum(bends, 0.0) / np.diag(squares))
+    return squares * sizes * sizes[:, np.newaxis]
+
+
+def _lowest(places: Floats, losses: Floats) -> float:
+    """Return the minimum of a parabola through the lowest loss on a grid and its neighbors."""
+    k = int(np.clip(np.argmin(losses), 1, len(losses) - 2))
+    bend, slope, _ = np.polyfit(places[k - 1 : k + 2] - places[k], losses[k - 1 : k + 2], 2)
+    reach = float(places[1] - places[0])
+    move = -0.5 * slope / bend if bend > 0.0 else 0.0
+    return float(places[k] + np.clip(move, -reach, reach))
 
 
 def correlation_time(values: Floats) -> float:

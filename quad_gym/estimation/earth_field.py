@@ -21,12 +21,9 @@ from quad_gym.frames import ecef_to_enu
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.sensors import SensorSuite
 
-_RADIUS = 6_371_200.0
-"""Radius a of the model [m]."""
-_EPOCH, _YEAR = 2025.0, 2026.0
-"""Year of the coefficients; and of the default fields in suites."""
-_SAME = 0.02
-"""Relative difference up to which two fields are equal."""
+_RADIUS = 6_371_200.0  #: radius a of the model [m]
+_EPOCH, _YEAR = 2025.0, 2026.0  #: year of the coefficients; and of the default fields in suites
+_SAME = 0.02  #: relative difference up to which two fields are equal
 
 
 @cache

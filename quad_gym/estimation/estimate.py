@@ -25,8 +25,7 @@ class Innovations(NamedTuple):
     nis: NDArray[np.float64]
     """(n,) normalized innovations squared; chi-square with 3, 2, 3, 2, 1 and 3 degrees of
     freedom"""
-    gate: NDArray[np.float64]
-    """(n,) gate decisions, see `quad_gym.records.GateDecision`"""
+    gate: NDArray[np.float64]  #: (n,) gate decisions, see `quad_gym.records.GateDecision`
 
 
 class FilterEstimate:

@@ -5,14 +5,11 @@ import numpy as np
 from quad_gym.estimation.logs import Log
 from quad_gym.params.sensors import SensorSuite
 
-SPAN = 1.0
-"""Time after the first fix whose positions show the speed at the first one [s]."""
+SPAN = 1.0  #: time after the first fix whose positions show the speed at the first one [s]
 TURNING, FAST = 0.3, 1.0
 """Angular rate [rad/s] and speed [m/s] at the first fix of a vehicle that moves."""
-CERTAIN = 4.0
-"""Standard deviations of a speed from positions beyond which it is no noise."""
-TILT = 0.3
-"""Standard deviation of roll and pitch of a vehicle that maneuvers [rad]."""
+CERTAIN = 4.0  #: standard deviations of a speed from positions beyond which it is no noise
+TILT = 0.3  #: standard deviation of roll and pitch of a vehicle that maneuvers [rad]
 
 
 def with_wide_start(suite: SensorSuite, log: Log) -> SensorSuite:

@@ -26,12 +26,9 @@ from quad_gym.rotations import dcm_to_euler, euler_to_dcm
 
 Floats = NDArray[np.float64]
 
-COUNT = 48
-"""Number of headings; a multiple of the lanes of any machine."""
-SPACING = 2.0 * math.pi / COUNT
-"""Angle between two headings [rad]."""
-RESOLVED = 0.07
-"""Standard deviation of the heading below which a single Gaussian takes over [rad]."""
+COUNT = 48  #: number of headings; a multiple of the lanes of any machine
+SPACING = 2.0 * math.pi / COUNT  #: angle between two headings [rad]
+RESOLVED = 0.07  #: standard deviation of the heading below which a single Gaussian takes over [rad]
 
 _VECTORS = ("r_hat", "v_hat", "b_a_hat", "b_g_hat")
 
@@ -39,11 +36,9 @@ _VECTORS = ("r_hat", "v_hat", "b_a_hat", "b_g_hat")
 class Moments(NamedTuple):
     """Mean and covariance of a sum of Gaussians."""
 
-    vectors: dict[str, Floats]
-    """r_hat, v_hat, b_a_hat and b_g_hat (3,), slow_hat (n,)"""
+    vectors: dict[str, Floats]  #: r_hat, v_hat, b_a_hat and b_g_hat (3,), slow_hat (n,)
     R_hat: Floats
-    covariance: Floats
-    """(15 + n, 15 + n)"""
+    covariance: Floats  #: (15 + n, 15 + n)
 
     @property
     def heading_sigma(self) -> float:

@@ -16,10 +16,9 @@ from typing import Any
 
 from quad_gym.estimation.samples import Measurement, Sample
 
-SAME_TIME = 1e-6
-"""Time stamps that differ by less are equal [s]; PX4 counts microseconds."""
+SAME_TIME = 1e-6  #: time stamps that differ by less are equal [s]; PX4 counts microseconds
 
-_EVERY = 8  # events between two copies of the state: a copy costs about as much as an event
+_EVERY = 8  #: events between two copies of the state: a copy costs about as much as an event
 
 
 @dataclass(slots=True)

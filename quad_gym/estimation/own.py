@@ -28,8 +28,7 @@ ESTIMATES: dict[str, tuple[int, ...]] = {
 }
 """Names in an estimate, and the shape of each for one flight."""
 
-_NORM_ERROR = 1e-2
-"""Largest error of the sum of the squares of a quaternion, or of R_BI."""
+_NORM_ERROR = 1e-2  #: largest error of the sum of the squares of a quaternion, or of R_BI
 
 
 class Estimator:

@@ -23,26 +23,20 @@ FORCE_CAUSES = (
     (math.inf, "accelerometer in milli-g or cm/s^2?"),
 )
 """Likely causes of other values, each up to a mean specific force [m/s^2]."""
-MOST_RATE = 35.0
-"""Largest angular rate that gyros measure [rad/s]: 2000 deg/s."""
+MOST_RATE = 35.0  #: largest angular rate that gyros measure [rad/s]: 2000 deg/s
 MOST_MEAN_RATE = 10.0
 """Mean angular rate of a vehicle over a log [rad/s]: one and a half turns per second."""
-MOST_FIELD = 5.0
-"""Ratio of the mean magnetic field and the suite's, either way [-]."""
-MOST_HEIGHT = 20_000.0
-"""Mean height by a barometer [m]."""
-MOST_NIS = 10.0
-"""Mean NIS of the measurements used, over their degrees of freedom [-]."""
-MOST_REJECTED = 0.1
-"""Share of the measurements of a sensor that the gate rejects [-]."""
+MOST_FIELD = 5.0  #: ratio of the mean magnetic field and the suite's, either way [-]
+MOST_HEIGHT = 20_000.0  #: mean height by a barometer [m]
+MOST_NIS = 10.0  #: mean NIS of the measurements used, over their degrees of freedom [-]
+MOST_REJECTED = 0.1  #: share of the measurements of a sensor that the gate rejects [-]
 MOST_CORRELATED, FEWEST = 0.8, 50
 """Correlation of successive innovations of GNSS that all axes exceed, and the number of innovations
 that shows it: they are then no noise, but errors of the clock, or motion that the filter misses."""
 MOST_BIAS = 4.0
 """Root mean square of an estimated bias, over the standard deviation in the suite [-]: a wrong
 field, clock or mounting moves the biases before it moves the innovations."""
-MOST_DIVERGED = 0.25
-"""Share of the samples at which the filter counts as diverged [-]."""
+MOST_DIVERGED = 0.25  #: share of the samples at which the filter counts as diverged [-]
 
 FIELD_UNITS = {1e4: "gauss", 1e6: "microtesla", 1e7: "milligauss", 1e9: "nanotesla"}
 """Units in which a field is written, by how many of them one tesla has."""

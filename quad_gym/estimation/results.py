@@ -51,7 +51,7 @@ class Replay:
     """
 
     estimator: str
-    """kind of the filter: "ukf" or "ekf\""""
+    """kind of the filter: "ukf" or "ekf\", or the class of an own one"""
     sensors: SensorSuite
     """sensor suite that the filter assumed; `gnss.reference_antenna_G` is the origin of I"""
     time: Floats

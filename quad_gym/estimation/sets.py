@@ -19,8 +19,7 @@ class SetRuns(NamedTuple):
 
     estimates: Floats
     """(n, KEPT, sets) estimates, see `quad_gym.records.KEPT`; n is 0 if they were not asked for"""
-    innovations: Floats
-    """(m, blocks, REPORTED, sets) innovations of each update"""
+    innovations: Floats  #: (m, blocks, REPORTED, sets) innovations of each update
 
 
 def run_sets(

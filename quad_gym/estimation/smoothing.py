@@ -28,7 +28,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 from quad_gym.estimation.filters import KalmanFilter
-from quad_gym.estimation.logs import Floats, Log
+from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.replaying import named_start, prepared
 from quad_gym.estimation.results import Smoothed
@@ -39,10 +39,10 @@ from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import OPERATION, Operation
 from quad_gym.rotations import dcm_to_euler, dcm_to_quaternion, euler_to_dcm
 
-_AT_ONCE = 256  # operations between two readings of the filter's memory
-_LEAST_JUMP = 1e-9  # share of a variance, at least, that an inflation adds
-_LEAST_CHANGE = 1e-6  # share of a variance that smoothing must remove for the consistency test
-_LEAST_VARIANCE = 1e-14  # added to all variances, in units of these, against rounding
+_AT_ONCE = 256  #: operations between two readings of the filter's memory
+_LEAST_JUMP = 1e-9  #: share of a variance, at least, that an inflation adds
+_LEAST_CHANGE = 1e-6  #: share of a variance that smoothing must remove for the consistency test
+_LEAST_VARIANCE = 1e-14  #: added to all variances, in units of these, against rounding
 _E = slice(6, 9)
 
 
@@ -74,7 +74,7 @@ def smooth(
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, body)
-    player = Player(_in_order(whole), suite, estimator, named_start(start), reported_noise, 0.0)
+    player = Player(whole, suite, estimator, named_start(start), reported_noise, None)
     forward = _filter_forward(player)
     x, R_BI, P = _smooth_back(forward)
     rows = forward.rows
@@ -94,14 +94,6 @@ def smooth(
         difference=difference / np.sqrt(gained),
         status=player.filter.status,
     )
-
-
-def _in_order(log: Log) -> Log:
-    """Return the log as if each measurement had arrived at its time stamp."""
-    streams: dict[str, Any] = {
-        name: replace(stream, received=stream.time) for name, stream in log.streams.items()
-    }
-    return replace(log, **streams)
 
 
 # ---- forward -------------------------------------------------------------------------------------

@@ -44,23 +44,20 @@ MOST_MOTION = 0.1
 """Fraction of gravity by which the specific force of a vehicle at rest may differ from it: twice
 the effect of the bias of a cheap accelerometer."""
 
-STEEPEST_NOSE = 0.05
-"""Horizontal fraction of the x axis below which its heading is undefined."""
+STEEPEST_NOSE = 0.05  #: horizontal fraction of the x axis below which its heading is undefined
 
 STEEP = 0.2
 """Horizontal fraction of a baseline, 12 degrees from the vertical, below which it does not observe
 the heading; as in `kernels/filter/align.py`."""
 
-_D = 15  # the first time-correlated error among the states
+_D = 15  #: the first time-correlated error among the states
 
 
 class FirstHeading(NamedTuple):
     """A heading, and the errors on which it depends."""
 
-    angle: float
-    """heading of the body x axis, from east toward north [rad]"""
-    sigma: float
-    """standard deviation of its independent error [rad]"""
+    angle: float  #: heading of the body x axis, from east toward north [rad]
+    sigma: float  #: standard deviation of its independent error [rad]
     of_tilt: tuple[float, float] = (0.0, 0.0)
     """error of the heading per error of the tilt, about the first two axes of the level frame
     [-]"""
@@ -71,27 +68,21 @@ class FirstHeading(NamedTuple):
 class Tilt(NamedTuple):
     """Direction of the vertical in the body, and the errors on which it depends."""
 
-    T: Floats
-    """(3, 3) rotation from the level frame to B"""
-    sigma: float
-    """standard deviation of its independent error, about each level axis [rad]"""
+    T: Floats  #: (3, 3) rotation from the level frame to B
+    sigma: float  #: standard deviation of its independent error, about each level axis [rad]
     of_bias: float = 0.0
     """error of the tilt per accelerometer bias across the vertical [rad s^2/m]"""
 
 
-LEVEL = Tilt(np.eye(3), 0.0)
-"""A level vehicle."""
+LEVEL = Tilt(np.eye(3), 0.0)  #: a level vehicle
 
 
 class FirstEstimate(NamedTuple):
     """First estimate of a filter."""
 
-    position: Floats
-    """(3,) position in I [m]"""
-    velocity: Floats
-    """(3,) velocity in I [m/s]"""
-    R_BI: Floats
-    """(3, 3) attitude"""
+    position: Floats  #: (3,) position in I [m]
+    velocity: Floats  #: (3,) velocity in I [m/s]
+    R_BI: Floats  #: (3, 3) attitude
     factor: Floats
     """(15 + n, 15 + n) lower factor of the covariance, with n time-correlated errors last"""
 

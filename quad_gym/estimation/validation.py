@@ -11,8 +11,7 @@ from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Replay, by_sensor
 from quad_gym.params.sensors import SensorSuite
 
-_PERIOD, _GAP = 5.0, 1.0
-"""Fixes are left out for a second in every five [s]."""
+_PERIOD, _GAP = 5.0, 1.0  #: fixes are left out for a second in every five [s]
 
 
 class Fit(NamedTuple):
@@ -20,12 +19,9 @@ class Fit(NamedTuple):
 
     measurements: int
     freedoms: int
-    mean_nis: float
-    """mean NIS over its degrees of freedom; 1 for a consistent filter"""
-    median_nis: float
-    """median NIS over its degrees of freedom"""
-    rejected: float
-    """share of the measurements that the gate rejects"""
+    mean_nis: float  #: mean NIS over its degrees of freedom; 1 for a consistent filter
+    median_nis: float  #: median NIS over its degrees of freedom
+    rejected: float  #: share of the measurements that the gate rejects
     correlation: float
     """correlation of successive innovations, the largest of all axes; 0 for a consistent filter"""
 
@@ -88,13 +84,7 @@ def _held_out(
     if gnss is None or suite.gnss is None:
         return None, None
     phase = (gnss.time - split) % _PERIOD
-    rows = (gnss.time < split) | (phase >= _GAP)
-    gnss = replace(
-        gnss,
-        time=gnss.time[rows],
-        received=gnss.received[rows],
-        values={name: value[rows] for name, value in gnss.values.items()},
-    )
+    gnss = gnss.rows((gnss.time < split) | (phase >= _GAP))
     result = replay(replace(log, gnss=gnss), sensors=suite, start=start, reported_noise=False)
     fixes = result.measured.get("gnss_position")
     if fixes is None:

@@ -24,8 +24,7 @@ LABELS = {TRUTH: "truth", ESTIMATE: "estimate", NO_CAMERA: "estimate, no camera"
 NEES_TAIL = 0.001
 """Probability that the NEES of a consistent filter exceeds the bound in the table"""
 
-Recordings = Mapping[str, Recording]
-"""Recordings by case."""
+Recordings = Mapping[str, Recording]  #: recordings by case
 
 
 @dataclass(frozen=True, kw_only=True)

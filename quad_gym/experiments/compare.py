@@ -28,12 +28,10 @@ NAMES = {
 }
 """Rows of the matrix."""
 
-FLOWN_ON = ("truth", "estimate")
-"""Observations of the flights: columns of the matrix."""
+FLOWN_ON = ("truth", "estimate")  #: observations of the flights: columns of the matrix
 
 _ENGINES = {"sb3": "Stable-Baselines3", "compiled": "the compiled engine"}
-MANY_CRASHES = 0.01
-"""Share of crashes above which mean errors are not compared."""
+MANY_CRASHES = 0.01  #: share of crashes above which mean errors are not compared
 ONE_SEED = (
     "One training seed proves nothing: another seed could reverse any of these differences. "
     "Run with five for intervals. Where good sensors determine the state, as on the circle, no "

@@ -13,17 +13,13 @@ from baselines.training import train
 from quad_gym.experiments.executors import Ended, Executor, Job
 from quad_gym.experiments.experiment import Training
 
-PAUSE = 0.1
-"""Time between looks at the jobs [s]."""
+PAUSE = 0.1  #: time between looks at the jobs [s]
 
-REFRESH = 1.0
-"""Time between updates of the progress bar [s]."""
+REFRESH = 1.0  #: time between updates of the progress bar [s]
 
-RETRIES = 2
-"""Default number of restarts of a training that died."""
+RETRIES = 2  #: default number of restarts of a training that died
 
-INTERRUPTED = 130
-"""Exit code of an experiment that was stopped."""
+INTERRUPTED = 130  #: exit code of an experiment that was stopped
 
 
 def train_here(trainings: Sequence[Training]) -> None:

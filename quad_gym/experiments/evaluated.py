@@ -11,8 +11,7 @@ from quad_gym.analysis.plots import save_figure
 from quad_gym.evaluation import Episodes
 from quad_gym.experiments.flown import Flown, path_of
 
-Evaluated = Mapping[tuple[str, str], Flown]
-"""Episodes by policy and observation."""
+Evaluated = Mapping[tuple[str, str], Flown]  #: episodes by policy and observation
 
 
 def evaluation_table(results: Evaluated, env: Any) -> str:

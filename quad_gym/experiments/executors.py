@@ -20,7 +20,7 @@ from baselines.training import train
 from quad_gym.experiments.experiment import Training
 from quad_gym.params import checks as check
 
-_DAY = 24 * 60  # minutes
+_DAY = 24 * 60  #: minutes
 
 
 class Ended(NamedTuple):
@@ -29,8 +29,7 @@ class Ended(NamedTuple):
     kind: str
     """One of finished; busy: another process trains in the folder; failed: the training raised an
     error; stopped: it was asked to stop; died"""
-    text: str = ""
-    """Reason"""
+    text: str = ""  #: reason
 
 
 class Job(Protocol):
@@ -43,8 +42,7 @@ class Job(Protocol):
         """Ask the training to write a checkpoint and stop; the second time, to stop at once."""
 
 
-Executor = Callable[[Training], Job]
-"""Function that starts or resumes a training."""
+Executor = Callable[[Training], Job]  #: function that starts or resumes a training
 
 
 def work(plan: Plan, folder: Path) -> Ended:

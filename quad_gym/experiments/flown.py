@@ -23,11 +23,9 @@ from quad_gym.params.suites import contents_of_suite_files
 
 Floats = NDArray[np.float64]
 
-MARKERS = 2
-"""Number of features that determine position and heading if the vertical is known."""
+MARKERS = 2  #: number of features that determine position and heading if the vertical is known
 
-TRACED = 12
-"""Number of episodes whose traces are stored."""
+TRACED = 12  #: number of episodes whose traces are stored
 
 
 @dataclass(frozen=True, eq=False)

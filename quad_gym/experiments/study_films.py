@@ -23,8 +23,7 @@ from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
 from quad_gym.rendering.video import checked_video_path
 
-RATE = 10.0
-"""Pictures per second of a film."""
+RATE = 10.0  #: pictures per second of a film
 
 _TRAINING = "Of each arm it is the training with the best validation. The episode is the first one "
 CHOICES: Mapping[str, str] = {
@@ -40,10 +39,8 @@ AWAY = math.radians(100.0)
 class Pair(NamedTuple):
     """Two trainings and a test episode."""
 
-    trainings: dict[str, int]
-    """Index of the seed by name of the arm, `truth` first"""
-    episode: int
-    """Index of the test episode"""
+    trainings: dict[str, int]  #: index of the seed by name of the arm, `truth` first
+    episode: int  #: index of the test episode
 
 
 def pair_of(results: StudyResults) -> Pair | None:

@@ -31,14 +31,12 @@ DEFAULTS: Mapping[str, Any] = {
 """Keys of a sweep, see `docs/sweeps.md`; None: as in the recipe."""
 
 TABLES = ("env", "set", "recipe")
-_SINGLE = ("algorithm", "steps", "n_envs")
-"""Fields of a recipe that are separate keys."""
+_SINGLE = ("algorithm", "steps", "n_envs")  #: fields of a recipe that are separate keys
 _ELSEWHERE = {**{name: name for name in _SINGLE}, "parameters": "set"}
 """Keys to use instead of fields of the recipe."""
 _RECIPE = tuple(f.name for f in fields(Recipe) if f.name not in (*_ELSEWHERE, "flights", "policy"))
 
-Axis = tuple[str, str]
-"""Table (empty for a separate key) and key of a value."""
+Axis = tuple[str, str]  #: table (empty for a separate key) and key of a value
 
 
 def read(file: Path) -> dict[str, Any]:
@@ -76,8 +74,8 @@ def expand(
         spec["env_ids"], spec["arms"] or [None], itertools.product(*tried)
     ):
         chosen = dict(zip(axes, values, strict=True))
-        compiled = spec["engine"] == "compiled"
-        words = [IDS[env_id], "compiled_ppo" if compiled else chosen["", "algorithm"]]
+        engine = "compiled_" if spec["engine"] == "compiled" else ""
+        words = [IDS[env_id], f"{engine}{chosen['', 'algorithm']}"]
         words += [] if arm is None else [arm]
         words += [  # values from lists, so that further values do not change it
             f"{axis[1]}={_word(value)}"

@@ -17,12 +17,9 @@ from quad_gym.evaluation import roll_out
 
 Floats = NDArray[np.float64]
 
-CRASH_FACTOR = 10.0
-"""Error of an episode that crashed, relative to the initial error."""
-RANGE = 3.0
-"""Gains are searched from 1 / RANGE to RANGE times the initial gains."""
-POPULATION = 8
-"""Candidates of a generation, for each gain."""
+CRASH_FACTOR = 10.0  #: error of an episode that crashed, relative to the initial error
+RANGE = 3.0  #: gains are searched from 1 / RANGE to RANGE times the initial gains
+POPULATION = 8  #: candidates of a generation, for each gain
 
 
 class _AllFlownError(Exception):

@@ -15,7 +15,7 @@ from quad_gym.records import FaultKind
 
 __all__ = ["Fault", "Span", "ends"]
 
-_SENSORS = {"gnss": "GNSS"}  # parts of a suite that are named without an article
+_SENSORS = {"gnss": "GNSS"}  #: parts of a suite that are named without an article
 
 Span = float | tuple[float, float]
 """A number, or a range (low, high) from which it is drawn uniformly at each onset of a fault."""

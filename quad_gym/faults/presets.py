@@ -40,8 +40,7 @@ PRESETS: dict[str, tuple[Fault, ...]] = {
 }
 """Presets of faults by name, for episodes of ten seconds and more."""
 
-ALL = "all"
-"""Name of all presets that a sensor suite can have."""
+ALL = "all"  #: name of all presets that a sensor suite can have
 
 
 def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:

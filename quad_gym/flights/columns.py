@@ -11,9 +11,9 @@ class Column(NamedTuple):
     """One quantity of a flight."""
 
     name: str
-    shape: tuple[int, ...]  # shape of one row; FEATURES stands for the camera's number of features
+    shape: tuple[int, ...]  #: shape of one row; FEATURES stands for the camera's number of features
     unit: str
-    frame: str  # I: inertial (east, north, up), B: body, C: image; "-": none
+    frame: str  #: I: inertial (east, north, up), B: body, C: image; "-": none
     meaning: str
 
 
@@ -56,7 +56,7 @@ def _column(row: str | Column) -> Column:
     return Column(row, shape, unit, quantity.frame, quantity.meaning)
 
 
-COLUMNS = tuple(map(_column, _ROWS))  # columns of a flight, in order
+COLUMNS = tuple(map(_column, _ROWS))  #: columns of a flight, in order
 
 READ = tuple(row for row in _ROWS if isinstance(row, str) and row != "reference_position")
 """Columns that are quantities of a batch, copied unchanged."""

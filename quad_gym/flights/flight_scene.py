@@ -15,27 +15,44 @@ Floats = NDArray[np.float64]
 class FlightScene:
     """Constants of a flight: vehicle, sensors, reference and surroundings."""
 
-    task: str  #: kind of task, see `TaskParams`
+    task: str
+    """Kind of task, see `TaskParams`"""
     observation: str
     """source of the controller's observations: "truth", "estimate", "noisy" or "measurements\""""
-    control_rate: float  #: control rate, and so rows per second [Hz]
-    rotor_positions_B: Floats  #: (4, 3) positions of the rotor hubs in B [m]
-    max_rotor_speed: float  #: rotor speed at full voltage [rad/s]
-    hover_rotor_speed: float  #: rotor speed in hover [rad/s]
+    control_rate: float
+    """Control rate, and so rows per second [Hz]"""
+    rotor_positions_B: Floats
+    """(4, 3) positions of the rotor hubs in B [m]"""
+    max_rotor_speed: float
+    """Rotor speed at full voltage [rad/s]"""
+    hover_rotor_speed: float
+    """Rotor speed in hover [rad/s]"""
     antennas_B: Floats
     """(2, 3) positions of the primary and the secondary antenna in B [m]; NaN: missing"""
-    camera_B: Floats  #: (3,) projection center in B [m]; NaN: no camera
-    R_CB: Floats  #: (3, 3) rotation from body to camera
-    camera_rate: float  #: images per second [Hz]; 0: no camera
-    focal_length: float  #: focal length [pixels]
-    half_image: Floats  #: (2,) half width and half height of the image [pixels]
-    features_I: Floats  #: (n, 3) positions of the features in I [m]
-    gates_I: Floats  #: (n, 3) centers of the course's gates in I; (0, 3) for other tasks [m]
-    gate_radius: float  #: distance from the center of a gate below which the gate is passed [m]
-    reference_omega: float  #: fundamental frequency of the reference [rad/s]
-    reference_center: Floats  #: (3,) constant term of the reference in I [m]
-    reference_cos: Floats  #: (k, 3) cosine coefficients of the reference in I [m]
-    reference_sin: Floats  #: (k, 3) sine coefficients of the reference in I [m]
+    camera_B: Floats
+    """(3,) projection center in B [m]; NaN: no camera"""
+    R_CB: Floats
+    """(3, 3) rotation from body to camera"""
+    camera_rate: float
+    """Images per second [Hz]; 0: no camera"""
+    focal_length: float
+    """Focal length [pixels]"""
+    half_image: Floats
+    """(2,) half width and half height of the image [pixels]"""
+    features_I: Floats
+    """(n, 3) positions of the features in I [m]"""
+    gates_I: Floats
+    """(n, 3) centers of the course's gates in I; (0, 3) for other tasks [m]"""
+    gate_radius: float
+    """Distance from the center of a gate below which the gate is passed [m]"""
+    reference_omega: float
+    """Fundamental frequency of the reference [rad/s]"""
+    reference_center: Floats
+    """(3,) constant term of the reference in I [m]"""
+    reference_cos: Floats
+    """(k, 3) cosine coefficients of the reference in I [m]"""
+    reference_sin: Floats
+    """(k, 3) sine coefficients of the reference in I [m]"""
     obstacles: Floats = field(default_factory=lambda: np.zeros((0, 9)))
     """(n, 9) obstacles: shape (see `records.Shape`), center in I, half length, half thickness and
     half height (cylinder: radius, radius, half height), horizontal direction of the length [m]"""
@@ -45,8 +62,10 @@ class FlightScene:
     """(m + 1,) times of the segments of a trajectory as the reference; (0,): no trajectory [s]"""
     trajectory_coefficients: Floats = field(default_factory=lambda: np.zeros((8, 0, 4)))
     """(8, m, 4) coefficients as in `quad_gym.Trajectory`, rotated as in the flight"""
-    trajectory_closed: bool = False  #: True: the trajectory repeats
-    trajectory_phase: float = 0.0  #: time on the trajectory at which the episode begins [s]
+    trajectory_closed: bool = False
+    """True: the trajectory repeats"""
+    trajectory_phase: float = 0.0
+    """Time on the trajectory at which the episode begins [s]"""
 
     @property
     def has_camera(self) -> bool:

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 TIMELINE = "flight"
 SIGMAS = 3.0
 TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
-ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55  # [m]
+ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55  #: [m]
 
 # colors by Okabe and Ito, which people with a color vision deficiency can distinguish, on the
 # viewer's dark background

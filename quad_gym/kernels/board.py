@@ -28,10 +28,8 @@ from quad_gym.records.board import (
     WORDS_OF_RANGE,
 )
 
-WATCH = 4_000
-"""Polls of the board before a helper sleeps, about 100 us."""
-PATIENCE = 100 * WATCH
-"""Polls of the caller before Python checks the other threads for errors."""
+WATCH = 4_000  #: polls of the board before a helper sleeps, about 100 us
+PATIENCE = 100 * WATCH  #: polls of the caller before Python checks the other threads for errors
 
 
 @kernel

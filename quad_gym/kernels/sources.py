@@ -6,8 +6,7 @@ The build of a wheel runs this file by itself.
 import hashlib
 from pathlib import Path
 
-MARK = b"quad_gym kernels "
-"""Beginning of the text with the digest in a library."""
+MARK = b"quad_gym kernels "  #: beginning of the text with the digest in a library
 
 
 def sources_digest(package: Path) -> str:

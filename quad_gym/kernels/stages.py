@@ -93,8 +93,7 @@ class Kernel(NamedTuple):
     """A compiled function for a slot, and the settings that need it."""
 
     stage: Stage
-    function: str
-    """its module in `quad_gym.kernels`, and its name without `_stage`"""
+    function: str  #: its module in `quad_gym.kernels`, and its name without `_stage`
     needed: Callable[[Any], bool]
     parts: tuple[str, ...]
     """parts of a flight's record that it uses in addition to the core, see `records.PARTS`"""

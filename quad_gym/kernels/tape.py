@@ -32,7 +32,7 @@ from quad_gym.records.tape import (
 _PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
 _PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
 _BAROMETER = int(Aid.BAROMETER)
-_LANES = 8 * WIDTH  # bytes
+_LANES = 8 * WIDTH  #: bytes
 
 
 @kernel

@@ -25,7 +25,7 @@ class SlowStates(NamedTuple):
 
     errors: tuple[SlowError, ...]
     """slow errors, padded to a multiple of three by constants with standard deviation one"""
-    estimated: int  # number of slow errors without the padding
+    estimated: int  #: number of slow errors without the padding
     drifts: bool
     """True if the first three are the drift of GNSS positions, which is zero at the start"""
     vectors: tuple[int, ...]

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +25,8 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
 
-if TYPE_CHECKING:
-    from quad_gym.estimation.own import Estimator
-
-MOST_FLIGHTS = 10**7  # largest number of flights in a batch
-FILTER_STARTS = ("cold", "warm")  # values of the keyword `filter_start`
+MOST_FLIGHTS = 10**7  #: largest number of flights in a batch
+FILTER_STARTS = ("cold", "warm")  #: values of the keyword `filter_start`
 
 _WITHOUT = {
     "gains": tuple(control for control in Control if control is not Control.PD),
@@ -82,7 +78,8 @@ class FlightConfiguration:
     """start of the next episode after one has ended"""
     run_filter: bool | None = None
     """True: sensors and filter run; None: they run if another argument needs them"""
-    estimator: "Estimator | type[Estimator] | str | None" = None
+    estimator: object = None
+    """an own `quad_gym.Estimator`, its class, or "module:Class"; None: the filter of the sensors"""
     filter_start: str = "cold"
     innovations: bool = False
     """True: keep innovations and NIS block by block, for `record`: "innovation",

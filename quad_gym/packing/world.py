@@ -14,7 +14,7 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, MAX_START_VELOCITY, SETTINGS, Start, Supply
 
-FALLEN_THROUGH = 0.5  # depth below ground that supports vehicles at which an episode ends [m]
+FALLEN_THROUGH = 0.5  #: depth below ground that supports vehicles at which an episode ends [m]
 
 
 def pack_options(

@@ -12,8 +12,8 @@ from quad_gym.records import Aid
 class SlowError(NamedTuple):
     """A time-correlated or constant error, which the filter estimates in augmented states."""
 
-    sigma: float  # stationary standard deviation, in the unit of the measurement
-    tau: float = math.inf  # correlation time [s]; infinite: the error is constant during a flight
+    sigma: float  #: stationary standard deviation, in the unit of the measurement
+    tau: float = math.inf  #: correlation time [s]; infinite: the error is constant during a flight
 
 
 class SensorBase(Checked):

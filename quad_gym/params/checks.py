@@ -17,14 +17,14 @@ _NO_NUMBERS = (str, bytes, bytearray, bool, np.bool_)
 Vector = tuple[float, ...]
 Matrix = tuple[tuple[float, ...], ...]
 
-MOST_TICKS = 10**5  # largest number of ticks between two events of a clock; 500 s at 200 Hz
-LARGEST = 1e15  # largest magnitude of any quantity in SI units; its square is far from overflow
+MOST_TICKS = 10**5  #: largest number of ticks between two events of a clock; 500 s at 200 Hz
+LARGEST = 1e15  #: largest magnitude of any quantity in SI units; its square is far from overflow
 
 SMALLEST = 1e-15
 """Smallest value of a quantity that has to be positive; its square is far from underflow."""
 
 
-FARTHEST_ON_VEHICLE = 100.0  # no part of a vehicle is farther from its center of mass [m]
+FARTHEST_ON_VEHICLE = 100.0  #: no part of a vehicle is farther from its center of mass [m]
 
 
 def package(module: str, what: str, extra: str) -> Any:

@@ -17,7 +17,7 @@ FARTHEST = 8.3
 class Affine(NamedTuple):
     """A distribution in the form that the kernel reads; u is uniform on (0, 1)."""
 
-    kind: int  # UNIFORM: a + b u; LOG_UNIFORM: a e^(b u); NORMAL: a + b Phi^-1(c + d u)
+    kind: int  #: UNIFORM: a + b u; LOG_UNIFORM: a e^(b u); NORMAL: a + b Phi^-1(c + d u)
     a: float
     b: float
     c: float = 0.0

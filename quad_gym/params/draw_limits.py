@@ -19,7 +19,7 @@ from quad_gym.params.vehicle import (
 from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, Drawable
 
-FAST = 100.0  # speed that no vehicle reaches [m/s]
+FAST = 100.0  #: speed that no vehicle reaches [m/s]
 
 
 class Ranges:

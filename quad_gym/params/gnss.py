@@ -16,7 +16,7 @@ HEADING_MEMORY = 60.0
 """Time over which a filter does not average out the constant heading error of a baseline [s]."""
 
 
-LEAST_BASELINE = 1e-3  # antennas are farther apart than this [m]
+LEAST_BASELINE = 1e-3  #: antennas are farther apart than this [m]
 
 
 def check_baseline(name: str, baseline: np.ndarray) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
-FARTHEST_FOOT = 10.0  # largest distance of a foot from the center of mass [m]
+FARTHEST_FOOT = 10.0  #: largest distance of a foot from the center of mass [m]
 
 
 class GroundParams(Checked):

@@ -7,7 +7,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams, SlowError
 from quad_gym.records import Aid
 
-MICROTESLA = 1e-6  # one microtesla [T]
+MICROTESLA = 1e-6  #: one microtesla [T]
 
 
 class MagnetometerParams(AidParams):

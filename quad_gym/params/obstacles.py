@@ -15,7 +15,7 @@ from quad_gym.records import Shape
 
 FARTHEST_OBSTACLE = 1e4
 """Largest size of an obstacle, distance of its center from the origin, and shift [m]."""
-LEAST_SIZE = 1e-3  # smallest length, thickness, height or radius [m]
+LEAST_SIZE = 1e-3  #: smallest length, thickness, height or radius [m]
 
 Size = Annotated[float, partial(check.positive, least=LEAST_SIZE, most=FARTHEST_OBSTACLE)]
 

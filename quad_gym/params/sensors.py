@@ -21,7 +21,7 @@ from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suite_files import Saved
 from quad_gym.records import MAX_UNDER_WAY, Aid
 
-SensorParams = GnssParams | CameraParams | AidParams  # parameters of a sensor other than the IMU
+SensorParams = GnssParams | CameraParams | AidParams  #: parameters of a sensor other than the IMU
 
 AID_PARAMS: dict[str, type[AidParams]] = {
     "barometer": BarometerParams,
@@ -39,7 +39,7 @@ SENSOR_PARAMS: dict[str, type[SensorParams]] = {
 """Parameters of all sensors but the IMU by their fields in `SensorSuite`."""
 
 Delay = Annotated[float, check.between(-2.0, 2.0)]
-_WORDS = {"gnss": "GNSS"}  # sensors in messages, where the name of the field is none
+_WORDS = {"gnss": "GNSS"}  #: sensors in messages, where the name of the field is none
 
 
 class InitialPoseParams(Checked):
@@ -128,6 +128,9 @@ class SensorSuite(Checked, Saved):
     """noise of `observation="noisy"`"""
     log_delays: LogDelays = field(default_factory=LogDelays)
     """delays of time stamps in this vehicle's logs, which a replay subtracts"""
+    log_rotation: check.Vector3 = (0.0, 0.0, 0.0)
+    """roll, pitch and yaw from the axes of the IMU in this vehicle's logs to B [rad], by which a
+    replay rotates the samples; 3-1-2 Euler angles"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

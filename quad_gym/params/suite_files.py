@@ -24,7 +24,7 @@ from typing import Any
 
 from quad_gym.params import checks as check
 
-SUFFIX = ".toml"  # ending of the names of such files
+SUFFIX = ".toml"  #: ending of the names of such files
 
 _NONE = "none"
 _HEADS = {"SensorSuite": "Sensor suite", "VehicleParams": "Vehicle"}

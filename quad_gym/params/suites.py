@@ -53,7 +53,7 @@ from quad_gym.params.suite_files import is_params_file, read_params
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
 
-_GNSS_LATENCY = 0.1  # [s]; PX4 assumes 0.11 s (EKF2_GPS_DELAY)
+_GNSS_LATENCY = 0.1  #: [s]; PX4 assumes 0.11 s (EKF2_GPS_DELAY)
 # time constants of MEMS biases, hundreds of seconds: N. El-Sheimy, H. Hou and X. Niu, IEEE Trans.
 # Instrumentation and Measurement 57(1), 2008
 _MEMS = ImuParams(samples="average", gyro_bias_tau=300.0, accel_bias_tau=300.0)
@@ -298,8 +298,8 @@ _ALL = {
     **{"indoor": INDOOR, "one_wall": ONE_WALL, "stale": STALE, "crazyflie": CRAZYFLIE},
     "flown": FLOWN,
 }
-ALL_SUITES = tuple(_ALL)  # names of all sensor suites
-SUITES = ALL_SUITES[:5]  # names of the sensor suites for all tasks
+ALL_SUITES = tuple(_ALL)  #: names of all sensor suites
+SUITES = ALL_SUITES[:5]  #: names of the sensor suites for all tasks
 
 
 def sensor_suite(name: str | Path) -> SensorSuite:

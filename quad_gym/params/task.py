@@ -15,13 +15,13 @@ from quad_gym.params.reward import RewardParams
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import MAX_GATES, Start, TaskKind
 
-TASKS = tuple(task.name.lower() for task in TaskKind)  # kinds of task
-STARTS = tuple(start.name.lower() for start in Start)  # names of the ways in which episodes begin
+TASKS = tuple(task.name.lower() for task in TaskKind)  #: kinds of task
+STARTS = tuple(start.name.lower() for start in Start)  #: names of the ways in which episodes begin
 
 FARTHEST = 1000.0
 """Largest distance of a reference from the origin, along an axis, in observations [m]."""
 
-MIN_PERIOD = 0.01  # period of the fastest reference [s]; no vehicle can follow a faster one
+MIN_PERIOD = 0.01  #: period of the fastest reference [s]; no vehicle can follow a faster one
 
 Size = Annotated[float, partial(check.positive, most=FARTHEST)]
 

@@ -27,12 +27,14 @@ LEAST_GYRATION = 1.0 / 30.0
 """Radius of gyration over the distance of the rotors, below which numbers are mistaken: the rotors
 would turn the vehicle faster than a tick resolves. Quadrotors have 0.2 to 0.8."""
 
-MOST_GYRATION = 10.0  # the same ratio, above which numbers are mistakes, such as moments in kg mm^2
+MOST_GYRATION = 10.0
+"""The same ratio, above which numbers are mistakes, such as moments in kg mm^2."""
 
 SLOWEST_ROTORS = 1.0
 """Time constant of rotors above which numbers are mistakes, such as milliseconds [s]."""
 
-MAX_LIFT = 1000.0  # thrust-to-weight ratio above which numbers are mistakes; racing drones reach 15
+MAX_LIFT = 1000.0
+"""Thrust-to-weight ratio above which numbers are mistakes; racing drones reach 15."""
 
 MAX_TORQUE_ARM = 10.0
 """Ratio of torque to thrust of a rotor above which numbers are mistakes; propellers have 0.02

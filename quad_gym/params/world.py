@@ -17,7 +17,7 @@ from quad_gym.params.ground import GroundParams
 from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
 from quad_gym.records import MAX_OBSTACLES
 
-MAX_WIND = 200.0  # largest wind speed [m/s]; the strongest tornadoes reach some 135 m/s
+MAX_WIND = 200.0  #: largest wind speed [m/s]; the strongest tornadoes reach some 135 m/s
 
 
 class BatteryParams(Checked):

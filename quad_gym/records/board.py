@@ -1,7 +1,6 @@
 """Words of a board, on which threads share the blocks of a batch, see `kernels/board.py`."""
 
-LINE = 8
-"""Words in a cache line; words that different threads write are in different lines."""
+LINE = 8  #: words in a cache line; words that different threads write are in different lines
 TICKET, FINISHED, COMMAND, STOP, CHUNK = 0, LINE, 2 * LINE, 3 * LINE, 3 * LINE + 1
 RANGES, WORDS_OF_RANGE = 4 * LINE, 2 * LINE
 NEXT, FIRST, LAST, PRESENT = 0, 1, 2, LINE

@@ -5,20 +5,20 @@ from typing import NamedTuple
 
 from quad_gym.records.sizes import MAX_ACTION_DELAY, MAX_FEATURES
 
-FIXED, UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2, 3  # codes of distributions in the kernels
+FIXED, UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2, 3  #: codes of distributions in the kernels
 
 
 class Drawable(NamedTuple):
     """A parameter that can be drawn."""
 
-    of: str  # part of the configuration that has its nominal value; empty: none, nominally 0
+    of: str  #: part of the configuration that has its nominal value; empty: none, nominally 0
     name: str
     size: int
     unit: str
     meaning: str
-    least: float = -math.inf  # smallest meaningful value, where the parameter itself has no bounds
-    above: float = -math.inf  # exclusive lower bound
-    most: float = math.inf  # largest meaningful value
+    least: float = -math.inf  #: smallest meaningful value, where the parameter itself has no bounds
+    above: float = -math.inf  #: exclusive lower bound
+    most: float = math.inf  #: largest meaningful value
 
     @property
     def field(self) -> str:
@@ -93,4 +93,4 @@ COLUMNS: dict[str, slice] = {}
 for _drawable in DRAWABLES:
     _first = max((columns.stop for columns in COLUMNS.values()), default=0)
     COLUMNS[_drawable.name] = slice(_first, _first + _drawable.size)
-DRAWN_SIZE = sum(drawable.size for drawable in DRAWABLES)  # number of columns
+DRAWN_SIZE = sum(drawable.size for drawable in DRAWABLES)  #: number of columns

@@ -46,8 +46,8 @@ SETTINGS = scalar_dtype(SETTINGS_FIELDS)
 class Room(NamedTuple):
     """The memory of a block of flights: consecutive parts of the full record."""
 
-    dtype: np.dtype  # data type of a block: the fields that are stored
-    skipped: int  # bytes of the full record before the first stored field
+    dtype: np.dtype  #: data type of a block: the fields that are stored
+    skipped: int  #: bytes of the full record before the first stored field
 
     def holds(self, name: str) -> bool:
         """Return True if a field is stored."""

@@ -5,7 +5,7 @@ from quad_gym.records.sizes import AIDS, MAX_FEATURES, MAX_SLOW, Field
 
 PARAMETERS_DRAWN = COLUMNS["action_delay"].stop
 """Number of draws with which the parameters begin; the camera's features have the other draws."""
-_OTHER_NAMES = {"inertia": "moments"}  # Names of fields by the names of draws, where they differ
+_OTHER_NAMES = {"inertia": "moments"}  #: names of fields by the names of draws, where they differ
 
 # fmt: off
 PARAMS_FIELDS = (

@@ -48,8 +48,8 @@ SHOWN_FIELDS = (
 )
 """Fields for views, computed at the end of a step."""
 
-SHOWN: dict[str, slice] = {}  # rows of each field, by its name
-SHOWN_SIZE = 0  # number of rows
+SHOWN: dict[str, slice] = {}  #: rows of each field, by its name
+SHOWN_SIZE = 0  #: number of rows
 for _field in SHOWN_FIELDS:
     SHOWN[_field.name] = slice(SHOWN_SIZE, SHOWN_SIZE + prod(_field.shape))
     SHOWN_SIZE = SHOWN[_field.name].stop

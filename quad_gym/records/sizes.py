@@ -6,52 +6,52 @@ from quad_gym.records.enums import AID_FREEDOMS, BLOCK_FREEDOMS, Aid, Block, Fau
 from quad_gym.records.width import WIDTH as WIDTH
 
 # fmt: off
-MAX_HARMONICS = 6  # largest number of terms in the Fourier series of a reference
-FOLLOWED = -1  # number of terms that denotes a user's trajectory instead of a series
-TERMS = 8  # coefficients of a segment of a user's trajectory, a polynomial of degree 7
+MAX_HARMONICS = 6  #: largest number of terms in the Fourier series of a reference
+FOLLOWED = -1  #: number of terms that denotes a user's trajectory instead of a series
+TERMS = 8  #: coefficients of a segment of a user's trajectory, a polynomial of degree 7
 HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY, HEADING_GIVEN = 0.0, 1.0, 2.0, 3.0
 """Rules of a reference's heading: toward a point, along a direction, along the velocity, by yaw."""
-MAX_GATES = 8  # largest number of gates on a course
-MAX_START_VELOCITY, MAX_START_RATE = 1.5, 2.0  # largest velocity and body rate of a moving start on each axis: [m/s], [rad/s]
-MAX_FEATURES = 16  # largest number of a camera's features
-MAX_OBSTACLES = 32  # largest number of obstacles in a world
-MAX_UNDER_WAY = 2  # longest latency of a sensor in its periods, and so the most measurements in transit
+MAX_GATES = 8  #: largest number of gates on a course
+MAX_START_VELOCITY, MAX_START_RATE = 1.5, 2.0  #: largest velocity and body rate of a moving start on each axis: [m/s], [rad/s]
+MAX_FEATURES = 16  #: largest number of a camera's features
+MAX_OBSTACLES = 32  #: largest number of obstacles in a world
+MAX_UNDER_WAY = 2  #: longest latency of a sensor in its periods, and so the most measurements in transit
 DELAY_SLOTS = MAX_UNDER_WAY + 1
 """Slots for delayed measurements: at a latency of MAX_UNDER_WAY periods, one is taken at the
 instant at which another arrives."""
-MAX_ACTION_DELAY = 10  # longest delay of an action, in control steps
-SENSORS = len(Sensor)  # number of sensors other than the IMU
-KINDS = 1 << SENSORS  # number of sets of sensors that can measure at an instant, the empty set included
-AIDS = len(Aid)  # number of sensors with parameters in the fields `aid_...`, which come last
-FIRST_AID = SENSORS - AIDS  # first sensor with parameters in the fields `aid_...`
+MAX_ACTION_DELAY = 10  #: longest delay of an action, in control steps
+SENSORS = len(Sensor)  #: number of sensors other than the IMU
+KINDS = 1 << SENSORS  #: number of sets of sensors that can measure at an instant, the empty set included
+AIDS = len(Aid)  #: number of sensors with parameters in the fields `aid_...`, which come last
+FIRST_AID = SENSORS - AIDS  #: first sensor with parameters in the fields `aid_...`
 POSITION_BLOCK = int(Block.POSITION)
 BASELINE_BLOCK = int(Block.BASELINE)
 VELOCITY_BLOCK = int(Block.VELOCITY)
-FEATURE_BLOCKS = int(Block.FEATURES)  # indices of the blocks in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i
-AID_BLOCKS = FEATURE_BLOCKS + MAX_FEATURES  # first block of the other sensors; the block of aid i is AID_BLOCKS + i
-MAX_BLOCKS = AID_BLOCKS + AIDS  # number of blocks: antenna position, baseline, velocity, features, other sensors
-FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_BLOCKS, MAX_BLOCKS))  # first block of each sensor
-FEATURE_SLICE = slice(FEATURE_BLOCKS, AID_BLOCKS)  # blocks of the features
-MAX_MEASUREMENTS = 3 * MAX_BLOCKS  # largest length of the stacked measurement; a direction has three numbers
-AID_GROUPS = len(Block)  # first group of the other sensors
-SENSOR_GROUPS = AID_GROUPS + AIDS  # number of groups of the gate: positions, baselines, velocities, images, other sensors
-FIRST_GROUP = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_GROUPS, SENSOR_GROUPS))  # first group of each sensor
-GROUP_COUNT = (FEATURE_BLOCKS, *[1] * (SENSORS - 1))  # number of groups of each sensor
-BLOCK_NUMBERS = (3, 3, *AID_FREEDOMS)  # length of a block of each sensor: a direction is a unit vector
+FEATURE_BLOCKS = int(Block.FEATURES)  #: indices of the blocks in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i
+AID_BLOCKS = FEATURE_BLOCKS + MAX_FEATURES  #: first block of the other sensors; the block of aid i is AID_BLOCKS + i
+MAX_BLOCKS = AID_BLOCKS + AIDS  #: number of blocks: antenna position, baseline, velocity, features, other sensors
+FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_BLOCKS, MAX_BLOCKS))  #: first block of each sensor
+FEATURE_SLICE = slice(FEATURE_BLOCKS, AID_BLOCKS)  #: blocks of the features
+MAX_MEASUREMENTS = 3 * MAX_BLOCKS  #: largest length of the stacked measurement; a direction has three numbers
+AID_GROUPS = len(Block)  #: first group of the other sensors
+SENSOR_GROUPS = AID_GROUPS + AIDS  #: number of groups of the gate: positions, baselines, velocities, images, other sensors
+FIRST_GROUP = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_GROUPS, SENSOR_GROUPS))  #: first group of each sensor
+GROUP_COUNT = (FEATURE_BLOCKS, *[1] * (SENSORS - 1))  #: number of groups of each sensor
+BLOCK_NUMBERS = (3, 3, *AID_FREEDOMS)  #: length of a block of each sensor: a direction is a unit vector
 FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1), *AID_FREEDOMS)
 """Degrees of freedom of the blocks: a direction has two."""
-MAX_OBSERVATION = 512  # largest length of an observation
-WARM_DRAWS = 21  # standard normals for the errors of a warm start: 15 for the states, 6 for the true biases
+MAX_OBSERVATION = 512  #: largest length of an observation
+WARM_DRAWS = 21  #: standard normals for the errors of a warm start: 15 for the states, 6 for the true biases
 MAX_SLOW = 9
 """Largest number of slow sensor errors among a filter's states, a multiple of three: the drift of
 GNSS positions, the hard iron of a magnetometer, and one number for each other sensor."""
-MAX_STATES = 15 + MAX_SLOW  # number of states of a filter with all slow errors
+MAX_STATES = 15 + MAX_SLOW  #: number of states of a filter with all slow errors
 WARM_SLOW_DRAWS = 2 * MAX_SLOW
 """Further standard normals for the slow errors of a warm start: for every three
 errors, three for the estimate, then three for the true values."""
-STAMP = 28  # length of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates
-FAULT_KINDS = len(FaultKind)  # number of kinds of faults
-NEVER = 1e18  # a tick that no flight reaches
+STAMP = 28  #: length of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates
+FAULT_KINDS = len(FaultKind)  #: number of kinds of faults
+NEVER = 1e18  #: a tick that no flight reaches
 # fmt: on
 
 

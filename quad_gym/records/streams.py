@@ -21,7 +21,7 @@ class DrawRange(NamedTuple):
     draws: int
 
 
-DRAW_RANGES: list[DrawRange] = []  # All ranges; no two overlap
+DRAW_RANGES: list[DrawRange] = []  #: all ranges; no two overlap
 
 
 def _claim(quantity: str, first: int, count: int) -> int:

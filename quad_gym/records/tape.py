@@ -37,12 +37,12 @@ MEASUREMENT = np.dtype(
 class Operation(IntEnum):
     """Operations of a tape."""
 
-    PREDICT = 0  # propagate with sample `index`
+    PREDICT = 0  #: propagate with sample `index`
     UPDATE = auto()
     """update with measurement `index`; its innovations go to row `target`, unless negative"""
-    COPY = auto()  # copy the memory of the filter into slot `target`
-    RESTORE = auto()  # restore the memory from slot `target`
-    KEEP = auto()  # store the estimate in row `target`
+    COPY = auto()  #: copy the memory of the filter into slot `target`
+    RESTORE = auto()  #: restore the memory from slot `target`
+    KEEP = auto()  #: store the estimate in row `target`
 
 
 OPERATION = np.dtype([("code", "i8"), ("index", "i8"), ("target", "i8")])

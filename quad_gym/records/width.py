@@ -2,8 +2,7 @@
 
 import os
 
-WIDTHS = (1, 2, 4, 8)
-"""Supported numbers of lanes; 1 is for filters on other processors."""
+WIDTHS = (1, 2, 4, 8)  #: supported numbers of lanes; 1 is for filters on other processors
 _NEEDED = {
     8: {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"},
     4: {"avx2"},

@@ -18,7 +18,7 @@ from quad_gym.rendering import colors
 from quad_gym.rendering.colors import Color
 
 Floats = NDArray[np.float64]
-Label = tuple[str, Floats, Color]  # text, its place (2,) [pixels], and its color
+Label = tuple[str, Floats, Color]  #: text, its place (2,) [pixels], and its color
 
 OVERSAMPLING = 2
 _RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
@@ -26,7 +26,7 @@ _RGBA = (0xFF, 0xFF00, 0xFF0000, 0xFF000000)
 """Bytes of a pixel in memory: red, green, blue, and an unused one, or the opacity. Pygame blends
 surfaces thirty times as fast if their bytes have the same order."""
 _CROSS = np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]])
-_FAR = 20000.0  # limit of coordinates [pixels]: pygame's integers overflow
+_FAR = 20000.0  #: limit of coordinates [pixels]: pygame's integers overflow
 
 
 def load_pygame() -> Any:

@@ -4,7 +4,7 @@ People with a color vision deficiency can distinguish them; they are darker, for
 ground, and shifted to remain distinct.
 """
 
-Color = tuple[int, int, int]  # red, green and blue, from 0 to 255
+Color = tuple[int, int, int]  #: red, green and blue, from 0 to 255
 
 WHITE: Color = (255, 255, 255)
 SKY: Color = (250, 251, 253)

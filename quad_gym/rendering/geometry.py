@@ -14,18 +14,22 @@ from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]
 
-NEAR = 0.05  # distance from the viewing camera below which objects are not drawn [m]
-AROUND = 6.0  # distance from reference and start within which a fixed view shows obstacles [m]
+NEAR = 0.05  #: distance from the viewing camera below which objects are not drawn [m]
+AROUND = 6.0  #: distance from reference and start within which a fixed view shows obstacles [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Perspective:
     """Perspective view of the inertial frame."""
 
-    eye: Floats  # position of the viewer, (3,) in I [m]
-    R_VI: Floats  # rotation from I to viewing axes, (3, 3); rows: right, down, into the picture
-    focal: float  # focal length [pixels]
-    center: Floats  # pixel of the optical axis, (2,)
+    eye: Floats
+    """Position of the viewer, (3,) in I [m]"""
+    R_VI: Floats
+    """Rotation from I to viewing axes, (3, 3); rows: right, down, into the picture"""
+    focal: float
+    """Focal length [pixels]"""
+    center: Floats
+    """Pixel of the optical axis, (2,)"""
 
     def in_view(self, points: Floats) -> Floats:
         """Transform points (..., 3) from I to viewing axes [m]."""

@@ -16,7 +16,7 @@ from quad_gym.rendering.renderer import VIEWS, Renderer, checked_size, tile
 
 RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
 """Values of Gymnasium's `render_mode`, besides None."""
-WINDOW_RATE = 50.0  # largest number of pictures per second in a window [Hz]
+WINDOW_RATE = 50.0  #: largest number of pictures per second in a window [Hz]
 
 _INVISIBLE = ("offscreen", "dummy")
 """Drivers that SDL uses without a display; their windows are invisible."""

@@ -18,10 +18,10 @@ from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.scene import Scene, ellipsoid_scale
 from quad_gym.rendering.strip import WINDOW_SECONDS, Box, Strip
 
-VIEWS = ("fixed", "chase")  # names of the views of a flight
+VIEWS = ("fixed", "chase")  #: names of the views of a flight
 MOVING_VIEWS = {"chase": chase_view, "course": course_view}
 LEAST_WIDTH, LEAST_HEIGHT = 320, 240
-STALE_FIX = 0.5  # time without a fix after which a warning is shown [s]
+STALE_FIX = 0.5  #: time without a fix after which a warning is shown [s]
 _SEEN = {
     "truth": "the truth",
     "estimate": "the estimate",

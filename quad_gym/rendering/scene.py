@@ -19,9 +19,9 @@ TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
 """Durations of trails, of fixes, and of the part of the reference ahead that is drawn bold [s]."""
 TRAIL_POINTS = 180
 SIGMAS = 3.0
-ELLIPSOID_SCALES = (50.0, 20.0, 10.0, 5.0, 2.0, 1.0)  # by which an ellipsoid may be magnified
-ELLIPSOID_LIMIT, SCALE_SECONDS = 0.5, 3.0  # largest half-axis then [m], over the past [s]
-ROTOR_RADIUS, FRUSTUM_DEPTH, GRID_HALF_SIZE = 0.13, 0.55, 9  # [m]
+ELLIPSOID_SCALES = (50.0, 20.0, 10.0, 5.0, 2.0, 1.0)  #: by which an ellipsoid may be magnified
+ELLIPSOID_LIMIT, SCALE_SECONDS = 0.5, 3.0  #: largest half-axis then [m], over the past [s]
+ROTOR_RADIUS, FRUSTUM_DEPTH, GRID_HALF_SIZE = 0.13, 0.55, 9  #: [m]
 
 _LINES = np.arange(-GRID_HALF_SIZE, GRID_HALF_SIZE + 1.0)
 _NORTHWARD = [
@@ -33,8 +33,8 @@ _GRID = np.stack([np.concatenate([ends, ends[:, [1, 0, 2]]]) for ends in _NORTHW
 _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
 _RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
 
-HARDLY_VISIBLE = 30.0  # scale below which a vehicle is marked by a disc [pixels/m]
-SOLID, GLASS = 0.55, 0.12  # opacity of obstacles behind the vehicle, and in front of it
+HARDLY_VISIBLE = 30.0  #: scale below which a vehicle is marked by a disc [pixels/m]
+SOLID, GLASS = 0.55, 0.12  #: opacity of obstacles behind the vehicle, and in front of it
 EDGES = (
     *((0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3)),
     *((2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7)),

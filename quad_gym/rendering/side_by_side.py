@@ -14,11 +14,11 @@ from quad_gym.rendering.canvas import Canvas
 from quad_gym.rendering.renderer import Renderer
 from quad_gym.rendering.video import Progress, checked_video_path, times_of, write_frames
 
-SIDE = (480, 460)  # width and height of one flight [pixels]
-HOLD = 1.5  # duration of the last picture, to read how the flights ended [s]
-_BAND = 70  # height of the label above a picture [pixels]
+SIDE = (480, 460)  #: width and height of one flight [pixels]
+HOLD = 1.5  #: duration of the last picture, to read how the flights ended [s]
+_BAND = 70  #: height of the label above a picture [pixels]
 _TEXT = 19
-_COLUMNS = 54  # characters of a label per line
+_COLUMNS = 54  #: characters of a label per line
 
 
 @dataclass(frozen=True, eq=False)

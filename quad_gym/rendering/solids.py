@@ -7,7 +7,7 @@ from quad_gym.records import Shape
 
 Floats = NDArray[np.float64]
 
-SIDES = 20  # of the prism that represents a cylinder
+SIDES = 20  #: of the prism that represents a cylinder
 
 
 def faces_of(obstacle: Floats, eye: Floats) -> list[Floats]:

@@ -13,7 +13,7 @@ from quad_gym.rendering.colors import Color
 
 Floats = NDArray[np.float64]
 
-WINDOW_SECONDS = 10.0  # duration of the past that a plot shows [s]
+WINDOW_SECONDS = 10.0  #: duration of the past that a plot shows [s]
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,13 @@ class Box:
 class Plot:
     """Plot of columns over time, on a logarithmic scale."""
 
-    curves: tuple[tuple[str, str, Color], ...]  # column, name and color of each
+    curves: tuple[tuple[str, str, Color], ...]
+    """Column, name and color of each"""
     low: float
     high: float
     ticks: dict[float, str]
-    share: float  # of the strip's width
+    share: float
+    """Of the strip's width"""
 
 
 ERRORS = Plot(

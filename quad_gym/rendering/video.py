@@ -13,7 +13,7 @@ from quad_gym.flights.record import Flight, FlightRecorder
 from quad_gym.params import checks as check
 from quad_gym.rendering.renderer import Renderer, checked_size
 
-VIDEO_ENDINGS = (".mp4", ".gif", ".webp")  # file name endings of the videos that can be written
+VIDEO_ENDINGS = (".mp4", ".gif", ".webp")  #: file name endings of the videos that can be written
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 

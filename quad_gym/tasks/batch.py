@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.starts import checked_mask
-from quad_gym.batch.state import State
+from quad_gym.batch.resets import checked_mask
 from quad_gym.params import checks as check
 from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
+from quad_gym.records.state import State
 from quad_gym.tasks import answers
 from quad_gym.tasks.answers import Start
-from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.observing import Joiner, Part
+from quad_gym.tasks.random import FlightRandom
 from quad_gym.tasks.task import METHODS, Task, label
 from quad_gym.tasks.view import View
 

@@ -13,7 +13,7 @@ from quad_gym.records import SHOWN, SHOWN_SHAPES, SHOWN_SIZE, WIDTH, Command, Re
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
-_GAP = 8  # padding between two rows of the memory: a cache line
+_GAP = 8  #: padding between two rows of the memory: a cache line
 _JUDGED = slice(int(Result.REWARD), int(Result.ENDING) + 1)
 
 

@@ -15,12 +15,12 @@ from quad_gym.tasks.task import ObservationSpec, Task
 if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
     from quad_gym.params.world import WorldParams
-    from quad_gym.tasks.draws import FlightRandom
+    from quad_gym.tasks.random import FlightRandom
     from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
 
-PROGRESS_WEIGHT = 5.0  # reward for each meter along the course, up to the rewarded speed [1/m]
+PROGRESS_WEIGHT = 5.0  #: reward for each meter along the course, up to the rewarded speed [1/m]
 
 PAID_SPEED = 5.0
 """Highest rewarded speed [m/s]; at higher speeds, many gaps would be flown in one outage."""
@@ -34,15 +34,15 @@ _ACTION_RATE: Term = -_WEIGHTS.action_rate * ActionRate()
 _BODY_RATES: Term = -_WEIGHTS.body_rates * BodyRates()
 _CRASH = Crash()
 
-PAST = 0.7  # distance beyond a wall at which the whole vehicle is through its gap [m]
-FINISH_WIDTH = 6.0  # width in observations for the finish, which follows the last gap [m]
+PAST = 0.7  #: distance beyond a wall at which the whole vehicle is through its gap [m]
+FINISH_WIDTH = 6.0  #: width in observations for the finish, which follows the last gap [m]
 
 
 class Gaps(NamedTuple):
     """Gaps of a course in order, followed by the finish."""
 
-    centers: Floats  # centers, (n, gaps + 1, 3) in I [m]
-    widths: Floats  # widths, (n, gaps + 1) [m]
+    centers: Floats  #: centers, (n, gaps + 1, 3) in I [m]
+    widths: Floats  #: widths, (n, gaps + 1) [m]
 
 
 class OutageDash(Task):

@@ -67,7 +67,8 @@ Weighted = tuple[float, Term]
 class Sum(Term):
     """Weighted sum of terms."""
 
-    terms: tuple[Weighted, ...]  # pairs of a weight and a term
+    terms: tuple[Weighted, ...]
+    """Pairs of a weight and a term"""
 
     def __call__(self, view: "View") -> Floats:
         (weight, piece), *rest = self.terms
@@ -81,7 +82,8 @@ class Sum(Term):
 class Constant(Term):
     """Constant term; numbers in sums are converted to it."""
 
-    value: float = 1.0  # value in every step
+    value: float = 1.0
+    """Value in every step"""
 
     def __call__(self, view: "View") -> Floats:
         return np.full(view.count, self.value)
@@ -91,7 +93,8 @@ class Constant(Term):
 class FunctionTerm(Term):
     """Term computed by a function of a view; functions in sums are converted to it."""
 
-    function: "Callable[[View], Floats]"  # function that takes a `View` and returns (n,)
+    function: "Callable[[View], Floats]"
+    """Function that takes a `View` and returns (n,)"""
 
     def __call__(self, view: "View") -> Floats:
         return self.function(view)
@@ -112,7 +115,8 @@ def _terms(value: Any) -> tuple[Weighted, ...]:
 class Tracking(Term):
     """exp(-rate e) of the true position error e: 1 on the reference, decreasing with distance."""
 
-    rate: float = 2.0  # rate of decay with distance [1/m]
+    rate: float = 2.0
+    """Rate of decay with distance [1/m]"""
 
     def __call__(self, view: "View") -> Floats:
         return np.exp(-self.rate * view.position_error)
@@ -174,7 +178,8 @@ class Crash(Term):
 class Uncertainty(Term):
     """Uncertainty of a block of the filter's state, computed from its covariance."""
 
-    of: str = "position"  # block of the state, one of `BLOCKS`
+    of: str = "position"
+    """Block of the state, one of `BLOCKS`"""
     measure: str = "trace"
     """Measure of uncertainty. "trace": trace of the covariance, the sum of variances; "log_det":
     logarithm of its determinant, which is proportional to the squared volume of the covariance

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 PROGRESS_WEIGHT = 0.1
 """Weight of the speed toward the next gate: a race at 4 m/s earns 0.4 per step."""
 
-GATE_REWARD = 1.0  # reward for each gate passed, so that flying past a gate is not worthwhile
-CRASH_COST = 5.0  # cost of a crash, as much as five gates
+GATE_REWARD = 1.0  #: reward for each gate passed, so that flying past a gate is not worthwhile
+CRASH_COST = 5.0  #: cost of a crash, as much as five gates
 
 
 class StaleRace(Task):

@@ -13,7 +13,7 @@ from quad_gym.params import checks as check
 if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
     from quad_gym.params.world import WorldParams
-    from quad_gym.tasks.draws import FlightRandom
+    from quad_gym.tasks.random import FlightRandom
     from quad_gym.tasks.view import View
 
 METHODS = ("reset", "update", "reward", "terminated", "truncated", "observe")

@@ -7,7 +7,7 @@ import pytest
 import quad_gym
 from quad_gym.commands import benchmark as script
 from quad_gym.commands.options import parse
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import learning, stages
 from quad_gym.experiments.benchmark.timing import Timing, by_turns
 from quad_gym.kernels.stages import needed_stages

@@ -66,7 +66,8 @@ def test_evaluate_without_included_policy_flies_pd(tmp_path, capsys):
 
 
 def compare(where, *more):
-    line = ["--quick", "--steps", 8192, "--output", where / "out", "--env", "duration=0.4"]
+    line = ["--quick", "--engine", "compiled", "--steps", 4096, "--output", where / "out"]
+    line += ["--env", "duration=0.4"]
     return run("compare", *line, *more, where=where)
 
 
@@ -80,7 +81,7 @@ def test_compare_writes_report_and_continues(tmp_path):
     page = (tmp_path / "out/report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert "http" not in page
-    kept = tmp_path / "out/runs/standard/truth/seed_0/best.zip"
+    kept = tmp_path / "out/runs/standard/truth/seed_0/best.npz"
     for file in (tmp_path / "out/flights/standard/truth/truth").iterdir():
         file.unlink()
     before = kept.stat().st_mtime_ns

@@ -15,8 +15,8 @@ import baselines
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import evaluate
-from quad_gym.envs.configuration import Flights
 from quad_gym.envs.effects import with_effect
+from quad_gym.envs.flights import Flights
 from quad_gym.envs.keywords import (
     DEFAULTS,
     RENDERING_KEYWORDS,
@@ -203,9 +203,6 @@ def test_arguments_of_a_batch_without_effect_are_refused(arguments, message):
     ("arguments", "name"),
     [
         ({"observation": "measurements", "layout": "relative"}, "layout"),
-        ({"feature_count": 3}, "feature_count"),
-        ({"gnss_velocity": True}, "gnss_velocity"),
-        ({"aids": ()}, "aids"),
         ({"drawn": ("mass",)}, "drawn"),
     ],
     ids=str,

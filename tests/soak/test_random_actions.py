@@ -48,16 +48,19 @@ def test_random_actions_leave_no_number_that_is_not_finite(task, action, total):
     rate = {} if task in BENCHMARKS else {"sensors": suite}  # they have their own
     needs_camera = task in ("look_around", "outage_dash")  # or has none to switch off
     camera = {} if needs_camera else {"camera": number % 3 != 0}
+    observation = OBSERVATIONS[number % 4]
+    own = observation == "measurements"  # has its own layout
+    layout = {} if own else {"layout": ("relative", "absolute")[number // 4 % 2]}
     env = QuadVectorEnv(
         COUNT,
         task,
         action=action,
-        observation=OBSERVATIONS[number % 4],
-        layout=("relative", "absolute")[number // 4 % 2],
+        observation=observation,
         include_std=True,
         privileged=True,
         **rate,
         **camera,
+        **layout,
         autoreset_mode=("NextStep", "SameStep")[number % 2],
     )
     rng = np.random.default_rng(number)

@@ -46,30 +46,69 @@ def ulps(got, expected):
     return np.max(np.abs(got - expected) / np.spacing(np.maximum(np.abs(expected), 2.3e-308)))
 
 
-def in_precision(function, values, digits=60):
+def precise_ulps(got, function, values):
+    """The same for a function of mpmath, whose values are not rounded."""
+    worst = 0.0
+    with mpmath.workdps(60):
+        for found, value in zip(got.tolist(), values.tolist(), strict=True):
+            truth = function(mpmath.mpf(value))
+            error = float(abs(found - truth))
+            worst = max(worst, error / np.spacing(max(abs(float(truth)), 2.3e-308)))
+    return worst
+
+
+def in_precision(function, values):
     """`function` of mpmath at every value, rounded to floats."""
-    with mpmath.workdps(digits):
+    with mpmath.workdps(60):
         return np.array([float(function(mpmath.mpf(float(v)))) for v in values])
 
 
-QUARTERS = np.concatenate([np.arange(-40, 41), np.geomspace(41, 636_000, 150).round()])
-QUARTERS = (QUARTERS[:, np.newaxis] * (np.pi / 2) + np.array([0.0, 1e-9, -1e-7, 1e-3])).ravel()
-HUGE = [999_999.9, 1e6, -1e6, 1e8, -1e8, 1e22, 1e300, -1e300, 1.7e308]
 NORMAL = np.random.default_rng(1).normal(size=(2, 4000))
+
+
+def near_quarter_turns():
+    """The floats next to multiples of a quarter turn, and others near them."""
+    turns = np.append(np.arange(-40, 41), np.geomspace(41, 636_000, 400).round())
+    with mpmath.workdps(60):
+        angles = np.array([float(turn * mpmath.pi / 2) for turn in turns.tolist()])
+    beside = [np.nextafter(angles, sign * np.inf) for sign in (1, -1)]
+    return np.concatenate([angles, *beside, *(angles + d for d in (1e-9, -1e-7, 1e-3))])
+
+
 ANGLES = {
-    "ordinary": (10 * NORMAL[0], 60),
-    "of any size": (NORMAL[1, :300] * np.geomspace(1e-9, 1e6, 300), 60),
-    "multiples of a quarter turn": (np.append(QUARTERS, np.nextafter(QUARTERS, np.inf)), 60),
-    "huge": (np.append(HUGE, np.geomspace(1e6, 1e308, 60)), 400),
+    "ordinary": 10 * NORMAL[0],
+    "within an eighth of a turn": np.linspace(-np.pi / 4, np.pi / 4, 4001),
+    "of any size": NORMAL[1, :1500] * np.geomspace(1e-300, 1e6, 1500),
+    "up to the limit": np.linspace(-1e6, 1e6, 2001),
+    "multiples of a quarter turn": near_quarter_turns(),
+    # of all floats up to 1e6, those nearest to a multiple
+    "hardest": np.array([45.553093477052, 91.106186954104, -364.424747816416, 321307.9594422229]),
 }
 
 
-@pytest.mark.parametrize("size", ANGLES)
-def test_sine_and_cosine_are_those_of_mpmath(evaluate, size):
-    x, digits = ANGLES[size]
+@pytest.mark.parametrize("kind", ANGLES)
+def test_sine_and_cosine_are_within_one_unit_in_the_last_place(evaluate, kind):
+    x = ANGLES[kind]
     out = evaluate(x)
-    assert ulps(out["sin"], in_precision(mpmath.sin, x, digits)) <= 3
-    assert ulps(out["cos"], in_precision(mpmath.cos, x, digits)) <= 3
+    assert precise_ulps(out["sin"], mpmath.sin, x) < 0.8
+    assert precise_ulps(out["cos"], mpmath.cos, x) < 0.8
+
+
+def test_sine_and_cosine_of_large_angles(evaluate):
+    x = np.append([1e9, -1e9], np.geomspace(1e6, 1e9, 500))
+    out = evaluate(x)
+    assert np.abs(out["sin"] - in_precision(mpmath.sin, x)).max() <= 2.0**-53
+    assert np.abs(out["cos"] - in_precision(mpmath.cos, x)).max() <= 2.0**-53
+    out = evaluate([1.01e9, -1e22, 1.7e308])  # as of no angle
+    assert (out["sin"] == 0.0).all()
+    assert (out["cos"] == 1.0).all()
+
+
+def test_sine_keeps_tiny_angles_and_the_sign_of_zero(evaluate):
+    x = np.array([0.0, -0.0, 5e-324, -5e-324, 1e-310, -1e-160, 1e-9])
+    out = evaluate(x)
+    assert out["sin"].tobytes() == x.tobytes()
+    assert (out["cos"] == 1.0).all()
 
 
 def test_cosine_less_one_keeps_its_relative_accuracy(evaluate):

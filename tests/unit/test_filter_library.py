@@ -170,6 +170,15 @@ def test_example_as_webassembly_prints_what_a_replay_computes_here(tmp_path):
     require_equal(estimates("node", run), log, quad_gym.sensor_suite("rtk"), {})
 
 
+@pytest.mark.parametrize("target", ["x86-64", "aarch64", "cortex-m7"])
+@pytest.mark.skipif(not shutil.which("nm"), reason="no nm (binutils)")
+def test_compiled_filter_calls_no_function_of_the_math_library(target):
+    command = ["nm", "--undefined-only", exported("rtk", target) / LIBRARY]
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split("\n")
+    called = {line.split()[1] for line in lines if " U " in line}
+    assert {name for name in called if not name.startswith(("__aeabi_", "mem"))} == set()
+
+
 @needs_compiler
 @needs_cmake
 def test_cmake_builds_the_example_without_warnings(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 import quad_gym
 from quad_gym import CameraParams
-from quad_gym.envs.configuration import Flights
+from quad_gym.envs.flights import Flights
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import Autoreset
 from quad_gym.rendering.canvas import Canvas

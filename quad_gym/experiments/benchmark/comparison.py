@@ -18,8 +18,7 @@ from quad_gym.experiments.benchmark.peers import Estimate, MeasuredTick, peers
 from quad_gym.experiments.benchmark.stages import hovering
 from quad_gym.records import WIDTH
 
-TICKS = 1000
-"""Ticks of a flight on which filters are compared, in its second half by their errors."""
+TICKS = 1000  #: ticks of a flight on which filters are compared, in its second half by their errors
 Make = Callable[[int], Any]
 SIMULATORS: dict[str, tuple[str, Make]] = {
     "PyFlyt": ("PyFlyt.gym_envs", lambda _: gymnasium.make("PyFlyt/QuadX-Hover")),

@@ -23,7 +23,7 @@ from quad_gym.analysis.metrics import nees
 from quad_gym.analysis.posterior_bound import posterior_bound
 from quad_gym.analysis.recovery import MOTION
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.evaluation import roll_out
 from quad_gym.experiments.benchmark import timing
 from quad_gym.faults.presets import possible

@@ -7,7 +7,7 @@ from typing import Any
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import timing
 from quad_gym.params.suites import SUITES
 from quad_gym.records import Control

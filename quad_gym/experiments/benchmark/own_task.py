@@ -16,8 +16,7 @@ from quad_gym.tasks.task import Task
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
-COUNTS = (8, 1024)
-"""Numbers of flights in the batches."""
+COUNTS = (8, 1024)  #: numbers of flights in the batches
 TIPPED = math.cos(math.radians(100.0))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.experiments.benchmark import timing
 from quad_gym.kernels.entries import run_stage

@@ -12,10 +12,8 @@ from quad_gym.experiments.benchmark.stages import hovering
 from quad_gym.records import Source
 
 SUITES = ("standard", "rtk", "consumer", "indoor", "flown", "crazyflie")
-TRUTH = "truth"
-"""Row of flights without sensors and filter."""
-MANY = 64
-"""Ratio of the large to the small number of flights."""
+TRUTH = "truth"  #: row of flights without sensors and filter
+MANY = 64  #: ratio of the large to the small number of flights
 MOST_BUSY = 4
 
 

@@ -14,8 +14,7 @@ class Effort(NamedTuple):
     """Number and length of the repeats."""
 
     repeats: int
-    seconds: float
-    """length of a repeat [s]"""
+    seconds: float  #: length of a repeat [s]
 
 
 @dataclass(frozen=True)
@@ -44,18 +43,15 @@ class Scope:
 class Timing(NamedTuple):
     """Duration of a piece of work."""
 
-    best: float
-    """fastest repeat [s]"""
-    spread: float
-    """ratio of the median of the repeats to the best, minus one"""
+    best: float  #: fastest repeat [s]
+    spread: float  #: ratio of the median of the repeats to the best, minus one
 
     def per(self, count: int) -> "Timing":
         """Duration of one of `count` equal parts."""
         return Timing(self.best / count, self.spread)
 
 
-Row = dict[str, Any]
-"""Result of a section, for the table and the file."""
+Row = dict[str, Any]  #: result of a section, for the table and the file
 
 
 def measure(
@@ -111,8 +107,7 @@ def report(name: str, timing: Timing, **more: Any) -> Row:
     return {"name": name, "seconds": timing.best, "spread": timing.spread, **more}
 
 
-CellText = Callable[[Row], str]
-"""Function that formats the cell of a row in one column."""
+CellText = Callable[[Row], str]  #: function that formats the cell of a row in one column
 
 
 def column(key: str, form: str = "", scale: float = 1) -> CellText:

@@ -18,8 +18,7 @@ from quad_gym.params.suites import sensor_suite
 from quad_gym.params.vehicle import vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 
-SETTLED = 1.0
-"""Time from which errors count [s]."""
+SETTLED = 1.0  #: time from which errors count [s]
 
 
 def cases_of(table: str, suite: SensorSuite, start: Literal["cold", "warm"]) -> list[Case]:
@@ -28,8 +27,7 @@ def cases_of(table: str, suite: SensorSuite, start: Literal["cold", "warm"]) -> 
     return [Case(name, sensors, start=start, keywords=more) for name, sensors, more in cases]
 
 
-Fields = tuple[str, SensorSuite, Mapping[str, Any]]
-"""Name, sensor suite and keywords of a case."""
+Fields = tuple[str, SensorSuite, Mapping[str, Any]]  #: name, sensor suite and keywords of a case
 
 
 def _models(suite: SensorSuite) -> Iterator[Fields]:

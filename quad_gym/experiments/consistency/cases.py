@@ -11,12 +11,11 @@ from tqdm import tqdm
 from quad_gym.analysis.consistency_flights import Findings, endless, measure_consistency
 from quad_gym.analysis.reports import as_json, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.kernels.digest import flights_digest
 from quad_gym.params.sensors import SensorSuite
 
-CaseResults = dict[str, dict[str, Any]]
-"""Results of cases, by name."""
+CaseResults = dict[str, dict[str, Any]]  #: results of cases, by name
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,8 @@ from quad_gym.params.suites import SUITES, sensor_suite
 FAULT_START, FAULT_DURATION, RECOVERY_TIME = 3.0, 5.0, 10.0
 """Start and duration of faults, and time that filters have to recover [s]."""
 CALM_TASKS = ("hover", "random_trajectory", "waypoints")
-CALM_DURATION = 60.0
-"""Length of flights without a fault [s]."""
-INSTANTANEOUS = (AccelBiasStep, GyroBiasStep, PositionJump)
-"""Faults that end at once."""
+CALM_DURATION = 60.0  #: length of flights without a fault [s]
+INSTANTANEOUS = (AccelBiasStep, GyroBiasStep, PositionJump)  #: faults that end at once
 
 COLUMNS = {
     "consistent_at_end": "consistent at its end [%]",

@@ -37,6 +37,8 @@ PROCESSORS = {
 """Oldest processors on which a library runs, by family and number of lanes."""
 _GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "QUAD_GYM_KERNELS": "numba"}
 _LINK = ("-shared", "-fPIC", "-O2", "-s", "-Wl,-Bsymbolic,-z,noexecstack,--no-undefined")
+_WITH_LIBM = {("x86_64", 2)}
+"""Libraries that call the C library's `fma`, `rint` and `floor`, which processors may lack."""
 _TYPES = {int: "int64_t", bool: "uint8_t", float: "double"}
 
 
@@ -106,7 +108,8 @@ def _build(digest: str, jobs: int) -> None:
                 Path(folder, f"{k}.o").write_bytes(task.result())
         Path(folder, "entries.c").write_text(_calls(digest), encoding="ascii")
         objects = [f"{k}.o" for k in range(len(names))]
-        command = [require_compiler(), *_LINK, "entries.c", *objects, "-lm", "-o", str(output)]
+        needed = ["-lm"] if (machine(), WIDTH) in _WITH_LIBM else []  # any other needs nothing
+        command = [require_compiler(), *_LINK, "entries.c", *objects, *needed, "-o", str(output)]
         subprocess.run(command, cwd=folder, check=True)
     output.replace(file_of(WIDTH))  # whole, even if another process loads or builds it
     say(f"quad_gym: compiled the library in {time.monotonic() - began:.0f} s")

@@ -22,13 +22,12 @@ from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.kernels.library import core_symbol
 
 _OPTIONS = {"nopython": True, "boundscheck": None, "error_model": "numpy", "nogil": True}
-_KEPT = 8
-"""Number of cached files of a kind for a function."""
-_FORM = 2
-"""Version of the emission; after a change, no older object is found."""
-_LIBRARY = re.compile(r"sin|cos|sqrt|llvm\..*")
-"""Functions that emitted code may call: LLVM's, and those of a C library."""
-
+_KEPT = 8  #: number of cached files of a kind for a function
+_FORM = 3  #: version of the emission; after a change, no older object is found
+_PAUSES = {
+    "x86_64": ("declare void @llvm.x86.sse2.pause()", "call void @llvm.x86.sse2.pause()"),
+    "aarch64": ("declare void @llvm.aarch64.hint(i32)", "call void @llvm.aarch64.hint(i32 1)"),
+}  #: hint of a waiting thread to the processor, declared and called, by the processor's family
 
 _LOADED = (b".text", b".rodata", b".data", b"CODE", b"DATA")
 """Beginnings of the names of sections with code and constants."""
@@ -40,8 +39,7 @@ class Processor(NamedTuple):
     triple: str
     cpu: str
     reloc: str = "pic"
-    level: int = 2
-    """level of optimization; 3 gives larger code"""
+    level: int = 2  #: level of optimization; 3 gives larger code
 
 
 class _ForeignLibrary(EntryLibrary):
@@ -92,7 +90,7 @@ def object_of(name: str, processor: Processor) -> bytes:
         processor: Processor to emit code for.
 
     Raises:
-        RuntimeError: If the code calls other functions than those of a C library.
+        RuntimeError: If the code calls a function.
     """
     file, ir_file = _file(name, processor), _file(name)
     made = _read(file)
@@ -158,14 +156,14 @@ def _linked(name: str) -> str:
             function.name = core_symbol(name)
         elif not function.is_declaration:
             function.linkage = llvm.Linkage.internal
-    return _without_python(str(module))
+    return _without_calls(str(module))
 
 
 def emitted(text: str, processor: Processor) -> bytes:
     """Return the object file of IR.
 
     Raises:
-        RuntimeError: If the code calls other functions than those of a C library.
+        RuntimeError: If the code calls a function.
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
@@ -175,9 +173,7 @@ def emitted(text: str, processor: Processor) -> bytes:
         reloc=processor.reloc,
         codemodel="small",
     )
-    if not processor.triple.startswith("x86"):
-        text = re.sub(r"(?m)^.*@llvm\.x86\.sse2\.pause\(\).*$", "", text)  # a hint while waiting
-    module = llvm.parse_assembly(text)
+    module = llvm.parse_assembly(_with_pauses(text, processor.triple.partition("-")[0]))
     module.triple, module.data_layout = processor.triple, str(machine.target_data)
     builder = llvm.create_pass_builder(
         machine, llvm.PipelineTuningOptions(speed_level=processor.level)
@@ -186,11 +182,20 @@ def emitted(text: str, processor: Processor) -> bytes:
     missing = [
         function.name
         for function in module.functions
-        if function.is_declaration and not _LIBRARY.fullmatch(function.name)
+        if function.is_declaration and not function.name.startswith("llvm.")
     ]
     if missing:
         raise RuntimeError(f"kernels must not call {', '.join(missing)}")
     return bytes(machine.emit_object(module))
+
+
+def _with_pauses(text: str, family: str) -> str:
+    """Return IR with the hints of a family in place of this machine's; none where it has none."""
+    wanted = _PAUSES.get(family, ("", ""))
+    for hint in _PAUSES.values():
+        for ours, theirs in zip(hint, wanted, strict=True):
+            text = re.sub(rf"(?m)^ *{re.escape(ours)}.*$", theirs, text)
+    return text
 
 
 def loaded_size(made: bytes) -> int:
@@ -199,8 +204,14 @@ def loaded_size(made: bytes) -> int:
     return sum(s.size() for s in sections if (s.name() or b"").startswith(_LOADED))
 
 
-def _without_python(text: str) -> str:
-    """Return IR without references to Numba's run time: kernels allocate no memory."""
+def _without_calls(text: str) -> str:
+    """Return IR without calls of Numba's run time, as kernels allocate no memory, and of `sqrt`."""
     text = re.sub(r"(?m)^ *(tail )?call void @NRT_(inc|dec)ref\(.*$", "", text)
     text = re.sub(r"\buwtable\b(\(sync\))?", "", text)
+    if "@sqrt(" in text:  # which an instruction computes
+        root = "declare double @llvm.sqrt.f64(double"
+        text = re.sub(r"(?m)^declare double @sqrt\(.*$", "", text).replace(
+            "@sqrt(", "@llvm.sqrt.f64("
+        )
+        text += "" if root in text else f"\n{root})\n"
     return text.replace("= common ", "= internal ")

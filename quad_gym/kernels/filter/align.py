@@ -24,8 +24,8 @@ from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_MARK
 
 _NOTHING = (0.0, 0.0, 0.0)
-_NO_HEADING = math.pi / math.sqrt(3.0)  # standard deviation of an unknown angle
-_STEEP = 0.2  # level share of a baseline 12 degrees from the vertical: too small for a heading
+_NO_HEADING = math.pi / math.sqrt(3.0)  #: standard deviation of an unknown angle
+_STEEP = 0.2  #: level share of a baseline 12 degrees from the vertical: too small for a heading
 
 
 @kernel

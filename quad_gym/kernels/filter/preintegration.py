@@ -35,8 +35,7 @@ from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm
 
-NOISE = 15
-"""First of the six columns of white noise, after the fifteen of the covariance's factor."""
+NOISE = 15  #: first of the six columns of white noise, after the fifteen of the covariance's factor
 
 
 @stage

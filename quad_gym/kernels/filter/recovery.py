@@ -30,36 +30,29 @@ from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import SENSOR_GROUPS
 
-DRIFT_ALARM = 0.55
-"""Mean of the last innovations, in standard deviations, above which they drift."""
+DRIFT_ALARM = 0.55  #: mean of the last innovations, in standard deviations, above which they drift
 _MEMORY = 0.02
 """Weight of the latest innovation in the mean, of standard deviation sqrt(0.02 / 1.98) = 0.1."""
-_CORRECTION_TIME = 3.0
-"""Time over which corrections of the biases are summed [s]."""
+_CORRECTION_TIME = 3.0  #: time over which corrections of the biases are summed [s]
 _LONG_TIME = 12.0
 """Time of the long sums, for errors that are small compared with the noise [s]: corrections of a
 bias compensate its error within P/Q, ten seconds or more, and show all of it only by then."""
-_ONE_WAY = 5.0
-"""Standard deviations of their sum above which they go one way."""
+_ONE_WAY = 5.0  #: standard deviations of their sum above which they go one way
 _ONE_WAY_LONG = 24.0
 """Normalized square of three long sums, chi-square, above which they go one way: exceeded with a
 probability of 2e-5, and, as these sums change slowly, once in many hours."""
 _HARMLESS = 1.0 / _ONE_WAY**2
 """Share of the bias's variance in the test: the sum must also exceed its standard deviation."""
-LARGEST = 3.0
-"""Limit on each innovation in the mean, in standard deviations, because of outliers."""
+LARGEST = 3.0  #: limit on each innovation in the mean, in standard deviations, because of outliers
 DIVERGED_RATIO, CONVERGED_RATIO = 2.1, 1.5
 """Mean NIS over degrees of freedom at which a filter is flagged as diverged, and no longer is."""
 _RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
-ALARM_TIME = 1.0
-"""Shortest time for which a filter is flagged as diverged after an alarm [s]."""
+ALARM_TIME = 1.0  #: shortest time for which a filter is flagged as diverged after an alarm [s]
 _LONGEST_MEMORY = 60.0
 """Longest such time where no variance is inflated [s]: by then the effect of a bias that is barely
 observable shows again."""
-FITTING_FEATURES = 3
-"""Fitting features of an image that support the estimate against GNSS."""
-_FIT_TIME = 1.0
-"""Time for which they support it [s]."""
+FITTING_FEATURES = 3  #: fitting features of an image that support the estimate against GNSS
+_FIT_TIME = 1.0  #: time for which they support it [s]
 MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
 """Largest standard deviations after an inflation [m/s^2], [rad/s], [rad]."""
 MOST_POSITION, MOST_VELOCITY = 100.0, 20.0

@@ -94,8 +94,7 @@ _FACTORS = (1e6, 1e6 / 9.0, 1e5 / 9.0, 1e4 / 9.0, 1e3 / 9.0, 100.0 / 9.0, 10.0 /
 _LAST = len(_FACTORS) - 1
 _FEW, _FIRST_OF_FEW = _LAST - 2, 100.0
 """The first of the last three steps, and its factor where these are enough."""
-_VAGUE = 0.2
-"""Standard deviation of a direction above which three steps are too few [rad]."""
+_VAGUE = 0.2  #: standard deviation of a direction above which three steps are too few [rad]
 
 
 @kernel

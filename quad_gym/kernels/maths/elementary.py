@@ -1,6 +1,7 @@
-"""Elementary functions on any number type, within a few units in the last place of the C library.
+"""Elementary functions on any number type, without the C library: the same bits everywhere.
 
-The polynomials come from fdlibm (Sun Microsystems, 1993), the public-domain ancestor of most C
+Sine and cosine are within one unit in the last place, the other functions within a few. The
+polynomials come from fdlibm (Sun Microsystems, 1993), the public-domain ancestor of most C
 libraries; here they have no branches, so that all lanes evaluate them together.
 """
 
@@ -11,19 +12,15 @@ from quad_gym.kernels.maths.vectors import polynomial
 from quad_gym.kernels.simd.bits import (
     exponent_of,
     fused_multiply_add,
-    library_cos,
-    library_sin,
     mantissa_of,
     power_of_two,
     round_to_even,
 )
 from quad_gym.kernels.simd.lanes import any_of, select
 
-# pi/2 in three parts of 33 bits and a rest: k * part is exact for |k| < 2^20 (Cody and Waite)
-_PIO2_1, _PIO2_2 = 1.57079632673412561417e00, 6.07710050630396597660e-11
-_PIO2_3 = 2.02226624871116645580e-21
-_PIO2_REST = 8.47842766036889956997e-32
-_REDUCIBLE = 1e6
+# pi/2 in three parts (Cody and Waite): x - k * first is exact, k * second is for |k| < 2^20
+_PIO2_1, _PIO2_2, _PIO2_3 = 1.5707963267948966, 6.12323399538461e-17, 3.5215598651832e-27
+_MOST_TURNED = 1e9
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _SMALL_ANGLE = 0.05
 
@@ -88,21 +85,32 @@ def quarter_turns(sine, cosine, quadrant):
 
 
 @kernel
+def _of_sum(x, rest):
+    """(sin, cos) of `x + rest`, where x is the sum rounded, for |x| <= pi/4."""
+    z = x * x
+    w = 1.0 - 0.5 * z
+    cosine = w + (((1.0 - w) - 0.5 * z) + (z * z * polynomial(z, _COS) - x * rest))
+    return x + (x * z * polynomial(z, _SIN) + rest * w), cosine
+
+
+@kernel
 def sin_cos(x):
-    """(sin x, cos x), for any x [rad]."""
+    """(sin x, cos x) of an angle x [rad].
+
+    The error is at most one unit in the last place for |x| <= 1e6, and at most 2^-53 for
+    |x| <= 1e9. Any larger angle counts as 0, which is as good as any: a unit in its last place may
+    be many degrees. Infinity and NaN give NaN.
+    """
+    x = select(abs(x) <= _MOST_TURNED, x, x - x)
     turns = round_to_even(x * 0.63661977236758138243)
-    reduced = fused_multiply_add(-turns, _PIO2_1, x)
-    reduced = fused_multiply_add(-turns, _PIO2_2, reduced)
-    reduced = fused_multiply_add(-turns, _PIO2_3, reduced)
-    reduced = fused_multiply_add(-turns, _PIO2_REST, reduced)
+    near = fused_multiply_add(-turns, _PIO2_1, x)
+    reduced = fused_multiply_add(-turns, _PIO2_2, near)
+    rest = fused_multiply_add(-turns, _PIO2_2, near - reduced)
+    rest = fused_multiply_add(-turns, _PIO2_3, rest)
     quadrant = turns - 4.0 * round_to_even(0.25 * turns - 0.375)
-    sine, cosine = near_zero(reduced)
+    sine, cosine = _of_sum(reduced, rest)
     sine, cosine = quarter_turns(sine, cosine, quadrant)
-    small_enough = abs(x) < _REDUCIBLE
-    if any_of(abs(x) >= _REDUCIBLE):
-        sine = select(small_enough, sine, library_sin(x))
-        cosine = select(small_enough, cosine, library_cos(x))
-    return sine, cosine
+    return select(x == 0.0, x, sine), cosine  # which keeps the sign of zero
 
 
 @kernel

@@ -52,7 +52,7 @@ from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import DRAW_FEATURE, DRAW_PHASE, FEATURE_BLOCKS, FilterForm, Sensor
 
 _CAMERA = int(Sensor.CAMERA)
-_PIXEL = 2e-6  # [m]; it cancels, so it is no parameter: the report writes rays in meters
+_PIXEL = 2e-6  #: [m]; it cancels, so it is no parameter: the report writes rays in meters
 
 
 @kernel

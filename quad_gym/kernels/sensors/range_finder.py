@@ -23,8 +23,7 @@ from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.RANGE_FINDER
-LEAST_COSINE = 0.5
-"""Cosine of the tilt below which it does not measure: 60 degrees."""
+LEAST_COSINE = 0.5  #: cosine of the tilt below which it does not measure: 60 degrees
 
 
 @kernel

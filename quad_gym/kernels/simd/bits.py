@@ -1,4 +1,4 @@
-"""Primitives of the elementary functions: bit patterns, rounding and the C library.
+"""Primitives of the elementary functions: bit patterns, rounding and fused multiply-adds.
 
 Each accepts a plain number or lanes, because LLVM's instructions do.
 """
@@ -72,10 +72,6 @@ def _mantissa_of(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
 
 round_to_even = _of_float(lambda builder, x: call_llvm(builder, "llvm.rint", x))
 """Nearest integer, ties to even, as a float."""
-library_sin = _of_float(lambda builder, x: call_llvm(builder, "llvm.sin", x))
-"""Sine from the C library, lane by lane: slow, for arguments too large to reduce."""
-library_cos = _of_float(lambda builder, x: call_llvm(builder, "llvm.cos", x))
-"""Cosine from the C library, lane by lane: slow, for arguments too large to reduce."""
 power_of_two = _of_float(_power_of_two)
 """2 ** x, exact, for an integer-valued float in [-1022, 1023]."""
 exponent_of = _of_float(_exponent_of)

@@ -25,7 +25,7 @@ from quad_gym.records import (
 )
 
 _FIRST = np.uint64(DRAW_PARAMETERS)
-_HALF_STEP = 2.0**-53  # moves a number on [0, 1) into (0, 1)
+_HALF_STEP = 2.0**-53  #: moves a number on [0, 1) into (0, 1)
 
 
 @kernel

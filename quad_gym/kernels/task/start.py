@@ -22,8 +22,7 @@ from quad_gym.records import (
 
 START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 0.3, 0.2, 0.03, 0.03
 """Standard deviations of a hovering start: [m], [rad], [rad], [m/s]."""
-GROUND_SHARE = 0.5
-"""Share of mixed starts that are on the ground."""
+GROUND_SHARE = 0.5  #: share of mixed starts that are on the ground
 _POSITION, _VELOCITY = COLUMNS["start_position_I"].start, COLUMNS["start_velocity_I"].start
 _RATES, _YAW = COLUMNS["start_body_rates"].start, COLUMNS["start_yaw"].start
 _ROLL, _PITCH = COLUMNS["start_roll"].start, COLUMNS["start_pitch"].start

@@ -24,8 +24,7 @@ from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.kernels.vehicle.dynamics import air_accelerations, load_start
 from quad_gym.records import Ending
 
-SWEEPS = 24
-"""Gauss-Seidel sweeps over all points in a tick."""
+SWEEPS = 24  #: Gauss-Seidel sweeps over all points in a tick
 STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
 """Speed [m/s], body rate [rad/s] and gap of the feet [m] below which a vehicle can come to rest.
 

@@ -19,7 +19,7 @@ LEAST_AIRSPEED = 1.0
 """Least airspeed with which gusts change [m/s]: turbulence that is frozen in the air (Taylor's
 hypothesis) would be constant for a vehicle that drifts with the wind."""
 _FOOT = 0.3048
-_LOWEST, _HIGHEST = 10.0, 1000.0  # feet: where the low-altitude form holds
+_LOWEST, _HIGHEST = 10.0, 1000.0  #: feet: where the low-altitude form holds
 _ROOT3, _ROOT_HALF, _ROOT_EIGHTH = math.sqrt(3.0), math.sqrt(0.5), math.sqrt(0.125)
 
 

@@ -22,7 +22,7 @@ undefined."""
 JUMP = 1e-5
 """Largest jump between segments of position [m], velocity [m/s] and acceleration [m/s^2]."""
 
-TURNABOUT = 1.0  # change of the heading between two checks that no vehicle can follow [rad]
+TURNABOUT = 1.0  #: change of the heading between two checks that no vehicle can follow [rad]
 
 ROUNDING = 1e-6
 """Fraction of a limit by which a demand may exceed it, so that a limit that is just met is
@@ -32,13 +32,13 @@ accepted."""
 class Demand(NamedTuple):
     """The largest demands of a trajectory on a vehicle."""
 
-    thrust: tuple[float, float]  # smallest and largest total thrust [N]
-    rotor_force: tuple[float, float]  # smallest and largest thrust of any single rotor [N]
-    tilt: float  # largest angle between body z and the vertical [rad]
+    thrust: tuple[float, float]  #: smallest and largest total thrust [N]
+    rotor_force: tuple[float, float]  #: smallest and largest thrust of any single rotor [N]
+    tilt: float  #: largest angle between body z and the vertical [rad]
     body_rates: tuple[float, float, float]
     """largest magnitude of the body rate about each body axis [rad/s]"""
-    speed: float  # largest speed [m/s]
-    acceleration: float  # largest acceleration [m/s^2]
+    speed: float  #: largest speed [m/s]
+    acceleration: float  #: largest acceleration [m/s^2]
 
 
 def check_trajectory(

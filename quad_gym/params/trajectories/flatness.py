@@ -14,17 +14,17 @@ import numpy as np
 from quad_gym.params.trajectories.pieces import Floats, Reference
 from quad_gym.params.vehicle import VehicleParams
 
-Jet = tuple[Floats, Floats, Floats]  # A vector (n, 3) over time with its first two derivatives
+Jet = tuple[Floats, Floats, Floats]  #: a vector (n, 3) over time with its first two derivatives
 
 
 class Motion(NamedTuple):
     """Demands of a motion at n instants."""
 
-    thrust: Floats  # (n,) total thrust of the rotors [N]
-    R_BI: Floats  # (n, 3, 3) attitude; its rows are the body axes in I
-    body_rates: Floats  # (n, 3) body rates in B [rad/s]
-    torque: Floats  # (n, 3) torque in B [N m]
-    rotor_forces: Floats  # (n, 4) thrust of each rotor [N]
+    thrust: Floats  #: (n,) total thrust of the rotors [N]
+    R_BI: Floats  #: (n, 3, 3) attitude; its rows are the body axes in I
+    body_rates: Floats  #: (n, 3) body rates in B [rad/s]
+    torque: Floats  #: (n, 3) torque in B [N m]
+    rotor_forces: Floats  #: (n, 4) thrust of each rotor [N]
 
     @property
     def tilt(self) -> Floats:

@@ -10,7 +10,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.trajectories.pieces import Pieces
 from quad_gym.params.trajectories.splines import through
 
-COLUMNS = ("time", "x", "y", "z")  # columns that a table must have; "yaw" is optional
+COLUMNS = ("time", "x", "y", "z")  #: columns that a table must have; "yaw" is optional
 
 OPTIONS = ("closed", "minimize", "at_rest", "yaw", "look_at")
 """Keywords of `Trajectory.through` that do not contradict a table."""

@@ -16,13 +16,13 @@ from quad_gym.params import checks as check
 from quad_gym.params.trajectories.pieces import Floats, HeadingRule, Pieces
 from quad_gym.params.trajectories.timing import choose_times
 
-ORDERS = {"snap": 4, "jerk": 3}  # order of the derivative that is minimized, by name
+ORDERS = {"snap": 4, "jerk": 3}  #: order of the derivative that is minimized, by name
 
 MAX_SPEED, MAX_ACCELERATION = 2.5, 3.0
 """Bounds where none are given [m/s], [m/s^2], as in the task of random trajectories."""
 
-PADDING = 6  # points before and after one round of a closed path, where it is approximated
-SHORTEST = 1e-6  # time between two points, and distance where times are chosen, at least [s], [m]
+PADDING = 6  #: points before and after one round of a closed path, where it is approximated
+SHORTEST = 1e-6  #: time between two points, and distance where times are chosen, at least [s], [m]
 
 
 def through(

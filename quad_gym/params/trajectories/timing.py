@@ -16,8 +16,8 @@ long and gain a few percent."""
 NORM = 20.0
 """Power of the mean that stands for the largest use in the search, which needs derivatives."""
 
-SAMPLES = 24  # samples of a segment, among which its peaks are looked for first
-MARGIN = 1e-9  # share of the bounds that is left to rounding
+SAMPLES = 24  #: samples of a segment, among which its peaks are looked for first
+MARGIN = 1e-9  #: share of the bounds that is left to rounding
 
 
 def choose_times(

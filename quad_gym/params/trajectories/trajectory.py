@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 Arguments = ParamSpec("Arguments")
 
-TERMS = 8  # coefficients of a polynomial of degree 7, as minimum snap requires
-LEAST_SPEED = 1e-3  # horizontal speed below which a heading along the path is held [m/s]
-EARLY = 1e-3  # fraction of a trajectory after which a start from rest has a direction
+TERMS = 8  #: coefficients of a polynomial of degree 7, as minimum snap requires
+LEAST_SPEED = 1e-3  #: horizontal speed below which a heading along the path is held [m/s]
+EARLY = 1e-3  #: fraction of a trajectory after which a start from rest has a direction
 
 
 def _making(
@@ -43,7 +43,9 @@ def _making(
 
     own = inspect.Parameter("cls", inspect.Parameter.POSITIONAL_ONLY)
     others = inspect.signature(function).parameters.values()
-    make.__signature__ = inspect.Signature([own, *others])  # type: ignore[attr-defined]
+    shown = inspect.Signature([own, *others], return_annotation="Trajectory")
+    make.__signature__ = shown  # type: ignore[attr-defined]
+    make.__annotations__ = {**function.__annotations__, "return": "Trajectory"}
     return classmethod(make)
 
 

@@ -13,7 +13,7 @@ from quad_gym.params.world import WorldParams
 MAX_SPEED = 1e4
 """Largest initial speed [m/s]: several times faster than any bullet, with drag still integrable."""
 
-MAX_YAW = 1e4  # largest initial yaw [rad], some thousand turns: larger ones are mistakes
+MAX_YAW = 1e4  #: largest initial yaw [rad], some thousand turns: larger ones are mistakes
 
 
 def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:

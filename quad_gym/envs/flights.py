@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.references import check_in_bounds, check_pad
-from quad_gym.batch.starts import checked_start
+from quad_gym.batch.resets import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.effects import require_effect, require_own_task, runs_no_sensor
 from quad_gym.envs.keywords import DEFAULTS, TASK_KEYWORDS
@@ -19,7 +19,7 @@ from quad_gym.envs.spaces import (
     OBSERVATIONS,
     ObservationField,
     layout_bounds,
-    layout_of_suite,
+    observation_layout,
     observation_space,
     policy_size,
 )
@@ -60,8 +60,8 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
 }
 """Defaults of each task, which keywords override."""
 
-SLOWEST = 1.0  # least control rate [Hz]: smaller ones are periods
-MAX_STEPS = 10**9  # longest time limit in steps; a duration of 0 has none
+SLOWEST = 1.0  #: least control rate [Hz]: smaller ones are periods
+MAX_STEPS = 10**9  #: longest time limit in steps; a duration of 0 has none
 
 
 def kind_and_task(
@@ -149,18 +149,18 @@ class Flights:
         flown["world"], own_task = place, keywords.get("task")
         if place.ground is None and own_task is None and "start_position_I" not in drawn.names:
             check_pad(self.task)  # a user-defined task may set where vehicles start
-        privileged = flown["privileged"]
-        self.table: tuple[ObservationField, ...] = layout_of_suite(
+        privileged, raw = flown["privileged"], self.observation == "measurements"
+        shown = drawn.names if drawn.names or place != WorldParams() else None
+        self.table: tuple[ObservationField, ...] = observation_layout(
             self.observation,
-            self.layout,
-            suite,
+            None if raw else self.layout,
+            sensors=suite,
             include_std=flown["include_std"],
             privileged=privileged,
-            drawn=drawn.names if drawn.names or place != WorldParams() else None,
+            drawn=shown if privileged else None,
         )
         self.control_rate = check.positive("control_rate", flown["control_rate"], least=SLOWEST)
         check_limit(self.task, self.control_rate, "control_rate")
-        raw = self.observation == "measurements"
         make = partial(
             FlightBatch,
             task=self.task,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from quad_gym.tasks.draws import FlightRandom, threefry
+from quad_gym.tasks.random import FlightRandom, threefry
 
 ALARM = 1e-6  # probability that a sound generator fails one statistical test
 
