@@ -67,6 +67,13 @@ CATALOG = {
             texts=texts.console("foreign_policy"),
         ),
         Result(
+            name="betaflight",
+            commands=["docs/examples/betaflight.py --output OUT"],
+            flights=("Circle, standard", "Hover, standard"),
+            texts=texts.console("betaflight"),
+            figures={"0/betaflight.png": "docs/images/betaflight.png"},
+        ),
+        Result(
             name="recipes",
             commands=[
                 "sweep --engine compiled --seeds 5 --output OUT --env-ids "
