@@ -133,7 +133,8 @@ class Likelihood:
 
         The suites have the same delays and mounting as the suite of the likelihood.
         """
-        return sum(each.losses(suites) for each in self._logs)
+        whole, thin = (each.losses(suites) for each in self._logs)
+        return whole + thin
 
 
 class _LogLosses:

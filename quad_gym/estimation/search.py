@@ -133,7 +133,7 @@ class Search:
         """
         whole, time = self.log, self.log.imu.time
         flying = np.cumsum(np.diff(time, prepend=time[0]) * in_flight(whole, time))
-        last = np.searchsorted(flying, _SHORT + SETTLING)
+        last = int(np.searchsorted(flying, _SHORT + SETTLING))
         self.log = whole.until(float(time[min(last, len(time) - 1)]))
         for k, number in enumerate(self.numbers):
             if number.sensor == "log_delays":
