@@ -23,7 +23,10 @@ FLAGS = (
     *("-nostartfiles", "--specs=nosys.specs", "-Wl,-e,start"),
     *("-Wl,--section-start=.vectors=0", "-Wl,-Ttext=0x400", "-Wl,-Tdata=0x20000000"),
 )
-BOARD = "-M mps2-an500 -icount shift=0 -nographic -monitor none -serial none -semihosting".split()
+BOARD = (
+    *("-M", "mps2-an500", "-icount", "shift=0", "-semihosting"),
+    *("-nographic", "-monitor", "none", "-serial", "none"),
+)
 CYCLES, CLOCK = 2.0, 480e6  # cycles per instruction (assumed), and Hz
 
 
