@@ -3,10 +3,10 @@
     python -m tests.wheel dist/quad_gym-*.whl          # the last step of make wheel
     python -m tests.wheel WHEEL --folder FOLDER        # keep environment and files there
 
-Installs the wheel with its extra `compile` in a new virtual environment. There, two commands export
-the filter of a suite and compile it; its example prints the estimates of a log, which must be those
-that `quad-gym replay` writes. The same for AArch64 in an emulator, where compiler and emulator are
-installed.
+Installs the wheel with the extras `compile` and `plot` (for `replay`) in a new virtual environment.
+There, two commands export the filter of a suite and compile it; its example prints the estimates of
+a log, which must be those that `quad-gym replay` writes. The same for AArch64 in an emulator, where
+compiler and emulator are installed.
 """
 
 import argparse
@@ -31,7 +31,7 @@ def installed(wheel, folder):
     commands = folder / "environment" / "bin"
     if not (commands / "quad-gym").exists():
         venv.create(folder / "environment", with_pip=True)
-        requirement = f"{wheel.resolve()}[compile]"
+        requirement = f"{wheel.resolve()}[compile,plot]"
         subprocess.run([commands / "pip", "install", "--quiet", requirement], check=True)
     return commands
 
