@@ -80,7 +80,7 @@ class Motors:
         self.torques = self.range * slope * np.array([*arm, 4.0 * twist])
 
     def throttle(self, thrust: NDArray[Any]) -> NDArray[Any]:
-        """Throttle in [0, 1] for a thrust [weights]; thrust grows with the square of the voltage."""
+        """Throttle in [0, 1] for a thrust [weights], as the square of the voltage gives it."""
         u = self.hover * np.sqrt(np.maximum(thrust, 0.0))
         return np.asarray(np.clip((u - _IDLE) / self.range, 0.0, 1.0))
 
