@@ -94,6 +94,7 @@ def main():
         "tracking error [mm]": ["whole episode", "second half"],
         " ": ["crashed"],
     }
+    print(f"Circle, standard, observation estimate, {EPISODES} episodes\n")
     print(text_table(heads, rows))
 
 

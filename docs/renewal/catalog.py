@@ -74,6 +74,12 @@ CATALOG = {
             figures={"0/betaflight.png": "docs/images/betaflight.png"},
         ),
         Result(
+            name="cortex_m7",
+            commands=["docs/examples/cortex_m7.py rtk consumer"],
+            flights=(),
+            texts=texts.console("cortex_m7"),
+        ),
+        Result(
             name="recipes",
             commands=[
                 "sweep --engine compiled --seeds 5 --output OUT --env-ids "
