@@ -80,12 +80,7 @@ def thinned(log: Log) -> Log:
 
 
 def tails(nis: Floats, d: int) -> float:
-    """Return the degrees of freedom of Student's t that describe normalized innovations best.
-
-    Args:
-        nis: (n,) normalized innovations squared, up to a common factor.
-        d: Their degrees of freedom.
-    """
+    """Return the degrees of freedom of Student's t that describe NIS (n,) of d numbers best."""
     from scipy.special import gammaln
 
     scales = np.exp(np.linspace(-3.0, 3.0, 61))[:, np.newaxis] * float(np.median(nis)) / d
@@ -138,7 +133,8 @@ class Likelihood:
 
         The suites have the same delays and mounting as the suite of the likelihood.
         """
-        return sum(each.losses(suites) for each in self._logs)
+        whole, thin = (each.losses(suites) for each in self._logs)
+        return whole + thin
 
 
 class _LogLosses:

@@ -73,12 +73,9 @@ image's center], or together `pixels` (n, features, 2).
 class Stream:
     """Measurements of one sensor."""
 
-    time: Floats
-    """(n,) time stamps [s]"""
-    received: Floats
-    """(n,) times of arrival [s]"""
-    values: dict[str, Floats]
-    """measurements (n, ...) by name"""
+    time: Floats  #: (n,) time stamps [s]
+    received: Floats  #: (n,) times of arrival [s]
+    values: dict[str, Floats]  #: measurements (n, ...) by name
 
     def __len__(self) -> int:
         return len(self.time)
@@ -103,18 +100,14 @@ class Log:
     Frames are the package's: B with x forward, y left, z up; I with east, north, up.
     """
 
-    imu: Stream
-    """IMU samples: gyro [rad/s] and accel [m/s^2], (n, 3) each, in B"""
+    imu: Stream  #: IMU samples: gyro [rad/s] and accel [m/s^2], (n, 3) each, in B
     gnss: Stream | None = None
     """GNSS measurements: position_G (n, 3) from the center of the Earth, or position_I from the
     origin [m]; velocity_G or velocity_I [m/s]; baseline_G or baseline_I [m]; reported standard
     deviations position_sigma_I (n, 3) [m] and velocity_sigma (n,) [m/s]"""
-    camera: Stream | None = None
-    """images: pixels (n, features, 2) from the image's center"""
-    barometer: Stream | None = None
-    """heights: barometer (n,) in I [m]"""
-    magnetometer: Stream | None = None
-    """magnetic fields: magnetometer (n, 3) in B [T]"""
+    camera: Stream | None = None  #: images: pixels (n, features, 2) from the image's center
+    barometer: Stream | None = None  #: heights: barometer (n,) in I [m]
+    magnetometer: Stream | None = None  #: magnetic fields: magnetometer (n, 3) in B [T]
     motors: Stream | None = None
     """commands, no measurements: motors (n, 4), voltages that hold until the next [V]"""
     barometer_from_start: bool = False
@@ -192,13 +185,6 @@ def ecef_of(lat: Floats, lon: Floats, height: Floats) -> Floats:
 @contextmanager
 def reading(path: Path | str, kind: str, logs: str, library: str, extra: str) -> Iterator[Path]:
     """Name file and library in errors of a library that reads a log.
-
-    Args:
-        path: Path of the log.
-        kind: Description of one log, for messages.
-        logs: Description of such logs.
-        library: Name of the library.
-        extra: Extra of quad-gym that installs it.
 
     Raises:
         ImportError: If the library is not installed.

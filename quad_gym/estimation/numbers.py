@@ -20,17 +20,12 @@ class Number:
 
     sensor: str
     """part of the suite, such as "imu"; empty: the suite itself"""
-    field: str
-    """field of that part"""
-    spread: float
-    """standard deviation of the prior: of the logarithm, or of the number"""
-    axes: tuple[int, ...] = ()
-    """elements of a field of several numbers; they change together"""
-    positive: bool = True
-    """False: the number may have either sign"""
+    field: str  #: field of that part
+    spread: float  #: standard deviation of the prior: of the logarithm, or of the number
+    axes: tuple[int, ...] = ()  #: elements of a field of several numbers; they change together
+    positive: bool = True  #: False: the number may have either sign
     unit: str = "-"
-    step: float = 0.1
-    """step of numerical derivatives, in coordinates"""
+    step: float = 0.1  #: step of numerical derivatives, in coordinates
 
     @property
     def of_log(self) -> bool:
@@ -127,13 +122,7 @@ sensor at rest, and vibration, airflow and motor currents multiply its noise."""
 
 
 def numbers_in(suite: SensorSuite, log: Log, delays: bool) -> list[Number]:
-    """Return the numbers of the sensors that a suite has and a log contains.
-
-    Args:
-        suite: The suite.
-        log: The log.
-        delays: True: delays, too.
-    """
+    """Return the numbers of the sensors that a suite and a log have, with or without delays."""
     measured = {name for name in log.streams if getattr(suite, name, None) is not None}
     paired = "gnss" in measured and has(log, "baseline")
     others = {

@@ -90,6 +90,7 @@ def smooth(
         quaternion=dcm_to_quaternion(R_BI),
         accel_bias=x[:, 9:12],
         gyro_bias=x[:, 12:15],
+        sigma=np.sqrt(np.diagonal(P, axis1=1, axis2=2)),
         covariance=P,
         difference=difference / np.sqrt(gained),
         status=player.filter.status,
@@ -103,26 +104,16 @@ def smooth(
 class _Forward:
     """States of the filter: the first one, and those after each of n predictions and updates."""
 
-    x: Floats
-    """(n + 1, N) estimates, zero for the error angles"""
-    R_BI: Floats
-    """(n + 1, 3, 3) estimated attitudes"""
-    factor: Floats
-    """(n + 1, N, N) lower factors of the covariance"""
-    variances: Floats
-    """(n + 1, N) its diagonal"""
-    sample: Any
-    """(n,) number of the sample of a prediction; -1: an update"""
-    jacobian: Floats
-    """(n, 15, 15) of predictions, without slow errors"""
-    decay: Floats
-    """(n, N - 15) of predictions, for slow errors"""
-    resets: bool
-    """True: the covariance is transformed when error angles are reset"""
-    rows: Any
-    """(m,) numbers of the states at samples of the log"""
-    time: Floats
-    """(m,) times of these [s]"""
+    x: Floats  #: (n + 1, N) estimates, zero for the error angles
+    R_BI: Floats  #: (n + 1, 3, 3) estimated attitudes
+    factor: Floats  #: (n + 1, N, N) lower factors of the covariance
+    variances: Floats  #: (n + 1, N) its diagonal
+    sample: Any  #: (n,) number of the sample of a prediction; -1: an update
+    jacobian: Floats  #: (n, 15, 15) of predictions, without slow errors
+    decay: Floats  #: (n, N - 15) of predictions, for slow errors
+    resets: bool  #: True: the covariance is transformed when error angles are reset
+    rows: Any  #: (m,) numbers of the states at samples of the log
+    time: Floats  #: (m,) times of these [s]
 
 
 def _filter_forward(player: Player) -> _Forward:

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_gym.estimation.calibration import correlation_time
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.replaying import prepared
+from quad_gym.estimation.search import correlation_time
 from quad_gym.estimation.smoothing import smooth
 from quad_gym.estimation.tables import read_log
 from quad_gym.params import checks as check

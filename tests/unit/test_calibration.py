@@ -9,10 +9,10 @@ import pytest
 import quad_gym
 from quad_gym import estimation
 from quad_gym.estimation import calibrate, replay
-from quad_gym.estimation.calibration import correlation_time
 from quad_gym.estimation.likelihood import in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import NUMBERS
+from quad_gym.estimation.search import correlation_time
 from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import euler_to_dcm
 from tests.console_commands import run
