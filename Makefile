@@ -104,6 +104,7 @@ wheel: kernels  ## build sdist and a wheel with the libraries into dist, and che
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
 	$(BIN)/auditwheel show dist/*.whl | tee /dev/stderr | grep -q '"manylinux_2_'
+	$(BIN)/python -m tests.wheel dist/*.whl
 
 clean:
 	rm -rf quad_gym/kernels/libraries

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 
+from baselines.gru import load_network
 from baselines.mlp import MlpPolicy
 from baselines.pd import REACH_OF_GAPS, PDPolicy
 from quad_gym import IDS, PDGains
@@ -62,7 +63,7 @@ def load_policy(name: str, env: Any) -> Policy:
             "pd:features_when_uncertain" (tuned gains, facing the features), "pd:slow" and
             "pd:waiting" (for courses with gaps: half the speed, or waiting when uncertain),
             "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
-            the task of the environment), or a file: `.npz` written by `MlpPolicy`, or `.zip`
+            the task of the environment), or a file: `.npz` with plain arrays, or `.zip`
             written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
         env: Environment of this package: single, vector or Stable-Baselines3.
 
@@ -79,7 +80,7 @@ def load_policy(name: str, env: Any) -> Policy:
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
     if file.suffix == ".npz":
-        policy: Any = MlpPolicy.load(file)
+        policy: Any = load_network(file)
         _require_agreement(file, policy.record, env)
         _require_size(file, policy.inputs, env)
         trained_on = policy.record.get("plan", {}).get("env_id", task_of(env))

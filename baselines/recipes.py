@@ -19,6 +19,8 @@ ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
 environments."""
 
+COMPILED = ("ppo", "recurrent_ppo")  #: algorithms of the compiled engine
+
 ACTIVATIONS = ("relu", "tanh", "elu")  #: activations between the layers of a policy
 
 
@@ -54,6 +56,9 @@ class Recipe(Checked):
     """Number of units in each hidden layer of the policy"""
     critic_layers: Annotated[tuple[int, ...], _sizes] = (64, 64)
     """Number of units in each hidden layer of the value function, or of each critic"""
+    memory_units: Annotated[int, check.whole] = 64
+    """Number of units of the memory of recurrent PPO, for the policy and for the value function: a
+    GRU with the compiled engine, an LSTM with SB3-Contrib"""
     activation: Annotated[str, partial(check.choice, choices=ACTIVATIONS)] = "relu"
     """Activation of hidden layers, one of `ACTIVATIONS`"""
     reward_scale: check.Positive = 0.2
@@ -92,10 +97,6 @@ _PPO = Recipe(
 )
 """Result of a search over learning rates, reward scales, activations and batch sizes on Circle."""
 
-_RECURRENT_PPO = _PPO.replace(
-    algorithm="recurrent_ppo", policy={**_PPO.policy, "lstm_hidden_size": 64}
-)
-
 _OFF_POLICY = {
     **{"batch_size": 1024, "buffer_size": 500_000, "learning_starts": 5_000},
     **{"train_freq": 1, "gradient_steps": 4, "gamma": 0.95, "tau": 0.01},
@@ -114,7 +115,6 @@ _SAC = Recipe(
 
 _DEFAULTS = {
     "ppo": _PPO,
-    "recurrent_ppo": _RECURRENT_PPO,
     "sac": _SAC,
     "td3": _SAC.replace(algorithm="td3", parameters={**_OFF_POLICY, "policy_delay": 2}),
     "tqc": _SAC.replace(algorithm="tqc"),
@@ -138,15 +138,6 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
     ("QuadGym/LookAround-v0", "ppo"): _changed(
         _PPO, {"gamma": 0.99}, steps=8_000_000, flights={"out_of_bounds": 3.0}
     ),
-    # As PPO on this task, with rollouts that are long enough to learn a memory of a second, and
-    # large batches, because the time of a gradient step depends on the length of the sequence. It
-    # is slow, and therefore has fewer steps than PPO.
-    ("QuadGym/LookAround-v0", "recurrent_ppo"): _changed(
-        _RECURRENT_PPO,
-        {"gamma": 0.99, "n_steps": 64, "batch_size": 2048},
-        steps=2_000_000,
-        flights={"out_of_bounds": 3.0},
-    ),
     # During an outage, halving the speed prevents few crashes, and waiting for its end prevents
     # most: a policy has to discover pauses of seconds. Exploration noise drawn ten times a second
     # averages out, so training holds each action for 0.25 s. Rewards after 7 s of waiting are
@@ -163,7 +154,11 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
 
 
 def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
-    """Included recipe for a task, by its id, and one of `ALGORITHMS`."""
+    """Included recipe for a task, by its id, and one of `ALGORITHMS`.
+
+    Recurrent PPO has the recipe of PPO, so that they differ in the memory only.
+    """
     check.choice("env_id", env_id, tuple(IDS))
     check.choice("algorithm", algorithm, ALGORITHMS)
-    return _SPECIAL.get((env_id, algorithm), _DEFAULTS[algorithm])
+    base = "ppo" if algorithm == "recurrent_ppo" else algorithm
+    return _SPECIAL.get((env_id, base), _DEFAULTS[base]).replace(algorithm=algorithm)

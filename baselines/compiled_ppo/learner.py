@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo import kernels
+from baselines.compiled_ppo.kernels import common as kernels
 from baselines.compiled_ppo.networks import Networks
 from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
 
@@ -13,15 +13,18 @@ PARTS = 2 * MIN_BLOCKS_PER_THREAD
 """Number of parts of a minibatch, enough for two threads: adding more parts would take longer. They
 are added in order, so that the sum does not depend on the number of threads."""
 
-Samples = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-"""Observations (n, o), actions (n, a), their log probabilities (n,) in the rollout, and returns
-(n,) as targets of the critic."""
+Samples = tuple[NDArray[Any], ...]
+"""Observations (n, o), actions (n, a), their log probabilities (n,) in the rollout, returns (n,) as
+targets of the critic; True if an episode ended with the step (n,), and the memories at the
+beginnings of all sequences, (sequences in time, 2, flights, units). Samples are ordered by time,
+then by flight."""
 
 
 class Learner:
     """Training on samples with advantages (n,), as in `stable_baselines3.PPO.train`.
 
-    Each `learn` reads samples and advantages again; `parameters` are a recipe's complete ones.
+    Each `learn` reads samples and advantages again; `parameters` are a recipe's complete ones. The
+    units of a minibatch are samples, or the sequences of networks with memory.
     """
 
     def __init__(
@@ -34,8 +37,12 @@ class Learner:
     ) -> None:
         self.networks, self.parameters, self._advantages = networks, parameters, advantages
         self.moments, self.steps = np.zeros((2, networks.params.size), np.float32), 0
-        self.span, self.order = np.zeros(2, np.int64), np.arange(len(advantages))
-        self.normalized = advantages.copy()
+        length, flights = networks.sequence_length, samples[5].shape[2]
+        # of each unit the first sample, and the distances of its samples from this one
+        self._first = np.arange(len(advantages)).reshape(-1, length, flights)[:, 0].reshape(-1)
+        self._later = flights * np.arange(length)
+        self.span, self.order = np.zeros(2, np.int64), self._first.copy()
+        self.normalized = np.zeros((len(self.order), length), np.float32)
         self.gradients = np.zeros((PARTS, networks.params.size), np.float32)
         self.sums = np.zeros((PARTS, len(kernels.SUMS)))
         minibatch, rooms = (self.span, self.order, self.normalized), networks.rooms(PARTS)
@@ -45,14 +52,14 @@ class Learner:
         def differentiate(
             board: NDArray[np.int64], number: int, command: int, serving: bool
         ) -> bool:
-            return kernels.differentiate(board, number, command, serving, *fixed)
+            return bool(networks.differentiate(board, number, command, serving, *fixed))
 
         self._differentiate = differentiate
         self._crew = Crew(differentiate, PARTS, threads)
 
     def prepare(self) -> None:
         """Call every kernel once to compile it, without changing the networks."""
-        kernels.flip(self.networks.model)
+        self.networks.flip()
         self._differentiate(board_of(0, 1), 0, POSTED_BEFORE, False)
         copies = self.networks.params.copy(), self.moments.copy()
         kernels.descend(self.gradients, *copies, 0.0, 1.0, np.ones(2))
@@ -62,17 +69,18 @@ class Learner:
 
         Raises a FloatingPointError if a gradient is not finite because the training has diverged.
         """
-        count, size = len(self.order), self.parameters["batch_size"]
+        count, length = self.normalized.shape
+        size = max(1, self.parameters["batch_size"] // length)
         for _ in range(self.parameters["n_epochs"]):
             sums = np.zeros(len(kernels.SUMS))
-            self.order[:] = rng.permutation(count)
-            self.normalized[:] = self._advantages[self.order]
+            self.order[:] = self._first[rng.permutation(count)]
+            self.normalized[:] = self._advantages[self.order[:, np.newaxis] + self._later]
             for first in range(0, count, size):
                 if self.parameters["normalize_advantage"]:
-                    _normalize(self.normalized[first : first + size])
+                    _normalize(self.normalized[first : first + size].reshape(-1))
                 sums += self.differentiate(first, min(first + size, count))
                 self.descend(rate)
-        return dict(zip(kernels.SUMS, (sums / count).tolist(), strict=True))
+        return dict(zip(kernels.SUMS, (sums / (count * length)).tolist(), strict=True))
 
     def differentiate(self, first: int, last: int) -> NDArray[np.float64]:
         """Compute the gradient of a minibatch of this epoch, in parts; returns its `SUMS`."""
@@ -94,7 +102,7 @@ class Learner:
         )
         if not np.isfinite(norm):
             raise FloatingPointError("the training has diverged: a gradient is not finite")
-        kernels.flip(self.networks.model)
+        self.networks.flip()
 
 
 def _normalize(advantages: NDArray[np.float32]) -> None:

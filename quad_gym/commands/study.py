@@ -7,11 +7,11 @@
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
-Arms of quad_gym/experiments/arms.py (or of a file like it) are trained with the compiled PPO, or
-with another algorithm of Stable-Baselines3 that they name, and every policy flies the same test
-episodes on the estimate. Prints a table with means over the seeds and 95 % intervals over seeds and
-episodes, and conclusions, and writes figures, numbers and a report. Each training is a folder: an
-interrupted study continues where it stopped.
+Arms of quad_gym/experiments/arms.py (or of a file like it) are trained with the compiled PPO, with
+or without memory, or with another algorithm of Stable-Baselines3 that they name, and every policy
+flies the same test episodes on the estimate. Prints a table with means over the seeds and 95 %
+intervals over seeds and episodes, and conclusions, and writes figures, numbers and a report. Each
+training is a folder: an interrupted study continues where it stopped.
 """
 
 import time

@@ -45,8 +45,8 @@ class TrainArgs:
     different flights, and so does quad-gym evaluate"""
 
     output: Path | None = None
-    """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED; compiled_ppo is the
-    ALGORITHM of the compiled engine"""
+    """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED; ALGORITHM begins
+    with compiled_ for the compiled engine"""
     resume: bool = False
     """continue the run in the folder, or begin one if there is none"""
     evaluations: int = 20
@@ -87,10 +87,11 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     plan = Plan(environment=environment, recipe=chosen, **values)
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
-    if args.export is not None and args.algorithm == "recurrent_ppo":
-        raise ValueError("--export does not support recurrent_ppo, whose policies have a memory")
+    exportable = args.engine == "compiled" or args.algorithm != "recurrent_ppo"
+    if args.export is not None and not exportable:
+        raise ValueError("--export of recurrent_ppo needs --engine compiled")
     task = IDS[args.env_id]
-    name = "compiled_ppo" if args.engine == "compiled" else args.algorithm
+    name = f"compiled_{args.algorithm}" if args.engine == "compiled" else args.algorithm
     folder = args.output or Path("results/train") / task / f"{name}_seed_{args.seed}"
     run_in(folder, plan, resume=args.resume)
     plan.make_judge().close()
@@ -135,5 +136,5 @@ def main(args: TrainArgs) -> None:
         print(f"Wrote {args.export}.")
     policy = f"--policy {done.best_policy}{options.flying_options(plan.environment)}"
     print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")
-    if plan.recipe.algorithm != "recurrent_ppo":
+    if plan.engine == "compiled" or plan.recipe.algorithm != "recurrent_ppo":
         print(f"Export it: quad-gym export policy {done.best_policy} --to c")

@@ -74,8 +74,8 @@ def expand(
         spec["env_ids"], spec["arms"] or [None], itertools.product(*tried)
     ):
         chosen = dict(zip(axes, values, strict=True))
-        compiled = spec["engine"] == "compiled"
-        words = [IDS[env_id], "compiled_ppo" if compiled else chosen["", "algorithm"]]
+        engine = "compiled_" if spec["engine"] == "compiled" else ""
+        words = [IDS[env_id], f"{engine}{chosen['', 'algorithm']}"]
         words += [] if arm is None else [arm]
         words += [  # values from lists, so that further values do not change it
             f"{axis[1]}={_word(value)}"

@@ -1,0 +1,1 @@
+"""Compiled parts: `common` ones, and those of networks without and with memory."""
