@@ -3,8 +3,8 @@
 Certainty equivalence, control on the estimate as if it were the state, is optimal where actions do
 not affect the covariance (linear systems). Where they do, a planner can penalize the trace of the
 covariance that it predicts for each sequence of actions: S. Patil, G. Kahn, M. Laskey, J. Schulman,
-K. Goldberg and P. Abbeel, Scaling up Gaussian belief space planning, WAFR 2014; "Revisiting
-Certainty Equivalence", arXiv:2607.07276, examines where this pays.
+K. Goldberg and P. Abbeel, Scaling up Gaussian belief space planning, WAFR 2014; see also Revisiting
+Certainty Equivalence, arXiv:2607.07276.
 
 The observation is that of the other arms with standard deviations. The model of the covariance has
 three states per axis, the errors of position, velocity and acceleration (tilt and bias), from the
