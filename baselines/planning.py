@@ -67,8 +67,10 @@ class PlanningPolicy(PDPolicy):
 
     def __init__(self, env: Any, weight: float | None = None) -> None:
         gaps = any(f.name == "gap_width" for f in env.unwrapped.flights.table)
-        mode = {"pace": "waiting"} if gaps else {"faces": "features_when_uncertain"}
-        super().__init__(env, **mode)
+        if gaps:
+            super().__init__(env, pace="waiting")
+        else:
+            super().__init__(env, faces="features_when_uncertain")
         self._waits, self._faces = False, "reference"  # the plan decides
         given = (TIME_PRICE if gaps else TRACE_WEIGHT) if weight is None else weight
         self._weight = check.number("weight", given, least=0.0)

@@ -85,9 +85,9 @@ def errors_figure(
     `bound` has times (b,) and the posterior Cramer-Rao bounds on the mean squares, (b, 15).
     """
     text = (
-        f"{title}\nError (blue) and standard deviation of the filter (dashed), "
-        "root mean square over flights"
-        + ("" if bound is None else "; posterior Cramer-Rao bound (red, dotted)")
+        f"{title}\nError (blue), standard deviation of the filter (dashed)"
+        + ("" if bound is None else ", Cramer-Rao bound (red, dotted)")
+        + "; root mean square over flights"
     )
     blocks = {name: part for name, part in PARTS.items() if name in _UNITS}
     figure, axes = _grid(len(blocks), text)
