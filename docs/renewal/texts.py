@@ -28,7 +28,6 @@ SUITES = {
 MEMORY = {
     "look_around": "--steps 1000000 --arms certainty certainty_recurrent",
     "stale_race": "--steps 1000000 --arms std std_recurrent",
-    "outage_dash": "--steps 300000 --env control_rate=4.0 --arms std std_recurrent",
 }
 """Budgets and arms of the comparisons of policies with and without memory, by task."""
 
