@@ -67,6 +67,19 @@ CATALOG = {
             texts=texts.console("foreign_policy"),
         ),
         Result(
+            name="betaflight",
+            commands=["docs/examples/betaflight.py --output OUT"],
+            flights=("Circle, standard", "Hover, standard"),
+            texts=texts.console("betaflight"),
+            figures={"0/betaflight.png": "docs/images/betaflight.png"},
+        ),
+        Result(
+            name="cortex_m7",
+            commands=["docs/examples/cortex_m7.py rtk consumer"],
+            flights=(),
+            texts=texts.console("cortex_m7"),
+        ),
+        Result(
             name="recipes",
             commands=[
                 "sweep --engine compiled --seeds 5 --output OUT --env-ids "

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.measurements import Measurements, StartView
 from quad_gym.batch.memory import FlightMemory
-from quad_gym.batch.state import State
 from quad_gym.estimation.own import Estimator, checked_estimate, factors
 from quad_gym.params import checks as check
 from quad_gym.records import (
@@ -19,6 +18,7 @@ from quad_gym.records import (
     field_of_flights,
     put_in_flights,
 )
+from quad_gym.records.state import State
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]

@@ -3,6 +3,7 @@
     quad-gym replay flight.csv --sensors rtk
     quad-gym replay flight.csv --sensors rtk --smooth
     quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
+    quad-gym replay flight.csv --sensors rtk --estimator module:Class
 
 A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
 some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. If units
@@ -36,8 +37,8 @@ class ReplayArgs:
 
     log: LogFile
     sensors: SuiteName = "standard"
-    estimator: Literal["ukf", "ekf"] = "ukf"
-    """filter: unscented or extended Kalman filter"""
+    estimator: str = "ukf"
+    """filter: ukf, ekf, or module:Class of a quad_gym.Estimator"""
     barometer: bool = False
     """add a barometer with default parameters to the suite"""
     magnetometer: tuple[float, float, float] | None = None
@@ -83,6 +84,8 @@ def folder_of(args: ReplayArgs) -> Path:
         raise ValueError("--heading must not be given with --course")
     if args.start_position is not None and args.heading is None:
         raise ValueError("--start-position must come with --heading")
+    if args.smooth and ":" in args.estimator:
+        raise ValueError("--smooth must not be given with an --estimator of your own")
     if args.figure:
         require_matplotlib()
     folder = args.output or Path("results/replay") / args.log.stem
@@ -206,7 +209,8 @@ def main(args: ReplayArgs) -> None:
         from quad_gym.analysis.replay_plots import replay_figure
 
         with house_style():
-            title = f"{args.log.name}, {args.estimator.upper()}, suite {args.sensors}"
+            name = result.estimator.upper() if ":" not in args.estimator else result.estimator
+            title = f"{args.log.name}, {name}, suite {args.sensors}"
             files += save_figure(replay_figure(result, title), folder / "replay")
     found = {
         **result.summary(),

@@ -10,6 +10,8 @@ import numpy as np
 from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
 from quad_gym.estimation.logs import Log
+from quad_gym.estimation.own import Estimator
+from quad_gym.estimation.own_player import OwnPlayer
 from quad_gym.estimation.plausibility import problems_of
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.results import Replay
@@ -23,7 +25,7 @@ def replay(
     log: Any,
     *,
     sensors: SensorSuite | str,
-    estimator: str = "ukf",
+    estimator: Any = "ukf",
     start: Mapping[str, Any] | None = None,
     reported_noise: bool = True,
     window: float = 0.5,
@@ -44,13 +46,16 @@ def replay(
         log: A table or a file, see `quad_gym.estimation.read_log`, or its result.
         sensors: The suite that the filter assumes, or its name. Its rates and latencies are
             ignored: the log has its own. Time stamps of the log are earlier by its `log_delays`.
-        estimator: "ukf" or "ekf".
+        estimator: "ukf" or "ekf"; or an own `quad_gym.Estimator`, its class, or "module:Class",
+            which receives the mean of the samples over each tick of the suite's IMU, and the
+            measurements that have arrived by its end. Its result has a row for each tick, and no
+            innovations.
         start: Keywords of `initialize`, such as `{"heading": 0.5}` or `{"course": True}`. Without
             GNSS: `{"position": (0, 0, 0), "heading": 0.0}` for a level vehicle at rest, with the
             errors of the suite's `initial_pose`, or all keywords of `set_state`; each with `time`,
             by default the first sample's.
         reported_noise: True: use the accuracy that the receiver reports, if the log has it, in
-            place of the suite's.
+            place of the suite's. An own estimator does not receive it.
         window: Longest delay of measurements beyond the suite's `log_delays` [s].
         body: Axes of a table, see `read_log`.
 
@@ -59,23 +64,27 @@ def replay(
             have other features than the suite, or the IMU samples have a gap longer than
             LONGEST_STEP.
     """
+    own = None
+    if not isinstance(estimator, str) or ":" in estimator:
+        own, estimator = check.own("estimator", estimator, Estimator), "ukf"
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, body)
     reach = window + max(0.0, *vars(suite.log_delays).values())
-    result = Player(whole, suite, estimator, named_start(start), reported_noise, reach).play()
+    player = Player(whole, suite, estimator, named_start(start), reported_noise, reach)
+    result = player.play() if own is None else OwnPlayer(player, own).play()
     return replace(result, problems=problems_of(whole, body, suite, result))
 
 
 def prepared(log: Any, sensors: SensorSuite | str, body: str) -> tuple[Log, SensorSuite]:
-    """Return a log without its delays, and a suite with the origin of I.
+    """Return a log without its delays, in the axes of B, and a suite with the origin of I.
 
     Raises:
         ValueError: As `replay`.
     """
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
-    whole = read_log(log, body=body).without_delays(vars(suite.log_delays))
+    whole = read_log(log, body=body).corrected(suite)
     return whole, origin_of(whole, suite)
 
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.resets import checked_start
-from quad_gym.batch.state import State
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.task import TaskParams
 from quad_gym.params.world import WorldParams
+from quad_gym.records.state import State
 from quad_gym.tasks.fields import Group
 from quad_gym.tasks.task import Task, TaskError, label
 from quad_gym.tasks.view import VIEW_FIELDS, View

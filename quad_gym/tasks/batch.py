@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.resets import checked_mask
-from quad_gym.batch.state import State
 from quad_gym.params import checks as check
 from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
+from quad_gym.records.state import State
 from quad_gym.tasks import answers
 from quad_gym.tasks.answers import Start
 from quad_gym.tasks.memory import ReadableBatch

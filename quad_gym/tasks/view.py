@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.batch.state import State
 from quad_gym.params.world import WorldParams
+from quad_gym.records.state import State
 from quad_gym.tasks.fields import Group, GroupField, field, quantity, shown
 from quad_gym.tasks.groups import BuiltinView, EstimateView, MeasuredView, ObservedView, TruthView
 from quad_gym.tasks.memory import ReadableBatch

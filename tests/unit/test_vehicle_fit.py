@@ -18,8 +18,16 @@ TRUE = LAB.replace(
 def found():
     flight = flown(RTK, 12.0, task="lemniscate", vehicle=TRUE)
     table = Recorded(flight, lost=0.0, jitter=0.0).table()
-    motors = {"time": flight["time"][:-1], "voltages": flight.about["voltages"][1:]}
-    return fit_vehicle(table, motors=motors, sensors=RTK)
+    times, voltages = flight["time"][:-1], flight.about["voltages"][1:]
+    empty = np.full(len(times), np.nan)
+    table = {name: np.append(column, empty) for name, column in table.items()}
+    for name in ("time", "received"):
+        table[name][-len(times) :] = times
+    order = np.argsort(table["received"], kind="stable")
+    motors = np.full((len(order), 4), np.nan)
+    motors[-len(times) :] = voltages
+    table = {name: column[order] for name, column in table.items()} | {"motors": motors[order]}
+    return fit_vehicle(table, sensors=RTK)
 
 
 @pytest.mark.parametrize(
@@ -66,3 +74,9 @@ def test_file_of_a_vehicle_with_a_mistake_is_refused(text, message, tmp_path):
 def test_motor_commands_must_have_a_row_for_each_time():
     with pytest.raises(ValueError, match="voltages"):
         fit_vehicle({}, motors={"time": [0.0, 1.0], "voltages": np.zeros((3, 4))}, sensors=RTK)
+
+
+def test_log_without_motor_voltages_is_refused():
+    table = {"time": [0.0, 0.1], "gyro": np.zeros((2, 3)), "accel": np.ones((2, 3))}
+    with pytest.raises(ValueError, match="must have the columns motor_0 to motor_3"):
+        fit_vehicle(table, sensors=RTK)
