@@ -150,6 +150,11 @@ def flights_behind(commanded: Any, keywords: Mapping[str, Any], threads: int | N
             raise ValueError(
                 f"{name} must be {' or '.join(map(str, expected))} behind Betaflight, got {found!r}"
             )
+    missing = {"body_rates", "last_action"} - {field.name for field in flights.table}
+    if missing:
+        raise ValueError(
+            f"observation must contain {min(missing)} behind Betaflight: the task replaces it"
+        )
     given = {name: value for name, value in keywords.items() if name != "action_params"}
     rate = flights.batch.clocks.imu_rate
     given |= {"action": "motor", "control_rate": rate}

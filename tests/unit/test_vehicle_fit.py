@@ -5,6 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import VehicleParams, vehicle_params
+from quad_gym.commands.calibrate import CalibrateArgs, fit_body
 from quad_gym.estimation import fit_vehicle
 from tests.logged_flights import RTK, Recorded, flown
 
@@ -15,7 +16,8 @@ TRUE = LAB.replace(
 
 
 @pytest.fixture(scope="module")
-def found():
+def table():
+    """A log with a row for each change of the motor voltages."""
     flight = flown(RTK, 12.0, task="lemniscate", vehicle=TRUE)
     table = Recorded(flight, lost=0.0, jitter=0.0).table()
     times, voltages = flight["time"][:-1], flight.about["voltages"][1:]
@@ -26,7 +28,12 @@ def found():
     order = np.argsort(table["received"], kind="stable")
     motors = np.full((len(order), 4), np.nan)
     motors[-len(times) :] = voltages
-    table = {name: column[order] for name, column in table.items()} | {"motors": motors[order]}
+    table = {name: column[order] for name, column in table.items()}
+    return table | {f"motor_{k}": motors[order, k] for k in range(4)}
+
+
+@pytest.fixture(scope="module")
+def found(table):
     return fit_vehicle(table, sensors=RTK)
 
 
@@ -55,6 +62,16 @@ def test_vehicle_that_was_found_flies_from_a_file(found, tmp_path):
     env = quad_gym.QuadEnv("circle", vehicle=str(file))
     env.reset(seed=0)
     assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+
+
+def test_command_writes_the_vehicle_of_a_log_in_a_file(table, found, tmp_path):
+    names = list(table)
+    rows = np.column_stack([table[name] for name in names])
+    lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows]
+    (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
+    args = CalibrateArgs(log=tmp_path / "flight.csv", vehicle=tmp_path / "body.toml")
+    assert "rotor lag 0.08" in fit_body(args, RTK, {})
+    assert vehicle_params(tmp_path / "body.toml") == found.vehicle
 
 
 @pytest.mark.parametrize(
