@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
-.PHONY: setup demo circle results test test-oldest test-clients test-slow soak golden lint benchmark docs reference kernels wheel clean
+.PHONY: setup demo circle results test test-oldest test-clients test-arm test-slow soak golden lint benchmark docs reference kernels wheel clean
 
 setup: $(VENV)/.developer
 
@@ -64,6 +64,9 @@ $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 test-clients:  ## each client of docs/libraries.md in an environment of its own; CLIENTS="torchrl minari": these
 	$(PYTHON) tests/clients/run.py $(CLIENTS)
 
+test-arm: setup  ## golden flights on AArch64, emulated: needs gcc-aarch64-linux-gnu and qemu-user-static
+	$(BIN)/python -m tests.golden.aarch64
+
 test-slow: $(VENV)/.sweeper  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
@@ -101,6 +104,7 @@ wheel: kernels  ## build sdist and a wheel with the libraries into dist, and che
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
 	$(BIN)/auditwheel show dist/*.whl | tee /dev/stderr | grep -q '"manylinux_2_'
+	$(BIN)/python -m tests.wheel dist/*.whl
 
 clean:
 	rm -rf quad_gym/kernels/libraries

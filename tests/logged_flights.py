@@ -80,7 +80,10 @@ class Recorded:
                 found.append((time[k] - late, arrival, values))
             return found
 
-        self.gnss = measured(("gnss_position", "gnss_baseline", "gnss_velocity"), 0.1)
+        self.gnss = measured(
+            ("gnss_position", "gnss_baseline", "gnss_velocity"),
+            suite.gnss.latency if suite.gnss else 0.0,
+        )
         self.aids = []
         for aid, params in suite.aids.items():
             found, latency = [], params.latency

@@ -4,15 +4,13 @@ The library has the kernels of `quad_gym.estimation` for one vehicle, with one f
 Records have another layout then, so a separate process writes the files.
 """
 
-import concurrent.futures
-import multiprocessing
 import os
 import pickle
 import struct
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from baselines.exporting.controller import Controller
 from baselines.exporting.filter_policy import policy_values
@@ -84,7 +82,7 @@ def export_filter(
     env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
     done = subprocess.run(
-        [sys.executable, "-c", f"from {__name__} import write; write()"],
+        [sys.executable, "-c", "from baselines.exporting.filter_process import write; write()"],
         input=pickle.dumps((suite, label, target, values)),
         stdout=subprocess.PIPE,
         env={**os.environ, **env, "PYTHONPATH": path},
@@ -98,44 +96,6 @@ def export_filter(
         files.append(folder / name)
         files[-1].write_bytes(content)
     return files
-
-
-def write() -> None:
-    """Write the files for a pickled suite on standard input, pickled, to standard output."""
-    sys.stdout.buffer.write(pickle.dumps(_contents(*pickle.load(sys.stdin.buffer))))
-
-
-def _contents(
-    suite: SensorSuite, label: str, target: str, policy: dict[str, Any]
-) -> dict[str, bytes]:
-    """Return the files by name; records must have one lane."""
-    from baselines.exporting.filter_sources import Sources
-    from quad_gym.kernels.compiling.foreign import (
-        Processor,
-        emitted,
-        is_cached,
-        loaded_size,
-        object_of,
-    )
-    from quad_gym.kernels.library import core_symbol, say
-
-    sources = Sources(suite, label, target, policy)
-    processor = Processor(*TARGETS[target].processor)
-    missing = [name for name in sources.functions if not is_cached(name, processor)]
-    if missing:
-        say(f"quad_gym: compiling {len(missing)} parts of the filter for {target} (once)")
-        context = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(min(4, os.cpu_count() or 1), context) as pool:
-            tasks = [pool.submit(object_of, name, processor) for name in missing]
-            for task in tasks:
-                task.result()
-    objects = {core_symbol(name): object_of(name, processor) for name in sources.functions}
-    for symbol, numbers in sources.constants.items():
-        text = "".join(f"\\{byte:02X}" for byte in numbers)
-        ir = f'@{symbol} = constant [{len(numbers)} x i8] c"{text}", align 64\n'
-        objects[symbol] = emitted(ir, processor)
-    flash = sum(map(loaded_size, objects.values()))
-    return {LIBRARY: archive(objects), **sources.texts(flash)}
 
 
 def archive(objects: dict[str, bytes]) -> bytes:

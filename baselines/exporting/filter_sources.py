@@ -1,6 +1,6 @@
 """The C sources of an exported filter: numbers of its records and suite, in the templates.
 
-Records must have one lane, see `filter_library`.
+Records must have one lane, see `filter_process`.
 """
 
 import math

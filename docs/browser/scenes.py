@@ -8,7 +8,7 @@ import numpy as np
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.flights import TASK_DEFAULTS
-from quad_gym.envs.spaces import ObservationField, layout_bounds, layout_of_suite
+from quad_gym.envs.spaces import ObservationField, layout_bounds, observation_layout
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.control import pd_gains
 from quad_gym.params.sensors import SensorSuite
@@ -105,6 +105,4 @@ def described(name: str, batch: FlightBatch) -> dict[str, Any]:
 
 def _table_of(suite: SensorSuite) -> tuple[ObservationField, ...]:
     """Return the table of the observations."""
-    return layout_of_suite(
-        "estimate", "relative", suite, include_std=False, privileged=False, drawn=None
-    )
+    return observation_layout(sensors=suite)

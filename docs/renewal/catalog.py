@@ -67,6 +67,19 @@ CATALOG = {
             texts=texts.console("foreign_policy"),
         ),
         Result(
+            name="betaflight",
+            commands=["docs/examples/betaflight.py --output OUT"],
+            flights=("Circle, standard", "Hover, standard"),
+            texts=texts.console("betaflight"),
+            figures={"0/betaflight.png": "docs/images/betaflight.png"},
+        ),
+        Result(
+            name="cortex_m7",
+            commands=["docs/examples/cortex_m7.py rtk consumer"],
+            flights=(),
+            texts=texts.console("cortex_m7"),
+        ),
+        Result(
             name="recipes",
             commands=[
                 "sweep --engine compiled --seeds 5 --output OUT --env-ids "
@@ -182,14 +195,16 @@ CATALOG = {
             texts=texts.study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),
             figures=texts.film_and_figures("outage_dash", "pace"),
         ),
-        Result(
-            name="memory",
-            commands=[
-                f"study {task} --output OUT --first-episode 100000 --arms {arms}"
-                for task, arms in texts.MEMORY.items()
-            ],
-            flights=("LookAround", "StaleRace", "OutageDash"),
-            texts=texts.memory,
+        *(
+            Result(
+                name=f"memory_{task}",
+                commands=[f"study {task} --output OUT --first-episode 100000 {options}"],
+                flights=(golden,),
+                texts=texts.memory(f"memory_{task}"),
+            )
+            for (task, options), golden in zip(
+                texts.MEMORY.items(), ("LookAround", "StaleRace"), strict=True
+            )
         ),
         Result(
             name="sb3_defaults",

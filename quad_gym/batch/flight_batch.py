@@ -42,7 +42,8 @@ from quad_gym.records import (
 
 _GROUP_MEMORY = 1 << 23
 """Memory of the blocks that a thread flies side by side [bytes], see `kernels/gathering.py`: less
-leaves gathered blocks half empty."""
+leaves gathered blocks half empty, more leaves the caches. A batch up to twice as large is one
+group."""
 _NO_BOUNDS = np.zeros(0)
 _WORTH_NO_COPY = 1 << 16  #: size of observations [bytes] above which a step allocates its own
 
@@ -107,7 +108,9 @@ class FlightBatch(FlightMemory):
         s, self._group = self._settings[0], 1  # blocks that a thread flies side by side
         own = s["randomized"] or s["faults"] or s["features_drawn"] or s["own_estimator"]
         if s["run_filter"] and not own and s["sensor_ticks"].max() > 1:
-            self._group = max(1, _GROUP_MEMORY // self._room.dtype.itemsize)
+            blocks, size = len(self._blocks), self._room.dtype.itemsize
+            whole = blocks * size <= 2 * _GROUP_MEMORY
+            self._group = blocks if whole else max(1, _GROUP_MEMORY // size)
         self._own = [self._world.copy() for _ in range(self.threads)]
         self._believed = [self._model.copy() for _ in range(self.threads)]
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]

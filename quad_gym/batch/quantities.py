@@ -41,8 +41,8 @@ class Quantity(NamedTuple):
     frame: str  #: I: inertial (east, north, up), B: body, C: image; "-": none
     meaning: str
     kind: type = float
-    filtered: bool = False  #: true if only flights have it in which a filter, and so sensors, run
-    builtin: bool = False  #: true if only the built-in filter has it: NaN with a user's estimator
+    filtered: bool = False  #: True if only flights have it in which a filter, and so sensors, run
+    builtin: bool = False  #: True if only the built-in filter has it: NaN with a user's estimator
 
 
 def read(batch: FlightMemory, name: str, flights: Flights) -> NDArray[Any]:

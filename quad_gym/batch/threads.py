@@ -105,7 +105,8 @@ def board_of(blocks: int, parts: int, group: int = 1) -> NDArray[np.int64]:
     ranges[:, board.FIRST], ranges[:, board.LAST] = cuts[:-1], cuts[1:]
     ranges[:, board.NEXT] = cuts[1:]
     words[board.FINISHED] = blocks
-    chunk = max(1 + blocks // (CHUNKS_OF_RANGE * parts), min(group, blocks // (4 * parts)))
+    # gathering lanes from half of a range makes up for the wait of a thread for the other's half
+    chunk = max(1 + blocks // (CHUNKS_OF_RANGE * parts), min(group, blocks // (2 * parts)))
     words[board.CHUNK] = chunk if parts > 1 else blocks
     return words
 

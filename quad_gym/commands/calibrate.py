@@ -3,6 +3,7 @@
     quad-gym calibrate flight.csv --sensors consumer
     quad-gym calibrate flight.ulg --sensors consumer --output results/mine
     quad-gym train --sensors results/mine/suite.toml
+    quad-gym calibrate flight.csv --vehicle mine-vehicle.toml
 
 The first part of the log is for the search, the rest for validation. The result is a suite
 with the rates, delays and noise of this vehicle, for `replay`, `train` and all other commands.
@@ -18,6 +19,7 @@ from quad_gym.commands.options import LogFile, SuiteName, refuse_overwriting, us
 if TYPE_CHECKING:
     from quad_gym.estimation.calibration import Calibration
     from quad_gym.estimation.validation import Validation
+    from quad_gym.params.sensors import SensorSuite
 
 SUITE, RESULT = "suite.toml", "calibration.json"
 
@@ -39,6 +41,9 @@ class CalibrateArgs:
     """use the direction of the first GNSS velocity as heading"""
     body: Literal["flu", "frd"] = "flu"
     """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
+    vehicle: Path | None = None
+    """file for a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the
+    log"""
     output: Path | None = None
     """folder for the results, created if it is missing; if not given, results/calibrate/LOG"""
     overwrite: bool = False
@@ -46,11 +51,8 @@ class CalibrateArgs:
 
 
 def number_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
-    """Return a row of texts for each delay and number."""
-    rows: list[tuple[str, ...]] = [
-        (f"delay of {name}", "0", f"{1e3 * delay:.0f}", "", "ms")
-        for name, delay in calibration.delays.items()
-    ]
+    """Return a row of texts for each number."""
+    rows: list[tuple[str, ...]] = []
     for found in calibration.numbers:
         interval = f"[{found.low:.3g}, {found.high:.3g}]" if found.determined else "not determined"
         row = (found.number.name, f"{found.prior:.3g}", f"{found.value:.3g}", interval)
@@ -153,6 +155,26 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     return report.write()
 
 
+def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -> str:
+    """Write the file of the vehicle; return a sentence about it."""
+    from quad_gym.estimation import fit_vehicle, read_log
+
+    assert args.vehicle is not None
+    log = read_log(args.log, body=args.body)
+    if log.motors is None:
+        return (
+            f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
+        )
+    with usage_errors():
+        fitted = fit_vehicle(log, sensors=suite, start=start)
+        file = fitted.vehicle.save(args.vehicle)
+    lag, hover = fitted.motor_time_constant, fitted.hover_voltage
+    return (
+        f"Wrote {file}: rotor lag {lag.value:.3f} s [{lag.low:.3f}, {lag.high:.3f}], hover voltage "
+        f"{hover.value:.2f} V [{hover.low:.2f}, {hover.high:.2f}]."
+    )
+
+
 def main(args: CalibrateArgs) -> None:
     """Search, validate and write."""
     from quad_gym.analysis.plots import require_matplotlib
@@ -165,6 +187,10 @@ def main(args: CalibrateArgs) -> None:
             raise ValueError("--heading must not be given with --course")
         require_matplotlib()
         refuse_overwriting(folder / RESULT, args.overwrite)
+        if args.vehicle is not None:
+            if args.vehicle.suffix != ".toml":
+                raise ValueError(f"--vehicle must end with .toml, got {args.vehicle}")
+            refuse_overwriting(args.vehicle, args.overwrite)
         require_writable("--output", folder)
         start: dict[str, Any] = {"course": True} if args.course else {}
         if args.heading is not None:
@@ -191,4 +217,6 @@ def main(args: CalibrateArgs) -> None:
     }
     files.append(write_json(folder / RESULT, contents))
     print(f"\nWrote {len(files)} files to {folder}; open {folder / 'report.html'}.")
+    if args.vehicle is not None:
+        print(fit_body(args, found.suite, start))
     print(f"Next: quad-gym replay {args.log} --sensors {folder / SUITE}")

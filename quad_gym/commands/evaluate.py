@@ -45,6 +45,9 @@ class EvaluateArgs:
     trained on raw measurements)"""
     sensors: options.OwnSuite = None
     estimator: options.EstimatorName = None
+    rate_loop: Literal["built-in", "betaflight"] = "built-in"
+    """loop that tracks the body rates of action "ctbr": built-in, or Betaflight's firmware, which
+    is built from its source package when it is first needed (Linux, gcc, make)"""
     env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
@@ -85,8 +88,7 @@ def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Pa
     policies = args.policy or default_policies(args)
     cases: dict[Pairing, tuple[Policy, Any]] = {}
     for observation, name in itertools.product(args.observation, policies):
-        env = make_flights(args, observation, args.episodes, name)
-        cases[name, observation] = (load_policy(name, env), env)
+        cases[name, observation] = policy_and_flights(args, observation, args.episodes, name)
     require_writable("--output", folder)
     if args.video != "none":
         checked_video_path(folder / f"video.{args.video}")
@@ -104,8 +106,28 @@ def default_policies(args: EvaluateArgs) -> tuple[str, ...]:
     return ("pd", "pretrained")
 
 
+def policy_and_flights(
+    args: EvaluateArgs, observation: str, count: int, policy: str
+) -> tuple[Policy, Any]:
+    """Load a policy, behind the rate loop, and make the environment in which it flies."""
+    env = make_flights(args, observation, count, policy)
+    loaded = load_policy(policy, env)
+    if args.rate_loop == "built-in":
+        return loaded, env
+    from baselines.betaflight import BehindBetaflight, flights_behind
+
+    flown = flights_behind(env, keywords_of_flights(args, observation, policy), args.threads)
+    return BehindBetaflight(loaded, env, flown), flown
+
+
 def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) -> Any:
     """Make the environment with an observation, for a policy."""
+    keywords = keywords_of_flights(args, observation, policy)
+    return gymnasium.make_vec(args.env_id, num_envs=count, threads=args.threads, **keywords)
+
+
+def keywords_of_flights(args: EvaluateArgs, observation: str, policy: str) -> dict[str, Any]:
+    """Keywords of the environment with an observation, for a policy."""
     given = options.leave(args.env, "observation", "sensors", "threads")
     keywords = {
         **keywords_of_policy(policy, args.env_id),
@@ -113,9 +135,7 @@ def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) 
         "observation": observation,
         "sensors": options.sensors_of(args.env_id, args.sensors),
     }
-    return gymnasium.make_vec(
-        args.env_id, num_envs=count, threads=args.threads, **with_effect(keywords)
-    )
+    return with_effect(keywords)
 
 
 def write_videos(
@@ -124,9 +144,9 @@ def write_videos(
     """Write a video of the first episode of each case."""
     files = []
     for name, observation in tqdm(cases, desc="filming", unit=" videos"):
-        env = make_flights(args, observation, 1, name)
+        policy, env = policy_and_flights(args, observation, 1, name)
         about = {"env_id": args.env_id, "policy": name, "observation": observation}
-        flight = flight_of(load_policy(name, env), env, seed=args.seed, about=about)
+        flight = flight_of(policy, env, seed=args.seed, about=about)
         stem = short_name(name).replace("/", "_").replace(":", "_")
         files.append(folder / f"video_{stem}_{observation}.{args.video}")
         save_video(flight, files[-1])
@@ -135,7 +155,7 @@ def write_videos(
 
 def main(args: EvaluateArgs) -> None:
     """Evaluate."""
-    with options.usage_errors():
+    with options.usage_errors((ValueError, OSError, ImportError, RuntimeError)):
         args = options.with_full_id(args)
         cases, folder = configure(args)
     began = time.perf_counter()

@@ -43,7 +43,7 @@ def require_own_task(given: Collection[str], name: str, kind: str, *, own_reward
 
 def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
     """Refuse keywords that were asked for and have no effect with the others."""
-    observation, action = keywords["observation"], keywords["action"]
+    observation = keywords["observation"]
     if "layout" in asked and observation == "measurements":
         raise ValueError(
             'layout must not be given with observation="measurements", which has its own layout, '
@@ -55,11 +55,6 @@ def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
                 f'{name} must not be given with observation="{observation}", where no filter runs '
                 f"unless include_std or innovations ask for it, got {keywords[name]!r}"
             )
-    if keywords["action_params"] is not None and action in ("motor", "wrench"):
-        raise ValueError(
-            f'action_params must not be given with action="{action}", whose scales follow from '
-            "the vehicle"
-        )
 
 
 def runs_no_sensor(keywords: Mapping[str, Any]) -> bool:

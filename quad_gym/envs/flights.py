@@ -19,7 +19,7 @@ from quad_gym.envs.spaces import (
     OBSERVATIONS,
     ObservationField,
     layout_bounds,
-    layout_of_suite,
+    observation_layout,
     observation_space,
     policy_size,
 )
@@ -149,18 +149,18 @@ class Flights:
         flown["world"], own_task = place, keywords.get("task")
         if place.ground is None and own_task is None and "start_position_I" not in drawn.names:
             check_pad(self.task)  # a user-defined task may set where vehicles start
-        privileged = flown["privileged"]
-        self.table: tuple[ObservationField, ...] = layout_of_suite(
+        privileged, raw = flown["privileged"], self.observation == "measurements"
+        shown = drawn.names if drawn.names or place != WorldParams() else None
+        self.table: tuple[ObservationField, ...] = observation_layout(
             self.observation,
-            self.layout,
-            suite,
+            None if raw else self.layout,
+            sensors=suite,
             include_std=flown["include_std"],
             privileged=privileged,
-            drawn=drawn.names if drawn.names or place != WorldParams() else None,
+            drawn=shown if privileged else None,
         )
         self.control_rate = check.positive("control_rate", flown["control_rate"], least=SLOWEST)
         check_limit(self.task, self.control_rate, "control_rate")
-        raw = self.observation == "measurements"
         make = partial(
             FlightBatch,
             task=self.task,

@@ -5,15 +5,17 @@ order.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import AID_PARAMS, SensorSuite
-from quad_gym.records import AID_FREEDOMS, COLUMNS, MAX_OBSERVATION, Aid, Control, Layout, Source
+from quad_gym.params.resolved import resolving
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import sensor_suite
+from quad_gym.records import AID_FREEDOMS, COLUMNS, MAX_OBSERVATION, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
 """Values of the keyword `observation`."""
@@ -86,9 +88,7 @@ _LAST_ACTION: Part = ("last_action", 4, "-", "-", 1.0)
 _FLAG = 0.0  #: bound that marks a flag, in [0, 1]
 
 
-def _sensor_fields(
-    feature_count: int, gnss_velocity: bool, aids: Sequence[Aid]
-) -> tuple[Part, ...]:
+def _sensor_fields(suite: SensorSuite) -> tuple[Part, ...]:
     fields = [
         ("gyro", 3, "rad/s", "B", 200.0),
         ("accel", 3, "m/s^2", "B", 1000.0),
@@ -99,24 +99,28 @@ def _sensor_fields(
         ("gnss_baseline", 3, "-", "I", 1.0),
         ("gnss_baseline_valid", 1, "0 or 1", "-", _FLAG),
     ]
-    if gnss_velocity:
+    if suite.gnss is not None and suite.gnss.velocity_sigma is not None:
         fields.append(("gnss_velocity", 3, "m/s", "I", 200.0))
         fields.append(("gnss_velocity_valid", 1, "0 or 1", "-", _FLAG))
-    for k in range(1, feature_count + 1):
+    for k in range(1, _feature_count(suite) + 1):
         fields.append((f"feature_{k}", 2, "half images", "C", 2.0))
         fields.append((f"feature_{k}_valid", 1, "0 or 1", "-", _FLAG))
-    for aid in aids:
+    for aid, params in suite.aids.items():
         name = aid.name.lower()
-        fields.append((name, AID_FREEDOMS[aid], *AID_PARAMS[name].raw))
+        fields.append((name, AID_FREEDOMS[aid], *params.raw))
         fields.append((f"{name}_valid", 1, "0 or 1", "-", _FLAG))
     return (*fields, *_REFERENCE)
 
 
-def _world_fields(drawn: Sequence[str], feature_count: int) -> tuple[Part, ...]:
+def _feature_count(suite: SensorSuite) -> int:
+    return 0 if suite.camera is None else len(suite.camera.features_I)
+
+
+def _world_fields(drawn: Sequence[str], suite: SensorSuite) -> tuple[Part, ...]:
     for name in drawn:
         check.choice("drawn", name, tuple(COLUMNS))
     sizes = {name: columns.stop - columns.start for name, columns in COLUMNS.items()}
-    sizes["feature_offsets_I"] = 3 * feature_count
+    sizes["feature_offsets_I"] = 3 * _feature_count(suite)
     drawn_sizes = ((name, size) for name, size in sizes.items() if name in drawn)
     parts = ((f"drawn_{name}", size, "of its spread", "-", 10.0) for name, size in drawn_sizes)
     return (("wind", 3, "m/s", "B", 100.0), *parts)
@@ -128,9 +132,7 @@ def observation_layout(
     *,
     include_std: bool = False,
     privileged: bool = False,
-    feature_count: int | None = None,
-    gnss_velocity: bool | None = None,
-    aids: Sequence[Aid] | None = None,
+    sensors: SensorSuite | str = "standard",
     drawn: Sequence[str] | None = None,
 ) -> tuple[ObservationField, ...]:
     """Return the table of an observation: name, slice, unit, frame and bounds of each part.
@@ -141,11 +143,7 @@ def observation_layout(
         include_std: True: append the filter's 15 standard deviations.
         privileged: True: append the truth. Its slices continue the numbering, although the
             environment returns this part under a separate key.
-        feature_count: Number of the camera's features, for "measurements" and for drawn features in
-            the truth; None: two.
-        gnss_velocity: True: GNSS measures velocity, for "measurements"; None: it does not.
-        aids: Barometer and magnetometer, as far as the suite has them, for "measurements"; None:
-            neither.
+        sensors: The environment's `sensors`, which "measurements" and drawn features depend on.
         drawn: Names of the parameters drawn in every episode, see `quad_gym.Randomization`: the
             truth ends with the wind and the draws. None: it does not, as in a calm world without
             draws.
@@ -154,22 +152,16 @@ def observation_layout(
         The table.
 
     Raises:
-        ValueError: If `observation`, `layout` or a name in `drawn` is unknown, or an argument has
-            no effect.
+        ValueError: If a name is unknown, or `layout` or `drawn` has no effect.
     """
     check.choice("observation", observation, tuple(OBSERVATIONS))
     check.choice("layout", "relative" if layout is None else layout, tuple(LAYOUTS))
+    suite = resolving(SensorSuite, sensor_suite)("sensors", sensors)
+    raw = observation == "measurements"
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
-    raw, features = observation == "measurements", 2 if feature_count is None else feature_count
     if raw:
-        parts = _sensor_fields(features, bool(gnss_velocity), aids or ())
-    for name, value, counts in (
-        ("layout", layout, not raw),
-        ("feature_count", feature_count, raw or (privileged and drawn is not None)),
-        ("gnss_velocity", gnss_velocity, raw),
-        ("aids", aids, raw),
-        ("drawn", drawn, privileged),
-    ):
+        parts = _sensor_fields(suite)
+    for name, value, counts in (("layout", layout, not raw), ("drawn", drawn, privileged)):
         if value is not None and not counts:
             raise ValueError(
                 f"{name} must not be given with observation={observation!r} and "
@@ -184,37 +176,13 @@ def observation_layout(
             for name, unit, frame in zip(STATE_NAMES, units, frames, strict=True)
         )
     if privileged:
-        parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn, features))
+        parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn, suite))
     table, first = [], 0
     for name, size, unit, frame, bound in parts:
         low, high = (0.0, 1.0) if bound == _FLAG else (-bound, bound)
         table.append(ObservationField(name, slice(first, first + size), unit, frame, low, high))
         first += size
     return tuple(table)
-
-
-def layout_of_suite(
-    observation: str,
-    layout: str,
-    suite: SensorSuite,
-    *,
-    include_std: bool,
-    privileged: bool,
-    drawn: Sequence[str] | None,
-) -> tuple[ObservationField, ...]:
-    """Return the `observation_layout` of an environment with a sensor suite."""
-    given: dict[str, Any] = {}
-    if observation == "measurements":
-        gnss = suite.gnss
-        given["gnss_velocity"] = gnss is not None and gnss.velocity_sigma is not None
-        given["aids"] = tuple(suite.aids)
-    else:
-        given["layout"] = layout
-    if privileged and drawn is not None:
-        given["drawn"] = drawn
-    if "aids" in given or "drawn" in given:
-        given["feature_count"] = 0 if suite.camera is None else len(suite.camera.features_I)
-    return observation_layout(observation, include_std=include_std, privileged=privileged, **given)
 
 
 def layout_bounds(

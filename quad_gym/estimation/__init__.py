@@ -1,6 +1,6 @@
 """State estimation for one vehicle: Kalman filters, replay of logs, and Wahba's problem."""
 
-from quad_gym.estimation.calibration import Calibrated, Calibration, calibrate
+from quad_gym.estimation.calibration import Calibration, calibrate
 from quad_gym.estimation.estimate import Innovations
 from quad_gym.estimation.filters import (
     LONGEST_STEP,
@@ -11,6 +11,7 @@ from quad_gym.estimation.first_fix import FARTHEST_FIX, FirstFix
 from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Stream
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Measured, Replay, Smoothed
+from quad_gym.estimation.search import Calibrated
 from quad_gym.estimation.smoothing import smooth
 from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.vehicle_fit import FittedNumber, FittedVehicle, fit_vehicle

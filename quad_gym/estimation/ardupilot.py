@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats, Log, Stream
-from quad_gym.frames import geodetic_to_ecef
+from quad_gym.estimation.logs import Floats, Log, Stream, ecef_of, reading
 
 GNSS_DELAY = 0.2  #: delay of receivers if the log does not contain it [s]
 
@@ -43,67 +42,50 @@ def read_bin(path: Path | str) -> Log:
         ValueError: If the file is no such log, or has no IMU samples.
         OSError: If there is no such file.
     """
-    try:
-        from pymavlink.DFReader import DFReader_binary
-    except ImportError:
-        raise ImportError(
-            "logs of ArduPilot need pymavlink: install it with pip install 'quad-gym[ardupilot]'"
-        ) from None
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"there is no file {file}")
     found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _KINDS}
-    try:
+    with reading(path, "a log of ArduPilot", "logs of ArduPilot", "pymavlink", "ardupilot") as file:
+        from pymavlink.DFReader import DFReader_binary
+
         reader = DFReader_binary(str(file))
         while (message := reader.recv_match(type=list(_KINDS))) is not None:
             if getattr(message, "I", 0) == 0:
                 found[message.get_type()].append(message.to_dict())
-    except Exception as error:  # pymavlink raises what it meets in a damaged file
-        raise ValueError(f"{file.name} must be a log of ArduPilot: {error}") from None
     if not found["IMU"]:
         raise ValueError(f"{file.name} must be a log of ArduPilot with messages IMU, got none")
     parameters = {row["Name"]: row["Value"] for row in found["PARM"]}
     delay = parameters.get("GPS_DELAY_MS") or parameters.get("GPS1_DELAY_MS") or 0.0
+    axes = {"gyro": _axes("Gyr"), "accel": _axes("Acc")}
+    imu = _stream(found["IMU"], axes, _TO_FLU)
+    assert imu is not None
     return Log(
-        imu=_imu(found["IMU"]),
+        imu=imu.increasing(),
         gnss=_gnss(found["GPS"], found["GPA"], 1e-3 * delay or GNSS_DELAY),
-        barometer=_stream(found["BARO"], "barometer", ("Alt",), 1.0),
-        magnetometer=_stream(
-            found["MAG"], "magnetometer", ("MagX", "MagY", "MagZ"), _MILLIGAUSS * _TO_FLU
-        ),
+        barometer=_stream(found["BARO"], {"barometer": ("Alt",)}),
+        magnetometer=_stream(found["MAG"], {"magnetometer": _axes("Mag")}, _MILLIGAUSS * _TO_FLU),
         barometer_from_start=True,
         about={"file": file.name},
     )
+
+
+def _axes(name: str) -> tuple[str, ...]:
+    return tuple(f"{name}{axis}" for axis in "XYZ")
 
 
 def _column(rows: list[dict[str, Any]], name: str) -> Floats:
     return np.array([row.get(name, np.nan) for row in rows], np.float64)
 
 
-def _times(rows: list[dict[str, Any]]) -> Floats:
-    return 1e-6 * _column(rows, "TimeUS")
-
-
 def _stream(
-    rows: list[dict[str, Any]], name: str, fields: tuple[str, ...], factor: float | Floats
+    rows: list[dict[str, Any]], fields: dict[str, tuple[str, ...]], factor: float | Floats = 1.0
 ) -> Stream | None:
-    """Return measurements of one sensor."""
+    """Return measurements of one sensor: fields of its messages by name."""
     if not rows:
         return None
-    values = np.column_stack([_column(rows, field) for field in fields]) * factor
-    time = _times(rows)
-    return Stream(time, time, {name: values if len(fields) > 1 else values[:, 0]})
-
-
-def _imu(rows: list[dict[str, Any]]) -> Stream:
-    """Return IMU samples, without those with a repeated time."""
-    time = _times(rows)
-    good = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0.0
-    values = {
-        name: (np.column_stack([_column(rows, f"{word}{axis}") for axis in "XYZ"]) * _TO_FLU)[good]
-        for name, word in (("gyro", "Gyr"), ("accel", "Acc"))
-    }
-    return Stream(time[good], time[good], values)
+    time, values = 1e-6 * _column(rows, "TimeUS"), {}
+    for name, columns in fields.items():
+        table = np.column_stack([_column(rows, column) for column in columns]) * factor
+        values[name] = table if len(columns) > 1 else table[:, 0]
+    return Stream(time, time, values)
 
 
 def _gnss(
@@ -113,15 +95,14 @@ def _gnss(
     rows = [row for row in rows if row["Status"] >= _LEAST_FIX]
     if not rows:
         return None
-    received = _times(rows)
+    received = 1e-6 * _column(rows, "TimeUS")
     lat, lon, height, speed, down = (_column(rows, n) for n in ("Lat", "Lng", "Alt", "Spd", "VZ"))
     course = np.radians(_column(rows, "GCrs"))
-    places = zip(np.radians(lat), np.radians(lon), height, strict=True)
     reported = {row["TimeUS"]: row for row in accuracy}
     sigmas = [reported.get(row["TimeUS"], {}) for row in rows]
     h, v, s = (_column(sigmas, name) for name in ("HAcc", "VAcc", "SAcc"))
     values = {
-        "position_G": np.array([geodetic_to_ecef(*place) for place in places]),
+        "position_G": ecef_of(lat, lon, height),
         "velocity_I": np.column_stack([speed * np.sin(course), speed * np.cos(course), -down]),
         "position_sigma_I": np.column_stack([h, h, v]),
         "velocity_sigma": s,

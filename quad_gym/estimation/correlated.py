@@ -49,14 +49,7 @@ def update_with_correlated(
     measurement: Measurement,
     covariance: Floats,
 ) -> None:
-    """Update with a single position whose errors have a covariance.
-
-    Args:
-        engine: The filter's memory.
-        condition: Updates the filter with a measurement.
-        measurement: The position.
-        covariance: (3, 3) covariance of its errors in I [m^2].
-    """
+    """Update with a single position whose errors have a (3, 3) covariance in I [m^2]."""
     T, sigmas = in_principal_axes(covariance)
     expected = _innovation_sigmas(engine, covariance)
     R_IG = engine.params["R_IG"].copy()

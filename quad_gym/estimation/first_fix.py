@@ -75,15 +75,7 @@ class FirstFix:
     """time stamp of the start [s]; all time stamps share its zero"""
 
     def refuse(self, what: str, *names: str) -> None:
-        """Refuse arguments that have no effect with the others.
-
-        Args:
-            what: Reason, as the end of the message.
-            names: Names of the arguments.
-
-        Raises:
-            ValueError: If one is given.
-        """
+        """Refuse arguments by name that have no effect with others, with the reason `what`."""
         for name in names:
             value = getattr(self, name)
             if not (value is None or (isinstance(value, bool | np.bool_) and not value)):

@@ -24,12 +24,9 @@ _EVERY = 8  #: events between two copies of the state: a copy costs about as muc
 @dataclass(slots=True)
 class _Event:
     given: Sample | Measurement
-    time: float
-    """time after the event"""
-    start: float
-    """time at which the event begins"""
-    before: Any = None
-    """copy of the state before the event, or None"""
+    time: float  #: time after the event
+    start: float  #: time at which the event begins
+    before: Any = None  #: copy of the state before the event, or None
 
 
 class InputHistory:
@@ -79,12 +76,7 @@ class InputHistory:
         self._forget()
 
     def insert(self, measurement: Measurement, time: float) -> None:
-        """Insert a delayed measurement, and filter again all inputs after it.
-
-        Args:
-            measurement: The measurement.
-            time: Its time stamp, at least `oldest` and less than the present [s].
-        """
+        """Insert a measurement at an earlier time, and filter again all inputs after it."""
         events = self._events
         i = len(events) - 1  # the first event that ends later
         while i and events[i - 1].time > time + SAME_TIME:

@@ -28,8 +28,9 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.engine import Floats
+from quad_gym.estimation.first_motion import SPAN
 from quad_gym.estimation.history import SAME_TIME
-from quad_gym.estimation.logs import Log, Stream
+from quad_gym.estimation.logs import Log
 from quad_gym.estimation.player import Player, name_of
 from quad_gym.estimation.sets import run_sets
 from quad_gym.packing.aids import blocks_of
@@ -42,8 +43,8 @@ SETTLING = 5.0  #: time after the start whose measurements do not count [s]
 SPACING = 0.5
 """Time between the measurements of a sensor in the second, thinned log [s]: errors that are
 correlated over shorter times count less in it, and noise of the IMU more."""
-_REACH = 3.0  #: longest delay [s]
-_FEWEST = 100
+PART = 0.1  #: length of the parts of a log whose losses are told apart [s]
+_FEWEST = 50
 _TOGETHER = 64  #: suites, as their innovations take memory
 _WINDOW = 0.5  #: [s]
 _AT_REST = 0.6
@@ -61,29 +62,25 @@ def in_flight(log: Log, times: Floats) -> Any:
 
 
 def thinned(log: Log) -> Log:
-    """Return a log in which the measurements of a sensor are at least `SPACING` apart."""
+    """Return a log in which the measurements of a sensor are at least `SPACING` apart.
+
+    It has all measurements of the first second, which show how the vehicle moves at the start.
+    """
     changes: dict[str, Any] = {}
     for name, stream in log.streams.items():
         if name == "imu":
             continue
-        kept, last = [], -math.inf
+        kept, last, first = [], -math.inf, stream.time.min()
         for k in np.argsort(stream.time, kind="stable"):
-            if stream.time[k] >= last + SPACING - SAME_TIME:
+            if stream.time[k] < first + SPAN or stream.time[k] >= last + SPACING - SAME_TIME:
                 kept.append(k)
                 last = stream.time[k]
-        rows = np.sort(kept)
-        values = {key: value[rows] for key, value in stream.values.items()}
-        changes[name] = Stream(stream.time[rows], stream.received[rows], values)
+        changes[name] = stream.rows(np.sort(kept))
     return replace(log, **changes)
 
 
 def tails(nis: Floats, d: int) -> float:
-    """Return the degrees of freedom of Student's t that describe normalized innovations best.
-
-    Args:
-        nis: (n,) normalized innovations squared, up to a common factor.
-        d: Their degrees of freedom.
-    """
+    """Return the degrees of freedom of Student's t that describe NIS (n,) of d numbers best."""
     from scipy.special import gammaln
 
     scales = np.exp(np.linspace(-3.0, 3.0, 61))[:, np.newaxis] * float(np.median(nis)) / d
@@ -98,45 +95,17 @@ def tails(nis: Floats, d: int) -> float:
 class Likelihood:
     """Losses of the innovations of a log, and of the same log with fewer measurements.
 
+    Measurements are processed in the order of their time stamps. They belong to parts of the log by
+    their time of arrival, which neither delays nor numbers of the suite change.
+
     Args:
         log: The log.
-        suite: Its suite.
+        suite: Its suite, whose delays and mounting correct the log.
         start: Keywords of `initialize`.
         nu: Degrees of freedom of Student's t by sensor; 5 for others.
-        fewer: False: only the losses of all measurements, which determine delays.
         margin: Time before the end of the log whose measurements do not count [s], so that losses
-            of logs with different delays contain the same measurements.
+            with different delays contain the same measurements.
     """
-
-    def __init__(
-        self,
-        log: Log,
-        suite: SensorSuite,
-        start: dict[str, Any],
-        nu: Mapping[str, float] | None = None,
-        *,
-        fewer: bool = True,
-        margin: float = 0.0,
-    ) -> None:
-        logs = (log, thinned(log)) if fewer else (log,)
-        self._parts = [_Part(each, suite, start, nu or {}, margin) for each in logs]
-        counts = [int(part.counts.sum()) for part in self._parts]
-        if counts[0] < _FEWEST:
-            raise ValueError(
-                f"a calibration must have at least {_FEWEST} measurements in flight, from "
-                f"{SETTLING:g} s after the start on, got {counts[0]}: use a longer part of the log "
-                "(share=, --share)"
-            )
-        self._parts[0].weight = counts[-1] / counts[0]
-        self.times = np.concatenate([part.times[part.counts] for part in self._parts])
-
-    def losses(self, suites: Sequence[SensorSuite]) -> Floats:
-        """Return the loss of each update that counts, (updates, suites)."""
-        return np.concatenate([part.losses(suites) for part in self._parts])
-
-
-class _Part:
-    """Losses of the innovations of one log."""
 
     def __init__(
         self,
@@ -146,8 +115,41 @@ class _Part:
         nu: Mapping[str, float],
         margin: float,
     ) -> None:
+        first, last = (log.imu if log.gnss is None else log.gnss).received[0], log.imu.time[-1]
+        span = (first + SETTLING, last - margin)
+        right = log.corrected(suite)
+        self._logs = [_LogLosses(each, suite, start, nu, span) for each in (right, thinned(right))]
+        counts = [int(each.counts.sum()) for each in self._logs]
+        if counts[0] < _FEWEST:
+            raise ValueError(
+                f"a calibration must have at least {_FEWEST} measurements in flight, from "
+                f"{SETTLING:g} s after the start on, got {counts[0]}: use a longer part of the log "
+                "(share=, --share)"
+            )
+        self._logs[0].weight = counts[1] / counts[0]
+
+    def losses(self, suites: Sequence[SensorSuite]) -> Floats:
+        """Return the losses of parts in time, (parts, suites), of the log and the thinned one.
+
+        The suites have the same delays and mounting as the suite of the likelihood.
+        """
+        whole, thin = (each.losses(suites) for each in self._logs)
+        return whole + thin
+
+
+class _LogLosses:
+    """Losses of the innovations of one log, of measurements that arrive within a span of time."""
+
+    def __init__(
+        self,
+        log: Log,
+        suite: SensorSuite,
+        start: dict[str, Any],
+        nu: Mapping[str, float],
+        span: tuple[float, float],
+    ) -> None:
         self.suite, self.nu, self.weight = suite, nu, 1.0
-        player = Player(log, suite, "ukf", start, False, _REACH)
+        player = Player(log, suite, "ukf", start, False, None)
         player.write_tape()
         if not player.filter.heading_known:
             raise ValueError(
@@ -155,16 +157,16 @@ class _Part:
                 "(--heading, --course), or use a suite and log with a magnetometer or baseline"
             )
         self._player, self._tape = player, player.writer.tape()
-        self.times = np.array(player.stamps).reshape(-1, 2)[:, 1]  # of arrival: without delays
-        first = (log.imu if log.gnss is None else log.gnss).received[0]
-        self.counts = in_flight(log, self.times) & (self.times > first + SETTLING)
-        self.counts &= self.times <= log.imu.time[-1] - margin
+        received = np.array(player.stamps).reshape(-1, 2)[:, 1]
+        self.counts = in_flight(log, received) & (received > span[0]) & (received <= span[1])
+        self._parts = ((received[self.counts] - span[0]) // PART).astype(int)
+        self._count = max(int((span[1] - span[0]) // PART) + 1, 1)
         self._valid = self._tape.valid
 
     def losses(self, suites: Sequence[SensorSuite]) -> Floats:
-        """Return the loss of each update that counts, (updates, suites)."""
-        parts = [suites[k : k + _TOGETHER] for k in range(0, len(suites), _TOGETHER)]
-        return np.concatenate([self._losses(part) for part in parts], axis=1)
+        """Return the losses of the parts, (parts, suites)."""
+        some = [suites[k : k + _TOGETHER] for k in range(0, len(suites), _TOGETHER)]
+        return np.concatenate([self._losses(few) for few in some], axis=1)
 
     def _losses(self, suites: Sequence[SensorSuite]) -> Floats:
         found = run_sets(self._player, self._tape, suites).innovations
@@ -175,4 +177,7 @@ class _Part:
             nu = self.nu.get(name_of(block), NU[0])
             losses[have] += 0.5 * (nu + d) * np.log1p(nis / (nu - 2.0)) + np.log(sigma).sum(axis=1)
         # a filter that failed is as unlikely as one that is wrong by far
-        return self.weight * np.nan_to_num(losses[self.counts], nan=1e3, posinf=1e3)
+        counted = np.nan_to_num(losses[self.counts], nan=1e3, posinf=1e3)
+        total = np.zeros((self._count, len(suites)))
+        np.add.at(total, self._parts, self.weight * counted)
+        return total

@@ -6,12 +6,19 @@ Missing values are NaN, or empty cells in a file. Rows are in the order of arriv
 delayed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from quad_gym.frames import geodetic_to_ecef
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.rotations import euler_to_dcm
 
 Floats = NDArray[np.float64]
 
@@ -33,6 +40,8 @@ def _enu(name: str) -> tuple[str, ...]:
     return tuple(f"{name}_{axis}" for axis in ("east", "north", "up"))
 
 
+_MOTORS = tuple(f"motor_{k}" for k in range(4))
+
 # fmt: off
 LOG_COLUMNS = {
     "time": LogColumn(("time",), "s", "-", "time stamp; of a mean, the end of its interval"),
@@ -50,6 +59,7 @@ LOG_COLUMNS = {
     "gnss_baseline_enu": LogColumn(_enu("gnss_baseline"), "m", "I", "between the antennas"),
     "barometer": LogColumn(("barometer",), "m", "I", "height by static pressure"),
     "magnetometer": LogColumn(_xyz("magnetometer"), "T", "B", "magnetic field"),
+    "motors": LogColumn(_MOTORS, "V", "-", "voltages of the motors, up to the next row with them"),
 }
 # fmt: on
 """Columns of a table, by the keys under which a dictionary may hold their numbers together.
@@ -63,15 +73,24 @@ image's center], or together `pixels` (n, features, 2).
 class Stream:
     """Measurements of one sensor."""
 
-    time: Floats
-    """(n,) time stamps [s]"""
-    received: Floats
-    """(n,) times of arrival [s]"""
-    values: dict[str, Floats]
-    """measurements (n, ...) by name"""
+    time: Floats  #: (n,) time stamps [s]
+    received: Floats  #: (n,) times of arrival [s]
+    values: dict[str, Floats]  #: measurements (n, ...) by name
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def rows(self, chosen: Any) -> "Stream":
+        """Return some of the measurements."""
+        values = {name: value[chosen] for name, value in self.values.items()}
+        return Stream(self.time[chosen], self.received[chosen], values)
+
+    def increasing(self) -> "Stream":
+        """Return the measurements that are finite and later than all before them."""
+        good = np.diff(np.maximum.accumulate(self.time), prepend=-np.inf) > 0.0
+        for values in self.values.values():
+            good &= np.isfinite(values).all(axis=1)
+        return self.rows(good)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +100,16 @@ class Log:
     Frames are the package's: B with x forward, y left, z up; I with east, north, up.
     """
 
-    imu: Stream
-    """IMU samples: gyro [rad/s] and accel [m/s^2], (n, 3) each, in B"""
+    imu: Stream  #: IMU samples: gyro [rad/s] and accel [m/s^2], (n, 3) each, in B
     gnss: Stream | None = None
     """GNSS measurements: position_G (n, 3) from the center of the Earth, or position_I from the
     origin [m]; velocity_G or velocity_I [m/s]; baseline_G or baseline_I [m]; reported standard
     deviations position_sigma_I (n, 3) [m] and velocity_sigma (n,) [m/s]"""
-    camera: Stream | None = None
-    """images: pixels (n, features, 2) from the image's center"""
-    barometer: Stream | None = None
-    """heights: barometer (n,) in I [m]"""
-    magnetometer: Stream | None = None
-    """magnetic fields: magnetometer (n, 3) in B [T]"""
+    camera: Stream | None = None  #: images: pixels (n, features, 2) from the image's center
+    barometer: Stream | None = None  #: heights: barometer (n,) in I [m]
+    magnetometer: Stream | None = None  #: magnetic fields: magnetometer (n, 3) in B [T]
+    motors: Stream | None = None
+    """commands, no measurements: motors (n, 4), voltages that hold until the next [V]"""
     barometer_from_start: bool = False
     """True: heights from pressure refer to another level, so that only their changes are used"""
     about: dict[str, Any] = field(default_factory=dict)
@@ -119,22 +136,25 @@ class Log:
         found = {name: getattr(self, name) for name in names}
         return {name: s for name, s in found.items() if s is not None and len(s)}
 
-    def without_delays(self, delays: Mapping[str, float]) -> "Log":
-        """Return the log with earlier time stamps, by the delays [s] of sensors by name."""
+    def corrected(self, suite: SensorSuite) -> "Log":
+        """Return the log without the delays of a suite, and with its IMU in the axes of B."""
+        delays = vars(suite.log_delays)
         changes: dict[str, Any] = {
             name: replace(stream, time=stream.time - delays[name])
             for name, stream in self.streams.items()
             if delays.get(name)
         }
+        if any(suite.log_rotation):
+            R = euler_to_dcm(suite.log_rotation)
+            changes["imu"] = replace(
+                self.imu, values={name: v @ R.T for name, v in self.imu.values.items()}
+            )
         return replace(self, **changes) if changes else self
 
     def until(self, time: float) -> "Log":
         """Return the log up to a time of arrival [s]."""
-        changes: dict[str, Any] = {}
-        for name, stream in self.streams.items():
-            rows = stream.received <= time
-            values = {key: value[rows] for key, value in stream.values.items()}
-            changes[name] = Stream(stream.time[rows], stream.received[rows], values)
+        streams = self.streams.items()
+        changes: dict[str, Any] = {name: s.rows(s.received <= time) for name, s in streams}
         return replace(self, **changes)
 
     def origin(self, near_G: Floats | None, within: float = 1e5) -> Floats | None:
@@ -151,3 +171,33 @@ class Log:
         if near_G is not None and np.linalg.norm(known[0] - near_G) < within:
             return near_G
         return known[0].copy()
+
+
+def ecef_of(lat: Floats, lon: Floats, height: Floats) -> Floats:
+    """Return (n, 3) positions in ECEF [m] from latitude, longitude [deg] and height; NaN stays."""
+    found = np.full((len(lat), 3), np.nan)
+    for k in np.flatnonzero(np.isfinite(lat) & np.isfinite(lon) & np.isfinite(height)):
+        check.number("gnss_lat [deg]", float(lat[k]), least=-90.0, most=90.0)
+        found[k] = geodetic_to_ecef(np.radians(lat[k]), np.radians(lon[k]), height[k])
+    return found
+
+
+@contextmanager
+def reading(path: Path | str, kind: str, logs: str, library: str, extra: str) -> Iterator[Path]:
+    """Name file and library in errors of a library that reads a log.
+
+    Raises:
+        ImportError: If the library is not installed.
+        ValueError: If it cannot read the file.
+        OSError: If there is no such file.
+    """
+    file = Path(path)
+    try:
+        yield file
+    except ImportError:
+        install = f"install it with pip install 'quad-gym[{extra}]'"
+        raise ImportError(f"{logs} need {library}: {install}") from None
+    except Exception as error:  # a library raises what it meets in a damaged file
+        if not file.exists():
+            raise FileNotFoundError(f"there is no file {file}") from None
+        raise ValueError(f"{file.name} must be {kind}: {error}") from None

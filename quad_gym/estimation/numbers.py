@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -19,26 +19,35 @@ class Number:
     """
 
     sensor: str
-    """part of the suite, such as "imu\""""
-    field: str
-    """field of that part"""
-    spread: float
-    """standard deviation of the prior: of the logarithm, or of the number"""
-    axes: tuple[int, ...] = ()
-    """elements of a field of several numbers; they change together"""
-    positive: bool = True
-    """False: the number may have either sign"""
+    """part of the suite, such as "imu"; empty: the suite itself"""
+    field: str  #: field of that part
+    spread: float  #: standard deviation of the prior: of the logarithm, or of the number
+    axes: tuple[int, ...] = ()  #: elements of a field of several numbers; they change together
+    positive: bool = True  #: False: the number may have either sign
     unit: str = "-"
+    step: float = 0.1  #: step of numerical derivatives, in coordinates
+
+    @property
+    def of_log(self) -> bool:
+        """True if the number changes the log before the filter: a delay, or the mounting."""
+        return self.field == _MOUNTING or self.sensor == _DELAYS
+
+    @property
+    def least(self) -> float:
+        """Lower bound of the coordinate: a sensor in flight is hardly better than at rest."""
+        standard_deviation = "sigma" in self.field or "density" in self.field
+        standard_deviation &= self.field != "drift_sigma_I"
+        return _LEAST / self.spread if standard_deviation else -MOST
 
     @property
     def name(self) -> str:
         """Name, such as "gnss.position_sigma_I[2]"."""
         place = f"[{', '.join(map(str, self.axes))}]" if self.axes else ""
-        return f"{self.sensor}.{self.field}{place}"
+        return f"{self.sensor}.{self.field}{place}".lstrip(".")
 
     def of(self, suite: SensorSuite) -> float:
         """Return the number in a suite."""
-        value = getattr(getattr(suite, self.sensor), self.field)
+        value = getattr(self.part(suite), self.field)
         return float(value[self.axes[0]] if self.axes else value)
 
     def value(self, prior: float, x: float) -> float:
@@ -51,22 +60,37 @@ class Number:
 
     def put(self, suite: SensorSuite, value: float) -> SensorSuite:
         """Return a suite with another number."""
-        part = getattr(suite, self.sensor)
-        new: Any = value
+        part, new = self.part(suite), cast("Any", value)
         if self.axes:
             values = list(getattr(part, self.field))
             for axis in self.axes:
                 values[axis] = value
             new = tuple(values)
-        return suite.replace(**{self.sensor: part.replace(**{self.field: new})})
+        part = part.replace(**{self.field: new})
+        return suite.replace(**{self.sensor: part}) if self.sensor else part
+
+    def part(self, suite: SensorSuite) -> Any:
+        """Return the part of a suite that has the number."""
+        return getattr(suite, self.sensor) if self.sensor else suite
 
 
 _LEVEL, _UP = (0, 1), (2,)
 _LEVER, _PRECISE = "primary_antenna_B", 0.1  #: [m]
 _WIDE, _NARROW = 1.5, 0.7  #: logarithms: factors of 4.5 and 2
+_DELAYS, _MOUNTING = "log_delays", "log_rotation"
+MOST, _LEAST = 3.0, -0.3
+"""Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's."""
 
 # fmt: off
 NUMBERS = (
+    *(
+        Number(sensor=_DELAYS, field=name, spread=0.3, positive=False, unit="s", step=1 / 30)
+        for name in ("gnss", "camera", "magnetometer", "barometer")
+    ),
+    *(
+        Number(sensor="", field=_MOUNTING, axes=(k,), spread=0.1, positive=False, unit="rad")
+        for k in range(3)
+    ),
     Number(sensor="imu", field="accel_noise_density", spread=2.5, unit="m/s^2/sqrt(Hz)"),
     Number(sensor="imu", field="gyro_noise_density", spread=2.0, unit="rad/s/sqrt(Hz)"),
     Number(sensor="imu", field="accel_bias_sigma", spread=_WIDE, unit="m/s^2"),
@@ -77,10 +101,12 @@ NUMBERS = (
     Number(sensor="gnss", field="drift_sigma_I", axes=_UP, spread=_WIDE, unit="m"),
     Number(sensor="gnss", field="drift_tau", spread=_WIDE, unit="s"),
     Number(sensor="gnss", field="velocity_sigma", spread=_WIDE, unit="m/s"),
+    Number(sensor="gnss", field="baseline_sigma", spread=_WIDE, unit="rad"),
     *(
         Number(sensor="gnss", field=_LEVER, axes=(k,), spread=0.15, positive=False, unit="m")
         for k in range(3)
     ),
+    Number(sensor="camera", field="pixel_sigma", spread=_WIDE, unit="pixels"),
     Number(sensor="barometer", field="noise_sigma", spread=_WIDE, unit="m"),
     Number(sensor="barometer", field="bias_sigma", spread=_WIDE, unit="m"),
     Number(sensor="magnetometer", field="noise_sigma", spread=_WIDE, unit="T"),
@@ -95,22 +121,33 @@ NUMBERS = (
 sensor at rest, and vibration, airflow and motor currents multiply its noise."""
 
 
-def numbers_in(suite: SensorSuite, log: Log) -> list[Number]:
-    """Return the numbers of the sensors that a suite has and a log contains."""
-    found, paired = [], has_baselines(log)
+def numbers_in(suite: SensorSuite, log: Log, delays: bool) -> list[Number]:
+    """Return the numbers of the sensors that a suite and a log have, with or without delays."""
+    measured = {name for name in log.streams if getattr(suite, name, None) is not None}
+    paired = "gnss" in measured and has(log, "baseline")
+    others = {
+        _MOUNTING: paired or bool(measured & {"camera", "magnetometer"}),  # with axes in B
+        "baseline_sigma": paired,
+        "velocity_sigma": has(log, "velocity"),
+        # with a baseline, its direction would change, and noise hides it
+        _LEVER: not paired
+        and suite.gnss is not None
+        and suite.gnss.position_sigma_I[0] <= _PRECISE,
+    }
+    found = []
     for number in NUMBERS:
-        part = getattr(suite, number.sensor)
-        if part is None or number.sensor not in log.streams:
-            continue
-        if number.field == _LEVER and (paired or max(part.position_sigma_I) > _PRECISE):
-            continue  # the direction of a baseline would change, or noise hides the lever arm
-        value = getattr(part, number.field)
-        if value is not None and (not number.positive or np.all(np.asarray(value) != 0.0)):
-            found.append(number)
+        known = number.sensor in measured or number.field == _MOUNTING
+        if number.sensor == _DELAYS:
+            known = delays and number.field in measured
+        if known and others.get(number.field, True):
+            value = getattr(number.part(suite), number.field)
+            if value is not None and (not number.positive or np.all(np.asarray(value) != 0.0)):
+                found.append(number)
     return found
 
 
-def has_baselines(log: Log) -> bool:
-    """Return True if a log has baselines between two antennas."""
+def has(log: Log, quantity: str) -> bool:
+    """Return True if a log has a quantity of GNSS, such as "baseline"."""
     given = {} if log.gnss is None else log.gnss.values
-    return "baseline_G" in given or "baseline_I" in given
+    values = [given[name] for name in (f"{quantity}_G", f"{quantity}_I") if name in given]
+    return any(np.isfinite(value).any() for value in values)

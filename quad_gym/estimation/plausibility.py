@@ -62,14 +62,7 @@ class MisfitError(ValueError):
 
 
 def problems_of(log: Log, body: str, suite: SensorSuite, result: Replay) -> tuple[str, ...]:
-    """Return sentences on implausible units and axes of a log, and on a suite that does not fit.
-
-    Args:
-        log: The log that was replayed.
-        body: Axes with which it was read, see `read_log`.
-        suite: The suite that the filter assumed.
-        result: The result of the replay.
-    """
+    """Return sentences on units and axes of a log, and on a suite that does not fit."""
     gyro, accel = (log.imu.values[name] for name in ("gyro", "accel"))
     found = [*_force(accel, body), *_rates(gyro), *_aids(log, suite)]
     if result.status:

@@ -41,7 +41,10 @@ PATIENCE = 2.0  #: time for which a start waits for the first magnetic field [s]
 
 
 class Player:
-    """Processes the contents of a log with a filter, in the order of arrival."""
+    """Processes the contents of a log with a filter, in the order of arrival.
+
+    Without a window, measurements are processed in the order of their time stamps, none late.
+    """
 
     def __init__(
         self,
@@ -50,9 +53,10 @@ class Player:
         estimator: str,
         start: dict[str, Any],
         reported_noise: bool,
-        window: float,
+        window: float | None,
     ) -> None:
         self.log, self.suite, self.estimator = log, suite, estimator
+        self.in_order, window = window is None, window or 0.0
         self.start, self.reported = start, reported_noise
         self.filter = ESTIMATORS[estimator](with_wide_start(suite, log), window=window)
         self.window = window
@@ -116,7 +120,8 @@ class Player:
             ValueError: If the log has no fix to start from, or its IMU samples have a gap.
         """
         names = list(self.streams)  # the IMU first: it comes before what arrives with it
-        received = np.concatenate([self.streams[name].received for name in names])
+        arrivals = "time" if self.in_order else "received"
+        received = np.concatenate([getattr(self.streams[name], arrivals) for name in names])
         kinds = np.concatenate([np.full(len(self.streams[n]), k) for k, n in enumerate(names)])
         places = np.concatenate([np.arange(len(self.streams[n])) for n in names])
         if "position" in self.start:
@@ -262,11 +267,14 @@ class Player:
         if name != "gnss":
             return
         stream = self.streams["gnss"]
-        fix = self._fix(stream, k)
-        if "gnss_position_G" not in fix:
+        fix, time = self._fix(stream, k), float(stream.time[k])
+        if "gnss_position_G" not in fix or time < self.imu_times[0] - LONGEST_STEP:
             return
         known = "gnss_baseline_G" in fix or {"heading", "course", "magnetometer"} & set(self.start)
         if not known and "magnetometer" in self.streams:
+            if self.in_order:  # the nearest one, even if it is later
+                fields = self.streams["magnetometer"].time
+                self.field = int(np.argmin(np.abs(fields - time)))
             self.first_fix = min(self.first_fix, float(stream.received[k]))
             if self.field is None and stream.received[k] < self.first_fix + PATIENCE:
                 return
@@ -279,7 +287,6 @@ class Player:
             if not self.takes_velocity:
                 why = "the sensors take none: GnssParams.velocity_sigma is None"
             raise ValueError(f"a start by its course must have a GNSS velocity, but {why}")
-        time = float(stream.time[k])
         self.first_state = {**fix, **self.start, "time": time}
         self.filter.initialize(**self.first_state)
         self._go_on()
@@ -287,27 +294,34 @@ class Player:
     def started(self, suite: SensorSuite) -> KalmanFilter:
         """Return a filter for another suite in the state in which the tape begins."""
         kf = ESTIMATORS[self.estimator](with_wide_start(suite, self.log), window=self.window)
-        kf.initialize(**self.first_state)
+        if "position" in self.start:
+            kf.set_state(**self._given_state(suite))
+        else:
+            kf.initialize(**self.first_state)
         if self.log.barometer_from_start:
             kf._engine.steps["level"] = np.nan
         return kf
 
     def _start_from_state(self) -> None:
         """Start from the state that the caller gives."""
-        state = {"time": float(self.log.imu.time[0]), **self.start}
-        if not {"R_BI", "covariance"} & set(state):
-            check.keywords(state, ("position", "heading", "time"), "a start at a position")
-            if "heading" not in state:
-                raise ValueError(
-                    "start must have a heading in addition to the position, or all keywords of "
-                    "set_state"
-                )
-            state = state_at_rest(self.suite, **state)
         try:
-            self.filter.set_state(**state)
+            self.filter.set_state(**self._given_state(self.suite))
         except TypeError as error:
             raise ValueError(f"start must be the keywords of set_state: {error}") from None
         self._go_on()
+
+    def _given_state(self, suite: SensorSuite) -> dict[str, Any]:
+        """Return keywords of `set_state`, completed for a vehicle at rest."""
+        state = {"time": float(self.log.imu.time[0]), **self.start}
+        if {"R_BI", "covariance"} & set(state):
+            return state
+        check.keywords(state, ("position", "heading", "time"), "a start at a position")
+        if "heading" not in state:
+            raise ValueError(
+                "start must have a heading in addition to the position, or all keywords of "
+                "set_state"
+            )
+        return state_at_rest(suite, **state)
 
     def _go_on(self) -> None:
         """Process the samples since the time of the start."""

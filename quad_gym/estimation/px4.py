@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats, Log, Stream
-from quad_gym.frames import geodetic_to_ecef
+from quad_gym.estimation.logs import Floats, Log, Stream, ecef_of, reading
 
 GNSS_DELAY = 0.11  #: delay of receivers if the log does not contain it [s]: PX4's default
 
@@ -45,19 +44,10 @@ def read_ulog(path: Path | str) -> Log:
         ValueError: If the file is not a ULog, is damaged, or has no IMU samples.
         OSError: If there is no such file.
     """
-    try:
+    with reading(path, "a ULog", "logs of PX4", "pyulog", "ulog") as file:
         from pyulog import ULog
-    except ImportError:
-        raise ImportError(
-            "logs of PX4 need pyulog: install it with pip install 'quad-gym[ulog]'"
-        ) from None
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"there is no file {file}")
-    try:
+
         ulog = ULog(str(file))
-    except Exception as error:  # pyulog raises what it meets in a damaged file
-        raise ValueError(f"{file.name} must be a ULog: {error}") from None
     topics: dict[str, dict[str, Any]] = {}
     for data in ulog.data_list:
         if data.multi_id == 0:
@@ -65,8 +55,10 @@ def read_ulog(path: Path | str) -> Log:
     if "sensor_combined" not in topics:
         raise ValueError(f"{file.name} must have the topic sensor_combined, got {sorted(topics)}")
     delay = ulog.initial_parameters.get("EKF2_GPS_DELAY")
+    imu = topics["sensor_combined"]
+    gyro, accel = (_triples(imu, name) * _TO_FLU for name in ("gyro_rad", "accelerometer_m_s2"))
     return Log(
-        imu=_imu(topics["sensor_combined"]),
+        imu=Stream(*_times(imu), {"gyro": gyro, "accel": accel}).increasing(),
         gnss=_gnss(
             _one_of(topics, "vehicle_gps_position", "sensor_gps"),
             GNSS_DELAY if delay is None else 1e-3 * float(delay),
@@ -101,16 +93,6 @@ def _triples(topic: dict[str, Any], name: str) -> Floats:
     return np.column_stack([np.asarray(topic[f"{name}[{i}]"], np.float64) for i in range(3)])
 
 
-def _imu(topic: dict[str, Any]) -> Stream:
-    """Return IMU samples, without those that are not finite or have a repeated time."""
-    time, received = _times(topic)
-    gyro = _triples(topic, "gyro_rad") * _TO_FLU
-    accel = _triples(topic, "accelerometer_m_s2") * _TO_FLU
-    good = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
-    good &= np.diff(time, prepend=-np.inf) > 0.0
-    return Stream(time[good], received[good], {"gyro": gyro[good], "accel": accel[good]})
-
-
 def _gnss(topic: dict[str, Any] | None, delay: float) -> Stream | None:
     """Return positions and velocities with a fix; NaN: not reported."""
     if topic is None:
@@ -123,11 +105,8 @@ def _gnss(topic: dict[str, Any] | None, delay: float) -> Stream | None:
     else:  # before PX4 1.14
         lat, lon = (1e-7 * np.asarray(topic[w], np.float64) for w in ("lat", "lon"))
         height = 1e-3 * np.asarray(topic["alt_ellipsoid"], np.float64)
-    fixed = np.asarray(topic["fix_type"]) >= LEAST_FIX
-    fixed &= np.isfinite(lat) & np.isfinite(lon) & np.isfinite(height)
-    position = np.full((len(time), 3), np.nan)
-    for k in np.flatnonzero(fixed):
-        position[k] = geodetic_to_ecef(np.radians(lat[k]), np.radians(lon[k]), height[k])
+    position = ecef_of(lat, lon, height)
+    fixed = (np.asarray(topic["fix_type"]) >= LEAST_FIX) & np.isfinite(position).all(axis=1)
     velocity = np.column_stack([topic["vel_e_m_s"], topic["vel_n_m_s"], -topic["vel_d_m_s"]])
     valid = np.asarray(topic.get("vel_ned_valid", np.ones(len(time))), bool) & fixed
     eph, epv = (np.asarray(topic[name], np.float64) for name in ("eph", "epv"))
@@ -137,7 +116,7 @@ def _gnss(topic: dict[str, Any] | None, delay: float) -> Stream | None:
         "position_sigma_I": _positive(np.column_stack([eph, eph, epv])),
         "velocity_sigma": _positive(np.asarray(topic["s_variance_m_s"], np.float64)),
     }
-    return Stream(time[fixed], received[fixed], {n: v[fixed] for n, v in values.items()})
+    return Stream(time, received, values).rows(fixed)
 
 
 def _positive(values: Floats) -> Floats:

@@ -77,14 +77,14 @@ def replay(
 
 
 def prepared(log: Any, sensors: SensorSuite | str, body: str) -> tuple[Log, SensorSuite]:
-    """Return a log without its delays, and a suite with the origin of I.
+    """Return a log without its delays, in the axes of B, and a suite with the origin of I.
 
     Raises:
         ValueError: As `replay`.
     """
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
-    whole = read_log(log, body=body).without_delays(vars(suite.log_delays))
+    whole = read_log(log, body=body).corrected(suite)
     return whole, origin_of(whole, suite)
 
 

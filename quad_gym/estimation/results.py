@@ -11,25 +11,28 @@ from quad_gym.estimation.logs import Floats
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FilterStatus, GateDecision
 
+SIGMAS = tuple(
+    f"{word}_sigma_{axis}"
+    for word in ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+    for axis in "xyz"
+)
+"""Columns of the standard deviations of estimates."""
+
 
 @dataclass(frozen=True, eq=False)
 class Measured:
     """Innovations of one kind of measurement."""
 
-    time: Floats
-    """(m,) time stamps [s]"""
-    received: Floats
-    """(m,) times of arrival [s]"""
+    time: Floats  #: (m,) time stamps [s]
+    received: Floats  #: (m,) times of arrival [s]
     innovation: Floats
     """(m, d) innovations; of positions and velocities in I, of directions across the predicted
     one"""
-    sigma: Floats
-    """(m, d) standard deviations of the innovations, as predicted by the filter"""
+    sigma: Floats  #: (m, d) standard deviations of the innovations, as predicted by the filter
     nis: Floats
     """(m,) normalized innovations squared; chi-square with d degrees of freedom for a consistent
     filter"""
-    gate: Floats
-    """(m,) gate decisions, see `quad_gym.records.GateDecision`"""
+    gate: Floats  #: (m,) gate decisions, see `quad_gym.records.GateDecision`
 
     @property
     def gated(self) -> Any:
@@ -43,7 +46,38 @@ class Measured:
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class Estimates:
+    """Estimates for a log, at samples of its IMU."""
+
+    sensors: SensorSuite
+    """sensor suite that the filter assumed; `gnss.reference_antenna_G` is the origin of I"""
+    time: Floats  #: (n,) times of the samples [s]
+    position: Floats  #: (n, 3) position in I [m]
+    velocity: Floats  #: (n, 3) velocity in I [m/s]
+    quaternion: Floats  #: (n, 4) attitude: unit quaternions (w, x, y, z), body to inertial
+    accel_bias: Floats  #: (n, 3) accelerometer bias in B [m/s^2]
+    gyro_bias: Floats  #: (n, 3) gyro bias in B [rad/s]
+    sigma: Floats
+    """(n, 15) standard deviations of position, velocity, error angles, accelerometer and gyro
+    bias"""
+    status: FilterStatus
+    """numerical failures; 0 does not imply that the suite fits the log, see `Replay.problems`"""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def columns(self) -> dict[str, Floats]:
+        """Return the estimates as a table: columns of one number each, by name."""
+        table = {"time": self.time}
+        for name in ("position", "velocity", "quaternion", "accel_bias", "gyro_bias"):
+            values = getattr(self, name)
+            axes = "wxyz" if values.shape[1] == 4 else "xyz"
+            table.update({f"{name}_{axis}": values[:, i] for i, axis in enumerate(axes)})
+        return table | dict(zip(SIGMAS, self.sigma.T, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Replay(Estimates):
     """Filter output for a log, at each IMU sample since the start of the filter.
 
     Each row holds the estimate at the arrival of the next sample: measurements contribute from
@@ -52,49 +86,23 @@ class Replay:
 
     estimator: str
     """kind of the filter: "ukf" or "ekf\", or the class of an own one"""
-    sensors: SensorSuite
-    """sensor suite that the filter assumed; `gnss.reference_antenna_G` is the origin of I"""
-    time: Floats
-    """(n,) times of the samples [s]"""
-    position: Floats
-    """(n, 3) estimated position in I [m]"""
-    velocity: Floats
-    """(n, 3) estimated velocity in I [m/s]"""
-    quaternion: Floats
-    """(n, 4) estimated attitude: unit quaternions (w, x, y, z), body to inertial"""
-    accel_bias: Floats
-    """(n, 3) estimated accelerometer bias in B [m/s^2]"""
-    gyro_bias: Floats
-    """(n, 3) estimated gyro bias in B [rad/s]"""
-    sigma: Floats
-    """(n, 15) standard deviations of position, velocity, error angles, accelerometer and gyro
-    bias"""
     heading_known: Any
     """(n,) True where the heading was known, from a measurement or from the motion"""
-    diverged: Any
-    """(n,) True where the innovations showed that the filter had diverged"""
-    status: FilterStatus
-    """numerical failures; 0 does not imply that the suite fits the log, see `problems`"""
+    diverged: Any  #: (n,) True where the innovations showed that the filter had diverged
     measured: dict[str, Measured]
     """innovations by measurement: "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0",
     ..., "barometer" and "magnetometer\""""
     too_late: int
     """number of measurements that were older than the window at their arrival, and were left out"""
-    unused: tuple[str, ...]
-    """sensors of the log that the suite does not use"""
+    unused: tuple[str, ...]  #: sensors of the log that the suite does not use
     problems: tuple[str, ...] = ()
     """sentences on implausible units and axes of the log, on divergence or failure of the filter,
     and on sensors that the suite does not describe, with likely causes; empty: no problem was
     found"""
 
-    def __len__(self) -> int:
-        return len(self.time)
-
     def columns(self) -> dict[str, Floats]:
         """Return the estimates as a table: columns of one number each, by name."""
-        table = columns_of(self)
-        table["diverged"] = self.diverged.astype(np.float64)
-        return table
+        return super().columns() | {"diverged": self.diverged.astype(np.float64)}
 
     def summary(self) -> dict[str, Any]:
         """Return counts and mean NIS per measurement, the diverged fraction, and `problems`."""
@@ -121,42 +129,14 @@ class Replay:
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
+class Smoothed(Estimates):
     """Smoothed trajectory of a log, at each IMU sample since the heading is known."""
 
-    sensors: SensorSuite
-    """sensor suite that the filter assumed; `gnss.reference_antenna_G` is the origin of I"""
-    time: Floats
-    """(n,) times of the samples [s]"""
-    position: Floats
-    """(n, 3) position in I [m]"""
-    velocity: Floats
-    """(n, 3) velocity in I [m/s]"""
-    quaternion: Floats
-    """(n, 4) attitude: unit quaternions (w, x, y, z), body to inertial"""
-    accel_bias: Floats
-    """(n, 3) accelerometer bias in B [m/s^2]"""
-    gyro_bias: Floats
-    """(n, 3) gyro bias in B [rad/s]"""
     covariance: Floats
     """(n, 15, 15) of position, velocity, error angles, accelerometer and gyro bias"""
     difference: Floats
     """(n, 15) filtered minus smoothed estimates, divided by the square root of the difference of
     their variances; NaN where this is less than a millionth of the filter's, as at the end"""
-    status: FilterStatus
-    """numerical failures of the filter"""
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    @property
-    def sigma(self) -> Floats:
-        """(n, 15) standard deviations."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
-
-    def columns(self) -> dict[str, Floats]:
-        """Return the estimates as a table: columns of one number each, by name."""
-        return columns_of(self)
 
     def consistency(self, limit: float = 3.0) -> dict[str, float]:
         """Return McReynolds' test of consistency: shares of large differences, by state.
@@ -173,14 +153,11 @@ class Smoothed:
         Returns:
             Shares by the names of the columns of standard deviations; NaN where nothing was tested.
         """
-        names = [name for name in columns_of(self) if "_sigma_" in name]
         large, tested = np.abs(self.difference) > limit, np.isfinite(self.difference)
         with np.errstate(invalid="ignore"):
             shares = large.sum(axis=0) / tested.sum(axis=0)
-        return {
-            name.replace("_sigma", ""): float(share)
-            for name, share in zip(names, shares, strict=True)
-        }
+        names = [name.replace("_sigma", "") for name in SIGMAS]
+        return dict(zip(names, shares.tolist(), strict=True))
 
 
 def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
@@ -192,22 +169,3 @@ def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
         parts = (np.concatenate([getattr(m, name) for m in features]) for name in names)
         found["features"] = Measured(*parts)
     return found
-
-
-def columns_of(estimates: Any) -> dict[str, Floats]:
-    """Return the estimates of a replay or a smoother as columns of one number each, by name."""
-    table = {"time": estimates.time}
-    names = {
-        "position": estimates.position,
-        "velocity": estimates.velocity,
-        "quaternion": estimates.quaternion,
-        "accel_bias": estimates.accel_bias,
-        "gyro_bias": estimates.gyro_bias,
-    }
-    for name, values in names.items():
-        axes = "wxyz" if values.shape[1] == 4 else "xyz"
-        table.update({f"{name}_{axis}": values[:, i] for i, axis in enumerate(axes)})
-    words = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
-    for k in range(15):
-        table[f"{words[k // 3]}_sigma_{'xyz'[k % 3]}"] = estimates.sigma[:, k]
-    return table

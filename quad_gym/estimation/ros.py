@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats, Log, Stream
-from quad_gym.frames import geodetic_to_ecef
+from quad_gym.estimation.logs import Floats, Log, Stream, ecef_of, reading
 
 _OTHER_CLOCK = 10.0  #: [s]
 _SEA_LEVEL, _SCALE, _EXPONENT = 101325.0, 44330.77, 0.190263
@@ -40,18 +39,11 @@ def read_bag(path: Path | str) -> Log:
         ValueError: If it is no bag, or has no IMU samples.
         OSError: If it does not exist.
     """
-    try:
+    rows: dict[str, list[tuple[float, float, Any]]] = {kind: [] for kind in _KINDS}
+    with reading(path, "a bag of ROS", "bags of ROS", "rosbags", "ros") as file:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise ImportError(
-            "bags of ROS need rosbags: install it with pip install 'quad-gym[ros]'"
-        ) from None
-    file = Path(path)
-    if not file.exists():
-        raise FileNotFoundError(f"there is no bag {file}")
-    rows: dict[str, list[tuple[float, float, Any]]] = {kind: [] for kind in _KINDS}
-    try:
+
         store = get_typestore(Stores.ROS2_HUMBLE)
         with AnyReader([file], default_typestore=store) as reader:
             chosen = _chosen(reader.connections)
@@ -60,20 +52,16 @@ def read_bag(path: Path | str) -> Log:
                 stamp = message.header.stamp
                 taken = stamp.sec + 1e-9 * stamp.nanosec
                 rows[_kind(connection)].append((taken, 1e-9 * recorded, message))
-    except Exception as error:  # rosbags raises what it meets in a damaged file
-        raise ValueError(f"{file.name} must be a bag of ROS: {error}") from None
     if not rows["Imu"]:
         raise ValueError(f"{file.name} must have messages sensor_msgs/Imu, got none")
     imu = _stream(rows["Imu"], gyro="angular_velocity", accel="linear_acceleration")
     assert imu is not None
-    good = np.diff(np.maximum.accumulate(imu.time), prepend=-np.inf) > 0.0
-    values = {name: value[good] for name, value in imu.values.items()}
     heights = _stream(rows["FluidPressure"], barometer="fluid_pressure")
     if heights is not None:
         ratio = heights.values["barometer"] / _SEA_LEVEL
         heights.values["barometer"] = _SCALE * (1.0 - ratio**_EXPONENT)
     return Log(
-        imu=Stream(imu.time[good], imu.received[good], values),
+        imu=imu.increasing(),
         gnss=_gnss(rows["NavSatFix"], rows["TwistStamped"]),
         barometer=heights,
         magnetometer=_stream(rows["MagneticField"], magnetometer="magnetic_field"),
@@ -132,8 +120,9 @@ def _gnss(
     if not rows:
         return None
     position, velocity, sigma = (np.full((len(rows), 3), np.nan) for _ in range(3))
+    places = np.array([(m.latitude, m.longitude, m.altitude) for _, _, m in fixes]).reshape(-1, 3)
+    position[: len(fixes)] = ecef_of(*places.T)
     for k, (_, _, m) in enumerate(fixes):
-        position[k] = geodetic_to_ecef(np.radians(m.latitude), np.radians(m.longitude), m.altitude)
         variances = np.array(m.position_covariance, np.float64)[::4]
         if m.position_covariance_type > 0 and (variances > 0.0).all():
             sigma[k] = np.sqrt(variances)
@@ -141,5 +130,4 @@ def _gnss(
         velocity[len(fixes) + k] = _numbers(m.twist.linear)
     values = {"position_G": position, "velocity_I": velocity, "position_sigma_I": sigma}
     time, received = _times(rows)
-    order = np.argsort(received, kind="stable")
-    return Stream(time[order], received[order], {n: v[order] for n, v in values.items()})
+    return Stream(time, received, values).rows(np.argsort(received, kind="stable"))

@@ -27,12 +27,9 @@ SIGMA_KEYWORDS = (
 class Sample:
     """An IMU sample that propagates the estimate over a time."""
 
-    gyro: Floats
-    """(3,) angular rate in B [rad/s]"""
-    accel: Floats
-    """(3,) specific force in B [m/s^2]"""
-    dt: float
-    """duration of the sample [s]"""
+    gyro: Floats  #: (3,) angular rate in B [rad/s]
+    accel: Floats  #: (3,) specific force in B [m/s^2]
+    dt: float  #: duration of the sample [s]
     gyro_before: Floats
     """(3,) angular rate of the sample before; the lever arm's acceleration follows from both
     [rad/s]"""
@@ -52,14 +49,10 @@ class Sample:
 class Measurement:
     """Measurements of one instant; None: not measured."""
 
-    position_G: Floats | None = None
-    """(3,) antenna position [m]"""
-    baseline_G: Floats | None = None
-    """(3,) baseline, scaled to a length near one [-]"""
-    velocity_G: Floats | None = None
-    """(3,) antenna velocity [m/s]"""
-    pixels: Floats | None = None
-    """(n_features, 2) image coordinates, NaN: not seen [pixels]"""
+    position_G: Floats | None = None  #: (3,) antenna position [m]
+    baseline_G: Floats | None = None  #: (3,) baseline, scaled to a length near one [-]
+    velocity_G: Floats | None = None  #: (3,) antenna velocity [m/s]
+    pixels: Floats | None = None  #: (n_features, 2) image coordinates, NaN: not seen [pixels]
     aids: dict[Aid, Floats] = field(default_factory=dict)
     noise: dict[str, Any] = field(default_factory=dict)
     """fields of the parameter record that replace the suite's for this measurement"""
@@ -187,15 +180,7 @@ def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Flo
 
 
 def gnss_noise(name: str, value: Any) -> tuple[Floats, Floats | None]:
-    """Return the noise of a position: standard deviations (3,) in I [m], covariance or None.
-
-    Args:
-        name: Name of the argument in messages.
-        value: A standard deviation, three of them, or a (3, 3) covariance.
-
-    Raises:
-        ValueError: If it is none of these, or not positive (definite).
-    """
+    """Return sigmas (3,) in I [m], and the covariance or None, of a number, three or (3, 3)."""
     if np.ndim(value) == 0:
         return np.full(3, check.positive(name, value, least=1e-9)), None
     if np.ndim(value) == 2:

@@ -25,14 +25,7 @@ class SetRuns(NamedTuple):
 def run_sets(
     player: Player, tape: Tape, suites: Sequence[SensorSuite], estimates: bool = False
 ) -> SetRuns:
-    """Run a tape with filters that assume different suites.
-
-    Args:
-        player: Wrote the tape; its suite has the same sensors.
-        tape: The tape.
-        suites: Suites that differ in numbers only.
-        estimates: True: store the estimates.
-    """
+    """Run a tape with filters of suites that differ in numbers only; estimates if asked for."""
     engines = [player.started(suite)._engine for suite in suites]
     first = engines[0]
     if not estimates:

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 from quad_gym.estimation.filters import KalmanFilter
-from quad_gym.estimation.logs import Floats, Log
+from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.replaying import named_start, prepared
 from quad_gym.estimation.results import Smoothed
@@ -74,7 +74,7 @@ def smooth(
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, body)
-    player = Player(_in_order(whole), suite, estimator, named_start(start), reported_noise, 0.0)
+    player = Player(whole, suite, estimator, named_start(start), reported_noise, None)
     forward = _filter_forward(player)
     x, R_BI, P = _smooth_back(forward)
     rows = forward.rows
@@ -90,18 +90,11 @@ def smooth(
         quaternion=dcm_to_quaternion(R_BI),
         accel_bias=x[:, 9:12],
         gyro_bias=x[:, 12:15],
+        sigma=np.sqrt(np.diagonal(P, axis1=1, axis2=2)),
         covariance=P,
         difference=difference / np.sqrt(gained),
         status=player.filter.status,
     )
-
-
-def _in_order(log: Log) -> Log:
-    """Return the log as if each measurement had arrived at its time stamp."""
-    streams: dict[str, Any] = {
-        name: replace(stream, received=stream.time) for name, stream in log.streams.items()
-    }
-    return replace(log, **streams)
 
 
 # ---- forward -------------------------------------------------------------------------------------
@@ -111,26 +104,16 @@ def _in_order(log: Log) -> Log:
 class _Forward:
     """States of the filter: the first one, and those after each of n predictions and updates."""
 
-    x: Floats
-    """(n + 1, N) estimates, zero for the error angles"""
-    R_BI: Floats
-    """(n + 1, 3, 3) estimated attitudes"""
-    factor: Floats
-    """(n + 1, N, N) lower factors of the covariance"""
-    variances: Floats
-    """(n + 1, N) its diagonal"""
-    sample: Any
-    """(n,) number of the sample of a prediction; -1: an update"""
-    jacobian: Floats
-    """(n, 15, 15) of predictions, without slow errors"""
-    decay: Floats
-    """(n, N - 15) of predictions, for slow errors"""
-    resets: bool
-    """True: the covariance is transformed when error angles are reset"""
-    rows: Any
-    """(m,) numbers of the states at samples of the log"""
-    time: Floats
-    """(m,) times of these [s]"""
+    x: Floats  #: (n + 1, N) estimates, zero for the error angles
+    R_BI: Floats  #: (n + 1, 3, 3) estimated attitudes
+    factor: Floats  #: (n + 1, N, N) lower factors of the covariance
+    variances: Floats  #: (n + 1, N) its diagonal
+    sample: Any  #: (n,) number of the sample of a prediction; -1: an update
+    jacobian: Floats  #: (n, 15, 15) of predictions, without slow errors
+    decay: Floats  #: (n, N - 15) of predictions, for slow errors
+    resets: bool  #: True: the covariance is transformed when error angles are reset
+    rows: Any  #: (m,) numbers of the states at samples of the log
+    time: Floats  #: (m,) times of these [s]
 
 
 def _filter_forward(player: Player) -> _Forward:

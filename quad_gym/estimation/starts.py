@@ -169,15 +169,10 @@ def magnetic_heading(
 def baseline_heading(
     baseline_B: Floats, baseline_I: Floats, sigma: float, tilt: Tilt
 ) -> FirstHeading | None:
-    """Return the heading of a vehicle of known tilt from two antennas; None if too steep.
+    """Return the heading by two antennas, for a vehicle of known tilt; None if they are too steep.
 
-    The baseline acts as a magnetic field whose direction is measured in I.
-
-    Args:
-        baseline_B: (3,) primary to secondary antenna in B.
-        baseline_I: (3,) primary to secondary antenna, measured in I.
-        sigma: Standard deviation of its direction [rad].
-        tilt: Tilt of the vehicle.
+    The baseline, (3,) from the primary antenna, acts as a magnetic field whose direction is
+    measured in I, to `sigma` [rad].
     """
     f = tilt.T.T @ (baseline_B / np.linalg.norm(baseline_B))
     f_h = math.hypot(f[0], f[1])
@@ -197,17 +192,7 @@ def still_start(
     tilt: Tilt,
     heading: FirstHeading,
 ) -> FirstEstimate:
-    """Return the first estimate of a vehicle of known tilt, with the factor of its covariance.
-
-    Args:
-        sensors: A suite with GNSS.
-        antenna_I: (3,) primary antenna [m].
-        position_root: (3, 3) a root of the covariance of the antenna's position [m].
-        velocity: (3,) velocity in I [m/s].
-        velocity_sigma: (3,) standard deviations of the velocity [m/s].
-        tilt: Level, or from an accelerometer.
-        heading: Heading of the level frame.
-    """
+    """Return the first estimate of a vehicle of known tilt, with the factor of its covariance."""
     assert sensors.gnss is not None
     imu, slow = sensors.imu, slow_states(sensors).first_sigmas
     record = np.zeros(1, START)
@@ -240,15 +225,9 @@ def still_start(
 def state_at_rest(
     sensors: SensorSuite, position: ArrayLike, heading: float, time: float
 ) -> dict[str, Any]:
-    """Return keywords of `set_state` for a level vehicle at rest at a known place.
+    """Return keywords of `set_state` for a level vehicle at rest at a known place (3,) in I [m].
 
     `SensorSuite.initial_pose` gives the errors of position and heading.
-
-    Args:
-        sensors: The suite of the filter.
-        position: (3,) position in I [m].
-        heading: Heading of the body x axis, from east toward north [rad].
-        time: Time stamp of the start [s].
     """
     pose, form, imu = sensors.initial_pose, sensors.estimator, sensors.imu
     tilt = form.initial_tilt_sigma or LEVEL_SIGMA

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.euroc import is_euroc, read_euroc
-from quad_gym.estimation.logs import LOG_COLUMNS, Floats, Log, Stream
-from quad_gym.frames import geodetic_to_ecef
+from quad_gym.estimation.logs import LOG_COLUMNS, Floats, Log, Stream, ecef_of
 from quad_gym.params import checks as check
 
 _FORMS = {
@@ -191,8 +190,8 @@ def _log_of(columns: dict[str, Floats], body: str, about: dict[str, Any]) -> Log
                 f"a log must have one of {', '.join(key + form for form in given)}, not both"
             )
         gnss[f"{quantity}_G"], gnss[f"{quantity}_I"] = forms[""], forms.get("_enu")
-        if forms.get("_lla") is not None:
-            gnss[f"{quantity}_G"] = _ecef_of(forms["_lla"])
+        if (places := forms.get("_lla")) is not None:
+            gnss[f"{quantity}_G"] = ecef_of(*places.T)
     field_B = together("magnetometer")
     measured = [f"{q}_{frame}" for q in ("position", "velocity", "baseline") for frame in "GI"]
     return Log(
@@ -203,6 +202,7 @@ def _log_of(columns: dict[str, Floats], body: str, about: dict[str, Any]) -> Log
         magnetometer=stream(
             {"magnetometer": None if field_B is None else field_B * axes}, ("magnetometer",)
         ),
+        motors=stream({"motors": together("motors")}, ("motors",)),
         about=about,
     )
 
@@ -217,14 +217,3 @@ def _image(columns: dict[str, Floats]) -> Floats | None:
     for name, (feature, axis) in found.items():
         pixels[:, feature, axis] = columns[name]
     return pixels
-
-
-def _ecef_of(places: Floats | None) -> Floats:
-    """(n, 3) in ECEF from latitude, longitude [deg] and height [m]; NaN stays."""
-    assert places is not None
-    found = np.full_like(places, np.nan)
-    for k in np.flatnonzero(np.isfinite(places).all(axis=1)):
-        lat, lon, height = places[k]
-        check.number("gnss_lat [deg]", float(lat), least=-90.0, most=90.0)
-        found[k] = geodetic_to_ecef(np.radians(lat), np.radians(lon), height)
-    return found

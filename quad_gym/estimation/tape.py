@@ -39,18 +39,12 @@ for _name in _NOISE:
 class Tape:
     """Inputs of a filter, and the operations that process them in order."""
 
-    samples: NDArray[Any]
-    """(n,) SAMPLE"""
-    measurements: NDArray[Any]
-    """(n,) MEASUREMENT"""
-    operations: NDArray[Any]
-    """(n,) OPERATION"""
-    slots: int = 1
-    """number of copies of the filter's memory that exist at a time"""
-    kept: int = 0
-    """number of estimates to store"""
-    reported: int = 0
-    """number of updates whose innovations are stored"""
+    samples: NDArray[Any]  #: (n,) SAMPLE
+    measurements: NDArray[Any]  #: (n,) MEASUREMENT
+    operations: NDArray[Any]  #: (n,) OPERATION
+    slots: int = 1  #: number of copies of the filter's memory that exist at a time
+    kept: int = 0  #: number of estimates to store
+    reported: int = 0  #: number of updates whose innovations are stored
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -118,14 +112,12 @@ class TapeWriter:
     samples: list[Sample] = field(default_factory=list)
     measurements: list[Measurement] = field(default_factory=list)
     operations: list[tuple[int, int, int]] = field(default_factory=list)
-    awaited: Measurement | None = None
-    """measurement whose next update is reported"""
+    awaited: Measurement | None = None  #: measurement whose next update is reported
     kept: int = 0
     reported: int = 0
     _places: dict[int, int] = field(default_factory=dict)
     _copies: int = 0
-    _oldest: int = 1
-    """age of the oldest copy that was restored, in copies"""
+    _oldest: int = 1  #: age of the oldest copy that was restored, in copies
 
     def apply(self, given: Sample | Measurement) -> None:
         """Process a sample or a measurement."""

@@ -34,26 +34,16 @@ class Validation:
     held_out_error: tuple[float, float] | None
     """root mean square difference of the prediction from the first fix after gaps: horizontal, and
     vertical [m]; None: no fixes"""
-    held_out_nis: float | None
-    """mean NIS of these fixes over three"""
-    diverged: float
-    """share of the samples at which the filter counts as diverged"""
-    problems: tuple[str, ...]
-    """sentences of the replay, see `Replay.problems`"""
+    held_out_nis: float | None  #: mean NIS of these fixes over three
+    diverged: float  #: share of the samples at which the filter counts as diverged
+    problems: tuple[str, ...]  #: sentences of the replay, see `Replay.problems`
     replay: Replay
 
 
 def validate(
     log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
 ) -> Validation:
-    """Replay a log, and compare the part after a time with the filter's predictions.
-
-    Args:
-        log: The log.
-        suite: The suite.
-        start: Keywords of `initialize`.
-        split: Time at which the part begins [s].
-    """
+    """Replay a log, and compare the part after a time with the predictions of the filter."""
     result = replay(log, sensors=suite, start=start, reported_noise=False)
     sensors = {}
     for name, m in by_sensor(result.measured).items():
@@ -84,13 +74,7 @@ def _held_out(
     if gnss is None or suite.gnss is None:
         return None, None
     phase = (gnss.time - split) % _PERIOD
-    rows = (gnss.time < split) | (phase >= _GAP)
-    gnss = replace(
-        gnss,
-        time=gnss.time[rows],
-        received=gnss.received[rows],
-        values={name: value[rows] for name, value in gnss.values.items()},
-    )
+    gnss = gnss.rows((gnss.time < split) | (phase >= _GAP))
     result = replay(replace(log, gnss=gnss), sensors=suite, start=start, reported_noise=False)
     fixes = result.measured.get("gnss_position")
     if fixes is None:

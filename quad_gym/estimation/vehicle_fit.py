@@ -18,10 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_gym.estimation.calibration import correlation_time
-from quad_gym.estimation.logs import Floats
+from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.replaying import prepared
+from quad_gym.estimation.search import correlation_time
 from quad_gym.estimation.smoothing import smooth
+from quad_gym.estimation.tables import read_log
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import LogDelays, SensorSuite
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
@@ -56,8 +57,8 @@ class FittedVehicle(NamedTuple):
 def fit_vehicle(
     log: Any,
     *,
-    motors: Mapping[str, ArrayLike],
     sensors: SensorSuite | str,
+    motors: Mapping[str, ArrayLike] | None = None,
     vehicle: VehicleParams | str = "lab",
     start: Mapping[str, Any] | None = None,
     body: str = "flu",
@@ -69,9 +70,9 @@ def fit_vehicle(
 
     Args:
         log: A table or a file, see `read_log`.
-        motors: Commands of the motors: `time` (n,) [s] from which on they hold, and `voltages`
-            (n, 4) [V].
         sensors: The suite that the smoother assumes, or its name.
+        motors: Commands of the motors: `time` (n,) [s] from which on they hold, and `voltages`
+            (n, 4) [V]; None: the columns `motors` of the log.
         vehicle: The vehicle to begin with, or its name.
         start: Keywords of `initialize`, such as `{"heading": 0.5}`.
         body: Axes of a table, see `read_log`.
@@ -84,9 +85,10 @@ def fit_vehicle(
 
     known = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
     check.instance("vehicle", known, VehicleParams)
-    times, voltages = _commands(motors)
-    whole, suite = prepared(log, sensors, body)
-    suite = suite.replace(log_delays=LogDelays())  # the log has none any more
+    whole = read_log(log, body=body) if motors is None else log
+    times, voltages = _commands(_in_log(whole) if motors is None else motors)
+    whole, suite = prepared(whole, sensors, body)
+    suite = suite.replace(log_delays=LogDelays(), log_rotation=(0.0, 0.0, 0.0))  # now corrected
     smoothed = smooth(whole, sensors=suite, start=start)
     first, last = max(smoothed.time[0], times[0]) + _SETTLING, min(smoothed.time[-1], times[-1])
     ends = whole.imu.time
@@ -127,6 +129,15 @@ def _commands(motors: Mapping[str, ArrayLike]) -> tuple[Floats, Floats]:
     if len(times) < 2 or not (np.diff(times) > 0.0).all():
         raise ValueError("motors['time'] must increase")
     return times, voltages
+
+
+def _in_log(log: Log) -> dict[str, ArrayLike]:
+    """Return the commands of the motors in a log."""
+    if log.motors is None:
+        raise ValueError(
+            "a log must have the columns motor_0 to motor_3 to fit a vehicle, or motors="
+        )
+    return {"time": log.motors.time, "voltages": log.motors.values["motors"]}
 
 
 def _result(known: VehicleParams, x: Floats, reach: Floats) -> FittedVehicle:

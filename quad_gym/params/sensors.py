@@ -128,6 +128,9 @@ class SensorSuite(Checked, Saved):
     """noise of `observation="noisy"`"""
     log_delays: LogDelays = field(default_factory=LogDelays)
     """delays of time stamps in this vehicle's logs, which a replay subtracts"""
+    log_rotation: check.Vector3 = (0.0, 0.0, 0.0)
+    """roll, pitch and yaw from the axes of the IMU in this vehicle's logs to B [rad], by which a
+    replay rotates the samples; 3-1-2 Euler angles"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

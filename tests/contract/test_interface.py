@@ -203,9 +203,6 @@ def test_arguments_of_a_batch_without_effect_are_refused(arguments, message):
     ("arguments", "name"),
     [
         ({"observation": "measurements", "layout": "relative"}, "layout"),
-        ({"feature_count": 3}, "feature_count"),
-        ({"gnss_velocity": True}, "gnss_velocity"),
-        ({"aids": ()}, "aids"),
         ({"drawn": ("mass",)}, "drawn"),
     ],
     ids=str,

@@ -6,21 +6,13 @@ import pytest
 import quad_gym
 from quad_gym.envs.spaces import layout_bounds
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.records import COLUMNS, FEATURE_SLICE, MAX_FEATURES, MAX_OBSERVATION, Aid
+from quad_gym.params.sensors import AID_PARAMS
+from quad_gym.records import COLUMNS, FEATURE_SLICE, MAX_FEATURES, MAX_OBSERVATION
 from tests.builders import actions_of, vec_env
 from tests.contract.test_tasks import SECONDS, UNBOUNDED, body_axes, level, unit
 from tests.reference_ukf import east_north_up
 
 OMEGA = 2 * np.pi / 10
-
-SHOWN_BY = {
-    name: {
-        "feature_count": len(quad_gym.sensor_suite(name).camera.features_I),
-        "gnss_velocity": quad_gym.sensor_suite(name).gnss.velocity_sigma is not None,
-    }
-    for name in ("lab", "rtk")
-}
-"""What the observation of raw measurements depends on."""
 
 
 def on_circle(t):
@@ -179,14 +171,14 @@ def test_imu_means_are_over_samples_since_the_last_step(suite):
     fast = QuadVectorEnv(3, "circle", **given, control_rate=200)  # shows every sample
     observation, _ = slow.reset(seed=4)
     fast.reset(seed=4)
-    seen = parts_of(observation, observation="measurements", **SHOWN_BY[suite])
+    seen = parts_of(observation, observation="measurements", sensors=suite)
     np.testing.assert_array_equal(seen["gyro_mean"], seen["gyro"])
     np.testing.assert_array_equal(seen["accel_mean"], seen["accel"])
     for k in range(5):
         actions = 0.2 * np.stack([actions_of(i, 5)[k] for i in range(3)])
-        seen = parts_of(slow.step(actions)[0], observation="measurements", **SHOWN_BY[suite])
+        seen = parts_of(slow.step(actions)[0], observation="measurements", sensors=suite)
         each = [
-            parts_of(fast.step(actions)[0], observation="measurements", **SHOWN_BY[suite])
+            parts_of(fast.step(actions)[0], observation="measurements", sensors=suite)
             for _ in range(4)
         ]
         for name in ("gyro", "accel"):
@@ -291,8 +283,8 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
         steps=2, sensors=suite, randomization=nearly_all_draws(), **keywords
     )
     batch = env.flights.batch
-    keywords |= {"feature_count": 16, "gnss_velocity": True, "aids": suite.aids}
-    parts = parts_of(observation, drawn=batch.randomization.names, **keywords)
+    drawn = batch.randomization.names
+    parts = parts_of(observation, sensors=suite, drawn=drawn, **keywords)
     assert sum(part.shape[1] for part in parts.values()) == 262
     values = batch.drawn()
     close(parts["last_action"], actions)
@@ -302,8 +294,10 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
 
 
 def test_every_observation_fits():
-    shown = {"include_std": True, "privileged": True, "gnss_velocity": True}
-    shown |= {"feature_count": MAX_FEATURES, "aids": tuple(Aid), "drawn": tuple(COLUMNS)}
+    suite = quad_gym.sensor_suite("rtk")
+    camera = suite.camera.replace(features_I=((1.0, 0.0, 0.0),) * MAX_FEATURES)
+    suite = suite.replace(camera=camera, **{name: kind() for name, kind in AID_PARAMS.items()})
+    shown = {"include_std": True, "privileged": True, "sensors": suite, "drawn": tuple(COLUMNS)}
     table = quad_gym.observation_layout("measurements", **shown)
     assert 256 < table[-1].slice.stop <= MAX_OBSERVATION
     longer = [*table, table[0]._replace(slice=slice(0, MAX_OBSERVATION + 1))]

@@ -6,6 +6,7 @@ import functools
 import math
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -180,6 +181,12 @@ def test_compiled_filter_calls_no_function_of_the_math_library(target):
 
 
 @needs_compiler
+def test_without_numba_one_sentence_names_the_extra(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(ImportError, match=r'needs numba: pip install "quad-gym\[compile\]"'):
+        export_filter(quad_gym.sensor_suite("rtk"), "rtk", "x86-64", tmp_path)
+
+
 @needs_cmake
 def test_cmake_builds_the_example_without_warnings(tmp_path):
     flags = "-DCMAKE_C_FLAGS=-Wall -Wextra -pedantic -Werror"

@@ -32,7 +32,7 @@ LINEAR = RTK.replace(
     estimator=RTK.estimator.replace(false_alarm_probability=0.0, recursive_update_threshold=None),
 )
 """Sensors whose model is linear near rest."""
-DT, STEPS, EVERY = 0.02, 100, 8
+DT, STEPS, EVERY = 0.02, 64, 8
 P0 = np.diag(np.repeat([0.1, 0.1, 0.001, 0.02, 0.0005], 3) ** 2)
 
 

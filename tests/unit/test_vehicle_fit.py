@@ -5,6 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import VehicleParams, vehicle_params
+from quad_gym.commands.calibrate import CalibrateArgs, fit_body
 from quad_gym.estimation import fit_vehicle
 from tests.logged_flights import RTK, Recorded, flown
 
@@ -15,11 +16,25 @@ TRUE = LAB.replace(
 
 
 @pytest.fixture(scope="module")
-def found():
+def table():
+    """A log with a row for each change of the motor voltages."""
     flight = flown(RTK, 12.0, task="lemniscate", vehicle=TRUE)
     table = Recorded(flight, lost=0.0, jitter=0.0).table()
-    motors = {"time": flight["time"][:-1], "voltages": flight.about["voltages"][1:]}
-    return fit_vehicle(table, motors=motors, sensors=RTK)
+    times, voltages = flight["time"][:-1], flight.about["voltages"][1:]
+    empty = np.full(len(times), np.nan)
+    table = {name: np.append(column, empty) for name, column in table.items()}
+    for name in ("time", "received"):
+        table[name][-len(times) :] = times
+    order = np.argsort(table["received"], kind="stable")
+    motors = np.full((len(order), 4), np.nan)
+    motors[-len(times) :] = voltages
+    table = {name: column[order] for name, column in table.items()}
+    return table | {f"motor_{k}": motors[order, k] for k in range(4)}
+
+
+@pytest.fixture(scope="module")
+def found(table):
+    return fit_vehicle(table, sensors=RTK)
 
 
 @pytest.mark.parametrize(
@@ -49,6 +64,16 @@ def test_vehicle_that_was_found_flies_from_a_file(found, tmp_path):
     assert np.isfinite(env.step(env.action_space.sample())[0]).all()
 
 
+def test_command_writes_the_vehicle_of_a_log_in_a_file(table, found, tmp_path):
+    names = list(table)
+    rows = np.column_stack([table[name] for name in names])
+    lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows]
+    (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
+    args = CalibrateArgs(log=tmp_path / "flight.csv", vehicle=tmp_path / "body.toml")
+    assert "rotor lag 0.08" in fit_body(args, RTK, {})
+    assert vehicle_params(tmp_path / "body.toml") == found.vehicle
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -66,3 +91,9 @@ def test_file_of_a_vehicle_with_a_mistake_is_refused(text, message, tmp_path):
 def test_motor_commands_must_have_a_row_for_each_time():
     with pytest.raises(ValueError, match="voltages"):
         fit_vehicle({}, motors={"time": [0.0, 1.0], "voltages": np.zeros((3, 4))}, sensors=RTK)
+
+
+def test_log_without_motor_voltages_is_refused():
+    table = {"time": [0.0, 0.1], "gyro": np.zeros((2, 3)), "accel": np.ones((2, 3))}
+    with pytest.raises(ValueError, match="must have the columns motor_0 to motor_3"):
+        fit_vehicle(table, sensors=RTK)

@@ -28,7 +28,7 @@ from quad_gym.records import WIDTH
 
 PROCESSORS = {
     "x86_64": {
-        8: Processor("x86_64-unknown-linux-gnu", "x86-64-v4", level=3),
+        8: Processor("x86_64-unknown-linux-gnu", "x86-64-v4", level=3, tune="znver4"),
         4: Processor("x86_64-unknown-linux-gnu", "x86-64-v3", level=3),
         2: Processor("x86_64-unknown-linux-gnu", "x86-64", level=3),
     },
@@ -97,16 +97,13 @@ def require_compiler() -> str:
 
 def _build(digest: str, jobs: int) -> None:
     """Build the library with the lanes of this process."""
-    names = list(dict.fromkeys([*names_of([source.name for source in SOURCES]), *ENTRIES]))
+    names = part_names()
     began, output = time.monotonic(), file_of(WIDTH).with_suffix(f".{os.getpid()}.tmp")
     say(f"quad_gym: compiling {len(names)} parts of the library with {WIDTH} lanes")
-    processor, context = PROCESSORS[machine()][WIDTH], multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
-        with concurrent.futures.ProcessPoolExecutor(jobs, context, gc.disable) as pool:
-            tasks = [pool.submit(object_of, name, processor) for name in names]
-            for k, task in enumerate(tasks):
-                Path(folder, f"{k}.o").write_bytes(task.result())
-        Path(folder, "entries.c").write_text(_calls(digest), encoding="ascii")
+        for k, content in enumerate(objects_of(names, PROCESSORS[machine()][WIDTH], jobs)):
+            Path(folder, f"{k}.o").write_bytes(content)
+        Path(folder, "entries.c").write_text(calls(digest), encoding="ascii")
         objects = [f"{k}.o" for k in range(len(names))]
         needed = ["-lm"] if (machine(), WIDTH) in _WITH_LIBM else []  # any other needs nothing
         command = [require_compiler(), *_LINK, "entries.c", *objects, *needed, "-o", str(output)]
@@ -115,7 +112,27 @@ def _build(digest: str, jobs: int) -> None:
     say(f"quad_gym: compiled the library in {time.monotonic() - began:.0f} s")
 
 
-def _calls(digest: str) -> str:
+def part_names() -> list[str]:
+    """Return the names of all stages and entries, the slowest to compile first."""
+    return list(dict.fromkeys([*names_of([source.name for source in SOURCES]), *ENTRIES]))
+
+
+def objects_of(names: Sequence[str], processor: Processor, jobs: int | None = None) -> list[bytes]:
+    """Return the object files of stages and entries, with the lanes of this process.
+
+    Args:
+        names: "module:function" of each.
+        processor: Processor to emit code for.
+        jobs: Number of processes that compile; None: one for each core.
+    """
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(
+        jobs or available_cores(), context, gc.disable
+    ) as pool:
+        return [task.result() for task in [pool.submit(object_of, n, processor) for n in names]]
+
+
+def calls(digest: str) -> str:
     """Return the C source of the functions that Python calls, and of the digest."""
     head = f'#include <stdint.h>\n\nconst char qg_sources[] = "{MARK.decode()}{digest}";\n'
     return "\n".join([head, *(_call_of(name, entry) for name, entry in ENTRIES.items())])

@@ -40,6 +40,7 @@ class Processor(NamedTuple):
     cpu: str
     reloc: str = "pic"
     level: int = 2  #: level of optimization; 3 gives larger code
+    tune: str = ""  #: processor for which instructions are chosen and ordered; empty: `cpu`
 
 
 class _ForeignLibrary(EntryLibrary):
@@ -173,7 +174,10 @@ def emitted(text: str, processor: Processor) -> bytes:
         reloc=processor.reloc,
         codemodel="small",
     )
-    module = llvm.parse_assembly(_with_pauses(text, processor.triple.partition("-")[0]))
+    text = _with_pauses(text, processor.triple.partition("-")[0])
+    if processor.tune:
+        text = re.sub(r"(?m)^attributes #\d+ = \{", rf'\g<0> "tune-cpu"="{processor.tune}"', text)
+    module = llvm.parse_assembly(text)
     module.triple, module.data_layout = processor.triple, str(machine.target_data)
     builder = llvm.create_pass_builder(
         machine, llvm.PipelineTuningOptions(speed_level=processor.level)

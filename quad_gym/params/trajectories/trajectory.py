@@ -43,7 +43,9 @@ def _making(
 
     own = inspect.Parameter("cls", inspect.Parameter.POSITIONAL_ONLY)
     others = inspect.signature(function).parameters.values()
-    make.__signature__ = inspect.Signature([own, *others])  # type: ignore[attr-defined]
+    shown = inspect.Signature([own, *others], return_annotation="Trajectory")
+    make.__signature__ = shown  # type: ignore[attr-defined]
+    make.__annotations__ = {**function.__annotations__, "return": "Trajectory"}
     return classmethod(make)
 
 

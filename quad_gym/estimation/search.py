@@ -1,0 +1,286 @@
+"""Search for the numbers of a sensor suite.
+
+The search maximizes the likelihood of the innovations (`likelihood.py`) in the first part of the
+log, with priors about the numbers (`numbers.py`). It begins on grids of delays, in a short part of
+the flight. Newton steps follow, whose derivatives are differences between filters: side by side for
+numbers of the suite, on a log each for delays and the mounting of the IMU. Their second derivatives
+are exact on the diagonal, and otherwise as correlated as the scores of parts of the log.
+
+The likelihood alone makes noise too small where errors are correlated in time, such as errors of a
+magnetometer near motors: innovations are then as small as predicted, but not white, and the filter
+counts the same error many times. Noise of such sensors becomes larger by sqrt(tau), at most two
+times, where tau is the integrated autocorrelation time of the innovations in samples, before the
+other numbers are fitted again.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_gym.estimation.engine import Floats
+from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, tails
+from quad_gym.estimation.logs import Log
+from quad_gym.estimation.numbers import MOST, Number, numbers_in
+from quad_gym.estimation.replaying import replay
+from quad_gym.params.sensors import SensorSuite
+
+_SILENT = 0.8
+"""Ratio of standard deviations after and before above which a log does not determine a number."""
+_COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
+"""Noise that the search begins with twice: as large as the samples admit, and at its prior."""
+_FEW_STEPS, _STEPS = 4, 12  #: Newton steps from each beginning, and after
+_SHARES = np.array([1.0, 0.75, 0.5, 0.35, 0.2, 0.1, 0.05, 0.02])
+"""Shares of a Newton step that are tried side by side."""
+_LEAST_GAIN = 0.02  #: drop of the log likelihood in a step with which the search ends
+_RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are estimates
+_SHORT = 45.0  #: time of flight that is enough for the first search [s]
+_CLUSTER, _CLUSTERS = 5.0, 20
+"""Length of independent parts of a log [s], shorter in short logs; their least number."""
+_FEWEST_TAILS = 30  #: number of innovations that determines their tails
+_COARSE = np.arange(-1.0, 1.01, 0.1)  #: first grid of a delay [s]
+_MARGIN = 0.2  #: time at the end of the log that changes of delays may reach [s]
+_WHITE = {
+    "gnss.position_sigma_I[0, 1]": ("gnss_position", slice(0, 2), 1.5),
+    "gnss.position_sigma_I[2]": ("gnss_position", slice(2, 3), 1.5),
+    "gnss.velocity_sigma": ("gnss_velocity", slice(3), 2.0),
+    "magnetometer.noise_sigma": ("magnetometer", slice(3), 2.0),
+}
+"""White noise that is inflated where innovations are correlated: their sensor, its axes, and the
+largest factor, which is smaller where the filter estimates a correlated error of the sensor."""
+
+
+class Calibrated(NamedTuple):
+    """A number that a calibration has found."""
+
+    number: Number
+    prior: float
+    value: float
+    low: float  #: lower end of its 95 % interval
+    high: float
+    determined: bool  #: False: the log does not determine it
+
+
+class Search:
+    """The search for the numbers of a suite, at coordinates x."""
+
+    def __init__(self, log: Log, prior: SensorSuite, start: dict[str, Any], delays: bool) -> None:
+        self.log, self.prior, self.start = log, prior, start
+        self.nu: dict[str, float] = {}
+        self.numbers = numbers_in(prior, log, delays)
+        self.values = np.array([number.of(prior) for number in self.numbers])
+        self.low = np.array([number.least for number in self.numbers])
+        self.of_log = np.array([number.of_log for number in self.numbers])
+        self.steps = np.diag([number.step for number in self.numbers])
+        self.x = np.clip(self._first(), self.low, MOST)
+        self._margin = _MARGIN
+        self._known: dict[bytes, Likelihood] = {}
+
+    def _first(self) -> Floats:
+        """Return where the search begins: with noise as wide as the log may need."""
+        x = np.zeros(len(self.numbers))
+        for k, (number, value) in enumerate(zip(self.numbers, self.values, strict=True)):
+            wide = {"gnss.velocity_sigma": 4.0, "magnetometer.hard_iron_sigma": 3.0}
+            if number.positive:
+                x[k] = number.coordinate(value, wide.get(number.name, 1.0) * value)
+            if number.name in _COARSE_NOISE:  # of the largest that the samples admit
+                x[k] = max(0.0, number.coordinate(value, self._roughness(number)))
+        return x
+
+    def _roughness(self, number: Number) -> float:
+        """Return the noise density of the IMU if its samples changed by noise only."""
+        values = self.log.imu.values[number.field.split("_")[0]]
+        dt = float(np.median(np.diff(self.log.imu.time)))
+        return float(np.diff(values, axis=0).std()) * math.sqrt(0.5 * dt)
+
+    def suite(self, x: Floats, gate: bool = False) -> SensorSuite:
+        """Return the suite at coordinates."""
+        found = self.prior
+        if not gate:  # whose decisions are no smooth function of the numbers
+            found = found.replace(estimator=found.estimator.replace(false_alarm_probability=0.0))
+        for number, value, place in zip(self.numbers, self.values, x, strict=True):
+            found = number.put(found, number.value(value, float(place)))
+        return found
+
+    def losses(self, points: Sequence[Floats]) -> Floats:
+        """Return the losses of parts of the log, (parts, points), without priors."""
+        found = np.empty((0, 0))
+        groups: dict[bytes, list[int]] = {}  # of points with the same delays and mounting
+        for k, point in enumerate(points):
+            groups.setdefault(point[self.of_log].tobytes(), []).append(k)
+        for key, rows in groups.items():
+            suites = [self.suite(points[k]) for k in rows]
+            likelihood = self._known.get(key)
+            if likelihood is None:
+                likelihood = Likelihood(self.log, suites[0], self.start, self.nu, self._margin)
+            if key == self.x[self.of_log].tobytes():
+                self._known = {key: likelihood}
+            some = likelihood.losses(suites)
+            found = found if found.size else np.empty((len(some), len(points)))
+            found[:, rows] = some
+        return found
+
+    def total(self, points: Sequence[Floats]) -> Floats:
+        """Return the losses of the whole log, with priors."""
+        return self.losses(points).sum(axis=0) + [0.5 * float(p @ p) for p in points]
+
+    def begin(self) -> None:
+        """Begin the search in a short part of the flight: delays on grids, and noise of the IMU.
+
+        The likelihood has several maxima, as noise of the IMU and drift of GNSS both explain large
+        innovations: the search begins with much and with little of the first.
+        """
+        whole, time = self.log, self.log.imu.time
+        flying = np.cumsum(np.diff(time, prepend=time[0]) * in_flight(whole, time))
+        last = int(np.searchsorted(flying, _SHORT + SETTLING))
+        self.log = whole.until(float(time[min(last, len(time) - 1)]))
+        for k, number in enumerate(self.numbers):
+            if number.sensor == "log_delays":
+                self._margin = max(0.0, -float((self.values[k] + _COARSE).min())) + _MARGIN
+                self._known = {}
+                places = self.x[k] + _COARSE / number.spread
+                points = [np.where(np.arange(len(self.x)) == k, x, self.x) for x in places]
+                self.x[k] = _lowest(places, self.total(points))
+        little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
+        tried = [self._descend(x, ~self.of_log, _FEW_STEPS) for x in (self.x, little)]
+        self.x = min(tried, key=lambda found: found[1])[0]
+        self.log, self._known = whole, {}
+
+    def fit(self) -> None:
+        """Find delays and mounting, and the numbers of the suite, in turn."""
+        delays = vars(self.suite(self.x).log_delays).values()
+        self._margin = _MARGIN + max(0.0, *(-delay for delay in delays))
+        self._known = {}
+        for _ in range(2):
+            if self.of_log.any():
+                self.x, _ = self._descend(self.x, self.of_log, 2)
+            self.x, _ = self._descend(self.x, ~self.of_log, _STEPS)
+
+    def _descend(self, x: Floats, chosen: Any, steps: int) -> tuple[Floats, float]:
+        """Return where Newton steps over the chosen coordinates end, and the loss there."""
+        index = np.flatnonzero(chosen)
+        axes, shares = self.steps[index], _SHARES[[0, 2, 4]] if self.of_log[index[0]] else _SHARES
+        loss = math.inf
+        for _ in range(steps):
+            losses = self.losses([x, *(x + s * step for step in axes for s in (1.0, -1.0))])
+            loss = float(losses[:, 0].sum() + 0.5 * x @ x)
+            scores, bends = _derivatives(losses, np.diag(self.steps)[index])
+            slope, place = scores.sum(axis=0) + x[index], x[index]
+            H = _curvature(scores, bends) + np.eye(len(index))
+            held = ((place <= self.low[index]) & (slope > 0.0)) | ((place >= MOST) & (slope < 0.0))
+            free, step = np.flatnonzero(~held), np.zeros(len(x))
+            step[index[free]] = -np.linalg.solve(H[np.ix_(free, free)], slope[free])
+            step /= max(1.0, float(np.abs(step).max()))
+            points = [np.clip(x + share * step, self.low, MOST) for share in shares]
+            totals = self.total(points)
+            best = int(np.argmin(totals))
+            gain = loss - float(totals[best])
+            if gain > 0.0:
+                x, loss = points[best], float(totals[best])
+            if gain < _LEAST_GAIN:
+                break
+        return x, loss
+
+    def adapt(self) -> None:
+        """Find the tails of the innovations, and widen noise where these are correlated in time."""
+        suite = self.suite(self.x, gate=True)
+        measured = replay(self.log, sensors=suite, start=self.start, reported_noise=False).measured
+        scaled = {}
+        for name, m in measured.items():
+            counts = in_flight(self.log, m.time) & np.isfinite(m.nis)
+            counts &= m.time > m.time[0] + SETTLING
+            scaled[name] = (m.innovation / m.sigma)[counts]
+            if len(scaled[name]) > _FEWEST_TAILS:
+                self.nu[name] = tails(m.nis[counts], scaled[name].shape[1])
+        for k, number in enumerate(self.numbers):
+            sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
+            if sensor not in scaled:
+                continue
+            tau = max(correlation_time(column) for column in scaled[sensor][:, axes].T)
+            factor = min(math.sqrt(tau), most)
+            if factor == 1.0:
+                continue
+            value = factor * number.value(self.values[k], float(self.x[k]))
+            wide = number.coordinate(self.values[k], value)
+            self.low[k] = min(max(self.low[k], wide), MOST - 0.1)
+        self.x = np.maximum(self.x, self.low)
+
+    def intervals(self) -> tuple[Calibrated, ...]:
+        """Return the numbers with 95 % intervals.
+
+        The covariance is H^-1 J H^-1 (Godambe), with the curvature H from differences and J the sum
+        of squares of the scores of independent parts of the log.
+        """
+        from scipy.stats import t
+
+        n, axes, h = len(self.x), self.steps, np.diag(self.steps)
+        row, column = np.triu_indices(n, 1)
+        points = [self.x, *(self.x + s * e for e in axes for s in (1.0, -1.0))]
+        points += [self.x + axes[i] + axes[j] for i, j in zip(row, column, strict=True)]
+        losses = self.losses(points)
+        scores, bends = _derivatives(losses, h)
+        total = losses.sum(axis=0)
+        ahead, both = total[1 : 2 * n : 2], total[2 * n + 1 :]
+        H = np.diag(bends)
+        H[row, column] = (both - ahead[row] - ahead[column] + total[0]) / (h[row] * h[column])
+        H[column, row] = H[row, column]
+        values, vectors = np.linalg.eigh(H)
+        information = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.eye(n)
+        length = max(1, round(min(_CLUSTER / PART, len(scores) / _CLUSTERS)))
+        sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
+        root = np.linalg.solve(information, np.linalg.cholesky(sums.T @ sums + np.eye(n)))
+        sigmas = np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0)
+        reach = float(t.ppf(0.975, len(sums) - 1))
+        found = []
+        for k, (number, prior) in enumerate(zip(self.numbers, self.values, strict=True)):
+            value, low, high = (
+                number.value(prior, float(self.x[k] + s * sigmas[k])) for s in (0.0, -reach, reach)
+            )
+            determined = bool(sigmas[k] < _SILENT)
+            found.append(Calibrated(number, prior, value, low, high, determined))
+        return tuple(found)
+
+
+def _derivatives(losses: Floats, steps: Floats) -> tuple[Floats, Floats]:
+    """Return scores (parts, n), and second derivatives (n,) of the sum over all parts.
+
+    The losses (parts, 1 + 2 n) are at a point, and a step (n,) ahead and back along each axis.
+    """
+    count = 2 * len(steps) + 1
+    ahead, back = losses[:, 1:count:2], losses[:, 2:count:2]
+    bends = (ahead + back).sum(axis=0) - 2.0 * losses[:, 0].sum()
+    return (ahead - back) / (2.0 * steps), bends / steps**2
+
+
+def _curvature(scores: Floats, bends: Floats) -> Floats:
+    """Return second derivatives with the correlations of the scores."""
+    squares = scores.T @ scores
+    squares += np.diag(_RIDGE * np.diag(squares) + 1e-9)
+    sizes = np.sqrt(np.maximum(bends, 0.0) / np.diag(squares))
+    return squares * sizes * sizes[:, np.newaxis]
+
+
+def _lowest(places: Floats, losses: Floats) -> float:
+    """Return the minimum of a parabola through the lowest loss on a grid and its neighbors."""
+    k = int(np.clip(np.argmin(losses), 1, len(losses) - 2))
+    bend, slope, _ = np.polyfit(places[k - 1 : k + 2] - places[k], losses[k - 1 : k + 2], 2)
+    reach = float(places[1] - places[0])
+    move = -0.5 * slope / bend if bend > 0.0 else 0.0
+    return float(places[k] + np.clip(move, -reach, reach))
+
+
+def correlation_time(values: Floats) -> float:
+    """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white.
+
+    The sum ends with the first correlation that white noise would also have, to two standard
+    deviations.
+    """
+    centered, least = values - values.mean(), max(0.05, 2.0 / math.sqrt(len(values)))
+    variance, tau = float((centered**2).mean()), 1.0
+    for lag in range(1, len(values) // 4):
+        rho = float((centered[:-lag] * centered[lag:]).mean()) / variance
+        if rho < least:
+            break
+        tau += 2.0 * rho
+    return tau

@@ -1,0 +1,193 @@
+"""Coverage of calibrated intervals, on simulated logs whose sensors have drawn numbers.
+
+    python -m tests.statistical.calibration_coverage --logs 0 20 --output /tmp/coverage
+
+Each log is a random trajectory with the sensors of a suite. Their noise
+is drawn from 0.8 to several times the suite's, and the delays of time stamps, the magnetic field
+and the mounting of the IMU differ from it. The calibration begins with the suite. Each log takes
+about a minute and has a file of results, so that ranges can be run apart; each run ends with the
+table of all files in the folder.
+"""
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+
+import quad_gym
+from quad_gym.estimation import calibrate, read_log
+from quad_gym.estimation.calibration import _prior_of
+from quad_gym.estimation.numbers import numbers_in
+from quad_gym.rotations import euler_to_dcm
+from tests.logged_flights import Recorded, flown
+
+SUITES = (
+    "consumer",
+    "rtk",
+    "flown",
+    "stale",
+    "indoor",
+    "standard",
+    "consumer",
+    "rtk",
+    "flown",
+    "lab",
+)
+SECONDS = {"standard": 26.0, "lab": 26.0}
+LONG = 50.0
+SPREADS = {
+    **{"declination": 0.2, "inclination": 0.1, "log_rotation": 0.04, "primary_antenna_B": 0.05},
+    **{"gnss": 0.2, "magnetometer": 0.08, "barometer": 0.1, "camera": 0.05},
+}
+"""Standard deviations of numbers of either sign; the suite's are their means."""
+
+
+def drawn(prior, log, rng):
+    """The numbers of a vehicle, by name, and its suite."""
+    suite, true = prior, {}
+    for number in numbers_in(prior, log, delays=True):
+        before = number.of(prior)
+        if number.positive:
+            low = -0.2 if number.least > -1.0 else -1.0
+            value = before * math.exp(rng.uniform(low, max(0.3, min(0.8 * number.spread, 1.5))))
+            if number.field == "strength":
+                value = before * math.exp(0.1 * rng.normal())
+        else:
+            value = before + SPREADS[number.field] * rng.normal()
+        true[number.name] = value
+        suite = number.put(suite, value)
+    return true, suite
+
+
+def as_logged(table, suite):
+    """The table of a vehicle whose clocks and axes are wrong by a suite's numbers."""
+    R = euler_to_dcm(suite.log_rotation).T  # from B to the axes of the IMU
+    table = {name: column.copy() for name, column in table.items()}
+    for name in ("gyro", "accel"):
+        names = [f"{name}_{axis}" for axis in "xyz"]
+        turned = np.column_stack([table[n] for n in names]) @ R.T
+        table.update(zip(names, turned.T, strict=True))
+    first = {"gnss": "gnss_east", "camera": "pixel_0_u", "magnetometer": "magnetometer_x"}
+    for sensor, delay in vars(suite.log_delays).items():
+        names = [n for n in table if n.startswith(first.get(sensor, sensor).split("_")[0])]
+        rows = np.zeros(len(table["time"]), bool)
+        for n in names:
+            rows |= np.isfinite(table[n])
+        table["time"] = table["time"] + delay * rows
+    table["received"] = np.maximum(table["received"], table["time"])
+    order = np.argsort(table["received"], kind="stable")
+    return {name: column[order] for name, column in table.items()}
+
+
+def with_changing_iron(table, compass, rng):
+    """The table with hard iron that is a Gauss-Markov process, in place of a constant."""
+    names = [f"magnetometer_{axis}" for axis in "xyz"]
+    rows = np.flatnonzero(np.isfinite(table[names[0]]))
+    error = compass.hard_iron_sigma * rng.normal(size=3)
+    steps = np.diff(table["time"][rows], prepend=table["time"][rows[0]])
+    for row, step in zip(rows, steps, strict=True):
+        decay = math.exp(-step / compass.hard_iron_tau)
+        drive = compass.hard_iron_sigma * math.sqrt(1.0 - decay**2)
+        error = decay * error + drive * rng.normal(size=3)
+        for name, value in zip(names, error, strict=True):
+            table[name][row] += value
+    return table
+
+
+def simulated(index):
+    """A table, the true numbers and the suite without them."""
+    name, rng = SUITES[index % len(SUITES)], np.random.default_rng(100 + index)
+    base = quad_gym.sensor_suite(name)
+    if base.camera is not None and base.gnss is not None:
+        base = base.replace(camera=None)
+    seconds = SECONDS.get(name, LONG)
+    log = read_log(Recorded(flown(base, 1.0), base, lost=0.0, jitter=0.0).table())
+    prior = _prior_of(base, log)
+    if base.magnetometer is not None:  # the field of the suite, not of one second
+        own = base.magnetometer
+        compass = prior.magnetometer.replace(strength=own.strength, inclination=own.inclination)
+        prior = prior.replace(magnetometer=compass)
+    true, suite = drawn(prior, log, rng)
+    free = {"out_of_bounds": 1e3, "min_height": -1e3, "max_tilt": math.pi}
+    flies = suite
+    if suite.magnetometer is not None:  # hard iron is constant in simulated flights
+        flies = suite.replace(magnetometer=suite.magnetometer.replace(hard_iron_sigma=1e-9))
+    flight = flown(flies, seconds, seed=index, task="random_trajectory", **free)
+    table = Recorded(flight, suite, seed=index, lost=0.0, jitter=0.0).table()
+    if suite.magnetometer is not None:
+        table = with_changing_iron(table, suite.magnetometer, rng)
+    table = as_logged(table, suite)
+    start = {}
+    if base.gnss is None:
+        start = {"position": flight["position"][0], "heading": 0.0}
+    return table, true, base, start
+
+
+def run(index):
+    """Results of one log."""
+    began = time.process_time()
+    table, true, base, start = simulated(index)
+    flown_in = time.process_time() - began
+    found = calibrate(table, sensors=base, start=start)
+    numbers = {
+        n.number.name: (true[n.number.name], n.prior, n.value, n.low, n.high, n.determined)
+        for n in found.numbers
+    }
+    nis = {
+        name: (fit.measurements, fit.freedoms, fit.mean_nis)
+        for name, fit in found.after.sensors.items()
+    }
+    took = time.process_time() - began - flown_in
+    return {"suite": SUITES[index % len(SUITES)], "numbers": numbers, "nis": nis, "seconds": took}
+
+
+def table_of(folder):
+    """Lines of a table of all results."""
+    results = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
+    inside, lines = {}, []
+    nis = {}
+    for result in results:
+        for name, (true, _, _, low, high, determined) in result["numbers"].items():
+            inside.setdefault(name, []).append((low <= true <= high, determined))
+        for name, (count, d, mean) in result["nis"].items():
+            nis.setdefault(name, []).append((count * d, mean))
+    lines += ["| number | within | logs | determined |", "|---|---:|---:|---:|"]
+    for name, rows in inside.items():
+        within, known = np.array(rows, float).sum(axis=0)
+        lines.append(f"| {name} | {within:.0f} | {len(rows)} | {known:.0f} |")
+    every = np.array([row for rows in inside.values() for row in rows])
+    for label, rows in (("all", every), ("determined", every[every[:, 1]])):
+        lines.append(f"| {label} | {100.0 * rows[:, 0].mean():.0f} % of {len(rows)} | | |")
+    lines += ["", "| sensor | NIS / degrees of freedom | range over logs |", "|---|---:|---:|"]
+    for name, rows in nis.items():
+        freedoms, means = np.array(rows).T
+        pooled = (freedoms * means).sum() / freedoms.sum()
+        lines.append(f"| {name} | {pooled:.2f} | {means.min():.2f} to {means.max():.2f} |")
+    took = [result["seconds"] for result in results]
+    lines += [
+        "",
+        f"{len(results)} logs, {np.mean(took):.0f} s each on average, {max(took):.0f} s at most.",
+    ]
+    return lines
+
+
+def main():
+    """Run the logs that have no results yet."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--logs", type=int, nargs=2, default=(0, 20))
+    parser.add_argument("--output", type=Path, default=Path("/tmp/coverage"))
+    args = parser.parse_args()
+    args.output.mkdir(parents=True, exist_ok=True)
+    for index in range(*args.logs):
+        file = args.output / f"{index:02d}.json"
+        if not file.exists():
+            result = run(index)
+            file.write_text(json.dumps(result))
+    print("\n".join(table_of(args.output)))
+
+
+if __name__ == "__main__":
+    main()
