@@ -203,7 +203,7 @@ CATALOG = {
                 texts=texts.memory(f"memory_{task}"),
             )
             for (task, options), golden in zip(
-                texts.MEMORY.items(), ("LookAround", "StaleRace"), strict=True
+                texts.MEMORY.items(), ("LookAround", "StaleRace", "OutageDash"), strict=True
             )
         ),
         Result(

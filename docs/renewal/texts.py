@@ -28,6 +28,7 @@ SUITES = {
 MEMORY = {
     "look_around": "--steps 1000000 --arms certainty certainty_recurrent",
     "stale_race": "--steps 1000000 --arms std std_recurrent",
+    "outage_dash": "--env control_rate=4.0 --steps 600000 --arms std std_recurrent",
 }
 """Budgets and arms of the comparisons of policies with and without memory, by task."""
 
