@@ -13,6 +13,7 @@ import gymnasium
 from baselines.gru import load_network
 from baselines.mlp import MlpPolicy
 from baselines.pd import REACH_OF_GAPS, PDPolicy
+from baselines.planning import PlanningPolicy
 from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
 from quad_gym.params import checks as check
@@ -30,7 +31,9 @@ _PD: dict[str, dict[str, Any]] = {
 }
 """Arguments of `PDPolicy` by name, see `load_policy`."""
 
-NAMES = (*_PD, "pretrained")  #: names of policies, see `load_policy`
+_PLANNING = "pd:planning"
+
+NAMES = (*_PD, _PLANNING, "pretrained")  #: names of policies, see `load_policy`
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",
@@ -62,6 +65,7 @@ def load_policy(name: str, env: Any) -> Policy:
         name: "pd" (tuned gains), "pd:lab" (gains of the report), "pd:features" and
             "pd:features_when_uncertain" (tuned gains, facing the features), "pd:slow" and
             "pd:waiting" (for courses with gaps: half the speed, or waiting when uncertain),
+            "pd:planning" (plans by predicted covariances, on LookAround and OutageDash),
             "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
             the task of the environment), or a file: `.npz` with plain arrays, or `.zip`
             written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
@@ -76,6 +80,8 @@ def load_policy(name: str, env: Any) -> Policy:
     """
     if name in _PD:
         return PDPolicy(env, **_PD[name])
+    if name == _PLANNING:
+        return PlanningPolicy(env)
     if name.startswith("pd:"):
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
@@ -102,7 +108,7 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
 
     Raises a ValueError if the name is "pretrained" and no policy is included for the task.
     """
-    if name in ("pd:features_when_uncertain", "pd:waiting"):
+    if name in ("pd:features_when_uncertain", "pd:waiting", _PLANNING):
         return {"include_std": True}
     if name != "pretrained":
         return {}

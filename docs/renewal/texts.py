@@ -25,15 +25,19 @@ SUITES = {
 """Options of the rows of the table of consistency, by their labels."""
 
 
-TASKS = {"look_around": "LookAround", "stale_race": "StaleRace", "outage_dash": "OutageDash"}
 MEMORY = {
-    "look_around --steps 1000000": "certainty certainty_recurrent",
-    "stale_race --steps 1000000": "std std_recurrent",
-    "outage_dash --steps 600000": "std std_recurrent",
+    "look_around": "--steps 1000000 --arms certainty certainty_recurrent",
+    "stale_race": "--steps 1000000 --arms std std_recurrent",
+    "outage_dash": "--env control_rate=4.0 --steps 600000 --arms std std_recurrent",
 }
-"""Tasks, with the budget, and arms of the comparison of policies with and without memory."""
+"""Budgets and arms of the comparisons of policies with and without memory, by task."""
 
-HEADINGS = {"success": "success", "crashed": "crashed", "error": "position error [m]"}
+HEADINGS = {
+    "return": "return",
+    "success": "success",
+    "crashed": "crashed",
+    "error": "position error [m]",
+}
 SPEEDS = {
     "estimate": "vector, estimate, 50 Hz, standard",
     "truth": "vector, truth, 50 Hz, standard",
@@ -242,18 +246,16 @@ def cell(found: Mapping[str, float], column: str) -> str:
     return share(estimated) if digits is None else number(estimated, digits)
 
 
-def memory(folder: Path, _: Sequence[str]) -> dict[str, str]:
-    """Arms with and without memory of the three studies, and the verdicts."""
-    rows, verdicts = [], []
-    for k, task in enumerate(MEMORY):
-        summary, name = _read(folder / f"{k}/summary.json"), TASKS[task.split()[0]]
-        for arm in summary["study"]["arms"]:
-            row = summary["rows"][arm["name"]]
-            cells = (cell(row[column], column) for column in ("return", "success", "crashed"))
-            rows.append([name, arm["label"], *cells])
-        verdicts += [f"- {name}: {each}" for each in summary["conclusions"] if "emory" in each]
-    text = table(("task", "policy", "return", "success", "crashed"), rows)
-    return {"memory": text + "\n" + "\n".join(verdicts) + "\n"}
+def memory(name: str) -> Texts:
+    """Arms with and without memory, and the verdict."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        summary = _read(folder / "0/summary.json")
+        verdict = next(each for each in summary["conclusions"] if each.startswith("Memory"))
+        rows = study_rows(summary, "trained on", (), ("return", "success", "crashed"))
+        return {name: f"{rows}\n{verdict}\n"}
+
+    return texts
 
 
 def study(name: str, *arms: str) -> Texts:

@@ -73,11 +73,21 @@ def mean_square_figure(
 
 
 @plots.house_style()
-def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
-    """Figure of root mean square errors and standard deviations of the filter, (t, 15) each."""
+def errors_figure(
+    time: Floats,
+    errors: Floats,
+    sigmas: Floats,
+    title: str,
+    bound: tuple[Floats, Floats] | None = None,
+) -> Any:
+    """Figure of root mean square errors and standard deviations of the filter, (t, 15) each.
+
+    `bound` has times (b,) and the posterior Cramer-Rao bounds on the mean squares, (b, 15).
+    """
     text = (
-        f"{title}\nError (blue) and standard deviation of the filter (dashed), "
-        "root mean square over flights"
+        f"{title}\nError (blue), standard deviation of the filter (dashed)"
+        + ("" if bound is None else ", Cramer-Rao bound (red, dotted)")
+        + "; root mean square over flights"
     )
     blocks = {name: part for name, part in PARTS.items() if name in _UNITS}
     figure, axes = _grid(len(blocks), text)
@@ -86,6 +96,9 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
         for values, color, dashes in ((errors, plots.BLUE, "-"), (sigmas, plots.INK, (0, (4, 3)))):
             size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
             axis.plot(time, size, color=color, linestyle=dashes, linewidth=1.3)
+        if bound is not None:
+            size = factor * np.sqrt(bound[1][:, part].sum(axis=1))
+            axis.plot(bound[0], size, color=plots.VERMILLION, linestyle=(0, (1, 2)), linewidth=1.6)
         axis.set_title(f"{_title(name)} [{unit}]")
         plots.logarithmic(axis, subs=(2.0, 5.0))
         axis.yaxis.set_minor_formatter("{x:g}")

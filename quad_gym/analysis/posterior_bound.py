@@ -75,7 +75,7 @@ class Recursion:
 def posterior_bound(
     batch: FlightBatch, *, seeds: Sequence[int], duration: float, settle: float, every: float = 0.1
 ) -> dict[str, float]:
-    """Bound on the root mean square errors of position, velocity and attitude per axis.
+    """Return the bound on the root mean square errors of position, velocity and attitude per axis.
 
     Args:
         batch: Flights on the true state, with a filter, of a task without endings.
@@ -87,12 +87,28 @@ def posterior_bound(
     Returns:
         Bounds by the names of `quad_gym.analysis.consistency.PARTS` [m, m/s, rad].
     """
+    times, variances = bound_over_time(batch, seeds=seeds, duration=duration, every=every)
+    mean = variances[times > settle - 0.5 * batch.sensors.imu.dt].mean(axis=0)
+    return {name: float(np.sqrt(mean[PARTS[name]].mean())) for name in list(PARTS)[1:4]}
+
+
+def bound_over_time(
+    batch: FlightBatch, *, seeds: Sequence[int], duration: float, every: float
+) -> tuple[Floats, Floats]:
+    """Return times (t,) [s] and the bounds (t, 15) on the mean square errors of a filter's states.
+
+    Args:
+        batch: As in `posterior_bound`.
+        seeds: Seeds of the flights.
+        duration: Length of the flights [s].
+        every: Time between two bounds [s].
+    """
     model, dt = SuiteModel(batch.sensors), batch.sensors.imu.dt
     delays = batch._settings["sensor_delay"][0].astype(int)
     batch.reset(seeds=seeds)
     recursion = Recursion(model.start(batch.covariance()), MOVING)
     past = deque([_truth(batch)], MEMORY)
-    variances = []
+    times, variances = [], []
 
     def at(sensor: Sensor) -> Truth:
         return past[-1 - min(delays[sensor], len(past) - 1)]
@@ -107,10 +123,10 @@ def posterior_bound(
         valid = batch.record("block_valid") > 0.0
         for rows, H, variance, sensor in model.measurements(valid, at, batch.feature_places()):
             recursion.measure(rows, H, variance, min(delays[sensor], len(past) - 1))
-        if tick * dt >= settle and tick % round(every / dt) == 0:
-            variances.append(np.einsum("nii->ni", recursion.P).mean(axis=0))
-    mean = np.mean(variances, axis=0)
-    return {name: float(np.sqrt(mean[PARTS[name]].mean())) for name in list(PARTS)[1:4]}
+        if tick % round(every / dt) == 0:
+            times.append(tick * dt)
+            variances.append(np.einsum("nii->ni", recursion.P)[:, :15].mean(axis=0))
+    return np.array(times), np.array(variances)
 
 
 def _truth(batch: FlightBatch) -> Truth:

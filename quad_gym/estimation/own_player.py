@@ -86,7 +86,8 @@ class OwnPlayer:
                 "estimator of your own (--heading)"
             )
         begin, imu = kf.time, player.log.imu
-        times = begin + dt * np.arange(1 + int((imu.time[-1] - begin) / dt + SAME_TIME))
+        count = 1 + int((imu.time[-1] - begin) / dt + SAME_TIME)
+        times = np.asarray(begin + dt * np.arange(count), np.float64)
         gyro, accel = (self._means(imu.values[name], times) for name in ("gyro", "accel"))
         last = np.searchsorted(imu.time, times + SAME_TIME, "right") - 1
         now = imu.values["gyro"][np.maximum(last, 0)]
@@ -152,7 +153,7 @@ class OwnPlayer:
                     value = value * (length / np.linalg.norm(value))
                 found[name] = Reading((R_IG @ value)[np.newaxis], EVERYONE, age)
         if given.pixels is not None:
-            seen = ~np.isnan(given.pixels).any(axis=1)
+            seen = np.asarray(~np.isnan(given.pixels).any(axis=1))
             found["pixels"] = Reading(given.pixels[np.newaxis], seen[np.newaxis], age)
         for aid, value in given.aids.items():
             one = value if AID_FREEDOMS[aid] == 1 else value[np.newaxis]
@@ -234,5 +235,6 @@ class OwnPlayer:
                 stamps = np.array(self._arrived[block])
                 unknown = np.full((len(stamps), FREEDOMS[block]), np.nan)
                 none = np.zeros(len(stamps))
-                found[name_of(block)] = Measured(*stamps.T, unknown, unknown, unknown[:, 0], none)
+                times = stamps[:, 0], stamps[:, 1]
+                found[name_of(block)] = Measured(*times, unknown, unknown, unknown[:, 0], none)
         return found

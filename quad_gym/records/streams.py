@@ -48,6 +48,7 @@ DRAW_VIBRATION = _claim("vibration of the IMU", 576, 3)
 DRAW_BLUR = _claim("places in blurred images", 592, MAX_FEATURES)
 DRAW_AID = _claim("white noise of aiding sensors", 720, 2 * AIDS)
 DRAW_AID_DRIFT = _claim("slow errors of aiding sensors", 736, AIDS)
+DRAW_AID_VECTOR = _claim("slow errors of aiding sensors, of three numbers", 740, 3 * AIDS)
 # at an episode's first instant
 DRAW_COURSE = _claim("phase, radius, period and sense of the reference", 64, 2)
 DRAW_START = _claim("start", 66, 5)

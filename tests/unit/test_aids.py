@@ -52,6 +52,17 @@ def test_bias_of_a_barometer_is_a_gauss_markov_process():
     assert (before * after).mean() == pytest.approx(sigma**2 * np.exp(-0.5), rel=0.1)
 
 
+def test_hard_iron_that_changes_is_a_gauss_markov_process():
+    suite = LAB.replace(magnetometer=MagnetometerParams(hard_iron_tau=0.5, rate=20.0, phase=0.0))
+    batch = fly(suite, 2000, task="hover")
+    before = batch.record("aid_vector")[:, MAGNETOMETER]
+    steps(batch, 0.25)
+    after, sigma = batch.record("aid_vector")[:, MAGNETOMETER], suite.magnetometer.hard_iron_sigma
+    np.testing.assert_allclose(after.std(axis=0), sigma, rtol=0.08)
+    expected = sigma**2 * np.exp(-0.5) * np.eye(3)
+    np.testing.assert_allclose(before.T @ after / 2000, expected, atol=0.1 * sigma**2)
+
+
 def test_a_magnetometer_measures_the_field_with_its_errors():
     magnetometer = MagnetometerParams(phase=0.0, soft_iron_sigma=0.02, declination_sigma=0.05)
     batch = fly(LAB.replace(magnetometer=magnetometer), 2000, task="hover")

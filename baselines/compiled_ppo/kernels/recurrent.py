@@ -30,7 +30,7 @@ SEQUENCES = 16  #: number of sequences in a tile
 RESET, UPDATE, CANDIDATE, HIDDEN = range(4)
 """Gates of a GRU, and U_n h + c_n. Its table has six rows: W and b, then U and c, of each gate."""
 
-_ZERO, _HALF, _ONE, _TWO = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0))
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _ODD = tuple(
     np.float32(c)
     for c in (
@@ -41,10 +41,8 @@ _ODD = tuple(
 _EVEN = tuple(
     np.float32(c)
     for c in (
-        1.19825839466702e-06,
-        1.18534705686654e-04,
-        2.26843463243900e-03,
-        4.89352518554385e-03,
+        *(1.19825839466702e-06, 1.18534705686654e-04),
+        *(2.26843463243900e-03, 4.89352518554385e-03),
     )
 )
 """Coefficients of a rational tanh for single precision, from Eigen (`generic_fast_tanh_float`)."""
@@ -154,62 +152,64 @@ def _differentiate_tile(units, model, samples, recipe, rooms, part, gradient, su
     """Add the gradient of the loss of some sequences; each sample has the weight `share`."""
     firsts, advantages, share = units
     net, actor, critic = model
-    ended, begun = samples[4], samples[5]
+    observations, ended, begun = samples[0], samples[4], samples[5]
+    inputs, memories, gates, products, joined, outputs, deltas, product = rooms
     m, length, flights = len(firsts), advantages.shape[1], begun.shape[2]
     rows = m * length
     chosen, A = np.empty(rows, np.int64), np.empty(rows, net[0].dtype)
+    kept = np.empty(rows, net[0].dtype)
     for t in range(length):
         for i in range(m):
-            chosen[t * m + i] = firsts[i] + t * flights
-            A[t * m + i] = advantages[i, t]
+            row, sample = t * m + i, firsts[i] + t * flights
+            chosen[row], A[row] = sample, advantages[i, t]
+            kept[row] = _ZERO if t > 0 and ended[sample - flights] else _ONE
+    tile = (chosen, A, samples, recipe, share)
+    layers = (joined[part], (outputs[part], deltas[part], product[part]))
+    before, after, d = memories[part, 0, :rows], memories[part, 1, :rows], memories[part, 2, :rows]
     for which in range(2):
         gru, table = (actor, critic)[which]
-        x = _matrix(rooms[0][part], rows, gru[0, INPUTS])
+        x = _matrix(inputs[part], rows, gru[0, INPUTS])
         for i in range(rows):
             for j in range(x.shape[1]):
-                x[i, j] = samples[0][chosen[i], j]
-        size = gru[0, OUTPUTS]
-        before, after = rooms[1][part, 0, :rows], rooms[1][part, 1, :rows]
+                x[i, j] = observations[chosen[i], j]
         for i in range(m):
-            sample = firsts[i]
-            for j in range(size):
-                before[i, j] = begun[sample // (length * flights), which, sample % flights, j]
-        _run(x, gru, net, rooms[2][part], rooms[3][part], before, after, chosen, ended, m)
-        d = rooms[1][part, 2, :rows]
-        _through_layers(
-            which, x, after, table, net, chosen, A, samples, recipe, share, rooms, part, d,
-            gradient, sums,
-        )  # fmt: skip
-        _run_back(x, gru, net, rooms, part, before, d, chosen, ended, m, gradient)
+            for j in range(before.shape[1]):
+                sequence, flight = firsts[i] // (length * flights), firsts[i] % flights
+                before[i, j] = begun[sequence, which, flight, j]
+        run = (x, before, after, kept, m)
+        _run(run, gru, net, gates[part], products[part])
+        _through_layers(which, x, after, table, net, tile, layers, d, gradient, sums)
+        _run_back(run, gru, net, gates[part], products[part], d, product[part], gradient)
 
 
 @routine
-def _run(x, gru, net, gates, products, before, after, chosen, ended, m):
-    """Run sequences of m flights: inputs x (rows, inputs), memories before and after each step."""
-    flights = chosen[m] - chosen[0] if len(x) > m else 0
+def _run(run, gru, net, gates, products):
+    """Run sequences of m flights.
+
+    `run`: inputs x (rows, inputs), memories before and after each step (rows, units), of which the
+    first m before are given; 0 for a row that begins an episode, otherwise 1 (rows,); m.
+    """
+    x, before, after, kept, m = run
     _take_in(x, gru, net, gates)
     for a in range(0, len(x), m):
         b = a + m
         if a > 0:
             for i in range(a, b):
-                kept = _ZERO if ended[chosen[i] - flights] else _ONE
                 for j in range(before.shape[1]):
-                    before[i, j] = kept * after[i - m, j]
+                    before[i, j] = kept[i] * after[i - m, j]
         r, u, n, q = gates[0, a:b], gates[1, a:b], gates[2, a:b], gates[3, a:b]
         _remember(before[a:b], gru, net, r, u, n, q, products, after[a:b])
 
 
 @routine
-def _through_layers(
-    which, x, after, table, net, chosen, advantages, samples, recipe, share, rooms, part, d,
-    gradient, sums,
-):  # fmt: skip
+def _through_layers(which, x, after, table, net, tile, layers, d, gradient, sums):
     """Loss of one network, and its gradient d with respect to the memories after each step."""
-    room = (rooms[5][part], rooms[6][part], rooms[7][part])
+    chosen, advantages, samples, recipe, share = tile
+    joined, room = layers
     inputs, size = x.shape[1], after.shape[1]
     for a in range(0, len(x), TILE):
         b = min(a + TILE, len(x))
-        both = _joined(x[a:b], after[a:b], rooms[4][part, 0])
+        both = _joined(x[a:b], after[a:b], joined[0])
         y = forward(both, table, net, room[0])
         if which == 0:
             log_std, slope = log_std_of(net[0], table), log_std_of(gradient, table)
@@ -218,7 +218,7 @@ def _through_layers(
         else:
             value_loss(y, chosen[a:b], samples[3], recipe, share, room[1][0], sums)
         delta = backward(both, table, net, room, gradient)
-        through = _matrix(rooms[4][part, 1], b - a, inputs + size)
+        through = _matrix(joined[1], b - a, inputs + size)
         np.dot(delta, weights(net[0], table[0], OUTPUTS, INPUTS), through)
         for i in range(a, b):
             for j in range(size):
@@ -226,25 +226,24 @@ def _through_layers(
 
 
 @routine
-def _run_back(x, gru, net, rooms, part, before, d, chosen, ended, m, gradient):
+def _run_back(run, gru, net, gates, products, d, product, gradient):
     """Add the gradient of a GRU, given the one with respect to its memories, d (rows, units)."""
-    gates, products, late = rooms[2][part], rooms[3][part], rooms[3][part, 3, :m]
-    flights = chosen[m] - chosen[0] if len(x) > m else 0
+    x, before, _, kept, m = run
+    late = products[3, :m]
     late[:] = _ZERO
     for a in range(len(x) - m, -1, -m):
         b = a + m
         r, u, n, q = gates[0, a:b], gates[1, a:b], gates[2, a:b], gates[3, a:b]
         _recall(before[a:b], gru, net, r, u, n, q, products, d[a:b], late)
-        if a > 0:
-            for i in range(m):
-                if ended[chosen[a + i] - flights]:
-                    late[i] = _ZERO
+        for i in range(m):
+            for j in range(late.shape[1]):
+                late[i, j] *= kept[a + i]
     for a in range(0, len(x), TILE):
         b = min(a + TILE, len(x))
         for k in range(3):
-            add_gradient(gates[k, a:b], x[a:b], gru[k], rooms[7][part], gradient)
+            add_gradient(gates[k, a:b], x[a:b], gru[k], product, gradient)
             slope = gates[HIDDEN if k == CANDIDATE else k, a:b]
-            add_gradient(slope, before[a:b], gru[3 + k], rooms[7][part], gradient)
+            add_gradient(slope, before[a:b], gru[3 + k], product, gradient)
 
 
 @entry
@@ -254,18 +253,20 @@ def evaluate(x, model, rooms, memory, means, values, after):
     Writes means (n, a), values (n,), and the memories `after`.
     """
     net, actor, critic = model
-    none, no_ends = np.empty(0, np.int64), np.empty(0, np.bool_)
+    inputs, _, gates, products, joined, outputs, _, _ = rooms
+    kept = np.empty(0, np.float32)  # of later steps, of which there are none
     for a in range(0, len(x), TILE):
         b = min(a + TILE, len(x))
         for which in range(2):
             gru, table = (actor, critic)[which]
-            seen = _matrix(rooms[0][0], b - a, gru[0, INPUTS])
+            seen = _matrix(inputs[0], b - a, gru[0, INPUTS])
             for i in range(b - a):
                 for j in range(seen.shape[1]):
                     seen[i, j] = x[a + i, j]
-            h, now = memory[which, a:b], after[which, a:b]
-            _run(seen, gru, net, rooms[2][0], rooms[3][0], h, now, none, no_ends, b - a)
-            y = forward(_joined(seen, now, rooms[4][0, 0]), table, net, rooms[5][0])
+            now = after[which, a:b]
+            run = (seen, memory[which, a:b], now, kept, b - a)
+            _run(run, gru, net, gates[0], products[0])
+            y = forward(_joined(seen, now, joined[0, 0]), table, net, outputs[0])
             if which == 0:
                 means[a:b] = y
             else:

@@ -1,7 +1,7 @@
 """Errors, delivery and gate shared by the sensors with parameters in the fields `aid_...`.
 
-A sensor has one block of up to three numbers. It may have a slow error of three numbers, constant
-in an episode, a Gauss-Markov error of one number, and constant errors of scale and alignment.
+A sensor has one block of up to three numbers. It may have Gauss-Markov errors of three numbers and
+of one, and constant errors of scale and alignment.
 """
 
 from typing import Any
@@ -27,6 +27,7 @@ from quad_gym.records import (
     DRAW_AID_DRIFT,
     DRAW_AID_MATRIX,
     DRAW_AID_PHASE,
+    DRAW_AID_VECTOR,
     DRAW_SLOW,
     FIRST_AID,
     Aid,
@@ -76,12 +77,18 @@ def draw_matrix(flight, p, s, mask):
 
 @kernel
 def _due(flight, p, settings, s, mask, starting):
-    """Lanes in which sensor s measures now; advances its clock and its Gauss-Markov error."""
+    """Lanes in which sensor s measures now; advances its clock and its Gauss-Markov errors."""
     due = tick_clock(flight, settings, FIRST_AID + s, mask)
     if not starting and any_of(due):
         n, _ = normal_pair(stream_of(flight), DRAW_AID_DRIFT + s)
         error = p.aid_scalar_decay[s] * flight.aid_scalar[s] + p.aid_scalar_drive[s] * n
         flight.aid_scalar[s] = select(due, error, flight.aid_scalar[s])
+        if any_of(p.aid_vector_drive[s] > 0.0):
+            for i in range(3):
+                n, _ = normal_pair(stream_of(flight), DRAW_AID_VECTOR + 3 * s + i)
+                last = flight.aid_vector[s, i]
+                error = p.aid_vector_decay[s] * last + p.aid_vector_drive[s] * n
+                flight.aid_vector[s, i] = select(due, error, last)
     return due
 
 
