@@ -268,7 +268,8 @@ class Player:
             return
         stream = self.streams["gnss"]
         fix, time = self._fix(stream, k), float(stream.time[k])
-        if "gnss_position_G" not in fix or time < self.imu_times[0] - LONGEST_STEP:
+        first = self.imu_times[0 if self.averages else 1]  # an instant needs the sample before
+        if "gnss_position_G" not in fix or time < first - LONGEST_STEP:
             return
         known = "gnss_baseline_G" in fix or {"heading", "course", "magnetometer"} & set(self.start)
         if not known and "magnetometer" in self.streams:

@@ -267,6 +267,18 @@ def test_bad_logs_raise_by_name(changes, message):
         replay(small(**changes), sensors=RTK)
 
 
+@pytest.mark.parametrize("name", ["rtk", "lab"])  # averages, and instants
+def test_fixes_long_before_the_imu_start_no_filter(name):
+    """Delays, such as those that a calibration tries, move fixes to before the log."""
+    suite = quad_gym.sensor_suite(name).replace(camera=None)
+    suite = suite.replace(log_delays=suite.log_delays.replace(gnss=0.995))
+    log = small(time=0.01 * np.arange(200), gyro=np.zeros((200, 3)))
+    log |= {"accel": np.tile([0.0, 0.0, 9.8], (200, 1)), "gnss_enu": np.zeros((200, 3))}
+    result = replay(log, sensors=suite, start={"heading": 0.0})
+    assert result.time[0] >= -1.0 + (0.0 if suite.imu.samples == "average" else 0.01)
+    assert np.isfinite(result.position).all()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
