@@ -30,6 +30,13 @@ _EVALUATE = (
     "evaluate QuadGym/{}-v0 --policy pd pd:lab pretrained --observation estimate --output OUT"
 )
 _GALLERY = "docs.gallery.estimators"
+_FLOWN_ON = {
+    "UKF": "ukf",
+    "EKF": "ekf",
+    "ErrorStateEKF": f"{_GALLERY}.error_state_ekf:ErrorStateEKF",
+    "InvariantEKF": f"{_GALLERY}.invariant_ekf:InvariantEKF",
+    "Complementary": f"{_GALLERY}.complementary:Complementary",
+}
 _DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
 
 CATALOG = {
@@ -217,6 +224,18 @@ CATALOG = {
             commands=["benchmark --only learning --output OUT"],
             flights=("Circle, standard", "Circle, mixed"),
             texts=texts.console("learning"),
+        ),
+        Result(
+            name="filters_flown",
+            commands=[
+                f"evaluate {options} --observation estimate --estimator {path} --episodes 100 "
+                "--seed 100000 --output OUT"
+                for task, options in texts.FLOWN.items()
+                for name, path in _FLOWN_ON.items()
+                if (task, name) != ("LookAround", "Complementary")
+            ],
+            flights=("LookAround", "OutageDash", "Circle, rtk"),
+            texts=texts.flown(list(_FLOWN_ON)),
         ),
         Result(
             name="filters",

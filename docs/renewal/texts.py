@@ -246,6 +246,38 @@ def cell(found: Mapping[str, float], column: str) -> str:
     return share(estimated) if digits is None else number(estimated, digits)
 
 
+FLOWN = {
+    "LookAround": "look_around --env task=baselines.arm_tasks:WithStd "
+    "--policy pd:features_when_uncertain pretrained",
+    "OutageDash": "outage_dash --policy pd pretrained",
+    "Circle": "circle --sensors rtk --policy pd pretrained",
+}
+"""Options of the flights on each filter, by task."""
+
+
+def flown(estimators: Sequence[str]) -> Texts:
+    """Crashes of PD control and of the included policy on each filter, by task."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        cells: dict[str, list[str]] = {name: [] for name in estimators}
+        number = 0
+        for task in FLOWN:
+            for name in estimators:
+                if task == "LookAround" and name == "Complementary":
+                    cells[name] += ["needs GNSS"] * 2
+                    continue
+                for case in _read(folder / f"{number}/summary.json")["cases"]:
+                    crashed = round(case["crash_rate"] * case["episodes"])
+                    off = "-" if case["late_error"] is None else f"{case['late_error']:.3f} m"
+                    shown = f"{crashed:.0f} %" if task != "Circle" else off
+                    cells[name].append(shown)
+                number += 1
+        heads = ["filter", *(f"{task}, {who}" for task in FLOWN for who in ("PD", "included"))]
+        return {"filters_flown": table(heads, [[name, *row] for name, row in cells.items()])}
+
+    return texts
+
+
 def memory(name: str) -> Texts:
     """Arms with and without memory, and the verdict."""
 

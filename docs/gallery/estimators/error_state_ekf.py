@@ -120,6 +120,8 @@ class ErrorStateEKF(quad_gym.Estimator):
         """Update with the features one by one."""
         camera = m.sensors.camera
         R_CB, l_c = euler_to_dcm(np.array(camera.attitude)), np.array(camera.position_B)
+        blur = camera.blur * np.linalg.norm(m.gyro_now - self.state.b_g, axis=1)
+        variance = (camera.pixel_sigma**2 + blur**2)[:, None, None]
         for k in range(m.features.shape[1]):
             new = m.pixels.new[:, k]
             if new.any():
@@ -130,9 +132,8 @@ class ErrorStateEKF(quad_gym.Estimator):
                 J = np.array([[one, none, -x / z], [none, one, -y / z]]) * camera.focal_length / z
                 J = np.moveaxis(J, -1, 0) @ R_CB
                 d = m.pixels.value[:, k] - camera.focal_length * np.stack([x / z, y / z], axis=1)
-                self.fuse(
-                    new, d, [(R, -J @ self.state.R), (E, J @ cross(X_B))], camera.pixel_sigma**2
-                )
+                jacobian = [(R, -J @ self.state.R), (E, J @ cross(X_B))]
+                self.fuse(new, d, jacobian, variance)
 
     def fuse(self, new, d, jacobian, variance):
         """Update flights in `new` with residuals d (n, k), by the blocks of the Jacobian."""
