@@ -234,7 +234,7 @@ CATALOG = {
                 for name, path in _FLOWN_ON.items()
                 if (task, name) != ("LookAround", "Complementary")
             ],
-            flights=("LookAround", "OutageDash", "Circle, rtk"),
+            flights=("LookAround", "OutageDash"),
             texts=texts.flown(list(_FLOWN_ON)),
         ),
         Result(
