@@ -35,7 +35,6 @@ _FLOWN_ON = {
     "EKF": "ekf",
     "ErrorStateEKF": f"{_GALLERY}.error_state_ekf:ErrorStateEKF",
     "InvariantEKF": f"{_GALLERY}.invariant_ekf:InvariantEKF",
-    "Complementary": f"{_GALLERY}.complementary:Complementary",
 }
 _DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
 
@@ -230,9 +229,8 @@ CATALOG = {
             commands=[
                 f"evaluate {options} --observation estimate --estimator {path} --episodes 100 "
                 "--seed 100000 --output OUT"
-                for task, options in texts.FLOWN.items()
-                for name, path in _FLOWN_ON.items()
-                if (task, name) != ("LookAround", "Complementary")
+                for options in texts.FLOWN.values()
+                for path in _FLOWN_ON.values()
             ],
             flights=("LookAround", "OutageDash"),
             texts=texts.flown(list(_FLOWN_ON)),

@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -259,16 +260,10 @@ def flown(estimators: Sequence[str]) -> Texts:
 
     def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
         cells: dict[str, list[str]] = {name: [] for name in estimators}
-        number = 0
-        for task in FLOWN:
-            for name in estimators:
-                if task == "LookAround" and name == "Complementary":
-                    cells[name] += ["needs GNSS"] * 2
-                    continue
-                for case in _read(folder / f"{number}/summary.json")["cases"]:
-                    crashed = round(case["crash_rate"] * case["episodes"])
-                    cells[name].append(f"{crashed} of {case['episodes']:.0f}")
-                number += 1
+        for k, (_, name) in enumerate(product(FLOWN, estimators)):
+            for case in _read(folder / f"{k}/summary.json")["cases"]:
+                crashed = round(case["crash_rate"] * case["episodes"])
+                cells[name].append(f"{crashed} of {case['episodes']:.0f}")
         heads = ["filter", *(f"{task}, {who}" for task in FLOWN for who in ("PD", "included"))]
         return {"filters_flown": table(heads, [[name, *row] for name, row in cells.items()])}
 
