@@ -18,9 +18,10 @@ class FilterpyEKF(ErrorStateEKF):
         kalman, H = KalmanFilter(dim_x=15, dim_z=size), np.zeros((len(d), size, 15))
         for part, block in jacobian:
             H[:, :, part] = block
+        noise = np.broadcast_to(variance * np.eye(size), (len(d), size, size))
         for k in np.flatnonzero(new):
             kalman.x, kalman.P = np.zeros(15), s.P[k]
-            kalman.update(d[k], R=variance * np.eye(size), H=H[k])
+            kalman.update(d[k], R=noise[k], H=H[k])
             s.P[k] = (kalman.P + kalman.P.T) / 2.0
             s.r[k] += kalman.x[R]
             s.v[k] += kalman.x[V]
