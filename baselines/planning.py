@@ -21,6 +21,8 @@ from scipy.special import ndtr
 from baselines.pd import MARGIN, WAITS_BEFORE, PDPolicy
 from quad_gym.params import checks as check
 from quad_gym.params.gravity import GRAVITY
+from quad_gym.tasks.look_around import HEADING_WEIGHT
+from quad_gym.tasks.outage_dash import CRASH_COST, PROGRESS_WEIGHT
 
 Array = NDArray[np.float64]
 
@@ -30,13 +32,11 @@ STEP = 0.25  #: time between two instants of a prediction [s]
 TURN_RATE = 2.5  #: assumed rate at which PD control turns to another heading [rad/s]
 EDGE = 0.35
 """Angle between body x and the markers at which most of them are still in view [rad]."""
-HEADING_WEIGHT = 0.15  #: reward for the heading per step, as in `LookAround`
 TRACE_WEIGHT = 1.0  #: cost of the trace of the covariance of the position per step [1/m^2]
 
 WAITS = (0.0, 1.0, 2.0, 4.0, 8.0)  #: times for which a plan waits before the next gap [s]
 TIME_PRICE = 1.0  #: cost of waiting, little because time that remains is not rewarded [1/s]
-METER_REWARD, CRASH_COST, COURSE = 5.0, 50.0, 132.0
-"""Reward per meter, cost of a crash and length of the course [m] of `OutageDash`."""
+COURSE = 132.0  #: length of the course of `OutageDash` [m]
 SPEED = 4.7  #: speed of PD control between gaps [m/s]
 GROWTH = ((0.25, 0.8, 2.0, 4.0, 6.0), (2.0, 5.0, 8.0, 12.0, 15.0))
 """Errors of the position [m] after times without GNSS [s], as in `OutageDash`."""
@@ -150,7 +150,7 @@ class PlanningPolicy(PDPolicy):
         distance = np.maximum((part["position_error"] * part["heading"]).sum(axis=1), 0.0)
         room = 0.5 * part["gap_width"][:, 0] - MARGIN
         P, costs = self._start(part, axis=1), []
-        at_stake = CRASH_COST + METER_REWARD * COURSE
+        at_stake = CRASH_COST + PROGRESS_WEIGHT * COURSE
         for wait in WAITS:
             way = distance if wait == 0.0 else np.maximum(distance, WAITS_BEFORE)
             arrival = wait + way / SPEED

@@ -1,12 +1,13 @@
 """`Measurements` of many flights that arrive at an instant, and the `Start` of episodes."""
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.memory import FlightMemory
+from quad_gym.estimation.own import Floats, Reading, Truths
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
@@ -21,18 +22,6 @@ from quad_gym.records import (
     Sensor,
     field_of_flights,
 )
-
-Floats = NDArray[np.float64]
-Truths = NDArray[np.bool_]
-
-
-class Reading(NamedTuple):
-    """Measurement of one sensor, of all flights."""
-
-    value: Floats  #: one row per flight; NaN where no measurement arrives at this instant
-    new: Truths  #: True where one arrives: (n,), for pixels (n, features)
-    age: float
-    """Time since the measurement was taken, its time stamp: the latency of the sensor [s]"""
 
 
 def _record(name: str, meaning: str) -> "cached_property[Floats]":

@@ -13,7 +13,7 @@ import numpy as np
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.numbers import has
 from quad_gym.estimation.replaying import origin_of
-from quad_gym.estimation.search import Calibrated, Search
+from quad_gym.estimation.search import Calibrated, NumberSearch
 from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.validation import Validation, validate
 from quad_gym.params import checks as check
@@ -90,7 +90,7 @@ def calibrate(
     time = whole.imu.time
     split = float(time[0] + share * (time[-1] - time[0]))
     report = progress or (lambda _: None)
-    search = Search(whole.until(split), prior, dict(start or {}), delays)
+    search = NumberSearch(whole.until(split), prior, dict(start or {}), delays)
     report(f"Search for {len(search.numbers)} numbers in a part of the flight")
     search.begin()
     report("Search in all of the first part")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,15 @@ ESTIMATES: dict[str, tuple[int, ...]] = {
 """Names in an estimate, and the shape of each for one flight."""
 
 _NORM_ERROR = 1e-2  #: largest error of the sum of the squares of a quaternion, or of R_BI
+
+
+class Reading(NamedTuple):
+    """Measurement of one sensor, of all flights."""
+
+    value: Floats  #: one row per flight; NaN where no measurement arrives at this instant
+    new: Truths  #: True where one arrives: (n,), for pixels (n, features)
+    age: float
+    """Time since the measurement was taken, its time stamp: the latency of the sensor [s]"""
 
 
 class Estimator:

@@ -3,14 +3,13 @@
 import copy
 from collections import deque
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.own import Estimator, checked_estimate, factors
+from quad_gym.estimation.own import Estimator, Reading, checked_estimate, factors
 from quad_gym.estimation.player import Player, name_of
 from quad_gym.estimation.results import Measured, Replay
 from quad_gym.estimation.samples import Measurement
@@ -32,14 +31,6 @@ _OF_GNSS = {
     "gnss_velocity": "velocity_G",
 }
 """Readings of GNSS, and their values in a `Measurement`."""
-
-
-class Reading(NamedTuple):
-    """Measurement of one sensor, in the form of `quad_gym.batch.measurements.Reading`."""
-
-    value: Floats
-    new: NDArray[np.bool_]
-    age: float
 
 
 class OwnPlayer:

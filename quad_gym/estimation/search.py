@@ -62,7 +62,7 @@ class Calibrated(NamedTuple):
     determined: bool  #: False: the log does not determine it
 
 
-class Search:
+class NumberSearch:
     """The search for the numbers of a suite, at coordinates x."""
 
     def __init__(self, log: Log, prior: SensorSuite, start: dict[str, Any], delays: bool) -> None:

@@ -206,6 +206,15 @@ def in_interface():
     }, modules
 
 
+def test_class_names_are_used_once():
+    found = {}
+    for file in (*ROOT.glob("quad_gym/**/*.py"), *ROOT.glob("baselines/**/*.py")):
+        for name in re.findall(r"^class (\w+)", file.read_text(encoding="utf-8"), re.MULTILINE):
+            found.setdefault(name, []).append(file.relative_to(ROOT).as_posix())
+    assert len(found) > 200
+    assert [files for files in found.values() if len(files) > 1] == []
+
+
 def test_every_public_name_is_in_the_interface():
     names, modules = in_interface()
     public = {*quad_gym.__all__, *quad_gym._LAZY} - {"__version__", "faults", "rewards"}

@@ -82,21 +82,6 @@ def as_logged(table, suite):
     return {name: column[order] for name, column in table.items()}
 
 
-def with_changing_iron(table, compass, rng):
-    """The table with hard iron that is a Gauss-Markov process, in place of a constant."""
-    names = [f"magnetometer_{axis}" for axis in "xyz"]
-    rows = np.flatnonzero(np.isfinite(table[names[0]]))
-    error = compass.hard_iron_sigma * rng.normal(size=3)
-    steps = np.diff(table["time"][rows], prepend=table["time"][rows[0]])
-    for row, step in zip(rows, steps, strict=True):
-        decay = math.exp(-step / compass.hard_iron_tau)
-        drive = compass.hard_iron_sigma * math.sqrt(1.0 - decay**2)
-        error = decay * error + drive * rng.normal(size=3)
-        for name, value in zip(names, error, strict=True):
-            table[name][row] += value
-    return table
-
-
 def simulated(index):
     """A table, the true numbers and the suite without them."""
     name, rng = SUITES[index % len(SUITES)], np.random.default_rng(100 + index)
@@ -112,13 +97,8 @@ def simulated(index):
         prior = prior.replace(magnetometer=compass)
     true, suite = drawn(prior, log, rng)
     free = {"out_of_bounds": 1e3, "min_height": -1e3, "max_tilt": math.pi}
-    flies = suite
-    if suite.magnetometer is not None:  # hard iron is constant in simulated flights
-        flies = suite.replace(magnetometer=suite.magnetometer.replace(hard_iron_sigma=1e-9))
-    flight = flown(flies, seconds, seed=index, task="random_trajectory", **free)
+    flight = flown(suite, seconds, seed=index, task="random_trajectory", **free)
     table = Recorded(flight, suite, seed=index, lost=0.0, jitter=0.0).table()
-    if suite.magnetometer is not None:
-        table = with_changing_iron(table, suite.magnetometer, rng)
     table = as_logged(table, suite)
     start = {}
     if base.gnss is None:
