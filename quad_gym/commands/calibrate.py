@@ -106,6 +106,7 @@ def summary_of(calibration: "Calibration") -> dict[str, Any]:
             "measurements": {name: fit._asdict() for name, fit in validation.sensors.items()},
             "held_out_error": validation.held_out_error,
             "held_out_nis": validation.held_out_nis,
+            "held_out_ratios": validation.held_out_ratios,
             "diverged": validation.diverged,
             "problems": validation.problems,
         }

@@ -13,7 +13,8 @@ derivative is zero on average at the right numbers, too.
 A filter with all measurements predicts over tenths of a second only, where errors of a receiver
 that are smooth in time look like motion, and are best explained by noise of the IMU. The loss
 therefore has a second part with equal weight: of a filter that uses a measurement of each sensor
-every half second, so that its predictions reach further.
+every half second, so that its predictions reach further. Sensors whose innovations are white have
+no such errors, and all their measurements count fully.
 
 Sources: F. C. Schweppe, IEEE Trans. Information Theory 11(1), 1965, for prediction errors; K. L.
 Lange, R. J. A. Little and J. M. G. Taylor, J. American Statistical Association 84(408), 1989, for
@@ -21,7 +22,7 @@ Student's t.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -103,6 +104,7 @@ class Likelihood:
         suite: Its suite, whose delays and mounting correct the log.
         start: Keywords of `initialize`.
         nu: Degrees of freedom of Student's t by sensor; 5 for others.
+        white: Sensors whose innovations are white.
         margin: Time before the end of the log whose measurements do not count [s], so that losses
             with different delays contain the same measurements.
     """
@@ -113,6 +115,7 @@ class Likelihood:
         suite: SensorSuite,
         start: dict[str, Any],
         nu: Mapping[str, float],
+        white: Collection[str],
         margin: float,
     ) -> None:
         first, last = (log.imu if log.gnss is None else log.gnss).received[0], log.imu.time[-1]
@@ -126,7 +129,10 @@ class Likelihood:
                 f"{SETTLING:g} s after the start on, got {counts[0]}: use a longer part of the log "
                 "(share=, --share)"
             )
-        self._logs[0].weight = counts[1] / counts[0]
+        self._logs[0].weights = {
+            name_of(block): 1.0 if name_of(block) in white else counts[1] / counts[0]
+            for block in blocks_of(suite)
+        }
 
     def losses(self, suites: Sequence[SensorSuite]) -> Floats:
         """Return the losses of parts in time, (parts, suites), of the log and the thinned one.
@@ -148,7 +154,8 @@ class _LogLosses:
         nu: Mapping[str, float],
         span: tuple[float, float],
     ) -> None:
-        self.suite, self.nu, self.weight = suite, nu, 1.0
+        self.suite, self.nu = suite, nu
+        self.weights: Mapping[str, float] = {}  #: of sensors; 1 for others
         player = Player(log, suite, "ukf", start, False, None)
         player.write_tape()
         if not player.filter.heading_known:
@@ -175,9 +182,10 @@ class _LogLosses:
             have, d = self._valid[:, block], FREEDOMS[block]
             nis, sigma = found[have, row, 6], found[have, row, 3 : 3 + d]
             nu = self.nu.get(name_of(block), NU[0])
-            losses[have] += 0.5 * (nu + d) * np.log1p(nis / (nu - 2.0)) + np.log(sigma).sum(axis=1)
+            some = 0.5 * (nu + d) * np.log1p(nis / (nu - 2.0)) + np.log(sigma).sum(axis=1)
+            losses[have] += self.weights.get(name_of(block), 1.0) * some
         # a filter that failed is as unlikely as one that is wrong by far
         counted = np.nan_to_num(losses[self.counts], nan=1e3, posinf=1e3)
         total = np.zeros((self._count, len(suites)))
-        np.add.at(total, self._parts, self.weight * counted)
+        np.add.at(total, self._parts, counted)
         return total

@@ -39,6 +39,13 @@ class Number:
         standard_deviation &= self.field != "drift_sigma_I"
         return _LEAST / self.spread if standard_deviation else -MOST
 
+    def step_for(self, period: float) -> float:
+        """Return the step of derivatives with a log whose IMU has a period [s].
+
+        The likelihood of a delay has a kink at each sample.
+        """
+        return max(self.step, period / self.spread) if self.sensor == _DELAYS else self.step
+
     @property
     def name(self) -> str:
         """Name, such as "gnss.position_sigma_I[2]"."""

@@ -8,9 +8,9 @@ are exact on the diagonal, and otherwise as correlated as the scores of parts of
 
 The likelihood alone makes noise too small where errors are correlated in time, such as errors of a
 magnetometer near motors: innovations are then as small as predicted, but not white, and the filter
-counts the same error many times. Noise of such sensors becomes larger by sqrt(tau), at most two
-times, where tau is the integrated autocorrelation time of the innovations in samples, before the
-other numbers are fitted again.
+counts the same error many times. Noise of such sensors becomes larger by sqrt(tau) (`widening`),
+where tau is the integrated autocorrelation time of the innovations in samples, before the other
+numbers are fitted again.
 """
 
 import math
@@ -34,6 +34,8 @@ _FEW_STEPS, _STEPS = 4, 12  #: Newton steps from each beginning, and after
 _SHARES = np.array([1.0, 0.75, 0.5, 0.35, 0.2, 0.1, 0.05, 0.02])
 """Shares of a Newton step that are tried side by side."""
 _LEAST_GAIN = 0.02  #: drop of the log likelihood in a step with which the search ends
+_FINE, _LONG = 0.3, 2.0
+"""Steps for intervals over those of the search: where the loss is smooth, and of delays."""
 _RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are estimates
 _SHORT = 45.0  #: time of flight that is enough for the first search [s]
 _CLUSTER, _CLUSTERS = 5.0, 20
@@ -49,6 +51,9 @@ _WHITE = {
 }
 """White noise that is inflated where innovations are correlated: their sensor, its axes, and the
 largest factor, which is smaller where the filter estimates a correlated error of the sensor."""
+_SMALL = 0.16
+"""Mean squared innovation over its variance below which noise is not inflated: its lower bound
+makes it large enough then."""
 
 
 class Calibrated(NamedTuple):
@@ -67,12 +72,14 @@ class NumberSearch:
 
     def __init__(self, log: Log, prior: SensorSuite, start: dict[str, Any], delays: bool) -> None:
         self.log, self.prior, self.start = log, prior, start
-        self.nu: dict[str, float] = {}
+        self.nu: dict[str, float] = {}  #: tails of innovations by sensor, see `Likelihood`
+        self.white: set[str] = set()  #: sensors whose innovations are white
         self.numbers = numbers_in(prior, log, delays)
         self.values = np.array([number.of(prior) for number in self.numbers])
         self.low = np.array([number.least for number in self.numbers])
         self.of_log = np.array([number.of_log for number in self.numbers])
-        self.steps = np.diag([number.step for number in self.numbers])
+        period = float(np.median(np.diff(log.imu.time)))
+        self.steps = np.diag([number.step_for(period) for number in self.numbers])
         self.x = np.clip(self._first(), self.low, MOST)
         self._margin = _MARGIN
         self._known: dict[bytes, Likelihood] = {}
@@ -113,7 +120,9 @@ class NumberSearch:
             suites = [self.suite(points[k]) for k in rows]
             likelihood = self._known.get(key)
             if likelihood is None:
-                likelihood = Likelihood(self.log, suites[0], self.start, self.nu, self._margin)
+                likelihood = Likelihood(
+                    self.log, suites[0], self.start, self.nu, self.white, self._margin
+                )
             if key == self.x[self.of_log].tobytes():
                 self._known = {key: likelihood}
             some = likelihood.losses(suites)
@@ -152,10 +161,12 @@ class NumberSearch:
         delays = vars(self.suite(self.x).log_delays).values()
         self._margin = _MARGIN + max(0.0, *(-delay for delay in delays))
         self._known = {}
-        for _ in range(2):
+        for again in (True, False):
             if self.of_log.any():
                 self.x, _ = self._descend(self.x, self.of_log, 2)
             self.x, _ = self._descend(self.x, ~self.of_log, _STEPS)
+            if again and self.nu:
+                self._describe()
 
     def _descend(self, x: Floats, chosen: Any, steps: int) -> tuple[Floats, float]:
         """Return where Newton steps over the chosen coordinates end, and the loss there."""
@@ -184,6 +195,21 @@ class NumberSearch:
 
     def adapt(self) -> None:
         """Find the tails of the innovations, and widen noise where these are correlated in time."""
+        scaled = self._describe()
+        for k, number in enumerate(self.numbers):
+            sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
+            if sensor not in scaled:
+                continue
+            factor = widening(scaled[sensor][:, axes], most)
+            if factor == 1.0:
+                continue
+            value = factor * number.value(self.values[k], float(self.x[k]))
+            wide = number.coordinate(self.values[k], value)
+            self.low[k] = min(max(self.low[k], wide), MOST - 0.1)
+        self.x = np.maximum(self.x, self.low)
+
+    def _describe(self) -> dict[str, Floats]:
+        """Find tails and whiteness of the innovations; return the innovations over their sigmas."""
         suite = self.suite(self.x, gate=True)
         measured = replay(self.log, sensors=suite, start=self.start, reported_noise=False).measured
         scaled = {}
@@ -193,18 +219,13 @@ class NumberSearch:
             scaled[name] = (m.innovation / m.sigma)[counts]
             if len(scaled[name]) > _FEWEST_TAILS:
                 self.nu[name] = tails(m.nis[counts], scaled[name].shape[1])
-        for k, number in enumerate(self.numbers):
-            sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
-            if sensor not in scaled:
-                continue
-            tau = max(correlation_time(column) for column in scaled[sensor][:, axes].T)
-            factor = min(math.sqrt(tau), most)
-            if factor == 1.0:
-                continue
-            value = factor * number.value(self.values[k], float(self.x[k]))
-            wide = number.coordinate(self.values[k], value)
-            self.low[k] = min(max(self.low[k], wide), MOST - 0.1)
-        self.x = np.maximum(self.x, self.low)
+        self.white = {
+            name
+            for name, values in scaled.items()
+            if len(values) > _FEWEST_TAILS and max(map(correlation_time, values.T)) == 1.0
+        }
+        self._known = {}
+        return scaled
 
     def intervals(self) -> tuple[Calibrated, ...]:
         """Return the numbers with 95 % intervals.
@@ -214,7 +235,9 @@ class NumberSearch:
         """
         from scipy.stats import t
 
-        n, axes, h = len(self.x), self.steps, np.diag(self.steps)
+        smooth = np.array([number.sensor != "log_delays" for number in self.numbers])
+        n, h = len(self.x), np.diag(self.steps) * np.where(smooth, _FINE, _LONG)
+        axes = np.diag(h)
         row, column = np.triu_indices(n, 1)
         points = [self.x, *(self.x + s * e for e in axes for s in (1.0, -1.0))]
         points += [self.x + axes[i] + axes[j] for i, j in zip(row, column, strict=True)]
@@ -225,6 +248,8 @@ class NumberSearch:
         H = np.diag(bends)
         H[row, column] = (both - ahead[row] - ahead[column] + total[0]) / (h[row] * h[column])
         H[column, row] = H[row, column]
+        silent = bends <= 0.0  # at a bound, where the loss has no minimum
+        H[silent], H[:, silent], scores[:, silent] = 0.0, 0.0, 0.0
         values, vectors = np.linalg.eigh(H)
         information = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.eye(n)
         length = max(1, round(min(_CLUSTER / PART, len(scores) / _CLUSTERS)))
@@ -270,13 +295,22 @@ def _lowest(places: Floats, losses: Floats) -> float:
     return float(places[k] + np.clip(move, -reach, reach))
 
 
+def widening(scaled: Floats, most: float) -> float:
+    """Return the factor of noise whose innovations (n, axes), over their sigmas, are correlated.
+
+    It is sqrt(tau), at most `most`, and as large as leaves the innovations at `_SMALL` at least.
+    """
+    tau = max(correlation_time(column) for column in scaled.T)
+    return math.sqrt(max(1.0, min(tau, most**2, float((scaled**2).mean()) / _SMALL)))
+
+
 def correlation_time(values: Floats) -> float:
     """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white.
 
-    The sum ends with the first correlation that white noise would also have, to two standard
+    The sum ends with the first correlation that white noise would also have, to three standard
     deviations.
     """
-    centered, least = values - values.mean(), max(0.05, 2.0 / math.sqrt(len(values)))
+    centered, least = values - values.mean(), max(0.05, 3.0 / math.sqrt(len(values)))
     variance, tau = float((centered**2).mean()), 1.0
     for lag in range(1, len(values) // 4):
         rho = float((centered[:-lag] * centered[lag:]).mean()) / variance

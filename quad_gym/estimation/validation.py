@@ -1,5 +1,6 @@
 """Validation of a suite with a part of a log that was not used to find its numbers."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -11,7 +12,8 @@ from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Replay, by_sensor
 from quad_gym.params.sensors import SensorSuite
 
-_PERIOD, _GAP = 5.0, 1.0  #: fixes are left out for a second in every five [s]
+_PERIOD, _GAP = 5, 1
+"""Fixes are left out for a second in every five [s], in five replays that leave out each second."""
 
 
 class Fit(NamedTuple):
@@ -35,6 +37,8 @@ class Validation:
     """root mean square difference of the prediction from the first fix after gaps: horizontal, and
     vertical [m]; None: no fixes"""
     held_out_nis: float | None  #: mean NIS of these fixes over three
+    held_out_ratios: tuple[float, float, float] | None
+    """mean squared difference over its variance: east, north, up; 1 for a consistent filter"""
     diverged: float  #: share of the samples at which the filter counts as diverged
     problems: tuple[str, ...]  #: sentences of the replay, see `Replay.problems`
     replay: Replay
@@ -68,22 +72,28 @@ def validate(
 
 def _held_out(
     log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
-) -> tuple[tuple[float, float] | None, float | None]:
-    """Return errors and mean NIS of the first fixes after gaps."""
+) -> tuple[Any, Any, Any]:
+    """Return errors, mean NIS and ratios of the first fixes after gaps."""
     gnss = log.gnss
     if gnss is None or suite.gnss is None:
-        return None, None
-    phase = (gnss.time - split) % _PERIOD
-    gnss = gnss.rows((gnss.time < split) | (phase >= _GAP))
-    result = replay(replace(log, gnss=gnss), sensors=suite, start=start, reported_noise=False)
-    fixes = result.measured.get("gnss_position")
-    if fixes is None:
-        return None, None
-    after = np.flatnonzero(np.diff(fixes.time, prepend=fixes.time[0]) > 0.9 * _GAP)
-    after = after[fixes.time[after] > split]
-    if not len(after):
-        return None, None
-    error = fixes.innovation[after]
-    level = float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
-    up = float(np.sqrt((error[:, 2] ** 2).mean()))
-    return (level, up), float(fixes.nis[after].mean() / 3.0)
+        return None, None, None
+    errors, sigmas, nis = [], [], []
+    for first in range(0, _PERIOD, _GAP):
+        since = gnss.time - split - first
+        kept = gnss.rows((since < 0.0) | (since % _PERIOD >= _GAP))
+        result = replay(replace(log, gnss=kept), sensors=suite, start=start, reported_noise=False)
+        fixes = result.measured.get("gnss_position")
+        if fixes is None:
+            return None, None, None
+        gaps = np.diff(fixes.time, prepend=fixes.time[0]) > 0.9 * _GAP
+        after = gaps & (fixes.time > split) & np.isfinite(fixes.nis)
+        errors.append(fixes.innovation[after])
+        sigmas.append(fixes.sigma[after])
+        nis.append(fixes.nis[after])
+    error, sigma = np.concatenate(errors), np.concatenate(sigmas)
+    if not len(error):
+        return None, None, None
+    squares = (error**2).mean(axis=0)
+    level, up = math.sqrt(squares[0] + squares[1]), math.sqrt(squares[2])
+    ratios = tuple(((error / sigma) ** 2).mean(axis=0).tolist())
+    return (level, up), float(np.concatenate(nis).mean() / 3.0), ratios

@@ -21,7 +21,7 @@ import quad_gym
 from quad_gym.estimation import calibrate, read_log
 from quad_gym.estimation.calibration import _prior_of
 from quad_gym.estimation.numbers import numbers_in
-from quad_gym.rotations import euler_to_dcm
+from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.logged_flights import Recorded, flown
 
 SUITES = (
@@ -102,7 +102,8 @@ def simulated(index):
     table = as_logged(table, suite)
     start = {}
     if base.gnss is None:
-        start = {"position": flight["position"][0], "heading": 0.0}
+        x_I = quaternion_to_dcm(flight["quaternion"][0])[0]
+        start = {"position": flight["position"][0], "heading": math.atan2(x_I[1], x_I[0])}
     return table, true, base, start
 
 

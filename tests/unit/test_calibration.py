@@ -8,11 +8,11 @@ import pytest
 
 import quad_gym
 from quad_gym import estimation
-from quad_gym.estimation import calibrate, replay
-from quad_gym.estimation.likelihood import in_flight, tails
+from quad_gym.estimation import calibrate, read_log, replay
+from quad_gym.estimation.likelihood import NU, SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import NUMBERS
-from quad_gym.estimation.search import correlation_time
+from quad_gym.estimation.search import correlation_time, widening
 from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import euler_to_dcm
 from tests.console_commands import run
@@ -71,10 +71,12 @@ def test_late_stamps_of_a_simulated_log_are_found(found):
 
 
 def test_intervals_contain_delay_and_mounting_of_a_simulated_log(found):
+    """Intervals widened by a half: three standard deviations for seven seconds in flight."""
     numbers = {number.number.name: number for number in found.numbers}
     true = {f"log_rotation[{k}]": angle for k, angle in enumerate(MOUNTING)}
     for name, value in (true | {"log_delays.gnss": DELAY}).items():
-        assert numbers[name].low < value < numbers[name].high, numbers[name]
+        low, high = numbers[name].low, numbers[name].high
+        assert abs(value - 0.5 * (low + high)) < 0.75 * (high - low), numbers[name]
     assert np.linalg.norm(np.subtract(found.suite.log_rotation, MOUNTING)) < 0.06
 
 
@@ -98,6 +100,7 @@ def test_validation_part_fits_the_suite_that_was_found(found):
     assert found.before.sensors["gnss_velocity"].mean_nis > 5.0
     assert not found.after.problems
     assert 0.3 < found.after.held_out_nis < 3.0
+    assert all(0.1 < ratio < 5.0 for ratio in found.after.held_out_ratios)
 
 
 def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
@@ -152,6 +155,44 @@ def test_correlation_time_of_an_autoregression_is_the_closed_form():
         for k in range(1, len(values)):
             values[k] = a * values[k - 1] + rng.normal()
         assert correlation_time(values) == pytest.approx((1 + a) / (1 - a), rel=0.15)
+
+
+def test_noise_is_widened_for_correlated_innovations_that_are_not_small():
+    """An AR(1) process with coefficient 0.5 and unit variance has tau = 3."""
+    rng, values = np.random.default_rng(4), np.zeros((40_000, 1))
+    for k in range(1, len(values)):
+        values[k] = 0.5 * values[k - 1] + np.sqrt(0.75) * rng.normal()
+    assert widening(values, 2.0) == pytest.approx(np.sqrt(3.0), rel=0.1)
+    assert widening(values, 1.5) == 1.5
+    assert widening(0.5 * values, 2.0) == pytest.approx(np.sqrt(0.25 / 0.16), rel=0.05)
+    assert widening(0.2 * values, 2.0) == 1.0
+    assert widening(rng.normal(size=(40_000, 3)), 2.0) == 1.0
+
+
+def test_every_measurement_of_a_sensor_with_white_innovations_counts():
+    """The loss grows by the terms of Student's t, less those that count in any case."""
+    late = Recorded(flown(TRUE, 16.0), TRUE, lost=0.0, jitter=0.0).table()
+    order = np.argsort(late["time"], kind="stable")
+    log = read_log({name: c[order] for name, c in late.items()} | {"received": late["time"][order]})
+    suite = TRUE.replace(estimator=TRUE.estimator.replace(false_alarm_probability=0.0))
+    measured = replay(log, sensors=suite, reported_noise=False).measured
+
+    def loss(*white):
+        return float(Likelihood(log, suite, {}, {}, white, 0.2).losses([suite]).sum())
+
+    def terms(m):
+        rows = in_flight(log, m.received) & (m.received > log.gnss.received[0] + SETTLING)
+        nis, sigma = m.nis[rows], m.sigma[rows]
+        rows = m.received[rows] <= log.imu.time[-1] - 0.2
+        d = sigma.shape[1]
+        some = 0.5 * (NU[0] + d) * np.log1p(nis / (NU[0] - 2.0)) + np.log(sigma).sum(axis=1)
+        return float(some[rows].sum())
+
+    shares = [
+        (loss(name) - loss()) / terms(measured[name]) for name in ("barometer", "magnetometer")
+    ]
+    assert 0.5 < shares[0] < 0.99
+    assert shares[1] == pytest.approx(shares[0], rel=1e-3)
 
 
 def test_vehicle_at_rest_is_not_in_flight():

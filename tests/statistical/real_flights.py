@@ -1,0 +1,102 @@
+"""Calibrations on a part of a real flight, or another flight, judged on the rest.
+
+    python -m tests.statistical.real_flights --ardupilot FOLDER --rtk FOLDER FOLDER FOLDER
+
+Prints the tables of docs/calibration.md. The folders are as published, see
+docs/examples/real_flights.py. It takes about five minutes.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import quad_gym
+from quad_gym.estimation import calibrate, read_log
+from quad_gym.estimation.validation import validate
+from quad_gym.rotations import quaternion_to_dcm
+
+sys.path.append(str(Path(__file__).parents[2] / "docs" / "examples"))
+import real_flights
+
+SETTLED = 60.0  #: time from which the attitude is compared [s]
+MOVING = 10.0  #: time from which fixes are left out, as the filter starts in motion [s]
+
+
+def attitude_errors(result, folder):
+    """Root mean square differences of roll, pitch, yaw from the autopilot, about their median."""
+    autopilot = np.loadtxt(folder / "ATT.txt")
+    time = 1e-3 * autopilot[:, 0]
+    rows = np.clip(np.searchsorted(result.time, time), 0, len(result.time) - 1)
+    R = quaternion_to_dcm(result.quaternion)[rows]  # from I (east, north, up) to forward, left, up
+    roll = np.arctan2(R[:, 1, 2], R[:, 2, 2])
+    pitch = np.arcsin(R[:, 0, 2])  # nose up
+    yaw = np.arctan2(R[:, 0, 0], R[:, 0, 1])  # from north toward east
+    found = np.degrees(np.column_stack([roll, pitch, yaw]))
+    errors = []
+    for angle, other in zip(found.T, autopilot[:, 2:5].T, strict=True):
+        error = (angle - other + 180.0) % 360.0 - 180.0
+        error = error[(time > time[0] + SETTLED) & (time <= result.time[-1])]
+        error = (error - np.median(error) + 180.0) % 360.0 - 180.0
+        errors.append(np.sqrt((error**2).mean()))
+    return np.array(errors)
+
+
+def fit_texts(validation):
+    """Texts of a validation."""
+    for name, fit in validation.sensors.items():
+        yield f"{name} {fit.mean_nis:.2f}, rejected {100.0 * fit.rejected:.1f} %"
+    if validation.held_out_error is not None:
+        level, up = validation.held_out_error
+        ratios = ", ".join(f"{ratio:.1f}" for ratio in validation.held_out_ratios)
+        yield f"left out {level:.2f} m, {up:.2f} m up, NIS / 3 {validation.held_out_nis:.2f}"
+        yield f"ratios {ratios}"
+
+
+def hobby_vehicle(folder):
+    """Print what `consumer`, the calibrated suite and `flown` make of the flight."""
+    log = read_log(real_flights.table(real_flights.ardupilot_flight(folder)))
+    found = calibrate(log, sensors="consumer")
+    for number in found.numbers:
+        interval = f"[{number.low:.3g}, {number.high:.3g}]" if number.determined else "-"
+        print(f"  {number.number.name} {number.value:.3g} {interval}")
+    first = float(log.imu.time[0]) + SETTLED
+    flown = validate(log, quad_gym.sensor_suite("flown"), None, first)
+    for name, seen in (("consumer", found.before), ("calibrated", found.after), ("flown", flown)):
+        angles = attitude_errors(seen.replay, folder)
+        print(name, *fit_texts(seen), f"roll, pitch, yaw {angles.round(2)} deg", sep="; ")
+
+
+def survey_vehicle(folders):
+    """Print offsets of the clocks, and predictions with the numbers of each flight."""
+    flights = {}
+    for folder in folders:
+        rows, heading = real_flights.rtk_flight(folder)
+        log = read_log(real_flights.table(rows))
+        start = {"heading": heading, "heading_sigma": 0.1}
+        found = calibrate(log, sensors="rtk", start=start, share=0.9)
+        (offset,) = (n for n in found.numbers if n.number.name == "log_delays.gnss")
+        print(f"{folder.name}: {offset.value:.3f} s [{offset.low:.3f}, {offset.high:.3f}]")
+        flights[folder.name] = log, start, found.suite
+    for source, (_, _, suite) in flights.items():
+        for name, (log, start, own) in flights.items():
+            seen = validate(
+                log, suite.replace(log_delays=own.log_delays), start, log.imu.time[0] + MOVING
+            )
+            print(f"{source} -> {name}", *fit_texts(seen), sep="; ")
+
+
+def main():
+    """Print the tables of the folders that are given."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--ardupilot", type=Path)
+    parser.add_argument("--rtk", type=Path, nargs="*", default=())
+    args = parser.parse_args()
+    if args.ardupilot is not None:
+        hobby_vehicle(args.ardupilot)
+    survey_vehicle(args.rtk)
+
+
+if __name__ == "__main__":
+    main()
