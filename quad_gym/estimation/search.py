@@ -34,8 +34,10 @@ _FEW_STEPS, _STEPS = 4, 12  #: Newton steps from each beginning, and after
 _SHARES = np.array([1.0, 0.75, 0.5, 0.35, 0.2, 0.1, 0.05, 0.02])
 """Shares of a Newton step that are tried side by side."""
 _LEAST_GAIN = 0.02  #: drop of the log likelihood in a step with which the search ends
-_FINE, _LONG = 0.3, 2.0
-"""Steps for intervals over those of the search: where the loss is smooth, and of delays."""
+_FINE, _LONG = 0.3, 3.0
+"""Steps for intervals over those of the search: of numbers in which the loss is smooth, and of
+delays in which it is not."""
+_KINKED = 0.4  #: share of a second derivative that remains with long steps if kinks cause it
 _RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are estimates
 _SHORT = 45.0  #: time of flight that is enough for the first search [s]
 _CLUSTER, _CLUSTERS = 5.0, 20
@@ -235,8 +237,7 @@ class NumberSearch:
         """
         from scipy.stats import t
 
-        smooth = np.array([number.sensor != "log_delays" for number in self.numbers])
-        n, h = len(self.x), np.diag(self.steps) * np.where(smooth, _FINE, _LONG)
+        n, h = len(self.x), self._steps_of_intervals()
         axes = np.diag(h)
         row, column = np.triu_indices(n, 1)
         points = [self.x, *(self.x + s * e for e in axes for s in (1.0, -1.0))]
@@ -257,14 +258,24 @@ class NumberSearch:
         root = np.linalg.solve(information, np.linalg.cholesky(sums.T @ sums + np.eye(n)))
         sigmas = np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0)
         reach = float(t.ppf(0.975, len(sums) - 1))
-        found = []
-        for k, (number, prior) in enumerate(zip(self.numbers, self.values, strict=True)):
+        found, priors = [], self.values.tolist()
+        for k, (number, prior) in enumerate(zip(self.numbers, priors, strict=True)):
             value, low, high = (
                 number.value(prior, float(self.x[k] + s * sigmas[k])) for s in (0.0, -reach, reach)
             )
             determined = bool(sigmas[k] < _SILENT)
             found.append(Calibrated(number, prior, value, low, high, determined))
         return tuple(found)
+
+    def _steps_of_intervals(self) -> Floats:
+        """Return steps: short where the loss is smooth, long for delays where it has kinks."""
+        steps, chosen = np.diag(self.steps), np.full(len(self.steps), _FINE)
+        for k in np.flatnonzero([number.sensor == "log_delays" for number in self.numbers]):
+            ends = [s * share * self.steps[k] for share in (1.0, _LONG) for s in (1.0, -1.0)]
+            losses = self.losses([self.x, *(self.x + end for end in ends)])
+            _, (short, long) = _derivatives(losses, steps[k] * np.array([1.0, _LONG]))
+            chosen[k] = _LONG if short <= 0.0 or long < _KINKED * short else 1.0
+        return steps * chosen
 
 
 def _derivatives(losses: Floats, steps: Floats) -> tuple[Floats, Floats]:

@@ -79,6 +79,12 @@ def survey_vehicle(folders):
         (offset,) = (n for n in found.numbers if n.number.name == "log_delays.gnss")
         print(f"{folder.name}: {offset.value:.3f} s [{offset.low:.3f}, {offset.high:.3f}]")
         flights[folder.name] = log, start, found.suite
+        try:
+            half = calibrate(log, sensors="rtk", start=start).after
+        except ValueError as error:
+            print(f"  first half: {error}")
+        else:
+            print("  first half -> second half", *fit_texts(half), sep="; ")
     for source, (_, _, suite) in flights.items():
         for name, (log, start, own) in flights.items():
             seen = validate(
