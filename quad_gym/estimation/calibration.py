@@ -100,8 +100,13 @@ def calibrate(
     search.fit()
     report("Intervals")
     found = search.intervals()
+    if search.keep_priors(found):
+        found = search.intervals()
     report("Validation")
-    new = _like_the_log(search.suite(search.x, gate=True), whole)
+    new = prior
+    for each in found:
+        new = each.number.put(new, each.value)
+    new = _like_the_log(new, whole)
     before, after = (validate(whole, s, start, split) for s in (prior, new))
     return Calibration(new, prior, found, before, after, split)
 

@@ -35,9 +35,13 @@ class Number:
     @property
     def least(self) -> float:
         """Lower bound of the coordinate: a sensor in flight is hardly better than at rest."""
-        standard_deviation = "sigma" in self.field or "density" in self.field
-        standard_deviation &= self.field != "drift_sigma_I"
-        return _LEAST / self.spread if standard_deviation else -MOST
+        bounded = self.noise and self.field != "drift_sigma_I"
+        return _LEAST / self.spread if bounded else -MOST
+
+    @property
+    def noise(self) -> bool:
+        """True for a standard deviation."""
+        return "sigma" in self.field or "density" in self.field
 
     def step_for(self, period: float) -> float:
         """Return the step of derivatives with a log whose IMU has a period [s].

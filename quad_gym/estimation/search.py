@@ -42,6 +42,11 @@ _RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are 
 _SHORT = 45.0  #: time of flight that is enough for the first search [s]
 _CLUSTER, _CLUSTERS = 5.0, 20
 """Length of independent parts of a log [s], shorter in short logs; their least number."""
+_INSIGNIFICANT = 1.92  #: log likelihood ratio that one number exceeds by chance in 5 % of logs
+_WIDEST = math.log(2.0)
+"""Largest logarithm of a standard deviation over the most likely one. It becomes wider by exp(2
+s^2), where s is the standard deviation of its logarithm if the other numbers are known: the root of
+the mean squared variance, as noise that is too small costs more than noise that is too large."""
 _FEWEST_TAILS = 30  #: number of innovations that determines their tails
 _COARSE = np.arange(-1.0, 1.01, 0.1)  #: first grid of a delay [s]
 _MARGIN = 0.2  #: time at the end of the log that changes of delays may reach [s]
@@ -64,6 +69,8 @@ class Calibrated(NamedTuple):
     number: Number
     prior: float
     value: float
+    """as in the suite; of a standard deviation up to twice the most likely one where the log hardly
+    determines it"""
     low: float  #: lower end of its 95 % interval
     high: float
     determined: bool  #: False: the log does not determine it
@@ -77,6 +84,7 @@ class NumberSearch:
         self.nu: dict[str, float] = {}  #: tails of innovations by sensor, see `Likelihood`
         self.white: set[str] = set()  #: sensors whose innovations are white
         self.numbers = numbers_in(prior, log, delays)
+        self.kept = np.zeros(len(self.numbers), bool)  #: numbers that keep their priors
         self.values = np.array([number.of(prior) for number in self.numbers])
         self.low = np.array([number.least for number in self.numbers])
         self.of_log = np.array([number.of_log for number in self.numbers])
@@ -249,7 +257,7 @@ class NumberSearch:
         H = np.diag(bends)
         H[row, column] = (both - ahead[row] - ahead[column] + total[0]) / (h[row] * h[column])
         H[column, row] = H[row, column]
-        silent = bends <= 0.0  # at a bound, where the loss has no minimum
+        silent = self.kept | (bends <= 0.0)  # at a bound, where the loss has no minimum
         H[silent], H[:, silent], scores[:, silent] = 0.0, 0.0, 0.0
         values, vectors = np.linalg.eigh(H)
         information = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.eye(n)
@@ -257,15 +265,30 @@ class NumberSearch:
         sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
         root = np.linalg.solve(information, np.linalg.cholesky(sums.T @ sums + np.eye(n)))
         sigmas = np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0)
+        alone = np.sqrt((sums**2).sum(axis=0) + 1.0) / (np.maximum(bends, 0.0) + 1.0)
         reach = float(t.ppf(0.975, len(sums) - 1))
         found, priors = [], self.values.tolist()
         for k, (number, prior) in enumerate(zip(self.numbers, priors, strict=True)):
-            value, low, high = (
-                number.value(prior, float(self.x[k] + s * sigmas[k])) for s in (0.0, -reach, reach)
-            )
+            wide = 2.0 * number.spread * float(alone[k]) ** 2 if number.noise else 0.0
+            moves = (min(wide, _WIDEST / number.spread), -reach * sigmas[k], reach * sigmas[k])
+            value, low, high = (number.value(prior, float(self.x[k] + move)) for move in moves)
             determined = bool(sigmas[k] < _SILENT)
             found.append(Calibrated(number, prior, value, low, high, determined))
         return tuple(found)
+
+    def keep_priors(self, found: Sequence[Calibrated]) -> bool:
+        """Move angles, delays and lever arms of which the log says nothing back to their priors.
+
+        The other numbers of the suite are fitted again. Return True if any number moved.
+        """
+        loose = [k for k, n in enumerate(found) if not (n.determined or n.number.positive)]
+        priors = [np.where(np.arange(len(self.x)) == k, 0.0, self.x) for k in loose]
+        losses = self.total([self.x, *priors])
+        self.kept[loose] = losses[1:] - losses[0] < _INSIGNIFICANT
+        if self.kept.any():
+            self.x, self._known = np.where(self.kept, 0.0, self.x), {}
+            self.x, _ = self._descend(self.x, ~(self.of_log | self.kept), _FEW_STEPS)
+        return bool(self.kept.any())
 
     def _steps_of_intervals(self) -> Floats:
         """Return steps: short where the loss is smooth, long for delays where it has kinks."""

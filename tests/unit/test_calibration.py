@@ -12,7 +12,7 @@ from quad_gym.estimation import calibrate, read_log, replay
 from quad_gym.estimation.likelihood import NU, SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import NUMBERS
-from quad_gym.estimation.search import correlation_time, widening
+from quad_gym.estimation.search import NumberSearch, correlation_time, widening
 from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import euler_to_dcm
 from tests.console_commands import run
@@ -101,6 +101,41 @@ def test_validation_part_fits_the_suite_that_was_found(found):
     assert not found.after.problems
     assert 0.3 < found.after.held_out_nis < 3.0
     assert all(0.1 < ratio < 5.0 for ratio in found.after.held_out_ratios)
+
+
+def test_suite_has_the_values_of_the_numbers_found(found):
+    for each in found.numbers:
+        assert each.number.of(found.suite) == each.value, each.number.name
+
+
+@pytest.mark.parametrize("name", ["log_delays.gnss", "log_rotation[2]"])
+def test_number_that_a_log_hardly_determines_keeps_its_prior_if_that_is_as_likely(
+    table, found, name
+):
+    """As if neither was determined: the delay differs from its prior, the rotation does not."""
+    search = NumberSearch(read_log(table).until(found.split), found.prior, {}, delays=True)
+    search.x = np.array([n.number.coordinate(n.prior, n.value) for n in found.numbers])
+    k = [n.number.name for n in found.numbers].index(name)
+    before = float(search.x[k])
+    assert before != 0.0
+    loose = [n._replace(determined=i != k) for i, n in enumerate(found.numbers)]
+    if name == "log_delays.gnss":
+        assert not search.keep_priors(loose)
+        assert search.x[k] == before
+    else:
+        assert search.keep_priors(loose)
+        again = search.intervals()[k]
+        assert (again.value, again.determined) == (0.0, False)
+
+
+def test_standard_deviations_that_a_log_hardly_determines_are_at_most_twice_the_most_likely(found):
+    """The most likely one is in the middle of its interval, in logarithms."""
+    noise = {n.number.name: n for n in found.numbers if n.number.noise}
+    factors = {name: n.value / np.sqrt(n.low * n.high) for name, n in noise.items()}
+    assert max(factors.values()) == pytest.approx(2.0), "the log determines all of them"
+    assert min(factors.values()) < 1.1
+    widths = {name: n.high / n.low for name, n in noise.items()}
+    assert factors[min(widths, key=widths.get)] < factors[max(widths, key=widths.get)]
 
 
 def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
