@@ -73,7 +73,7 @@ test-slow: $(VENV)/.sweeper  ## the slow tests: statistics, soak, many processes
 soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults
 	QUAD_GYM_SOAK_STEPS=100000000 QUAD_GYM_SOAK_UPDATES=10000000 $(BIN)/python -m pytest -s -m slow tests/soak
 
-golden: setup  ## after flights have changed on purpose: their digests anew
+golden: setup  ## after flights have changed on purpose: compute their digests again
 	$(BIN)/python -m tests.golden.flights --renew
 
 lint: setup  ## style, types, import rules and words

@@ -28,14 +28,14 @@ extensions = [
 exclude_patterns = ["_build", "gallery", "tutorials/*.ipynb", "tutorials/*.py"]
 suppress_warnings = [
     "config.cache",  # settings of the gallery are objects
-    # CONTRIBUTING.md and CHANGELOG.md stand at the top of the repository and are included here
+    # CONTRIBUTING.md and CHANGELOG.md are at the top of the repository and are included here
     "myst.header",
 ]
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 4
 
-# single backticks in docstrings: names, as links where they are documented
+# single backticks in docstrings are names, with links to their documentation
 default_role = "py:obj"
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -59,7 +59,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "show_signature": False,
-    "capture_repr": (),  # what is worth saying is printed
+    "capture_repr": (),  # examples print their results
     "min_reported_time": 1e9,
     "remove_config_comments": True,
     "reset_modules": ("matplotlib", "extensions.gallery.reset"),

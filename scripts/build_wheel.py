@@ -1,4 +1,4 @@
-"""Build hook of wheels: `make wheel` puts compiled kernels in; any other wheel needs Numba."""
+"""Build hook of wheels: `make wheel` includes compiled kernels; other wheels need Numba."""
 
 import os
 import runpy
@@ -8,7 +8,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 LOWEST_GLIBC = "2_17"
-"""glibc whose functions the libraries use, which `make wheel` verifies."""
+"""Lowest version of glibc that the libraries run with; `make wheel` verifies it."""
 
 
 class KernelsHook(BuildHookInterface[Any]):

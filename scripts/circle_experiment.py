@@ -1,4 +1,4 @@
-"""The same as `quad-gym circle`, with `--seeds` for `--episodes`: see `quad_gym/commands`."""
+"""Run `quad-gym circle`, with `--seeds` for `--episodes`; see `quad_gym/commands`."""
 
 import sys
 

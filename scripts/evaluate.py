@@ -1,4 +1,4 @@
-"""The same as `quad-gym evaluate`: see `quad_gym/commands`."""
+"""Run `quad-gym evaluate`; see `quad_gym/commands`."""
 
 import sys
 

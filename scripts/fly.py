@@ -1,4 +1,4 @@
-"""The same as `quad-gym fly`: see `quad_gym/commands`."""
+"""Run `quad-gym fly`; see `quad_gym/commands`."""
 
 import sys
 

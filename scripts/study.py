@@ -1,4 +1,4 @@
-"""The same as `quad-gym study`: see `quad_gym/commands`."""
+"""Run `quad-gym study`; see `quad_gym/commands`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The same as `quad-gym sweep`: see `quad_gym/commands`."""
+"""Run `quad-gym sweep`; see `quad_gym/commands`."""
 
 import sys
 

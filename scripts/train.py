@@ -1,4 +1,4 @@
-"""The same as `quad-gym train`: see `quad_gym/commands`."""
+"""Run `quad-gym train`; see `quad_gym/commands`."""
 
 import sys
 

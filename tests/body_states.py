@@ -1,4 +1,4 @@
-"""States of vehicles as the public classes take them, and as records hold them."""
+"""Vehicle states in the form of the public classes and in the form of records."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -7,7 +7,7 @@ from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 
 def random_state(seed):
-    """A state of a vehicle in flight that turns."""
+    """Return the state of a vehicle that turns in flight."""
     rng = np.random.default_rng(seed)
     return {
         "position": rng.normal(0.0, 0.1, 3),
@@ -26,7 +26,7 @@ def put_state(flight, state):
 
 
 def state_of(record, flight):
-    """The state of a flight, from a function that gives a field of all flights by its name."""
+    """Return the state of a flight; `record(name)` returns a field of all flights."""
     return {
         "position": record("r")[flight],
         "velocity": record("v")[flight],

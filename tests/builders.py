@@ -19,7 +19,7 @@ MAKERS = {
 """Every interface, on the circle."""
 STEPS = 60
 SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
-"""Episodes end by the time limit and by tipping over, at different steps in different flights."""
+"""Keywords for episodes that end by time limit and by tipping over, at different steps."""
 
 
 def single_env(base="hover", seed=None, **keywords):
@@ -39,7 +39,7 @@ def vec_env(base="hover", count=5, seed=None, **keywords):
 
 
 def batch(count=5, seed=0, **keywords):
-    """A batch of flights that have begun, with seeds from the given one on."""
+    """A batch of flights after a reset, with consecutive seeds from the given one."""
     made = FlightBatch(count, **keywords)
     made.reset(seeds=range(seed, seed + count))
     return made
@@ -63,7 +63,7 @@ def flown_batch(seeds, ticks, **keywords):
 
 
 def recorded_flight(task="circle", steps=12, seed=2, **keywords):
-    """(environment, its recorded flight, observations of each row), with random actions."""
+    """Fly random actions; return (environment, recorded flight, observations of each row)."""
     env = QuadEnv(task, **keywords)
     recorder = FlightRecorder(env.flights.batch, about={"seed": seed})
     observations = [env.reset(seed=seed)[0]]
@@ -92,33 +92,31 @@ def part(env, observations, name):
 
 
 def actions_of(flight, steps=STEPS):
-    """(steps, 4) random actions that lean to one side, so that flights end at different times."""
+    """Random actions (steps, 4) with an offset, so that flights end at different times."""
     rng = np.random.default_rng([flight, 77])
     lean = rng.uniform(-0.5, 0.5, 4)
     return np.clip(lean + rng.uniform(-0.6, 0.6, (steps, 4)), -1.0, 1.0).astype(np.float32)
 
 
 def actions_for(flights, steps=STEPS):
-    """(steps, n, 4) random actions of some flights."""
+    """Random actions (steps, n, 4) of some flights."""
     return np.stack([actions_of(flight, steps) for flight in flights], axis=1)
 
 
 def flat(observation):
-    """An observation; of a dictionary, both parts side by side."""
+    """An observation as one array; the parts of a dictionary are concatenated."""
     if isinstance(observation, dict):
         return np.concatenate(list(observation.values()), axis=-1)
     return observation
 
 
 def _columns(rows):
-    """Columns of rows."""
     observations, *others = zip(*rows, strict=True)
     return tuple(np.array(column) for column in (list(map(flat, observations)), *others))
 
 
 def together(base, flights, *, mode="NextStep", threads=1, **keywords):
-    """Fly several flights in one batch: observations, rewards, terminated, truncated. Arrays of all
-    steps, (steps, n, ...) each."""
+    """Fly a batch; return observations, rewards, terminated, truncated, (steps, n, ...) each."""
     count = len(flights)
     made = {**SHORT, "base": base, "autoreset_mode": mode, **keywords}
     env = QuadVectorEnv(count, threads=threads, **made)

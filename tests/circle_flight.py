@@ -1,6 +1,7 @@
-"""What the sensors of a vehicle on a circle measure, in closed form and with NumPy alone. The
-vehicle circles the origin while it heaves and swings its heading, so that features leave the image
-and come back."""
+"""Sensor measurements on a circle around the origin, in closed form and with NumPy only.
+
+The vehicle heaves and swings its heading, so that features leave the image and return.
+"""
 
 from dataclasses import dataclass
 
@@ -27,7 +28,7 @@ def _derivatives(t, phase):
 
 
 def _attitudes(t, phase, swing, gravity):
-    """R_BI with body z along the specific force and body x as near the heading as it can be."""
+    """R_BI with body z along the specific force and body x as near the heading as possible."""
     _, a = _derivatives(t, phase)
     heading = OMEGA * t + phase + np.pi + swing * np.sin(0.9 * t)
     toward = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)
@@ -38,7 +39,7 @@ def _attitudes(t, phase, swing, gravity):
 
 @dataclass
 class Recording:
-    """Truth and measurements at every tick; features that the camera does not see are NaN."""
+    """Truth and measurements at every tick; features out of view are NaN."""
 
     r: np.ndarray
     v: np.ndarray
@@ -51,7 +52,7 @@ class Recording:
 
 
 def record_circle(sensors, ticks, seed, *, swing=1.2):
-    """A flight of some ticks; `swing` [rad] is how far the heading turns away from the origin."""
+    """Record a flight; `swing` [rad] is the largest angle of the heading from the origin."""
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0.0, 2 * np.pi)
     dt, n = sensors.imu.dt, ticks

@@ -1,4 +1,4 @@
-"""Settings of all tests: reproducible examples, no time limit, and how many threads there are."""
+"""Settings of all tests: reproducible examples, no deadline, and the number of threads."""
 
 import os
 
@@ -12,7 +12,7 @@ from quad_gym.kernels.entries import FILTER_ENTRIES, SENSORS_AND_VEHICLE
 from quad_gym.kernels.linked import names_of
 from quad_gym.kernels.stages import SOURCES
 
-if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # for this process and those that it starts
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # for this process and its children
     share = str(max(1, available_cores() // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])))
     for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(variable, share)
@@ -28,7 +28,7 @@ settings.load_profile("quad_gym")
 
 
 def pytest_sessionstart(session):
-    """Compile what tests share where they run in several processes, which then only load it."""
+    """Compile shared kernels before tests run in several processes, which then load them."""
     if getattr(session.config.option, "numprocesses", None):
         prepare(
             [*names_of([source.name for source in SOURCES]), *FILTER_ENTRIES, *SENSORS_AND_VEHICLE]

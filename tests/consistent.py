@@ -1,24 +1,24 @@
-"""Whether a filter's NEES and NIS over many flights are those of a consistent filter."""
+"""Check of the NEES, NIS and innovations of a filter over many flights."""
 
 import numpy as np
 
 STATE = ("state", "attitude", "accel_bias", "gyro_bias")
-"""Parts whose errors hardly change in 10 s."""
+"""Parts of the state with errors that hardly change in 10 s."""
 
 
 def assert_consistent(nees, nis, whiteness, apart=()):
-    """NEES of all parts and NIS of all sensors in their bands, innovations white.
+    """Check that all NEES and NIS are in their bands, and that innovations are white.
 
-    In the band of 95 % are 90 % of the instants, or the mean over all instants tells: where errors
-    last, the instants are all in the band or all out of it, by chance. That mean is off by less
-    than 3.5 deviations of one instant's if errors last as long as the flights, and by less than one
-    if they last for a second or so, with 80 % of the instants in the band still.
+    A part passes with 90 % of its instants in the 95 % band. If errors are correlated over time,
+    the instants may all be outside by chance; then the mean over all instants decides. It must be
+    off by less than 3.5 standard deviations of one instant for errors that last as long as the
+    flights (`STATE`), and by less than one, with 80 % of the instants in the band, for others.
 
     Args:
         nees: `MeanSquare` by part.
         nis: `MeanSquare` by sensor.
         whiteness: `Whiteness` by sensor.
-        apart: Sensors whose innovations are not as in a filter that models everything.
+        apart: Sensors to skip, because the filter does not model all of their errors.
     """
     found = nees | {f"NIS of {name}": part for name, part in nis.items() if name not in apart}
     for name, part in found.items():
@@ -26,7 +26,7 @@ def assert_consistent(nees, nis, whiteness, apart=()):
         off = abs(part.overall - part.dimension) / deviation
         by_mean = off < 1.0 and part.share_inside >= 0.8
         lasting = name in STATE and off < 3.5
-        message = f"{name}: {part.share_inside:.3f} inside, {off:.2f} deviations off"
+        message = f"{name}: {part.share_inside:.3f} inside, off by {off:.2f} sigma"
         assert part.consistent or by_mean or lasting, message
     for name, white in whiteness.items():
         assert white.white or name in apart, f"{name}: autocorrelation {white.largest:.3f}"

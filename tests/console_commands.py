@@ -1,5 +1,4 @@
-"""Commands run in the test's own process, which has imported already what each would import anew.
-What needs a process of its own, such as a signal, starts one by `line`."""
+"""Commands in the process of the test, which saves imports; `line` is for separate processes."""
 
 import contextlib
 import io
@@ -16,7 +15,7 @@ SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
 
 class Ended(NamedTuple):
-    """How a command has ended."""
+    """Exit code and output of a command."""
 
     returncode: int
     stdout: str
@@ -24,12 +23,12 @@ class Ended(NamedTuple):
 
 
 def line(script, *options):
-    """The line that runs a script in a process of its own."""
+    """The command line that runs a script in a separate process."""
     return [sys.executable, str(SCRIPTS / script), *map(str, options)]
 
 
 def run(command, *options, where=None):
-    """Run `quad-gym COMMAND` with its options, in a folder of its own if one is given."""
+    """Run `quad-gym COMMAND` with its options, in the folder `where` if it is given."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.redirect_stdout(out))
@@ -54,5 +53,5 @@ def refused(words, capsys):
 
 
 def plain(text: str) -> str:
-    """The words of `text` on one line, without the frames that messages of the parser have."""
+    """The words of `text` on one line, without the frames around the parser's messages."""
     return " ".join(re.sub("[╭╮╰╯│─]", " ", text).split())

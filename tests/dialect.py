@@ -1,10 +1,10 @@
-"""Counter of words that a native engineer would not write, in pages and docstrings.
+"""Counter of words that a native engineer would not write, in pages, docstrings and names of tests.
 
     python -m tests.dialect              # the counts per 1,000 words, as `make lint` prints them
     python -m tests.dialect --list NAME  # every find in pages and folders whose name contains NAME
 
-A text, which is a page or the docstrings of a folder, may have one find, and more up to `LIMIT` per
-1,000 words. The table in CONTRIBUTING.md has the standard words to write instead.
+A text is a page or the docstrings of a folder. It may have one find, or up to `LIMIT` per 1,000
+words. The table in CONTRIBUTING.md has the standard words to write instead.
 """
 
 import argparse
@@ -95,12 +95,12 @@ class Count(NamedTuple):
 
 
 def blanked(found: re.Match[str]) -> str:
-    """As many characters and lines, but one word."""
+    """Return one word with as many characters and lines."""
     return "X" + re.sub(r"[^\n]", " ", found[0][1:])
 
 
 def is_numbers(line: str) -> bool:
-    """True for a row of a table with more digits than letters."""
+    """Return True for a row of a table with more than half as many digits as letters."""
     digits, letters = (sum(map(kind, line)) for kind in (str.isdigit, str.isalpha))
     return line.lstrip().startswith("|") and 2 * digits > letters
 
@@ -120,11 +120,13 @@ def count(text: str, where: str, first_line: int = 1) -> Count:
 
 
 def docstrings(file: Path) -> list[Count]:
-    """Counts of the docstrings of a module, and of descriptions behind constants."""
+    """Counts of docstrings, of descriptions behind constants, and of names of tests."""
     where, text = file.relative_to(ROOT).as_posix(), file.read_text(encoding="utf-8")
     behind = enumerate((line.partition("  #: ")[2] for line in text.split("\n")), start=1)
     counts = [count(words, where, line) for line, words in behind if words]
     for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+            counts.append(count(node.name.replace("_", " "), where, node.lineno))
         value = getattr(node.value, "value", None) if isinstance(node, ast.Expr) else None
         if isinstance(value, str):
             text = inspect.cleandoc(value)
@@ -146,7 +148,7 @@ def counts() -> dict[str, Count]:
         prose = "\n".join(line[2:] if line.startswith("# ") else "" for line in text.split("\n"))
         head = ast.get_docstring(ast.parse(text)) or ""
         parts[page] = [count(head, page), count(prose, page)]
-    for folder in ("quad_gym", "baselines"):
+    for folder in ("quad_gym", "baselines", "docs", "scripts", "tests"):
         for file in sorted((ROOT / folder).rglob("*.py")):
             name = "/".join(file.relative_to(ROOT).parts[:-1][:2])
             parts.setdefault(f"docstrings of {name}", []).extend(docstrings(file))

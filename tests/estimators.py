@@ -1,4 +1,4 @@
-"""Estimators that tests fly on: simple ones, and those of docs/gallery/estimators."""
+"""Estimators for tests: simple ones, and the modules of docs/gallery/estimators."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -17,7 +17,7 @@ def gallery(name):
 
 
 class Simple(quad_gym.Estimator):
-    """Positions filtered by a constant gain, velocities of the start, attitudes of the gyro."""
+    """Constant-gain filter of positions, with initial velocities and integrated gyro rates."""
 
     state: ClassVar = {"r": np.zeros(3), "v": np.zeros(3), "R": np.eye(3), "ticks": 0}
 
@@ -45,7 +45,7 @@ class Simple(quad_gym.Estimator):
 
 
 class Certain(Simple):
-    """The same with a covariance and biases."""
+    """`Simple` with a covariance and biases."""
 
     def estimate(self):
         n = len(self.state.r)
@@ -57,14 +57,14 @@ class Certain(Simple):
 
 
 class Diverges(Simple):
-    """The same until a position is not a number."""
+    """`Simple` with NaN positions in every update."""
 
     def update(self, measurements):
         return super().update(measurements) | {"position": np.full((measurements.count, 3), np.nan)}
 
 
 class Given(quad_gym.Estimator):
-    """An estimate that is given."""
+    """Constant estimate, in which the caller can replace or omit values."""
 
     def __init__(self, **changes):
         self.changes = changes

@@ -1,4 +1,4 @@
-"""Flights whose filters are judged: errors in the filter's coordinates, and their size."""
+"""Flights to evaluate filters: errors in the filter's coordinates, and NEES."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from quad_gym.records import AID_BLOCKS, Control
 
 
 def fly(sensors, count=200, *, task="random_trajectory", seed=0, start=None, **keywords):
-    """A batch under PD control on its estimate that goes on whatever happens."""
+    """A batch under PD control on its estimate, with episodes that do not end."""
     params = TASK_DEFAULTS[task].replace(
         duration=0.0,
         out_of_bounds=1e6,
@@ -35,7 +35,7 @@ def steps(batch, seconds):
 
 
 def small_euler_angles(R):
-    """The 3-1-2 angles (n, 3) of rotations (n, 3, 3) near the identity."""
+    """The 3-1-2 Euler angles (n, 3) of rotations (n, 3, 3) near the identity."""
     yaw, pitch = np.arctan2(-R[:, 1, 0], R[:, 1, 1]), np.arctan2(-R[:, 0, 2], R[:, 2, 2])
     return np.stack([np.arcsin(R[:, 1, 2]), pitch, yaw], axis=-1)
 
@@ -50,7 +50,7 @@ def attitudes(q):
 
 
 def state_errors(batch):
-    """(n, 15) truth less estimate, in the order r, v, e, b_a, b_g."""
+    """Truth minus estimate (n, 15), in the order r, v, e, b_a, b_g."""
     R_error = attitudes(batch.record("q")) @ batch.record("R_hat").transpose(0, 2, 1)
     return np.concatenate(
         [
@@ -65,11 +65,11 @@ def state_errors(batch):
 
 
 def nees(batch, block=slice(0, 15)):
-    """(n,) normalized estimation error squared of all 15 states, or of some."""
+    """Normalized estimation error squared (n,) of all 15 states, or of some."""
     x, P = state_errors(batch)[:, block], batch.covariance()[:, block, block]
     return np.einsum("ni,ni->n", x, np.linalg.solve(P, x[..., np.newaxis])[..., 0])
 
 
 def measured_now(batch):
-    """(n, blocks): which blocks were measured at the present instant."""
+    """Array (n, blocks): True for blocks that were measured at the present instant."""
     return batch.record("block_valid")[:, :AID_BLOCKS] > 0.0

@@ -1,10 +1,10 @@
-"""States to set filters to."""
+"""Initial states of filters."""
 
 import numpy as np
 
 
 def at_rest(**told):
-    """The state at rest at the origin, level and without biases, but for what is told."""
+    """The state at rest at the origin, level and without biases, except for `told`."""
     state = {
         "position": np.zeros(3),
         "velocity": np.zeros(3),
@@ -16,7 +16,7 @@ def at_rest(**told):
 
 
 def set_at_rest(kalman, covariance, **told):
-    """Set a filter to that state."""
+    """Set a filter to the state `at_rest`."""
     kalman.set_state(**at_rest(**told), covariance=covariance)
 
 

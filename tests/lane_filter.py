@@ -1,4 +1,4 @@
-"""The filter's stages for blocks of flights, and how flights get into their blocks."""
+"""The filter's stages on blocks of flights, with access to single flights."""
 
 import numpy as np
 
@@ -22,12 +22,12 @@ from quad_gym.records import (
 )
 
 EIGHT = 8
-"""Filters that fly together: one block or more, as lanes are 2, 4 or 8."""
+"""Number of filters: one block or more, with 2, 4 or 8 lanes each."""
 STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
 
 
 class LaneFilter:
-    """EIGHT filters in as many blocks as they fill."""
+    """EIGHT filters in as many blocks as they need."""
 
     def __init__(self, sensors):
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
@@ -53,7 +53,7 @@ class LaneFilter:
             self.params[name][block, ..., lane] = value
 
     def set_valid(self, number, measured, valid):
-        """Flag blocks of the measurement of one flight."""
+        """Set the validity of measurement blocks of one flight."""
         block, lane = divmod(number, WIDTH)
         self.blocks["block_valid"][block, measured, lane] = valid
 
@@ -62,7 +62,7 @@ class LaneFilter:
         return field_of_flights(self.blocks, name, EIGHT)
 
     def measure(self, number, recording, k, *, position=True, baseline=True, camera=True):
-        """Hand one flight what a recording holds at tick k; what is not measured becomes NaN."""
+        """Set one flight's measurements from tick k of a recording; missing ones become NaN."""
         pixels = recording.pixels[k]
         seen = np.isfinite(pixels).all(axis=1) & camera
         self.put(
@@ -98,7 +98,7 @@ class LaneFilter:
             run_stage(block.ctypes.data, 0, 1, int(stage), *others)
 
     def _each(self, mask):
-        """Blocks and what they need, one by one, the part of a mask that is theirs in force."""
+        """Set each block's part of the mask; yield the block, parameters, settings and work."""
         self.settings["form"] = self.form
         for k, chosen in enumerate(np.reshape(mask, (-1, WIDTH))):
             self.work["mask"][0] = chosen

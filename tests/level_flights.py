@@ -1,5 +1,5 @@
-"""Closed-form flights of a vehicle that keeps its attitude, for filters that start level. It swings
-level, r = A (sin wt, (1 - cos wt)/2, 0): no law of a quadrotor, but a filter knows none."""
+"""Closed-form flights with constant attitude, for filters that start level. The vehicle swings
+level, r = A (sin wt, (1 - cos wt)/2, 0); filters do not model the dynamics of a quadrotor."""
 
 import math
 
@@ -24,7 +24,7 @@ GRAVITY = MAGNETIC.estimator.gravity
 
 
 class LevelFlight:
-    """One drawn flight, its start drawn as the filter believes of it."""
+    """Random flight, with an initial state from the filter's initial distribution."""
 
     def __init__(self, suite, rng, *, amplitude=3.0, omega=1.5, velocity=(0.0, 0.0, 0.0)):
         self.suite, self.rng, imu = suite, rng, suite.imu
@@ -45,7 +45,7 @@ class LevelFlight:
         a, w = self.amplitude, self.omega
         s, c = math.sin(w * t), math.cos(w * t)
         start = self.speed + self.drift
-        # the swing begins with the velocity a w to the east; it is taken off again
+        # the swing begins with the velocity a w to the east, which is subtracted
         r = np.array([a * (s - w * t), 0.5 * a * (1.0 - c), 0.0]) + start * t
         v = np.array([a * w * (c - 1.0), 0.5 * a * w * s, 0.0]) + start
         return {
@@ -82,7 +82,7 @@ class LevelFlight:
         return self.R @ field_I + self.iron + self.rng.normal(0.0, m.noise_sigma, 3)
 
     def error(self, ukf, t):
-        """(15,) errors of a filter."""
+        """Errors (15,) of a filter."""
         estimate = {name: getattr(ukf, name) for name in self.truth(t)}
         return state_error(self.truth(t), estimate)
 

@@ -1,6 +1,6 @@
-"""Logs of simulated flights, as a recorder on board would have written them. IMU samples at
-irregular times (means over one to three ticks), some lost; measurements with their right time
-stamps, some lost, arriving with a jitter beside their latency. As CSV and as ULog."""
+"""Logs of simulated flights as CSV and ULog, as a recorder on board would write them. IMU samples
+have irregular times (means over one to three ticks). Measurements have correct time stamps, and
+arrive with a jitter in addition to their latency. Some of both are lost."""
 
 import csv
 import struct
@@ -19,7 +19,7 @@ RTK = quad_gym.sensor_suite("rtk")
 PX4 = RTK.replace(
     camera=None, barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
 )
-"""What a log of PX4 can hold, and two antennas."""
+"""Sensors in a log of PX4, and two antennas."""
 LOST, JITTER = 0.01, 0.05
 AXES_OF_FIELD = [f"magnetometer_{axis}" for axis in "xyz"]
 
@@ -27,7 +27,7 @@ AXES_OF_FIELD = [f"magnetometer_{axis}" for axis in "xyz"]
 def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
     """A flight under PD control on the estimate, with a row per IMU sample.
 
-    Its `about` has what aiding sensors measured, (n, 2, 3), NaN where they did not, and the
+    Its `about` has measurements of aiding sensors (n, 2, 3), NaN where there is none, and the
     voltages (n, 4) over the tick before each row.
     """
     rate = suite.imu.rate
@@ -53,7 +53,7 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
 
 
 class Recorded:
-    """What a recorder has of a flight: (time, received, values) of each sensor."""
+    """Recording of a flight: (time, received, values) of each sensor."""
 
     def __init__(self, flight, suite=RTK, seed=0, *, lost=LOST, jitter=JITTER, most_ticks=3):
         rng, time = np.random.default_rng(seed), flight["time"]
@@ -75,7 +75,7 @@ class Recorded:
                     continue
                 if k and rng.random() < lost:
                     continue
-                late = latency if k else 0.0  # the first ones come at once
+                late = latency if k else 0.0  # the first ones have no latency
                 arrival = time[k] + (rng.uniform(0.0, jitter) if k else 0.0)
                 found.append((time[k] - late, arrival, values))
             return found
@@ -96,7 +96,7 @@ class Recorded:
         self.camera = measured(("pixels",), suite.camera.latency if suite.camera else 0.0)
 
     def table(self):
-        """Columns, a row per sample or measurement, in the order of arrival."""
+        """Columns with a row per sample or measurement, in the order of arrival."""
         features = self.flight["pixels"].shape[1]
         names = ["time", "received", *(f"{s}_{a}" for s in ("gyro", "accel") for a in "xyz")]
         for quantity in ("gnss", "gnss_baseline", "gnss_velocity"):
@@ -134,7 +134,7 @@ class Recorded:
                 writer.writerow(["" if np.isnan(x) else repr(float(x)) for x in row])
 
     def write_ulog(self, file, boot=12.0):
-        """The same without camera and baselines, of which PX4 has none."""
+        """Write a ULog file, without camera and baselines, which PX4 does not log."""
         flu = np.array([1.0, -1.0, -1.0])
         us = lambda t: round(1e6 * (t + boot))  # noqa: E731
         origin = np.array(self.suite.gnss.reference_antenna_G)
@@ -182,7 +182,7 @@ _CODES |= {"double": "d", "float": "f"}
 
 
 class ULogWriter:
-    """Writes the file format of PX4, see "ULog File Format" in its user guide."""
+    """Writer of PX4's log files; see "ULog File Format" in its user guide."""
 
     def __init__(self, file):
         self.file, self.packers, self.data = file, [], []
@@ -194,7 +194,7 @@ class ULogWriter:
         return struct.pack("<HB", len(content), ord(kind)) + content
 
     def topic(self, name, fields):
-        """Define and subscribe a topic; returns its number."""
+        """Define and subscribe to a topic; return its number."""
         number, codes = len(self.packers), "<"
         for item in fields.rstrip(";").split(";"):
             kind, count = item.split()[0], 1
@@ -217,14 +217,14 @@ class ULogWriter:
 
 
 def errors_in_flight(recorded, k):
-    """(n, 9) errors of position, velocity and attitude of the filter in flight, at rows `k`."""
+    """Errors (n, 9) of position, velocity and attitude of the filter in flight, at rows `k`."""
     f = recorded.flight
     words = ("position", "velocity", "quaternion")
     return _errors(f, k, *(f[f"estimated_{word}"][k] for word in words))
 
 
 def errors_in_replay(recorded, result, k):
-    """The same of a replay, each row of which is one of the flight."""
+    """Errors (n, 9) of a replay, whose rows are the rows `k` of the flight."""
     return _errors(recorded.flight, k, result.position, result.velocity, result.quaternion)
 
 

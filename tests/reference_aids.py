@@ -1,9 +1,8 @@
-"""The plain filter of `reference_ukf.py` with a barometer and a magnetometer. Slow errors come
-behind b_g: the drift of GNSS positions, if there is one; hard iron b (three); then one each, the
-barometer's bias and the error of the declination. Where the covariance turns with the attitude,
-hard iron turns so that what the field tells of both together stays as it is. What the filter
-believes to be constant has a driving noise so small that 45 digits do not notice it. As there: UKF
-and, by numerical derivatives, EKF, in any number type."""
+"""The plain filters of `reference_ukf.py` with a barometer and a magnetometer. Slow errors follow
+b_g in the state: the drift of GNSS positions, if there is one; hard iron b (three); the barometer's
+bias; and the error of the declination. If the covariance turns with the attitude, hard iron turns,
+too, so that the error of the predicted field does not change. Constant states have a driving noise
+that is negligible in 45 digits. UKF and, by numerical derivatives, EKF, in any number type."""
 
 import math
 
@@ -21,7 +20,7 @@ def cross_matrix(v):
 
 
 class Aided:
-    """What the two plain filters gain."""
+    """Barometer and magnetometer for the two plain filters."""
 
     def __init__(self, sensors, number=np.float64):
         super().__init__(sensors, number)

@@ -1,12 +1,11 @@
-"""A filter that meets late measurements by filtering all over again from their time stamps. It
-stores its state at every tick, every IMU sample and every measurement: what a measurement that
-arrives late should do to an estimate, without any approximation."""
+"""A filter that processes a late measurement by filtering again from its time stamp. It stores its
+state at every tick, every IMU sample and every measurement, and makes no approximation."""
 
 from collections import defaultdict
 
 
 class Rewinding:
-    """A filter of `tests.reference_ukf` with a memory.
+    """A filter of `tests.reference_ukf` with a history.
 
     Args:
         plain: The filter, at tick 0.
@@ -22,7 +21,7 @@ class Rewinding:
         return tuple(part.copy() for part in (f.r, f.v, f.R, f.b_a, f.b_g, f.d, f.P))
 
     def predict(self, gyro, accel):
-        """Carry the filter over a tick."""
+        """Predict over a tick."""
         self._samples.append((gyro, accel))
         self._predict(self.tick)
         self.tick += 1
@@ -33,7 +32,7 @@ class Rewinding:
         self._states.append(self._state())
 
     def update(self, taken_at, **measurement):
-        """Take a measurement into account that was taken at a tick not after the present one."""
+        """Process a measurement that was taken at the present tick or an earlier one."""
         self._measured[taken_at].append(measurement)
         f = self.plain
         f.r, f.v, f.R, f.b_a, f.b_g, f.d, f.P = (part.copy() for part in self._states[taken_at])

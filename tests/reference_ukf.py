@@ -1,12 +1,15 @@
 """A plain augmented unscented Kalman filter, written from the equations: the truth for the package.
-No structure is used: the noise is part of the state, every sigma point is evaluated, the weights
-are the textbook's near -1e6. Their cancellation costs some ten digits, so that neither float64 nor
-an 80-bit long double (which is off by 1e-9 m) can serve as truth; with `number=decimal.Decimal` the
-filter computes in as many digits as the decimal context has. In float64 it is the plain NumPy
-filter that speeds are compared with. State (r, v, e, b_a, b_g) with R_BI = R(e) Rbar_BI and e = 0
-after each step. Prediction noise (v_g, v_g2, v_a, v_a2). Where GNSS positions drift, the slow error
-d is part of the state, after b_g, and its driving noise part of the noise, at the end. `PlainEKF`
-differentiates the same models numerically, which is as good as exact in that many digits."""
+
+It uses no structure: the noise is part of the state, every sigma point is evaluated, and the
+weights are the textbook's, near -1e6. Their cancellation costs about ten digits, so that neither
+float64 nor an 80-bit long double (off by 1e-9 m) can serve as truth. With `number=decimal.Decimal`,
+the filter computes in as many digits as the decimal context has. In float64, it is the plain NumPy
+filter in comparisons of speed. `PlainEKF` differentiates the same models numerically.
+
+The state is (r, v, e, b_a, b_g) with R_BI = R(e) Rbar_BI and e = 0 after each step. The prediction
+noise is (v_g, v_g2, v_a, v_a2). If GNSS positions drift, the slow error d follows b_g in the state,
+and its driving noise is the last part of the noise.
+"""
 
 from decimal import Decimal
 
@@ -17,7 +20,7 @@ WGS84_A, WGS84_INVERSE_FLATTENING = 6378137, "298.257223563"
 
 TOLERANCES = {"position": 1e-9, "velocity": 1e-8, "R_BI": 1e-9, "accel_bias": 1e-7}
 TOLERANCES |= {"gyro_bias": 1e-10}
-"""Of filters in floats against these in 45 digits."""
+"""Tolerances of filters in floats against these filters in 45 digits."""
 
 
 def array_of(number, values):
@@ -31,7 +34,7 @@ def eye_of(number, n=3):
 
 
 def cos_sin(x):
-    """Cosine and sine, by their series where NumPy has none."""
+    """Cosine and sine, by their series for types without NumPy functions."""
     if x.dtype != object:
         return np.cos(x), np.sin(x)
     terms, cosine, sine, order = 1 + 0 * x, 0 * x, 0 * x, 0
@@ -66,7 +69,7 @@ def euler_rate_matrix(e):
 
 
 def turn_by(vector):
-    """exp(-[vector x]) by Rodrigues' formula: a body that turns by `vector` from the identity."""
+    """exp(-[vector x]) by Rodrigues' formula: the attitude after a turn by `vector`."""
     x, y, z = vector
     cross = np.array([[0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x]])
     angle = np.sqrt(vector @ vector)
@@ -105,7 +108,7 @@ def unit(v):
 
 
 def cholesky(P):
-    """Lower Cholesky factor; `numpy.linalg` knows float64 only."""
+    """Lower Cholesky factor; `numpy.linalg` supports only float64."""
     if P.dtype == np.float64:
         return np.linalg.cholesky(P)
     L = 0 * P
@@ -140,8 +143,7 @@ def block_diagonal(*blocks):
 
 
 def attitude_from_two_pairs(u_B, v_B, u_I, v_I):
-    """Wahba's problem for two pairs of unit vectors of equal weight. The sums of both pairs are
-    then parallel, and so are the differences."""
+    """Solve Wahba's problem for two pairs of equal weight: their sums and differences align."""
 
     def triad(u, v):
         s, d = unit(u + v), unit(u - v)
@@ -151,7 +153,7 @@ def attitude_from_two_pairs(u_B, v_B, u_I, v_I):
 
 
 class PlainUKF:
-    """The filter, called like `quad_gym.estimation.UnscentedKalmanFilter`, in any float type."""
+    """Filter with the methods of `quad_gym.estimation.UnscentedKalmanFilter`, in any float type."""
 
     def __init__(self, sensors, number=np.float64):
         self.number, self.sensors = number, sensors
@@ -198,7 +200,7 @@ class PlainUKF:
     # ---- the unscented transform ----
 
     def _sigma_points(self, x, P):
-        """(2n + 1, n) points, and the weights of mean and covariance."""
+        """Points (2n + 1, n), and the weights of mean and covariance."""
         n = len(x)
         lam = self.alpha**2 * (self.kappa + n) - n
         offsets = np.sqrt(n + lam) * cholesky(P).T
@@ -244,7 +246,7 @@ class PlainUKF:
             self.number(imu.gyro_bias_sigma) ** 2 * eye,
         )
         self.d = self.zeros[: self.states - 15]
-        if self.drifts:  # known to be zero, but for what a factor needs
+        if self.drifts:  # zero, with a variance that keeps P positive definite
             self.P = block_diagonal(self.P, self.number(1e-30) * eye)
 
     def predict(self, gyro, accel):
@@ -266,7 +268,7 @@ class PlainUKF:
         return mean, (w_cov * deviations.T) @ deviations
 
     def _process(self, points, w_B, f_B):
-        """(n, 15 or 18) states after a tick, of states with noise before it."""
+        """States (n, 15 or 18) after a tick, from states with noise before it."""
         r, v, e, b_a, b_g = np.split(points[:, :15], 5, axis=1)
         noise = points[:, self.states :]
         v_g, v_g2, v_a, v_a2 = np.split(noise[:, :12], 4, axis=1)
@@ -312,7 +314,7 @@ class PlainUKF:
         self._condition(np.concatenate(measured), block_diagonal(*noises), models)
 
     def _predicted(self, models, points):
-        """What is measured at states (n, 15 and more), (n, n_z)."""
+        """Predicted measurements (n, n_z) of states (n, 15 or more)."""
         r, R_BI = points[:, :3], rotation_312(points[:, 6:9]) @ self.R
         d = points[:, 15:18] if self.drifts else 0 * r
         return np.concatenate([model(r, R_BI, d) for model in models], axis=1)
@@ -366,7 +368,7 @@ class PlainUKF:
 
 
 class PlainEKF(PlainUKF):
-    """The error-state extended filter of the same models, in the textbook's form."""
+    """The error-state extended filter with the same models, in the textbook's form."""
 
     def _differences(self, function, x0):
         """Value and Jacobian of a function of points (n, k), by central differences."""

@@ -1,4 +1,4 @@
-"""Suites whose filters start as vaguely as is allowed, and more so."""
+"""Suites with the largest initial uncertainty that is allowed, or more."""
 
 import math
 
@@ -15,7 +15,7 @@ from tests.field_flights import fly, nees, steps
 
 KINDS = ("ukf", "ekf")
 BAND = (14.0, 17.0)
-"""In which the mean NEES of 15 states of a consistent filter is."""
+"""Band of the mean NEES of 15 states of a consistent filter."""
 
 
 def one_antenna(suite, **changes):
@@ -33,7 +33,7 @@ def with_mark(name, **sigmas):
 
 
 def with_iron(name, heading_sigma):
-    """With hard iron that turns the heading by `heading_sigma`."""
+    """A suite with hard iron that turns the heading by `heading_sigma`."""
     field = quad_gym.sensor_suite("consumer").magnetometer
     iron = heading_sigma * math.hypot(*field.field_I[:2])
     return one_antenna(
@@ -42,7 +42,7 @@ def with_iron(name, heading_sigma):
 
 
 def vague_suites(scale=1.0):
-    """Suites by what is vague, at `scale` times its bound."""
+    """Suites by the uncertain quantity, with a sigma of `scale` times its bound."""
     baseline, mark = scale * MAX_BASELINE_SIGMA, scale * MAX_HEADING_SIGMA
     indoors = scale * MAX_HEADING_SIGMA_INDOORS
     suites = {}
@@ -61,7 +61,7 @@ def vague_suites(scale=1.0):
 
 
 def largest_tilt(name):
-    """Draws of the largest roll and pitch that a cold filter of a suite takes."""
+    """Draws of roll and pitch up to the largest that a cold filter of a suite accepts."""
     most = 0.999 * math.sqrt(3.0) * MAX_START_TILT
     if name == "consumer":
         most /= math.tan(quad_gym.sensor_suite(name).magnetometer.inclination)

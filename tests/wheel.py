@@ -1,12 +1,12 @@
-"""Test a built wheel: from `pip install` to a filter's library whose example equals a replay.
+"""Test a built wheel, from `pip install` to an exported filter whose estimates equal a replay.
 
     python -m tests.wheel dist/quad_gym-*.whl          # the last step of make wheel
     python -m tests.wheel WHEEL --folder FOLDER        # keep environment and files there
 
 Installs the wheel with the extras `compile` and `plot` (for `replay`) in a new virtual environment.
-There, two commands export the filter of a suite and compile it; its example prints the estimates of
-a log, which must be those that `quad-gym replay` writes. The same for AArch64 in an emulator, where
-compiler and emulator are installed.
+There, commands export the filter of a suite and compile it. Its example prints the estimates of a
+log, which must equal the output of `quad-gym replay`. The same test runs for AArch64 in an emulator
+if compiler and emulator are installed.
 """
 
 import argparse
@@ -27,7 +27,7 @@ GCC, EMULATOR = "aarch64-linux-gnu-gcc", "qemu-aarch64-static"
 
 
 def installed(wheel, folder):
-    """Folder of the commands of an environment with the wheel, made if it does not exist."""
+    """Folder of the commands of an environment with the wheel, made if it is missing."""
     commands = folder / "environment" / "bin"
     if not (commands / "quad-gym").exists():
         venv.create(folder / "environment", with_pip=True)

@@ -2,8 +2,8 @@
 
     python docs/examples/cleanrl_ppo.py --env-id quad_gym:QuadGym/Circle-v0
 
-CleanRL is no package but scripts to copy, written for Gymnasium 0.29. This is the same algorithm,
-written anew for Gymnasium 1: options, defaults and order of the wrappers are those of CleanRL.
+CleanRL is not a package: its scripts are to be copied, and need Gymnasium 0.29. This script is the
+same algorithm for Gymnasium 1, with CleanRL's options, defaults and order of the wrappers.
 """
 
 from collections import deque
@@ -57,7 +57,7 @@ def make_env(env_id, gamma):
 
 
 def network(inputs, outputs, last):
-    """Two tanh layers of 64 units, with orthogonal weights and `last` as the gain of the last."""
+    """Two tanh layers of 64 units with orthogonal weights; `last` is the output layer's gain."""
     sizes = [(inputs, 64, np.sqrt(2.0)), (64, 64, np.sqrt(2.0)), (64, outputs, last)]
     layers = []
     for before, after, gain in sizes:
@@ -93,7 +93,7 @@ class Agent(nn.Module):
 
 
 def advantages_of(rewards, dones, values, last_done, last_value, args):
-    """Generalized advantage estimates; as in CleanRL, an end by time limit counts as any end."""
+    """Generalized advantage estimates; as in CleanRL, a truncation counts as a termination."""
     advantages = torch.zeros_like(rewards)
     following, advantage = last_value, torch.zeros_like(last_value)
     goes_on = 1.0 - last_done
@@ -119,7 +119,7 @@ def loss_of(agent, batch, args):
 
 
 def train(args):
-    """The trained agent."""
+    """Train and return the agent."""
     rng = np.random.default_rng(args.seed)
     torch.manual_seed(args.seed)
     makers = [lambda: make_env(args.env_id, args.gamma)] * args.num_envs
@@ -171,7 +171,7 @@ def train(args):
 
 
 def main(args):
-    """Train, evaluate, save."""
+    """Train, save and evaluate."""
     from quad_gym.evaluation import roll_out
 
     torch.set_num_threads(1)  # the networks are small

@@ -6,12 +6,12 @@ FOLDER holds either flight of:
 
 - `IMU_1.csv` and `GT.csv` of "Quadrotor Dead Reckoning with Multiple Inertial Sensors" (D. Hurwitz
   and I. Klein, 2023, CC BY 4.0, github.com/ansfl): an Xsens DOT IMU at 120 Hz, and RTK positions at
-  10 Hz with a clock of their own. The heading at the first position is printed, for `--heading`.
+  10 Hz with a separate clock. The heading at the first position is printed, for `--heading`.
 - `IMU.txt`, `GPS.txt`, `MAG.txt` and `NTUN.txt` of InertialNav (P. Riseborough, 2014,
   BSD-3-Clause): logs of ArduPilot, with times of arrival. Measurements keep them as time stamps;
   `quad-gym calibrate` finds the delays.
 
-Both are examples for your own data: a list of rows, each a time of arrival and what was measured.
+Both are examples for your own data: a list of rows, each with a time of arrival and measurements.
 """
 
 import csv
@@ -28,7 +28,7 @@ def rtk_flight(folder):
     imu = np.loadtxt(folder / "IMU_1.csv", delimiter=",", skiprows=1)
     truth = np.loadtxt(folder / "GT.csv", delimiter=",", skiprows=1)
     rows = []
-    for row in imu:  # time, angles of its own filter, m/s^2, deg/s; forward, left, up
+    for row in imu:  # time, angles of the sensor's filter, m/s^2, deg/s; forward, left, up
         rows.append((row[0], vector("accel", row[4:7]) | vector("gyro", np.radians(row[7:10]))))
     for row in truth:
         north, east, down = row[7:10]
@@ -65,7 +65,7 @@ def vector(name, values):
 
 
 def table(rows):
-    """Return the columns of rows in the order of time; NaN where nothing was measured."""
+    """Return the columns of rows in the order of time; NaN where there is no measurement."""
     rows = sorted(rows, key=lambda row: row[0])
     names = dict.fromkeys(name for _, values in rows for name in values)
     columns = {name: np.array([values.get(name, np.nan) for _, values in rows]) for name in names}

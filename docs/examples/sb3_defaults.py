@@ -1,9 +1,9 @@
-"""Stable-Baselines3 with nothing but its default settings, and what its policies reach.
+"""Train Stable-Baselines3 with its default settings, and evaluate the policies.
 
     python docs/examples/sb3_defaults.py --algorithm sac --env-id QuadGym/Hover-v0 --seed 1
 
-While it learns, the policy flies test episodes, without exploration; none of it changes what is
-learned. SAC takes 8 to 15 ms a step.
+During training, the policy flies test episodes without exploration, which do not change the
+training. SAC takes 8 to 15 ms a step.
 """
 
 from dataclasses import dataclass
@@ -31,29 +31,29 @@ class Args:
     algorithm: Literal["ppo", "sac"] = "ppo"
     env_id: str = "QuadGym/Circle-v0"
     start: Literal["ground", "hover", "mixed", "moving"] | None = None
-    """how episodes start, in training and evaluation; if not given, as the task's do"""
+    """start of episodes in training and evaluation; if not given, the default of the task"""
     out_of_bounds: float | None = None
-    """distance from the reference at which episodes end [m], likewise"""
+    """distance from the reference at which episodes end [m]; if not given, the default"""
     seed: int = 0
     total_timesteps: int | None = None
-    """if not given, 1,000,000 of PPO and 300,000 of SAC"""
+    """if not given, 1,000,000 for PPO and 300,000 for SAC"""
     num_envs: int | None = None
-    """flights at a time; if not given, 16 of PPO and 1 of SAC"""
+    """flights at a time; if not given, 16 for PPO and 1 for SAC"""
     every: int = 25_000
     """steps from one evaluation to the next"""
     evaluate: int = 1000
-    """episodes of each"""
+    """episodes of each evaluation"""
     save: Path | None = None
     """file for the policy, as it is at the last evaluation"""
 
 
 def keywords_of(args):
-    """Keywords of the environment, in training and evaluation; None is the task's own."""
+    """Keywords of the environment, in training and evaluation; None is the default of the task."""
     return {"start": args.start, "out_of_bounds": args.out_of_bounds}
 
 
 class Evaluation(BaseCallback):
-    """Fly the policy on test episodes, every so many steps and at the end."""
+    """Fly the policy on test episodes, every `args.every` steps and at the end."""
 
     def __init__(self, args):
         super().__init__()
@@ -69,7 +69,7 @@ class Evaluation(BaseCallback):
             self.fly()
 
     def fly(self):
-        """Say how well the policy flies, and save it."""
+        """Print error and crash rate of the policy, and save it."""
         self.flown = self.num_timesteps
         self.due = self.flown + self.args.every
         test = gymnasium.make_vec(
@@ -87,7 +87,7 @@ class Evaluation(BaseCallback):
 
 
 def main(args):
-    """Train, and evaluate on the way."""
+    """Train with evaluations."""
     torch.set_num_threads(1)  # the networks are small, and more threads round differently
     count = args.num_envs or FLIGHTS[args.algorithm]
     first_flight = 10**9 + 1000 * args.seed  # seeds below 10^9 are for tests

@@ -1,4 +1,4 @@
-"""The page on which one flies in the browser, bundled when the site is built."""
+"""The page for flights in the browser, bundled when the site is built."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,11 +13,11 @@ _WITHOUT = (
     "<!doctype html><title>quad_gym</title><p>This site was built on a machine without {tools}, "
     "which the page needs. In a clone: <code>python -m docs.browser.build fly.html</code></p>\n"
 )
-"""The page where it cannot be built."""
+"""Page of a site that is built without the tools."""
 
 
 def write_page(app: "Sphinx", error: Exception | None) -> None:
-    """Write `_static/fly.html` into the site, or a sentence where tools are missing."""
+    """Write `_static/fly.html` into the site, or a sentence if tools are missing."""
     if error is None and app.builder.format == "html":
         missing = missing_tools()
         text = _WITHOUT.format(tools=", ".join(missing)) if missing else page()

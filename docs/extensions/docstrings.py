@@ -1,7 +1,7 @@
-"""Docstrings for Sphinx, which reads reStructuredText: Markdown tables, and the specification.
+"""Conversion of docstrings for Sphinx: Markdown tables, and the specification.
 
-Tables in docstrings are Markdown's, as `help` shows them best. The specification of environments,
-`QuadEnv`'s docstring, has its own pages (`environment_pages.py`); its arguments stay.
+Docstrings have Markdown tables, which are readable in `help`; Sphinx reads reStructuredText. Of the
+specification, `QuadEnv`'s docstring, only arguments stay: `environment_pages.py` shows the rest.
 """
 
 import re
@@ -21,13 +21,13 @@ SPECIFICATION = (
     "",
 )
 PLAIN = ("attribute", "data", "property")
-"""What has no sections in its docstring."""
+"""Kinds of objects without sections in their docstrings."""
 
 kept: dict[str, list[str]] = {}
-"""Such docstrings, while Napoleon works."""
+"""Docstrings of these kinds, stored while Napoleon works."""
 
 ALIAS = re.compile("Alias for field number")
-"""What Python says of the fields of a named tuple."""
+"""Default docstring of the fields of a named tuple."""
 
 ARRAYS = {
     stringify_annotation(long, "smart"): short
@@ -47,7 +47,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _list_table(lines: list[str]) -> Iterator[str]:
-    """A table of Markdown as a list-table."""
+    """Convert a Markdown table to a list-table."""
     indent = lines[0][: len(lines[0]) - len(lines[0].lstrip())]
     head, _, *rows = map(_cells, lines)
     yield from ("", f"{indent}.. list-table::", f"{indent}   :header-rows: 1", "")
@@ -77,7 +77,7 @@ def rewrite(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
 
 
 def restore(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Undo what Napoleon makes of fields: types of what stands before a colon."""
+    """Undo Napoleon's change of fields, where it turns text before a colon into a type."""
     if what in PLAIN:
         lines[:] = kept.pop(name)
 
@@ -91,7 +91,7 @@ def shorten(
     signature: str | None,
     returns: str | None,
 ) -> tuple[str | None, str | None]:
-    """Types of arrays by the names that the code has for them."""
+    """Shorten types of arrays to their names in the code."""
     parts = [signature, returns]
     for long, short in ARRAYS.items():
         parts = [part and part.replace(long, short) for part in parts]

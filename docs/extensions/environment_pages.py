@@ -3,9 +3,9 @@
     python -m docs.extensions.environment_pages    # or make reference
 
 They are committed in docs/reference, so that a repository's web page shows them; a test compares
-them with the code. Tables of observations come from `observation_layout`, tables of keywords from
-the fields of `TaskParams` and the signature behind the environments, their words from docstrings.
-A keyword or a part of an observation that the docstring lacks is an error.
+them with the code. Tables of observations come from `observation_layout`. Tables of keywords come
+from the fields of `TaskParams`, the signature of the environments and their docstrings. A keyword
+or a part of an observation that is missing in the docstring is an error.
 """
 
 import ast
@@ -86,7 +86,7 @@ def _digits(value: float) -> str:
 
 
 def _value(value: Any) -> str:
-    """A default value as it would be typed, in few digits."""
+    """A default value as in code, rounded to few digits."""
     if isinstance(value, tuple) and all(isinstance(part, float) for part in value):
         return "`(" + ", ".join(map(_digits, value)) + ")`"
     if isinstance(value, float):
@@ -145,7 +145,7 @@ def _observations_page() -> str:
 
 
 def _keywords_page() -> str:
-    """Keywords of all environments, from the signature behind them and the specification."""
+    """Keywords of all environments, from their signature and the specification."""
     parsed = docstring_parser.parse(
         inspect.getdoc(quad_gym.QuadEnv) or "", docstring_parser.DocstringStyle.GOOGLE
     )
@@ -186,7 +186,7 @@ def _vehicles() -> str:
 
 
 def _task_sections(task: type[quad_gym.Task]) -> dict[str, str]:
-    """What the docstring of a task says, by its headings; "About" is what stands before them."""
+    """Sections of a task's docstring by heading; "About" is the text before the first one."""
     text = inspect.getdoc(task) or ""
     parts = re.split(r"^## (.+)$", text.split("\nArgs:")[0], flags=re.MULTILINE)
     about = "\n".join(parts[0].splitlines()[1:]).strip()
@@ -267,14 +267,14 @@ def _suites_page() -> str:
         for name in (field.name for field in dataclasses.fields(kind)):
             of = (getattr(suite, part) for suite in suites.values())
             values = ["-" if p is None else _value(getattr(p, name)) for p in of]
-            unit = re.search(r"\[[^]\d][^]]*\]", said[name])  # no range, such as [0, 1)
+            unit = re.search(r"\[[^]\d][^]]*\]", said[name])  # not a range, such as [0, 1)
             rows.append((f"`{name}`" + (f" {unit[0]}" if unit else ""), *values))
         text += f"\n## `{part}`: {kind.__name__}\n\n{_table(('', *suites), rows)}"
     return text
 
 
 def _fields_page() -> str:
-    """What a flight's record and a recorded flight hold."""
+    """Columns of a recorded flight, quantities of a batch, and fields of a view."""
 
     def row(name: str, shape: Any, about: Any) -> tuple[str, ...]:
         if not isinstance(shape, str):

@@ -14,7 +14,7 @@ from sphinx.util import logging
 
 LOGGER = logging.getLogger(__name__)
 SIZE, SCALE = 18.0, 1.08
-"""At which equations are drawn [pixels], and how much larger than the text they appear."""
+"""Size at which equations are drawn [pixels], and their scale relative to the text."""
 
 
 def _picture(node: nodes.Element, *, inline: bool) -> str:
@@ -22,7 +22,7 @@ def _picture(node: nodes.Element, *, inline: bool) -> str:
     try:
         drawn = ziamath.Latex(tex, size=SIZE, inline=inline, color="currentColor")
         svg = drawn.svgxml()
-    except Exception as error:  # whatever is wrong with it, the page and line say where
+    except Exception as error:  # the warning names page and line
         LOGGER.warning("equation: %r", error, location=node)
         return ""
     for side in ("width", "height"):
@@ -44,6 +44,6 @@ def _display(self: Any, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Tell Sphinx of the renderer."""
+    """Register the renderer."""
     app.add_html_math_renderer("pictures", (_inline, None), (_display, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

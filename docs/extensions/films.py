@@ -1,4 +1,4 @@
-"""A film for the page of each environment, made when the site is built: the included policy."""
+"""Film of the included policy for each environment's page, made when the site is built."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from quad_gym.commands import fly
 from quad_gym.commands.fly import FlyArgs
 
 FOLDER = "generated/films"
-"""Inside the sources of the site; Git ignores it."""
+"""Folder in the sources of the site, which Git ignores."""
 SIZE = (480, 360)
 SPEED = 2.0
 """Seconds of flight per second of the film."""
@@ -22,7 +22,7 @@ RATE = 12.5
 
 
 def policy_of(env_id: str) -> str:
-    """Policy in the film: the included trained policy, or PD control where there is none."""
+    """Policy in the film: the included trained policy, or PD control if there is none."""
     try:
         pretrained_file(env_id)
     except ValueError:

@@ -1,4 +1,4 @@
-"""How tutorials are ordered and drawn."""
+"""Order and figure style of the tutorials."""
 
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,11 @@ LESSONS = (
     "foreign_policy.py",
     "deploy.py",
 )
-"""The order in which to read them; others follow by name."""
+"""Tutorials in reading order; others follow by name."""
 
 
 class LessonOrder:
-    """Sorts tutorials."""
+    """Sort key of tutorials."""
 
     def __init__(self, folder: str) -> None:
         self.folder = folder
@@ -40,7 +40,7 @@ class LessonOrder:
 
 
 def reset(settings: dict[str, Any], file: str) -> None:
-    """Draw the figures of each tutorial alike, whatever the one before has set."""
+    """Reset the style of figures before each tutorial."""
     import matplotlib.pyplot as plt
 
     plt.rcParams.update(

@@ -1,11 +1,11 @@
 """Renew the numbers, tables and figures of README and the pages that are out of date.
 
-    python -m docs.renewal            # all that are stale, and write the pages
-    python -m docs.renewal --list     # which are, and about how long they take
+    python -m docs.renewal            # measure all stale results, and write the pages
+    python -m docs.renewal --list     # list them, with their last durations
     python -m docs.renewal --only circle compare
-    python -m docs.renewal --only speed_tick --again   # though it is up to date
+    python -m docs.renewal --only speed_tick --again   # even if it is up to date
 
-Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables go on where
+Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables resume where
 an interrupted run stopped.
 """
 
@@ -26,7 +26,7 @@ def measure(result: Result) -> dict[str, object]:
     """Run the commands of a result, and copy its figures.
 
     Returns:
-        Its entry of the ledger.
+        Entry of the result in the ledger.
     """
     folder, printed = OUTPUT / result.name, []
     folder.mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ def measure(result: Result) -> dict[str, object]:
 
 
 def main() -> int:
-    """Measure what is stale, one result after the other, and write each into the pages."""
+    """Measure stale results one after the other, and write their texts into the pages."""
     parser = argparse.ArgumentParser(prog="make results", description=__doc__.split("\n")[0])
     parser.add_argument("--list", action="store_true", help="say what is stale, and stop")
     parser.add_argument("--only", nargs="+", choices=sorted(CATALOG), help="names of results")

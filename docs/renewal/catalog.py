@@ -1,4 +1,4 @@
-"""The catalog of results: commands, what they fly, and the texts and figures made of them.
+"""Catalog of results: commands, golden flights, texts and figures.
 
 To add a result, add an entry, and its marks to a page (`docs.renewal.pages`).
 """
@@ -15,15 +15,15 @@ class Result:
     """One result of the pages."""
 
     name: str
-    """also of its folder below results/renewal"""
+    """name of the result, and of its folder in results/renewal"""
     commands: list[str]
-    """of `quad-gym`, or a script; OUT stands for a folder of their own"""
+    """options of `quad-gym`, or a script; OUT is a separate folder for each command"""
     flights: tuple[str, ...]
-    """golden flights of its tasks and suites, as patterns; none: a measurement of time"""
+    """patterns of the golden flights of its tasks and suites; none for times"""
     texts: Texts
-    """texts by the names of their marks, from the folder and what the commands printed"""
+    """function of the folder and the printed output that returns texts by mark"""
     figures: Mapping[str, str] = field(default_factory=dict)
-    """from files below its folder to files of the repository"""
+    """files of the repository by files in the folder"""
 
 
 _EVALUATE = (
@@ -277,4 +277,4 @@ CATALOG = {
         ),
     )
 }
-"""By name, in the order in which they are renewed."""
+"""Results by name, in the order of renewal."""

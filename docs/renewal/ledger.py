@@ -1,7 +1,7 @@
-"""The ledger of results: of each its commands, the digest of what it flies, and its texts.
+"""Ledger of results: commands, digest of golden flights and texts of each result.
 
-A result is stale if its commands have changed, or the golden flights of its tasks and suites. A
-change of the code that leaves these flights as they are, bit for bit, leaves results as they are.
+A result is stale if its commands or the golden flights of its tasks and suites have changed. It
+stays valid after a change of the code that keeps these flights bitwise equal.
 """
 
 import fnmatch
@@ -22,16 +22,16 @@ def read() -> dict[str, Any]:
 
 
 def write(entries: dict[str, Any]) -> None:
-    """Keep them."""
+    """Write the entries."""
     text = json.dumps(entries, indent=1, sort_keys=True, ensure_ascii=False)
     FILE.write_text(text + "\n", encoding="utf-8")
 
 
 def digest(result: Result) -> str:
-    """Of the golden flights of the tasks and suites that a result flies.
+    """Digest of the golden flights of the tasks and suites of a result.
 
     Raises:
-        ValueError: If one of its patterns fits no golden flight.
+        ValueError: If a pattern matches no golden flight.
     """
     golden = json.loads(GOLDEN.read_text(encoding="utf-8"))
     chosen: dict[str, str] = {}
@@ -44,7 +44,7 @@ def digest(result: Result) -> str:
 
 
 def stale(result: Result, entries: dict[str, Any]) -> bool:
-    """Whether a result has to be measured."""
+    """True if a result has to be measured."""
     entry = entries.get(result.name, {})
     return entry.get("commands") != result.commands or entry.get("flights") != digest(result)
 

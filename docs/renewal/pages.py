@@ -1,6 +1,6 @@
 """Results on pages: text between marks, `<!-- =NAME -->` and `<!-- / -->`.
 
-A mark may stand within a sentence or around a table. The same name may stand in several places.
+Marks may be within a sentence or around a table. A name may occur in several places.
 """
 
 import re
@@ -12,7 +12,7 @@ MARKED = re.compile(r"(<!-- =([\w.]+) -->)(.*?)(<!-- / -->)", re.DOTALL)
 
 
 def pages() -> list[Path]:
-    """README and the pages, less those that are generated."""
+    """README and the pages that are not generated."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -42,7 +42,7 @@ def write(texts: Mapping[str, str]) -> list[Path]:
 
 
 def wrong(texts: Mapping[str, str]) -> Iterable[str]:
-    """Sentences about marks that differ from the ledger, have no result, or are missing."""
+    """Yield a sentence for each mark that differs from the ledger, has no result, or is missing."""
     shown = {page: marked(page) for page in pages()}
     for page, marks in shown.items():
         for name, found in marks.items():
@@ -56,12 +56,12 @@ def wrong(texts: Mapping[str, str]) -> Iterable[str]:
 
 
 def console(text: str) -> str:
-    """What a command prints, as a block of a page."""
+    """The output of a command as a block of a page."""
     return f"\n```text\n{text.strip()}\n```\n"
 
 
 def table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table in Markdown, numbers to the right."""
+    """A table in Markdown, with numbers aligned to the right."""
     first, *others = heads
     lines = [[first, *others], ["---", *("---:" for _ in others)], *map(list, rows)]
     return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"

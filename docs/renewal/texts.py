@@ -1,4 +1,4 @@
-"""Texts of the pages, made of the files and the output of the commands of a result."""
+"""Texts of the pages, made from the files and the output of the commands of a result."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ SUITES = {
     "`lab`, no camera": "--sensors lab --no-camera --episodes 1000",
     "`lab`": "--sensors lab --episodes 1000",
 }
-"""Options of the rows of the table of consistency, by their labels."""
+"""Options of the rows of the table of consistency, by label."""
 
 
 MEMORY = {
@@ -43,7 +43,7 @@ SPEEDS = {
     "estimate": "vector, estimate, 50 Hz, standard",
     "truth": "vector, truth, 50 Hz, standard",
 }
-"""Names of the benchmark's rows by the names of their marks."""
+"""Names of the benchmark's rows by mark."""
 
 
 def _read(file: Path) -> Any:
@@ -51,7 +51,7 @@ def _read(file: Path) -> Any:
 
 
 def _body(printed: str) -> str:
-    """What a command printed, less the lines about the files that it wrote."""
+    """The output of a command, without the lines about written files."""
     return printed.partition("\nWrote ")[0]
 
 
@@ -117,7 +117,7 @@ def ablation(which: str) -> Texts:
 
 
 def filters(folder: Path, _: Sequence[str]) -> dict[str, str]:
-    """Errors and consistency of filters, and what control on their estimates costs."""
+    """Errors and consistency of filters, and tracking errors and losses under control on them."""
     parts = {"position": (1e3, ".1f"), "velocity": (1e3, ".1f"), "attitude": (1e3, ".2f")}
     faults = ("none", "gnss_outage", "gnss_outliers", "wrong_associations")
     accuracy, control = [], []
@@ -186,7 +186,7 @@ def _write_cells(file: Path, first: str, cells: dict[str, Any], *, misses: bool 
 
 
 def matrix(folder: Path, _: Sequence[str]) -> dict[str, str]:
-    """All cells as CSV, and those that deviate, with the reason where it is known."""
+    """Write all cells as CSV; the table has unexpected misses."""
     cells = _read(folder / "0/matrix.json")["cells"]
     _write_cells(folder / "0/matrix.csv", "cell", cells, misses=True)
     rows = []
@@ -203,7 +203,7 @@ def matrix(folder: Path, _: Sequence[str]) -> dict[str, str]:
 
 
 def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
-    """All trials as CSV, and those with more than 1 % undetected failures."""
+    """Write all trials as CSV; the table has trials with more than 1 % undetected failures."""
     cells = _read(folder / "0/recovery.json")["cells"]
     faulty = {label: cell for label, cell in cells.items() if "undetected" in cell["values"]}
     calm = {label: cell for label, cell in cells.items() if "undetected" not in cell["values"]}
@@ -231,7 +231,7 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
 def study_rows(
     summary: Mapping[str, Any], head: str, arms: Sequence[str], columns: Sequence[str]
 ) -> str:
-    """Some arms of a study's table, or all (empty), and columns of `HEADINGS`."""
+    """A table of some arms of a study, or of all if empty, with columns of `HEADINGS`."""
     labels = {arm["name"]: arm["label"] for arm in summary["study"]["arms"]}
     rows = [
         [labels[name], *(cell(summary["rows"][name][column], column) for column in columns)]

@@ -1,11 +1,12 @@
-"""Test each client of docs/libraries.md in an environment of its own, installed as the page says.
+"""Test each client of docs/libraries.md in a separate environment, installed as on the page.
 
     python tests/clients/run.py                # all of them
     python tests/clients/run.py torchrl minari
 
-What the line `pip install ...` in a section of the page names is installed into .venv-clients/NAME,
-with the versions of constraints-clients.txt. Then the client's tests run, and the programs of the
-page. An environment is used again until that line, the constraints or pyproject.toml change.
+The packages of the line `pip install ...` in a section of the page are installed into
+.venv-clients/NAME, with the versions of constraints-clients.txt. Then the client's tests run, and
+the programs of the page. An environment is reused until the line, the constraints or pyproject.toml
+change.
 """
 
 import re
@@ -23,14 +24,14 @@ PROGRAMS = "tests/contract/test_documentation.py::test_programs_run[libraries.md
 
 
 def clients():
-    """What the page installs, by the names of its sections in lower case."""
+    """Return the packages that the page installs, by section name in lower case."""
     sections = SECTION.findall(PAGE.read_text(encoding="utf-8"))
     found = {name.lower(): INSTALL.search(text) for name, text in sections}
     return {name: shlex.split(line[1], comments=True) for name, line in found.items() if line}
 
 
 def installed(name, packages):
-    """The Python of a client's environment, which is made where it is missing or out of date."""
+    """Return the Python of a client's environment; make it if it is missing or out of date."""
     folder = ROOT / ".venv-clients" / name
     python, stamp = folder / "bin" / "python", folder / "installed.txt"
     files = (CONSTRAINTS, ROOT / "pyproject.toml")
@@ -44,12 +45,12 @@ def installed(name, packages):
 
 
 def passes(name, packages):
-    """Whether a client can be installed and passes its tests."""
+    """Return True if a client can be installed and passes its tests."""
     print(f"==== {name}: pip install {shlex.join(packages)}", flush=True)
     try:
         python = installed(name, packages)
         for tests in (f"tests/clients/test_{name.replace('-', '_')}.py", PROGRAMS):
-            # where the client cannot be imported, nothing is collected, which fails
+            # if the client cannot be imported, pytest collects no test and fails
             subprocess.run([python, "-m", "pytest", "-q", tests], cwd=ROOT, check=True)
     except subprocess.CalledProcessError as error:
         print(f"==== {name} failed: {error}", flush=True)

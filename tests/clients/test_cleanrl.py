@@ -1,4 +1,4 @@
-"""The script in the style of CleanRL trains, and computes its advantages as it should."""
+"""The script in the style of CleanRL trains and computes correct advantages."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 @pytest.fixture(scope="module")
 def cleanrl():
-    """The script in the style of CleanRL, as a module."""
+    """Return the script as a module."""
     return example("cleanrl_ppo")
 
 
@@ -23,13 +23,13 @@ def test_the_script_of_cleanrl_trains_evaluates_and_saves(cleanrl, tmp_path, cap
     weights = torch.load(file)
     agent = cleanrl.Agent(28, 4)
     agent.load_state_dict(weights)
-    assert (weights["variance"] != 1.0).any()  # of the observations that it has seen
+    assert (weights["variance"] != 1.0).any()  # from the observations in training
     actions, _ = agent.predict(np.zeros((5, 28), np.float32))
     assert actions.shape == (5, 4)
     assert np.abs(actions).max() <= 1.0
 
 
-def test_advantages_of_the_script_are_returns_less_values(cleanrl):
+def test_advantages_of_script_equal_returns_minus_values(cleanrl):
     rng = np.random.default_rng(0)
     rewards, values = rng.normal(size=(2, 6, 3))
     dones = np.zeros((6, 3))

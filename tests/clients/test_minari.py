@@ -1,4 +1,4 @@
-"""Minari records flights, and makes their environment again."""
+"""Minari records flights and recreates their environment."""
 
 import gymnasium
 import numpy as np
@@ -13,7 +13,7 @@ minari = pytest.importorskip("minari")
 SHORT = {"max_episode_steps": 20}
 
 
-def test_minari_keeps_flights_and_makes_their_environment(tmp_path, monkeypatch):
+def test_minari_records_flights_and_recovers_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     env = minari.DataCollector(gymnasium.make("QuadGym/Hover-v0", **SHORT), record_infos=True)
     policy = PDPolicy(env, gains="tuned")
@@ -42,6 +42,6 @@ def test_minari_keeps_flights_and_makes_their_environment(tmp_path, monkeypatch)
 
 
 def columns_of(episode):
-    """What `rows` holds of a step, as recorded."""
-    infos = episode.infos["position_error"][1:]  # the first is that of the reset
+    """Return the recorded columns of an episode, in the order of `rows`."""
+    infos = episode.infos["position_error"][1:]  # the first is of the reset
     return episode.observations[1:], episode.actions, episode.rewards, infos

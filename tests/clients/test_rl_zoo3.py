@@ -1,4 +1,4 @@
-"""rl-zoo3 trains as docs/libraries.md shows, but for fewer steps, and evaluates what it trained."""
+"""rl-zoo3 trains as docs/libraries.md shows, with fewer steps, and evaluates the policy."""
 
 import os
 import shlex

@@ -15,7 +15,7 @@ SMALL = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
 
 @pytest.fixture(autouse=True)
 def _without_pygame(monkeypatch):
-    """Stable-Baselines3 asks for pictures, which nobody looks at in training."""
+    """Hide pygame: Stable-Baselines3 requests rendering but does not use it in training."""
     monkeypatch.setitem(sys.modules, "pygame", None)
 
 
@@ -29,7 +29,7 @@ def test_ppo_trains_from_an_id():
 @pytest.mark.parametrize("name", ["DummyVecEnv", "SubprocVecEnv"])
 def test_ppo_trains_in_vector_environments_of_stable_baselines(name):
     envs = env_util.make_vec_env(
-        "quad_gym:QuadGym/Circle-v0",  # which tells other processes what to import
+        "quad_gym:QuadGym/Circle-v0",  # other processes import the module before the colon
         2,
         seed=0,
         env_kwargs={"max_episode_steps": 10},

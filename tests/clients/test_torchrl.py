@@ -38,7 +38,7 @@ def test_torchrl_flies_the_native_vector_environment():
         observation, reward, *_ = alone.step(data["action"][:, k].numpy())
         np.testing.assert_array_equal(data["next", "reward"][:, k, 0], reward.astype(np.float32))
         np.testing.assert_array_equal(data["next", "observation"][:, k], observation)
-    assert (data["observation"][:, 20] != data["next", "observation"][:, 19]).any()  # begun anew
+    assert (data["observation"][:, 20] != data["next", "observation"][:, 19]).any()  # a new episode
 
 
 def test_torchrl_flies_single_environments_in_processes():

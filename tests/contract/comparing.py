@@ -20,7 +20,7 @@ LAYOUTS = ("relative", "absolute")
 
 
 def assert_same(left, right, where="root"):
-    """Same types, same keys, same dtypes, same bits."""
+    """Check that types, keys, dtypes and all values are bitwise equal."""
     assert type(left) is type(right), f"{where}: {type(left)} is not {type(right)}"
     if isinstance(left, dict):
         assert left.keys() == right.keys(), f"{where}: {set(left) ^ set(right)}"
@@ -42,12 +42,12 @@ def assert_same(left, right, where="root"):
 
 
 def state_of(env):
-    """The bits of all flights behind any of the three interfaces."""
+    """Return the state of all flights as bytes, for each of the three interfaces."""
     return getattr(env, "unwrapped", env).flights.batch.snapshot().tobytes()
 
 
 def future_of(env, count, vector):
-    """Everything that the next 80 steps and two resets return."""
+    """Return the results of the next 80 steps and of two resets."""
     seen = []
     for k in range(80):
         action = actions_of(k, 1)[0]

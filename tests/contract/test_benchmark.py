@@ -1,4 +1,4 @@
-"""The benchmark's script runs and writes what it says; no test asserts on a clock."""
+"""Tests of the benchmark's sections and files; no test depends on measured times."""
 
 import json
 
@@ -40,7 +40,7 @@ def test_filters_section_compares_filters_on_the_same_flights(tmp_path, capsys):
             (value, low, high), (bound,) = row[f"{part}_rmse"], found["bound"][f"{part}_rmse"]
             assert low < value < high
             assert row[f"{part}_ratio"] == pytest.approx(value / bound)
-            assert 0.5 < value / bound < 2.0  # of eight flights
+            assert 0.5 < value / bound < 2.0  # only eight flights
         assert row["seconds"] > 0.0
         assert list(row["lost"]) == ["none", "wrong_associations"]
     assert (found["Simple"]["nees"], found["Simple"]["nis"]) == (None, None)
@@ -67,7 +67,7 @@ def test_tick_section_names_every_stage_of_a_suite(tmp_path):
             assert row["share"] == pytest.approx(row["seconds"] / mine["whole tick"]["seconds"])
 
 
-def test_suites_section_compares_each_with_standard_and_with_few_flights(tmp_path):
+def test_suites_section_gives_ratios_to_standard_suite_and_to_few_flights(tmp_path):
     options = ("--only", "suites", "--n-envs", "8", "--threads", "2")
     rows = run(tmp_path, *options)["sections"]["suites"]
     of = {(row["suite"], row["flights"], row["threads"]): row["seconds"] for row in rows}
@@ -92,7 +92,7 @@ def test_busy_section_compares_threads_next_to_busy_processes(tmp_path):
 
 
 def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_path):
-    """The plain filter computes the same estimate, filterpy's one with fewer sigma points."""
+    """The plain filter computes the same estimate; filterpy's filter has fewer sigma points."""
     rows = run(tmp_path, "--only", "peers", "--n-envs", "16")["sections"]["peers"]
     ours, plain, *others = [row for row in rows if row["position"] is not None]
     assert (ours["name"], plain["name"]) == (
@@ -115,7 +115,7 @@ def test_options_section_compares_each_with_everything_off(tmp_path):
 
 def test_learning_section_finds_when_the_policy_beats_pd(tmp_path, capsys):
     rows = run(tmp_path, "--only", "learning", "--seeds", "2")["sections"]["learning"]
-    assert [(row["seed"], row["steps_to_pd"]) for row in rows] == [(0, None)]  # quick
+    assert [(row["seed"], row["steps_to_pd"]) for row in rows] == [(0, None)]  # a quick run
     assert "0 of 1 below tuned PD" in capsys.readouterr().out
     names = ("steps", "training_seconds", "mean_error", "crash_rate")
     flown = [(0, 0.0, 0.05, 0.5), (10, 1.0, 0.08, 0.0), (20, 2.0, 0.06, 0.0), (30, 3.0, 0.05, 0.0)]
@@ -133,7 +133,7 @@ def test_blocks_over_a_period_measure_as_often_as_sensors():
     assert batch.record("block_valid")[:, POSITION_BLOCK].mean() == pytest.approx(1 / 20, abs=0.02)
 
 
-def test_what_takes_turns_is_timed_by_turns():
+def test_jobs_are_timed_in_alternation_with_minimum_and_spread():
     order, slow, fast = [], iter([4.0, 2.0, 3.0]), iter([1.0, 1.0, 1.5])
     jobs = [lambda: order.append("slow") or next(slow), lambda: order.append("fast") or next(fast)]
     timings = by_turns(jobs, 3)

@@ -1,4 +1,4 @@
-"""The page on which one flies in the browser: bits, buttons, controllers, errors, frames."""
+"""Tests of the browser page: bitwise states, buttons, controllers, errors, frame rate."""
 
 import base64
 import json
@@ -24,7 +24,7 @@ KEY, STEPS, EVERY = 7, 500, 25
 FIELDS = ("r", "v", "q", "w", "rotor_speeds", "b_g", "r_hat", "v_hat", "R_hat", "b_a_hat", "L")
 BUTTONS = {100: "gnss", 150: "gust", 250: "bias", 375: "camera", 450: "bias"}
 NOISE_AT, LATENCY_AT = 300, 350
-"""Steps before which the sliders move: twice the noise, and 1.5 times the latency."""
+"""Steps before which the sliders change: noise times 2, and latency times 1.5."""
 NOISES = ("position_sigma_I", "velocity_sigma", "baseline_sigma", "pixel_sigma", "aid_sigma")
 MISSING = [*emission.missing_tools(), *([] if shutil.which("chromium") else ["chromium"])]
 pytestmark = [
@@ -37,7 +37,7 @@ SCRIPT = Path(__file__).with_name("browser_page.js")
 
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory):
-    """Report of the page after ten seconds in each scene, and its messages in the console."""
+    """Return the page's report after ten seconds in each scene, and its console messages."""
     folder, received = tmp_path_factory.mktemp("page"), []
 
     class Receiver(BaseHTTPRequestHandler):
@@ -82,7 +82,7 @@ def reported(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def replayed(reported):
-    """Flights in Python with the actions, buttons and sliders of the page."""
+    """Fly in Python with the actions, buttons and sliders of the page."""
     return {name: replay(name, flight["actions"]) for name, flight in reported["flights"].items()}
 
 
@@ -92,7 +92,7 @@ def replay(name, actions):
     for i, action in enumerate(actions):
         button = BUTTONS.get(i)
         if button in ("gnss", "camera") and getattr(batch.sensors, button) is not None:
-            batch.switch_sensors(**{button: False})  # for as long as the flight lasts
+            batch.switch_sensors(**{button: False})  # until the flight ends
         if button == "bias":
             biased = not biased
             batch.switch_faults(biased)
@@ -114,7 +114,7 @@ def replay(name, actions):
 
 
 def delay(batch, factor):
-    """Lengthen the latencies; measurements that have arrived do not arrive again."""
+    """Multiply the latencies; measurements that have arrived do not arrive again."""
     settings = batch._settings[0]
     before = settings["sensor_delay"].copy()
     settings["sensor_delay"] = np.round(factor * before)
@@ -134,12 +134,12 @@ def error_of(batch):
 
 
 def aloft(flight):
-    """Steps that each controller has flown without a crash."""
+    """Return the number of steps of each controller without a crash."""
     return [STEPS if over is None else round(over["time"] * 50) - 1 for over in flight["over"]]
 
 
 @pytest.mark.parametrize("name", scenes.SCENES)
-def test_ten_seconds_in_the_browser_have_the_bits_of_python(reported, replayed, name):
+def test_browser_flight_of_ten_seconds_equals_python_bitwise(reported, replayed, name):
     rows = replayed[name][0]
     flown = [np.frombuffer(base64.b64decode(row)) for row in reported["flights"][name]["rows"]]
     assert rows.shape[:2] == (STEPS // EVERY, 3)
@@ -148,7 +148,7 @@ def test_ten_seconds_in_the_browser_have_the_bits_of_python(reported, replayed, 
 
 
 @pytest.mark.parametrize("name", scenes.SCENES)
-def test_plotted_nees_is_the_one_of_the_package(reported, replayed, name):
+def test_plotted_nees_equals_nees_of_package(reported, replayed, name):
     for k, steps in enumerate(aloft(reported["flights"][name])):
         plotted = [row[k] for row in reported["flights"][name]["nees"][: steps // EVERY]]
         expected = replayed[name][2][: steps // EVERY, k]
@@ -156,7 +156,7 @@ def test_plotted_nees_is_the_one_of_the_package(reported, replayed, name):
 
 
 @pytest.mark.parametrize("name", ["circle", "look_around"])
-def test_controllers_act_as_those_of_the_package(reported, replayed, name):
+def test_controllers_give_same_actions_as_in_package(reported, replayed, name):
     flight, observations = reported["flights"][name], replayed[name][1]
     actions = np.array(flight["actions"])
     env = gymnasium.make("QuadGym/Circle-v0", sensors=scenes.SCENES[name].sensors)
@@ -188,7 +188,7 @@ def test_policy_in_look_around_observes_direction_and_standard_deviation(reporte
         observation = batch.step(action[np.newaxis])
 
 
-def test_look_around_separates_the_controllers(reported):
+def test_policy_trained_on_truth_crashes_and_pretrained_policy_does_not(reported):
     over = reported["flights"]["look_around"]["over"]
     assert over[1] is not None
     assert over[2] is None
@@ -199,7 +199,7 @@ def test_console_has_no_message(reported):
 
 
 def test_page_flies_in_real_time(reported):
-    """With wide limits, as the browser has no graphics and the machine is busy."""
+    """Limits are wide, because the browser has no graphics hardware and the machine is busy."""
     assert len(reported["frames"]) > 20
     assert np.median(reported["frames"]) < 50.0  # [ms]; 16.7 are available
     assert reported["flown"] > 0.5
@@ -212,7 +212,7 @@ def test_page_is_one_file_without_references_to_others():
     assert len(text) < 700_000
 
 
-def test_site_holds_the_page_or_a_sentence(tmp_path, monkeypatch):
+def test_site_has_page_or_explanation_if_tools_are_missing(tmp_path, monkeypatch):
     app = SimpleNamespace(builder=SimpleNamespace(format="html"), outdir=tmp_path)
     (tmp_path / "_static").mkdir()
     browser_page.write_page(app, None)

@@ -1,4 +1,4 @@
-"""Gymnasium's and Stable-Baselines3's own checkers pass, with every warning an error."""
+"""The checkers of Gymnasium and Stable-Baselines3 pass, with warnings as errors."""
 
 import warnings
 
@@ -22,13 +22,13 @@ COVERING = [
 
 @pytest.fixture(autouse=True)
 def _no_display(monkeypatch):
-    """Gymnasium's checker makes an environment of each render mode, a window among them."""
+    """Use a dummy display: Gymnasium's checker uses all render modes, including a window."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
 def passes_both_checkers(env_id, **keywords):
     if keywords.get("observation") == "measurements":
-        keywords.pop("layout", None)  # which has one of its own
+        keywords.pop("layout", None)  # raw measurements have a fixed layout
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make(env_id, **keywords)
@@ -44,7 +44,7 @@ def test_both_checkers_pass(env_id, observation, action, layout):
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_both_checkers_pass_in_every_configuration(name):
     base, keywords = CONFIGURATIONS[name]
-    # innovations without a measurement are NaN, which to Gymnasium's checker equals nothing
+    # innovations without a measurement are NaN, which Gymnasium's checker finds unequal
     keywords = {key: value for key, value in keywords.items() if key != "innovations"}
     ids = {task: env_id for env_id, task in quad_gym.IDS.items()}
     passes_both_checkers(ids[base], **keywords)

@@ -1,4 +1,4 @@
-"""The experiment's script: what it prints, what it writes, what it refuses."""
+"""Tests of the command `circle`: errors, files and options."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ def run(folder, line=""):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    """Leave out the figures, which take most of the time of a short run."""
+    """Skip the figures, which take most of the time of a short run."""
     monkeypatch.setattr(script.circle, "write_figures", lambda results, setup: [])
 
 
@@ -33,7 +33,7 @@ def flown(tmp_path_factory):
     return folder, run(folder, "--episodes 20")
 
 
-def test_errors_are_those_expected(flown):
+def test_errors_are_within_expected_ranges(flown):
     cases = flown[1]["cases"]
     mean = {case: cases[case]["tracking_error"]["mean"]["mean"] for case in CASES}
     late = {case: cases[case]["tracking_error"]["last_half"]["mean"] for case in CASES}
@@ -66,7 +66,7 @@ def test_csv_agrees_with_the_summary(flown):
         assert all(row["ended_at_s"] == "" for row in finished)
 
 
-def test_figures_are_those_of_the_report(flown):
+def test_figures_of_report_are_written_as_png_and_svg(flown):
     names = {f"{kind}_{case}" for kind in ("path", "height") for case in CASES[1:]}
     names |= {f"error_{case}" for case in CASES} | {"overview"}
     written = {file.name for file in flown[0].iterdir() if file.suffix in (".png", ".svg")}

@@ -1,4 +1,4 @@
-"""Pages are those that code, ledger and the table of words make."""
+"""Committed pages match the code, the ledger of results and the table of words."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The environments among processes, threads and caches that are not theirs alone."""
+"""Tests of environments in several processes and threads, and of the cores that they use."""
 
 import functools
 import os
@@ -17,15 +17,15 @@ from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.kernels import cores
 from tests.builders import actions_of, vec_env
 from tests.contract.comparing import assert_same
-from tests.contract.hovering import SHORT, further, hover
+from tests.contract.hovering import SHORT, make_hover, next_steps
 
 PATIENCE = 300
-"""Seconds after which a process is taken to hang."""
+"""Timeout of a process [s]."""
 STARTS = ["fork", "spawn"]
 
 
 def expected_run(n, mode, seed=7, steps=40, batch_threads=1):
-    """(observations, rewards, over) of every step, flown in this process."""
+    """Return (observations, rewards, over) of every step, flown in this process."""
     env = QuadVectorEnv(n, "hover", autoreset_mode=mode, threads=batch_threads, **SHORT)
     rows = [(env.reset(seed=seed)[0], np.zeros(n), np.zeros(n, bool))]
     for k in range(steps):
@@ -40,9 +40,9 @@ def actions_at(n, k, steps):
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("context", STARTS)
-def test_gymnasiums_processes_fly_the_same(context):
+def test_gymnasium_async_env_equals_flights_in_one_process(context):
     expected_run(64, "NextStep", steps=2, batch_threads=2)  # this process has flown, with threads
-    env = AsyncVectorEnv([hover] * 2, context=context)
+    env = AsyncVectorEnv([make_hover] * 2, context=context)
     try:
         observation, _ = env.reset(seed=7)
         for k, (expected, reward, over) in enumerate(expected_run(2, "NextStep")):
@@ -58,10 +58,10 @@ def test_gymnasiums_processes_fly_the_same(context):
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize(
     "start_method",
-    ["fork", pytest.param("spawn", marks=pytest.mark.slow)],  # each process imports torch anew
+    ["fork", pytest.param("spawn", marks=pytest.mark.slow)],  # each process imports torch
 )
-def test_stable_baselines3s_processes_fly_the_same(start_method):
-    env = SubprocVecEnv([hover] * 2, start_method=start_method)
+def test_sb3_subproc_env_equals_flights_in_one_process(start_method):
+    env = SubprocVecEnv([make_hover] * 2, start_method=start_method)
     try:
         env.seed(7)
         observation = env.reset()
@@ -83,13 +83,13 @@ def test_environments_may_be_stepped_from_several_threads():
             assert_same(flown.result(PATIENCE), run(seed=seed))
 
 
-def test_an_environment_travels_to_a_worker_in_mid_episode():
+def test_environment_pickled_in_mid_episode_continues_in_another_process():
     env = vec_env(count=9, seed=3, threads=2)
     env.step(np.zeros((9, 4)))
     code = (
-        "import pickle, sys; from tests.contract.hovering import further;"
+        "import pickle, sys; from tests.contract.hovering import next_steps;"
         "env = pickle.load(sys.stdin.buffer);"
-        "sys.stdout.buffer.write(pickle.dumps(further(env)))"
+        "sys.stdout.buffer.write(pickle.dumps(next_steps(env)))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -98,7 +98,7 @@ def test_an_environment_travels_to_a_worker_in_mid_episode():
         check=True,
         timeout=PATIENCE,
     )
-    assert_same(pickle.loads(done.stdout), further(env))
+    assert_same(pickle.loads(done.stdout), next_steps(env))
 
 
 def test_cores_are_limited_by_quota_affinity_and_variable(monkeypatch):
@@ -119,7 +119,7 @@ def test_an_environment_takes_the_available_cores(monkeypatch):
     assert QuadVectorEnv(4, "hover", threads=2).flights.batch.threads == 2
 
 
-def test_importing_the_package_brings_in_nothing_heavy():
+def test_import_of_package_loads_no_heavy_modules():
     code = "import sys, quad_gym; print(*sorted(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules = set(done.stdout.split())

@@ -94,7 +94,7 @@ def test_compare_writes_report_and_continues(tmp_path):
     assert "contains a run of another plan (different: environment)" in other.stderr
 
 
-def test_evaluate_replaces_results_only_when_told(tmp_path, capsys, monkeypatch):
+def test_evaluate_replaces_results_only_with_overwrite(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     few = "--policy pd --observation truth --episodes 2 --env duration=0.4"
     line = ["evaluate", "hover", *few.split()]

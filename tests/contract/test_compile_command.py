@@ -24,7 +24,7 @@ gymnasium.make_vec("QuadGym/Circle-v0", 3, observation="truth").reset(seed=0)
 
 
 def run(folder, *words):
-    """The process, with a cache of its own."""
+    """Run Python in a process with a separate cache."""
     return subprocess.run(
         [sys.executable, *words],
         env=os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(folder)},
@@ -51,7 +51,7 @@ def fill(folder, names, monkeypatch):
 
 @pytest.mark.parametrize("count", [2, pytest.param(None, marks=pytest.mark.slow)])
 def test_parts_compiled_ahead_are_not_compiled_again(tmp_path, monkeypatch, count):
-    """Two functions that are missing in the cache, or all of them."""
+    """Two functions, or all, are missing in the cache."""
     names = names_of_kinds(["truth"])
     missing = names if count is None else names[-count:]
     fill(tmp_path, [name for name in names if name not in missing], monkeypatch)
@@ -64,7 +64,7 @@ def test_parts_compiled_ahead_are_not_compiled_again(tmp_path, monkeypatch, coun
     assert f"quad_gym: compiling {len(missing)} parts" in first.stderr
     environment = run(tmp_path, "-c", FIRST_RESET)
     assert environment.returncode == 0, environment.stderr
-    assert environment.stderr == ""  # it prints what it compiles
+    assert environment.stderr == ""  # it would list compiled functions
 
 
 def test_kinds_are_sets_of_stages_and_entries():
@@ -78,7 +78,7 @@ def test_kinds_are_sets_of_stages_and_entries():
     assert not filters & truth
 
 
-def test_code_that_cannot_be_kept_is_an_error(monkeypatch, capsys):
+def test_compile_fails_if_code_cannot_be_written_to_cache(monkeypatch, capsys):
     monkeypatch.setattr(EntryDispatcher, "is_cached", lambda self: False)
     monkeypatch.setattr(workers, "prepare", lambda names, processes: None)
     monkeypatch.setattr("quad_gym.commands.compile._is_kept", lambda dispatcher: False)

@@ -1,4 +1,4 @@
-"""Training with the compiled engine: repeatable, resumable after any death, without torch."""
+"""Trainings with the compiled engine are repeatable, resume after a kill, and need no torch."""
 
 import json
 import signal
@@ -27,7 +27,7 @@ CIRCLE = "QuadGym/Circle-v0"
 
 
 def small_plan(**changes):
-    """A training of seconds."""
+    """Return the plan of a training that takes seconds."""
     shipped = recipe(CIRCLE)
     parameters = {**shipped.parameters, "n_steps": 16, "batch_size": 128, "n_epochs": 2}
     options = {
@@ -68,7 +68,7 @@ def die_after(rollouts, plan, folder, monkeypatch):
 
 
 @pytest.mark.parametrize("rollouts", [3, 8])
-def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollouts):
+def test_resumed_run_equals_uninterrupted_run(tmp_path, monkeypatch, rollouts):
     plan = small_plan()
     run(plan, tmp_path / "whole")
     die_after(rollouts, plan, tmp_path / "cut", monkeypatch)
@@ -78,7 +78,7 @@ def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollout
 
 
 def evaluations(folder):
-    """Rows of the evaluations, without their times."""
+    """Return rows of the evaluations, without their times."""
     lines = (folder / "evaluations.csv").read_text().split()
     return [line.split(",")[:1] + line.split(",")[2:] for line in lines]
 
@@ -98,14 +98,14 @@ def test_run_stopped_between_evaluations_has_no_further_evaluation(tmp_path, mon
         patch.setattr(CompiledPPO, "_roll_out", stop)
         stopped = run(plan, tmp_path / "cut")
     assert (stopped.finished, stopped.steps) == (False, 768)
-    assert len(evaluations(tmp_path / "cut")) == 1 + 2  # a heading, and steps 0 and 512
+    assert len(evaluations(tmp_path / "cut")) == 1 + 2  # a header, and steps 0 and 512
     assert run(plan, tmp_path / "cut", resume=True).finished
     assert_same_policy(tmp_path / "whole", tmp_path / "cut")
     assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "cut")
 
 
 def asymmetric_plan(critic_only=15, **changes):
-    """A training whose critic sees the truth."""
+    """Return the plan of a training whose critic observes the truth."""
     plan = small_plan()
     parameters = {**plan.recipe.parameters, "critic_only": critic_only}
     return small_plan(
@@ -119,7 +119,7 @@ def asymmetric_plan(critic_only=15, **changes):
     )
 
 
-def test_a_policy_whose_critic_saw_the_truth_flies_without_it(tmp_path):
+def test_policy_trained_with_privileged_critic_needs_no_privileged_observation(tmp_path):
     plan = asymmetric_plan()
     done = run(plan, tmp_path / "whole")
     env = plan.make_judge()
@@ -138,18 +138,18 @@ def test_a_policy_whose_critic_saw_the_truth_flies_without_it(tmp_path):
         (asymmetric_plan(environment={"include_std": True}), "got 15"),
     ],
 )
-def test_a_critic_sees_more_than_the_policy_by_so_many_numbers(tmp_path, plan, message):
+def test_wrong_number_of_critic_only_values_raises_value_error(tmp_path, plan, message):
     with pytest.raises(ValueError, match="critic_only must be the number of values .*" + message):
         run(plan, tmp_path)
 
 
-def test_stable_baselines_has_no_critic_of_its_own_eyes(tmp_path):
+def test_sb3_engine_refuses_critic_only_values(tmp_path):
     pytest.importorskip("stable_baselines3")
     with pytest.raises(ValueError, match=r"critic_only must be 0 with .*, got 15"):
         run(asymmetric_plan(engine="sb3"), tmp_path)
 
 
-def test_the_best_policy_flies_by_its_file_and_can_be_exported(tmp_path):
+def test_best_policy_is_loaded_from_file_and_exported(tmp_path):
     done = run(small_plan(), tmp_path / "run")
     assert done.best_policy == tmp_path / "run" / "best.npz"
     env = gymnasium.make_vec(CIRCLE, num_envs=2, duration=1.0)
@@ -184,7 +184,7 @@ def test_a_policy_with_memory_resumes_flies_and_is_exported(tmp_path, monkeypatc
 
 
 class SameDraws:
-    """Draws what Stable-Baselines3 draws, from the same generators in the same order."""
+    """Generator that draws the same numbers as Stable-Baselines3, in the same order."""
 
     def __init__(self, torch, flights, steps):
         self.torch, self.flights, self.steps = torch, flights, steps
@@ -202,10 +202,10 @@ class SameDraws:
 @pytest.mark.parametrize("normalize", [True, False])
 @pytest.mark.parametrize("activation", ["relu", "tanh", "elu"])
 def test_training_with_the_same_draws_equals_stable_baselines(activation, normalize):
-    """Rollouts, episodes that end and are cut off, advantages, gradients, epochs, learning rate.
+    """The test covers terminated and truncated episodes, advantages, gradients and learning rate.
 
-    Among eight million inputs of ReLU, one or two round to the other side of zero, where the
-    gradient is another one. Which ones depends on the processor.
+    One or two of eight million inputs of ReLU round to the other side of zero, where the gradient
+    differs. These inputs depend on the processor.
     """
     torch = pytest.importorskip("torch")
     pytest.importorskip("stable_baselines3")
@@ -270,7 +270,7 @@ def test_the_command_trains_and_exports(tmp_path):
     assert MlpPolicy.load(tmp_path / "policy.npz").record["plan"]["engine"] == "compiled"
 
 
-def test_nothing_of_it_needs_torch():
+def test_compiled_engine_is_imported_without_torch():
     code = (
         "import sys; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
         "import baselines.training, baselines.compiled_ppo.run"
@@ -279,7 +279,7 @@ def test_nothing_of_it_needs_torch():
 
 
 @pytest.mark.parametrize("file", sorted(PRETRAINED.glob("*.npz")), ids=lambda f: f.stem)
-def test_a_policy_that_ships_has_the_record_of_its_training(file):
+def test_included_policy_has_the_record_of_its_training(file):
     record = MlpPolicy.load(file).record
     assert record["finished"]
     assert {"plan", "steps", "best", "versions"} <= set(record)

@@ -1,4 +1,4 @@
-"""The consistency script: what it writes, and that it finds fault where there is fault."""
+"""Tests of the commands `consistency` and `ablation`: files, verdicts and tables."""
 
 import json
 from dataclasses import replace
@@ -56,7 +56,7 @@ def test_small_innovations_of_a_constant_error_are_expected(tmp_path):
 
 
 @pytest.mark.parametrize(("mean", "consistent"), [(0.1, True), (2.0, True), (2.1, False)])
-def test_nis_of_a_constant_error_may_be_small_only(mean, consistent):
+def test_nis_of_constant_error_is_consistent_unless_too_large(mean, consistent):
     one = np.ones(4)
     nees = {"state": MeanSquare("state", 15, one, 15.0 * one, 14.0 * one, 16.0 * one)}
     nis = {"baseline": MeanSquare("baseline", 2, one, mean * one, 1.9 * one, 2.1 * one)}
@@ -73,7 +73,7 @@ def tables(output, *options):
     return done.stdout, json.loads((output / f"{options[0]}.json").read_text())
 
 
-def test_wrong_models_stand_beside_the_matched_one(tmp_path):
+def test_models_table_compares_wrong_models_with_nominal_model(tmp_path):
     printed, found = tables(tmp_path, "models")
     rows = found["rows"]
     assert next(iter(rows)) == "nominal"
@@ -85,7 +85,7 @@ def test_wrong_models_stand_beside_the_matched_one(tmp_path):
     assert found["seeds"] == [0, 47]
 
 
-def test_forms_of_the_filter_stand_beside_each_other(tmp_path):
+def test_filters_table_compares_forms_of_the_filter(tmp_path):
     printed, found = tables(tmp_path, "filters", "--sensors", "indoor")
     rows = found["rows"]
     assert list(rows)[:2] == ["UKF", "EKF"]

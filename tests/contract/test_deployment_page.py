@@ -1,4 +1,4 @@
-"""Deployment: the page is true, and `quad-gym export` writes what it says."""
+"""Tests of docs/deployment.md and of the files that `quad-gym export` writes."""
 
 import ctypes
 import re
@@ -19,14 +19,14 @@ PAGE = (Path(__file__).parents[2] / "docs" / "deployment.md").read_text(encoding
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
-def test_the_table_of_the_observation_is_the_layout():
+def test_observation_table_of_page_equals_layout():
     rows = re.findall(r"^\| (\d+):(\d+) \| `(\w+)` \|.*\| (\S+) \| (\S+) \|$", PAGE, re.MULTILINE)
     layout = quad_gym.observation_layout()
     want = [(str(f.slice.start), str(f.slice.stop), f.name, f.unit, f.frame) for f in layout]
     assert rows == want
 
 
-def test_the_numbers_of_the_action_are_the_default_ones():
+def test_action_numbers_of_page_equal_default_scales():
     fields = controller_of("pretrained", "QuadGym/Circle-v0").action_fields
     assert "thrust 7.644 (1 + a[0]) N" in PAGE
     assert fields[0].formula(0).startswith("thrust = 7.644 (1 + a[0]) N")
@@ -34,8 +34,8 @@ def test_the_numbers_of_the_action_are_the_default_ones():
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
-def test_c_of_the_page_observes_as_the_environment(tmp_path):
-    """On the state and the reference of the absolute layout, which the same flights show."""
+def test_c_code_of_page_computes_observation_of_environment(tmp_path):
+    """The C code receives state and reference from the absolute layout."""
     (tmp_path / "it.c").write_text(re.search(r"```c\n(.*?)```", PAGE, re.DOTALL)[1])
     flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
     library = tmp_path / "it.so"
@@ -54,7 +54,7 @@ def test_c_of_the_page_observes_as_the_environment(tmp_path):
             row, found = seen[flight], np.full(28, np.nan, np.float32)
             state = [row[places[n]] for n in ("position", "velocity", "R_BI", "body_rates")]
             start, stop = places["reference_position"].start, places["preview_2"].stop
-            # R_BI row by row; the reference lies in the order of the structure
+            # R_BI is row by row; the reference has the order of the structure
             inputs = (np.concatenate(state), row[start:stop].copy(), row[places["last_action"]])
             observe(*(a.ctypes.data_as(ctypes.c_void_p) for a in (*map(np.copy, inputs), found)))
             np.testing.assert_allclose(found, want[flight], rtol=0.0, atol=5e-6)
@@ -76,7 +76,7 @@ def test_a_policy_becomes_a_c_file_named_after_its_task(tmp_path, capsys):
     assert "hover(observation, action) 50 times per second" in told
 
 
-def test_a_file_is_replaced_only_when_told(tmp_path, capsys):
+def test_export_replaces_file_only_with_overwrite(tmp_path, capsys):
     line = "export policy pretrained QuadGym/Hover-v0 --output it.c"
     assert main(line.split()) == 0
     before = (tmp_path / "it.c").read_text()

@@ -1,12 +1,12 @@
-"""The documentation keeps its promises: its programs run, its commands parse, what it names exists.
+"""Tests of the documentation: programs run, commands parse, and named files and functions exist.
 
-Python blocks of a page run in order, in one namespace. A comment on the line above a block changes
-how it is run; on the page nobody sees it:
+The Python blocks of a page run in order, in one namespace. A hidden comment on the line above a
+block changes how the block runs:
 
-    <!-- test: skip, REASON -->           not at all
-    <!-- test: replace OLD by NEW -->     with another text, such as fewer steps of a training
-    <!-- test: slow, REASON -->           only with the slow tests, and so its whole page
-    <!-- test: needs MODULE -->           only where it can be imported
+    <!-- test: skip, REASON -->           it does not run
+    <!-- test: replace OLD by NEW -->     it runs with another text, such as fewer training steps
+    <!-- test: slow, REASON -->           its whole page runs only with the slow tests
+    <!-- test: needs MODULE -->           it runs only if the module can be imported
 """
 
 import importlib
@@ -35,7 +35,7 @@ REPLACEMENT = re.compile(r"(.+) by (.+)")
 
 
 def blocks(page, *languages):
-    """(line, text, notes) of the blocks of a page in some languages."""
+    """Yield (line, text, notes) of the blocks of a page in some languages."""
     text = page.read_text(encoding="utf-8")
     for found in BLOCK.finditer(text):
         if found["language"] in languages:
@@ -44,7 +44,7 @@ def blocks(page, *languages):
 
 
 def programs():
-    """Pages with Python blocks."""
+    """Yield the pages with Python blocks."""
     for page in PAGES:
         notes = [kind for _, _, found in blocks(page, "python") for kind, _ in found]
         marks = [pytest.mark.slow] if "slow" in notes else []
@@ -61,7 +61,7 @@ def importable(module):
 
 
 def as_run(line, text, notes):
-    """The text of a block as its notes want it, after as many lines as are above it; None: skip."""
+    """Return a block's text after its notes, at its line of the page, or None to skip it."""
     for kind, what in notes:
         if kind == "skip" or (kind == "needs" and not importable(what)):
             return None
@@ -84,7 +84,7 @@ def test_programs_run(page, tmp_path, monkeypatch):
             exec(compile(program, str(page), "exec"), namespace)
 
 
-def test_every_note_is_understood():
+def test_every_test_comment_is_valid():
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         used = [note for *_, notes in blocks(page, "python") for note in notes]
@@ -94,15 +94,14 @@ def test_every_note_is_understood():
 
 
 def commands_of(text):
-    """Command lines `quad-gym ...` in a shell block, a Makefile or a docstring. Docstrings explain
-    them behind three spaces."""
+    """Yield command lines `quad-gym ...`, without explanations after three spaces in docstrings."""
     text = text.replace("\\\n", " ")
     for found in re.finditer(r"^\s*(?:[$@] ?)?(?:\$\(BIN\)/)?quad-gym +(.*)$", text, re.MULTILINE):
         yield re.split(r" {3,}", found[1])[0]
 
 
 def command_lines():
-    """All of them, with the file that they are in."""
+    """Yield (file, command line) of pages, commands, gallery and Makefile."""
     for page in PAGES:
         for _, text, _ in blocks(page, "sh", "console"):
             yield from ((page, words) for words in commands_of(text))
@@ -124,27 +123,27 @@ def test_command_lines_are_found():
 
 
 def exit_code(module, options):
-    """What parsing the options of a command ends with; --help ends with 0."""
+    """Return the exit code after parsing the options of a command; --help gives 0."""
     try:
         args = parse(options_of(module_of(module)), options)
     except SystemExit as end:
         return end.code
     if module == "study" and (args.arms_file is None or args.arms_file.exists()):
-        arms_of(args)  # refuses arms that there are not
+        arms_of(args)  # refuses unknown arms
     return 0
 
 
 @pytest.mark.parametrize(("file", "words"), LINES)
 def test_command_lines_parse(file, words, monkeypatch):
-    monkeypatch.chdir(ROOT)  # files of arms are named from there
+    monkeypatch.chdir(ROOT)  # paths of arms files are relative to it
     command, *options = shlex.split(words, comments=True)
-    if command not in COMMANDS:  # it has two words
+    if command not in COMMANDS:  # its name has two words
         command = f"{command} {options.pop(0)}"
     assert command in COMMANDS
     assert exit_code(command, options) == 0, f"{file}: quad-gym {words}"
 
 
-def test_files_that_pages_name_exist():
+def test_files_named_on_pages_exist():
     for page in PAGES:
         if page.name == "CHANGELOG.md":
             continue
@@ -159,7 +158,7 @@ REFERENCE = sorted((ROOT / "docs" / "reference").rglob("*.md"))
 
 
 def anchors(page):
-    """Anchors of a page's headings, as repositories' web pages and MyST make them."""
+    """Return anchors of a page's headings, as repositories' web pages and MyST generate them."""
     text = re.sub(
         r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
     )
@@ -173,14 +172,14 @@ def anchors(page):
 def test_links_lead_to_files_and_headings_of_the_repository(page):
     for target in LINK.findall(BLOCK.sub("", page.read_text(encoding="utf-8"))):
         if target.startswith(("http", "tutorials/")):
-            continue  # the site alone has tutorials
+            continue  # only the site has tutorials
         path, _, anchor = target.partition("#")
         file = (page.parent / path).resolve() if path else page
         assert file.exists(), f"{page.name}: {target}"
         assert not anchor or anchor in anchors(file), f"{page.name}: {target}"
 
 
-def test_functions_that_the_equations_name_exist():
+def test_functions_named_on_equation_pages_exist():
     pages = ("filter-equations", "measurement-equations", "recovery")
     text = " ".join((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in pages)
     text = " ".join(text.split())
@@ -192,8 +191,8 @@ def test_functions_that_the_equations_name_exist():
             assert f"def {name}(" in source, f"{path} has no {name}"
 
 
-def in_interface():
-    """Names in the pages of the interface: of objects, and of modules with all their members."""
+def names_on_api_pages():
+    """Return names on the API pages, with all members of documented modules, and the modules."""
     text = "\n".join(p.read_text(encoding="utf-8") for p in (ROOT / "docs" / "api").glob("*.md"))
     modules = set(re.findall(r"automodule:: ([\w.]+)", text))
     objects = set(re.findall(r"auto(?:class|function|data):: ([\w.]+)", text))
@@ -215,8 +214,8 @@ def test_class_names_are_used_once():
     assert [files for files in found.values() if len(files) > 1] == []
 
 
-def test_every_public_name_is_in_the_interface():
-    names, modules = in_interface()
+def test_every_public_name_is_on_api_pages():
+    names, modules = names_on_api_pages()
     public = {*quad_gym.__all__, *quad_gym._LAZY} - {"__version__", "faults", "rewards"}
     assert public <= names, sorted(public - names)
     assert "PDPolicy" in names

@@ -1,4 +1,4 @@
-"""Driver of trainings: restarts, failures, stops, locks; the same tables after any death."""
+"""Tests of the driver of trainings: restarts, failures, stops, locks, tables after kills."""
 
 import contextlib
 import json
@@ -36,7 +36,7 @@ class Bar:
 
 
 class Scripted:
-    """Executor and its jobs, which end as given, training by training."""
+    """Executor whose jobs end as given for each training."""
 
     def __init__(self, script):
         self.script, self.started, self.running, self.most = script, [], 0, 0
@@ -170,7 +170,7 @@ def end(process, code=0):
 
 
 def worker_at(process, folder, rows=3):
-    """Process that trains in a folder, after some evaluations."""
+    """Return the id of the process that trains in a folder, after some evaluations."""
     limit = time.monotonic() + 600.0
     while time.monotonic() < limit:
         assert process.poll() is None, process.communicate()
@@ -209,7 +209,7 @@ def test_tables_are_the_same_after_kills(tmp_path, undisturbed, executor):
     said, _ = process.communicate()
     assert "restarts from its checkpoint (1 of 2)" in said
     end(start(tmp_path, *executor))
-    if executor == EXECUTORS["local"]:  # whose processes survive the sweep
+    if executor == EXECUTORS["local"]:  # its processes survive the sweep
         assert int(holder(second).split()[1]) == worker
     assert tables(tmp_path) == undisturbed
 

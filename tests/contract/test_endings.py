@@ -1,4 +1,4 @@
-"""Starts and endings that callers give or provoke mean the same in every interface."""
+"""Endings are equal in every interface, and requested starts must be within bounds."""
 
 import gymnasium
 import numpy as np
@@ -29,19 +29,17 @@ CRASHES = {
 
 
 class Late(quad_gym.Task):
-    """Judges as the built-in task, by methods of its own."""
+    """Task whose methods return the endings of the built-in task."""
 
     def terminated(self, view):
-        """(n,) whether the built-in task ends the episode."""
         return view.builtin.terminated.copy()
 
     def truncated(self, view):
-        """(n,) whether the built-in task cuts it short."""
         return view.builtin.truncated.copy()
 
 
 def ended_after(name, keywords, action):
-    """Steps until the episode of seed 3 is over, and how each interface tells so."""
+    """Fly the episode of seed 3 in each interface; return its steps and its ending."""
     single = gymnasium.make(name, **keywords)
     together = gymnasium.make_vec(name, num_envs=2, **keywords)
     sb3 = quad_gym.make_sb3_vec_env(name, 2, seed=2, **keywords)
@@ -66,7 +64,7 @@ def ended_after(name, keywords, action):
     "own_task", [None, quad_gym.Task(), Late()], ids=["built-in", "own", "late"]
 )
 @pytest.mark.parametrize("crash", CRASHES)
-def test_a_crash_in_the_last_step_of_the_time_limit_is_both(crash, own_task):
+def test_crash_at_time_limit_is_terminated_and_truncated(crash, own_task):
     task, keywords, action = CRASHES[crash]
     name = f"QuadGym/{task}-v0"
     if own_task is not None:
@@ -98,7 +96,7 @@ def is_refused(env, place):
 
 @pytest.mark.parametrize(("task", "keywords"), REFERENCES, ids=str)
 def test_a_start_out_of_bounds_of_the_reference_is_refused(task, keywords):
-    """Wherever 512 episodes begin, what is refused is out of bounds of all their references."""
+    """A refused position is out of bounds of the references of 512 random episodes."""
     env = gymnasium.make_vec(f"QuadGym/{task}-v0", num_envs=512, observation="truth", **keywords)
     env.reset(seed=1)
     begins = env.unwrapped.flights.batch.read("reference_position")
@@ -109,18 +107,17 @@ def test_a_start_out_of_bounds_of_the_reference_is_refused(task, keywords):
         if is_refused(env, place):
             refused += 1
             assert nearest > bound
-        else:  # some episode may begin there; 512 draws are nearly as near as any
+        else:  # an episode may begin there, and one of 512 references is nearly as near as possible
             assert nearest < bound + (2.0 if task == "RandomTrajectory" else 0.6)
     assert refused > 20
     assert not is_refused(env, begins[0] + [0.0, 0.0, 0.9 * bound])
 
 
-def test_task_with_its_own_endings_may_start_elsewhere():
+def test_task_with_own_endings_accepts_start_out_of_bounds():
     class Patient(quad_gym.Task):
-        """Ends no episode."""
+        """Task that ends no episode."""
 
         def terminated(self, view):
-            """(n,) never."""
             return np.zeros(view.count, bool)
 
     env = QuadVectorEnv(2, base="hover", task=Patient)

@@ -20,7 +20,7 @@ def script():
 
 
 def evaluations(text):
-    """Steps and errors, of the lines that the script prints."""
+    """Return errors by step, from the lines that the script prints."""
     found = re.findall(r"^([\d,]+) steps: mean error ([\d.]+) m, [\d.]+% of 4", text, re.MULTILINE)
     return {int(steps.replace(",", "")): error for steps, error in found}
 
@@ -38,7 +38,7 @@ def test_sb3_defaults_are_evaluated_while_learning(script, algorithm, steps, tmp
     assert found[steps] == f"{flown.mean_error.mean():.4f}"
 
 
-def test_training_and_evaluation_fly_as_the_options_say(script, monkeypatch):
+def test_options_apply_to_training_and_evaluation(script, monkeypatch):
     made = []
 
     def keeping(make):
@@ -57,7 +57,7 @@ def test_training_and_evaluation_fly_as_the_options_say(script, monkeypatch):
         assert (task.start, task.out_of_bounds) == ("moving", 1.5)
 
 
-def test_evaluations_change_nothing_that_is_learned(script, capsys):
+def test_number_of_evaluations_does_not_change_training(script, capsys):
     options = {"algorithm": "sac", "total_timesteps": 160, "evaluate": 4}
     for every in (20, 160):
         script.main(script.Args(**options, every=every))
@@ -69,7 +69,7 @@ def tune(*options):
     return console_commands.run("tune", *options)
 
 
-def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
+def test_tune_finds_gains_better_than_initial_gains(tmp_path):
     tiny = ["--candidates", 64, "--episodes", 4, "--fresh-episodes", 8, "--env", "duration=3.0"]
     done = tune("--env-ids", "hover", *tiny, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
@@ -77,7 +77,7 @@ def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
     rows = (tmp_path / "search.csv").read_text().splitlines()
     errors = [float(row.split(",")[0]) for row in rows[1:]]
     assert len(errors) == record["candidates"] == 64
-    assert errors[0] == 1.0  # the gains at the start are the first that fly
+    assert errors[0] == 1.0  # the initial gains are flown first
     assert min(errors) < 1.0
     best = rows[1:][errors.index(min(errors))].split(",")
     assert float(best[1]) == pytest.approx(record["gains"]["position"])
@@ -89,7 +89,7 @@ def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["no JSON", "{}", '{"gains": {"wings": 2}}'])
-def test_refuses_files_without_gains(tmp_path, text):
+def test_file_without_pd_gains_raises_value_error(tmp_path, text):
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=1)
     (tmp_path / "gains.json").write_text(text)
     with pytest.raises(ValueError, match="does not contain PD gains"):

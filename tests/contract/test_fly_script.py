@@ -1,4 +1,4 @@
-"""`scripts/fly.py` from the command line."""
+"""Tests of the command `fly`."""
 
 import os
 import subprocess
@@ -28,7 +28,7 @@ def fly(*options, cwd, **environment):
     )
 
 
-def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
+def test_fly_writes_video_and_flight_that_replays_to_same_video(tmp_path):
     size = ("--size", 320, 240, "--fps", 5)
     done = fly(
         *("hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif"), cwd=tmp_path
@@ -51,7 +51,7 @@ def test_every_task_is_made_with_the_default_options(env_id):
     assert env.unwrapped.flights.batch.sensors.camera is not None or "outage" in IDS[env_id]
 
 
-def test_actions_and_faults_default_to_those_of_the_task():
+def test_fly_uses_default_action_and_faults_of_task():
     flights = script.make_env(script.FlyArgs(env_id="outage_dash")).unwrapped.flights
     assert flights.action == "velocity"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
@@ -79,31 +79,31 @@ def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
     assert (tmp_path / "new" / "hover.rrd").read_bytes()[:4] == b"RRF2"
 
 
-def test_faults_come_and_go_at_the_given_time(tmp_path):
+def test_faults_begin_and_end_at_given_times(tmp_path):
     options = ("hover", "--duration", 3, "--faults", "gnss_outage", "--fault-time", 1, 2)
     done = fly(*options, "--no-camera", "--output", "flight.npz", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     flight = Flight.load(tmp_path / "flight.npz")
     fixed = np.isfinite(flight["gnss_position"][:, 0])
     away = (flight["time"] >= 1.0) & (flight["time"] < 2.0)
-    # a row holds the fixes since the row before, so that of 1.0 s has some
+    # a row holds the fixes since the previous row, so the row of 1.0 s has some
     np.testing.assert_array_equal(fixed, ~away | (flight["time"] == 1.0))
     np.testing.assert_array_equal(flight["faults"] == 1.0, away)
     sigma = np.sqrt(flight["covariance"][:, 0, 0])
-    assert sigma[99] > 10.0 * sigma[50]  # the filter knows that it is lost
+    assert sigma[99] > 10.0 * sigma[50]  # the uncertainty grows in the outage
     assert sigma[110] < 0.1 * sigma[99]
     assert not flight.scene.has_camera
 
 
-def test_without_a_display_the_window_is_a_clear_error(tmp_path):
+def test_window_without_display_ends_with_hint_to_write_video(tmp_path):
     done = fly("hover", cwd=tmp_path, SDL_VIDEODRIVER="x11")
     assert done.returncode == 2
     assert "without a display, --output writes a video instead" in done.stderr
 
 
-def test_keys_change_the_flight_while_one_watches():
+def test_keys_switch_sensors_and_faults_pause_and_end_flight():
     class Keyboard:
-        """A window on which keys are pressed at given pictures."""
+        """Window in which keys are pressed at given pictures."""
 
         def __init__(self, presses):
             self.presses, self.shown, self.closed = presses, 0, False
@@ -132,7 +132,7 @@ def test_keys_change_the_flight_while_one_watches():
         {20: ["g"], 50: ["g"], 60: ["v"], 70: ["space"], 75: ["space"]}
     )
     assert goes_on
-    assert shown == len(flight) + 5  # time stood still for five pictures
+    assert shown == len(flight) + 5  # the flight paused for five pictures
     fixed = np.isfinite(flight["gnss_position"][:, 0])
     np.testing.assert_array_equal(np.flatnonzero(~fixed), np.arange(20, 50))
     _, flight, _ = watched({30: ["f"], 45: ["f"]})

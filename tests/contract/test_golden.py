@@ -1,4 +1,4 @@
-"""Flights are what they were, to the bit, whatever they fly with: `tests.golden`."""
+"""Flights are bitwise equal to the golden ones, in any batch and process: `tests.golden`."""
 
 import json
 import os
@@ -26,18 +26,18 @@ def test_every_fault_changes_a_flight():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_flights_are_what_they_were(name):
+def test_flights_equal_golden_flights(name):
     assert fly(CASES[name]) == GOLDEN[name], "changed on purpose? see tests/golden/__init__.py"
 
 
 @pytest.mark.parametrize(("flights", "threads"), [(FLIGHTS + 1, 1), (5 * FLIGHTS, 2)])
 @pytest.mark.parametrize("name", SOME)
-def test_they_do_not_depend_on_the_other_flights(name, flights, threads):
+def test_golden_flights_do_not_depend_on_batch_size_or_threads(name, flights, threads):
     assert fly(CASES[name], flights=flights, threads=threads) == GOLDEN[name]
 
 
 def assert_the_same_with(**environment):
-    """Fly all of them in a process with other environment variables."""
+    """Check all golden flights in a process with other environment variables."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.golden.flights"],
         cwd=Path(__file__).parents[2],
@@ -49,13 +49,13 @@ def assert_the_same_with(**environment):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow  # each compiles everything anew
+@pytest.mark.slow  # each compiles all kernels
 @pytest.mark.parametrize("lanes", WIDTHS)
-def test_they_do_not_depend_on_the_number_of_lanes(lanes):
+def test_golden_flights_do_not_depend_on_number_of_lanes(lanes):
     assert_the_same_with(QUAD_GYM_LANES=str(lanes))
 
 
 @pytest.mark.slow
 def test_digests_do_not_depend_on_the_processor():
-    """NumPy's linear algebra rounds as its code for the processor does; flights must not."""
+    """Rounding in NumPy's linear algebra depends on the processor; flights must not."""
     assert_the_same_with(OPENBLAS_CORETYPE="Prescott")

@@ -1,4 +1,4 @@
-"""Whatever is passed as an action is flown as documented or refused before anything changes."""
+"""Any action is either flown as documented or refused before a state changes."""
 
 import gymnasium
 import numpy as np
@@ -28,7 +28,7 @@ def make(interface, action="ctbr"):
 
 
 def begin(env):
-    """The same episode every time."""
+    """Reset the environment to the episode of seed 1."""
     if isinstance(env, gymnasium.Env | QuadVectorEnv):
         env.reset(seed=1)
     else:
@@ -37,12 +37,12 @@ def begin(env):
 
 
 def for_all(interface, row):
-    """An action of one flight, for all flights of a interface."""
+    """Repeat the action of one flight for all flights of an interface."""
     return row if interface == "single" else [row] * COUNT
 
 
 def refuses(env, action):
-    """The step raises a ValueError that names the action, and not a bit of the flights changes."""
+    """Check that a step raises a ValueError that names the action, and changes no flight."""
     before = state_of(env)
     with pytest.raises(ValueError, match="action"):
         env.step(action)
@@ -54,7 +54,7 @@ ROWS = [
     *(MASKED, np.array([0.0, np.nan, 0.0, 0.0]), [0.0, 0.0, 0.0, -np.inf], np.zeros((4, 1))),
     *([0.0, None, 0.0, 0.0], ["0.1", "0.2", "0.3", "0.4"], [b"0", b"1", b"0", b"1"]),
     *(np.array([1j, 0.0, 0.0, 0.0]), [1j, 0.0, 0.0, 0.0], np.array([0, 1, 2, 3], "datetime64[s]")),
-    [10**400, 0, 0, 0],  # beyond floats
+    [10**400, 0, 0, 0],  # too large for a float
     *([[0.0], [0.0, 1.0], 0.0, 0.0], [set(), set(), set(), set()]),
 ]
 NO_ACTIONS = [None, "forward", 0.0, {}, {"a": 1}, object(), (), [], np.zeros((2, 4))]
@@ -71,7 +71,7 @@ def test_invalid_actions_are_refused(interface):
 
 
 @pytest.mark.parametrize("interface", ["vector", "sb3"])
-def test_one_flights_bad_action_stops_the_step_of_all(interface):
+def test_invalid_action_of_one_flight_refuses_step_of_all_flights(interface):
     actions = np.zeros((COUNT, 4))
     actions[1, 2] = np.nan
     env = make(interface)
@@ -92,7 +92,7 @@ def test_numbers_beyond_the_bounds_are_clipped(interface, action):
 
 
 @pytest.mark.parametrize("interface", INTERFACES)
-def test_any_type_and_sequence_of_real_numbers_is_flown(interface):
+def test_actions_of_any_real_type_or_sequence_are_accepted(interface):
     row = [1.0, 0.0, 1.0, 0.0]
     twin = make(interface)
     plain = np.array(for_all(interface, row))
@@ -109,14 +109,14 @@ def test_any_type_and_sequence_of_real_numbers_is_flown(interface):
         assert state_of(env) == state_of(twin)
 
 
-def test_the_action_of_the_caller_is_not_written_to():
+def test_step_does_not_modify_action_of_caller():
     env = make("single")
     action = np.array([5.0, -5.0, 0.5, 0.0])
     env.step(action)
     np.testing.assert_array_equal(action, [5.0, -5.0, 0.5, 0.0])
 
 
-def test_invalid_action_before_reset_raises_reset_needed():
+def test_step_before_reset_raises_reset_needed_or_refuses_action():
     env = QuadEnv("hover")
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(4))
@@ -139,8 +139,8 @@ rows = st.one_of(
 )
 
 
-def meant(action, shape):
-    """The numbers that an action stands for, or None if it is no action; by the documentation."""
+def expected_action(action, shape):
+    """Return the clipped numbers of an action by the documentation; None if it is invalid."""
     if not isinstance(action, (list, np.ndarray)):
         return None
     if isinstance(action, np.ndarray):
@@ -178,7 +178,7 @@ def check_one(pair, action, shape):
     env, twin = pair
     for each in pair:
         begin(each)
-    numbers = meant(action, shape)
+    numbers = expected_action(action, shape)
     if numbers is None:
         refuses(env, action)
         return

@@ -1,7 +1,8 @@
-"""Hostile values for every keyword: refused by name, or flown without a number that is not finite.
-A table: every keyword of every interface, of flights, filters, parameters, draws and faults, with
-values that are not numbers, not finite, too large, too small, of another kind, or of another
-shape."""
+"""Invalid values are refused by the name of their argument, or flown with finite numbers.
+
+The arguments belong to interfaces, flights, filters, parameters, draws and faults. The values
+are not numbers, not finite, too large, too small, or of another type or shape.
+"""
 
 import dataclasses
 import inspect
@@ -30,9 +31,9 @@ def vectors(size):
 
 
 def assert_refused_or_flown(call, name, value):
-    """An error that names the argument, or what `call` returns: arrays without NaN and infinity."""
+    """Check that `call` raises an error that names the argument, or returns finite arrays."""
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # overflow and such, too
+        warnings.simplefilter("error")  # overflow, for example
         warnings.filterwarnings("ignore", rf".*{name} is .*: after a cold start", UserWarning)
         try:
             seen = call(value)
@@ -58,7 +59,7 @@ def names_of(kind):
 
 
 def environment_keywords():
-    """What the documentation of the environment lists as its arguments."""
+    """Return the documented arguments of the environment, and the fields of a task."""
     text = inspect.getdoc(quad_gym.QuadEnv).partition("Args:")[2].partition("Raises:")[0]
     heads = [line for line in text.splitlines() if line.startswith("    ") and line[4] != " "]
     names = [n for head in heads for n in head.strip().split(":")[0].split(", ")]
@@ -91,18 +92,18 @@ def fly(interface, task, **keywords):
 
 @pytest.mark.parametrize("name", [*environment_keywords(), "threads"])
 @pytest.mark.parametrize("interface", INTERFACES)
-def test_keywords_of_environments(interface, name):
+def test_any_value_of_environment_keyword_is_refused_by_name_or_flown(interface, name):
     if name == "render_mode":
-        pytest.skip("Gymnasium itself has a say in that keyword")
+        pytest.skip("Gymnasium itself handles this keyword")
     if name.startswith("render"):
-        pytest.skip("another keyword's business")
+        pytest.skip("it has no effect without render_mode")
     task = ONE_TASK.get(name, "Circle")
     for value in [*NUMBERS[:: 1 + (interface != "make")], *OTHERS]:
         assert_refused_or_flown(lambda v: fly(interface, task, **{name: v}), name, value)
 
 
 @pytest.mark.parametrize("name", ["position", "velocity", "yaw", "seed", "options", "colour"])
-def test_arguments_of_reset(name):
+def test_any_value_of_reset_argument_is_refused_by_name_or_flown(name):
     env = quad_gym.QuadEnv("hover")
     env.reset(seed=1)
 
@@ -112,7 +113,7 @@ def test_arguments_of_reset(name):
 
     for value in [*NUMBERS, *OTHERS, *vectors(3), None]:
         if isinstance(value, dict) and name == "options":
-            continue  # no options
+            continue  # an empty dictionary is valid
         assert_refused_or_flown(reset, name, value)
 
 
@@ -133,23 +134,23 @@ def fly_batch(controls=(Control.PD, Control.VELOCITY), **keywords):
 @pytest.mark.parametrize(
     "name", sorted(set(inspect.signature(FlightBatch).parameters) - {"bounds"})
 )
-def test_arguments_of_flights(name):
+def test_any_value_of_batch_argument_is_refused_by_name_or_flown(name):
     enumerations = ("source", "control", "layout", "autoreset")
     names = name if name not in enumerations else name.capitalize()
     for value in [*NUMBERS, *OTHERS]:
         if name == "count":
             if type(value) is float and value in (1e4, 1e6):
-                continue  # flights that one may have
+                continue  # a valid number of flights
             assert_refused_or_flown(lambda v: [FlightBatch(v).results], name, value)
         elif name in enumerations and isinstance(value, np.ndarray):
-            continue  # Python's own message
+            continue  # Python raises its own message
         elif name not in ("run_filter", "include_std", "privileged") or isinstance(value, str):
-            # anything is true or false to those
+            # these flags accept any value
             assert_refused_or_flown(lambda v: fly_batch(**{name: v}), names, value)
 
 
 @pytest.mark.parametrize("name", ["seeds", "keys", "mask", "position", "velocity", "yaw"])
-def test_arguments_of_a_batch_that_is_reset(name):
+def test_any_value_of_batch_reset_argument_is_refused_by_name_or_flown(name):
     def reset(value):
         batch = FlightBatch(3)
         batch.reset(**{"seeds": range(3), **({name: value} if name != "keys" else {})})
@@ -198,7 +199,7 @@ FIELDS_OF_PARAMETERS = [
 
 
 @pytest.mark.parametrize(("nominal", "use", "name"), FIELDS_OF_PARAMETERS)
-def test_fields_of_parameters(nominal, use, name):
+def test_any_value_of_parameter_field_is_refused_by_name_or_flown(nominal, use, name):
     controls = {
         quad_gym.VehicleParams: (Control.PD, Control.VELOCITY),
         TaskParams: (Control.PD, Control.VELOCITY),
@@ -215,7 +216,7 @@ def test_fields_of_parameters(nominal, use, name):
 
 
 @pytest.mark.parametrize("drawable", quad_gym.params.randomization.DRAWABLES, ids=lambda d: d.name)
-def test_ranges_of_draws(drawable):
+def test_any_range_of_draw_is_refused_by_name_or_flown(drawable):
     keywords = {"sensors": RTK, "world": WorldParams(battery=quad_gym.BatteryParams())}
 
     def drawn(span):
@@ -244,7 +245,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("kind", "name"), FAULTS, ids=lambda part: getattr(part, "__name__", part))
-def test_fields_of_faults(kind, name):
+def test_any_value_of_fault_field_is_refused_by_name_or_flown(kind, name):
     needed, sensors = {}, RTK
     if kind is fault_kinds.SensorLoss:
         needed, sensors = {"sensor": "barometer"}, RTK.replace(barometer=BarometerParams())
@@ -266,7 +267,7 @@ def test_fields_of_faults(kind, name):
         *(("update", "pixels"), ("predict", "gyro"), ("predict", "accel")),
     ],
 )
-def test_arguments_of_filters(kind, method, name):
+def test_any_value_of_filter_argument_is_refused_by_name_or_finite(kind, method, name):
     good = {
         "initialize": {"gnss_position_G": np.ones(3), "gnss_baseline_G": [0.1, 0.1, 0.0]},
         "set_state": at_rest(covariance=np.eye(15) * 1e-2),
@@ -279,7 +280,7 @@ def test_arguments_of_filters(kind, method, name):
         ukf.initialize(**good["initialize"])
         before = [ukf.position, ukf.velocity, ukf.R_BI, ukf.covariance]
         try:
-            with warnings.catch_warnings():  # a filter that keeps its last good state says so
+            with warnings.catch_warnings():  # a filter that keeps its last valid state warns
                 warnings.simplefilter("ignore", RuntimeWarning)
                 getattr(ukf, method)(**{**good[method], name: value})
         except (ValueError, TypeError):

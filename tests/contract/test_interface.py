@@ -68,13 +68,13 @@ def test_signatures_show_every_keyword_with_its_type_and_default(shown):
     assert "self" not in parameters
 
 
-def test_a_vector_of_stable_baselines_shows_its_own_keywords_too():
+def test_signature_of_make_sb3_vec_env_has_vector_keywords():
     more = set(inspect.get_annotations(VectorKeywords)) - set(inspect.get_annotations(EnvKeywords))
     assert more == {"task", "threads", "render_mode", "render_flights"}
     assert more <= set(inspect.signature(quad_gym.make_sb3_vec_env).parameters)
 
 
-def test_keywords_are_what_environments_are_built_with():
+def test_declared_keywords_match_task_params_and_flight_batch():
     fields = {field.name for field in dataclasses.fields(quad_gym.TaskParams)} - {"kind"}
     assert set(inspect.get_annotations(TaskKeywords)) == fields == set(TASK_KEYWORDS)
     of_flights = set(inspect.signature(FlightBatch).parameters)
@@ -83,7 +83,7 @@ def test_keywords_are_what_environments_are_built_with():
     assert set(inspect.get_annotations(EnvKeywords)) == set(DEFAULTS) | others
 
 
-def test_defaults_are_those_of_an_environment_that_is_given_none():
+def test_declared_defaults_equal_defaults_of_flights():
     given = Flights("hover", 1, Autoreset.DISABLED, **DEFAULTS).batch
     plain = Flights("hover", 1, Autoreset.DISABLED).batch
     assert given._settings.tobytes() == plain._settings.tobytes()
@@ -129,7 +129,7 @@ def test_a_type_checker_refuses_wrong_keywords(tmp_path):
     ],
 )
 @pytest.mark.parametrize("kind", [TypeError, ValueError])
-def test_unknown_names_are_refused_with_the_one_that_may_be_meant(make, meant, kind):
+def test_unknown_keywords_are_refused_with_suggestion(make, meant, kind):
     with pytest.raises(kind, match=meant):
         make()
 
@@ -169,11 +169,11 @@ def test_inputs_without_effect_are_refused(keywords, name):
     ],
     ids=str,
 )
-def test_they_are_accepted_where_they_have_one(keywords):
+def test_inputs_with_effect_are_accepted(keywords):
     quad_gym.QuadEnv("hover", **keywords)
 
 
-def test_comparison_gives_filter_keywords_where_a_filter_runs(tmp_path):
+def test_evaluate_passes_filter_keywords_only_to_flights_with_filter(tmp_path):
     args = evaluate.EvaluateArgs(env={"filter_start": "warm", "estimator": "ekf"}, output=tmp_path)
     for observation in ("truth", "noisy", "estimate"):
         evaluate.make_flights(args, observation, 1, "pd").close()
@@ -212,7 +212,7 @@ def test_arguments_of_a_layout_without_effect_are_refused(arguments, name):
         quad_gym.observation_layout(**arguments)
 
 
-def test_a_kind_of_task_is_refused_beside_an_id():
+def test_task_name_next_to_id_or_base_is_refused():
     with pytest.raises(ValueError, match=r"task must be a quad_gym.Task.* choose the id of hover"):
         gymnasium.make("QuadGym/Circle-v0", task="hover")
     with pytest.raises(ValueError, match="choose the id of hover"):
@@ -228,7 +228,7 @@ def test_a_kind_of_task_is_refused_beside_an_id():
 
 
 def test_packages_and_names_imported_on_first_use_have_types():
-    """A type checker does not run `__getattr__`: it reads the imports that are for it alone."""
+    """A type checker does not run `__getattr__`; it reads the imports under `TYPE_CHECKING`."""
     for package in (quad_gym, baselines):
         assert (Path(package.__file__).parent / "py.typed").exists()
     tree = ast.parse(Path(quad_gym.__file__).read_text(encoding="utf-8"))
@@ -236,4 +236,4 @@ def test_packages_and_names_imported_on_first_use_have_types():
     assert ast.unparse(block.test) == "TYPE_CHECKING"
     told = {name.name: statement.module for statement in block.body for name in statement.names}
     assert told == quad_gym._LAZY
-    assert set(told) <= set(quad_gym.__all__)  # exported, so that type checkers admit them
+    assert set(told) <= set(quad_gym.__all__)  # exported, so that type checkers accept them

@@ -1,4 +1,4 @@
-"""Observations hold what their table says, computed here from the state in NumPy."""
+"""Observations match their table, computed from the state in NumPy."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ OMEGA = 2 * np.pi / 10
 
 
 def on_circle(t):
-    """r*, v*, a* and x* of the circle at the time t."""
+    """Return r*, v*, a* and x* of the circle at the time t."""
     c, s = np.cos(OMEGA * t), np.sin(OMEGA * t)
     r = np.array([4 * c, 4 * s, 1.0])
     v = 4 * OMEGA * np.array([-s, c, 0.0])
@@ -24,7 +24,7 @@ def on_circle(t):
 
 
 def flown(steps=13, n=6, **keywords):
-    """A vector environment after some steps, its observation, and the last action."""
+    """Return a vector environment after some steps, its observation and the last action."""
     env = vec_env("circle", n, seed=21, autoreset_mode="Disabled", **{**UNBOUNDED, **keywords})
     for k in range(steps):
         actions = 0.3 * np.stack([actions_of(i, steps)[k] for i in range(n)])
@@ -45,7 +45,7 @@ def close(actual, expected, scale=1.0):
 
 
 def seen_state(env, source):
-    """r, v, R_BI and w_B as the controller's source has them."""
+    """Return r, v, R_BI and w_B of the controller's source, truth or estimate."""
     batch = env.flights.batch
     if source == "truth":
         return batch.record("r"), batch.record("v"), body_axes(batch.record("q")), batch.record("w")
@@ -58,7 +58,7 @@ def in_body(R_BI, v_I):
 
 
 @pytest.mark.parametrize("source", ["estimate", "truth"])
-def test_the_relative_layout(source):
+def test_relative_layout_equals_formulas(source):
     env, observation, actions = flown(observation=source)
     seen = parts_of(observation, observation=source)
     r, v, R, w = seen_state(env, source)
@@ -76,7 +76,7 @@ def test_the_relative_layout(source):
 
 
 @pytest.mark.parametrize("source", ["estimate", "truth"])
-def test_the_absolute_layout(source):
+def test_absolute_layout_equals_formulas(source):
     env, observation, actions = flown(observation=source, layout="absolute")
     seen = parts_of(observation, observation=source, layout="absolute")
     r, v, R, w = seen_state(env, source)
@@ -97,7 +97,7 @@ def test_the_absolute_layout(source):
     close(seen["last_action"], actions)
 
 
-def test_on_a_course_the_previews_are_the_coming_gates():
+def test_previews_of_course_are_next_gates():
     env = QuadVectorEnv(5, "waypoints", observation="truth", gate_count=3)
     observation, _ = env.reset(seed=2)
     seen = parts_of(observation, observation="truth")
@@ -137,7 +137,7 @@ def test_the_privileged_part_is_the_truth(source):
 
 
 def test_measurements_come_with_flags_at_their_own_rates():
-    # looking at the origin from where the camera sees both features
+    # the vehicle faces the origin, with both features in view
     suite = quad_gym.sensor_suite("standard").with_rates(gnss=10.0, camera=25.0)
     env = QuadVectorEnv(4, "hover", observation="measurements", sensors=suite)
     observation, _ = env.reset(seed=2)
@@ -201,7 +201,7 @@ def test_new_episode_has_no_samples_of_the_last_one():
     assert (last["gyro_mean"] != last["gyro"]).all()
 
 
-def test_measurements_are_what_sensors_have_measured():
+def test_observed_measurements_equal_records_of_sensors():
     env, observation, _ = flown(start="hover", observation="measurements", sensors="lab")
     seen, batch = parts_of(observation, observation="measurements"), env.flights.batch
     suite = quad_gym.sensor_suite("lab")
@@ -255,7 +255,7 @@ def test_observations_are_held_within_their_bounds():
 
 
 def nearly_all_draws():
-    """A distribution for all that can be drawn together in a world without a battery."""
+    """Return distributions of parameters that can be drawn together without a battery."""
     left_out = ("wind_speed", "wind_direction", "battery_charge", "battery_resistance")
     absolute = ("wind_", "start_", "feature", "camera_", "lever_arm", "center_of", "gust_")
     draws = {}
@@ -270,7 +270,7 @@ def nearly_all_draws():
 
 
 def test_the_longest_observation_fits_and_ends_with_the_draws():
-    """Raw measurements of all sensors, sixteen features, deviations, the truth and draws."""
+    """The parts are measurements with 16 features, standard deviations, truth and draws."""
     suite = quad_gym.sensor_suite("rtk")
     features = tuple((2.0 + 0.1 * i, 0.2 * i, 1.0) for i in range(16))
     suite = suite.replace(
@@ -293,7 +293,7 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
     close(parts["drawn_wind_up"][:, 0], (values["wind_up"] - 0.005) / 0.005, 10.0)
 
 
-def test_every_observation_fits():
+def test_observation_with_all_parts_fits_in_maximum_length():
     suite = quad_gym.sensor_suite("rtk")
     camera = suite.camera.replace(features_I=((1.0, 0.0, 0.0),) * MAX_FEATURES)
     suite = suite.replace(camera=camera, **{name: kind() for name, kind in AID_PARAMS.items()})

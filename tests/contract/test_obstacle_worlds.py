@@ -27,7 +27,7 @@ def hovering(count=6, **keywords):
     return QuadVectorEnv(count, base="hover", world=OBSTACLES, **keywords)
 
 
-def test_hitting_a_wall_is_a_crash_and_info_says_so():
+def test_collision_with_wall_terminates_with_ending_in_info():
     env = single_env(seed=0, world=OBSTACLES, observation="truth", task=Near)
     for _ in range(400):
         _, _, terminated, truncated, info = env.step(EASTWARD)
@@ -42,7 +42,7 @@ def test_hitting_a_wall_is_a_crash_and_info_says_so():
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
+def test_new_episode_after_collision_has_new_obstacles_and_continues(mode):
     env = gymnasium.make_vec(
         "QuadGym/Hover-v0", num_envs=4, world=OBSTACLES, observation="truth", autoreset_mode=mode
     )
@@ -58,7 +58,7 @@ def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
     episodes = (np.diff(np.array(places)[:, 0, 0, 0]) != 0.0).sum()
     assert endings.count(Ending.COLLISION) > 4
     assert episodes >= 1
-    # nobody collides at once in the next episode, as one whose collision is not forgotten would
+    # no flight collides at once in the next episode, so its collision is reset
     assert np.array(lasted).max() > 50
 
 
@@ -72,7 +72,8 @@ def test_view_has_observed_and_true_obstacle_distances():
     np.testing.assert_array_equal(view.obstacles, batch.record("obstacle_center")[:, :2])
     vector_I = np.einsum("nji,nj->ni", view.observed.R_BI, view.observed.obstacle_vector)
     truth, believed = view.truth.obstacle_vector, view.observed.position - view.position
-    near_wall = np.abs(truth[:, 0]) > np.abs(truth[:, 1])  # flat, so that the gap adds up
+    # where the wall is flat, the errors of vector and position are equal
+    near_wall = np.abs(truth[:, 0]) > np.abs(truth[:, 1])
     np.testing.assert_allclose((vector_I - truth)[near_wall, 0], -believed[near_wall, 0], atol=1e-9)
     np.testing.assert_allclose(view.truth.obstacle_distance, np.linalg.norm(truth, axis=1))
     np.testing.assert_allclose(seen[:, -4], view.observed.obstacle_distance, atol=1e-6)
@@ -100,10 +101,10 @@ def test_a_flight_keeps_its_obstacles(tmp_path):
 
 
 @pytest.mark.parametrize("view", ["fixed", "chase"])
-def test_obstacles_are_drawn(view):
+def test_rendered_frames_show_obstacles(view):
     pytest.importorskip("pygame")
     frames = []
-    # beside the vehicle, and around the eye of the chase view
+    # next to the vehicle, and around the camera of the chase view
     for obstacles in ((), (*OBSTACLES.obstacles, Wall(center_I=(3.0, 1.5, 1.0)))):
         env = gymnasium.make(
             "QuadGym/Hover-v0",

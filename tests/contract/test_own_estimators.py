@@ -1,4 +1,4 @@
-"""A user's estimator in place of the built-in filter."""
+"""Tests of a user's estimator in place of the built-in filter."""
 
 import copy
 import json
@@ -30,7 +30,7 @@ def differences(one, other, *names):
 
 @pytest.mark.parametrize("ticks", [500, pytest.param(2000, marks=pytest.mark.slow)])
 def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one(ticks):
-    """An episode of the circle, or a quarter, by PD control; each on its own filter's estimate."""
+    """A circle, or a quarter of it, is flown by PD control on the estimate of each filter."""
     built_in, own = (batch(2, 3, sensors="lab", estimator=given) for given in (None, UKF()))
     names = [
         f"{of}{name}" for of in ("", "estimated_") for name in ("position", "velocity", "R_BI")
@@ -45,7 +45,7 @@ def test_ukf_in_numpy_gives_the_flights_of_the_built_in_one(ticks):
 
 
 def test_error_state_ekf_is_as_accurate_as_the_built_in_filter():
-    """Estimation errors of four flights over 2 s of the circle, without latency."""
+    """Errors are RMS values of four flights over 2 s of the circle, without latency."""
     errors = []
     for estimator in (None, gallery("error_state_ekf").ErrorStateEKF):
         made = batch(4, sensors="standard", control_rate=50.0, gains="tuned", estimator=estimator)
@@ -77,9 +77,9 @@ def test_complementary_filter_refuses_sensors_without_gnss():
 
 @pytest.mark.parametrize("sensors", ["standard", "rtk"])
 def test_invariant_ekf_is_consistent_and_as_accurate_as_the_built_in_filter(sensors):
-    """From 1 s to 2.5 s on the circle; `rtk` has a latency of 0.1 s.
+    """Errors are from 1 s to 2.5 s on the circle; `rtk` has a latency of 0.1 s.
 
-    The NEES of 40 flights has a mean of 15 with a standard deviation of 0.9 at an instant.
+    At one instant, the mean NEES of 40 flights is 15 with a standard deviation of 0.9.
     """
     errors, squares = [], []
     for estimator in (None, gallery("invariant_ekf").InvariantEKF):
@@ -104,8 +104,8 @@ def test_invariant_ekf_is_consistent_and_as_accurate_as_the_built_in_filter(sens
     assert 12.0 < np.mean(squares[75:]) < 18.0
 
 
-def test_learned_estimator_flies_as_well_as_its_page_claims():
-    """Errors from 2 s to 4 s; the built-in filter without a camera has 6 mm."""
+def test_learned_estimator_has_documented_accuracy():
+    """Errors are from 2 s to 4 s; the built-in filter without a camera has an error of 6 mm."""
     learned, squares = gallery("learned"), []
     made = batch(
         32,
@@ -182,7 +182,7 @@ def test_body_rates_default_to_the_gyro_minus_its_bias():
     task = quad_gym.TaskParams(kind="hover", start="hover")
     made = batch(estimator=rates, control=Control.CTBR, control_rate=50.0, task=task)
     for _ in range(5):
-        made.step(np.zeros((5, 4)))  # the inner loop brakes rates that the vehicle does not have
+        made.step(np.zeros((5, 4)))  # the inner loop counteracts estimated rates that are not real
     np.testing.assert_array_equal(made.read("observed_body_rates"), np.tile(RATES, (5, 1)))
     assert (made.read("body_rates")[:, 0] < -0.05).all()
 
@@ -206,7 +206,7 @@ def test_covariance_is_observed_and_evaluated():
 
 
 class Log(Simple):
-    """Measurements as they arrive, by flight 0."""
+    """Estimator that stores measurements as they arrive."""
 
     def __init__(self):
         self.seen = []
@@ -223,7 +223,7 @@ class Log(Simple):
 
 @pytest.mark.parametrize("sensors", ["lab", LATE])
 def test_measurements_arrive_as_the_sensors_deliver_them(sensors):
-    """Compared with what `read` has in flights that are stepped tick by tick."""
+    """Measurements equal the values of `read` in flights that are stepped tick by tick."""
     seen = Log()
     made = FlightBatch(3, sensors=sensors, estimator=seen, source=Source.TRUTH, run_filter=True)
     plain = FlightBatch(3, sensors=sensors, source=Source.TRUTH, run_filter=True)
@@ -277,7 +277,7 @@ def test_state_is_saved_restored_copied_and_pickled(source):
 
 
 class Counting(Simple):
-    """The number of ticks as the position; `reset` writes to the state of all flights."""
+    """Estimator with the number of ticks as position; `reset` writes to all flights."""
 
     def reset(self, view, mask):
         assert (view.time[mask] == 0.0).all()
@@ -294,7 +294,7 @@ class Counting(Simple):
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("task", [None, "tests.tasks.tasks:Chase"])
-def test_episodes_begin_with_a_reset_of_their_flights_only(mode, task):
+def test_new_episode_resets_estimator_of_its_flight_only(mode, task):
     made = gymnasium.make_vec(
         "QuadGym/Hover-v0",
         num_envs=3,
@@ -414,7 +414,7 @@ def test_an_instance_flies_in_several_environments_at_once():
 
 @pytest.fixture
 def named(monkeypatch):
-    """Name of an estimator in the working directory of commands."""
+    """Yield the name of an estimator in the import path of commands."""
     monkeypatch.syspath_prepend(str(FOLDER))
     yield "complementary:Complementary"
     sys.modules.pop("complementary", None)
@@ -447,7 +447,7 @@ def test_commands_fly_on_an_estimator(named, tmp_path):
     assert "--env must not contain estimator: use --estimator instead" in wrong.stderr
 
 
-def test_consistency_of_an_estimator(tmp_path, monkeypatch):
+def test_consistency_command_uses_own_estimator(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     options = ("--sensors", "lab", "--episodes", 4, "--duration", 0.2, "--output", tmp_path)
     done = console_commands.run("consistency", *options, "--estimator", "ukf:PlainUKF")
@@ -464,7 +464,7 @@ def test_consistency_of_an_estimator(tmp_path, monkeypatch):
         assert f"{option} has no effect with an own --estimator" in message
 
 
-def test_training_on_an_estimator(named, tmp_path):
+def test_train_command_uses_own_estimator(named, tmp_path):
     done = console_commands.run(
         *("train", "hover", "--engine", "compiled", "--steps", 4096, "--n-envs", 8),
         *("--set", "n_steps=32", "batch_size=64", "--evaluations", 1, "--episodes", 2),

@@ -1,4 +1,4 @@
-"""The PD policy computes from observations what the compiled controller does from the estimate."""
+"""The PD policy on observations acts as the compiled controller does on the estimate."""
 
 import warnings
 
@@ -21,7 +21,7 @@ TRACKING += ("QuadGym/RandomTrajectory-v0",)
 
 
 def keywords_for(action, **keywords):
-    """What an environment needs to admit the controller with an action."""
+    """Return the keywords that an environment needs for the controller with an action."""
     if action == "velocity":
         keywords["layout"] = "absolute"
     if action in ("motor", "wrench"):
@@ -30,7 +30,7 @@ def keywords_for(action, **keywords):
 
 
 def errors_of_the_compiled_controller(seeds, sensors):
-    """(ticks, n) true position errors of the report's circle, flown by the kernel itself."""
+    """Return true position errors (ticks, n) on the report's circle, flown by the kernel."""
     batch = FlightBatch(len(seeds), control=Control.PD, gains="lab", sensors=sensors)
     batch.reset(seeds=seeds)
     errors = []
@@ -63,7 +63,7 @@ def test_policy_at_every_tick_equals_the_compiled_controller(action, layout, dir
     assert abs(errors.mean() - direct.mean()) < spread
     late, late_direct = errors[1000:], direct[1000:]
     assert late.mean() == pytest.approx(late_direct.mean(), rel=0.05)
-    # the same seeds bring the same noise: flight by flight nearly the same errors
+    # the same seeds give the same noise, so each flight's errors are nearly the same
     assert np.corrcoef(late.mean(axis=0), late_direct.mean(axis=0))[0, 1] > 0.9
 
 
@@ -82,7 +82,7 @@ def test_policy_flies_every_tracking_task_on_the_estimate(env_id, gains, count):
 
 
 @pytest.mark.parametrize("action", ACTIONS)
-def test_it_flies_with_every_action(action):
+def test_policy_flies_with_every_action(action):
     keywords = keywords_for(action, duration=10.0)
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=50, **keywords)
     with warnings.catch_warnings():
@@ -95,7 +95,7 @@ def test_it_flies_with_every_action(action):
 
 @pytest.mark.parametrize("observation", ["truth", "noisy"])
 @pytest.mark.parametrize("layout", ["relative", "absolute"])
-def test_it_flies_on_every_observation_of_a_state(observation, layout):
+def test_policy_flies_on_truth_and_noisy_observations(observation, layout):
     env = gymnasium.make_vec(
         "QuadGym/RandomTrajectory-v0", num_envs=40, observation=observation, layout=layout
     )
@@ -106,7 +106,7 @@ def test_it_flies_on_every_observation_of_a_state(observation, layout):
 
 @pytest.mark.parametrize("count", EPISODES)
 @pytest.mark.parametrize("gains", ["lab", "tuned"])
-def test_it_passes_all_gates(gains, count):
+def test_policy_passes_all_gates(gains, count):
     env = gymnasium.make_vec("QuadGym/Waypoints-v0", num_envs=count)
     episodes = roll_out(PDPolicy(env, gains), env, seed=0)
     assert not episodes.crashed.any()
@@ -149,7 +149,7 @@ def test_policy_acts_the_same_in_every_interface(policy):
     np.testing.assert_allclose(actions, [actions[0]] * 3, atol=1e-6)
 
 
-def test_it_does_not_change_the_observation_and_has_no_memory():
+def test_policy_does_not_change_observation_and_has_no_memory():
     env = QuadEnv("circle")
     observation, _ = env.reset(seed=2)
     kept = observation.copy()
@@ -168,7 +168,7 @@ def test_it_does_not_change_the_observation_and_has_no_memory():
         ({"action": "velocity", "observation": "truth"}, "absolute"),
     ],
 )
-def test_what_does_not_admit_it_is_refused(keywords, complaint):
+def test_environment_without_needed_observation_is_refused(keywords, complaint):
     with pytest.raises(ValueError, match=complaint):
         PDPolicy(QuadEnv("hover", **keywords))
 
@@ -183,7 +183,7 @@ def test_other_environments_and_gains_are_refused():
 
 
 @pytest.mark.parametrize("action", ["motor", "wrench", "ctbr", "attitude"])
-def test_low_rates_without_inner_loops_are_warned_of(action):
+def test_low_control_rate_without_inner_loop_gives_warning(action):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         PDPolicy(QuadEnv("hover", action=action, control_rate=50))

@@ -35,7 +35,7 @@ REFUSED = [
     ("train --env observation", "--env: must be KEY=VALUE, got 'observation'"),
     ("train --env camera={[1]:2}", "camera must be True or False, got '{[1]:2}'"),
     ("train --env radius=-1", "radius must be greater than 0"),
-    ("train --env height=4", "out_of_bounds must be at least 4 m"),  # half start on the pad
+    ("train --env height=4", "out_of_bounds must be at least 4 m"),  # half are on the pad
     ("train --env colour=red", "colour is not a keyword"),
     ("train --set gama=0.9", "did you mean gamma?"),
     ("train --set gamma=abc", "gamma must be a number, got 'abc'"),
@@ -137,7 +137,7 @@ NAMED = {
     "train": ("--steps abc", "--output"),
     "tune": ("--candidates 0", "--output /dev/null/x"),
 }
-"""Options whose error must name the first of them."""
+"""Command lines whose error must name their first option."""
 REFUSED += [
     (f"{command} {options}", options.split()[0].removeprefix("--"))
     for command, lines in NAMED.items()
@@ -176,7 +176,7 @@ def test_help_has_all_commands_and_their_descriptions(command):
     done = console_commands.run(*command.split(), "--help")
     assert done.returncode == 0
     assert f"usage: quad-gym {command}" in done.stdout
-    assert COMMANDS[command] not in plain(done.stdout)  # the full text instead
+    assert COMMANDS[command] not in plain(done.stdout)  # it has the full text instead
     above = console_commands.run(*command.split()[:-1], "--help")
     assert COMMANDS[command] in plain(above.stdout)
 
@@ -231,7 +231,7 @@ def test_ctrl_c_in_the_middle_leaves_no_traceback(tmp_path):
         err = ""
         while not re.search(r"[1-9]\d*/2001 ", err):
             char = process.stderr.read(1)
-            assert char, err  # it is still running
+            assert char, err  # the command still runs
             err += char
         process.send_signal(signal.SIGINT)
         err += process.communicate(timeout=200)[1]

@@ -1,4 +1,4 @@
-"""Mistakes that environments are known for: none of them is made here."""
+"""Common mistakes of environments, none of which is made here."""
 
 import random
 
@@ -48,12 +48,12 @@ def test_the_options_of_reset_are_honoured_at_any_time(task):
 
 
 def global_state():
-    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - it is what must not move
+    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - this state must not change
     return random.getstate(), kind, keys.tobytes(), tuple(rest)
 
 
 @pytest.mark.parametrize("seed", [None, 4])
-def test_no_interface_touches_the_global_random_states(seed):
+def test_interfaces_do_not_change_global_random_state(seed):
     before = global_state()
     single, vector = QuadEnv("random_trajectory"), QuadVectorEnv(3, "hover")
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", 3, seed=seed)
@@ -68,7 +68,7 @@ def test_no_interface_touches_the_global_random_states(seed):
     assert global_state() == before
 
 
-def test_the_global_random_states_do_not_touch_the_flights():
+def test_flights_do_not_depend_on_global_random_state():
     seen = []
     for seed in (1, 2):
         np.random.seed(seed)  # noqa: NPY002
@@ -111,7 +111,7 @@ NONSENSE = [
 @pytest.mark.parametrize("maker", MAKERS)
 def test_keywords_that_make_no_sense_are_refused_by_name(maker, keywords):
     if maker != "make_sb3_vec_env" and "render_mode" in keywords:
-        pytest.skip("Gymnasium itself has a say in that keyword")
+        pytest.skip("Gymnasium itself handles this keyword")
     with pytest.raises(ValueError, match=next(iter(keywords))) as error:
         MAKERS[maker](**keywords)
     if "frameskip" in keywords:  # the error that TorchRL expects

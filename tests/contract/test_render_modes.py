@@ -1,4 +1,4 @@
-"""Every interface renders what Gymnasium asks for, and a flight does not notice."""
+"""Every interface renders as Gymnasium specifies, and rendering does not change a flight."""
 
 import copy
 import os
@@ -38,14 +38,14 @@ def test_every_task_has_frames(env_id, view):
     assert frame.shape == (480, 640, 3)
     assert frame.dtype == np.uint8
     colors = frame.astype(int) @ [65536, 256, 1]
-    assert len(np.unique(colors)) > 100  # it is a picture of something
+    assert len(np.unique(colors)) > 100  # the picture is not blank
     assert not np.array_equal(frame[:, ::-1], frame)
     np.testing.assert_array_equal(frame, env.render())
     env.step(np.zeros(4, np.float32))
     assert (frame != env.render()).any()
 
 
-def test_the_metadata_says_what_there_is():
+def test_metadata_has_render_modes_and_frame_rate():
     assert QuadEnv.metadata["render_modes"] == ["human", "rgb_array", "rgb_array_list"]
     env = QuadEnv("hover", control_rate=100.0, render_mode="rgb_array")
     assert env.metadata["render_fps"] == 100
@@ -54,7 +54,7 @@ def test_the_metadata_says_what_there_is():
     assert vector.metadata["render_modes"] == QuadEnv.metadata["render_modes"]
 
 
-def test_a_list_holds_every_instant_since_it_was_taken():
+def test_frame_list_has_all_frames_since_last_render():
     env = QuadEnv("hover", render_mode="rgb_array_list", **SMALL)
     one = QuadEnv("hover", render_mode="rgb_array", **SMALL)
     env.reset(seed=1), one.reset(seed=1)
@@ -74,7 +74,7 @@ def test_without_a_render_mode_there_is_a_warning_and_no_frame(capfd):
         assert env.render() is None
 
 
-def test_before_the_first_reset_there_is_nothing_to_see():
+def test_render_before_reset_raises_reset_needed():
     for env in (
         QuadEnv("hover", render_mode="rgb_array"),
         QuadVectorEnv(2, "hover", render_mode="rgb_array"),
@@ -121,7 +121,7 @@ def test_rendering_never_changes_a_flight(env_id):
     assert state_of(plain) == state_of(rendered)
 
 
-def test_a_vector_environment_renders_what_single_ones_do():
+def test_vector_environment_renders_same_frames_as_single_ones():
     env = vec_env("circle", 4, seed=5, render_mode="rgb_array", render_flights=(3, 0), **SMALL)
     plain = vec_env("circle", 4, seed=5)
     ones = [QuadEnv("circle", render_mode="rgb_array", **SMALL) for _ in range(2)]
@@ -184,7 +184,7 @@ def run_python(code, **environment):
 
 
 def test_pygame_is_imported_at_the_first_drawing():
-    """Nor a variable of the environment."""
+    """Environment variables do not change, either."""
     done = run_python(
         """
 import os, sys, gymnasium, numpy as np, quad_gym
@@ -209,7 +209,7 @@ assert dict(os.environ) == before
 
 
 def test_rendering_without_pygame_raises_a_hint():
-    """Stable-Baselines3 asks for "rgb_array" wherever it makes an environment from an id."""
+    """Stable-Baselines3 requests "rgb_array" for every environment that it makes from an id."""
     done = run_python(
         """
 import sys
@@ -262,10 +262,10 @@ except RuntimeError as error:
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
 @pytest.mark.parametrize("variables", [{}, {"SDL_VIDEODRIVER": "x11"}])
 def test_window_without_a_display_is_refused(variables):
-    """SDL falls back on a driver without a display, silently, and a flight would go on for ever."""
+    """SDL silently falls back to a driver without a display, and flights would not end."""
     done = run_python(OPEN_A_WINDOW, **variables)
     assert "cannot open a window: " in done.stdout, done.stderr
     assert 'render_mode="rgb_array"' in done.stdout

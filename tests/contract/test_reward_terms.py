@@ -76,7 +76,7 @@ def test_own_task_shows_the_terms_that_it_returns():
     assert crashes > 0
 
 
-def test_own_task_has_one_term_or_those_of_its_base():
+def test_own_task_has_one_term_or_terms_of_its_base():
     task = quad_gym.Task.of(reward=rewards.Heading())
     paid, terms, _ = flown(task, 5, base="hover")
     np.testing.assert_array_equal(terms["reward"], paid)

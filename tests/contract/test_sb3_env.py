@@ -1,4 +1,4 @@
-"""The interface for Stable-Baselines3: what its algorithms and wrappers rely on."""
+"""Tests of the properties that algorithms and wrappers of Stable-Baselines3 rely on."""
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,7 @@ OMITTED = {"ending", "filter_status", "filter_diverged", "gates_passed", "drawn"
 
 
 def plain(observation):
-    """An observation, as a dictionary of the plain kind where it has parts."""
+    """Return an observation, with an ordered dictionary as a plain one."""
     return dict(observation) if isinstance(observation, dict) else observation
 
 
@@ -97,7 +97,7 @@ def test_options_hold_for_the_next_reset_only():
     assert state_of(env) == before
 
 
-def test_what_is_returned_has_the_stated_types_and_is_fresh():
+def test_results_have_stated_types_and_share_no_memory():
     env = make(3)
     assert isinstance(env, VecEnv)
     first = env.reset()
@@ -138,7 +138,7 @@ def test_attributes_and_methods_are_shared_by_all_flights():
 
 @pytest.mark.filterwarnings("ignore:The environment is already wrapped:UserWarning")
 @pytest.mark.parametrize("wrapper", [VecMonitor, VecNormalize])
-def test_the_usual_wrappers_fit(wrapper):
+def test_sb3_wrappers_accept_environment_and_count_episodes(wrapper):
     env = wrapper(make(4, **SHORT))
     env.reset()
     lengths = []

@@ -1,4 +1,4 @@
-"""Training, validation and test never fly the same flight; equal seeds keep flights in pairs."""
+"""Training, validation and test have disjoint flights; equal seeds give paired flights."""
 
 import itertools
 
@@ -13,7 +13,7 @@ SEEDS, COUNT = range(10), 256
 
 
 def keys_of(seeds):
-    """The streams of flights, drawn as Gymnasium seeds environments."""
+    """Return the keys of random streams, drawn from seeds as in Gymnasium."""
     generators = (gymnasium.utils.seeding.np_random(int(seed))[0] for seed in seeds)
     return {tuple(g.integers(0, 2**64, size=2, dtype=np.uint64).tolist()) for g in generators}
 
@@ -36,7 +36,7 @@ def test_training_validation_and_test_share_no_stream():
     assert all(len(found) == COUNT for found in keys.values())
     together = [set().union(*(keys[purpose, seed] for seed in SEEDS)) for purpose in PURPOSES]
     assert_disjoint(together)
-    for purpose in ("training", "validation"):  # nor between two trainings, or their validations
+    for purpose in ("training", "validation"):  # two trainings or validations, too
         assert_disjoint([keys[purpose, seed] for seed in SEEDS])
 
 
@@ -65,8 +65,8 @@ def test_refuses_seeds_out_of_their_block(purpose, seed, count, message):
         flight_seeds(purpose, seed, count)
 
 
-def test_trainings_are_judged_on_flights_of_their_own_block():
-    """The algorithm seeds its environment too, which must not bring other flights in."""
+def test_trainings_are_evaluated_on_seeds_of_validation_block():
+    """The algorithm also seeds its environment, which must not change the flights."""
     pytest.importorskip("stable_baselines3")
     from baselines.checkpoints import Keeper
     from baselines.models import make_model
@@ -93,7 +93,7 @@ def test_trainings_are_judged_on_flights_of_their_own_block():
 
 
 def test_equal_seeds_with_autoreset_have_equal_starts():
-    """With autoreset each flight comes to its tenth episode when its crashes have it so."""
+    """The start of the tenth episode does not depend on the times of earlier crashes."""
 
     def tenth(seed):
         rng, count = np.random.default_rng(seed), 9

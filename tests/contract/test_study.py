@@ -49,7 +49,7 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     assert main(words) == 0
     assert kept.stat().st_mtime_ns == before[0]
     again = json.loads((folder / "summary.json").read_text())
-    assert again["rows"] == summary["rows"]  # the same training, bit for bit
+    assert again["rows"] == summary["rows"]  # the repeated training is bitwise equal
 
 
 @pytest.mark.parametrize(

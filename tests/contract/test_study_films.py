@@ -17,7 +17,7 @@ QUICK = ["--quick", "--steps", "4096", "--env", f"duration={DURATION}", "--arms"
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
-    """The folder of a tiny study with a film, and its words."""
+    """Return the folder of a tiny study with a film, and its command line."""
     folder = tmp_path_factory.mktemp("film")
     words = ["study", "look_around", *QUICK, "--video", "webp", "--output", str(folder / "out")]
     assert main(words) == 0
@@ -25,7 +25,7 @@ def filmed(tmp_path_factory):
 
 
 def seconds_of(film):
-    """How long a film runs [s]."""
+    """Return the duration of a film [s]."""
     total = 0
     for k in range(film.n_frames):
         film.seek(k)
@@ -37,14 +37,14 @@ def seconds_of(film):
 def test_film_lasts_as_long_as_the_episode_and_loops(filmed):
     folder, _ = filmed
     with Image.open(folder / "out/film.webp") as film:
-        pictures = int(np.ceil(DURATION * RATE)) + 1  # the end among them
+        pictures = int(np.ceil(DURATION * RATE)) + 1  # including the end
         assert film.n_frames == pictures
         assert film.size == (2 * SIDE[0], SIDE[1])
-        assert film.info["loop"] == 0  # without end
+        assert film.info["loop"] == 0  # endless
         assert seconds_of(film) == pytest.approx((pictures + round(HOLD * RATE)) / RATE)
 
 
-def test_film_shows_the_episode_of_the_test(filmed):
+def test_film_shows_same_flights_as_evaluation(filmed):
     folder, _ = filmed
     study = command.configure(
         command.StudyArgs(

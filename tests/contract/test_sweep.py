@@ -26,7 +26,7 @@ n_envs = 16
 """
 
 
-def test_every_combination_has_a_folder_first_seeds_first(tmp_path):
+def test_every_combination_has_own_folder_and_is_ordered_by_seed(tmp_path):
     given = {
         "env_ids": ["QuadGym/Hover-v0", "QuadGym/Circle-v0"],
         "seeds": [3, 1],
@@ -42,7 +42,7 @@ def test_every_combination_has_a_folder_first_seeds_first(tmp_path):
     assert dict(first.plan.environment) == {"sensors": "lab", "duration": 2.0}
     assert first.plan.recipe.layers == (32, 32)
     assert first.plan.recipe.parameters["gamma"] == 0.9
-    assert first.plan.recipe.parameters["n_epochs"] == 5  # the recipe's
+    assert first.plan.recipe.parameters["n_epochs"] == 5  # from the recipe
     assert (first.plan.engine, first.plan.threads) == ("sb3", 2)
     fewer = expand({**given, "set": {"gamma": [0.9]}, "seeds": [3]}, {}, tmp_path)
     assert {t.folder for t in fewer} < {t.folder for t in found}
@@ -131,7 +131,7 @@ def test_tables_contain_records_of_folders(tmp_path):
     (group,) = groups_of(rows)
     assert (group["trainings"], group["finished"]) == (5, 3)
     np.testing.assert_allclose(group["mean_error"], 0.3)
-    # Student's t of three: 4.3027 standard errors
+    # Student's t of three values: 4.3027 standard errors
     half = 4.3027 * np.std([0.1, 0.2, 0.6], ddof=1) / np.sqrt(3.0)
     np.testing.assert_allclose(group["mean_error_high"] - 0.3, half, rtol=1e-4)
     np.testing.assert_allclose(0.3 - group["mean_error_low"], half, rtol=1e-4)

@@ -13,12 +13,12 @@ from quad_gym.records import Ending
 from tests.builders import actions_of, single_env, vec_env
 
 SECONDS = 1 / 50
-"""A control period."""
+"""Control period [s]."""
 UNBOUNDED = {"out_of_bounds": 50.0, "max_tilt": np.pi, "min_height": -50.0}
 
 
 def body_axes(q):
-    """(n, 3, 3) R_BI of quaternions (n, 4), body to inertial; its rows are the body axes in I."""
+    """Return R_BI (n, 3, 3) of quaternions (n, 4), body to inertial; rows are body axes in I."""
     w, x, y, z = q.T
     return np.stack(
         [
@@ -39,7 +39,7 @@ def level(v):
 
 
 def reference_of(task, t, batch):
-    """(r*, x*) (n, 3) each at the time t of an episode, by the task's description."""
+    """Return r* and x* (n, 3) at the time t of an episode, by the task's description."""
     w, n = 2 * np.pi / 10.0, batch.count
     if task == "hover":
         r = np.array([4.0, 0.0, 1.0])
@@ -64,11 +64,11 @@ DOCUMENTED = {"near": 1.0, "near_decay": 2.0, "fine": 0.5, "fine_decay": 20.0, "
 DOCUMENTED |= {"gate_passed": 1.0, "heading": 0.1, "action_rate": 0.02, "body_rates": 0.002}
 OTHERS = {"near": 0.7, "near_decay": 1.5, "fine": 0.4, "fine_decay": 9.0, "progress": 0.8}
 OTHERS |= {"gate_passed": 3.0, "heading": 0.3, "action_rate": 0.05, "body_rates": 0.01}
-"""Weights by default, and other ones."""
+"""Default weights, and others."""
 
 
 def weights_for(task, weights):
-    """Keywords of an environment: none for the default weights."""
+    """Return keywords of an environment with these weights; none for the default ones."""
     others = ("near", "near_decay", "fine", "fine_decay")
     others = others if task == "waypoints" else ("progress", "gate_passed")
     mine = {name: weight for name, weight in weights.items() if name not in others}
@@ -100,7 +100,7 @@ def test_the_reward_of_a_tracking_task_is_the_documented_formula(task, weights):
     last = np.zeros((n, 4))
     actions = np.stack([actions_of(i, 25) for i in range(n)], axis=1)
     for k in range(25):
-        given = actions[k] * 1.7  # beyond the bounds now and then
+        given = actions[k] * 1.7  # sometimes out of bounds
         _, reward, _, _, info = env.step(given)
         action = np.clip(given.astype(float), -1.0, 1.0)
         r_ref, x_ref = reference_of(task, (k + 1) * SECONDS, batch)
@@ -135,7 +135,7 @@ def test_the_reward_of_waypoints_is_the_documented_formula(weights):
         distance = np.linalg.norm(gates[rows, passed] - batch.record("r"), axis=1)
         through = distance < 0.3
         passed += through
-        aligned = body_axes(batch.record("q"))[:, 0, 0]  # body x with east
+        aligned = body_axes(batch.record("q"))[:, 0, 0]  # body x along east
         action = action.astype(float)
         expected = common_terms(weights, action, last, batch, aligned)
         expected["progress"] = weights["progress"] * (before - distance) / SECONDS
@@ -169,7 +169,7 @@ BOUNDS = {"hover": 1.6, "circle": 3.0, "lemniscate": 3.0, "random_trajectory": 3
 def test_flight_beyond_its_bound_is_out_of_bounds(task):
     start = single_env(task, seed=1)
     r_ref, _ = reference_of(task, 0.0, start.flights.batch)
-    for speed, over in ((0.0, False), (20.0, True)):  # by 0.4 m in a step
+    for speed, over in ((0.0, False), (20.0, True)):  # 0.4 m in a step
         env = QuadEnv(task)
         place = r_ref[0] + [0, 0, BOUNDS[task] - 0.2]
         options = {"position": place, "velocity": [0, 0, speed]}
@@ -192,7 +192,7 @@ def test_a_course_has_wider_bounds():
     env = QuadEnv("waypoints")
     env.reset(seed=1, options={"position": [0.0, 0.0, 9.0]})
     assert not env.step(STILL)[2]
-    env.reset(seed=1, options={"position": [0.0, 0.0, 13.8]})  # near enough to a lower gate
+    env.reset(seed=1, options={"position": [0.0, 0.0, 13.8]})  # near enough to some gates
     assert env.step(STILL)[4]["ending"] == Ending.OUT_OF_BOUNDS
 
 
@@ -208,7 +208,7 @@ def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
     ("task", "options"),
     [("hover", {"out_of_bounds": 3.0}), ("circle", {"pad": False}), ("waypoints", {})],
 )
-def test_half_a_meter_below_the_origin_is_on_the_ground(task, options):
+def test_flight_half_a_meter_below_origin_ends_below_min_height(task, options):
     env = QuadEnv(task, **options)
     *_, terminated, truncated, info = last_step(env, np.array([-1.0, 0.0, 0.0, 0.0]))
     assert (terminated, truncated, info["ending"]) == (True, False, Ending.BELOW_MIN_HEIGHT)

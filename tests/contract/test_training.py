@@ -1,4 +1,4 @@
-"""Training: repeatable, resumable after any death, and refusing nonsense before it begins."""
+"""Trainings are repeatable, resume after a kill, and refuse invalid plans at the start."""
 
 import json
 import os
@@ -29,7 +29,7 @@ QUIET = {"quiet": True, "tensorboard": False}
 
 
 def small_plan(algorithm="ppo", **changes):
-    """A training of seconds."""
+    """Return the plan of a training that takes seconds."""
     shipped = recipe(CIRCLE, algorithm)
     if algorithm in ("ppo", "recurrent_ppo"):
         parameters = {"n_steps": 16, "batch_size": 128, "n_epochs": 2}
@@ -71,15 +71,15 @@ def test_equal_seeds_give_equal_policies_and_others_do_not(tmp_path):
 
 def test_keywords_of_the_environment_hold_in_training_too():
     plan = small_plan()
-    assert plan.make_flights().unwrapped.flights.batch.task.start == "mixed"  # the recipe's
+    assert plan.make_flights().unwrapped.flights.batch.task.start == "mixed"  # from the recipe
     given = {"start": "ground", "randomize_reference": False, "sensors": "rtk"}
     batch = small_plan(environment=given).make_flights().unwrapped.flights.batch
     assert (batch.task.start, batch.task.randomize_reference) == ("ground", False)
     assert batch.sensors == quad_gym.sensor_suite("rtk")
 
 
-def test_td3_explores():
-    """Its policy has no noise of its own: without any, actions would be what the policy says."""
+def test_td3_explores_with_action_noise():
+    """TD3's policy is deterministic, so exploration needs action noise."""
     plan = small_plan("td3")
     model = make_model(plan, plan.make_flights())
     model.learn(800)
@@ -92,7 +92,7 @@ def test_td3_explores():
     ("algorithm", "steps"),
     [("ppo", 70), ("ppo", 20), ("sac", 75), pytest.param("td3", 75, marks=pytest.mark.slow)],
 )
-def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, algorithm, steps):
+def test_resumed_run_equals_uninterrupted_run(tmp_path, monkeypatch, algorithm, steps):
     plan = small_plan(algorithm)
     train(plan, tmp_path / "whole", **QUIET)
     from baselines.checkpoints import Keeper
@@ -155,12 +155,12 @@ def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
         assert "--resume" in err
     kept = rows(folder)
     model = algorithm_class("ppo").load(folder / "last.zip", device="cpu")
-    # the first row is of step 0, and the last may be there a moment before its checkpoint
+    # the first row is of step 0, and the last may be written shortly before its checkpoint
     assert model.num_timesteps >= (kept - 1) * 1250 - 1250 - 256
     steps = str(int(model.num_timesteps) + 1024)
     finished = train_again(folder, steps, tmp_path)
     assert "goes on" not in finished.stderr
-    assert finished.returncode == 2  # another number of steps is another plan
+    assert finished.returncode == 2  # a different number of steps is a different plan
     assert "different: recipe" in finished.stderr
 
 
@@ -169,7 +169,7 @@ def train_again(folder, steps, where):
     return console_commands.run("train", *options(folder, *more), where=where)
 
 
-def test_a_run_that_is_not_there_begins_and_says_so(tmp_path):
+def test_resume_without_run_starts_new_run_with_message(tmp_path):
     few = ("--steps", 400, "--evaluations", 2, "--no-tensorboard", "--resume")
     done = console_commands.run("train", *options(tmp_path / "run", *few), where=tmp_path)
     assert done.returncode == 0
@@ -241,11 +241,11 @@ def test_every_task_and_algorithm_has_a_valid_recipe():
 
 
 @pytest.mark.parametrize("algorithm", ["td3", "tqc"])
-def test_every_algorithm_runs(tmp_path, algorithm):
+def test_td3_and_tqc_write_best_policy(tmp_path, algorithm):
     assert train(small_plan(algorithm), tmp_path, **QUIET).best_policy.exists()
 
 
-def test_a_policy_with_a_memory_begins_each_episode_without_one(tmp_path):
+def test_recurrent_policy_resets_memory_at_start_of_episode(tmp_path):
     plan = small_plan("recurrent_ppo")
     done = train(plan, tmp_path, **QUIET)
     many, one = (gymnasium.make_vec(CIRCLE, num_envs=n, duration=1.0) for n in (4, 1))
@@ -257,7 +257,7 @@ def test_a_policy_with_a_memory_begins_each_episode_without_one(tmp_path):
     env = gymnasium.make_vec(CIRCLE, num_envs=1, duration=1.0)
     observation, _ = env.reset(seed=7)
     total, state, over = 0.0, None, False
-    while not over:  # what the memory is for: a state that is handed on
+    while not over:  # the memory is the state that is passed on
         starts = np.array([state is None])
         actions, state = policy.predict(observation, state, starts, deterministic=True)
         observation, reward, terminated, truncated, _ = env.step(actions)

@@ -1,4 +1,4 @@
-"""Trajectories of a user's own in all interfaces: kernels against `Trajectory`, and options."""
+"""User-defined trajectories in all interfaces: kernels against `Trajectory`, and options."""
 
 import gymnasium
 import numpy as np
@@ -11,6 +11,7 @@ from quad_gym.batch.surroundings import nearest_obstacle
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Source
+from quad_gym.rotations import quaternion_to_dcm
 from tests.builders import batch, part
 
 FIVE = [(0, 0, 1.5), (1, 0.5, 2), (1, -0.5, 1), (-1, 0.5, 2), (-1, -0.5, 1)]
@@ -36,7 +37,7 @@ def direction(angle):
 
 
 def assert_on_reference(batch, time):
-    """What kernels have is what the trajectories of the flights say."""
+    """Check the kernels' reference against the trajectories of the flights."""
     for i in range(batch.count):
         path, phase = batch.trajectory(i)
         t = time + phase
@@ -45,7 +46,7 @@ def assert_on_reference(batch, time):
                 batch.record(name)[i], path(t, k), rtol=0.0, atol=1e-12 * (1 + 100 * k)
             )
         heading, speed = direction(path.yaw(t)), np.linalg.norm(path(t, 1))
-        miss = 1e-12 * max(1.0, 1.0 / (speed + 1e-6))  # of the direction of a short velocity
+        miss = 1e-12 * max(1.0, 1.0 / (speed + 1e-6))  # for the direction of a small velocity
         np.testing.assert_allclose(batch.record("path_x")[i], heading, rtol=0.0, atol=miss)
         ahead = path(t + np.array(batch.task.preview))
         np.testing.assert_allclose(batch.record("path_ahead")[i], ahead, rtol=0.0, atol=1e-12)
@@ -53,7 +54,7 @@ def assert_on_reference(batch, time):
 
 @pytest.mark.parametrize("randomize", [False, True])
 @pytest.mark.parametrize("preview", [(0.2, 0.4), (0.0, 1.0)])
-def test_kernels_evaluate_what_python_does(randomize, preview):
+def test_kernel_reference_equals_python_trajectory(randomize, preview):
     batch = batch_of(SEVERAL, count=9, randomize_reference=randomize, preview=preview)
     batch.reset(seeds=range(9))
     assert len(set(batch.record("path"))) == 3
@@ -65,7 +66,7 @@ def test_kernels_evaluate_what_python_does(randomize, preview):
         batch.step()
 
 
-def test_many_segments_and_long_flights():
+def test_kernel_reference_is_accurate_with_many_segments_and_long_flights():
     rng = np.random.default_rng(0)
     places = np.cumsum(rng.normal(size=(300, 3)) * 0.3, axis=0)
     path = Trajectory.through(places, np.arange(300.0), yaw=np.cumsum(rng.normal(size=300)))
@@ -124,7 +125,7 @@ def test_a_users_task_sees_the_reference():
             np.testing.assert_allclose(seen["v"][i], path(phase + k / 50, 1), rtol=0.0, atol=1e-10)
 
 
-def test_a_recorded_flight_knows_its_trajectory(tmp_path):
+def test_recorded_flight_contains_its_trajectory(tmp_path):
     env = QuadEnv(
         "trajectory", trajectory=[CLOSED, OPEN], randomize_reference=True, observation="truth"
     )
@@ -149,7 +150,7 @@ def test_a_recorded_flight_knows_its_trajectory(tmp_path):
 
 
 @pytest.mark.parametrize("action", ["ctbr", "attitude", "velocity"])
-def test_pd_control_follows_the_default(action):
+def test_pd_control_follows_default_trajectory(action):
     layout = "absolute" if action == "velocity" else "relative"
     env = gymnasium.make_vec(
         "QuadGym/Trajectory-v0", num_envs=20, action=action, layout=layout, randomize_reference=True
@@ -163,7 +164,7 @@ def test_pd_control_follows_the_default(action):
     assert np.mean(errors[150:]) < 0.15
 
 
-def test_the_time_limit_is_the_trajectorys():
+def test_time_limit_defaults_to_duration_of_trajectory():
     for given, seconds in ((OPEN, 4.8), (CLOSED, 6.2), (SEVERAL, 6.2), (None, 10.0)):
         env = QuadEnv("trajectory", trajectory=given, observation="truth")
         assert env.flights.batch.max_steps == round(50 * seconds)
@@ -172,7 +173,7 @@ def test_the_time_limit_is_the_trajectorys():
     assert env.unwrapped.flights.batch.max_steps == 40
 
 
-def test_a_table_by_its_path(tmp_path):
+def test_trajectory_is_read_from_path_of_table(tmp_path):
     file = tmp_path / "path.csv"
     rows = [f"{t},{x},{y},{z}" for t, (x, y, z) in zip(WHEN, FIVE, strict=True)]
     file.write_text("\n".join(["time,x,y,z", *rows]))
@@ -181,7 +182,7 @@ def test_a_table_by_its_path(tmp_path):
         assert env.flights.task.trajectories[0] == Trajectory.through(FIVE, WHEN)
 
 
-def test_what_does_not_fit_is_refused():
+def test_infeasible_or_invalid_trajectory_is_refused():
     fast = Trajectory.through(FIVE, max_speed=8.0, max_acceleration=30.0)
     with pytest.raises(ValueError, match=r"trajectory must be .* fly: .* at .* s .segment . of 4"):
         gymnasium.make("QuadGym/Trajectory-v0", trajectory=fast)
@@ -218,7 +219,7 @@ INTO_A_WALL = Trajectory.through([(-3, 0, 1.5), (0, 3, 1.5), (3, 1, 1.5)], max_s
 
 
 def fly(trajectory, world, count=4, **options):
-    """States of all ticks, and who has collided; under PD control on the estimate."""
+    """Return positions, collisions, distances and obstacle centers of all ticks."""
     task = TaskParams(kind="trajectory", start="hover", trajectory=trajectory, duration=0.0)
     flights = batch(count, task=task, sensors="indoor", gains="tuned", world=world, **options)
     seconds = max(path.duration for path in task.trajectories)
@@ -232,7 +233,7 @@ def fly(trajectory, world, count=4, **options):
 
 def test_trajectory_through_a_gap_does_not_collide():
     world = WorldParams(obstacles=GAP)
-    seeing = {"source": Source.TRUTH}  # an estimate is worse behind walls, which hide markers
+    seeing = {"source": Source.TRUTH}  # walls hide markers, which makes the estimate worse
     r, collided, distance, centers = fly(THROUGH, world, **seeing)
     assert not collided.any()
     for k in range(0, len(r), 50):
@@ -251,7 +252,7 @@ def test_trajectory_into_a_wall_collides():
         assert abs(r[k, flight, 0]) < 0.1 + radius + 1e-9
 
 
-def test_a_task_sees_the_wall_and_the_way_ahead():
+def test_own_task_observes_wall_and_reference_ahead_in_body_frame():
     class Sees(quad_gym.Task):
         def observe(self, view):
             return {
@@ -266,3 +267,8 @@ def test_a_task_sees_the_wall_and_the_way_ahead():
     flights = env.unwrapped.flights
     lengths = np.linalg.norm(part(env, observations, "wall"), axis=1)
     np.testing.assert_allclose(lengths, flights.batch.record("obstacle_distance"), rtol=1e-5)
+    q, path_r, ahead = map(flights.batch.record, ("q", "path_r", "path_ahead"))
+    offsets = np.einsum("nij,nkj->nki", quaternion_to_dcm(q), ahead - path_r[:, np.newaxis])
+    np.testing.assert_allclose(
+        part(env, observations, "ahead").reshape(3, 2, 3), offsets, rtol=1e-5, atol=1e-6
+    )

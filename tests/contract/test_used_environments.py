@@ -1,4 +1,4 @@
-"""An episode depends on its seed alone, and on nothing that the environment flew before it."""
+"""An episode depends only on its seed, not on earlier episodes of the environment."""
 
 import gymnasium
 import numpy as np
@@ -32,11 +32,11 @@ STALE = frozenset(
         *("gyro_sum", "accel_sum", "fault_news"),
     )
 )
-"""Fields that are always written before they are read, and hold anything in between."""
+"""Fields that are always written before they are read; earlier values have no effect."""
 
 
 def world_parts(rng):
-    """What a world may have, with numbers at random."""
+    """Return parts of a world, with random numbers."""
     wall = quad_gym.Wall(center_I=(6.0, 0.0, 1.0), shift_I=(0.5, 0.5, 0.0))
     return {
         "wind_I": tuple(rng.uniform(-5.0, 5.0, 3)),
@@ -51,7 +51,7 @@ def world_parts(rng):
 
 
 def other_options(rng):
-    """Values of keywords that have nothing to do with faults, world or draws."""
+    """Return values of keywords other than faults, world and randomization."""
     return {
         "sensors": [*SUITES, AIDED],
         "observation": ["truth", "noisy", "measurements"],
@@ -74,18 +74,18 @@ def other_options(rng):
 
 
 def some(rng, names, most):
-    """Up to `most` of the names."""
+    """Choose up to `most` of the names."""
     return rng.choice(sorted(names), rng.integers(0, most + 1), replace=False).tolist()
 
 
 def drawn_options(rng):
-    """Keywords of an environment: some of what an episode may leave behind, and some others."""
+    """Draw keywords, some with effects that an episode could pass on to the next one."""
     keywords = {"sensors": "rtk"}
     for name in some(rng, other_options(rng), 3):
         values = other_options(rng)[name]
         keywords[name] = values[rng.integers(len(values))]
     faults = [fault for name in some(rng, PRESETS, 2) for fault in PRESETS[name]]
-    if faults:  # those that come at a time come at once, or soon
+    if faults:  # faults with a start time begin at once or soon
         soon = rng.choice([0.0, 0.02, 0.1])
         keywords["faults"] = [f if f.start is None else f.replace(start=soon) for f in faults]
     parts = world_parts(rng)
@@ -101,7 +101,7 @@ def made(name, keywords):
 
 
 def flown(env, seed, steps):
-    """What an episode shows, and the records of the flights at its start and after some steps."""
+    """Return results of an episode, and the records at its start and after some steps."""
     rng, batch = np.random.default_rng(seed), env.unwrapped.flights.batch
 
     def records():
@@ -115,14 +115,14 @@ def flown(env, seed, steps):
 @pytest.mark.parametrize(
     "configurations", [range(100), pytest.param(range(100, 5000), marks=pytest.mark.slow)], ids=len
 )
-def test_a_used_environment_flies_what_a_fresh_one_flies(configurations):
+def test_episode_of_used_environment_equals_episode_of_fresh_one(configurations):
     refused = 0
     for k in configurations:
         rng = np.random.default_rng([2026, k])
         name, keywords = IDS[rng.integers(len(IDS))], drawn_options(rng)
         try:
             used, fresh = made(name, keywords), made(name, keywords)
-        except ValueError:  # options that do not go together
+        except ValueError:  # options that cannot be combined
             refused += 1
             continue
         flown(used, k, int(rng.integers(3, 20)))

@@ -1,4 +1,4 @@
-"""The vector environment against Gymnasium's book, and bit for bit against its SyncVectorEnv."""
+"""The vector environment follows Gymnasium's rules and equals its SyncVectorEnv bitwise."""
 
 import gymnasium
 import numpy as np
@@ -16,7 +16,7 @@ MODES = ("NextStep", "SameStep", "Disabled")
 
 
 def both(name, count, mode):
-    """Ours, and Gymnasium's loop over single environments, of a configuration."""
+    """Return our vector environment and Gymnasium's SyncVectorEnv of a configuration."""
     base, keywords = CONFIGURATIONS[name]
     keywords = {**SHORT, "base": base, **keywords}
     envs = [lambda: QuadEnv(**keywords)] * count
@@ -24,41 +24,41 @@ def both(name, count, mode):
     return ours, SyncVectorEnv(envs, autoreset_mode=AutoresetMode(mode))
 
 
-def spoken_of(infos):
-    """Infos by flight, without what the masks next to them say that they do not hold."""
+def masked_infos(infos):
+    """Return infos without the values that the masks next to them exclude."""
     kept = {}
     for name, values in infos.items():
         mask = infos.get(f"_{name}")
         if isinstance(values, dict):
-            kept[name] = spoken_of(values)
+            kept[name] = masked_infos(values)
         elif mask is None:
             kept[name] = values
         elif values.dtype == object and name != "ending":
             kept[name] = [value for value, said in zip(values, mask, strict=True) if said]
-        else:  # endings of Gymnasium's loop are objects, numbers in ours
+        else:  # endings are objects in Gymnasium's infos and numbers in ours
             kept[name] = values[mask].astype(float)
     return kept
 
 
-def assert_alike(mine, other, where):
-    """Everything the same, infos as far as their masks say that they hold something."""
+def assert_same_results(mine, other, where):
+    """Check that results are equal, and infos where their masks are true."""
     assert_same(mine[:-1], other[:-1], where)
-    assert_same(spoken_of(mine[-1]), spoken_of(other[-1]), where)
+    assert_same(masked_infos(mine[-1]), masked_infos(other[-1]), where)
 
 
 def fly_both(ours, theirs, steps, seed):
-    """Step both alike and compare everything; return how many episodes ended in which way."""
+    """Step and compare both; return the numbers of terminated and truncated episodes."""
     actions = actions_for(range(ours.num_envs), steps)
-    assert_alike(ours.reset(seed=seed), theirs.reset(seed=seed), "start")
+    assert_same_results(ours.reset(seed=seed), theirs.reset(seed=seed), "start")
     ended = np.zeros(2, int)
     for k in range(steps):
         mine, other = ours.step(actions[k]), theirs.step(actions[k])
-        assert_alike(mine, other, f"step {k}")
+        assert_same_results(mine, other, f"step {k}")
         ended += mine[2].sum(), mine[3].sum()
         over = mine[2] | mine[3]
         if ours.metadata["autoreset_mode"] == AutoresetMode.DISABLED and over.any():
             chosen = {"reset_mask": over}
-            assert_alike(
+            assert_same_results(
                 ours.reset(options={**chosen}), theirs.reset(options={**chosen}), f"reset {k}"
             )
     return ended
@@ -66,13 +66,13 @@ def fly_both(ours, theirs, steps, seed):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_it_returns_what_a_loop_over_single_environments_returns(name, mode):
+def test_vector_env_equals_sync_vector_env_of_gymnasium(name, mode):
     terminated, truncated = fly_both(*both(name, 11, mode), steps=STEPS, seed=5)
     assert terminated + truncated > 11
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_spaces_hold_what_is_returned_with_the_stated_types(name):
+def test_results_are_in_spaces_and_have_stated_types(name):
     base, keywords = CONFIGURATIONS[name]
     env = QuadVectorEnv(6, base=base, **keywords)
     single = QuadEnv(base=base, **keywords)
@@ -127,7 +127,7 @@ def test_changes_to_returned_arrays_do_not_reach_flights():
             array[...] = None if array.dtype == object else 1
 
 
-def test_none_in_a_list_of_seeds_lets_a_flights_stream_go_on():
+def test_flight_with_seed_none_continues_its_random_stream():
     env, goes_on = (QuadVectorEnv(3, "hover") for _ in range(2))
     env.reset(seed=6)
     goes_on.reset(seed=6)

@@ -1,5 +1,4 @@
-"""Golden flights: digests of what flights do, so that no change of them goes unnoticed.
+"""Golden flights: digests of flights, so that tests detect every change.
 
-Whoever changes flights on purpose makes the digests anew by `make golden`, and the changelog says
-why.
+After an intended change, renew the digests with `make golden` and give the reason in the changelog.
 """

@@ -5,7 +5,7 @@ python -m tests.golden.aarch64 [CASE ...]    # needs aarch64-linux-gnu-gcc and q
 Python flies the cases here, with two lanes and the library of compiled kernels, and records the
 memory before and after the calls. A C program (`replay.c`), linked with the kernels for AArch64,
 makes the same calls on a copy of this memory; then both must be equal. Only the bits of NaNs may
-differ, as processors make different ones.
+differ, as they depend on the processor.
 """
 
 import itertools
@@ -22,13 +22,13 @@ import numpy as np
 
 LANES, COMPILER, EMULATOR = 2, "aarch64-linux-gnu-gcc", "qemu-aarch64-static"
 PLACE = 1 << 36  #: address of the memory in the C program
-LINE = 64  #: bytes; what Python writes is sent in such pieces
-SHOWN_EVERY = 30  #: calls, and the last one
+LINE = 64  #: size of the pieces in which changed memory is sent [bytes]
+SHOWN_EVERY = 30  #: calls between comparisons; the last call is compared, too
 ROOT = Path(__file__).parents[2]
 
 
 class Memory:
-    """The memory of a batch as the C program has it, with its own addresses."""
+    """The memory of a batch, with the addresses of the C program."""
 
     def __init__(self, batch: Any) -> None:
         from quad_gym.batch.threads import board_of
@@ -49,9 +49,9 @@ class Memory:
                 words[word] = put(self._settings)
             elif isinstance(value, int):
                 words[word] = value
-            else:  # of the first of all threads
+            else:  # of a list, one for each thread, the first
                 words[word] = put(value[0] if isinstance(value, list) else value)
-        if hasattr(batch, "_shown"):  # what a user's task reads
+        if hasattr(batch, "_shown"):  # fields that a user's task reads
             words[Call.SHOWN], words[Call.SHOWN_PITCH] = put(batch._shown), batch._shown.strides[0]
         words[Call.BLOCKS] = put(batch._blocks) - batch._room.skipped
         words[Call.PITCH] = batch._room.dtype.itemsize
@@ -64,7 +64,7 @@ class Memory:
         self.size = size
 
     def content(self) -> np.ndarray:
-        """Return its present bytes."""
+        """Return the current bytes."""
         self._settings["max_steps"] = self.batch._settings["max_steps"]
         content = np.zeros(self.size, np.uint8)
         for place, array in self._arrays:
@@ -73,7 +73,7 @@ class Memory:
 
 
 class Recording:
-    """The calls of one batch, as the C program reads them, and the memory that it must find."""
+    """The calls of one batch, as the C program reads them, and the memory that it must produce."""
 
     def __init__(self, symbols: dict[str, int]) -> None:
         self._symbols, self._memory = symbols, None
@@ -101,7 +101,7 @@ class Recording:
         return observations
 
     def given(self) -> bytes:
-        """Return what the C program reads."""
+        """Return the input of the C program."""
         m = self._memory
         assert m is not None
         places = (PLACE, m.size, m.compared, m.call, m.board, m.table, m.board_size)
@@ -114,13 +114,13 @@ class Recording:
         return b"".join(content)
 
     def differences(self, found: bytes) -> str:
-        """Describe where the memory that the C program has shown differs; empty: nowhere."""
+        """Describe the differences of the memory that the C program has shown; empty if none."""
         assert self._memory is not None
         shown = self._shown + [self._known] * ((len(self.calls) - 1) % SHOWN_EVERY > 0)
-        wanted = np.concatenate([memory[: self._memory.compared] for memory in shown])
-        if len(found) != len(wanted):
-            return f"{len(found)} bytes, not {len(wanted)}"
-        a, b = wanted.view(np.float64), np.frombuffer(found, np.float64)
+        expected = np.concatenate([memory[: self._memory.compared] for memory in shown])
+        if len(found) != len(expected):
+            return f"{len(found)} bytes, not {len(expected)}"
+        a, b = expected.view(np.float64), np.frombuffer(found, np.float64)
         other = (a.view(np.uint64) != b.view(np.uint64)) & ~(np.isnan(a) & np.isnan(b))
         return f"{other.sum()} of {len(a)} words differ" if other.any() else ""
 
@@ -163,7 +163,7 @@ def _compare(chosen: list[str]) -> None:
         program, symbols = _program(Path(folder))
         flown = {name: case for name, case in cases().items() if name in chosen or not chosen}
         for name, case in flown.items():
-            recordings: dict[int, Recording] = {}  # of the batches of a case, most have one
+            recordings: dict[int, Recording] = {}  # by batch; most cases have one
 
             def record(batch: Any, command: int, found: Any = recordings) -> Any:
                 recording = found.setdefault(id(batch), Recording(symbols))
@@ -188,7 +188,7 @@ def _compare(chosen: list[str]) -> None:
 
 
 def main() -> None:
-    """Check the tools, build the library with which Python flies, and compare in a process."""
+    """Check the tools, build the library for Python, and compare in a separate process."""
     missing = [tool for tool in (COMPILER, EMULATOR, "cc") if shutil.which(tool) is None]
     if missing:
         print(

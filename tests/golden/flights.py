@@ -1,7 +1,7 @@
-"""The golden flights: what flies, and its digest.
+"""The golden flights and their digests.
 
 python -m tests.golden.flights            # compare with the digests in flights.json
-python -m tests.golden.flights --renew    # make them anew
+python -m tests.golden.flights --renew    # renew the digests
 """
 
 import argparse
@@ -47,14 +47,14 @@ def _late(suite, gnss=0.1, camera=0.06):
 
 
 def _early(fault):
-    """The faults of a preset, those that come at a time before flights end in a crash."""
+    """Return the faults of a preset, with start times before flights end in a crash."""
     return [
         single if single.start is None else single.replace(start=0.2) for single in PRESETS[fault]
     ]
 
 
 def trajectories():
-    """Two of coefficients that no solver has rounded: loops, and from rest to rest."""
+    """Return two trajectories with exact coefficients: a loop, and a path from rest to rest."""
     s3 = np.poly1d([1, 0, 0, 0])
     hump = s3 * np.poly1d([-1, 1]) ** 3  # s^3 (1 - s)^3
     rise = s3 * np.poly1d([-20, 70, -84, 35, 0])
@@ -76,7 +76,7 @@ def trajectories():
 
 
 def cases():
-    """Keywords of the environments that fly, by name."""
+    """Return the keywords of the environments, by name of the case."""
     found = {}
     for task in ("Hover", "Circle", "Lemniscate", "RandomTrajectory", "Waypoints"):
         for suite in SUITES:
@@ -171,11 +171,11 @@ def cases():
 
 
 def fly(case, flights=FLIGHTS, threads=None):
-    """The digest of the first FLIGHTS flights of a case, which must not depend on the others."""
+    """Return the digest of a case's first FLIGHTS flights; it must not depend on the others."""
     keywords = dict(case)
     task = keywords.pop("id", "Circle")
     name = f"QuadGym/{task}-v0"
-    if task == "Circle":  # most cases take off; its default, either start, is a case of its own
+    if task == "Circle":  # most cases take off; the default start is a separate case
         keywords.setdefault("start", "ground")
     env = gymnasium.make_vec(name, num_envs=flights, threads=threads, **keywords)
     digest = hashlib.sha256()
@@ -186,7 +186,7 @@ def fly(case, flights=FLIGHTS, threads=None):
         observations, rewards, *_ = env.step(actions)
         if step % 30 == 29:
             parts = observations.values() if isinstance(observations, dict) else (observations,)
-            # the columns of "drawn" that there were first
+            # only the oldest columns of "drawn"
             states = [
                 batch.record(name)[:, :FIRST] if name == "drawn" else batch.record(name)
                 for name in STATES
@@ -198,14 +198,14 @@ def fly(case, flights=FLIGHTS, threads=None):
 
 
 def differing():
-    """Names of the cases whose flights differ from the golden ones."""
+    """Return the names of cases whose flights differ from the golden flights."""
     golden = json.loads(DIGESTS.read_text())
     return [name for name, case in cases().items() if fly(case) != golden.get(name)]
 
 
 def main():
     parser = argparse.ArgumentParser(description="Compare flights with the golden ones.")
-    parser.add_argument("--renew", action="store_true", help="make the digests anew instead")
+    parser.add_argument("--renew", action="store_true", help="renew the digests instead")
     if parser.parse_args().renew:
         digests = {name: fly(case) for name, case in cases().items()}
         DIGESTS.write_text(json.dumps(digests, indent=1) + "\n")

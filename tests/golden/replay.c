@@ -1,7 +1,8 @@
 /* The calls of one golden flight, replayed by compiled kernels on another processor.
 
    Standard input: the memory of a batch, as if it began at a fixed address, and for each call the
-   numbers that Python has written since the last one. Standard output: the memory after calls. */
+   numbers that Python has written since the previous call. Standard output: the memory after
+   calls. */
 
 #include <stdint.h>
 #include <stdio.h>

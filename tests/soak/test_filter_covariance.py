@@ -1,7 +1,7 @@
-"""Millions of filter updates, all suites and faults: sound covariances, every failure counted.
-QUAD_GYM_SOAK_UPDATES sets how many updates are made in all, by default 10^6; `make soak` makes
-10^7. After every update the covariance is factored anew by LAPACK, and an update without effect
-must be one that the filter has told of: by its gate, or as a failure."""
+"""Millions of filter updates, all suites and faults: valid covariances, every failure counted.
+QUAD_GYM_SOAK_UPDATES sets the total number of updates, by default 10^6; `make soak` makes 10^7.
+After every update LAPACK factors the covariance again. An update without effect must have been
+rejected by the gate or counted as a failure."""
 
 import os
 
@@ -15,9 +15,9 @@ from tests.field_flights import fly
 
 UPDATES = int(float(os.environ.get("QUAD_GYM_SOAK_UPDATES", "1e6")))
 SHARES = {"lab": 0.55, "rtk": 0.25, "consumer": 0.1, "indoor": 0.1}
-"""Of the updates: sensors of the laboratory measure every 5 ms, the consumer's every 100 ms."""
+"""Shares of the updates: `lab` has measurements every 5 ms, `consumer` every 100 ms."""
 COUNTS = {"lab": 64, "rtk": 256, "consumer": 256, "indoor": 256}
-"""Flights at a time, so that each is some 10 s long or longer with the full number of updates."""
+"""Number of flights in a batch, so that each lasts 10 s or more with 10^7 updates."""
 CASES = [
     (suite, kind, fault)
     for suite in SHARES
@@ -32,15 +32,15 @@ CASES = [
 
 @pytest.fixture(scope="module")
 def tally():
-    """Counts over all cases, printed at the end."""
+    """Yield counts over all cases, and print them at the end."""
     counts = {"updates": 0, "failed updates": 0, "failed predictions": 0, "wholly left out": 0}
     yield counts
     print("\n" + ", ".join(f"{number:,} {name}" for name, number in counts.items()))
 
 
 def assert_positive_definite(L):
-    """Factors L (n, 15, 15) are lower triangular, and LAPACK factors L L^T anew. A column of L may
-    have either sign: the large turn of a reset can change it, and not L L^T."""
+    """Check that factors L (n, 15, 15) are lower triangular, and that LAPACK can factor L L^T. A
+    column of L may have either sign: the large turn of a reset can change it, but not L L^T."""
     assert np.isfinite(L).all()
     assert not np.triu(L, 1).any()
     assert (np.diagonal(L, axis1=1, axis2=2) != 0.0).all()
@@ -52,11 +52,11 @@ def assert_positive_definite(L):
     np.linalg.cholesky(correlation)
 
 
-def assert_told(batch, failures, nis):
-    """Failures are those of the status, and no update that was taken went without effect.
+def assert_failures_are_reported(batch, failures, nis):
+    """Check that the status reports all failures, and that each accepted update had an effect.
 
     Returns:
-        How many updates were made, how many of them rejected as a whole, the failures and NIS.
+        Flags of flights with an update, the number of wholly rejected updates, failures and NIS.
     """
     counted = np.array([batch.record("update_failures"), batch.record("prediction_failures")])
     status, now = batch.record("filter_status").astype(np.int64), batch.record("nis")
@@ -66,7 +66,7 @@ def assert_told(batch, failures, nis):
     measured, gate = batch.record("block_valid") > 0.0, batch.record("gate")
     made, accepted = measured.any(axis=1), (measured & (gate == GateDecision.ACCEPTED)).any(axis=1)
     failed = counted[0] > failures[0]
-    known = np.isfinite(now) & np.isfinite(nis)  # of an image processed in steps there is no NIS
+    known = np.isfinite(now) & np.isfinite(nis)  # no NIS for an image processed in steps
     np.testing.assert_array_equal((now != nis)[known], (accepted & ~failed)[known])
     np.testing.assert_array_equal((measured & (gate == GateDecision.FAILED)).any(axis=1), failed)
     return made, int((made & ~accepted & ~failed).sum()), counted, now
@@ -74,7 +74,7 @@ def assert_told(batch, failures, nis):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind", "fault"), CASES)
-def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fault, tally):
+def test_covariances_stay_positive_definite_and_failures_are_reported(name, kind, fault, tally):
     suite = quad_gym.sensor_suite(name)
     suite = suite.replace(estimator=suite.estimator.replace(kind=kind))
     number = CASES.index((name, kind, fault))
@@ -87,13 +87,13 @@ def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fa
     while updates < goal:
         batch.step()
         ticks += 1
-        made, rejected, failures, nis = assert_told(batch, failures, nis)
+        made, rejected, failures, nis = assert_failures_are_reported(batch, failures, nis)
         updates += int(made.sum())
         tally["wholly left out"] += rejected
         looked_at = np.flatnonzero(made | (ticks % 20 == 0))
         if looked_at.size:
             assert_positive_definite(batch.record("L", looked_at))
-        # a crashed vehicle, or one long in the air, begins anew
+        # reset vehicles that have crashed or flown for long
         lost = ~(np.abs(batch.record("r")).max(axis=1) < 1e3) | (ticks % 4000 == 0)
         if lost.any():
             tally["failed updates"] += int(failures[0, lost].sum())

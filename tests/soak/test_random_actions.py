@@ -1,6 +1,6 @@
 """Random actions for a long time, over all tasks and actions: every number stays finite.
-QUAD_GYM_SOAK_STEPS sets how many steps of single flights are flown in all, by default 10^6; the
-full soak flies 10^8."""
+QUAD_GYM_SOAK_STEPS sets the total number of steps of single flights, by default 10^6; the full soak
+makes 10^8."""
 
 import os
 
@@ -18,9 +18,9 @@ COUNT = 1000
 COMBINATIONS = [(task, action) for task in quad_gym.IDS.values() for action in ACTIONS]
 NOT_MEASURED = (
     *("start_given", "innovation", "innovation_sigma", "block_nis", "obstacle_distance"),
-    "nis",  # of an update in steps
-    "stamps",  # of measurements that do not wait
-    "drawn",  # of a sensor that the suite lacks
+    "nis",  # after an update in steps
+    "stamps",  # without a waiting measurement
+    "drawn",  # for a sensor that the suite lacks
 )
 """Fields that hold NaN where nothing was given or measured."""
 ALWAYS_FINITE = [field.name for field in FLIGHT_FIELDS if field.name not in NOT_MEASURED]
@@ -34,7 +34,7 @@ def assert_records_are_finite(env):
 
 @pytest.fixture(scope="module")
 def total():
-    """Counts the steps of all cases and prints them at the end."""
+    """Yield a list of the steps of all cases, and print the total at the end."""
     steps = []
     yield steps
     print(f"\n{sum(steps):,} steps in all")
@@ -42,14 +42,14 @@ def total():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "action"), COMBINATIONS)
-def test_random_actions_leave_no_number_that_is_not_finite(task, action, total):
+def test_records_stay_finite_under_random_actions(task, action, total):
     number = COMBINATIONS.index((task, action))
     suite = quad_gym.sensor_suite("standard").with_rates(gnss=(200.0, 10.0)[number % 2])
-    rate = {} if task in BENCHMARKS else {"sensors": suite}  # they have their own
-    needs_camera = task in ("look_around", "outage_dash")  # or has none to switch off
+    rate = {} if task in BENCHMARKS else {"sensors": suite}  # benchmarks have their own
+    needs_camera = task in ("look_around", "outage_dash")  # or have none to switch off
     camera = {} if needs_camera else {"camera": number % 3 != 0}
     observation = OBSERVATIONS[number % 4]
-    own = observation == "measurements"  # has its own layout
+    own = observation == "measurements"  # these have their own layout
     layout = {} if own else {"layout": ("relative", "absolute")[number // 4 % 2]}
     env = QuadVectorEnv(
         COUNT,

@@ -1,12 +1,11 @@
-"""Coverage of calibrated intervals, on simulated logs whose sensors have drawn numbers.
+"""Coverage of calibrated intervals on simulated logs with randomly drawn sensor numbers.
 
     python -m tests.statistical.calibration_coverage --logs 0 20 --output /tmp/coverage
 
-Each log is a random trajectory with the sensors of a suite. Their noise
-is drawn from 0.8 to several times the suite's, and the delays of time stamps, the magnetic field
-and the mounting of the IMU differ from it. The calibration begins with the suite. Each log takes
-about a minute and has a file of results, so that ranges can be run apart; each run ends with the
-table of all files in the folder.
+Each log is a random trajectory with the sensors of a suite. The noise is drawn from 0.8 to several
+times the suite's noise; delays of time stamps, the magnetic field and the mounting of the IMU also
+differ from the suite. The calibration starts from the suite. Each log takes about a minute and has
+a file of results, so ranges can be run separately. A run prints the table of all files.
 """
 
 import argparse
@@ -42,11 +41,11 @@ SPREADS = {
     **{"declination": 0.2, "inclination": 0.1, "log_rotation": 0.04, "primary_antenna_B": 0.05},
     **{"gnss": 0.2, "magnetometer": 0.08, "barometer": 0.1, "camera": 0.05},
 }
-"""Standard deviations of numbers of either sign; the suite's are their means."""
+"""Standard deviations of numbers of either sign; the means are the suite's numbers."""
 
 
 def drawn(prior, log, rng):
-    """The numbers of a vehicle, by name, and its suite."""
+    """Return drawn numbers of a vehicle, by name, and its suite."""
     suite, true = prior, {}
     for number in numbers_in(prior, log, delays=True):
         before = number.of(prior)
@@ -63,7 +62,7 @@ def drawn(prior, log, rng):
 
 
 def as_logged(table, suite):
-    """The table of a vehicle whose clocks and axes are wrong by a suite's numbers."""
+    """Return the table of a log with the clock delays and the IMU mounting of a suite."""
     R = euler_to_dcm(suite.log_rotation).T  # from B to the axes of the IMU
     table = {name: column.copy() for name, column in table.items()}
     for name in ("gyro", "accel"):
@@ -83,7 +82,7 @@ def as_logged(table, suite):
 
 
 def simulated(index):
-    """A table, the true numbers and the suite without them."""
+    """Return a table, the true numbers, the suite without them and the start."""
     name, rng = SUITES[index % len(SUITES)], np.random.default_rng(100 + index)
     base = quad_gym.sensor_suite(name)
     if base.camera is not None and base.gnss is not None:
@@ -91,7 +90,7 @@ def simulated(index):
     seconds = SECONDS.get(name, LONG)
     log = read_log(Recorded(flown(base, 1.0), base, lost=0.0, jitter=0.0).table())
     prior = _prior_of(base, log)
-    if base.magnetometer is not None:  # the field of the suite, not of one second
+    if base.magnetometer is not None:  # the field of the suite, not the field measured in 1 s
         own = base.magnetometer
         compass = prior.magnetometer.replace(strength=own.strength, inclination=own.inclination)
         prior = prior.replace(magnetometer=compass)
@@ -108,7 +107,7 @@ def simulated(index):
 
 
 def run(index):
-    """Results of one log."""
+    """Return the results of one log."""
     began = time.process_time()
     table, true, base, start = simulated(index)
     flown_in = time.process_time() - began
@@ -126,7 +125,7 @@ def run(index):
 
 
 def table_of(folder):
-    """Lines of a table of all results."""
+    """Return the lines of a table of all results."""
     results = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
     inside, lines = {}, []
     nis = {}
@@ -156,7 +155,7 @@ def table_of(folder):
 
 
 def main():
-    """Run the logs that have no results yet."""
+    """Run the logs that have no results yet, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--logs", type=int, nargs=2, default=(0, 20))
     parser.add_argument("--output", type=Path, default=Path("/tmp/coverage"))

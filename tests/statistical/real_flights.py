@@ -1,9 +1,9 @@
-"""Calibrations on a part of a real flight, or another flight, judged on the rest.
+"""Calibrations on part of a real flight, or on another flight, validated on the rest.
 
     python -m tests.statistical.real_flights --ardupilot FOLDER --rtk FOLDER FOLDER FOLDER
 
-Prints the tables of docs/calibration.md. The folders are as published, see
-docs/examples/real_flights.py. It takes about five minutes.
+The script prints the tables of docs/calibration.md, in about five minutes. The folders are as
+published, see docs/examples/real_flights.py.
 """
 
 import argparse
@@ -25,7 +25,7 @@ MOVING = 10.0  #: time from which fixes are left out, as the filter starts in mo
 
 
 def attitude_errors(result, folder):
-    """Root mean square differences of roll, pitch, yaw from the autopilot, about their median."""
+    """Return RMS differences of roll, pitch and yaw from the autopilot, about their medians."""
     autopilot = np.loadtxt(folder / "ATT.txt")
     time = 1e-3 * autopilot[:, 0]
     rows = np.clip(np.searchsorted(result.time, time), 0, len(result.time) - 1)
@@ -44,7 +44,7 @@ def attitude_errors(result, folder):
 
 
 def fit_texts(validation):
-    """Texts of a validation."""
+    """Yield texts that describe a validation."""
     for name, fit in validation.sensors.items():
         yield f"{name} {fit.mean_nis:.2f}, rejected {100.0 * fit.rejected:.1f} %"
     if validation.held_out_error is not None:
@@ -55,7 +55,7 @@ def fit_texts(validation):
 
 
 def hobby_vehicle(folder):
-    """Print what `consumer`, the calibrated suite and `flown` make of the flight."""
+    """Print the results of `consumer`, the calibrated suite and `flown` for the flight."""
     log = read_log(real_flights.table(real_flights.ardupilot_flight(folder)))
     found = calibrate(log, sensors="consumer")
     for number in found.numbers:
@@ -69,7 +69,7 @@ def hobby_vehicle(folder):
 
 
 def survey_vehicle(folders):
-    """Print offsets of the clocks, and predictions with the numbers of each flight."""
+    """Print clock offsets, and predictions with the numbers of each flight."""
     flights = {}
     for folder in folders:
         rows, heading = real_flights.rtk_flight(folder)
@@ -94,7 +94,7 @@ def survey_vehicle(folders):
 
 
 def main():
-    """Print the tables of the folders that are given."""
+    """Print the tables of the given folders."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ardupilot", type=Path)
     parser.add_argument("--rtk", type=Path, nargs="*", default=())

@@ -1,4 +1,4 @@
-"""Filters with a barometer and a magnetometer are consistent, late and gated, cold and warm."""
+"""Filters with a barometer and a magnetometer are consistent, with latency and after any start."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.field_flights import fly, nees, state_errors, steps
 
 
 def aided(suite, kind="ukf", late=False, gate=True, **sensors):
-    """A suite with both, without what a filter does not model; or with those given."""
+    """Return a simplified suite with a barometer and a magnetometer, or with the given sensors."""
     plain = quad_gym.sensor_suite(suite).simplified()
     choices = {} if gate else {"false_alarm_probability": 0.0}
     both = {
@@ -25,8 +25,8 @@ def aided(suite, kind="ukf", late=False, gate=True, **sensors):
 
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-def test_late_and_gated_flights_are_consistent_after_two_seconds(kind):
-    """Mean NEES of 300 flights, of deviation 0.32; NIS of the last ones, of 0.08 and 0.14."""
+def test_filter_with_late_gated_measurements_is_consistent(kind):
+    """Standard deviations of means over 300 flights are 0.32 for NEES, 0.08 and 0.14 for NIS."""
     batch = fly(aided("consumer", kind, late=True), 300, filter_start="warm")
     steps(batch, 2.0)
     assert not batch.record("filter_status").any()
@@ -37,9 +37,9 @@ def test_late_and_gated_flights_are_consistent_after_two_seconds(kind):
     assert (batch.record("rejections")[:, AID_BLOCKS:] <= 1).all()
 
 
-def test_a_heading_is_as_wrong_as_claimed_while_maneuvers_tell_it():
-    """Mean square of 1,200 headings, of deviation 0.04. It is 1.3 where velocities tell nothing of
-    the heading and hard iron does not follow it; the unit tests notice either by itself."""
+def test_heading_error_during_maneuvers_matches_covariance():
+    """The mean square of 1,200 errors has a standard deviation of 0.04. It would be 1.3 if velocity
+    did not observe the heading and hard iron did not follow it; unit tests detect either alone."""
     batch = fly(quad_gym.sensor_suite("consumer"), 1200, task="hover", filter_start="cold")
     steps(batch, 1.5)
     vertical = batch.record("R_hat")[:, :, 2]
@@ -49,8 +49,8 @@ def test_a_heading_is_as_wrong_as_claimed_while_maneuvers_tell_it():
     assert (error**2 / variance).mean() == pytest.approx(1.03, abs=0.13)
 
 
-def test_slow_errors_and_state_go_together_as_a_warm_filter_claims():
-    """The joint error has the joint covariance, and nothing to do with the estimate."""
+def test_joint_error_of_state_and_slow_errors_matches_warm_start_covariance():
+    """The joint error has the joint covariance, and is uncorrelated with the estimate."""
     sensors = aided("consumer")
     batch, flights = fly(sensors, 4000, task="hover", filter_start="warm"), 4000
     places = slow_states(sensors)
@@ -65,7 +65,7 @@ def test_slow_errors_and_state_go_together_as_a_warm_filter_claims():
     L = np.zeros((flights, 24, 24))
     L[:, :15, :15], L[:, 15:] = batch.record("L"), batch.record("L_slow")
     joint = np.concatenate([state_errors(batch), errors], axis=1)
-    white = np.linalg.solve(L, joint[..., np.newaxis])[..., 0][:, :23]  # the last measures nothing
+    white = np.linalg.solve(L, joint[..., np.newaxis])[..., 0][:, :23]  # the last state is unused
     np.testing.assert_allclose(np.cov(white.T), np.eye(23), atol=0.1)
     estimate = hat[:, vector : vector + 3]
     correlation = (estimate * errors[:, vector : vector + 3]).mean(axis=0)

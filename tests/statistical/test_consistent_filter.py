@@ -1,6 +1,6 @@
-"""The suites' filters are consistent, for UKF and EKF alike; the report's is not, by how much.
-Means over 1,500 flights of random trajectories, on the estimate, judged by the band of 1,000
-flights. Errors of biases last for seconds, so that the means of fewer flights are all high or all
+"""The filters of the field suites are consistent, both UKF and EKF.
+Means over 1,500 flights of random trajectories, on the estimate, are compared with the band of
+1,000 flights. Bias errors last for seconds, so the means of fewer flights may all be high or all
 low for long, by chance."""
 
 import numpy as np
@@ -17,7 +17,7 @@ from tests.consistent import assert_consistent
 
 
 def flown(sensors, *, flights=1500, seconds=10.0, matched=False, **keywords):
-    """What came of flights on the estimate, none of whose filters failed."""
+    """Return the consistency of flights on the estimate; check that no filter failed."""
     task = endless(TASK_DEFAULTS["random_trajectory"])
     batch = FlightBatch(
         flights, sensors=sensors, task=task, gains="tuned", innovations=True, **keywords
@@ -31,8 +31,8 @@ def flown(sensors, *, flights=1500, seconds=10.0, matched=False, **keywords):
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("suite", ["rtk", "consumer", "indoor"])
-def test_a_suite_is_consistent_from_its_first_instant_on(suite, kind, start):
-    """But for baselines with a constant heading error, which the filter counts as noise."""
+def test_filter_of_suite_is_consistent_from_first_instant(suite, kind, start):
+    """Baselines with a constant heading error are an exception: the filter models it as noise."""
     sensors = quad_gym.sensor_suite(suite)
     sensors = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
     findings = flown(sensors, filter_start=start)
@@ -43,15 +43,15 @@ def test_a_suite_is_consistent_from_its_first_instant_on(suite, kind, start):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-def test_errors_of_prediction_alone_are_as_claimed(kind):
-    """10,000 runs of IMU alone: the covariance within 5 % of its diagonal."""
+def test_prediction_errors_match_covariance(kind):
+    """The covariance of 10,000 runs on the IMU alone agrees within 5 % of its diagonal."""
     runs = 10_000
     sensors = quad_gym.sensor_suite("rtk").simplified()
     sensors = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
-    alike = {"source": Source.TRUTH, "run_filter": True}  # so that all fly and claim alike
+    on_truth = {"source": Source.TRUTH, "run_filter": True}  # equal flights and covariances
     task = endless(TASK_DEFAULTS["circle"])
     made = {"sensors": sensors, "gains": "tuned", "task": task, "filter_start": "warm"}
-    batch = flights_of(runs, **made, **alike)
+    batch = flights_of(runs, **made, **on_truth)
     start_matched(batch, seed=7)
     batch.switch_sensors(gnss=False, camera=False)
     first = np.sqrt(np.diagonal(batch.covariance()[0]))

@@ -1,9 +1,8 @@
-"""Outages, outliers and jumps over 1,000 flights: the filter knows how lost it is, and comes back.
-"Inside 3 sigma" of an error of d numbers means that its normalized square is below the chi-square
-quantile that holds 99.73 % of a consistent filter's errors, as 3 sigma do of a single number. Of
-1,000 flights of such a filter nearly three lie outside at any given instant, so that no filter can
-have all of them inside at one instant; it must have each of them inside at some instant of the time
-allowed, and all of them within the quantile of 1e-6 in 1,000 at its end."""
+"""Outages and outliers over 1,000 flights: errors match the covariance, and decrease afterwards.
+An error of d numbers is "inside 3 sigma" if its normalized square is below the 99.73 % quantile of
+chi-square, as for 3 sigma of a single number. Of 1,000 flights of a consistent filter, nearly three
+are outside at any given instant. So each flight must be inside at some instant of the allowed time,
+and all of them within the quantile of 1e-6 in 1,000 at its end."""
 
 import numpy as np
 import pytest
@@ -32,10 +31,10 @@ def of_kind(suite, kind):
 
 @pytest.mark.parametrize("suite", [LAB, RTK], ids=["euler", "midpoint"])
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
-def test_uncertainty_at_rest_grows_in_closed_form(kind, suite):
-    """Double and triple integrals of white noise and of constants, at rest and level. Gravity
-    couples tilt into horizontal acceleration; constant biases, for their time constant is a million
-    years here."""
+def test_covariance_growth_at_rest_matches_closed_form(kind, suite):
+    """The closed form has double and triple integrals of white noise and of constants, at rest and
+    level. Gravity couples tilt into horizontal acceleration. Biases are constant, as their time
+    constant is a million years."""
     forever = {"accel_bias_tau": 3e13, "gyro_bias_tau": 3e13}
     suite = suite.replace(imu=suite.imu.replace(**forever))
     g, dt = suite.estimator.gravity, suite.imu.dt
@@ -57,7 +56,7 @@ def test_uncertainty_at_rest_grows_in_closed_form(kind, suite):
 
 
 def lost_for_a_minute(suite, task, dark=OUTAGE):
-    """Flights on the true state just when an outage of a minute begins, the camera dark, too."""
+    """Return flights on the true state when a GNSS outage of a minute and a dark image begin."""
     faults = [GnssOutage(start=BEFORE, duration=OUTAGE)]
     if suite.camera is not None:
         faults.append(CameraOcclusion(start=BEFORE, duration=dark))
@@ -79,8 +78,8 @@ def lost_for_a_minute(suite, task, dark=OUTAGE):
         ("consumer", "ukf", "random_trajectory", OUTAGE),
     ],
 )
-def test_error_after_an_outage_is_soon_inside_three_sigma(name, kind, task, dark):
-    """Also where the camera is back before, and sees features that the filter has long lost."""
+def test_error_returns_within_three_sigma_after_outage(name, kind, task, dark):
+    """In one case the camera returns before GNSS, with features far from their predictions."""
     batch = lost_for_a_minute(of_kind(quad_gym.sensor_suite(name), kind), task, dark)
     steps(batch, OUTAGE - batch.sensors.imu.dt)
     assert batch.active_faults()["gnss_outage"].all()
@@ -105,7 +104,7 @@ def test_error_after_an_outage_is_soon_inside_three_sigma(name, kind, task, dark
 
 
 def rms_error(suite, faults):
-    """Of the estimated position, over flights on the estimate, from two to twelve seconds [m]."""
+    """Return the RMS position error of flights on the estimate, from 2 s to 12 s [m]."""
     batch = fly(suite, COUNT, faults=faults, threads=1)
     steps(batch, 2.0)
     squares = []
@@ -130,7 +129,7 @@ SUITES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SUITES)
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-def test_with_five_percent_outliers_the_error_is_hardly_larger(kind, name):
+def test_five_percent_outliers_raise_rms_error_by_less_than_20_percent(kind, name):
     suite = of_kind(SUITES[name], kind)
     clean = rms_error(suite, None)
     corrupt = rms_error(suite, GnssOutliers(share=0.05, size=(10.0, 100.0)))

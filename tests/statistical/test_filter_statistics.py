@@ -1,6 +1,6 @@
-"""What the filter believes of its errors, and what they are: over thousands of flights. Seeds are
-fixed, so a run of these tests is repeatable; the bounds leave a false alarm less often than once in
-a million draws of seeds."""
+"""Errors and covariances of the filter over thousands of flights.
+The seeds are fixed, so the tests are repeatable. With random seeds, a false alarm would have a
+probability below 1e-6."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ FLIGHTS = 1000
 
 
 def circle_batch(sensors=LAB, source=Source.ESTIMATE, **options):
-    """The report's experiment, one flight per seed."""
+    """Return the report's experiment, with one flight per seed."""
     task = TaskParams(duration=0, pad=False)
     return flights_of(FLIGHTS, sensors=sensors, source=source, task=task, **options)
 
@@ -31,18 +31,18 @@ def nees_after_five_seconds(sensors):
 
 
 @pytest.mark.parametrize("sensors", [LAB.replace(camera=None), PREDICTED], ids=["blind", "camera"])
-def test_the_errors_are_about_as_large_as_the_filter_believes(sensors):
-    """15 for a perfect filter; it holds an IMU sample over the tick, which costs a little."""
+def test_mean_nees_after_five_seconds_is_about_15(sensors):
+    """NEES is 15 for a perfect filter; holding IMU samples over a tick increases it slightly."""
     assert 13.0 < nees_after_five_seconds(sensors).mean() < 18.0
 
 
-def test_a_first_fix_starts_the_filter_with_errors_that_it_expects():
-    """Both directions of Wahba's problem give way: the errors are smaller than believed."""
+def test_errors_after_first_fix_are_no_larger_than_claimed():
+    """Wahba's solution adjusts to both directions, so the errors are smaller than claimed."""
     batch = circle_batch(LAB.replace(camera=None))
     assert 8.0 < nees(batch).mean() < 16.0
 
 
-def test_more_noise_moves_flights_on_the_estimate_only():
+def test_sensor_noise_changes_only_flights_on_the_estimate():
     paths = {}
     for source in (Source.TRUTH, Source.ESTIMATE):
         for factor in (1.0, 10.0):

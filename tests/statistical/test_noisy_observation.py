@@ -1,4 +1,4 @@
-"""The noise of `observation="noisy"` is as large as the errors of each suite's own filter."""
+"""The noise of `observation="noisy"` is as large as the errors of the suite's filter."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ FLIGHTS, RATE, BEGIN, END = 256, 50.0, 20.0, 26.0
 
 
 def measured_errors(suite):
-    """Root mean square errors per axis of what control on the estimate sees, on the circle."""
+    """Return RMS errors per axis of the state that control on the estimate uses, on the circle."""
     task = TaskParams(kind="circle", start="hover", duration=0.0, out_of_bounds=100.0)
     batch = FlightBatch(
         FLIGHTS, sensors=suite, task=task, source=Source.ESTIMATE, control_rate=RATE, gains="tuned"
@@ -34,7 +34,7 @@ def measured_errors(suite):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["rtk", "consumer", "indoor"])
-def test_noise_of_a_suite_is_the_error_of_its_filter(suite):
+def test_observation_noise_of_suite_equals_rms_error_of_its_filter(suite):
     noisy = sensor_suite(suite).noisy
     stated = [noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates]
     np.testing.assert_allclose(stated, measured_errors(suite), rtol=0.25)

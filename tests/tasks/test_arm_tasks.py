@@ -1,4 +1,4 @@
-"""Variants of tasks that arms of a study learn in, recomputed from the flights."""
+"""Task variants in which arms of a study learn, recomputed from the flights."""
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,7 @@ def largest_sigma(env):
     return np.sqrt(np.diagonal(L @ L.transpose(0, 2, 1), axis1=1, axis2=2)[:, :3]).max(axis=1)
 
 
-def test_log_sigma_is_that_of_the_largest_position_sigma():
+def test_log_sigma_is_logarithm_of_largest_position_sigma():
     env, observations = make("WithStd")
     for _ in range(30):
         expected = np.log10(largest_sigma(env) / 0.03)
@@ -104,7 +104,7 @@ def test_observed_race_equals_the_builtin_observation():
         a, b = plain.step(action)[0], own.step(action)[0]
 
 
-def test_residuals_of_a_race_are_those_of_the_model():
+def test_residual_race_observes_true_state_plus_residual():
     env, b = make("ResidualRace", env_id="QuadGym/StaleRace-v0", observation="truth")
     batch = env.unwrapped.flights.batch
     for _ in range(30):
@@ -138,7 +138,7 @@ def test_constant_crash_cost_is_the_same_everywhere():
         "ConstantCrashCostWithUncertainty", env_id="QuadGym/OutageDash-v0", observation="truth"
     )
     batch, last, action = env.unwrapped.flights.batch, np.zeros((6, 4)), np.zeros((6, 4))
-    action[:, :3] = 0.3, 0.0, -0.5  # on, and down to the ground
+    action[:, :3] = 0.3, 0.0, -0.5  # forward, and down to the ground
     for _ in range(60):
         _, reward, over, *_ = env.step(action)
         effort = ((action - last) ** 2).sum(axis=1)
@@ -148,7 +148,7 @@ def test_constant_crash_cost_is_the_same_everywhere():
         if over.any():
             return
         last = action
-    raise AssertionError("nobody crashed")
+    raise AssertionError("no flight crashed")
 
 
 def test_starts_are_before_the_first_wall_or_between_two():
@@ -198,7 +198,7 @@ def test_rules_fly_the_plain_task_and_arms_the_scaled_one():
 
 
 def true_state(env, target):
-    """Of flights whose reference stands at targets: errors, vertical, rates; rotated by SciPy."""
+    """Return true errors relative to fixed targets, up and body rates, rotated by SciPy."""
     batch = env.unwrapped.flights.batch
     body = Rotation.from_quat(batch.record("q"), scalar_first=True)
     into = body.inv().apply
@@ -265,7 +265,7 @@ def test_certainty_reward_is_added():
     (plain, _), (paid, _) = make("WithStd"), make("WithStdCertaintyReward")
     for _ in range(40):
         actions = np.zeros((6, 4), np.float32)
-        actions[:, 3] = 1.0  # turning, so that markers come and go
+        actions[:, 3] = 1.0  # turn, so that features enter and leave the view
         reward, with_pay = plain.step(actions)[1], paid.step(actions)[1]
         expected = reward + np.maximum(0.3 - 0.6 * largest_sigma(paid), 0.0)
         np.testing.assert_allclose(with_pay, expected, atol=1e-12)

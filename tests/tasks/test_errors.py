@@ -16,7 +16,7 @@ FLIGHTS = 9
 
 
 def at(flights, value):
-    """(n,) ones, with a value at some flights."""
+    """Return ones (n,), with a value at some flights."""
     array = np.ones(FLIGHTS)
     array[list(flights)] = value
     return array
@@ -72,7 +72,7 @@ CASES = [(method, *case) for method, cases in WRONG.items() for case in cases]
 
 
 class Switch:
-    """A method that is right until it is switched."""
+    """Method that returns valid values until it is switched."""
 
     def __init__(self, method, wrong):
         right = {
@@ -115,7 +115,7 @@ def test_error_names_method_and_flights_and_reset_recovers(method, wrong, messag
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_snapshot_from_before_an_error_flies_on(mode):
+def test_snapshot_from_before_error_is_restored_and_continues(mode):
     env, switch = with_switch("reward", lambda v: at([1], np.nan), mode)
     actions = np.full((FLIGHTS, 4), 0.1)
     env.step(actions)
@@ -132,7 +132,7 @@ def test_snapshot_from_before_an_error_flies_on(mode):
 
 def test_flights_that_failed_must_be_reset():
     class Wrong(quad_gym.Task):
-        """Starts where it must not, if told so."""
+        """Task whose start can be set to an invalid one."""
 
         wrong = None
 
@@ -186,7 +186,7 @@ def test_interrupted_step_needs_a_reset():
 
 def test_privileged_task_observes_the_truth():
     class Open(quad_gym.Task):
-        """Sees it all."""
+        """Task that observes the truth."""
 
         privileged = True
 
@@ -251,7 +251,7 @@ def test_invalid_declarations_are_refused(attributes, message):
         gymnasium.make("QuadGym/Hover-v0", task=quad_gym.Task.of(**attributes))
 
 
-def test_misspelled_method_is_warned_of():
+def test_misspelled_method_gives_warning():
     with pytest.warns(UserWarning, match=r"Mine\.rewards is not called; did you mean reward\?"):
 
         class Mine(quad_gym.Task):
@@ -271,10 +271,10 @@ def test_misspelled_method_is_warned_of():
 
 def test_missing_attribute_of_a_user_object_has_no_suggestion():
     class Silent:
-        """Does not say what it has."""
+        """Object that does not list its attributes."""
 
         def __dir__(self):
-            raise RuntimeError("nobody may ask")
+            raise RuntimeError("attributes are not listed")
 
     env = vec_env(count=2, seed=0, task=quad_gym.Task.of(reward=lambda view: Silent().gain))
     with pytest.raises(TaskError, match=r"reward failed.*no attribute 'gain'$") as caught:

@@ -1,4 +1,4 @@
-"""What else takes a task: checkers, registration, policies, commands, rendering."""
+"""Tests of tasks in registration, policies, observations, commands and rendering."""
 
 import json
 
@@ -17,7 +17,7 @@ from tests.tasks.tasks import Chase
 
 
 class Half(quad_gym.Task):
-    """Half the reward that ships."""
+    """Task with half of the built-in reward."""
 
     def reward(self, view):
         return 0.5 * view.builtin.reward
@@ -35,7 +35,7 @@ def registered():
     del gymnasium.registry["Mine/Chase-v0"]
 
 
-def test_a_registered_id_makes_all_interfaces(registered):
+def test_registered_id_works_in_all_interfaces(registered):
     one = gymnasium.make(registered)
     assert one.spec.max_episode_steps == 30
     assert one.observation_space.shape == (32,)
@@ -122,7 +122,7 @@ def test_observations_are_clipped_to_their_bounds():
     assert env.observation_space.contains(observation)
 
 
-def test_a_lone_array_needs_no_name():
+def test_observed_array_without_name_is_called_observed():
     env = gymnasium.make(
         "QuadGym/Hover-v0", task=quad_gym.Task.of(observe=lambda view: view.observed.position)
     )

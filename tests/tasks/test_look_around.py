@@ -1,4 +1,4 @@
-"""`LookAround`: reward, observation and features in view recomputed, and what fixed rules reach."""
+"""`LookAround`: recomputed reward, observation and features in view, and results of policies."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ def actions(rng, count):
 @pytest.mark.parametrize(
     ("weight", "options"), [(0.15, {}), (0.3, {"sensors": "indoor"})], ids=["default", "others"]
 )
-def test_reward_is_its_equation(weight, options):
+def test_reward_equals_documented_equation(weight, options):
     task = {"task": LookAround(heading_weight=weight)} if options else {}
     env, rng = make(**options, **task), np.random.default_rng(0)
     env.reset(seed=0)
@@ -52,7 +52,7 @@ def test_reward_is_its_equation(weight, options):
         if over.any():
             env.reset(options={"reset_mask": over})
             over[:] = False
-    assert crashes > 5  # the cost of a crash has been compared, too
+    assert crashes > 5  # the cost of a crash was compared, too
 
 
 @pytest.mark.parametrize("observation", ["estimate", "truth", "noisy"])
@@ -98,7 +98,7 @@ def facing():
 def test_rule_that_never_looks_crashes_more_than_one_that_does(facing):
     env = gymnasium.make_vec(ID, num_envs=60)
     blind = fly(PDPolicy(env), env, 0, traced=("sigma",))
-    # 64 % of 500 crash: of 60 at most 24 with a probability below 1e-4
+    # 64 % of 500 flights crash; at most 24 crashes in 60 flights have p < 1e-4
     assert blind.episodes.crashed.mean() > 0.4
     assert not facing.episodes.crashed.any()
     assert facing.recorded["in_view"].mean() > 0.9 > 0.7 > blind.recorded["in_view"].mean()
@@ -124,7 +124,7 @@ def test_policy_without_features_in_its_observation_is_refused():
         PDPolicy(circle, faces="north")
 
 
-def test_other_weights_are_used_and_invalid_ones_refused():
+def test_other_weights_are_accepted_and_invalid_ones_refused():
     quad_gym.register_task("Test/LookMore-v0", LookAround(heading_weight=0.2), ID)
     flights = gymnasium.make_vec("Test/LookMore-v0", num_envs=2).unwrapped.flights
     assert (flights.name, flights.task.duration) == ("look_around", 15.0)

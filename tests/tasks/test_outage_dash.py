@@ -1,4 +1,4 @@
-"""`OutageDash`: course, reward and observation recomputed, and what fixed rules reach."""
+"""`OutageDash`: recomputed course, reward and observation, and results of policies."""
 
 import itertools
 
@@ -28,7 +28,7 @@ def actions(rng, count):
 
 
 def edges(batch):
-    """(n, 10) places of the walls, and of the northern and southern edges of their gaps."""
+    """Return x of the walls, and y of the northern and southern edges of gaps, (n, 10) each."""
     walls = batch.record("obstacle_center")[:, :20]
     assert batch.world.obstacles[0].size == (0.3, 30.0, 12.0)
     return walls[:, ::2, 0], walls[:, ::2, 1] - 15.0, walls[:, 1::2, 1] + 15.0
@@ -77,7 +77,7 @@ def test_gaps_have_the_specified_distribution():
 
 
 @pytest.mark.parametrize("keywords", [{}, FAST])
-def test_reward_is_its_equation(keywords):
+def test_reward_equals_documented_equation(keywords):
     env, rng = make(30, observation="truth", **keywords), np.random.default_rng(0)
     env.reset(seed=0)
     batch, crashes, over = env.unwrapped.flights.batch, 0, np.zeros(30, bool)
@@ -179,7 +179,7 @@ def test_outage_without_sensors_is_refused():
 
 
 def test_fixed_rules_crash_in_some_flights():
-    """Of 60 flights each, 0 crash on the truth, 19 on the estimate, and 6 of those that wait."""
+    """PD control crashes in 0 of 60 flights on the truth, 19 on the estimate, and 6 if it waits."""
     crashed, returns = {}, {}
     for name, shown in (
         ("pd", {"observation": "truth"}),

@@ -29,7 +29,7 @@ GALLERY = DOCS / "gallery"
 
 
 def run(name, folder=GALLERY):
-    """The names of an example that has run in a folder."""
+    """Run an example in a folder; return its names."""
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     with contextlib.chdir(folder):
@@ -40,7 +40,7 @@ TRAINED = ("landing.py", "moving_target.py", "slalom.py")
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_the_policy_of_an_example_does_what_the_example_says(name):
+def test_policy_of_example_reaches_result_stated_there(name):
     run(name)  # it asserts the result
 
 
@@ -52,19 +52,19 @@ def test_an_example_trains_its_policy(name, tmp_path):
     assert (tmp_path / "policies" / name).with_suffix(".npz").exists()
 
 
-def test_the_trajectory_is_followed():
+def test_trajectory_example_follows_its_trajectory():
     names = run("own_trajectory.py")
     assert names["info"]["position_error"].max() < 0.1
     assert np.linalg.norm(names["path"](names["t"], 1), axis=1).max() <= 2.5
 
 
-def test_looking_at_markers_pays():
+def test_reward_is_higher_when_looking_at_markers():
     names = run("look_at_markers.py")
     toward, away = (line.get_ydata() for line in names["of_reward"].lines)
     assert toward[:20].mean() > away[:20].mean() + 0.2
 
 
-def test_a_foreign_policy_adapts_to_a_mass_that_it_is_not_given():
+def test_foreign_policy_adapts_to_unknown_mass():
     pytest.importorskip("foundation_policy")
     names = run("foreign_policy.py")
     assert max(names["errors"][:5]) < 40.0  # mm, half to twice the assumed mass
@@ -74,7 +74,7 @@ TASKS = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", TASKS.read_text(encoding="utf-8"), re.DOTALL)[:3]
 
 
-def test_examples_do_what_the_page_says():
+def test_examples_of_page_give_stated_results():
     names, envs = {}, []
     for block in BLOCKS:
         exec(block, names)
@@ -83,7 +83,7 @@ def test_examples_do_what_the_page_says():
     reward.reset(seed=0)
     first = reward.step(np.full(4, 0.5, np.float32))[1]
     again = reward.step(np.full(4, 0.5, np.float32))[1]
-    assert again > first + 0.05, "a change of the action costs 0.1 of its square more"
+    assert again > first + 0.05, "a change of the action costs 0.1 times its square"
     flown = names["path"]
     times = np.linspace(0.0, flown.duration, 20_001)
     for point in names["points"]:

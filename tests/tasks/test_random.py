@@ -6,7 +6,7 @@ from scipy import stats
 
 from quad_gym.tasks.random import FlightRandom, threefry
 
-ALARM = 1e-6  # probability that a sound generator fails one statistical test
+ALARM = 1e-6  # probability that a correct generator fails one statistical test
 
 
 def generator(flights, method=1, seed=0):

@@ -1,4 +1,4 @@
-"""Equal flights of a task in all interfaces and modes, and of the built-in task without changes."""
+"""Tasks without changes fly as the built-in task, in all modes; resets and snapshots."""
 
 import gymnasium
 import numpy as np
@@ -35,7 +35,7 @@ def fields_of(env):
 
 
 def fly(env, seeds):
-    """Everything that a vector environment returns, and often all that its flights are."""
+    """Return all results of a vector environment, and all fields in every sixth step."""
     rows, over = [env.reset(seed=list(seeds))], np.zeros(env.num_envs, bool)
     for k, action in enumerate(actions_for(range(env.num_envs))):
         if env.autoreset_mode.value == "Disabled" and over.any():
@@ -57,7 +57,7 @@ WITHOUT_TASK["per second"] = ("circle", {"reward_per": "second", "privileged": T
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", WITHOUT_TASK)
-def test_task_without_changes_changes_no_flight(name, mode):
+def test_task_equal_to_builtin_task_gives_same_flights(name, mode):
     base, keywords = WITHOUT_TASK[name]
     made = {"autoreset_mode": mode, **SHORT, **keywords}
     plain = fly(vec_env(base, 5, **made), range(5))

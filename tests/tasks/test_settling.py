@@ -10,8 +10,8 @@ from tests.builders import vec_env
 FLIGHTS, STEPS, LIMIT = 13, 60, 40
 
 
-class Said:
-    """Return values of a task, drawn for every step."""
+class RandomAnswers:
+    """Random return values of a task for every step."""
 
     def __init__(self, methods):
         self.rng, self.methods = np.random.default_rng(7), methods
@@ -26,12 +26,12 @@ class Said:
         return quad_gym.Task.of(**answers)
 
 
-def expected_endings(said, plain):
-    """Terminated, truncated and the reason, by the rules, from results of the built-in task."""
+def expected_endings(random_answers, plain):
+    """Return terminated, truncated and ending by the rules, from built-in results."""
     crashed = plain.result("terminated") > 0.0
     late, failed = plain.result("episode_steps") >= LIMIT, plain.result("filter_status") > 0.0
-    terminated = said.terminated if "terminated" in said.methods else crashed
-    truncated = said.truncated if "truncated" in said.methods else late | failed
+    terminated = random_answers.terminated if "terminated" in random_answers.methods else crashed
+    truncated = random_answers.truncated if "truncated" in random_answers.methods else late | failed
     why, cut = np.where(terminated | truncated, float(Ending.TASK), 0.0), truncated & ~terminated
     why[cut & late] = Ending.TIME_LIMIT
     why[cut & failed] = Ending.FILTER_FAILED
@@ -44,24 +44,24 @@ def expected_endings(said, plain):
     [("reward",), ("terminated",), ("truncated", "reward"), ("reward", "terminated", "truncated")],
 )
 @pytest.mark.parametrize("per", ["step", "second"])
-def test_results_and_records_have_the_judgment_of_the_task(methods, per):
-    said = Said(methods)
+def test_results_and_records_have_rewards_and_endings_of_task(methods, per):
+    random_answers = RandomAnswers(methods)
     keywords = {"autoreset_mode": "Disabled", "max_episode_steps": LIMIT, "max_tilt": 0.5}
     keywords["reward_per"] = per
     own, plain = (
         vec_env(count=FLIGHTS, seed=5, task=task, **keywords).flights.batch
-        for task in (said.task(), None)
+        for task in (random_answers.task(), None)
     )
     rng, returns, endings = np.random.default_rng(2), np.zeros(FLIGHTS), set()
     for _ in range(STEPS):
         actions = rng.uniform(-0.6, 0.7, (FLIGHTS, 4))
-        said.draw()
+        random_answers.draw()
         own.step(actions)
         plain.step(actions)
-        terminated, truncated, why = expected_endings(said, plain)
+        terminated, truncated, why = expected_endings(random_answers, plain)
         reward = plain.result("reward")
         if "reward" in methods:
-            reward = said.reward * (0.02 if per == "second" else 1.0)
+            reward = random_answers.reward * (0.02 if per == "second" else 1.0)
         returns = returns + reward
         for name, values in {
             **{"terminated": terminated, "truncated": truncated, "ending": why},
@@ -70,22 +70,22 @@ def test_results_and_records_have_the_judgment_of_the_task(methods, per):
             np.testing.assert_array_equal(own.result(name), values, name)
             np.testing.assert_array_equal(own.record(name), values, name)
         endings |= set(why.astype(int))
-    assert len(endings) >= 3, "too few kinds of endings came"
+    assert len(endings) >= 3, "too few kinds of endings occurred"
 
 
 def test_returns_after_a_restore_continue():
-    said = Said(("reward",))
-    batch = vec_env(count=FLIGHTS, task=said.task()).flights.batch
+    random_answers = RandomAnswers(("reward",))
+    batch = vec_env(count=FLIGHTS, task=random_answers.task()).flights.batch
     batch.reset(seeds=range(FLIGHTS))
     actions = np.full((FLIGHTS, 4), 0.05)
-    said.draw()
+    random_answers.draw()
     batch.step(actions)
     instant, returns = batch.snapshot(), batch.record("episode_return")
     batch.step(actions)
     batch.restore(instant)
     batch.step(actions)
-    np.testing.assert_array_equal(batch.record("episode_return"), returns + said.reward)
+    np.testing.assert_array_equal(batch.record("episode_return"), returns + random_answers.reward)
     mask = np.arange(FLIGHTS) < 4
     batch.reset(mask=mask)
     batch.step(actions)
-    np.testing.assert_array_equal(batch.record("episode_return")[mask], said.reward[mask])
+    np.testing.assert_array_equal(batch.record("episode_return")[mask], random_answers.reward[mask])

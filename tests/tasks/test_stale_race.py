@@ -1,4 +1,4 @@
-"""`StaleRace`: its reward recomputed, and what its late measurements cost."""
+"""`StaleRace`: recomputed reward, and the effect of late measurements."""
 
 import gymnasium
 import numpy as np
@@ -13,7 +13,7 @@ def make(count=16, **keywords):
     return gymnasium.make_vec(ID, num_envs=count, **keywords)
 
 
-def test_defaults_are_those_of_the_description():
+def test_defaults_equal_documented_values():
     flights = make(1).unwrapped.flights
     assert flights.task.kind == "waypoints"
     assert (flights.task.gate_count, flights.task.gate_radius) == (8, 0.6)
@@ -22,7 +22,7 @@ def test_defaults_are_those_of_the_description():
     assert suite.estimator.delay_compensation == "none"
 
 
-def test_reward_is_its_equation():
+def test_reward_equals_documented_equation():
     env, rng = make(observation="truth"), np.random.default_rng(1)
     observation, _ = env.reset(seed=0)
     policy, batch = PDPolicy(env), env.unwrapped.flights.batch
@@ -47,8 +47,7 @@ def test_reward_is_its_equation():
     assert passed_in_all > 20
 
 
-def test_time_stamps_reduce_the_errors():
-    """The control: the same sensors, and a filter that knows how old their measurements are."""
+def test_latency_compensation_reduces_estimation_errors():
     stale = quad_gym.sensor_suite("stale")
     told = stale.replace(estimator=stale.estimator.replace(delay_compensation="retrodict"))
     errors = {}

@@ -15,13 +15,13 @@ FLIGHTS = 5
 
 
 def view_of(base="circle", **keywords):
-    """The batch of some flights after some steps, and its view."""
+    """Return a batch of flights after some steps, and its view."""
     batch = flown(base, task=quad_gym.Task(), **keywords).flights.batch
     return batch, batch.view
 
 
 def begun(base="circle", count=FLIGHTS, **keywords):
-    """An environment whose flights have begun."""
+    """Return an environment after its reset."""
     return vec_env(base, count, seed=1, task=quad_gym.Task(), **keywords)
 
 
@@ -131,7 +131,7 @@ def test_observed_errors_equal_the_builtin_observation():
     np.testing.assert_array_equal(view.observed.body_rates, batch.record("w_seen"))
 
 
-def test_features_in_view_are_those_the_camera_measures():
+def test_features_in_view_equal_features_measured_by_camera():
     seen = np.zeros(2, int)
     env = begun("hover", start="hover")
     view = env.flights.batch.view
@@ -144,7 +144,7 @@ def test_features_in_view_are_those_the_camera_measures():
             env.flights.batch.record("block_valid")[:, FEATURE_SLICE][flying, :2],
         )
         seen += np.bincount(view.truth.features_in_view[flying].ravel(), minlength=2)
-    assert (seen > 20).all()  # both cases came
+    assert (seen > 20).all()  # both cases occurred
 
 
 def test_measurements_not_taken_are_nan():
@@ -228,7 +228,7 @@ def test_view_after_a_restore_shows_the_restored_instant(task, mode):
     def shown():
         return {name: np.array(value_of(batch.view, name)) for name in names}
 
-    for steps in (0, 13, 7 + (mode == "NextStep")):  # at the start, later, and as others begin
+    for steps in (0, 13, 7 + (mode == "NextStep")):  # start, later, new episodes
         for _ in range(steps):
             batch.step(actions)
         instant, before = batch.snapshot(), shown()

@@ -8,11 +8,11 @@ from quad_gym.records import WIDTH, aligned_zeros
 
 
 class Compiled:
-    """`body(record, option)` on flights, whose fields are given by name as arrays (n_flights, ...).
+    """A kernel `body(record, option)` for flights; fields are given by name, (n_flights, ...).
 
     Args:
-        body: What to compile: it reads some fields of the record and writes others.
-        fields: Shape of each field of one flight; its name begins with `word_` if it holds uint64.
+        body: Function to compile; it reads some fields of the record and writes others.
+        fields: Shape of each field of one flight; a name that begins with `word_` holds uint64.
     """
 
     def __init__(self, body, **fields):
@@ -26,7 +26,7 @@ class Compiled:
             for i in range(len(blocks)):
                 body(lanes_of(blocks[i]), option)
 
-        for function in (on_records, on_blocks):  # a name of its own in the cache
+        for function in (on_records, on_blocks):  # a unique name in the cache
             function.__qualname__ = f"{function.__name__}_of_{name}"
         self._on_records, self._on_blocks = entry(on_records), entry(on_blocks)
         kinds = [(n, "u8" if n.startswith("word_") else "f8", shape) for n, shape in fields.items()]
@@ -34,7 +34,7 @@ class Compiled:
         self._block = np.dtype([(n, k, (*shape, WIDTH)) for n, k, shape in kinds], align=True)
 
     def on_floats(self, option=0, **inputs):
-        """All fields as the plain instance leaves them, by name, each (n_flights, ...)."""
+        """Run the plain instance; return all fields by name, each (n_flights, ...)."""
         records = np.zeros(len(next(iter(inputs.values()))), self._record)
         for name, values in inputs.items():
             records[name] = values
@@ -42,7 +42,7 @@ class Compiled:
         return {name: records[name] for name in self._record.names}
 
     def on_lanes(self, option=0, **inputs):
-        """The same from the lanes' instance; the last block is filled up with zeros."""
+        """Run the instance for lanes, the last block padded with zeros; return all fields."""
         count = len(next(iter(inputs.values())))
         blocks = aligned_zeros(-(-count // WIDTH), self._block)
         for name, values in inputs.items():

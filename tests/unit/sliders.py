@@ -1,4 +1,4 @@
-"""A small environment that is not ours, and a recipe, for tests of the compiled PPO."""
+"""A small environment unrelated to quadrotors, and a recipe, for tests of the compiled PPO."""
 
 import gymnasium
 import numpy as np
@@ -8,7 +8,7 @@ from baselines.recipes import Recipe
 
 
 class Slider(gymnasium.Env):
-    """A point on a line that actions move; the reward is highest at 0, the episode 20 steps."""
+    """A point on a line that actions move; the reward is highest at 0, an episode has 20 steps."""
 
     observation_space = gymnasium.spaces.Box(-10.0, 10.0, (3,))
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))

@@ -1,4 +1,4 @@
-"""Delayed actions: the flight of a delay is the flight of the actions shifted by it."""
+"""A flight with an action delay equals a flight without one whose actions are shifted."""
 
 import gymnasium
 import numpy as np
@@ -27,7 +27,7 @@ def commands(seed=1, steps=STEPS):
 
 
 def fly(flights, actions, fields=TRUTH):
-    """The fields after each action."""
+    """Return the fields after each action."""
     found = []
     for action in actions:
         flights.step(action)
@@ -55,8 +55,8 @@ def test_a_delay_of_whole_steps_shifts_the_actions(source, control, delay, optio
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 3, 5, 7])
-def test_a_delay_of_parts_of_a_step_shifts_them_by_ticks(ticks):
-    """Four ticks in a step: as the same actions at 200 Hz, each four times, shifted."""
+def test_fractional_action_delay_shifts_actions_by_ticks(ticks):
+    """The reference flies at 200 Hz, with each action repeated four times and shifted by ticks."""
     actions = commands()
     every_tick = np.repeat(actions, 4, axis=0)
     every_tick = np.concatenate([np.zeros((ticks, COUNT, 4)), every_tick])[: 4 * STEPS]
@@ -65,7 +65,7 @@ def test_a_delay_of_parts_of_a_step_shifts_them_by_ticks(ticks):
 
 
 def test_each_episode_draws_its_own_delay():
-    """And flies as with that delay, rounded to ticks, given to all."""
+    """Each flight equals one with its drawn delay, rounded to ticks, as a constant."""
     randomization = {"action_delay": Uniform(0.0, 3.0)}
     flights, actions = batch(randomization=randomization), commands()
     drawn = flights.drawn()["action_delay"]
@@ -79,7 +79,7 @@ def test_each_episode_draws_its_own_delay():
     assert not np.array_equal(flights.drawn()["action_delay"], drawn)
 
 
-def test_a_new_episode_forgets_the_actions_before_it():
+def test_new_episode_clears_delayed_actions():
     short = HOVER.replace(duration=0.1)
     flights = batch(task=short, action_delay=3, autoreset=Autoreset.SAME_STEP)
     fly(flights, np.ones((5, COUNT, 4)))
@@ -89,7 +89,7 @@ def test_a_new_episode_forgets_the_actions_before_it():
     assert not flights.record("delayed_action").any()
 
 
-def test_draws_and_flights_without_actions_are_limited():
+def test_delay_out_of_range_or_without_actions_raises_value_error():
     for randomization in ({"action_delay": Uniform(0.0, 11.0)}, {"action_delay": Uniform(-1, 1)}):
         with pytest.raises(ValueError, match="action_delay"):
             batch(randomization=randomization)
@@ -99,7 +99,7 @@ def test_draws_and_flights_without_actions_are_limited():
 
 
 def test_observation_has_the_commanded_action():
-    """While the delay lasts only the cost of changes, 0.02 |da|^2 a step, differs."""
+    """During the delay only the cost of action changes differs: 0.02 |da|^2 per step."""
     last = quad_gym.observation_layout("truth")[-1]
     assert last.name == "last_action"
     keywords = {"observation": "truth", "start": "hover"}

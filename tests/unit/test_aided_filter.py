@@ -1,4 +1,4 @@
-"""Filters with a barometer and a magnetometer equal plain ones that have their errors as states."""
+"""Filters with barometer and magnetometer equal plain filters with sensor errors as states."""
 
 import decimal
 from decimal import Decimal
@@ -32,7 +32,7 @@ SUITES = {
 
 
 def measured_by_aids(suite, recording, ticks, seed):
-    """Altitudes and fields of a recording, with constant errors and noise; None: not measured."""
+    """Return altitudes and fields with constant errors and noise; None where not measured."""
     rng = np.random.default_rng(seed)
     altitudes, fields = [None] * ticks, [None] * ticks
     hard_iron = rng.normal(0.0, 1e-6, 3)
@@ -49,8 +49,8 @@ def measured_by_aids(suite, recording, ticks, seed):
     "kinds", [(UnscentedKalmanFilter, AidedUKF), (ExtendedKalmanFilter, AidedEKF)]
 )
 @pytest.mark.parametrize("name", SUITES)
-def test_filter_with_slow_errors_equals_a_plain_one_with_more_states(name, kinds):
-    """The plain one computes in 45 digits; measurements come and go."""
+def test_filter_with_slow_errors_equals_plain_filter_with_augmented_state(name, kinds):
+    """The plain filter computes with 45 digits; a random part of the measurements is missing."""
     suite, ticks, seed = SUITES[name], 18, 5
     ours_class, plain_class = kinds
     recording = record_circle(suite, ticks, seed)
@@ -84,7 +84,7 @@ def test_filter_with_slow_errors_equals_a_plain_one_with_more_states(name, kinds
         np.testing.assert_allclose(ours.gnss_drift, d[drift], rtol=0.0, atol=1e-9)
         gap = (ours.gnss_drift_covariance - P[drift, drift]) / relative[drift, drift]
         assert abs(gap).max() < 1e-7
-        assert abs(ours.gnss_drift).max() > 0.01  # there was something to find
+        assert abs(ours.gnss_drift).max() > 0.01  # the drift is not trivially zero
     if suite.barometer is not None:
         assert ours.aid_errors["barometer"][0] == pytest.approx(d[plain.altitude_bias], abs=1e-9)
         assert abs(ours.aid_errors["barometer"][0]) > 0.05
@@ -98,7 +98,7 @@ def test_filter_with_slow_errors_equals_a_plain_one_with_more_states(name, kinds
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
 def test_velocity_of_a_turning_vehicle_observes_its_heading(kind):
-    """The antenna goes by w x l, seen from I: by the linear update, with numerical derivatives."""
+    """The update equals a linear one with a numerical Jacobian of v + R_BI^T (w_B x l_B)."""
     one_antenna = LAB.gnss.replace(secondary_antenna_B=None, velocity_sigma=0.02)
     suite = LAB.replace(gnss=one_antenna, camera=None, barometer=BOTH["barometer"])
     ours = kind(suite)
@@ -116,13 +116,13 @@ def test_velocity_of_a_turning_vehicle_observes_its_heading(kind):
     R_IG = PlainUKF(LAB).R_IG
     ours.update(gnss_velocity_G=R_IG.T @ antenna(np.zeros(15)))
     sigma = np.sqrt(np.diag(P))
-    tolerance = 1e-5 if kind is ExtendedKalmanFilter else 0.02  # the sigma points' second order
+    tolerance = 1e-5 if kind is ExtendedKalmanFilter else 0.02  # second-order terms of the UKF
     gap = (ours.covariance - expected) / np.outer(sigma, sigma)
     assert abs(gap).max() < tolerance
     assert ours.covariance[8, 8] < 0.8 * P[8, 8]
 
 
-def test_measurements_beyond_the_gate_are_accepted_at_last():
+def test_gate_accepts_measurement_after_maximum_number_of_rejections():
     gated = LAB.estimator.replace(false_alarm_probability=1e-4, max_rejections=5)
     suite = LAB.replace(camera=None, estimator=gated, **BOTH)
     recording = record_circle(suite, 1, 1)
@@ -133,7 +133,7 @@ def test_measurements_beyond_the_gate_are_accepted_at_last():
         ours.update(barometer=altitude)
         assert ours.gate_decisions[-2] == GateDecision.REJECTED
         assert ours.aid_errors["barometer"][0] == before
-    ours.update(barometer=altitude)  # the filter has doubted itself
+    ours.update(barometer=altitude)  # the filter has inflated its covariance
     assert ours.gate_decisions[-2] == GateDecision.ACCEPTED
     assert ours.aid_errors["barometer"][0] > 3.0
     field = recording.R_BI[0] @ suite.magnetometer.field_I + 3e-5

@@ -1,4 +1,4 @@
-"""Barometer and magnetometer in flights: what they measure, when, late, lost, and who is told."""
+"""Barometer and magnetometer in flights: values, times, latency, loss, observation and info."""
 
 import gymnasium
 import numpy as np
@@ -20,7 +20,7 @@ AIDED = LAB.replace(
 
 
 def field_B(batch, magnetometer, declination_error=0.0, soft_iron=0.0):
-    """The field that vehicles are in, by NumPy alone, of a level compass rose."""
+    """Return the field in B by NumPy, from strength, inclination, declination and soft iron."""
     level = magnetometer.strength * np.cos(magnetometer.inclination)
     angle = np.pi / 2 - magnetometer.declination - declination_error  # from east toward north
     down = np.full_like(angle, magnetometer.strength * np.sin(magnetometer.inclination))
@@ -107,14 +107,14 @@ def test_sensors_measure_at_their_rates_and_phases(phase):
 
 
 @pytest.mark.parametrize("periods", [1, 2])
-def test_late_measurements_arrive_as_they_were_taken(periods):
-    """At latencies of one period and of the longest, two: at the limit."""
+def test_late_measurements_arrive_with_values_of_their_measurement_time(periods):
+    """The latency is one period, or two periods, the longest possible."""
     waits = {"phase": 0.0, "latency": periods * 0.02}
     late = LAB.replace(barometer=BarometerParams(**waits), magnetometer=MagnetometerParams(**waits))
     prompt, delayed = fly(AIDED, 16, task="hover"), fly(late, 16, task="hover")
     delay, noise, truth = 4 * periods, [], []
     for tick in range(60):
-        # both fly on estimates, which differ: what they have in common is the noise
+        # both fly on estimates, which differ: only the noise is common to both
         noise.append(prompt.record("aid_measurement")[:, BAROMETER, 0] - undisturbed(prompt))
         truth.append(undisturbed(delayed))
         if tick % 4 == 0:
@@ -127,11 +127,11 @@ def test_late_measurements_arrive_as_they_were_taken(periods):
 
 
 def undisturbed(batch):
-    """What a barometer without white noise would measure now."""
+    """Return the current measurement of a barometer without white noise."""
     return batch.record("r")[:, 2] + batch.record("aid_scalar")[:, BAROMETER]
 
 
-def test_a_loss_silences_one_sensor_while_it_lasts():
+def test_sensor_loss_stops_only_its_sensor_while_active():
     faults = (
         SensorLoss(sensor="barometer", start=0.1, duration=0.2),
         SensorLoss(sensor="magnetometer", start=0.2, duration=0.2),
@@ -165,7 +165,7 @@ def test_sensors_can_be_switched_off_and_on():
         FlightBatch(1, sensors=AIDED, true_sensors=AIDED.with_rates(magnetometer=25.0))
 
 
-def test_observation_and_info_have_what_was_measured():
+def test_observation_and_info_contain_aid_measurements():
     shown = {"observation": "measurements", "innovations": True, "control_rate": 50}
     env = gymnasium.make("QuadGym/Hover-v0", sensors=AIDED, **shown)
     observation, _ = env.reset(seed=3)

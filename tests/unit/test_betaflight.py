@@ -16,13 +16,13 @@ from quad_gym.params.vehicle import vehicle_params
 
 needs_firmware = pytest.mark.skipif(
     not firmware.is_built(),
-    reason="Betaflight's firmware is not built; quad-gym evaluate --rate-loop betaflight does it",
+    reason="Betaflight's firmware is not built; quad-gym evaluate --rate-loop betaflight builds it",
 )
 LAB = vehicle_params("lab")
 
 
 def flights(count=1, **keywords):
-    """An environment with action "ctbr", and the one behind Betaflight."""
+    """Return an environment with action "ctbr" and its counterpart behind Betaflight."""
     env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, threads=1, **keywords)
     return env, flights_behind(env, keywords, threads=1)
 
@@ -44,7 +44,7 @@ def test_settings_give_the_torque_of_the_built_in_loop():
 
 def test_throttle_and_motor_actions_invert_each_other_at_hover():
     motors = Motors(LAB)
-    command = 0.01 + motors.range * motors.throttle(np.ones(1))  # idle, and the throttle's share
+    command = 0.01 + motors.range * motors.throttle(np.ones(1))  # idle plus the throttle's share
     np.testing.assert_allclose(motors.actions(np.full((1, 4), command)), 0.0, atol=1e-12)
     assert motors.order == [3, 0, 2, 1]  # rear right, front right, rear left, front left
     assert not motors.reversed
@@ -71,7 +71,7 @@ def test_environments_that_betaflight_cannot_fly_are_refused(keywords, message):
         flights(**keywords)
 
 
-def test_one_sentence_names_what_the_firmware_lacks(monkeypatch, tmp_path, capsys):
+def test_evaluate_without_make_or_with_too_many_episodes_exits(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(firmware.shutil, "which", lambda name: None if name == "make" else name)
     options = {"policy": ("pd",), "rate_loop": "betaflight", "output": tmp_path}

@@ -80,8 +80,7 @@ def test_intervals_contain_delay_and_mounting_of_a_simulated_log(found):
     assert np.linalg.norm(np.subtract(found.suite.log_rotation, MOUNTING)) < 0.06
 
 
-def test_samples_are_replayed_in_the_axes_of_the_body(table):
-    """The axes of an IMU that was turned back into them, to rounding."""
+def test_replay_rotates_imu_samples_into_body_axes(table):
     columns = dict(table)
     for name in ("gyro", "accel"):
         axes = [f"{name}_{axis}" for axis in "xyz"]
@@ -92,7 +91,7 @@ def test_samples_are_replayed_in_the_axes_of_the_body(table):
     np.testing.assert_allclose(askew.quaternion, body.quaternion, atol=1e-6)
 
 
-def test_validation_part_fits_the_suite_that_was_found(found):
+def test_calibrated_suite_fits_the_validation_part_of_the_log(found):
     """GNSS velocity is too noisy by half: its noise is found from the seven seconds in flight."""
     for name, fit in found.after.sensors.items():
         assert 0.3 < fit.mean_nis < 1.5, name
@@ -109,10 +108,8 @@ def test_suite_has_the_values_of_the_numbers_found(found):
 
 
 @pytest.mark.parametrize("name", ["log_delays.gnss", "log_rotation[2]"])
-def test_number_that_a_log_hardly_determines_keeps_its_prior_if_that_is_as_likely(
-    table, found, name
-):
-    """As if neither was determined: the delay differs from its prior, the rotation does not."""
+def test_undetermined_number_keeps_its_prior_if_the_prior_is_as_likely(table, found, name):
+    """Both count as undetermined here; the true delay differs from its prior, the rotation not."""
     search = NumberSearch(read_log(table).until(found.split), found.prior, {}, delays=True)
     search.x = np.array([n.number.coordinate(n.prior, n.value) for n in found.numbers])
     k = [n.number.name for n in found.numbers].index(name)
@@ -128,7 +125,7 @@ def test_number_that_a_log_hardly_determines_keeps_its_prior_if_that_is_as_likel
         assert (again.value, again.determined) == (0.0, False)
 
 
-def test_standard_deviations_that_a_log_hardly_determines_are_at_most_twice_the_most_likely(found):
+def test_uncertain_sigma_is_at_most_twice_its_most_likely_value(found):
     """The most likely one is in the middle of its interval, in logarithms."""
     noise = {n.number.name: n for n in found.numbers if n.number.noise}
     factors = {name: n.value / np.sqrt(n.low * n.high) for name, n in noise.items()}
@@ -138,7 +135,7 @@ def test_standard_deviations_that_a_log_hardly_determines_are_at_most_twice_the_
     assert factors[min(widths, key=widths.get)] < factors[max(widths, key=widths.get)]
 
 
-def test_suite_that_was_found_flies_and_is_kept_in_a_file(found, tmp_path):
+def test_calibrated_suite_flies_after_saving_and_loading(found, tmp_path):
     again = quad_gym.sensor_suite(found.suite.save(tmp_path / "mine.toml"))
     assert again == found.suite
     env = quad_gym.QuadEnv("circle", sensors=str(tmp_path / "mine.toml"))
@@ -204,7 +201,7 @@ def test_noise_is_widened_for_correlated_innovations_that_are_not_small():
     assert widening(rng.normal(size=(40_000, 3)), 2.0) == 1.0
 
 
-def test_every_measurement_of_a_sensor_with_white_innovations_counts():
+def test_loss_counts_every_measurement_of_sensors_with_white_innovations():
     """The loss grows by the terms of Student's t, less those that count in any case."""
     late = Recorded(flown(TRUE, 16.0), TRUE, lost=0.0, jitter=0.0).table()
     order = np.argsort(late["time"], kind="stable")
@@ -241,7 +238,7 @@ def test_vehicle_at_rest_is_not_in_flight():
 
 
 def test_tails_of_normal_and_of_heavy_tailed_innovations_differ():
-    """Of Student's t with four degrees of freedom, and of a Gaussian with another variance."""
+    """One sample is Gaussian with another variance, the other is Student's t with nu = 4."""
     rng = np.random.default_rng(2)
     normal = rng.normal(size=(1000, 3))
     heavy = normal / np.sqrt(rng.chisquare(4, size=(1000, 1)) / 4.0)

@@ -1,4 +1,4 @@
-"""The camera: what it sees and where, against a projection in NumPy; points and lines of images."""
+"""Pixels and visible features of the camera against a projection in NumPy."""
 
 import numpy as np
 from hypothesis import given
@@ -12,7 +12,7 @@ from tests.unit.alarms import assert_normal
 LAB = quad_gym.CameraParams()
 SHARP = LAB.replace(pixel_sigma=1e-9)
 HALF_IMAGE = np.array([1920.0, 1080.0])
-# R_CB of the roll of 120 and yaw of 90 degrees, by SciPy
+# R_CB for a roll of 120 and a yaw of 90 degrees, by SciPy
 R_CB = Rotation.from_euler("ZXY", [90.0, 120.0, 0.0], degrees=True).as_matrix().T
 
 seeds = st.integers(0, 2**32 - 1)
@@ -24,7 +24,7 @@ def random_pose(seed):
 
 
 def point_seen_at(v_C, position, R_BI, params=LAB):
-    """The point in I whose camera coordinates are v_C."""
+    """Return the point in I whose camera coordinates are v_C."""
     return position + R_BI.T @ (R_CB.T @ v_C + params.position_B)
 
 

@@ -1,4 +1,4 @@
-"""The compiled PPO against torch, Stable-Baselines3, and plain sums."""
+"""The compiled PPO: gradients, first weights, repeatability, saved states and learning."""
 
 import gymnasium
 import numpy as np
@@ -10,8 +10,8 @@ from tests.unit.sliders import sliders, small_recipe
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh", "elu"])
-def test_gradients_of_an_actor_that_sees_less_are_those_without_weights(activation):
-    """Of an actor whose weights of what it does not see are zero; size takes two tiles."""
+def test_critic_only_input_gives_gradients_of_actor_with_zero_weights(activation):
+    """The reference actor has zero weights for the hidden input; 751 samples take two tiles."""
     draw, count, size, found = np.random.default_rng(0), 800, 751, []
     samples = {name: draw.normal(size=(count, 1)).astype("f4") for name in ("_targets", "_lp")}
     seen, acted = (draw.normal(size=(count, n)).astype(np.float32) for n in (3, 2))
@@ -48,7 +48,7 @@ def test_gradients_of_an_actor_that_sees_less_are_those_without_weights(activati
     assert max(abs(part).max() for part in found[0]) > 1e-3
 
 
-def test_first_weights_are_orthogonal_as_those_of_stable_baselines():
+def test_initial_weights_are_orthogonal_as_in_stable_baselines():
     networks = CompiledPPO(sliders(), small_recipe(layers=(64, 32))).networks
     (W1, b1), (W2, _), (W3, _) = networks.layers(networks.actor)
     np.testing.assert_allclose(W1.T @ W1, 2.0 * np.eye(3), atol=1e-5)
@@ -73,7 +73,7 @@ def test_same_seed_same_bits_with_any_number_of_threads(critic_only):
 
 
 @pytest.mark.parametrize("critic_only", [0, 1])
-def test_a_kept_state_goes_on_bit_for_bit(critic_only):
+def test_training_continues_bit_for_bit_from_restored_state(critic_only):
     states, recipe = [], small_recipe(parameters={"critic_only": critic_only})
 
     def watch(model):
@@ -90,7 +90,7 @@ def test_a_kept_state_goes_on_bit_for_bit(critic_only):
         assert other.training_return == model.training_return
 
 
-def test_it_learns_an_environment_that_is_not_ours():
+def test_training_improves_return_in_foreign_environment():
     recipe = small_recipe(
         learning_rate=(3e-3, 3e-3), parameters={"n_steps": 32, "batch_size": 64, "n_epochs": 5}
     )
@@ -103,7 +103,7 @@ def test_it_learns_an_environment_that_is_not_ours():
 
     model.learn(20_000, watch)
     assert np.nanmean(returns[:5]) < 8.0
-    assert model.training_return > 14.0  # 20 without the way from the start
+    assert model.training_return > 14.0  # 20 if x were 0 from the start
     x = np.array([[1.0, 1.0, 0.5], [-1.0, 1.0, 0.5]], np.float32)
     action, state = model.predict(x)
     assert state is None
@@ -111,7 +111,7 @@ def test_it_learns_an_environment_that_is_not_ours():
     assert action[1, 0] > 0.3
 
 
-def test_a_diverged_training_says_so():
+def test_diverged_training_raises_floating_point_error():
     model = CompiledPPO(sliders(), small_recipe(), seed=0)
     model.prepare()
     model.networks.params[0] = np.nan
@@ -135,7 +135,7 @@ def test_a_diverged_training_says_so():
         (sliders(), small_recipe(parameters={"critic_only": 3}), "at least one of 3 obs.*, got 3"),
     ],
 )
-def test_what_does_not_fit_is_refused(env, recipe, message):
+def test_unsupported_environment_or_recipe_raises_value_error(env, recipe, message):
     with pytest.raises(ValueError, match=message):
         CompiledPPO(env, recipe)
 

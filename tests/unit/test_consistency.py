@@ -1,4 +1,4 @@
-"""Statistics of consistency, on errors whose distribution is known."""
+"""Consistency statistics on errors with a known distribution."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from quad_gym.records import FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK, GateDec
 from tests.unit.alarms import assert_normal
 
 
-def test_the_band_is_that_of_a_mean_of_chi_squares():
+def test_mean_band_matches_mean_of_chi_squares():
     low, high = mean_band(15, [1000])
     assert low[0] == pytest.approx(14.66, abs=5e-3)
     assert high[0] == pytest.approx(15.34, abs=5e-3)
@@ -33,7 +33,7 @@ def test_the_band_is_that_of_a_mean_of_chi_squares():
 
 
 @pytest.mark.parametrize(("dimension", "counts"), [(0, [1]), (3, [0]), (3, [])])
-def test_a_band_of_nothing_is_refused(dimension, counts):
+def test_invalid_arguments_of_mean_band_raise_value_error(dimension, counts):
     with pytest.raises(ValueError, match=r"^dimension and counts must be at least 1"):
         mean_band(dimension, counts)
     with pytest.raises(ValueError, match=r"^probability must be between 0 and 1"):
@@ -41,7 +41,7 @@ def test_a_band_of_nothing_is_refused(dimension, counts):
 
 
 def drawn(factor, instants=400, flights=500):
-    """The mean square of a filter whose errors are `factor` times what it claims."""
+    """Return the mean NEES of a filter whose errors are `factor` times its standard deviations."""
     rng = np.random.default_rng(2)
     mean = factor**2 * rng.chisquare(15, (instants, flights)).mean(axis=1)
     low, high = mean_band(15, np.full(instants, flights))
@@ -67,8 +67,8 @@ def test_verdict_is_consistent_or_the_ratio_of_errors():
         assert words in verdict(part)
 
 
-def test_a_recorder_sees_the_errors_of_a_batch():
-    """Against the definition: e^T P^-1 e from errors that were put there."""
+def test_nees_recorder_computes_mean_nees_and_errors_of_a_batch():
+    """The mean NEES equals its definition, the mean of e^T P^-1 e."""
     batch = FlightBatch(16, sensors=sensor_suite("lab").replace(camera=None))
     batch.reset(seeds=range(16))
     recorder = NeesRecorder()
@@ -83,7 +83,7 @@ def test_a_recorder_sees_the_errors_of_a_batch():
     np.testing.assert_allclose(sigmas[0, :3] ** 2, np.diagonal(P, axis1=1, axis2=2).mean(axis=0))
 
 
-def test_matched_start_has_errors_as_claimed():
+def test_matched_start_draws_errors_from_the_filter_covariance():
     batch = FlightBatch(4000, sensors=sensor_suite("lab").replace(camera=None))
     batch.reset(seeds=range(4000))
     before = batch.snapshot()
@@ -100,7 +100,7 @@ def test_matched_start_has_errors_as_claimed():
 
 
 class Measured:
-    """What a recorder reads of a batch: innovations that were put there."""
+    """A substitute for a batch, with given innovations."""
 
     count = 300
 
@@ -119,7 +119,7 @@ class Measured:
 
 
 def recorded(memory, factor=1.0, instants=200):
-    """Innovations whose successive ones are correlated by `memory`, in flights that skip some."""
+    """Record innovations with correlation `memory` between successive ones; 30 % are missing."""
     rng = np.random.default_rng(5)
     seen = np.zeros((Measured.count, MAX_BLOCKS))
     recorder = None
@@ -142,7 +142,7 @@ def test_white_innovations_are_white_and_have_a_consistent_nis():
     white = recorder.whiteness()["position"]
     assert white.white
     assert (np.abs(white.correlation) < 3.0 * white.band).all()
-    # 300 flights, 70 % of 200 instants, 3 components, less the first lags
+    # 300 flights, 70 % of 200 instants, 3 components, minus the first lags
     assert white.band[0] == pytest.approx(1.96 / np.sqrt(300 * 0.7 * 200 * 3), rel=0.02)
     nis = recorder.nis()["position"]
     assert nis.time[0] == pytest.approx(0.25)
@@ -163,7 +163,7 @@ def test_large_innovations_are_white_and_have_a_large_nis():
     assert recorder.whiteness()["position"].white
 
 
-def test_of_an_image_the_first_feature_seen_counts():
+def test_nis_of_an_image_uses_its_first_visible_feature():
     seen = np.zeros((Measured.count, MAX_BLOCKS))
     seen[:, FEATURE_BLOCKS + 2 : FEATURE_BLOCKS + 5] = 1.0
     batch = Measured(np.ones((Measured.count, 3)), np.ones(Measured.count), seen)

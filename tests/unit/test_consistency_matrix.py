@@ -1,4 +1,4 @@
-"""Tables of consistency and of recovery: their cells, what they mark, and how they resume."""
+"""Tables of consistency and recovery: cells, marks, and resumed runs."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def test_cells_are_consistent_but_for_the_reports_filter(tmp_path):
     cells = chosen("rtk, hover, warm, nominal", "lab, circle, cold, nominal")
     done = run(cells, tmp_path)
     sound, report = (done[f"{name}, nominal"] for name in ("rtk, hover, warm", "lab, circle, cold"))
-    assert 13.0 < sound["values"]["state"] < 17.0  # 3 deviations of the mean of 64 at one instant
+    assert 13.0 < sound["values"]["state"] < 17.0  # 3 standard deviations: 64 flights, one instant
     assert report["values"]["state"] > 17.0
     assert report["misses"]
     assert report["expected"] == {"": "the report's filter"}
@@ -84,7 +84,7 @@ def test_run_continues_and_repeats_with_other_flights(tmp_path, monkeypatch):
 @pytest.mark.parametrize("task", ["hover", "circle", "random_trajectory", "waypoints"])
 @pytest.mark.parametrize("suite", [name for name in SUITES if name != "lab"])
 def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
-    """Means over 400 flights of 10 s: 0.8 is 2.9 deviations even if a flight's errors stayed."""
+    """For 400 flights of 10 s, 0.8 is 2.9 standard deviations even if errors stay constant."""
     cell = matrix.case_of(suite, task, start)
     found = matrix.measure(cell, CaseFlights(400))
     assert found["filters_failed"] == 0
@@ -96,7 +96,7 @@ def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
 @pytest.mark.parametrize("start", matrix.STARTS)
 @pytest.mark.parametrize("fault", ["gnss_outage", "gnss_outage+camera_occlusion", "baseline_loss"])
 def test_default_filter_is_consistent_without_sensors(fault, start):
-    """Of 400 flights none may take a feature near a position that is uncertain for a fix."""
+    """No filter of 400 flights may use a feature near its position if the position is uncertain."""
     cell = matrix.case_of("standard", "random_trajectory", start, faults=fault)
     found = matrix.measure(cell, CaseFlights(400))
     assert 14.2 < found["values"]["state"] < 15.8
@@ -117,7 +117,7 @@ def test_long_large_errors_without_a_flag_are_missed_alarms():
     assert found.hours == pytest.approx(5 * 3 * 0.5 / 3600.0)
 
 
-def test_the_time_to_recover_is_until_nearly_all_are_consistent():
+def test_recovery_time_ends_when_99_percent_of_flights_are_consistent():
     consistent = np.ones((8, 100), bool)
     consistent[:3] = consistent[4, 0] = consistent[5, :2] = False  # 1 in 100 is allowed
     found = flights_of(consistent, np.zeros_like(consistent), ~consistent)
@@ -127,8 +127,8 @@ def test_the_time_to_recover_is_until_nearly_all_are_consistent():
     assert found.share(found.undetected, 3.0) == pytest.approx(0.02)
 
 
-def test_flights_that_go_wrong_later_had_not_recovered():
-    """As after a step of a bias: the errors need seconds to grow."""
+def test_flights_that_become_inconsistent_later_count_as_not_recovered():
+    """Errors after a bias step need seconds to grow."""
     consistent = np.ones((8, 100), bool)
     consistent[3:6, :20] = False
     found = flights_of(consistent, np.zeros_like(consistent), ~consistent)
@@ -151,7 +151,7 @@ def test_consistent_flights_and_flags_equal_a_plain_computation():
         follow_recovery(batch, seeds=range(64), duration=0.1, every=0.1)
 
 
-def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
+def test_recovery_table_is_written_with_misses_marked(tmp_path):
     chosen = [t for t in recovery.cases() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
     chosen = [t for t in chosen if t.keywords]  # hovering takes a minute
     how = (recovery.measure, recovery.table_of)

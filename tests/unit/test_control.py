@@ -56,7 +56,7 @@ def forces_of(voltages, vehicle=LAB):
 
 
 def allocated(thrust, torque, vehicle=LAB):
-    """Rotor forces that the kernel asks for."""
+    """Return the rotor forces that the kernel commands."""
     voltages = np.empty((1, 4))
     demand = np.array([[thrust, *torque]])
     allocate_all(demand, numbers_of(vehicle), voltages)
@@ -65,7 +65,7 @@ def allocated(thrust, torque, vehicle=LAB):
 
 
 def searched(thrust, torque, vehicle=LAB):
-    """Rotor forces by the laboratory's rule, with the largest alpha found by bisection."""
+    """Return rotor forces by the laboratory's rule, and the largest alpha by bisection."""
     places, spins = np.array(vehicle.rotor_positions_B), np.array(vehicle.rotor_spins)
     ratio = vehicle.torque_coefficient / vehicle.thrust_coefficient
     matrix = np.array([np.ones(4), places[:, 1], -places[:, 0], -ratio * spins])
@@ -106,7 +106,7 @@ def test_rotors_on_unequal_arms_stay_within_their_limit(thrust):
 
 
 def seen_state(seed):
-    """A random view of the state, a reference and an action."""
+    """Return a random observed state, reference and action."""
     rng = np.random.default_rng(seed)
     return {
         "r": rng.normal(size=3),
@@ -119,7 +119,7 @@ def seen_state(seed):
 
 
 def commanded(mode, state, vehicle=LAB):
-    """Motor voltages that the kernel sets."""
+    """Return the motor voltages that the kernel sets."""
     flight = np.zeros(1, FLIGHT)
     flight["r_seen"], flight["v_seen"] = state["r"], state["v"]
     flight["R_seen"], flight["w_seen"] = state["R_BI"], state["w"]
@@ -138,7 +138,7 @@ def voltages_for(thrust, torque, vehicle):
 
 
 def pd_controller(state, vehicle):
-    """The laboratory's controller as it is printed."""
+    """Return thrust and torque of the laboratory's controller as published."""
     r_ref, v_ref, a_ref, x_ref = state["ref"]
     R_BI, w, m = state["R_BI"], state["w"], vehicle.mass
     e3, J = np.array([0.0, 0.0, 1.0]), np.array(vehicle.inertia)
@@ -158,19 +158,19 @@ def rate_loop(w_wanted, w, vehicle):
 
 
 def tilt_loop(z_I, state, yaw_rate, vehicle):
-    """Rates k_a (e3 x R z*), plus the wanted yaw rate."""
+    """Return the torque for the rates k_a (e3 x R z*) plus the desired yaw rate."""
     rates = 7.0 * np.cross([0.0, 0.0, 1.0], state["R_BI"] @ z_I) + [0.0, 0.0, yaw_rate]
     return rate_loop(rates, state["w"], vehicle)
 
 
 def heading_frame(state):
-    """Columns: ahead, left and up, in I."""
+    """Return the columns ahead, left and up in I."""
     x = unit(state["R_BI"][0] * [1.0, 1.0, 0.0])
     return np.stack([x, np.cross([0.0, 0.0, 1.0], x), [0.0, 0.0, 1.0]], axis=1)
 
 
 def demanded(mode, state, vehicle):
-    """Thrust and torque that an action asks for."""
+    """Return the thrust and torque that an action demands."""
     a = state["action"]
     weight = vehicle.mass * vehicle.gravity
     if mode == Control.PD:
@@ -197,7 +197,7 @@ MODES = [Control.PD, Control.WRENCH, Control.CTBR, Control.ATTITUDE, Control.VEL
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("vehicle", [LAB, TILTED], ids=["lab", "tilted"])
-def test_the_voltages_are_those_of_the_equations(mode, vehicle):
+def test_voltages_match_the_control_equations(mode, vehicle):
     for seed in range(60):
         state = seen_state(seed)
         expected = voltages_for(*demanded(mode, state, vehicle), vehicle)
@@ -210,7 +210,7 @@ def test_the_voltages_are_those_of_the_equations(mode, vehicle):
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 4))
-def test_a_motor_action_is_a_share_of_the_hover_voltage(action):
+def test_motor_action_scales_the_hover_voltage(action):
     got = commanded(Control.MOTOR, seen_state(1) | {"action": action})
     expected = np.minimum(LAB.hover_voltage * (1.0 + np.array(action)), LAB.max_voltage)
     np.testing.assert_allclose(got, expected, rtol=1e-14)
@@ -241,7 +241,7 @@ def test_voltages_are_finite_without_a_desired_direction(ref_force):
 
 
 @pytest.mark.parametrize("mode", [Control.MOTOR, *MODES])
-def test_lanes_command_eight_flights_as_floats_do(mode):
+def test_controller_on_lanes_equals_controller_on_floats(mode):
     states = [seen_state(seed) for seed in range(WIDTH)]
     ref = states[0]["ref"]
     block = aligned_zeros(1, FLIGHT_BLOCK)

@@ -1,4 +1,4 @@
-"""Features that are elsewhere in each episode, and a filter that knows where."""
+"""Features with drawn positions in each episode, and a filter with the drawn map."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def batch(count=4, **options):
 
 
 def places(drawn, nominal=NOMINAL):
-    """(n, m, 3) by the formula."""
+    """Return feature positions (n, m, 3) by the formula."""
     yaw, zero = drawn["features_yaw"], np.zeros(len(drawn["features_yaw"]))
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]])
@@ -35,7 +35,7 @@ def places(drawn, nominal=NOMINAL):
     return np.einsum("ijn,nmj->nmi", R, moved) + drawn["features_shift_I"][:, None]
 
 
-def test_draws_are_those_of_their_distributions():
+def test_drawn_features_follow_their_distributions():
     flights = batch(2000, run_filter=False, source=quad_gym.records.Source.TRUTH)
     drawn = flights.drawn()
     offsets = drawn["feature_offsets_I"]
@@ -56,7 +56,7 @@ def test_draws_are_those_of_their_distributions():
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_flight_with_drawn_features_equals_the_one_that_has_them(known):
+def test_flight_with_drawn_features_equals_flight_with_given_features(known):
     flights = batch(3, randomization=Randomization(FEATURES, known=known))
     for _ in range(100):
         flights.step()
@@ -85,8 +85,8 @@ def test_each_episode_draws_its_own_and_seeds_repeat_them():
     assert (batch(9).feature_places()[:4] == first).all()
 
 
-def test_an_error_of_the_map_turns_with_it():
-    """All markers hang 0.2 m from where the filter believes: what the camera measures says so."""
+def test_map_error_rotates_with_the_drawn_map():
+    """All markers are 0.2 m from the filter's map, and the camera measures the true ones."""
     wrong = NOMINAL + np.array([0.2, 0.0, 0.0])
     camera = INDOOR.camera.replace(features_I=tuple(map(tuple, wrong)), pixel_sigma=1e-3)
     flights = batch(6, true_sensors=INDOOR.replace(camera=camera))
@@ -106,7 +106,7 @@ def test_an_error_of_the_map_turns_with_it():
 
 
 @pytest.mark.parametrize("drawn", [False, True])
-def test_a_filter_that_knows_the_sensors_knows_the_true_map(drawn):
+def test_filter_with_known_sensors_uses_the_true_feature_map(drawn):
     wrong = NOMINAL + np.array([0.2, 0.0, 0.0])
     true = INDOOR.replace(camera=INDOOR.camera.replace(features_I=tuple(map(tuple, wrong))))
     for known, map_I in ((True, wrong), (False, NOMINAL)):
@@ -122,8 +122,8 @@ def test_a_filter_that_knows_the_sensors_knows_the_true_map(drawn):
         estimator=INDOOR.estimator.replace(kind="ekf"))}],
     ids=["cold", "late and imperfect", "warm", "ekf"],
 )  # fmt: skip
-def test_the_filter_stays_consistent(options):
-    """NEES of 15 degrees of freedom, mean over 400 flights: 15 +- 0.27."""
+def test_filter_stays_consistent_with_drawn_features(options):
+    """The mean over 400 flights of a NEES with 15 degrees of freedom is 15 +- 0.27."""
     flights = batch(400, **options)
     for _ in range(600):
         flights.step()
@@ -131,7 +131,7 @@ def test_the_filter_stays_consistent(options):
     assert 12.0 < found < 15.0 + alarm_score(1) * np.sqrt(30.0 / 400), found
 
 
-def test_obstacles_hide_features_where_they_are():
+def test_features_behind_obstacles_are_not_seen():
     world = WorldParams(
         obstacles=(
             Wall(center_I=(5.0, 0.0, 1.0), size=(0.2, 6.0, 4.0), shift_I=(0.0, 2.0, 0.0)),
@@ -162,6 +162,6 @@ def test_obstacles_hide_features_where_they_are():
         ({"features_yaw": Uniform(0.5, 1.0, relative=True)}, {}, "features_yaw.*relative"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(draws, options, message):
+def test_invalid_feature_draws_raise_value_error(draws, options, message):
     with pytest.raises(ValueError, match=message):
         FlightBatch(1, **{"sensors": INDOOR, **options}, randomization=draws)

@@ -1,4 +1,4 @@
-"""Starts that move or are drawn: their distribution, and a filter that stays consistent."""
+"""Moving and drawn starts: their distribution, and the consistency of the filter."""
 
 import gymnasium
 import numpy as np
@@ -14,7 +14,7 @@ FLIGHTS = 20_000
 
 
 def begun(count=FLIGHTS, start="moving", options=None, env_id="QuadGym/Hover-v0", **keywords):
-    """Flights at the start of their first episodes."""
+    """Return flights at the start of their first episodes."""
     env = gymnasium.make_vec(env_id, num_envs=count, start=start, **keywords)
     env.reset(seed=0, options=options)
     return env.unwrapped.flights.batch
@@ -30,14 +30,14 @@ def hovering():
     return begun(start="hover")
 
 
-def test_position_and_attitude_are_those_of_a_hovering_start(moving, hovering):
+def test_moving_start_has_position_and_attitude_of_hovering_start(moving, hovering):
     np.testing.assert_array_equal(moving.record("r"), hovering.record("r"))
     np.testing.assert_array_equal(moving.record("rotor_speeds"), hovering.record("rotor_speeds"))
     np.testing.assert_array_equal(moving.record("q"), hovering.record("q"))
 
 
 def test_motion_is_uniform_within_its_bounds(moving, hovering):
-    """Kolmogorov-Smirnov on each axis, on top of the hovering start; alarm level 1e-4 each."""
+    """The motion added to a hovering start passes a Kolmogorov-Smirnov test at 1e-4 per axis."""
     on_top = {
         "velocity": (moving.record("v") - hovering.record("v"), 1.5),
         "body rates": (moving.record("w") - hovering.record("w"), 2.0),
@@ -57,8 +57,8 @@ def test_motion_is_uniform_within_its_bounds(moving, hovering):
         (LogUniform(0.5, 2.0), (4.0 - 0.25) / (2.0 * np.log(4.0))),
     ],
 )
-def test_a_cold_filter_knows_how_much_velocities_vary(drawn, added):
-    suite = quad_gym.SensorSuite()  # the report's: no GNSS velocity tells how fast a start is
+def test_cold_filter_covariance_includes_variance_of_start_velocity(drawn, added):
+    suite = quad_gym.SensorSuite()  # the report's suite has no GNSS velocity
     draws = {} if drawn is None else {"start_velocity_I": drawn}
     variances = [
         [(L @ L.T).diagonal() for L in begun(4, start, sensors=suite, **given).record("L")]
@@ -69,7 +69,7 @@ def test_a_cold_filter_knows_how_much_velocities_vary(drawn, added):
     np.testing.assert_allclose(found[:, [0, 1, 2, *range(6, 15)]], 0.0, atol=1e-12)
 
 
-def test_draws_come_on_top_of_the_motion(moving):
+def test_drawn_body_rates_add_to_the_moving_start(moving):
     drawn = begun(randomization={"start_body_rates": Uniform(2.0, 3.0)})
     on_top = drawn.record("w") - moving.record("w")
     assert (on_top.min() >= 2.0 - 1e-12) & (on_top.max() <= 3.0 + 1e-12)
@@ -106,7 +106,7 @@ DRAWS = {
 
 
 def worst(batch):
-    """The largest mean NEES at the start and in the second after it, which may be too small."""
+    """Return the largest mean NEES in the first second; small values are accepted."""
     found = [nees(batch).mean()]
     for _ in range(4):
         steps(batch, 0.25)
@@ -116,7 +116,7 @@ def worst(batch):
 
 @pytest.mark.parametrize("drawn", [*DRAWS, "moving"])
 @pytest.mark.parametrize("name", SUITES)
-def test_a_start_that_is_drawn_or_moves_leaves_the_filter_consistent(name, drawn):
+def test_filter_is_consistent_after_drawn_or_moving_start(name, drawn):
     suite = quad_gym.sensor_suite(name)
     how = {"start": "moving"} if drawn == "moving" else {"randomization": DRAWS[drawn]}
     batch = fly(suite, CONSISTENT, **{"task": "circle", "start": "hover", **how})
@@ -129,14 +129,14 @@ def test_a_start_that_is_drawn_or_moves_leaves_the_filter_consistent(name, drawn
 def test_filter_of_the_default_suite_is_consistent_on_every_task(task, filter_start):
     suite = quad_gym.QuadEnv("hover").flights.batch.sensors
     batch = fly(suite, CONSISTENT, task=task, filter_start=filter_start)
-    steps(batch, 0.5)  # from the ground it is cautious at first
+    steps(batch, 0.5)  # after a ground start it is conservative at first
     for _ in range(4):
         steps(batch, 0.5)
         assert abs(nees(batch).mean() - 15.0) < BAND
 
 
 @pytest.mark.parametrize("name", SUITES)
-def test_the_filter_is_told_a_velocity_that_a_reset_gives(name):
+def test_filter_starts_with_the_velocity_given_to_reset(name):
     batch = fly(quad_gym.sensor_suite(name), CONSISTENT, task="circle", start="hover")
     batch.reset(seeds=range(CONSISTENT), velocity=(1.0, 0.5, 0.2))
     np.testing.assert_array_equal(batch.record("v_hat"), np.tile((1.0, 0.5, 0.2), (CONSISTENT, 1)))

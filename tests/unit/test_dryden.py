@@ -22,7 +22,7 @@ WIND, HEIGHT = 8.0, 6.0
 
 
 def military_scales(height, wind_speed):
-    """sigma_u, sigma_w [m/s], L_u, L_w [m] as the specification prints them, in feet."""
+    """Return sigma_u, sigma_w [m/s], L_u, L_w [m] by the formulas of the specification, in feet."""
     h = np.clip(height / FOOT, 10.0, 1000.0)
     sigma_w = 0.1 * wind_speed
     sigma_u = sigma_w / (0.177 + 0.000823 * h) ** 0.4
@@ -43,7 +43,7 @@ filter_of = Compiled(filters, x=(), y=(), h=(), n=(), m=(), u=(), v=(), w=())
 
 
 @given(st.floats(-10.0, 1000.0), st.floats(0.0, 40.0))
-def test_scales_are_those_of_the_specification(height, wind_speed):
+def test_gust_scales_match_the_specification(height, wind_speed):
     got = scales_of.on_floats(height=[height], wind_speed=[wind_speed])
     expected = military_scales(height, wind_speed)
     for name, value in zip(("sigma_u", "sigma_w", "L_u", "L_w"), expected, strict=True):
@@ -52,18 +52,18 @@ def test_scales_are_those_of_the_specification(height, wind_speed):
 
 @pytest.mark.parametrize("h", [1e-9, 1e-6, 1e-3, 0.03, 0.9, 1.1, 4.0])
 def test_the_discretization_is_exact(h):
-    """Transition and noise covariance are those of Van Loan's matrix exponential (1978)."""
+    """Transition and noise covariance equal Van Loan's matrix exponential (1978)."""
     A, B = np.array([[-1.0, 0.0], [1.0, -1.0]]), np.array([[1.0], [0.0]])
     van_loan = expm(h * np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]]))
     transition = van_loan[2:, 2:].T
     noise = transition @ van_loan[:2, 2:]
-    # columns: response to each state, and to each normal
+    # columns: response to each state, and to each normal sample
     inputs = {"x": [1, 0, 0, 0], "y": [0, 1, 0, 0], "n": [0, 0, 1, 0], "m": [0, 0, 0, 1]}
     got = filter_of.on_lanes(**inputs, h=[h] * 4)
     responses = np.stack([got["v"], got["w"]])
     np.testing.assert_allclose(responses[:, :2], transition, rtol=1e-13, atol=1e-14)
     factor = responses[:, 2:]
-    # Van Loan's own entries lose digits where h^3 vanishes beside 1: compare in their proportions
+    # Van Loan's entries lose digits where h^3 vanishes next to 1: compare scaled entries
     sizes = np.sqrt(np.diag([h, h**3 / 3])) if h < 1e-2 else np.eye(2)
     whiten = np.linalg.inv(sizes)
     found, tolerance = whiten @ (factor @ factor.T) @ whiten, {"rtol": 1e-8, "atol": 1e-8}
@@ -75,7 +75,7 @@ def test_the_discretization_is_exact(h):
 
 
 def hovering_in_gusts(count, *, height=HEIGHT, wind=(0.0, WIND, 0.0), dt=0.005):
-    """Vehicles that nothing moves: no drag, level, thrust as large as the weight."""
+    """Return vehicles at rest: level, without drag, with a thrust equal to the weight."""
     vehicle = quad_gym.vehicle_params("lab").replace(disc_area=0.0)
     sensors = quad_gym.sensor_suite("lab").replace(camera=None).with_rates(imu=1.0 / dt)
     task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0)
@@ -88,7 +88,7 @@ def hovering_in_gusts(count, *, height=HEIGHT, wind=(0.0, WIND, 0.0), dt=0.005):
 
 
 def gusts(batch):
-    """(n, 3) along the wind (north), across it (west) and up, over their intensities."""
+    """Return gusts (n, 3) along the wind (north), across (west) and up, divided by intensities."""
     sigma_u, sigma_w, _, _ = military_scales(HEIGHT, WIND)
     east, north, up = (batch.record("wind") - batch.world.wind_I).T
     return np.stack([north / sigma_u, -east / sigma_u, up / sigma_w], axis=1)
@@ -112,18 +112,18 @@ def test_gusts_are_normal_with_the_specified_intensities(history, tick):
 
 
 @pytest.mark.parametrize("tick", [1, 40, 400])
-def test_correlation_of_gusts_over_time_is_that_of_the_spectra(history, tick):
+def test_autocorrelation_of_gusts_matches_dryden_spectra(history, tick):
     _, _, L_u, L_w = military_scales(HEIGHT, WIND)
     x, z = np.array([L_u, L_u, L_w]), WIND * tick * 0.005
     first_order_decay = np.exp(-z / x)
     expected = first_order_decay * np.array([1.0, 1.0 - 0.5 * z / L_u, 1.0 - 0.5 * z / L_w])
     start, now = history[0], history[tick]
-    # the innovation of one time given the other is normal with a known variance
+    # given the first gust, the innovation of the second is normal with a known variance
     innovation = (now - expected * start) / np.sqrt(1.0 - expected**2)
     assert_normal(np.hstack([start, innovation]), np.zeros(6), np.eye(6))
 
 
-def test_across_and_along_follow_the_wind():
+def test_gust_axes_turn_with_the_wind_direction():
     still, turned = hovering_in_gusts(8), hovering_in_gusts(8, wind=(-WIND, 0.0, 0.0))
     np.testing.assert_allclose(
         (turned.record("wind") - turned.world.wind_I)[:, 0], -(still.record("wind")[:, 1] - WIND)

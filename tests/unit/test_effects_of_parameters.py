@@ -1,4 +1,4 @@
-"""Every number of a parameter counts: a change of it changes what kernels read."""
+"""A change of any parameter changes the data that kernels read."""
 
 import dataclasses
 import math
@@ -33,11 +33,11 @@ ELSEWHERE = {
     "estimator.gravity": "of a filter without flights, as its docstring says",
     "initial_pose.position_sigma": "of suites without GNSS",
 }
-"""Numbers that have an effect elsewhere."""
+"""Parameters with an effect elsewhere."""
 
 
 def packed(**keywords):
-    """Everything that kernels read of a batch's parameters."""
+    """Return all parameter data of a batch that kernels read."""
     batch = FlightBatch(1, **{"sensors": SENSORS, "task": TASK, "world": WORLD} | keywords)
     settings = batch._settings.copy()
     settings["paths"] = settings["pieces"] = 0  # addresses
@@ -46,7 +46,7 @@ def packed(**keywords):
 
 
 def changed(value):
-    """Other values of a parameter, the first of which may be invalid."""
+    """Return other values of a parameter; the first may be invalid."""
     if isinstance(value, bool):
         return [not value]
     if isinstance(value, int):
@@ -57,7 +57,7 @@ def changed(value):
         return [0.3, 0.05, (0.1, 0.1, 0.1)]
     if isinstance(value, tuple) and value and isinstance(value[0], float):
         return [tuple(1.01 * x + 1e-5 for x in value), tuple(0.5 * x for x in value)]
-    return []  # a choice, or parameters of their own
+    return []  # a choice, or a group of parameters
 
 
 def in_suite(part):
@@ -103,7 +103,7 @@ GROUPS = {
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_a_change_of_a_number_changes_what_kernels_read(group):
+def test_change_of_any_parameter_changes_kernel_data(group):
     params, keywords = GROUPS[group]
     before, without, tried = packed(**keywords(params)), [], 0
     for field in dataclasses.fields(params):

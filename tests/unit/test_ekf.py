@@ -1,4 +1,4 @@
-"""The error-state EKF equals the textbook's, and its derivatives are those of the models."""
+"""The error-state EKF equals the textbook filter, and its Jacobians match the models."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ MIDPOINT = {"integration": "midpoint", "attitude_reset": True}
     ],
     ids=str,
 )
-def test_the_filter_equals_the_plain_filter(choices):
+def test_ekf_equals_plain_filter(choices):
     classes = {"filter_class": ExtendedKalmanFilter, "plain_class": PlainEKF}
     worst, cases = compare(estimator(**choices), 40, seed=4, **classes)
     assert_equal(worst)
@@ -35,7 +35,7 @@ def test_the_filter_equals_the_plain_filter(choices):
 
 
 def started(sensors, filter_class, seed, covariance=None):
-    """A filter at a random state."""
+    """Return a filter at a random state."""
     rng = np.random.default_rng(seed)
     ukf = filter_class(sensors)
     sigmas = np.repeat([0.01, 0.02, 0.01, 0.05, 0.001], 3)
@@ -53,12 +53,12 @@ def started(sensors, filter_class, seed, covariance=None):
 
 
 def exact_motion(state, error, noise, gyro, accel, imu):
-    """Where a body goes in a tick of constant rates and constant force in the frame halfway.
+    """Return the state after a tick of constant rates and constant force in the halfway frame.
 
     Args:
         state: position, velocity, R_BI, accel_bias, gyro_bias.
-        error: (15,) of the state: r, v, e, b_a, b_g.
-        noise: (6,) of gyro and accelerometer.
+        error: (15,) errors of r, v, e, b_a, b_g.
+        noise: (6,) noise of gyro and accelerometer.
     """
     dt = imu.dt
     r, v = state[0] + error[:3], state[1] + error[3:6]
@@ -73,7 +73,7 @@ def exact_motion(state, error, noise, gyro, accel, imu):
 
 
 def difference(moved, reference):
-    """(15,) error coordinates of one state about another."""
+    """Return error coordinates (15,) of one state about another."""
     e = dcm_to_euler(moved[2] @ reference[2].T)
     parts = [m - r for m, r in zip(moved, reference, strict=True)]
     return np.concatenate([parts[0], parts[1], e, parts[3], parts[4]])
@@ -82,12 +82,12 @@ def difference(moved, reference):
 @pytest.mark.parametrize("kind", [ExtendedKalmanFilter, UnscentedKalmanFilter])
 @pytest.mark.parametrize("seed", range(5))
 def test_midpoint_prediction_is_the_linearized_exact_motion(seed, kind):
-    """F P F^T + G Q G^T with F and G by finite differences of the exact motion on the manifold."""
+    """The covariance is F P F^T + G Q G^T, with F and G by finite differences on the manifold."""
     sensors = LAB.replace(estimator=LAB.estimator.replace(**MIDPOINT))
     ukf, imu = started(sensors, kind, seed), sensors.imu
     rng = np.random.default_rng(seed)
     gyro, accel = rng.normal(0.0, 3.0, 3), rng.normal((0.0, 0.0, 9.8), 2.0)
-    P = 1e-4 * ukf.covariance  # small, so that the UKF's second order does not show
+    P = 1e-4 * ukf.covariance  # small, so that second-order terms of the UKF vanish
     state = (ukf.position, ukf.velocity, ukf.R_BI, ukf.accel_bias, ukf.gyro_bias)
     names = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias")
     ukf.set_state(**dict(zip(names, state, strict=True)), covariance=P)
@@ -124,8 +124,8 @@ def test_midpoint_prediction_is_the_linearized_exact_motion(seed, kind):
 
 
 @pytest.mark.parametrize("turn", [False, True])
-def test_a_reset_turns_the_covariance_as_the_error_angles_turn(turn):
-    """By finite differences of the new error angles, after an update with a large correction."""
+def test_attitude_reset_rotates_covariance_with_the_error_angles(turn):
+    """The reference is a finite difference of the new error angles after a large correction."""
     sensors = LAB.replace(camera=None).replace(
         estimator=LAB.estimator.replace(attitude_reset=turn, initial_velocity_variance=1.0)
     )
@@ -160,7 +160,7 @@ def test_a_reset_turns_the_covariance_as_the_error_angles_turn(turn):
         np.testing.assert_array_equal(other.R_BI, plain.R_BI)
 
 
-def test_a_batch_flies_the_filter_of_the_friendly_class():
+def test_batch_estimates_equal_extended_kalman_filter_class():
     sensors = LAB.replace(estimator=LAB.estimator.replace(kind="ekf", **MIDPOINT))
     batch = quad_gym.FlightBatch(1, sensors=sensors)
     batch.reset(seeds=[5])

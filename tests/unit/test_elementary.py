@@ -41,13 +41,13 @@ def evaluate(request):
 
 
 def ulps(got, expected):
-    """The error in units in the last place of the truth."""
+    """Return the largest error in units in the last place of the truth."""
     got, expected = np.broadcast_arrays(np.asarray(got), np.asarray(expected))
     return np.max(np.abs(got - expected) / np.spacing(np.maximum(np.abs(expected), 2.3e-308)))
 
 
 def precise_ulps(got, function, values):
-    """The same for a function of mpmath, whose values are not rounded."""
+    """Return the largest error in units in the last place of unrounded values of mpmath."""
     worst = 0.0
     with mpmath.workdps(60):
         for found, value in zip(got.tolist(), values.tolist(), strict=True):
@@ -58,7 +58,7 @@ def precise_ulps(got, function, values):
 
 
 def in_precision(function, values):
-    """`function` of mpmath at every value, rounded to floats."""
+    """Return a function of mpmath at every value, rounded to floats."""
     with mpmath.workdps(60):
         return np.array([float(function(mpmath.mpf(float(v)))) for v in values])
 
@@ -67,7 +67,7 @@ NORMAL = np.random.default_rng(1).normal(size=(2, 4000))
 
 
 def near_quarter_turns():
-    """The floats next to multiples of a quarter turn, and others near them."""
+    """Return the floats next to multiples of a quarter turn, and others near them."""
     turns = np.append(np.arange(-40, 41), np.geomspace(41, 636_000, 400).round())
     with mpmath.workdps(60):
         angles = np.array([float(turn * mpmath.pi / 2) for turn in turns.tolist()])
@@ -81,7 +81,7 @@ ANGLES = {
     "of any size": NORMAL[1, :1500] * np.geomspace(1e-300, 1e6, 1500),
     "up to the limit": np.linspace(-1e6, 1e6, 2001),
     "multiples of a quarter turn": near_quarter_turns(),
-    # of all floats up to 1e6, those nearest to a multiple
+    # the floats up to 1e6 that are nearest to a multiple
     "hardest": np.array([45.553093477052, 91.106186954104, -364.424747816416, 321307.9594422229]),
 }
 
@@ -94,12 +94,12 @@ def test_sine_and_cosine_are_within_one_unit_in_the_last_place(evaluate, kind):
     assert precise_ulps(out["cos"], mpmath.cos, x) < 0.8
 
 
-def test_sine_and_cosine_of_large_angles(evaluate):
+def test_sine_and_cosine_are_accurate_up_to_1e9_radians(evaluate):
     x = np.append([1e9, -1e9], np.geomspace(1e6, 1e9, 500))
     out = evaluate(x)
     assert np.abs(out["sin"] - in_precision(mpmath.sin, x)).max() <= 2.0**-53
     assert np.abs(out["cos"] - in_precision(mpmath.cos, x)).max() <= 2.0**-53
-    out = evaluate([1.01e9, -1e22, 1.7e308])  # as of no angle
+    out = evaluate([1.01e9, -1e22, 1.7e308])  # too large: as for an angle of zero
     assert (out["sin"] == 0.0).all()
     assert (out["cos"] == 1.0).all()
 
@@ -123,7 +123,7 @@ def test_cosine_less_one_keeps_its_relative_accuracy(evaluate):
     assert ulps(out["sin_small"], in_precision(mpmath.sin, x)) <= 3
 
 
-def test_exponential_and_logarithm_are_numpys(evaluate):
+def test_exponential_and_logarithm_match_numpy(evaluate):
     rng = np.random.default_rng(4)
     limits = [0.0, -0.0, 1e-300, 709.78, -708.39]
     x = np.concatenate([limits, rng.uniform(-708, 709, 4000), rng.uniform(-1, 1, 4000)])
@@ -138,7 +138,7 @@ def test_exponential_and_logarithm_are_numpys(evaluate):
     assert found[0] == 0.0
 
 
-def test_functions_beyond_their_range(evaluate):
+def test_functions_return_limits_or_nan_beyond_their_range(evaluate):
     inf, nan = math.inf, math.nan
     out = evaluate([709.79, 1e4, 1e308, inf, -709.0, -1e4, -1e308, -inf, nan])["exp"]
     np.testing.assert_array_equal(out, [inf] * 4 + [0.0] * 4 + [nan])
@@ -152,7 +152,7 @@ def test_functions_beyond_their_range(evaluate):
         np.testing.assert_array_equal(out[name], value)
 
 
-def test_angle_of_a_point(evaluate):
+def test_atan2_matches_numpy(evaluate):
     rng = np.random.default_rng(6)
     x, y = rng.normal(size=(2, 8000)) * 10 ** rng.uniform(-100, 100, (2, 8000))
     x[:4000], y[:4000] = rng.normal(size=(2, 4000))
@@ -168,7 +168,7 @@ def test_angle_of_a_point(evaluate):
         *((math.inf, 1.0, math.pi / 2), (-math.inf, -1.0, -math.pi / 2), (1e-320, 1e308, 0.0)),
     ],
 )
-def test_angles_of_special_points(evaluate, y, x, angle):
+def test_atan2_of_special_points_is_accurate(evaluate, y, x, angle):
     assert evaluate([x], y)["angle"][0] == pytest.approx(angle, rel=3e-16, abs=0.0)
 
 
@@ -177,7 +177,7 @@ def test_angles_of_special_points(evaluate, y, x, angle):
     st.integers(0, WIDTH - 1),
     st.lists(st.floats(-0.04, 0.04) | st.floats(-1e5, 1e5), min_size=WIDTH, max_size=WIDTH),
 )
-def test_a_strange_angle_in_one_lane_changes_no_other(bad, where, values):
+def test_extreme_value_in_one_lane_changes_no_other_lane(bad, where, values):
     x = np.array(values)
     corrupt = x.copy()
     corrupt[where] = bad

@@ -1,4 +1,4 @@
-"""The catalog of compiled functions: what it holds, and that it needs no Numba."""
+"""The catalog of compiled functions is complete and needs no Numba."""
 
 import inspect
 import subprocess
@@ -43,6 +43,6 @@ def test_catalog_has_the_entries_of_kernels_with_their_arguments():
         (np.zeros(1, PARAMS), "of {'names'"),
     ],
 )
-def test_array_that_a_function_has_no_code_for_is_refused(flights, words):
+def test_array_of_wrong_layout_or_type_raises_type_error(flights, words):
     with pytest.raises(TypeError, match=f"step_biases takes an array .*{words}"):
         entries.step_biases(flights, np.zeros(1, PARAMS))

@@ -1,4 +1,4 @@
-"""The friendly filter: what it refuses, what it survives, how it starts."""
+"""The filter class for users: refused input, failures, and starts."""
 
 import warnings
 
@@ -58,13 +58,13 @@ def test_an_update_without_measurements_changes_nothing():
     assert ukf.status == FilterStatus(0)
 
 
-def test_pixels_without_a_camera_and_writes_change_nothing():
+def test_pixels_without_camera_raise_and_properties_return_copies():
     ukf = UnscentedKalmanFilter(LAB.replace(camera=None))
     ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
     ukf.update(pixels=np.zeros((0, 2)))
     with pytest.raises(ValueError, match="pixels"):
         ukf.update(pixels=np.zeros((2, 2)))
-    for name in PROPERTIES:  # what they return is the caller's own
+    for name in PROPERTIES:  # each returns a copy
         before = getattr(ukf, name).copy()
         getattr(ukf, name)[...] = 7.0
         np.testing.assert_array_equal(getattr(ukf, name), before)
@@ -97,7 +97,7 @@ def test_exact_fix_gives_position_and_attitude(yaw):
         np.testing.assert_array_equal(getattr(ukf, name), 0.0)
 
 
-def test_the_first_covariance_is_the_laboratorys():
+def test_initial_covariance_equals_laboratory_values():
     ukf = running_filter(cycles=0)
     milli_g, degree_per_hour = 9.8e-3, np.radians(1.0) / 3600.0
     variances = np.repeat(
@@ -108,7 +108,7 @@ def test_the_first_covariance_is_the_laboratorys():
 
 
 def test_tilt_is_split_between_baseline_and_vertical():
-    """Two directions of equal weight that disagree by 2d: each is turned by d."""
+    """Two directions with equal weight that disagree by 2d are each turned by d."""
     ukf, tilt = UnscentedKalmanFilter(LAB), 0.3
     baseline_I = 0.19 * np.array([-np.cos(tilt), 0.0, np.sin(tilt)])
     ukf.initialize((0.0, 0.0, 0.0), R_IG.T @ baseline_I)
@@ -118,7 +118,7 @@ def test_tilt_is_split_between_baseline_and_vertical():
 
 @pytest.mark.parametrize("name", ["lab", "rtk"])
 @pytest.mark.parametrize("heading", np.linspace(-3.0, 3.0, 5))
-def test_a_steep_baseline_leaves_the_heading_to_the_mark(name, heading):
+def test_heading_with_vertical_baseline_is_taken_from_argument(name, heading):
     suite = quad_gym.sensor_suite(name)
     up = {"primary_antenna_B": (0.01, 0.02, 0.05), "secondary_antenna_B": (0.01, 0.02, 0.24)}
     suite = suite.replace(
@@ -133,12 +133,11 @@ def test_a_steep_baseline_leaves_the_heading_to_the_mark(name, heading):
     variance = suite.estimator.initial_covariance_scale * 0.1**2
     np.testing.assert_allclose(ukf.covariance[8, 8], variance, rtol=1e-12)
     ukf.initialize(*fix)
-    np.testing.assert_allclose(ukf.covariance[8, 8], np.pi**2 / 3, rtol=1e-12)  # any
+    np.testing.assert_allclose(ukf.covariance[8, 8], np.pi**2 / 3, rtol=1e-12)  # any heading
 
 
 @pytest.mark.parametrize("sigma", [0.05, 1.0])
-def test_a_level_baseline_tells_the_heading_itself(sigma):
-    """However noisy it is."""
+def test_level_baseline_overrides_given_heading_even_if_noisy(sigma):
     fix = RECORDING.gnss_position[0], RECORDING.gnss_baseline[0]
     suite = LAB.replace(gnss=LAB.gnss.replace(baseline_sigma=sigma))
     told, not_told = UnscentedKalmanFilter(suite), UnscentedKalmanFilter(suite)
@@ -147,7 +146,7 @@ def test_a_level_baseline_tells_the_heading_itself(sigma):
     assert_same(estimate(not_told), estimate(told))
 
 
-def test_initialize_starts_anew_and_forgets_failures():
+def test_initialize_resets_state_and_failure_status():
     ukf = running_filter()
     with pytest.warns(RuntimeWarning, match="last good state"):
         ukf.predict((0.0, 0.0, 0.0), (1e300, 0.0, 0.0))
@@ -169,7 +168,7 @@ def given_state(**changes):
     return {**state, **changes}
 
 
-def test_set_state_is_what_one_reads_back():
+def test_properties_return_values_given_to_set_state():
     ukf, state = UnscentedKalmanFilter(LAB), given_state()
     ukf.set_state(**state)
     for name in PROPERTIES:
@@ -194,7 +193,7 @@ def test_set_state_is_what_one_reads_back():
     ],
     ids=str,
 )
-def test_set_state_refuses_what_is_no_state_and_changes_nothing(name, value):
+def test_set_state_with_invalid_value_raises_and_changes_nothing(name, value):
     ukf = running_filter()
     before = estimate(ukf)
     with pytest.raises(ValueError, match=name):
@@ -207,7 +206,7 @@ EXTREMES = [1e300, -1e300, 1e160, 1e100, -1e30, 1e17]
 
 @pytest.mark.parametrize("value", EXTREMES)
 @pytest.mark.parametrize("name", ["gyro", "accel", "gnss_position_G", "pixels"])
-def test_enormous_values_warn_or_are_used_but_make_no_nan(name, value):
+def test_enormous_values_keep_estimate_finite_with_or_without_warning(name, value):
     ukf, shape = running_filter(), (2, 2) if name == "pixels" else (3,)
     before, of_imu = estimate(ukf), name in ("gyro", "accel")
     given = {"gyro": (0.0, 0.0, 0.1), "accel": (0.0, 0.0, 9.8)} if of_imu else {}
@@ -225,7 +224,7 @@ def test_enormous_values_warn_or_are_used_but_make_no_nan(name, value):
 
 
 @pytest.mark.parametrize("length", [1e300, 1e160, 1e100, 1e-8])
-def test_baseline_counts_by_its_direction_or_is_refused(length):
+def test_baseline_of_extreme_length_updates_by_its_direction_or_raises(length):
     wild, tame = running_filter(), running_filter()
     before, direction = estimate(wild), RECORDING.gnss_baseline[5] / 0.19
     try:

@@ -17,7 +17,7 @@ LIMIT = 41
 
 
 class Wobbly:
-    """Acts at random by the observation's bits, so that some flights crash."""
+    """A policy with pseudorandom actions from the bits of observations; some flights crash."""
 
     def __init__(self, size):
         self.size = size
@@ -28,7 +28,7 @@ class Wobbly:
 
 
 class Wavering(Wobbly):
-    """The same by what it has observed since the episode began, which it remembers."""
+    """A policy with memory: pseudorandom actions depend on all observations of the episode."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         seen = np.asarray(observation, float)[..., :4]
@@ -40,7 +40,7 @@ class Wavering(Wobbly):
 
 
 def plain_loop(task, policy, seed, **keywords):
-    """One episode: return, length, mean, late and estimation error, crashed, gates, ending."""
+    """Fly one episode and return its results by name."""
     env = QuadEnv(task, **keywords)
     observation, _ = env.reset(seed=seed)
     rewards, errors, estimation, state = [], [], [], None
@@ -68,7 +68,7 @@ def plain_loop(task, policy, seed, **keywords):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("kind", [Wobbly, Wavering])
 @pytest.mark.parametrize(("task", "size"), [("hover", 0.8), ("circle", 0.3), ("waypoints", 0.6)])
-def test_it_measures_what_a_plain_loop_measures(task, size, kind, mode):
+def test_roll_out_measures_same_values_as_plain_loop(task, size, kind, mode):
     keywords = {"max_episode_steps": LIMIT, "max_tilt": 0.9}
     env = QuadVectorEnv(24, task, autoreset_mode=mode, **keywords)
     policy = kind(size)
@@ -97,7 +97,7 @@ def test_a_course_that_is_finished_is_no_crash():
     assert (episodes.gates_passed == 1).all()
 
 
-def test_evaluate_is_a_roll_out_of_an_environment_made_for_it():
+def test_evaluate_equals_roll_out_of_environment_made_by_hand():
     policy = Wobbly(0.5)
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=9, max_tilt=0.7)
     roll_out(policy, env, seed=4)
@@ -107,7 +107,7 @@ def test_evaluate_is_a_roll_out_of_an_environment_made_for_it():
         np.testing.assert_array_equal(mine, other)
 
 
-def test_what_cannot_be_rolled_out_is_refused():
+def test_invalid_roll_outs_raise_value_error():
     policy = Wobbly(0.5)
     with pytest.raises(ValueError, match="QuadVectorEnv"):
         roll_out(policy, gymnasium.make_vec("Pendulum-v1", num_envs=2))

@@ -1,4 +1,4 @@
-"""Exported controllers act as the policies they come from."""
+"""Exported controllers compute the actions of their policies."""
 
 import ctypes
 import json
@@ -25,7 +25,7 @@ CIRCLE = "QuadGym/Circle-v0"
 
 
 def library_of(controller, folder):
-    """The exported C file, compiled."""
+    """Compile the exported C file."""
     (folder / "it.c").write_text(c_source(controller, "it"))
     library = folder / "it.so"
     line = [COMPILER, *FLAGS, "-shared", "-fPIC", str(folder / "it.c"), "-o", str(library), "-lm"]
@@ -34,7 +34,7 @@ def library_of(controller, folder):
 
 
 def compiled(controller, folder):
-    """The exported C function over rows of observations; NaN where it returns 1."""
+    """Return the exported C function, from rows of observations to actions and status."""
     function = library_of(controller, folder).it
 
     def act(observations):
@@ -49,7 +49,7 @@ def compiled(controller, folder):
 
 
 def exact(controller, observations):
-    """The network in double precision."""
+    """Evaluate the network in double precision."""
     x = observations.astype(float)
     rules = {"none": lambda x: x, "relu": lambda x: np.maximum(x, 0.0), "tanh": np.tanh}
     policy = controller.policy
@@ -59,7 +59,7 @@ def exact(controller, observations):
 
 
 def observations_in_flight(controller, count):
-    """What a policy sees in flight, (count, n), with some noise on its actions."""
+    """Return observations (count, n) of a policy in flight, with some noise on its actions."""
     rng, seen = np.random.default_rng(0), []
     env = gymnasium.make_vec(controller.env_id, num_envs=count // 100, **controller.keywords)
     observation, _ = env.reset(seed=0)
@@ -72,7 +72,7 @@ def observations_in_flight(controller, count):
 
 
 def stable_baselines_file(folder, algorithm, keywords=None):
-    """An untrained policy of Stable-Baselines3."""
+    """Save an untrained policy of Stable-Baselines3."""
     pytest.importorskip("stable_baselines3")
     from baselines.models import make_model
     from baselines.plans import Plan
@@ -91,7 +91,7 @@ def stable_baselines_file(folder, algorithm, keywords=None):
 
 
 def let_act(model):
-    """So that an untrained policy does more than nothing."""
+    """Give an untrained policy weights that produce actions."""
     import torch
 
     for name, parameter in model.policy.named_parameters():
@@ -102,7 +102,7 @@ def let_act(model):
 
 
 def compiled_ppo_file(folder, algorithm="ppo"):
-    """An untrained policy of the compiled PPO, as a training keeps it."""
+    """Save an untrained policy of the compiled PPO as training does."""
     from baselines.compiled_ppo.run import make_compiled
     from baselines.plans import Plan, description
     from baselines.recipes import recipe
@@ -140,7 +140,7 @@ def test_c_acts_as_the_policy_in_flight(source, tmp_path):
 
 
 def recurrent(folder):
-    """A policy with memory, observations of ten flights (100, 10, n), its actions and memories."""
+    """Return a policy with memory, observations of ten flights (100, 10, n), actions, memories."""
     controller = controller_of(str(compiled_ppo_file(folder, "recurrent_ppo")))
     seen = observations_in_flight(controller, 1000).reshape(100, 10, -1)
     memory, steps = None, []
@@ -195,7 +195,7 @@ def test_c_holds_observations_within_their_bounds(tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("place", [0, 27])
-def test_c_refuses_what_is_not_finite(bad, place, tmp_path):
+def test_c_returns_error_for_non_finite_observation(bad, place, tmp_path):
     observation = np.zeros((1, 28), np.float32)
     observation[0, place] = bad
     actions, status = compiled(controller_of("pretrained", CIRCLE), tmp_path)(observation)
@@ -206,7 +206,7 @@ def test_c_refuses_what_is_not_finite(bad, place, tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("activation", ["relu", "tanh", "elu", "none"])
 def test_c_has_every_activation_and_odd_sizes(activation, tmp_path):
-    """Layers of 28, 5, 3 and 4 numbers: the sums of four at a time have a rest of each length."""
+    """Layers of 28, 5, 3 and 4 numbers leave different remainders of sums of four at a time."""
     rng = np.random.default_rng(0)
     sizes = (28, 5, 3, 4)
     shapes = [(outputs, inputs) for inputs, outputs in pairwise(sizes)]
@@ -232,7 +232,7 @@ def test_onnx_acts_as_the_policy_in_flight(source, tmp_path):
     np.testing.assert_allclose(actions, controller.policy.predict(seen)[0], rtol=0.0, atol=1e-6)
 
 
-def test_onnx_says_what_observation_and_action_are(tmp_path):
+def test_onnx_metadata_describes_observation_and_action(tmp_path):
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     save_onnx(controller_of("pretrained", CIRCLE), tmp_path / "it.onnx")
@@ -260,7 +260,7 @@ def test_onnx_that_acts_differently_is_not_written(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("action", ["ctbr", "motor", "wrench", "attitude", "velocity"])
 def test_zeros_hover_in_every_action(action):
-    """Actions of zero carry the weight and turn nothing, m g = 0.78 kg 9.8 m/s^2."""
+    """Zero actions carry the weight, m g = 0.78 kg 9.8 m/s^2, and command no rotation."""
     params = params_record(quad_gym.vehicle_params("lab"), quad_gym.sensor_suite("lab"))[0]
     offsets = [field.offset for field in action_fields(action, params)]
     if action == "motor":
@@ -280,12 +280,12 @@ def test_zeros_hover_in_every_action(action):
         ("nothing.txt", CIRCLE, None, "there is no policy"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(policy, env_id, keywords, message):
+def test_export_of_unsuitable_policy_raises_value_error(policy, env_id, keywords, message):
     with pytest.raises(ValueError, match=message):
         controller_of(policy, env_id, keywords)
 
 
-def test_a_policy_that_sees_the_truth_is_refused(tmp_path):
+def test_export_of_privileged_policy_raises_value_error(tmp_path):
     keywords = {"privileged": True}
     file = stable_baselines_file(tmp_path, "ppo", keywords)
     with pytest.raises(ValueError, match="observes the truth"):

@@ -1,4 +1,4 @@
-"""A measurement that fails half way leaves the estimate bitwise unchanged, and is counted."""
+"""A failed measurement leaves the estimate bitwise unchanged and is counted."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ BLOCKS = {
 
 
 def filters_with(blocks, sensors, form):
-    """Eight filters that have just measured some blocks."""
+    """Return eight filters with measurements of some blocks."""
     filters = LaneFilter(sensors)
     filters.form |= int(form)
     for lane in range(EIGHT):
@@ -69,7 +69,7 @@ def filters_with(blocks, sensors, form):
 )
 @pytest.mark.parametrize("how", ["nan", "infinity", "singular", "covariance"])
 def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
-    """One block alone or all at once; its neighbors' updates are theirs."""
+    """One flight fails, with one block or all blocks; the others update as without the failure."""
     if how == "infinity" and sensors is FIELD:
         pytest.skip("a gate rejects what is infinitely far")
     filters, free = (filters_with(blocks, sensors, form) for _ in range(2))
@@ -104,7 +104,7 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
         assert (
             np.delete(filters.get("gate")[:, taken], BAD, axis=0) == GateDecision.ACCEPTED
         ).all()
-    # with a sound measurement the filter goes on as if nothing had been
+    # with a valid measurement the filter continues as if nothing had failed
     if how in ("nan", "infinity"):
         filters.put(BAD, **{VALUES[last]: filters.get(VALUES[last])[0]})
         for name in STATE:
@@ -137,7 +137,7 @@ def test_a_failed_prediction_changes_nothing(field, sensors, form):
     assert filters.get("prediction_failures")[BAD] == 2.0
 
 
-def test_an_environment_tells_of_a_failed_filter_and_begins_anew():
+def test_environment_reports_failed_filter_and_resets_the_flight():
     env = QuadVectorEnv(9, "hover", autoreset_mode="SameStep")
     env.reset(seed=1)
     batch = env.flights.batch

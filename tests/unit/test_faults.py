@@ -1,6 +1,5 @@
-"""Faults: when they come and go, and what they do, against the same flights without them. A fault
-changes no other draw, so on the true state a flight with faults is the flight without, but for what
-the fault does: differences show that alone."""
+"""Faults: times and effects, against the same flights without faults. A fault changes no other
+draw, so on the true state the difference between both flights is the effect of the fault."""
 
 import math
 
@@ -40,7 +39,7 @@ R_IG = ecef_to_enu(LAB.gnss.reference_antenna_G)
 
 
 def both(sensors, faults, count=16, **options):
-    """The same flights on the true state, without and with faults."""
+    """Return flights on the true state without faults, and the same flights with faults."""
     options = {"source": Source.TRUTH, "run_filter": True, "threads": 1} | options
     return tuple(fly(sensors, count, faults=given, **options) for given in (None, faults))
 
@@ -54,7 +53,7 @@ def at(kind, batch, name="fault_active"):
     return batch.record(name)[:, kind]
 
 
-def test_a_scheduled_fault_is_there_from_its_start_until_its_end():
+def test_scheduled_fault_is_active_from_start_to_end():
     faults = (GnssOutage(start=0.1, duration=0.05), BaselineLoss(), ImuSaturation(start=0.2))
     batch = fly(BLIND, 3, faults=faults, threads=1)
     for tick in range(1, 61):
@@ -98,7 +97,7 @@ def test_a_fault_with_a_rate_comes_again_after_exponential_waits():
     assert len(waits) > 2000
     assert stats.kstest(waits, stats.expon(scale=1 / 20.0).cdf).pvalue > ALARM
     counts = at(fault.kind, batch, "fault_count")
-    # renewals of 0.05 s wait and 0.1 s stay on average, within one second
+    # renewals with a mean wait of 0.05 s and a mean duration of 0.1 s, within one second
     assert 5.0 < counts[concerned].mean() < 7.5
     assert (counts[~concerned] == 0.0).all()
 
@@ -147,7 +146,7 @@ def test_an_outage_takes_the_fixes_away_and_changes_nothing_else():
 
 
 def offsets(calm, faulty, ticks):
-    """(ticks, flights, 3) what faults add to GNSS positions, in I."""
+    """Return the errors (ticks, flights, 3) that faults add to GNSS positions, in I."""
     found = []
     for _ in range(ticks):
         step(calm, faulty)
@@ -208,7 +207,7 @@ def test_occlusion_hides_the_same_features_while_it_lasts():
 
 
 @pytest.mark.parametrize("how", ["swap", "copy"])
-def test_wrong_associations_take_one_seen_feature_for_another(how):
+def test_wrong_associations_swap_or_copy_visible_features(how):
     suite = quad_gym.sensor_suite("indoor").simplified().with_rates(camera=200.0)
     calm, faulty = both(suite, WrongAssociations(share=0.3, how=how), count=100)
     images = changed = 0
@@ -237,7 +236,7 @@ def test_wrong_associations_take_one_seen_feature_for_another(how):
     assert images > 1000
     assert stats.binomtest(changed, images, 0.3).pvalue > ALARM
     three = [place for place, count in places if count == 3]
-    if how == "copy" and three:  # any of those seen is as likely
+    if how == "copy" and three:  # each visible one is equally likely
         assert stats.chisquare(np.bincount(three, minlength=3)).pvalue > ALARM
 
 
@@ -262,7 +261,7 @@ def test_a_bias_step_is_part_of_the_true_bias_while_it_lasts():
 
 
 @pytest.mark.parametrize("sensors", [BLIND, RTK], ids=["instant", "average"])
-def test_saturated_samples_end_at_the_ranges(sensors):
+def test_saturation_clips_imu_samples_to_their_ranges(sensors):
     ranges = ImuSaturation(start=0.1, accel_range=9.5, gyro_range=0.3)
     calm, faulty = both(sensors, ranges, count=50)
     clipped = 0

@@ -1,4 +1,4 @@
-"""Exported filters: the example's estimates are bitwise those of a replay, on any processor."""
+"""Exported filters: estimates of the example equal a replay bitwise on every processor."""
 
 import ctypes
 import dataclasses
@@ -55,7 +55,7 @@ def exported(name, target="x86-64", policy=None):
 
 @functools.cache
 def logged(name, seconds=3.0, most_ticks=3):
-    """A log with delays, jitter and losses, without columns of sensors that the suite lacks."""
+    """Write a log with latency, jitter and losses, without columns of absent sensors."""
     suite = quad_gym.sensor_suite(name)
     recorded = Recorded(flown(suite, seconds), suite, most_ticks=most_ticks)
     table = recorded.table()
@@ -90,7 +90,7 @@ def require_equal(found, log, suite, start):
 
 @needs_compiler
 @pytest.mark.parametrize("name", ["rtk", "consumer", "standard", "indoor"])
-def test_example_prints_what_a_replay_computes(name):
+def test_example_prints_estimates_of_replay(name):
     suite, log = quad_gym.sensor_suite(name), logged(name)
     rests = suite.gnss is None
     found = estimates(example(name, "x86-64"), log, *(FROM_REST if rests else ()))
@@ -99,8 +99,8 @@ def test_example_prints_what_a_replay_computes(name):
 
 @needs_compiler
 @pytest.mark.parametrize("option", ["heading", "course"])
-def test_example_starts_as_a_replay_does(option, tmp_path):
-    """In flight, with a known heading or along the course, without baseline and magnetic field."""
+def test_example_with_start_in_flight_equals_replay(option, tmp_path):
+    """A start in flight uses a given heading or the course, without baseline or magnetometer."""
     lines = [line.split(",") for line in logged("consumer").read_text().split()]
     lines = [lines[0], *(line for line in lines[1:] if float(line[1]) > 1.5)]
     kept = [k for k, name in enumerate(lines[0]) if not name.startswith("magnetometer")]
@@ -118,7 +118,7 @@ def on_aarch64(name, log):
 
 
 def on_arm(name, log):
-    """The code for Cortex-M7, without the attributes that forbid its use in a program of Linux."""
+    """Run the code for Cortex-M7, without the attributes that prevent its use on Linux."""
     folder = exported(name, "cortex-m7")
     program, flat = folder / "example", folder / "without_attributes.a"
     if not program.exists():
@@ -137,7 +137,7 @@ def on_arm(name, log):
     ],
 )
 @pytest.mark.parametrize("name", ["rtk", "consumer"])
-def test_example_on_a_foreign_processor_prints_what_a_replay_computes_here(run, name):
+def test_example_on_foreign_processor_prints_estimates_of_replay(run, name):
     require_equal(run(name, logged(name)), logged(name), quad_gym.sensor_suite(name), {})
 
 
@@ -154,7 +154,7 @@ def test_examples_print_a_replay_of_1e5_samples():
 
 
 @needs_wasm
-def test_example_as_webassembly_prints_what_a_replay_computes_here(tmp_path):
+def test_example_as_webassembly_prints_estimates_of_replay(tmp_path):
     folder, log = exported("rtk", "wasm32"), logged("rtk")
     program, run = tmp_path / "example.wasm", tmp_path / "run.mjs"
     clock = ["-D_WASI_EMULATED_PROCESS_CLOCKS", "-lwasi-emulated-process-clocks", "-lm"]
@@ -181,7 +181,7 @@ def test_compiled_filter_calls_no_function_of_the_math_library(target):
 
 
 @needs_compiler
-def test_without_numba_one_sentence_names_the_extra(monkeypatch, tmp_path):
+def test_export_without_numba_raises_import_error_with_install_hint(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(ImportError, match=r'needs numba: pip install "quad-gym\[compile\]"'):
         export_filter(quad_gym.sensor_suite("rtk"), "rtk", "x86-64", tmp_path)
@@ -214,7 +214,7 @@ OK, NOT_STARTED, NOT_FINITE, OUT_OF_RANGE, TOO_OLD, TOO_NEW = range(6)
 
 
 class Library:
-    """The exported filter of a suite, called from here."""
+    """The exported filter of a suite, loaded by ctypes."""
 
     def __init__(self, name, policy=None):
         folder = exported(name, "x86-64", policy)
@@ -231,7 +231,7 @@ class Library:
         self.memory = ctypes.create_string_buffer(self._c.qg_size() + 64)
 
     def call(self, name, *arguments):
-        """Call a function; floats are numbers, sequences arrays of them."""
+        """Call a function; scalars become doubles, sequences become arrays of doubles."""
         given = [
             ctypes.c_double(a) if np.ndim(a) == 0 else (ctypes.c_double * len(a))(*a)
             for a in arguments
@@ -265,7 +265,7 @@ def started(name):
 
 @needs_compiler
 def test_calls_give_the_estimates_of_the_python_filter():
-    """Samples of any length, measurements now and up to 0.4 s late."""
+    """Samples have any length, and measurements are up to 0.4 s late."""
     ukf, c = started("crazyflie")
     rng = np.random.default_rng(0)
     for _ in range(400):
@@ -327,8 +327,8 @@ def test_calls_before_the_start_return_an_error():
 
 
 @needs_compiler
-def test_measurement_of_the_future_waits_for_the_sample_of_its_time():
-    """As if the sample had been split there."""
+def test_early_measurement_waits_for_the_imu_sample_of_its_time():
+    """The estimate equals the one with a late measurement of this time."""
     c, whole = library("crazyflie"), []
     for early in (True, False):
         assert c.call("init_at_rest", [0.0, 0.0, 0.8], 0.0, 0.0) == OK
@@ -343,7 +343,7 @@ def test_measurement_of_the_future_waits_for_the_sample_of_its_time():
 
 @needs_compiler
 def test_full_memory_shortens_the_window_only():
-    """Ten times as many measurements as the suite's rates announce."""
+    """Ten times as many measurements arrive as the suite's rates imply."""
     ukf, c = started("crazyflie")
     rng = np.random.default_rng(1)
     for _ in range(150):

@@ -1,4 +1,4 @@
-"""Starts from one antenna: level, with a heading from elsewhere, or from nowhere."""
+"""Level starts with one antenna, and a heading from another source or an unknown heading."""
 
 import math
 
@@ -15,14 +15,13 @@ from tests.level_flights import MAGNETIC, R_IG, LevelFlight
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
 DRAWS = 300
-STEADY = MAGNETIC.replace(  # so that biases do not change in a flight, as in these they do not
+STEADY = MAGNETIC.replace(  # biases stay constant, as in the flights
     imu=MAGNETIC.imu.replace(accel_bias_tau=1e7, gyro_bias_tau=1e7)
 )
 ONE_ANTENNA = MAGNETIC.replace(gnss=MAGNETIC.gnss.replace(secondary_antenna_B=None))
 
 
 def start(flight, kf, how):
-    """Start a filter on a flight."""
     position, velocity = flight.gnss(0.0)
     if how == "heading":
         kf.initialize(position, heading=flight.yaw + flight.rng.normal(0.0, 0.05))
@@ -46,13 +45,13 @@ def flight_for(how, seed):
 
 
 def share(dimension, count):
-    """Bounds that the mean NEES of a consistent filter leaves once in a thousand."""
+    """Return the 99.9 % interval of the mean NEES of a consistent filter."""
     return chi2.ppf((0.0005, 0.9995), dimension * count) / count
 
 
 @pytest.mark.parametrize("how", ["heading", "magnetometer", "course", "nothing"])
-def test_errors_at_the_start_are_as_large_as_the_covariance_says(how):
-    """1 in 1,000 each; a heading that may be any has errors as large, not distributed alike."""
+def test_initial_errors_match_the_initial_covariance(how):
+    """An unknown heading has errors as large as the covariance, but they are not Gaussian."""
     squares, kf = [], UnscentedKalmanFilter(MAGNETIC)
     count = DRAWS if how != "nothing" else 100
     for seed in range(count):
@@ -72,8 +71,8 @@ def test_errors_at_the_start_are_as_large_as_the_covariance_says(how):
 
 
 @pytest.mark.parametrize("suite", [ONE_ANTENNA, quad_gym.sensor_suite("consumer")])
-def test_flights_and_filters_take_the_same_heading_from_a_field(suite):
-    """Kernels start a flight's filter, NumPy one alone: same attitude, position and covariance."""
+def test_batch_and_filter_class_start_with_same_heading_from_magnetometer(suite):
+    """Kernels and NumPy start filters with the same attitude, position and covariance."""
     batch, kf = fly(suite, 4, task="hover", seed=3), UnscentedKalmanFilter(suite)
     read = {
         name: batch.record(name)
@@ -93,8 +92,8 @@ def test_flights_and_filters_take_the_same_heading_from_a_field(suite):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_motion_tells_a_heading_that_nobody_knew(kind):
-    """25 flights from any heading: consistent all the way (4 in 1,000), resolved, and right."""
+def test_unknown_heading_is_found_from_motion(kind):
+    """In 25 flights the NEES stays consistent (false alarms: 0.4 %) and the heading is resolved."""
     count, dt, kf = 25, 0.02, kind(STEADY)
     squares = np.zeros((count, 4))
     resolved = []
@@ -121,7 +120,7 @@ def test_motion_tells_a_heading_that_nobody_knew(kind):
     assert ((low < mean) & (mean < high)).all(), mean
 
 
-def test_without_motion_the_heading_stays_unknown_and_says_so():
+def test_unknown_heading_without_motion_stays_unknown():
     rng = np.random.default_rng(0)
     flight = LevelFlight(MAGNETIC, rng, amplitude=0.0)
     kf = start(flight, UnscentedKalmanFilter(MAGNETIC), "nothing")
@@ -131,7 +130,7 @@ def test_without_motion_the_heading_stays_unknown_and_says_so():
     assert not kf.heading_known
     assert math.sqrt(kf.covariance[8, 8]) > 1.0
     np.testing.assert_allclose(kf.R_BI @ kf.R_BI.T, np.eye(3), atol=1e-12)
-    kf.initialize(flight.gnss(0.0)[0], heading=0.3)  # and begins anew
+    kf.initialize(flight.gnss(0.0)[0], heading=0.3)  # a new start
     assert kf.heading_known
 
 
@@ -158,12 +157,12 @@ def test_late_measurements_resolve_the_heading_as_those_in_time():
         if due > 150:
             late.update(position, gnss_velocity_G=velocity, time=stamp)
     assert in_time.heading_known
-    assert (True, False) in told  # late it was told later
+    assert (True, False) in told  # the late filter resolves it later
     np.testing.assert_array_equal(in_time.covariance, late.covariance)
     np.testing.assert_array_equal(in_time.position, late.position)
 
 
-def test_a_baseline_takes_velocity_and_noise_too():
+def test_start_with_baseline_uses_given_velocity_and_noise():
     kf = UnscentedKalmanFilter(MAGNETIC)
     kf.initialize(
         np.zeros(3), [1.0, 0.0, 0.0], gnss_velocity_G=R_IG.T @ [1.0, 2.0, 0.5],

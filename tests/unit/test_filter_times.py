@@ -1,4 +1,4 @@
-"""Filters take samples of any length, and measurements at any time, with their own noise."""
+"""Filters accept samples of any length, and measurements of any time and with given noise."""
 
 import math
 
@@ -13,7 +13,7 @@ from tests.level_flights import R_IG
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
 SUITE = quad_gym.sensor_suite("consumer")
-SUITE = SUITE.replace(  # with every measurement that there is
+SUITE = SUITE.replace(  # with every available measurement
     gnss=SUITE.gnss.replace(secondary_antenna_B=(0.1, 0.0, 0.0472), baseline_sigma=np.radians(2.0)),
     magnetometer=quad_gym.MagnetometerParams(),
     barometer=quad_gym.BarometerParams(),
@@ -55,8 +55,8 @@ def assert_same(one, other):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("factor", [0.4, 2.0, 3.7])
-def test_a_sample_of_another_length_is_a_tick_of_another_rate(kind, factor):
-    """A suite whose IMU has that rate, without vibration, packs the same numbers by itself."""
+def test_sample_of_another_length_equals_tick_of_imu_with_that_rate(kind, factor):
+    """The reference is a suite with this IMU rate and without vibration."""
     imu = SUITE.imu.replace(accel_vibration=0.0, gyro_vibration=0.0)
     ours = started(kind, SUITE.replace(imu=imu))
     rate = imu.rate / factor
@@ -75,8 +75,8 @@ def test_a_sample_of_another_length_is_a_tick_of_another_rate(kind, factor):
         np.testing.assert_allclose(value, estimate(theirs)[name], rtol=1e-9, atol=1e-13)
 
 
-def test_white_noise_does_not_depend_on_how_it_is_cut():
-    """Ten short samples leave the covariance of one long one, where nothing moves."""
+def test_covariance_at_rest_does_not_depend_on_sample_length():
+    """At rest, ten short samples give the same covariance as one long sample."""
     whole, parts = started(), started()
     at_rest = ([0.0] * 3, [0.0, 0.0, SUITE.estimator.gravity])
     for _ in range(20):
@@ -101,7 +101,7 @@ def test_bad_lengths_raise_and_change_nothing(dt):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_late_measurements_in_any_order_count_as_if_in_time(kind):
+def test_late_measurements_in_any_order_equal_measurements_in_time(kind):
     in_time, late = started(kind), started(kind)
     rng, waiting = np.random.default_rng(1), []
     for k, sample in enumerate(samples(200)):
@@ -120,8 +120,8 @@ def test_late_measurements_in_any_order_count_as_if_in_time(kind):
 
 
 @pytest.mark.parametrize("samples_of", ["average", "instant"])
-def test_a_stamp_within_a_sample_splits_it(samples_of):
-    """Also where the accelerometer has a lever arm: the gyro's rate of change stays."""
+def test_time_stamp_within_an_imu_sample_splits_the_sample(samples_of):
+    """The split keeps the gyro's rate of change, which the accelerometer's lever arm needs."""
     lab = quad_gym.sensor_suite("lab")
     imu = lab.imu.replace(samples=samples_of, lever_arm_B=(0.1, 0.05, 0.0))
     integration = "midpoint" if samples_of == "average" else "euler"
@@ -130,7 +130,7 @@ def test_a_stamp_within_a_sample_splits_it(samples_of):
     for gyro, accel in samples(30):
         late.predict(gyro, accel, dt=0.01)
         whole.predict(gyro, accel, dt=0.01)
-    wide = 1e6  # a measurement that says nothing shows what the split by itself does
+    wide = 1e6  # an uninformative measurement shows only the effect of the split
     late.update(np.zeros(3), gnss_sigma=wide, time=0.153)
     np.testing.assert_allclose(late.velocity, whole.velocity, atol=0.02)
     np.testing.assert_allclose(late.position, whole.position, atol=0.005)
@@ -170,7 +170,7 @@ def test_stamps_outside_the_window_are_refused():
         UnscentedKalmanFilter(SUITE, window=-1.0)
 
 
-def test_a_filter_without_a_window_takes_what_is_in_time():
+def test_filter_without_window_accepts_only_measurements_in_time():
     kept, plain = started(), started(window=0.0)
     for sample in samples(20):
         for kf in (kept, plain):
@@ -181,7 +181,7 @@ def test_a_filter_without_a_window_takes_what_is_in_time():
         plain.update(np.zeros(3), time=plain.time - TICK)
 
 
-def test_the_last_update_is_of_what_was_given_even_late():
+def test_last_update_reports_only_the_latest_call_even_if_late():
     kf = started()
     for sample in samples(40):
         kf.predict(*sample)
@@ -208,7 +208,7 @@ def test_the_last_update_is_of_what_was_given_even_late():
         ),
     ],
 )  # fmt: skip
-def test_noise_of_a_measurement_is_that_of_a_suite_with_it(kind, given, sigma, change):
+def test_given_measurement_noise_equals_suite_with_that_noise(kind, given, sigma, change):
     sensor, name, value = change
     like = SUITE.replace(**{sensor: getattr(SUITE, sensor).replace(**{name: value})})
     ours, theirs = kind(SUITE), kind(like)
@@ -221,7 +221,7 @@ def test_noise_of_a_measurement_is_that_of_a_suite_with_it(kind, given, sigma, c
     ours.update(**given, **sigma)
     theirs.update(**given)
     assert_same(ours, theirs)
-    ours.update(**given)  # the suite's numbers hold again
+    ours.update(**given)  # the suite's noise applies again
     plain = params_record(VehicleParams(), SUITE)
     for field in ("position_sigma_I", "velocity_sigma", "aid_sigma"):
         np.testing.assert_array_equal(ours._engine.params[field][0, ..., 0], plain[field][0])
@@ -229,8 +229,8 @@ def test_noise_of_a_measurement_is_that_of_a_suite_with_it(kind, given, sigma, c
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("suite", [SUITE, quad_gym.sensor_suite("lab")], ids=["drift", "lab"])
-def test_a_covariance_is_what_a_plain_update_makes_of_it(kind, suite):
-    """Against the textbook: K = P H^T S^-1 with the antenna's lever arm, by NumPy."""
+def test_update_with_given_covariance_equals_textbook_update(kind, suite):
+    """The update equals the textbook, K = P H^T S^-1 with the antenna's lever arm, by NumPy."""
     kf = kind(suite)
     kf.initialize(np.zeros(3), [1.0, 0.0, 0.0])
     for sample in samples(20):
@@ -250,7 +250,7 @@ def test_a_covariance_is_what_a_plain_update_makes_of_it(kind, suite):
     nu = z - x - R.T @ np.array(suite.gnss.primary_antenna_B) - kf.gnss_drift
     kf.update(R_IG.T @ z, gnss_sigma=C)
     report = kf.last_update
-    tolerance = 1e-6 if kind is ExtendedKalmanFilter else 0.02  # the sigma points' second order
+    tolerance = 1e-6 if kind is ExtendedKalmanFilter else 0.02  # second-order terms of the UKF
     np.testing.assert_allclose(report.nis[0], nu @ np.linalg.solve(S, nu), rtol=tolerance)
     second_order = 1e-9 if kind is ExtendedKalmanFilter else 2e-3
     np.testing.assert_allclose(report.innovation[0], nu, atol=second_order)

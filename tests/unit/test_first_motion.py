@@ -1,4 +1,4 @@
-"""A replay that begins in motion starts with the uncertainty of one."""
+"""A replay that begins in motion starts with a larger uncertainty."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ RTK = quad_gym.sensor_suite("rtk")
 
 
 def log(speed=0.0, turning=0.0, noise=0.0):
-    """Two seconds of a flight to the east: IMU at 100 Hz, positions at 10 Hz."""
+    """Return two seconds of a flight to the east: IMU at 100 Hz, positions at 10 Hz."""
     time = 0.01 * np.arange(200)
     east = np.where(np.arange(200) % 10 == 0, speed * time, np.nan)
     position = np.column_stack([east, 0.0 * east, 0.0 * east])
@@ -31,6 +31,6 @@ def test_start_in_motion_is_uncertain(speed, turning):
 @pytest.mark.parametrize(
     ("name", "motion"), [("rtk", {}), ("consumer", {"noise": 0.2}), ("lab", {"speed": 3.0})]
 )
-def test_rest_noise_and_wahbas_problem_leave_the_start(name, motion):
+def test_start_at_rest_or_noisy_or_by_wahbas_problem_is_unchanged(name, motion):
     suite = quad_gym.sensor_suite(name)
     assert with_wide_start(suite, log(**motion)) is suite

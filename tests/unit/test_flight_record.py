@@ -1,4 +1,4 @@
-"""A flight's record says what happened, and its files give it back."""
+"""Records of flights, and files that restore them exactly."""
 
 import csv
 import dataclasses
@@ -46,7 +46,7 @@ def test_rows_are_control_steps_from_the_start():
     assert len(flight.until(-1.0)) == 1
 
 
-def test_estimate_and_reference_are_those_of_the_observation():
+def test_recorded_estimate_and_reference_equal_the_observation():
     _, flight, observed = recorded_flight(layout="absolute")
     part = {f.name: f.slice for f in quad_gym.observation_layout(layout="absolute")}
     for name, column in (
@@ -75,7 +75,7 @@ def test_errors_are_distances_between_columns(task):
         assert np.linalg.norm(start) == pytest.approx(flight["position_error"][0])
 
 
-def test_what_the_gate_made_of_measurements_is_kept():
+def test_gate_decisions_are_recorded_with_their_measurements():
     faults = {"faults": GnssOutliers(share=0.5, size=(50.0, 100.0))}
     env, flight, _ = recorded_flight("hover", steps=100, sensors="rtk", **faults)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
@@ -85,11 +85,11 @@ def test_what_the_gate_made_of_measurements_is_kept():
     np.testing.assert_array_equal(np.isfinite(flight["gnss_decision"][:, 0]), measured)
     antenna_B = env.flights.batch.sensors.gnss.primary_antenna_B
     antenna = flight["position"] + antenna_B @ quaternion_to_dcm(flight["quaternion"])
-    # the vehicle moves some centimeters from a fix to the end of its row
+    # the vehicle moves some centimeters between a fix and the end of its row
     far = np.linalg.norm(flight["gnss_position"] - antenna, axis=1) > 0.3
     assert far.sum() > 5
     np.testing.assert_array_equal(flight["gnss_decision"][far, 0], GateDecision.REJECTED)
-    kept = flight["gnss_decision"][measured & ~far, 0][1:]  # the fix of the start is not gated
+    kept = flight["gnss_decision"][measured & ~far, 0][1:]  # the first fix is not gated
     assert (kept == GateDecision.ACCEPTED).mean() > 0.8
     np.testing.assert_array_equal(
         np.isfinite(flight["feature_decision"]), np.isfinite(flight["pixels"]).all(axis=2)
@@ -108,7 +108,7 @@ def test_wind_and_faults_are_kept():
     np.testing.assert_array_equal(flight["faults"], np.where(away, bit, 0.0))
 
 
-def test_without_a_filter_nothing_is_estimated():
+def test_flight_without_filter_has_nan_estimates():
     _, flight, _ = recorded_flight(observation="truth")
     assert not flight.estimated
     for name in ("estimated_position", "covariance", "nees", "gnss_position", "pixels", "gyro"):
@@ -117,7 +117,7 @@ def test_without_a_filter_nothing_is_estimated():
     assert recorded_flight()[1].estimated
 
 
-def test_a_new_episode_is_a_new_flight_and_the_old_one_lives_on():
+def test_new_episode_starts_new_flight_and_keeps_the_old_one():
     env, first, _ = recorded_flight(steps=5)
     recorder = FlightRecorder(env.flights.batch)
     env.reset(seed=1)
@@ -132,7 +132,7 @@ def test_a_new_episode_is_a_new_flight_and_the_old_one_lives_on():
 
 
 def test_rows_do_not_depend_on_when_they_are_read():
-    """An episode ends on the way, so that the copies of another one are dropped."""
+    """Episodes end during the run, so that copies of earlier episodes are dropped."""
     env = QuadVectorEnv(11, "circle", autoreset_mode="SameStep", max_episode_steps=9)
     at_once, at_the_end = (FlightRecorder(env.flights.batch, 10) for _ in range(2))
     env.reset(seed=1)
@@ -146,7 +146,7 @@ def test_rows_do_not_depend_on_when_they_are_read():
 
 
 def test_nothing_is_computed_for_frames_that_are_not_rendered(monkeypatch):
-    """Stable-Baselines3 asks for "rgb_array" in training, and never renders."""
+    """Stable-Baselines3 requests "rgb_array" in training and never renders."""
     monkeypatch.setattr("quad_gym.flights.record._fill", None)
     monkeypatch.setattr("quad_gym.rendering.live.Renderer", None)
     for render_mode in (None, "rgb_array"):
@@ -159,7 +159,7 @@ def test_nothing_is_computed_for_frames_that_are_not_rendered(monkeypatch):
         env.render()
 
 
-def test_a_flight_that_is_not_there_is_refused():
+def test_recording_a_missing_flight_raises_value_error():
     env = QuadEnv("hover")
     with pytest.raises(ValueError, match="flight must be within"):
         FlightRecorder(env.flights.batch, 1)
@@ -167,7 +167,7 @@ def test_a_flight_that_is_not_there_is_refused():
         _ = FlightRecorder(env.flights.batch).flight
 
 
-def test_a_recorded_policy_flies_what_it_flies_unrecorded():
+def test_recording_does_not_change_the_flight_of_a_policy():
     keywords = {"observation": "estimate", "sensors": "lab"}
     env = gymnasium.make("QuadGym/Waypoints-v0", **keywords)
     policy = PDPolicy(env)
@@ -264,7 +264,7 @@ def test_the_table_names_every_number_once():
     _, flight, _ = recorded_flight()
     columns = table(flight.rows)
     numbers = sum(int(np.prod(flight[c.name].shape[1:])) for c in COLUMNS)
-    assert len(columns) == numbers - 225 + 15  # the covariance has its standard deviations
+    assert len(columns) == numbers - 225 + 15  # only standard deviations of the covariance
     np.testing.assert_array_equal(columns["quaternion_w"], flight["quaternion"][:, 0])
     np.testing.assert_array_equal(columns["rotor_speeds_4"], flight["rotor_speeds"][:, 3])
     np.testing.assert_array_equal(columns["gnss_decision_velocity"], flight["gnss_decision"][:, 2])

@@ -1,4 +1,4 @@
-"""Recordings for the Rerun viewer hold what the flight holds: written to a file and read back."""
+"""Recordings for the Rerun viewer, read back from a file, hold the data of the flight."""
 
 import sys
 
@@ -16,7 +16,7 @@ def flown(task="hover", steps=30, **keywords):
 
 @pytest.fixture
 def read_back(tmp_path):
-    """A function from a flight to the columns of its recording, entity by entity."""
+    """Return a function from a flight to the columns of its recording by entity."""
     pytest.importorskip("rerun")
     chunk = pytest.importorskip("rerun.chunk", reason="this rerun-sdk cannot read files")
 
@@ -34,7 +34,7 @@ def read_back(tmp_path):
 
 
 def numbers(column):
-    """A column with one value per row, as an array."""
+    """Return a column with one value per row as an array."""
     return np.array([np.array(row[0], np.float64) for row in column.to_pylist()])
 
 
@@ -42,7 +42,7 @@ def seconds(entity):
     return np.array(entity["flight"].cast("int64").to_pylist()) * 1e-9
 
 
-def test_poses_are_those_of_the_flight_on_its_time_line(read_back):
+def test_rerun_poses_equal_the_flight_on_its_time_line(read_back):
     flight = flown()
     entities = read_back(flight)
     for name, position, attitude in (
@@ -62,7 +62,7 @@ def test_poses_are_those_of_the_flight_on_its_time_line(read_back):
             np.testing.assert_allclose(turned, expected, atol=1e-6)
 
 
-def test_ellipsoids_are_those_of_the_covariance(read_back):
+def test_ellipsoids_match_the_position_covariance(read_back):
     flight = flown(steps=5)
     entity = read_back(flight)["/world/ellipsoid"]
     half = numbers(entity["Ellipsoids3D:half_sizes"])
@@ -73,7 +73,7 @@ def test_ellipsoids_are_those_of_the_covariance(read_back):
     np.testing.assert_allclose(P, expected, atol=1e-5 * expected.max())
 
 
-def test_the_image_holds_what_was_measured(read_back):
+def test_image_shows_the_measured_pixels(read_back):
     flight = flown()
     entities = read_back(flight)
     camera = "/world/truth/camera/image"
@@ -91,7 +91,7 @@ def test_the_image_holds_what_was_measured(read_back):
     np.testing.assert_allclose(found, [0.1 * flight.scene.focal_length, 0.0], rtol=1e-5)
 
 
-def test_fixes_appear_when_they_come(read_back):
+def test_gnss_fixes_appear_only_at_measurement_times(read_back):
     flight = flown(sensors=quad_gym.sensor_suite("standard").with_rates(gnss=10.0))
     entity = read_back(flight)["/world/gnss"]
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
@@ -127,7 +127,7 @@ def test_plots_keep_every_bit(read_back):
         ({"task": "waypoints"}, "/world/gates", "/world/reference/path"),
     ],
 )
-def test_what_a_flight_lacks_is_left_out(read_back, keywords, there, missing):
+def test_entities_without_data_are_left_out(read_back, keywords, there, missing):
     entities = read_back(flown(steps=3, **keywords))
     assert there in entities
     assert missing not in entities

@@ -1,4 +1,4 @@
-"""What trajectories demand of a vehicle, by an inverse dynamics of the test's own."""
+"""Demands of trajectories on a vehicle, against separate inverse dynamics."""
 
 import math
 
@@ -17,7 +17,7 @@ UP = np.array([0.0, 0.0, VEHICLE.gravity])
 
 
 def attitudes(path, t):
-    """(n, 3, 3) body axes in I as rows, from thrust direction and heading."""
+    """Return body axes in I as rows (n, 3, 3), from thrust direction and heading."""
     z = path(t, 2) + UP
     z /= np.linalg.norm(z, axis=1, keepdims=True)
     yaw = path.yaw(t)
@@ -27,7 +27,7 @@ def attitudes(path, t):
 
 
 def rates_between(path, t, h):
-    """Mean body rates over [t - h, t + h], from the turn between the attitudes."""
+    """Return mean body rates over [t - h, t + h], from the rotation between the attitudes."""
     turn = attitudes(path, t + h) @ attitudes(path, t - h).transpose(0, 2, 1)
     return -Rotation.from_matrix(turn).as_rotvec() / (2.0 * h)
 
@@ -36,8 +36,8 @@ def rates_between(path, t, h):
     "options", [{}, {"yaw": "along"}, {"look_at": (0.5, 9.0)}, {"yaw": [0.0, 1.0, -1.0, 2.0, 0.5]}]
 )
 @pytest.mark.parametrize("closed", [False, True])
-def test_what_a_motion_takes_is_what_makes_it(options, closed):
-    """Thrust and torques, put into the equations of motion, give its accelerations."""
+def test_required_thrust_and_torque_produce_the_motion(options, closed):
+    """The equations of motion with thrust and torques give the accelerations of the motion."""
     path = Trajectory.through(FIVE, max_speed=4.0, max_acceleration=6.0, closed=closed, **options)
     t, h = np.linspace(0.4, path.duration - 0.4, 60), 1e-4
     motion = motion_of(path, VEHICLE, t)
@@ -69,7 +69,7 @@ def test_what_a_motion_takes_is_what_makes_it(options, closed):
     assert demand.tilt == pytest.approx(np.arccos(attitudes(path, fine)[:, 2, 2]).max(), rel=1e-3)
 
 
-def test_what_cannot_be_flown_is_refused_with_its_place_and_size():
+def test_infeasible_trajectory_error_names_value_time_and_segment():
     path = Trajectory.through(FIVE, max_speed=9.0, max_acceleration=7.0)
     times, segments = sampling_times(path), len(path.times) - 1
     motion, weak = motion_of(path, VEHICLE, times), 1.03 * VEHICLE.hover_voltage
@@ -94,8 +94,8 @@ def test_what_cannot_be_flown_is_refused_with_its_place_and_size():
         path.check("lab")
 
 
-def test_a_rotor_cannot_pull():
-    """Falling faster than gravity takes rotors that pull; a trajectory on its head, none."""
+def test_trajectory_that_needs_negative_thrust_raises_value_error():
+    """A fall faster than gravity needs rotors that pull, unless the vehicle is upside down."""
     path = Trajectory.of(lambda t: (0.0, 0.0, 9.0 - 5.5 * t * t), 1.0)
     path.check(VEHICLE, max_tilt=math.pi)  # upside down, thrust downward
     with pytest.raises(ValueError, match="a tilt of 180 degrees"):
@@ -122,8 +122,8 @@ def test_jumps_are_refused():
         closed.check(VEHICLE)
 
 
-def test_a_heading_that_turns_about_at_once_is_refused():
-    """There and back on a straight line: the heading along it jumps where the velocity turns."""
+def test_heading_jump_by_180_degrees_raises_value_error():
+    """On a straight line there and back, the heading along it jumps where the velocity reverses."""
     points = [(0, 0, 1), (3, 0, 1)]
     Trajectory.through(points, closed=True).check(VEHICLE)
     back = Trajectory.through(points, closed=True, yaw="along")

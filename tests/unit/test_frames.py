@@ -18,7 +18,7 @@ heights = st.floats(-1e4, 1e6)
 
 
 def place(reduced_latitude, longitude, height):
-    """A point at a height above the ellipsoid, and the ellipsoid's outward normal below it."""
+    """Return a point at a height above the ellipsoid, and the outward normal below the point."""
     c, s = np.cos(reduced_latitude), np.sin(reduced_latitude)
     foot = np.array([EQUATOR * c * np.cos(longitude), EQUATOR * c * np.sin(longitude), POLE * s])
     gradient = foot / np.array([EQUATOR, EQUATOR, POLE]) ** 2
@@ -33,7 +33,7 @@ def test_up_is_the_normal_of_the_ellipsoid(latitude, longitude, height):
 
 
 @given(reduced_latitudes, longitudes, heights)
-def test_axes_are_right_handed_with_east_along_the_parallel(latitude, longitude, height):
+def test_axes_form_a_right_handed_frame_with_east_along_the_parallel(latitude, longitude, height):
     r_G, _ = place(latitude, longitude, height)
     R_IG = ecef_to_enu(r_G)
     np.testing.assert_allclose(R_IG @ R_IG.T, np.eye(3), rtol=0.0, atol=1e-15)
@@ -47,7 +47,7 @@ def test_axes_are_right_handed_with_east_along_the_parallel(latitude, longitude,
 
 
 @given(reduced_latitudes, longitudes, heights)
-def test_geodetic_coordinates_lead_back_to_the_place(latitude, longitude, height):
+def test_ecef_to_geodetic_recovers_the_position(latitude, longitude, height):
     r_G, normal = place(latitude, longitude, height)
     lat, lon, h = ecef_to_geodetic(r_G)
     assert lat == pytest.approx(np.arcsin(np.clip(normal[2], -1, 1)), abs=1e-7)
@@ -57,7 +57,7 @@ def test_geodetic_coordinates_lead_back_to_the_place(latitude, longitude, height
     assert h == pytest.approx(height, abs=1e-8)
 
 
-def test_a_published_pair_of_coordinates():
+def test_geodetic_coordinates_match_published_example():
     # the worked example of IOGP guidance note 7-2, method 9602
     lat, lon, height = ecef_to_geodetic([3771793.968, 140253.342, 5124304.349])
     assert np.degrees(lat) == pytest.approx(53 + 48 / 60 + 33.820 / 3600, abs=2e-8)
@@ -74,7 +74,7 @@ def test_a_published_pair_of_coordinates():
         ([0.0, 0.0, -POLE], [[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
     ],
 )
-def test_the_axes_at_the_equator_and_the_poles(r_G, axes):
+def test_axes_at_equator_and_poles_have_known_directions(r_G, axes):
     np.testing.assert_allclose(ecef_to_enu(r_G), axes, rtol=0.0, atol=1e-15)
     assert ecef_to_geodetic(r_G)[2] == pytest.approx(0.0, abs=1e-8)
 
@@ -82,14 +82,14 @@ def test_the_axes_at_the_equator_and_the_poles(r_G, axes):
 @pytest.mark.parametrize(
     "bad", [[1.0, 2.0], 0.0, "Austin", [np.nan, 0.0, EQUATOR], [0.0, 0.0, 5e5], None]
 )
-def test_what_is_no_place_is_refused_by_name(bad):
+def test_invalid_ecef_position_raises_value_error_with_its_name(bad):
     with pytest.raises(ValueError, match=r"^r_G must"):
         ecef_to_geodetic(bad)
     with pytest.raises(ValueError, match=r"^r0_G must"):
         ecef_to_enu(bad)
 
 
-# latitude, longitude [deg], height [km], year; north, east, down [nT]: of pygeomag 1.1.0, which
+# latitude, longitude [deg], height [km], year; north, east, down [nT] by pygeomag 1.1.0, which
 # reproduces the test values of the World Magnetic Model 2025
 PLACES = [
     (-37.87, 144.676, 0.0, 2027.5, 21195.0, 4454.7, -55950.1),
@@ -105,7 +105,7 @@ def place_at(latitude, longitude, height=0.0):
 
 
 @pytest.mark.parametrize("row", PLACES)
-def test_field_is_that_of_another_implementation(row):
+def test_magnetic_field_matches_pygeomag(row):
     latitude, longitude, height, year, north, east, down = row
     field = 1e9 * earth_field(place_at(latitude, longitude, height), year)
     np.testing.assert_allclose(field, [east, north, -down], atol=0.1)
@@ -116,21 +116,21 @@ def test_default_field_is_the_model_at_the_laboratory():
     np.testing.assert_allclose(quad_gym.MagnetometerParams().field_I, field, rtol=0.002)
 
 
-def test_suite_that_moves_takes_the_field_of_the_place():
+def test_moved_suite_takes_magnetic_field_of_new_place():
     melbourne = place_at(-37.87, 144.676)
     moved = at_place(quad_gym.sensor_suite("consumer"), melbourne)
     np.testing.assert_allclose(moved.magnetometer.field_I, earth_field(melbourne), rtol=1e-12)
     assert moved.gnss.reference_antenna_G == tuple(melbourne)
 
 
-def test_suite_that_moves_keeps_a_field_that_a_user_gave():
+def test_moved_suite_keeps_field_given_by_user():
     suite = quad_gym.sensor_suite("consumer")
     compass = suite.magnetometer.replace(declination=0.4)
     moved = at_place(suite.replace(magnetometer=compass), place_at(-37.87, 144.676))
     assert moved.magnetometer == compass
 
 
-def test_replay_far_from_the_laboratory_has_the_field_there():
+def test_replay_far_from_the_laboratory_uses_local_magnetic_field():
     count, spot = 400, place_at(47.4, 8.5)
     field = earth_field(spot)
     time = 0.005 * np.arange(count)

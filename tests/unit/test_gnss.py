@@ -43,7 +43,7 @@ kernels = Compiled(
     st.floats(0.05, 5.0),
 )
 def test_noisy_baseline_has_the_reports_covariance_and_its_length(u, normals, sigma_b, floor, l_b):
-    """Drawn by the symmetric root of the covariance, before it is scaled to the known length."""
+    """The reference applies the symmetric root of the covariance, then scales to the length."""
     R_bG = (l_b * sigma_b) ** 2 * (np.eye(3) - np.outer(u, u)) + floor * np.eye(3)
     values, vectors = np.linalg.eigh(R_bG)
     noisy = l_b * u + vectors @ (np.sqrt(values.clip(0.0)) * (vectors.T @ normals))
@@ -64,13 +64,13 @@ def measurements(params, position, R_BI, count=SAMPLES):
 
 @pytest.fixture(scope="module")
 def flight():
-    """A place, an attitude, and many measurements there with a well-known baseline."""
+    """Return a position, an attitude, and many measurements with a precise baseline."""
     position, R_BI = np.array([3.0, -2.0, 1.5]), Rotation.random(rng=3).as_matrix()
     params = LAB.replace(baseline_sigma=0.004)
     return (params, position, R_BI, *measurements(params, position, R_BI))
 
 
-def test_the_position_noise_is_that_of_the_east_north_up_frame(flight):
+def test_position_noise_is_normal_in_the_east_north_up_frame(flight):
     params, position, R_BI, positions, _ = flight
     R_IG = ecef_to_enu(params.reference_antenna_G)
     antenna = position + R_BI.T @ params.primary_antenna_B
@@ -105,7 +105,7 @@ def test_without_noise_the_geometry_is_exact(seed):
     R_IG = ecef_to_enu(params.reference_antenna_G)
     expected = position + R_BI.T @ params.primary_antenna_B
     np.testing.assert_allclose(R_IG @ r_pG, expected, rtol=0.0, atol=1e-10)
-    # the floor of the covariance stays: 0.1 mm
+    # the floor of the covariance remains: 0.1 mm
     np.testing.assert_allclose(R_IG @ r_bG, R_BI.T @ params.baseline_B, rtol=0.0, atol=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The slow error of GNSS positions among the filter's states."""
+"""The drift of GNSS positions as a state of the filter."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def with_filter(suite, **choices):
     return suite.replace(estimator=suite.estimator.replace(**choices))
 
 
-def test_a_slow_error_in_one_axis_leaves_the_others_without():
+def test_drift_in_one_axis_leaves_other_axes_without_drift():
     suite = CONSUMER.replace(gnss=CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.0, 0.0)))
     batch = fly(suite, 50, task="hover")
     steps(batch, 5.0)
@@ -28,8 +28,8 @@ def test_a_slow_error_in_one_axis_leaves_the_others_without():
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("latency", [0.0, pytest.param(0.1, marks=pytest.mark.slow), 0.2])
-def test_the_filter_is_consistent(kind, start, latency):
-    """A mean over 300 flights has a deviation of 0.32; here are five of them."""
+def test_filter_with_gnss_drift_is_consistent(kind, start, latency):
+    """The mean NEES of 300 flights has a standard deviation of 0.32; five of them are allowed."""
     suite = with_filter(CONSUMER, kind=kind)
     suite = suite.replace(gnss=suite.gnss.replace(latency=latency))
     batch = fly(suite, 300, filter_start=start)
@@ -40,7 +40,7 @@ def test_the_filter_is_consistent(kind, start, latency):
 
 
 def test_warm_start_draws_the_drift_of_a_running_receiver():
-    """It has its variance after ten seconds, and goes with the errors as the filter claims."""
+    """The drift has its variance after 10 s, and the joint errors match the filter's covariance."""
     batch = fly(CONSUMER, 4000, task="hover", filter_start="warm")
     true = batch.record("gnss_drift")
     error = true - batch.record("gnss_drift_hat")
@@ -57,7 +57,7 @@ def test_warm_start_draws_the_drift_of_a_running_receiver():
 
 
 def test_a_gross_outlier_is_rejected():
-    """A third of the fixes are off by 5 m and more, and the estimate hardly feels it."""
+    """About 30 % of the fixes are off by at least 5 m; the RMS error grows by less than 20 %."""
     outliers = GnssOutliers(share=0.3, size=(10.0, 30.0))
     batch, sound = fly(CONSUMER, 100, faults=outliers), fly(CONSUMER, 100)
     struck = rejected = 0
@@ -79,7 +79,7 @@ def test_jump_of_the_fixes_moves_the_estimated_drift():
     steps(batch, 3.2)
     assert (batch.record("block_nis")[:, 0] > 100.0).mean() > 0.9
     assert (batch.record("gate")[:, 0] == 2.0).all()
-    steps(batch, 3.0)  # the filter doubts its position meanwhile
+    steps(batch, 3.0)  # the filter inflates its position covariance
     assert (batch.record("alarm_tick") > 3.0 * CONSUMER.imu.rate).all()
     assert (batch.record("gate")[:, 0] == 1.0).all()
     assert nees(batch, slice(0, 3)).mean() < 30.0

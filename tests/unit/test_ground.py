@@ -1,4 +1,4 @@
-"""The ground that carries a vehicle: contact against closed forms, and what it must not do."""
+"""Ground contact of a vehicle against closed forms and conservation laws."""
 
 import math
 
@@ -36,7 +36,7 @@ def resting_rotors(flights):
 
 
 def at_random(flights, rng, height=(0.05, 0.3)):
-    """Any attitude, tumbling, a little above the ground; rotors at rest."""
+    """Put tumbling vehicles at any attitude a little above the ground, with rotors at rest."""
     n = flights.count
     q = rng.normal(size=(n, 4))
     put(
@@ -50,7 +50,7 @@ def at_random(flights, rng, height=(0.05, 0.3)):
 
 
 def points(flights):
-    """(n, 8, 3) feet and hubs in I."""
+    """Return feet and hubs in I, (n, 8, 3)."""
     R_BI = quaternion_to_dcm(flights.record("q"))
     p_B = np.vstack([GroundParams().feet_B, CALM.rotor_positions_B])
     return flights.record("r")[:, None] + p_B @ R_BI
@@ -63,7 +63,7 @@ def energy(flights):
 
 
 def standing(support, count, world=None, **options):
-    """Vehicles on the launch pad, or on ground that carries them."""
+    """Return vehicles on the launch pad, or on ground that carries them."""
     if support == "ground":
         flights = batch(count, world, task={"start": "ground"}, **options)
     else:
@@ -75,13 +75,13 @@ def standing(support, count, world=None, **options):
 
 
 def stands(support, flights):
-    """(n,) True where a vehicle stands."""
+    """Return a mask (n,) of the vehicles that stand."""
     return flights.record("footing") == 4.0 if support == "ground" else flights.record("on_pad") > 0
 
 
 @pytest.mark.parametrize("wind", [0.0, 3.0])
 @pytest.mark.parametrize("support", ["pad", "ground"])
-def test_a_vehicle_stands_still_for_a_minute(support, wind):
+def test_vehicle_on_the_ground_does_not_move_for_a_minute(support, wind):
     world = {"wind_I": (wind, 0.0, 0.0), "linear_drag_B": (0.3, 0.3, 0.3)}
     flights = standing(support, 3, world, run_filter=True)
     before = {name: flights.record(name) for name in ("r", "q")}
@@ -97,7 +97,7 @@ def test_a_vehicle_stands_still_for_a_minute(support, wind):
 
 @pytest.mark.parametrize("sensors", ["lab", "standard"])
 @pytest.mark.parametrize("support", ["pad", "ground"])
-def test_the_accelerometer_reads_gravity(support, sensors):
+def test_accelerometer_on_the_ground_reads_gravity(support, sensors):
     flights = standing(support, 128, sensors=sensors, run_filter=True)
     f, w = np.zeros((2, 128, 3))
     for _ in range(100):
@@ -131,7 +131,7 @@ def test_a_level_fall_ends_at_rest_where_it_touches():
 
 
 @pytest.mark.parametrize(("friction", "depth"), [(0.6, 0.015), (5.0, 0.05)])
-def test_contact_never_gains_energy_and_nothing_sinks_in(friction, depth):
+def test_ground_contact_gains_no_energy_and_limits_penetration(friction, depth):
     flights = batch(96, ground={"friction": friction, **TOUGH})
     flights.reset(seeds=range(96))
     at_random(flights, np.random.default_rng(0))
@@ -142,8 +142,8 @@ def test_contact_never_gains_energy_and_nothing_sinks_in(friction, depth):
         assert (has <= had + 1e-9).all(), (has - had).max()
         had = has
         deepest = min(deepest, (points(flights)[..., 2] - FLOOR).min())
-    assert deepest > -depth  # turned by a tick of some 20 rad/s
-    # upright, upside down, or on an edge of both: all have come to rest
+    assert deepest > -depth  # one tick of rotation at some 20 rad/s
+    # all have come to rest: upright, upside down, or on an edge
     assert np.linalg.norm(flights.record("v"), axis=1).max() < 0.02
 
 
@@ -158,8 +158,8 @@ def test_without_friction_horizontal_momentum_stays():
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
-def test_it_slides_to_a_stop_as_coulomb_says(friction):
-    """With a = friction g it stops after v / a, having slid v^2 / (2 a)."""
+def test_sliding_vehicle_stops_according_to_coulomb_friction(friction):
+    """With a = friction g, the vehicle stops after v / a and slides v^2 / (2 a)."""
     flights = batch(ground={"friction": friction})
     flights.reset(seeds=[0])
     put(flights, q=[[1.0, 0.0, 0.0, 0.0]], r=[[0.0] * 3], v=[[1.0, 0.5, 0.0]], w=[[0.0] * 3])
@@ -175,8 +175,8 @@ def test_it_slides_to_a_stop_as_coulomb_says(friction):
     assert abs(slid[2]) < 1e-4
 
 
-def test_wind_beyond_friction_pushes_it_along():
-    """Linear drag k v against friction: it stands below v = friction m g / k, slides above."""
+def test_wind_beyond_friction_limit_moves_the_vehicle():
+    """The vehicle slides if linear drag k v exceeds friction, at v > friction m g / k."""
     for wind, moves in ((9.0, False), (15.0, True)):
         world = {"wind_I": (wind, 0.0, 0.0), "linear_drag_B": (0.2, 0.2, 0.0)}
         flights = batch(world=world, ground={"friction": 0.3}, task={"start": "ground"})
@@ -189,8 +189,8 @@ def test_wind_beyond_friction_pushes_it_along():
 
 @pytest.mark.parametrize("action", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("support", ["pad", "ground"])
-def test_it_lifts_off_when_thrust_exceeds_weight(support, action):
-    """W(t) = cm ea (1 - exp(-t / tau)) reaches the speed of hover at a time in closed form."""
+def test_vehicle_lifts_off_when_thrust_exceeds_weight(support, action):
+    """The time at which W(t) = cm ea (1 - exp(-t / tau)) reaches hover speed has a closed form."""
     lab = vehicle_params("lab")
     flights = standing(support, 1, vehicle=lab)
     voltage = min(lab.hover_voltage * (1.0 + action), lab.max_voltage)
@@ -209,7 +209,7 @@ def test_it_lifts_off_when_thrust_exceeds_weight(support, action):
 
 
 def test_thrust_on_one_side_tips_it_over():
-    """About the right feet, 0.15 m from the middle: thrust on the left beyond m g 0.15 / 0.36."""
+    """It tips about the right feet, 0.15 m off center, if left thrust exceeds m g 0.15 / 0.36."""
     lab, tipped = vehicle_params("lab"), []
     for share in (0.9, 1.1):
         flights = batch(task={"start": "ground"}, vehicle=lab)
@@ -225,8 +225,8 @@ def test_thrust_on_one_side_tips_it_over():
 
 
 @pytest.mark.parametrize("samples", ["average", "instant"])
-def test_the_imu_feels_all_that_changes_the_velocity(samples):
-    """Specific force less gravity, summed up over a landing, is the change of the velocity."""
+def test_integrated_specific_force_equals_velocity_change_in_landing(samples):
+    """Specific force minus gravity, integrated over a landing, is the change of velocity."""
     suite = quad_gym.sensor_suite("lab")
     tiny = dict.fromkeys(("accel_noise_density", "gyro_noise_density"), 1e-12)
     tiny |= dict.fromkeys(("accel_bias_sigma", "gyro_bias_sigma"), 1e-12)
@@ -260,7 +260,7 @@ def test_the_imu_feels_all_that_changes_the_velocity(samples):
         ({"q": (0.0, 1.0, 0.0, 0.0)}, True),
     ],
 )
-def test_a_hard_landing_is_the_end(start, crashes):
+def test_hard_landing_ends_the_episode(start, crashes):
     flights = batch(2)
     flights.reset(seeds=[0, 1])
     state = {"q": (1.0, 0.0, 0.0, 0.0), "r": (0.0, 0.0, 0.06), "v": (0.0, 0.0, 0.0)} | start
@@ -275,7 +275,7 @@ def test_a_hard_landing_is_the_end(start, crashes):
     assert (ended == (float(Ending.BELOW_MIN_HEIGHT) if crashes else 0.0)).all()
 
 
-def test_a_start_in_the_ground_is_lifted_and_one_on_it_stands():
+def test_start_below_the_ground_is_lifted_onto_it():
     flights = batch(3, world={"ground_height": -0.3}, task={"start": "ground"})
     flights.reset(seeds=[0, 1, 2])
     np.testing.assert_allclose(flights.record("r")[:, 2], -0.2, atol=1e-12)
@@ -288,9 +288,9 @@ def test_a_start_in_the_ground_is_lifted_and_one_on_it_stands():
 
 
 @pytest.mark.parametrize("suite", ["standard", "indoor"])
-def test_the_filter_is_consistent_while_the_vehicle_stands(suite):
-    """NEES of 15 degrees of freedom, mean over 256 flights: 15 +- 0.34, of which 5 deviations.
-    Filters of suites with several errors believe in somewhat larger ones than there are."""
+def test_filter_is_consistent_while_vehicle_is_on_the_ground(suite):
+    """The mean NEES over 256 flights is 15 +- 0.34, and the test allows five standard deviations.
+    Filters of suites with several errors are slightly conservative."""
     flights = batch(256, sensors=suite, source=Source.ESTIMATE, task={"start": "ground"})
     flights.reset(seeds=range(256))
     for _ in range(5 * 200):

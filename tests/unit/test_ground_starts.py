@@ -1,4 +1,4 @@
-"""Where vehicles begin in a world whose ground carries them, and what ground is refused."""
+"""Starts of vehicles on ground that carries them, and refused parameters of the ground."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def batch(count=4, height=-0.1, task=None, ground=None, **options):
 
 
 def stand(flights, steps=20):
-    """Let flights stand with stopped rotors; the endings that there were."""
+    """Let flights stand with stopped rotors and return their endings."""
     endings = np.zeros(flights.count)
     for _ in range(steps):
         flights.step(np.full((flights.count, 4), -1.0))
@@ -30,7 +30,7 @@ def stand(flights, steps=20):
     ("height", "reference"), [(-300.0, 1.0), (-0.7, 1.0), (-0.4, 1.0), (5.0, 6.0), (900.0, 901.0)]
 )
 @pytest.mark.parametrize("kind", ["hover", "circle", "waypoints"])
-def test_no_episode_ends_because_of_where_the_ground_is(kind, height, reference):
+def test_episode_does_not_end_at_start_for_any_ground_height(kind, height, reference):
     task = {"kind": kind, "height": reference, "out_of_bounds": 400.0}
     flights = batch(height=height, task=task)
     flights.reset(seeds=range(4))
@@ -55,7 +55,7 @@ def test_ground_out_of_bounds_of_the_reference_is_refused(start):
             batch(height=-2.2, task=task)
 
 
-def test_where_a_reference_begins_decides():
+def test_ground_height_is_checked_against_start_of_reference():
     path = Trajectory.through([(0, 0, 10), (2, 0, 11), (4, 0, 14)])
     given = {"kind": "trajectory", "trajectory": path}
     for height, refused in ((7.0, False), (12.0, False), (0.0, True), (14.0, True)):
@@ -71,13 +71,13 @@ def test_where_a_reference_begins_decides():
 
 SMALL = Uniform(-1e-3, 1e-3)
 DRAWS = [{}, *({name: SMALL} for name in ("start_velocity_I", "start_body_rates", "start_yaw"))]
-DRAWS += [{"start_position_I": (None, None, Uniform(-0.5, -0.1))}]  # lifted onto it
+DRAWS += [{"start_position_I": (None, None, Uniform(-0.5, -0.1))}]  # lifted onto the ground
 DRAWS += [{"center_of_mass_B": (SMALL, SMALL, None)}]
 
 
 @pytest.mark.parametrize("pad", [True, False])
 @pytest.mark.parametrize("draws", DRAWS, ids=str)
-def test_starts_on_the_ground_are_on_it_with_any_draws(pad, draws):
+def test_start_on_the_ground_with_any_draws_is_at_ground_height(pad, draws):
     task = {"pad": pad, "out_of_bounds": 10.0}
     flights = batch(16, height=-2.0, task=task, randomization=draws)
     flights.reset(seeds=range(16))
@@ -106,7 +106,7 @@ def test_a_drawn_height_is_on_top_of_the_ground(pad, start):
     assert (flights.record("r")[:, 2] == -1.0).all()
 
 
-def test_only_flights_that_begin_are_put_onto_the_ground():
+def test_only_reset_flights_are_put_onto_the_ground():
     flights = batch(16, height=-2.0, task={"out_of_bounds": 10.0})
     flights.reset(seeds=range(16), position=[0.0, 0.0, 1.0])
     chosen = np.arange(16) % 2 == 0
@@ -118,7 +118,7 @@ def test_only_flights_that_begin_are_put_onto_the_ground():
 
 @pytest.mark.parametrize("whose", ["vehicle", "true_vehicle"])
 def test_feet_that_are_not_below_the_rotor_hubs_are_refused(whose):
-    """Nominally or as it is: only the latter stands on them."""
+    """Only the true vehicle stands on the feet; the nominal hubs have no effect."""
     lab = vehicle_params("lab")
     for z, refused in ((0.1, False), (-0.099, False), (-0.1, True), (-0.2, True)):
         hubs = tuple((x, y, z if k == 2 else 0.2) for k, (x, y, _) in enumerate(HUBS))

@@ -1,4 +1,4 @@
-"""The ground under vehicles whose rotors turn: thrust works, too, and must not press them in."""
+"""Ground contact under thrust: vehicles come to rest or slide, and do not sink in."""
 
 import math
 
@@ -12,7 +12,7 @@ STILL_GAP = 2e-4
 
 
 def rotors(shares):
-    """(n, 4) rotor speeds that carry shares of the weight, and the actions that hold them."""
+    """Return rotor speeds (n, 4) that carry shares of the weight, and actions that hold them."""
     forces = np.asarray(shares) * CALM.mass * CALM.gravity / 4.0
     speeds = np.sqrt(forces / CALM.thrust_coefficient)
     actions = speeds / CALM.motor_speed_per_volt / CALM.hover_voltage - 1.0
@@ -20,7 +20,7 @@ def rotors(shares):
 
 
 def level(flights, shares, height, velocity):
-    """Put flights above the ground, level and not turning; returns what holds their thrust."""
+    """Put flights above the ground, level, without rotation; return actions for their thrust."""
     n = flights.count
     speeds, actions = rotors(shares)
     r = np.column_stack([np.zeros((n, 2)), height])
@@ -48,7 +48,7 @@ def test_landings_under_thrust_come_to_rest():
 
 @pytest.mark.parametrize("friction", [0.0, 0.1])
 def test_sliding_under_thrust_keeps_its_height(friction):
-    """The ground carries (1 - share) m g, so that sliding slows by friction (1 - share) g."""
+    """The ground carries (1 - share) m g, so the deceleration is friction (1 - share) g."""
     shares = np.array([0.0, 0.5, 0.9])
     flights = batch(3, ground={"friction": friction})
     flights.reset(seeds=range(3))
@@ -60,7 +60,7 @@ def test_sliding_under_thrust_keeps_its_height(friction):
     np.testing.assert_allclose(flights.record("v")[:, 0], 1.0 - slower, atol=5e-3)
 
 
-def test_who_tumbles_under_thrust_does_not_sink_in():
+def test_vehicle_tumbling_under_thrust_does_not_sink_in():
     flights = batch(96, ground=TOUGH)
     flights.reset(seeds=range(96))
     at_random(flights, np.random.default_rng(0))
@@ -76,7 +76,7 @@ def test_who_tumbles_under_thrust_does_not_sink_in():
 
 @pytest.mark.parametrize("tilt", [0.0, 0.01])
 def test_feet_below_the_plane_come_to_rest(tilt):
-    """Nothing pushes them out, which would gain energy; they stand where they are."""
+    """The ground does not push feet out, which would gain energy; vehicles stay in place."""
     rng = np.random.default_rng(0)
     flights = batch(64)
     flights.reset(seeds=range(64))
@@ -84,7 +84,7 @@ def test_feet_below_the_plane_come_to_rest(tilt):
     angle, half = rng.uniform(-math.pi, math.pi, 64), 0.5 * tilt
     aside = math.sin(half) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     put(flights, q=np.column_stack([np.full(64, math.cos(half)), aside, np.zeros(64)]))
-    for _ in range(4 * 200):  # who leans on a foot below the plane settles slowly
+    for _ in range(4 * 200):  # a vehicle on one foot below the plane settles slowly
         flights.step(actions)
     assert (flights.record("v") == 0.0).all()
     assert (flights.record("w") == 0.0).all()

@@ -1,6 +1,6 @@
-"""Errors of scale and alignment, vibration, constant heading errors, and what limits a camera.
-Flights on the true state fly alike whatever measures them, so that samples with an effect and
-without it, of the same seeds, differ by the effect alone."""
+"""Errors of scale and alignment, vibration, constant heading errors, and limits of the camera.
+Flights on the true state do not depend on the sensors, so samples with and without an effect,
+drawn with equal seeds, differ only by the effect."""
 
 import itertools
 import math
@@ -67,7 +67,7 @@ def shaking(count, steps=40, seed=5):
 
 
 def specific_force(state, vehicle, lever):
-    """What an accelerometer at `lever` feels, by the public model of the vehicle."""
+    """Specific force at `lever`, by the public model of the vehicle."""
     rate = state_derivative(state, np.zeros(4), np.zeros(3), vehicle)
     w, dw = state["body_rates"], rate["body_rates"]
     f = state["R_BI"] @ (rate["velocity"] + [0.0, 0.0, vehicle.gravity])
@@ -78,7 +78,7 @@ def specific_force(state, vehicle, lever):
     "lever", [(0.0, 0.0, 0.0), (0.05, -0.03, 0.02)], ids=["center", "lever arm"]
 )
 def test_regression_recovers_errors_of_scale_and_alignment(lever):
-    """With exact sensors; the errors' standard deviations are those asked for."""
+    """Sensors are exact otherwise. The errors have the standard deviations of the parameters."""
     count, vehicle = 24, VehicleParams()
     suite = with_imu(LAB, **CALM_IMU, **ERRORS, lever_arm_B=lever)
     fast = {"start_velocity_I": quad_gym.Uniform(-5.0, 5.0)}  # so that there is drag
@@ -106,8 +106,8 @@ def test_regression_recovers_errors_of_scale_and_alignment(lever):
             assert low < total < high, (name, kind)
 
 
-def test_averaged_samples_err_in_what_differs_from_rest():
-    """The mean over a tick with errors is (I + D) that without, about (0, 0, g)."""
+def test_error_of_averaged_samples_is_linear_in_deviation_from_rest():
+    """The mean over a tick with errors is (I + D) times the one without, relative to (0, 0, g)."""
     plain, erring = batch(STANDARD), batch(with_imu(STANDARD, **ERRORS))
     names = ("accel", "gyro", "w_meas", "r", "q")
     without, found = (flown(b, shaking(64, 20), names) for b in (plain, erring))
@@ -124,7 +124,7 @@ def test_averaged_samples_err_in_what_differs_from_rest():
         np.testing.assert_array_equal(found[k], without[k])
 
 
-def test_errors_last_an_episode():
+def test_scale_and_alignment_errors_change_only_between_episodes():
     flights = batch(with_imu(STANDARD, **ERRORS), 8)
     first = flights.record("accel_error")
     flights.step(np.zeros((8, 4)))
@@ -135,12 +135,12 @@ def test_errors_last_an_episode():
 
 @pytest.mark.parametrize("suite", [LAB, STANDARD], ids=["instant", "average"])
 def test_vibration_grows_with_the_square_of_the_rotor_speeds(suite):
-    """Its variance is that of hovering times the mean fourth power of the speeds over hover's."""
+    """The variance is the variance in hover times the mean of (speed / hover speed)^4."""
     vehicle, count = VehicleParams(), 64
     hover = vehicle.motor_speed_per_volt * vehicle.hover_voltage
     shaken = with_imu(suite, accel_vibration=0.3, gyro_vibration=0.02)
     for level in ((0.0, 0.0, 0.0, 0.0), (-0.3, 0.4, -0.3, 0.4)):
-        # rotors settle in ten time constants; what a wild attitude does to means does not matter
+        # rotors settle in ten time constants; means under wild attitudes do not matter
         actions = np.broadcast_to(np.array(level), (130, count, 4))
         names = ("accel", "gyro", "w_meas", "rotor_speeds")
         without, found = (flown(batch(s, count), actions, names) for s in (suite, shaken))
@@ -156,8 +156,8 @@ def test_vibration_grows_with_the_square_of_the_rotor_speeds(suite):
 
 
 @pytest.mark.parametrize("lift", [0.0, 1.0, 2.5])
-def test_filter_counts_the_vibration_of_the_measured_thrust(lift):
-    """In a tick: white noise, and vibration by the square of the specific force over g."""
+def test_filter_scales_vibration_noise_with_measured_thrust(lift):
+    """The variance of a tick is white noise plus vibration times the square of force over g."""
     imu = STANDARD.imu.replace(accel_vibration=0.3, gyro_vibration=0.02)
     kalman = quad_gym.UnscentedKalmanFilter(STANDARD.replace(imu=imu))
     set_at_rest(kalman, 1e-16 * np.eye(15))
@@ -165,11 +165,11 @@ def test_filter_counts_the_vibration_of_the_measured_thrust(lift):
     added = np.diag(kalman.covariance) / imu.dt**2
     accel = imu.accel_noise_density**2 * imu.rate + (0.3 * lift) ** 2
     gyro = imu.gyro_noise_density**2 * imu.rate + (0.02 * lift) ** 2
-    np.testing.assert_allclose(added[5], accel, rtol=1e-6)  # up: gyro noise does not turn into it
+    np.testing.assert_allclose(added[5], accel, rtol=1e-6)  # upward: gyro noise has no effect on it
     np.testing.assert_allclose(added[6:9], gyro, rtol=1e-6)
 
 
-def test_baselines_of_an_episode_share_a_turn_about_body_z():
+def test_heading_error_turns_all_baselines_of_an_episode_about_body_z():
     sigma, count = 0.1, 400
     erring = LAB.replace(gnss=LAB.gnss.replace(heading_error_sigma=sigma))
     plain, turned = batch(LAB, count), batch(erring, count)
@@ -189,7 +189,7 @@ def test_baselines_of_an_episode_share_a_turn_about_body_z():
 
 
 def seen_by_projection(flights, camera, ground=None):
-    """Which features a camera sees, by NumPy."""
+    """Visibility of each feature, by NumPy."""
     R_CB = euler_to_dcm(camera.attitude)
     features, expected = np.array(camera.features_I), []
     for r, q in zip(flights.record("r"), flights.record("q"), strict=True):
@@ -230,7 +230,7 @@ def test_ground_hides_features_below_it_and_all_from_below(ground):
 
 @pytest.mark.parametrize("rate", [0.0, 2.0])
 def test_blur_grows_with_the_body_rate(rate):
-    """Places in a smear of focal_length |w| exposure pixels, evenly."""
+    """Shifts are uniform within a smear of focal_length |w| exposure pixels."""
     spin = {"start_body_rates": [None, None, quad_gym.Uniform(rate, rate)]}
     sharp, blurred = with_camera(), with_camera(exposure=0.004)
     plain, found = (batch(s, 400, randomization=spin) for s in (sharp, blurred))
@@ -247,12 +247,12 @@ def test_blur_grows_with_the_body_rate(rate):
 
 @pytest.mark.parametrize("kind", [quad_gym.UnscentedKalmanFilter, quad_gym.ExtendedKalmanFilter])
 def test_errors_of_scale_and_alignment_add_noise_in_a_maneuver(kind):
-    """As so much more white noise: by that of half a second of the same force. An axis errs by its
-    own scale and by its alignment to two others: the mean over the axes counts."""
+    """The errors count as white noise, with the effect of half a second of constant force. An axis
+    has one error of scale and two of alignment; the variance is the mean over the axes."""
     accel, error = np.array([1.5, -0.7, 11.0]), 0.004
     plain, dt = with_imu(STANDARD, accel_misalignment_sigma=0.0), STANDARD.imu.dt
     excess = np.linalg.norm(accel - [0.0, 0.0, 9.8])
-    white = plain.imu.accel_noise_density**2 + (error * excess) ** 2 / 3.0  # half of two thirds
+    white = plain.imu.accel_noise_density**2 + (error * excess) ** 2 / 3.0  # 0.5 s times 2 / 3
     suites = (
         with_imu(STANDARD, accel_misalignment_sigma=error),
         with_imu(
@@ -275,7 +275,7 @@ def test_errors_of_scale_and_alignment_add_noise_in_a_maneuver(kind):
 
 
 def test_classes_of_one_vehicle_have_every_effect():
-    """Two sensors of the same seed differ by the effect alone; its size is tested above."""
+    """Two sensors with equal seeds differ only by the effect, whose size is tested above."""
 
     def pair(kind, plain, **changes):
         both = plain, plain.replace(**changes)
@@ -311,7 +311,7 @@ def test_classes_of_one_vehicle_have_every_effect():
 
 FLIGHTS = 400
 BAND = 5 * np.sqrt(2 * 15 / FLIGHTS)
-"""Five deviations of the mean of that many NEES of 15 degrees of freedom."""
+"""Five standard deviations of the mean of FLIGHTS NEES of 15 degrees of freedom."""
 
 
 def mounted(name, lever_arm, **choices):
@@ -354,9 +354,9 @@ def test_a_known_lever_arm_leaves_the_filter_consistent(name):
 @pytest.mark.parametrize(
     ("kind", "tolerance"), [(ExtendedKalmanFilter, 1e-9), (UnscentedKalmanFilter, 1e-5)]
 )
-def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind, tolerance):
-    """The closed form: f = dw x l + w x (w x l) + g e3, with w = (0, 0, a t) about the vertical.
-    The UKF's mean has a second order: the gyro's noise makes the force point up a little less."""
+def test_filter_with_lever_arm_stays_at_rest_while_vehicle_spins_up(kind, tolerance):
+    """The force is f = dw x l + w x (w x l) + g e3, with w = (0, 0, a t) about the vertical.
+    The UKF's mean has a second-order term: gyro noise slightly reduces the vertical force."""
     arm, rate = np.array([0.3, -0.2, 0.1]), 4.0
     suite = mounted("lab", tuple(arm))
     kalman = kind(sensors=suite)

@@ -34,7 +34,7 @@ def resting():
 
 
 def position_of_body_point(state, disturbance_I, l_B, t):
-    """Where a point fixed in the body is at time t, by flying there with steady rotors."""
+    """Position of a body-fixed point after a flight of time t with constant rotor speeds."""
     flight, params = np.zeros(1, FLIGHT), params_record(VEHICLE, quad_gym.SensorSuite())
     put_state(flight, state)
     flight["voltages"] = state["rotor_speeds"] / VEHICLE.motor_speed_per_volt
@@ -46,7 +46,7 @@ def position_of_body_point(state, disturbance_I, l_B, t):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_specific_force_is_that_of_a_moving_point_of_the_body(seed):
+def test_specific_force_matches_acceleration_at_the_lever_arm(seed):
     state, rng = random_state(seed), np.random.default_rng(seed)
     l_B, force = rng.normal(0.0, 0.3, 3), rng.normal(size=3)
     h = 1e-3
@@ -64,7 +64,7 @@ def test_specific_force_is_that_of_a_moving_point_of_the_body(seed):
 
 @functools.cache
 def sampled(params, count, seed=1):
-    """Readings of a hovering vehicle less the truth, and the biases before each of them."""
+    """Samples of a hovering vehicle minus the truth, and the biases before each sample."""
     imu, state = Imu(params, np.random.default_rng(seed), VEHICLE), resting()
     since = {"since": state} if params.samples == "average" else {}
     rows = [(imu.gyro_bias, imu.accel_bias, *imu.measure(state, **since)) for _ in range(count)]
@@ -82,7 +82,7 @@ def test_white_noise_has_the_density_of_the_laboratory(samples):
     assert_normal(noise, np.zeros(6), np.diag([gyro_variance] * 3 + [accel_variance] * 3))
 
 
-def test_each_step_of_a_bias_follows_equations_6_and_7():
+def test_biases_are_first_order_gauss_markov_processes():
     params = LAB.replace(accel_bias_tau=0.05, gyro_bias_tau=0.02)
     _, _, gyro_bias, accel_bias = sampled(params, 4_000)
     for bias, tau, sigma in (
@@ -92,7 +92,7 @@ def test_each_step_of_a_bias_follows_equations_6_and_7():
         alpha = np.exp(-params.dt / tau)
         driving = bias[1:] - alpha * bias[:-1]
         assert_normal(driving, np.zeros(3), sigma**2 * (1.0 - alpha**2) * np.eye(3))
-        # what drives it is new each time: independent of the bias itself
+        # the driving noise is drawn each time, independent of the bias
         correlation = (driving * bias[:-1]).mean(axis=0) / (driving.std(axis=0) * sigma)
         assert np.abs(correlation).max() < alarm_score(3) / np.sqrt(len(driving))
 

@@ -19,7 +19,7 @@ LAB = quad_gym.sensor_suite("lab")
 AVERAGE = LAB.replace(
     imu=LAB.imu.replace(samples="average"), estimator=LAB.estimator.replace(integration="midpoint")
 )
-# hardly any drag: it has a kink where the flow through the rotors turns, which quadrature feels
+# hardly any drag: its kink, where the flow through the rotors reverses, disturbs quadrature
 VEHICLE = quad_gym.VehicleParams(disc_area=1e-9)
 LEVER = (0.05, -0.03, 0.02)
 SHAPES = {"position": 3, "velocity": 3, "R_BI": (3, 3), "body_rates": 3, "rotor_speeds": 4}
@@ -37,7 +37,7 @@ def unpacked(x):
 
 
 def fly_finely(state, voltages, force, dt):
-    """The state at the ends and at Gauss points of a tick, with their weights, by SciPy."""
+    """States at the Gauss points of a tick, their weights, and the state at its end, by SciPy."""
     nodes, weights = np.polynomial.legendre.leggauss(8)
     instants = np.append(0.5 * dt * (nodes + 1.0), dt)
     solution = solve_ivp(
@@ -70,11 +70,11 @@ def instant_force(state, force, lever):
     return imu.measure(state, force)[1]
 
 
-@settings(max_examples=30)  # SciPy integrates for a while
+@settings(max_examples=30)  # SciPy's integration is slow
 @given(st.integers(0, 2**32 - 1))
 @example(500)  # the quaternions of its start and end have opposite signs
-def test_a_sample_is_the_mean_of_what_is_felt_over_the_tick(seed):
-    """Seen from the attitude halfway; SciPy integrates, the IMU's instants give what is felt."""
+def test_averaged_sample_is_the_mean_rate_and_force_over_the_tick(seed):
+    """The axes are at the attitude halfway. SciPy integrates states; instant samples give force."""
     start, rng, dt = random_state(seed), np.random.default_rng(seed), 0.005
     voltages, force = rng.uniform(3.0, 9.0, 4), rng.normal(size=3)
     states, weights, end = fly_finely(start, voltages, force, dt)
@@ -89,8 +89,8 @@ def test_a_sample_is_the_mean_of_what_is_felt_over_the_tick(seed):
     np.testing.assert_allclose(accel, mean, rtol=0.0, atol=1e-7)
 
 
-def test_a_batch_samples_the_tick_that_it_flew():
-    """Its samples are those of the friendly class between its states, noise and bias apart."""
+def test_averaged_samples_of_batch_and_imu_class_are_equal():
+    """The samples equal the ones of `Imu` between the batch's states, without noise and bias."""
     quiet = AVERAGE.replace(imu=QUIET.replace(samples="average", lever_arm_B=LEVER))
     batch = FlightBatch(8, sensors=quiet, source=Source.TRUTH, run_filter=True)
     batch.reset(seeds=range(8))
@@ -105,7 +105,7 @@ def test_a_batch_samples_the_tick_that_it_flew():
         np.testing.assert_allclose(batch.record("w_meas"), batch.record("w"), rtol=0.0, atol=1e-12)
 
 
-def test_inner_loops_read_the_gyro_now_and_the_filter_the_mean():
+def test_inner_loops_read_the_instant_rate_and_the_filter_the_mean_rate():
     batch = FlightBatch(8, sensors=AVERAGE)
     batch.reset(seeds=range(8))
     for _ in range(50):
@@ -115,14 +115,14 @@ def test_inner_loops_read_the_gyro_now_and_the_filter_the_mean():
         noise = batch.record("w_meas") - batch.record("w") - bias
         seen = batch.record("w_meas") - batch.record("b_g_hat")
         np.testing.assert_array_equal(batch.record("w_seen"), seen)
-        # the same noise in both; the mean rate is near the middle of the tick's ends
+        # both have equal noise; the mean rate is near the middle of the rates at both ends
         middle = 0.5 * (start + batch.record("w"))
         spread = abs(batch.record("w") - start).max()
         assert abs(batch.record("gyro") - bias - noise - middle).max() < 0.3 * spread + 1e-6
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-3, 1.0, 3.1])
-def test_the_turn_of_a_tick_may_be_small_or_large(turn):
+def test_averaged_gyro_is_exact_for_small_and_large_turns(turn):
     rng = np.random.default_rng(4)
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
@@ -132,7 +132,7 @@ def test_the_turn_of_a_tick_may_be_small_or_large(turn):
     np.testing.assert_allclose(gyro * 0.005, turn * axis, rtol=0.0, atol=1e-13)
 
 
-def test_samples_must_be_understood_the_same_by_all():
+def test_inconsistent_kinds_of_imu_samples_are_refused():
     with pytest.raises(ValueError, match=r"^ImuParams.samples must be one of instant, average"):
         LAB.imu.replace(samples="mean")
     with pytest.raises(ValueError, match=r"^true_sensors must have the IMU samples of sensors"):

@@ -1,4 +1,4 @@
-"""A filter that doubts itself again and again inflates nothing beyond the largest deviations."""
+"""Repeated inflation of a covariance stops at the largest standard deviations."""
 
 import math
 
@@ -11,7 +11,7 @@ from quad_gym.records import FEATURE_BLOCKS, POSITION_BLOCK
 from tests.field_flights import fly, steps
 from tests.filter_states import set_at_rest
 
-MOST = np.repeat([100.0, 20.0, math.nan, 2.0, 0.1], 3)  # of attitude: tilt 0.2, heading pi/sqrt 3
+MOST = np.repeat([100.0, 20.0, math.nan, 2.0, 0.1], 3)  # attitude: tilt 0.2, heading pi/sqrt 3
 
 
 def axis_turn(angle, axis):
@@ -27,7 +27,7 @@ R_IG = quad_gym.frames.ecef_to_enu(SUITE.gnss.reference_antenna_G)
 
 
 def started(deviations, seed=0):
-    """A filter whose states are correlated, and the position that its antenna measures."""
+    """A filter whose states are correlated, with given standard deviations."""
     ukf = quad_gym.UnscentedKalmanFilter(SUITE)
     rng = np.random.default_rng(seed)
     mixed = np.eye(15) + 0.3 * rng.standard_normal((15, 15))
@@ -38,19 +38,19 @@ def started(deviations, seed=0):
 
 
 def fix(ukf):
-    """The velocity that the filter expects, so that it corrects nothing; no gate rejects it."""
+    """The velocity that the filter predicts: it passes the gate and corrects nothing."""
     lever = np.cross(ukf._engine.read("w_meas")[0] - ukf.gyro_bias, SUITE.gnss.primary_antenna_B)
     return {"gnss_velocity_G": R_IG.T @ (ukf.velocity + ukf.R_BI.T @ lever)}
 
 
 def alarm(ukf):
-    """Let innovations of velocities drift, as if the last 50 had been 0.9 deviations off."""
+    """Cause an alarm, as if the last 50 velocity innovations were 0.9 standard deviations off."""
     ukf._engine.blocks["innovation_drift"][:, 2] = 0.9
     ukf.update(**fix(ukf))
 
 
 def inflated(P):
-    """P after an alarm, by NumPy: a congruence, and what is added of the biases."""
+    """P after an alarm, by NumPy: a congruence, plus the variances added to the biases."""
     M, var = np.zeros((15, 15)), np.diag(P)
     k = R_BI[:, 2]
     P_ee = P[6:9, 6:9]
@@ -79,7 +79,7 @@ def inflated(P):
     [(0.1, 0.05, 0.01, 0.02, 1e-3), (50.0, 3.0, 0.1, 0.3, 0.02), (300.0, 30.0, 0.5, 3.0, 0.2)],
     ids=["small", "some beyond", "all beyond"],
 )
-def test_an_alarm_inflates_each_deviation_up_to_its_bound(deviations):
+def test_alarm_inflates_each_standard_deviation_up_to_its_bound(deviations):
     quiet, alarmed = started(np.repeat(deviations, 3)), started(np.repeat(deviations, 3))
     quiet.update(**fix(quiet))
     alarm(alarmed)
@@ -92,7 +92,7 @@ def test_an_alarm_inflates_each_deviation_up_to_its_bound(deviations):
 
 
 def test_repeated_alarms_leave_unmeasured_states_bounded():
-    """Only velocities are measured: nothing tells the position or the heading for 25 alarms."""
+    """Only velocities are measured: position and heading are unobserved for 25 alarms."""
     ukf = started(np.repeat([0.1, 0.05, 0.05, 0.05, 0.005], 3))
     for _ in range(25):
         alarm(ukf)
@@ -103,15 +103,15 @@ def test_repeated_alarms_leave_unmeasured_states_bounded():
     assert ukf._engine.read("update_failures").max() == 0
     assert ukf._engine.read("prediction_failures").max() == 0
     others = np.r_[0:6, 9:15]
-    assert (sigma[others] <= 1.01 * MOST[others]).all()  # and what the samples between add
+    assert (sigma[others] <= 1.01 * MOST[others]).all()  # 1 %: noise of the samples in between
     assert sigma[:3].max() > 50.0
     k = R_BI[:, 2]
     assert math.sqrt(k @ ukf.covariance[6:9, 6:9] @ k) < 2.0
 
 
 def test_a_sensor_that_no_longer_measures_raises_no_more_alarms():
-    """Without a gate nothing begins its mean anew; the camera goes on. The filter stays lost for as
-    long as biases may err, but from the last fix on."""
+    """Without a gate the mean of the innovations is not restarted; the camera still measures. The
+    filter stays diverged for as long as biases may be wrong, counted from the last fix."""
     batch = fly("standard", 8, task="hover", filter_start="warm")
     steps(batch, 1.0)
     assert not batch.record("diverged").any()

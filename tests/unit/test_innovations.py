@@ -1,4 +1,4 @@
-"""Innovations block by block against a plain filter; the gate, and its way back."""
+"""Innovations of each block against a plain filter; the gate, and its reopening."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ FIX = slice(0, 3)
 
 
 def warm(sensors, ticks):
-    """A filter that has flown the recording for a while."""
+    """A filter after the first `ticks` ticks of the recording."""
     ukf = UnscentedKalmanFilter(sensors)
     ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
     for k in range(ticks):
@@ -51,7 +51,7 @@ def cycle(ukf, k, **changes):
 
 
 class InnovatingUKF(PlainUKF):
-    """The plain filter, which also says what the stacked innovation was and its covariance."""
+    """The plain filter, with the NIS of each block."""
 
     def update(self, *measurements):
         super().update(*measurements)
@@ -67,7 +67,7 @@ class InnovatingUKF(PlainUKF):
 
 
 @pytest.mark.parametrize("across", ["measured", "predicted", "pinhole"])
-def test_the_nis_of_each_block_is_that_of_a_plain_filter(across):
+def test_nis_of_each_block_agrees_with_a_plain_filter(across):
     sensors = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at=across))
     ours, plain = UnscentedKalmanFilter(sensors), InnovatingUKF(sensors)
     for ukf in (ours, plain):
@@ -112,7 +112,7 @@ def test_a_rejected_block_is_as_good_as_not_measured(wrong):
     assert abs(gap).max() < 1e-6
 
 
-def test_the_gate_is_the_chi_square_quantile_of_its_false_alarm():
+def test_gate_threshold_is_the_chi_square_quantile_of_its_false_alarm_probability():
     record = params_record(quad_gym.VehicleParams(), GATED)
     assert record["gate_position"][0] == pytest.approx(stats.chi2.isf(1e-4, 3), rel=1e-12)
     assert record["gate_direction"][0] == pytest.approx(stats.chi2.isf(1e-4, 2), rel=1e-12)
@@ -120,7 +120,7 @@ def test_the_gate_is_the_chi_square_quantile_of_its_false_alarm():
 
 
 def test_a_lane_gates_for_itself():
-    """The neighbors of a flight with a wild position update as they would without a gate."""
+    """The neighbors of a flight with a rejected position have the estimates of ungated filters."""
     filters, free = LaneFilter(GATED), LaneFilter(CONSISTENT)
     for lanes in (filters, free):
         for lane in range(EIGHT):
@@ -135,13 +135,13 @@ def test_a_lane_gates_for_itself():
     np.testing.assert_array_equal(filters.get("gate")[:, POSITION_BLOCK], [1, 1, 1, 2, 1, 1, 1, 1])
 
 
-def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
+def test_valid_measurements_are_rejected_at_the_false_alarm_probability():
     suite = quad_gym.sensor_suite("consumer").simplified()
     two = suite.gnss.replace(secondary_antenna_B=(0.1, 0.0, 0.0472), baseline_sigma=0.035)
     suite = suite.replace(gnss=two, estimator=suite.estimator.replace(false_alarm_probability=0.01))
     batch = fly(suite, 400, task="hover")
-    steps(batch, 5.0)  # until the start's larger uncertainty is over
-    blocks = measured_now(batch).shape[1]  # of GNSS and camera, before those of other sensors
+    steps(batch, 5.0)  # until the larger uncertainty of the start is over
+    blocks = measured_now(batch).shape[1]  # GNSS and camera; the blocks of other sensors follow
     before, taken = batch.record("rejections").sum(axis=0)[:blocks], 0
     for _ in range(1000):
         batch.step()
@@ -153,7 +153,7 @@ def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
 
 
 def shifted(batch, **changes):
-    """Move the estimate, as if the filter had been led astray."""
+    """Change the estimate, so that it is wrong."""
     flights = batch.snapshot()
     for name, change in changes.items():
         flights[name] = change(flights[name])
@@ -163,7 +163,7 @@ def shifted(batch, **changes):
 @pytest.mark.parametrize("name", ["rtk", "consumer"])
 def test_a_jump_does_not_lock_the_filter_out_for_ever(name):
     suite = quad_gym.sensor_suite(name)
-    if name == "consumer":  # with a slow error a jump of the vehicle looks like one of the receiver
+    if name == "consumer":  # with a drift, a jump of the vehicle looks like a GNSS jump
         suite = suite.replace(gnss=suite.gnss.replace(drift_sigma_I=(0.0, 0.0, 0.0)))
     batch = fly(suite.replace(camera=None), 200, task="hover")
     steps(batch, 5.0)

@@ -19,7 +19,7 @@ SKEWED_INERTIA = ((0.02, 0.003, -0.001), (0.003, 0.03, 0.002), (-0.001, 0.002, 0
 
 
 def flown(vehicle, duration, substeps, *, R_BI=None, **start):
-    """The record of one flight after `duration`, from rest where `start` does not say otherwise."""
+    """The record of one flight after `duration`, from rest except for the values in `start`."""
     flight, params = np.zeros(1, FLIGHT), params_record(vehicle, quad_gym.SensorSuite())
     flight["q"] = dcm_to_quaternion(np.eye(3) if R_BI is None else R_BI)
     for name, value in start.items():
@@ -82,7 +82,7 @@ def test_random_flights_agree_with_scipy(seed, skewed):
 
 @pytest.mark.parametrize("name", ["r", "v", "q", "w", "rotor_speeds"])
 def test_the_error_falls_with_the_fourth_power_of_the_step(name):
-    # it climbs so fast that z_I . v keeps its sign: at the kink of the drag the order is lower
+    # a climb so fast that z_I . v keeps its sign: at the kink of the drag the order is lower
     start = random_start(5) | {"R_BI": np.eye(3), "v": (3.0, 2.0, 30.0), "w": (2.0, -3.0, 4.0)}
     vehicle = LAB.replace(disc_area=0.3)
     exact = flown(vehicle, 0.2, 20_000, **start)[name]
@@ -118,7 +118,7 @@ lanes_and_floats = Compiled(lambda f, n: integrate(f, f, n), **STATE, **PARAMS, 
 
 
 def eight_flights():
-    """Fields of eight flights that differ in everything, their vehicles included."""
+    """Fields of eight flights with different states, inputs and vehicles."""
     vehicles = [LAB.replace(mass=0.5 + 0.1 * i, disc_area=0.1 * i) for i in range(8)]
     records = [params_record(v, quad_gym.SensorSuite())[0] for v in vehicles]
     fields = {name: np.array([record[name] for record in records]) for name in PARAMS}
@@ -128,7 +128,7 @@ def eight_flights():
     return fields | {name: np.array([start[name] for start in starts]) for name in starts[0]}
 
 
-def test_eight_flights_in_lanes_are_eight_flights_in_floats():
+def test_lanes_and_floats_integrate_eight_flights_equally():
     flights = eight_flights()
     plain = lanes_and_floats.on_floats(20, **flights)
     lanes = lanes_and_floats.on_lanes(20, **flights)

@@ -1,5 +1,5 @@
-"""Confidence intervals: their coverage by simulation, and closed forms and SciPy's where there are.
-A coverage of 95 % over 2,000 draws has a standard deviation of 0.5 %."""
+"""Confidence intervals against simulated coverage, closed forms and SciPy. A coverage of 95 % over
+2,000 draws has a standard deviation of 0.5 %."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_interval_over_trainings_covers_95_percent(seeds, of_seeds, of_episodes,
 @pytest.mark.parametrize(("rate", "alike"), [(0.05, 20.0), (0.5, 4.0), (0.9, 10.0), (0.5, 1e6)])
 def test_rate_over_trainings_covers_at_least_95_percent(seeds, rate, alike):
     rng = np.random.default_rng(seeds)
-    own = rng.beta(alike * rate, alike * (1.0 - rate), (DRAWS, seeds))  # of each training
+    own = rng.beta(alike * rate, alike * (1.0 - rate), (DRAWS, seeds))  # rate of each training
     found = [rate_over_trainings(rates, 100) for rates in rng.binomial(100, own) / 100]
     assert np.mean([each.holds(rate) for each in found]) > 0.935
 
@@ -62,14 +62,14 @@ def test_probability_of_improvement_covers_90_percent(seeds, apart):
     assert np.mean(held) > 0.86
 
 
-def test_worst_tenth_of_a_fixed_rule_covers_95_percent():
+def test_interval_of_worst_tenth_of_a_fixed_policy_covers_95_percent():
     exact = -norm.pdf(norm.ppf(0.1)) / 0.1
     samples = np.random.default_rng(1).normal(size=(200, 1, 200))
     held = [mean_over_trainings(x, worst_tenth).holds(exact) for x in samples]
     assert 0.86 < np.mean(held) < 0.99
 
 
-def test_interval_of_a_mean_is_student_s():
+def test_interval_of_a_mean_is_student_t():
     x = np.random.default_rng(6).normal(size=5)
     expected = ttest_1samp(x, 0.0).confidence_interval()
     np.testing.assert_allclose(mean_interval(x), [expected.low, expected.high], rtol=1e-12)
@@ -77,20 +77,20 @@ def test_interval_of_a_mean_is_student_s():
 
 
 @pytest.mark.parametrize(("count", "trials"), [(0, 20), (1, 20), (20, 20), (13, 40), (0, 1)])
-def test_interval_of_a_rate_is_clopper_and_pearson_s(count, trials):
+def test_interval_of_a_rate_is_clopper_pearson(count, trials):
     expected = binomtest(count, trials).proportion_ci(method="exact")
     found = rate_interval(count, trials)
     np.testing.assert_allclose(found, [expected.low, expected.high], rtol=1e-9)
 
 
-def test_interval_over_trainings_is_students_if_one_part_varies():
+def test_interval_over_trainings_is_student_t_if_only_one_source_varies():
     rng = np.random.default_rng(2)
     episodes, trainings = rng.normal(3.0, 2.0, 400), rng.normal(size=5)
     of_rule = mean_over_trainings([episodes])
     np.testing.assert_allclose(of_rule, [episodes.mean(), *mean_interval(episodes)])
     equal = mean_over_trainings(np.repeat(trainings[:, np.newaxis], 50, axis=1))
     np.testing.assert_allclose(equal, [trainings.mean(), *mean_interval(trainings)])
-    values = rng.normal(size=(3, 40))  # the jackknife of a mean is its variance
+    values = rng.normal(size=(3, 40))  # the jackknife gives the variance of a mean
     other = mean_over_trainings(values, lambda x: x.mean(axis=-1))
     np.testing.assert_allclose(other, mean_over_trainings(values))
     for rate in (0.0, 0.1, 1.0):
@@ -121,13 +121,13 @@ def test_worst_tenth_is_the_mean_of_the_lowest_numbers():
     np.testing.assert_array_equal(worst_tenth(np.arange(40.0).reshape(2, 20)), [0.5, 20.5])
 
 
-def test_the_difference_of_rates_is_newcombe_s():
+def test_interval_of_a_difference_of_rates_is_newcombe():
     # R. G. Newcombe, Statistics in Medicine 17, 1998, table II: 56/70 - 48/80, with score intervals
     found = difference(Estimated(0.8, 0.6918, 0.8773), Estimated(0.6, 0.4904, 0.7002))
     np.testing.assert_allclose(found, [0.2, 0.0526, 0.3341], atol=1e-3)
 
 
-def test_probability_of_improvement_is_that_of_mann_and_whitney():
+def test_probability_of_improvement_agrees_with_mann_whitney():
     rng = np.random.default_rng(6)
     a, b = rng.normal(1.0, 1.0, 7), rng.normal(0.0, 1.0, 9)
     found = probability_of_improvement(a, b)
@@ -135,7 +135,7 @@ def test_probability_of_improvement_is_that_of_mann_and_whitney():
     assert found.low < found.value < found.high
 
 
-def test_the_probability_of_improvement_at_its_limits():
+def test_probability_of_improvement_of_separated_scores_is_0_or_1():
     better = probability_of_improvement([2.0, 3.0, 2.5], [0.0, 1.0, 0.5])
     worse = probability_of_improvement([0.0, 1.0, 0.5], [2.0, 3.0, 2.5])
     assert better == (1.0, pytest.approx(0.501, abs=1e-3), 1.0)
@@ -143,7 +143,7 @@ def test_the_probability_of_improvement_at_its_limits():
     assert probability_of_improvement([1.0, 1.0], [1.0]).value == 0.5
 
 
-def test_pairs_show_what_seeds_hide():
+def test_paired_difference_is_significant_despite_large_seed_variance():
     rng = np.random.default_rng(10)
     seeds = rng.normal(0.0, 10.0, size=200)
     first, second = seeds + rng.normal(0.5, 0.1, size=200), seeds

@@ -1,4 +1,4 @@
-"""Draws, distributions and faults that are refused, with what the message says."""
+"""Invalid draws, distributions and faults, and the messages with which they are refused."""
 
 import math
 
@@ -94,7 +94,7 @@ SIGMAS = (*SIGMAS, "position_sigma_I", "baseline_sigma", "pixel_sigma")
 
 
 @pytest.mark.parametrize("name", SIGMAS)
-def test_drawn_deviation_of_zero_is_refused(name):
+def test_drawn_standard_deviation_of_zero_is_refused(name):
     with pytest.raises(ValueError, match=rf"randomization of '{name}'.*Params.{name} must be"):
         FlightBatch(1, randomization={name: Uniform(0.0, 0.0)})
     FlightBatch(1, randomization={name: Uniform(1e-6, 1e-6)})
@@ -165,7 +165,7 @@ def test_invalid_faults_are_refused(make, words):
         make()
 
 
-def test_presets_by_name():
+def test_fault_presets_are_found_by_name():
     assert faults_of(None, LAB) == faults_of("none", LAB) == faults_of((), LAB) == ()
     kinds = {fault.kind for preset in PRESETS.values() for fault in preset}
     assert kinds <= set(FaultKind)  # some faults have no name

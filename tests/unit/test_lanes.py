@@ -1,4 +1,4 @@
-"""The number type: eight lanes compute what eight floats would, and never see one another."""
+"""The number type: eight lanes compute the values of eight floats, independently."""
 
 import math
 
@@ -117,7 +117,7 @@ def awkward_pairs():
 
 
 @pytest.mark.parametrize("instance", INSTANCES)
-def test_arithmetic_is_that_of_ieee_floats_bit_for_bit(instance):
+def test_arithmetic_equals_ieee_floats_bit_for_bit(instance):
     x, y = awkward_pairs()
     out = getattr(arithmetic_on, instance)(3, x=x, y=y)["out"]
     with np.errstate(all="ignore"):
@@ -139,14 +139,14 @@ def test_a_fused_multiply_add_rounds_once(instance):
 
 @pytest.mark.parametrize("instance", INSTANCES)
 @pytest.mark.parametrize("option", [0, 1])
-def test_comparisons_and_choices_are_those_of_floats(instance, option):
+def test_comparisons_and_selections_equal_floats(instance, option):
     x, y = awkward_pairs()
     out = getattr(asking_on, instance)(option, x=x, y=y)["out"]
     for column, values in enumerate(truth_of_asking(x, y, option)):
         np.testing.assert_array_equal(out[:, column], values, err_msg=f"column {column}")
 
 
-def test_a_kernel_may_ask_whether_any_or_every_lane_is_set():
+def test_any_of_and_all_of_combine_all_lanes():
     pattern = np.arange(256)[:, np.newaxis] >> np.arange(WIDTH) & 1
     asked = asking_on.on_lanes(x=-pattern.ravel().astype(float), y=np.zeros(256 * WIDTH))
     any_less = asked["any_less"].reshape(256, WIDTH)
@@ -156,7 +156,7 @@ def test_a_kernel_may_ask_whether_any_or_every_lane_is_set():
 
 
 @pytest.mark.parametrize("instance", INSTANCES)
-def test_words_are_added_and_turned_modulo_two_to_the_sixty_four(instance):
+def test_words_are_added_and_rotated_modulo_2_to_the_64(instance):
     rng = np.random.default_rng(2)
     a = rng.integers(0, 2**64, 100, np.uint64)
     b = rng.integers(0, 2**64, 100, np.uint64)
@@ -181,7 +181,7 @@ def test_words_are_added_and_turned_modulo_two_to_the_sixty_four(instance):
     st.integers(0, WIDTH - 1),
     st.lists(st.floats(-1e3, 1e3), min_size=WIDTH, max_size=WIDTH),
 )
-def test_a_lane_never_sees_its_neighbor(bad, where, values):
+def test_invalid_value_in_one_lane_leaves_other_lanes_unchanged(bad, where, values):
     x, y = np.array(values), np.linspace(-1.0, 2.0, WIDTH)
     corrupt_x, corrupt_y = x.copy(), y.copy()
     corrupt_x[where] = corrupt_y[where] = bad

@@ -25,7 +25,7 @@ def late(suite, gnss=None, camera=None, **choices):
 
 
 def corrected_lab(kind="ukf", quiet=False, drift=False, **latencies):
-    """The laboratory's sensors at rates of the field, with the corrected filter, without a gate."""
+    """The sensors of `lab` at field rates, with the corrected filter and without a gate."""
     lab = quad_gym.sensor_suite("lab").with_rates(gnss=10.0, camera=25.0)
     imu = lab.imu.replace(samples="average")
     if quiet:
@@ -46,7 +46,7 @@ def corrected_lab(kind="ukf", quiet=False, drift=False, **latencies):
     [(0.035, 0.015), (0.1, 0.04), (0.13, 0.055), (0.2, 0.08), (0.0, 0.06), (0.11, 0.0)],
 )
 def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
-    """Up to two intervals; flights on the truth, so that both batches fly and measure the same."""
+    """Latencies are up to two periods. Both batches fly on the truth, with equal measurements."""
     task = {"task": "circle", "start": "hover", "source": Source.TRUTH}
     prompt, delayed = fly(RTK, 20, **task), fly(late(RTK, gnss, camera), 20, **task)
     waits = {"gnss": round(gnss / DT), "camera": round(camera / DT)}
@@ -73,8 +73,8 @@ def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
 
 
 def deviations_from_the_reference(suite, plain, seconds=1.0):
-    """Worst deviation of the means in claimed deviations, and of the covariances' entries. Of a
-    circle, against a filter that filters all over again."""
+    """Worst differences of the mean, in claimed standard deviations, and of the scaled covariance,
+    on a circle, from a filter that repeats all steps since the time stamp."""
     start_filter = "cold" if suite.drifts else "warm"
     batch = fly(suite, 1, task="circle", start="hover", filter_start=start_filter)
     start = plain(suite.replace(gnss=suite.gnss.replace(latency=0.0)))
@@ -130,11 +130,11 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
         (PlainUKF, False, 0.1, None, (0.15, 0.1)),  # with GNSS that drifts
     ],
 )
-def test_late_measurements_leave_what_filtering_all_over_again_does(
+def test_late_measurements_agree_with_a_filter_that_repeats_all_steps(
     plain, quiet, gnss, camera, bounds
 ):
-    """Up to the second order, and to what measurements in between tell about the IMU's noise. At
-    two periods one measurement is taken at the instant at which another arrives."""
+    """Differences are of second order, or due to IMU noise that measurements in between correct.
+    With a latency of two periods, one measurement is taken when another arrives."""
     kind = "ekf" if plain is PlainEKF else "ukf"
     drift, seconds = camera is None, 1.5 if camera is None or gnss == 0.2 or camera == 0.08 else 1.0
     seconds = 3.0 if drift else seconds
@@ -146,8 +146,8 @@ def test_late_measurements_leave_what_filtering_all_over_again_does(
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("name", ["rtk", "indoor"])
-def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
-    """Means over 400 flights, five deviations wide; the band itself is for longer flights."""
+def test_nees_is_consistent_only_with_delay_compensation(name, kind):
+    """Means over 400 flights lie within five standard deviations; longer flights test the band."""
     suite = quad_gym.sensor_suite(name)
     latencies = {"camera": 0.06} if suite.gnss is None else {"gnss": 0.11, "camera": 0.06}
     suite = late(suite, **latencies, kind=kind)
@@ -169,7 +169,7 @@ def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
 def test_failed_late_measurement_leaves_the_estimate():
     suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25), camera=None), gnss=0.05)
     batch = fly(suite, 10, task="hover")
-    steps(batch, 6 * DT)  # one fix is under way, until tick 15
+    steps(batch, 6 * DT)  # one fix is still to arrive, at tick 15
     bad, none = batch.snapshot(), batch.snapshot()
     assert (bad["waiting_valid"][:, POSITION_BLOCK, 0] == 1.0).any()
     bad["waiting"][0, POSITION_BLOCK, 0, 1, ::2] = np.nan
@@ -198,7 +198,7 @@ def test_delay_compensation_has_no_effect_without_latency():
         assert one[name].tobytes() == other[name].tobytes(), name
 
 
-def test_an_episode_begins_with_nothing_under_way():
+def test_episode_begins_without_pending_measurements():
     suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25)), gnss=0.1, camera=0.06)
     batch = fly(suite, 4)
     for _ in range(2):
@@ -211,7 +211,7 @@ def test_an_episode_begins_with_nothing_under_way():
         batch.reset()
 
 
-def test_nonsense_is_refused():
+def test_invalid_latencies_are_refused():
     for params, label in ((RTK.gnss, "GnssParams"), (RTK.camera, "CameraParams")):
         for latency in (-0.1, np.nan, "soon"):
             with pytest.raises(ValueError, match=rf"{label}\.latency"):

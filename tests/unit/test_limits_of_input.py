@@ -1,4 +1,4 @@
-"""Values that were once taken silently are refused by name; those at the limit are taken."""
+"""Invalid values are refused by name; values at the limit are accepted."""
 
 import math
 
@@ -37,14 +37,14 @@ def refused(message, make, *arguments, kind=ValueError, **keywords):
         ("imu", {"samples": "instant"}, "IMU samples"),
     ],
 )
-def test_true_sensors_that_measure_otherwise_are_refused(part, changes, message):
+def test_incompatible_true_sensors_are_refused(part, changes, message):
     true = RTK.replace(**{part: getattr(RTK, part).replace(**changes)})
     message = f"true_sensors must have the .*{message}"
     refused(message, FlightBatch, 1, sensors=RTK, true_sensors=true)
     refused(message, QuadEnv, "hover", sensors=RTK, true_sensors=true)
 
 
-def test_a_duration_that_rounds_to_no_limit_is_refused():
+def test_duration_that_rounds_to_zero_steps_is_refused():
     for duration in (0.001, 0.0099):
         refused("duration must be 0", QuadEnv, "hover", duration=duration)
     refused("duration must be 0", FlightBatch, 1, task=TaskParams(duration=0.001))
@@ -59,7 +59,7 @@ def test_a_duration_that_rounds_to_no_limit_is_refused():
 
 
 def amplification(z):
-    """Of one classic Runge-Kutta step along a decay: the series of exp(-z) to the fourth power."""
+    """Factor of one classic Runge-Kutta step of a decay: the series of exp(-z) to fourth order."""
     return abs(sum((-z) ** k / math.factorial(k) for k in range(5)))
 
 
@@ -84,7 +84,7 @@ def test_rotors_too_fast_for_the_integration_are_refused(substeps):
     QuadEnv("hover", randomization={"motor_time_constant": Uniform(slow, 0.1)}, substeps=substeps)
 
 
-def test_moments_of_inertia_of_no_body_are_refused():
+def test_physically_impossible_inertia_is_refused():
     flat, rod = np.diag([1.0, 2.0, 3.0]), np.diag([1e-3, 1.0, 1.0])
     for good in (flat, rod):
         quad_gym.VehicleParams(inertia=good)
@@ -94,7 +94,7 @@ def test_moments_of_inertia_of_no_body_are_refused():
         refused("VehicleParams.inertia must belong to a body", quad_gym.VehicleParams, inertia=bad)
 
 
-def test_drawn_moments_of_no_body_are_refused():
+def test_draws_of_physically_impossible_inertia_are_refused():
     def drawn(*moments):
         return {"inertia": [Uniform(low, high) for low, high in moments]}
 
@@ -116,20 +116,20 @@ def test_averaged_samples_need_midpoint_integration():
 
 @pytest.mark.parametrize(
     ("task", "least", "options"),
-    [  # the least period, by the thrust of twice the weight
+    [  # the least period with a thrust of twice the weight
         ("circle", 3.05, {}),
         ("circle", 4.26, {"randomize_reference": True}),
         ("circle", 0.98, {"action": "motor"}),
         ("lemniscate", 3.85, {}),
     ],
 )
-def test_periods_that_no_thrust_allows_are_refused(task, least, options):
+def test_periods_too_short_for_the_thrust_limit_are_refused(task, least, options):
     message = "period must be one that the vehicle can fly"
     refused(message, QuadEnv, task, period=0.99 * least, **options)
     QuadEnv(task, period=1.01 * least, **options)
 
 
-def test_starts_out_of_all_bounds_change_nothing():
+def test_invalid_start_options_are_refused_without_effect():
     env, vector = QuadEnv("hover"), QuadVectorEnv(2, "hover")
     for one in (env, vector):
         one.reset(seed=1)
@@ -150,7 +150,7 @@ def test_starts_out_of_all_bounds_change_nothing():
 
 
 @pytest.mark.parametrize("seed", [1.5, "a", -1, True, (), {}])
-def test_seeds_that_are_none_are_refused(seed):
+def test_invalid_seeds_are_refused(seed):
     for env in (QuadEnv("hover"), QuadVectorEnv(2, "hover")):
         refused("seed must be", env.reset, seed=seed)
     if seed != ():
@@ -162,7 +162,7 @@ def test_seeds_that_are_none_are_refused(seed):
     np.testing.assert_array_equal(first, QuadEnv("hover").reset(seed=7)[0])
 
 
-def test_flights_that_never_began_are_not_flown():
+def test_step_before_reset_is_refused():
     for kind in (ValueError, RuntimeError):
         refused("call reset", FlightBatch(3).step, kind=kind)
     batch = FlightBatch(3)
@@ -207,7 +207,7 @@ def test_faults_of_sensors_need_sensors(maker, observation):
     make(observation="measurements", faults="gnss_outage")
 
 
-def test_pd_control_is_not_shown_other_observations():
+def test_pd_policy_refuses_transformed_observations():
     from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
     single = gymnasium.make("QuadGym/Circle-v0")

@@ -38,7 +38,7 @@ def embedded(matrix):
 @pytest.mark.parametrize("instance", INSTANCES)
 @pytest.mark.parametrize("n", range(3, LARGEST + 1, 3))
 @pytest.mark.parametrize("condition", [10.0, 1e6])
-def test_factor_and_solutions_are_those_of_scipy(instance, n, condition):
+def test_factor_and_solutions_agree_with_scipy(instance, n, condition):
     rng = np.random.default_rng(n)
     a = np.array([positive_definite(rng, n, condition) for _ in range(5)])
     x, b = rng.normal(size=(5, ROWS, LARGEST)), rng.normal(size=(5, LARGEST))

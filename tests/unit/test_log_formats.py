@@ -1,4 +1,4 @@
-"""Logs in other formats, written here, are the same logs as tables."""
+"""Logs in other formats, written here, contain the values of the table."""
 
 import struct
 import sys
@@ -61,7 +61,7 @@ SCALES = {"L": 1e7, "e": 1e2}
 
 
 def write_bin(file, recorded):
-    """The self-describing format: FMT messages, then messages in the order of time."""
+    """Write ArduPilot's self-describing format: FMT messages, then the others in order of time."""
     layouts = {"FMT": (128, "BBnNZ", None)}
     data = b""
     for name, (number, kinds, fields) in (layouts | MESSAGES).items():
@@ -85,7 +85,7 @@ def write_bin(file, recorded):
     add("PARM", -BOOT, b"GPS_DELAY_MS", 100.0)
     for time, _, values in recorded.imu:
         add("IMU", time, 0, *(values[:3] * FLU), *(values[3:] * FLU))
-        add("IMU", time, 1, *(9.0 * values))  # a second one
+        add("IMU", time, 1, *(9.0 * values))  # a second IMU
     for (_, received, values), place in zip(recorded.gnss, geodetic(recorded), strict=True):
         e, n, u = values["gnss_velocity"]
         course = np.degrees(np.arctan2(e, n)) % 360.0
@@ -99,7 +99,7 @@ def write_bin(file, recorded):
     file.write_bytes(data + b"".join(row for _, row in sorted(rows, key=lambda row: row[0])))
 
 
-def test_a_log_of_ardupilot_is_the_log_that_was_flown(recorded, table, tmp_path):
+def test_ardupilot_log_has_the_values_of_the_table(recorded, table, tmp_path):
     pytest.importorskip("pymavlink")
     write_bin(tmp_path / "flight.bin", recorded)
     log = read_log(tmp_path / "flight.bin")
@@ -182,7 +182,7 @@ def write_bag(path, recorded, version):
 
 
 @pytest.mark.parametrize(("version", "name"), [(1, "flight.bag"), (2, "flight")])
-def test_a_bag_of_ros_is_the_log_that_was_flown(recorded, table, tmp_path, version, name):
+def test_ros_bag_has_the_values_of_the_table(recorded, table, tmp_path, version, name):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / name, recorded, version)
     log = read_log(tmp_path / name)
@@ -212,8 +212,8 @@ def test_missing_libraries_are_named(tmp_path, monkeypatch, file, library):
 
 
 @pytest.mark.parametrize("up", ["z", "x"])
-def test_a_folder_of_euroc_is_the_log_that_was_flown(recorded, table, tmp_path, up):
-    """With a rotated IMU, and with EuRoC's body, which has x up and z forward."""
+def test_euroc_folder_has_the_values_of_the_table(recorded, table, tmp_path, up):
+    """The IMU is rotated. If x is up, the body is EuRoC's, with z forward."""
     R_BS = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     body = np.eye(3) if up == "z" else np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0]])
     for name in ("imu0", "leica0"):

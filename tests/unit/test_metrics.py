@@ -1,4 +1,4 @@
-"""Errors, consistency and intervals, against distributions that are known."""
+"""Errors, consistency and intervals against known distributions."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ class TestTrackingSummary:
         for error in errors.T:
             running.add(error)
         found = running.result()
-        last = errors[:, instants // 2 :]  # with the middle instant of an odd number
+        last = errors[:, instants // 2 :]  # includes the middle one of an odd number
         np.testing.assert_allclose(found.mean, errors.mean(axis=1), rtol=1e-13)
         np.testing.assert_allclose(found.last_half, last.mean(axis=1), rtol=1e-13)
 
@@ -55,7 +55,7 @@ def test_spread_of_known_numbers():
     assert np.isnan([one.sd, none.mean]).all()
 
 
-def test_band_and_quantile_are_those_of_tables():
+def test_chi_square_band_and_quantile_agree_with_tables():
     # 2.5 % and 97.5 % points of chi-square with 15 degrees of freedom
     assert metrics.chi_square_band(15) == pytest.approx((6.262, 27.488), abs=5e-4)
     assert metrics.chi_square_quantile(15, 0.999) == pytest.approx(37.697, abs=5e-4)
@@ -82,7 +82,7 @@ def test_invalid_numbers_are_refused(function, arguments, message):
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
-def test_estimate_and_error_make_the_truth(shape):
+def test_estimate_plus_error_is_the_truth(shape):
     names, rng = ("position", "velocity", "accel_bias", "gyro_bias"), np.random.default_rng(3)
     truth, estimate = (
         {name: rng.normal(size=(*shape, 3)) for name in names}

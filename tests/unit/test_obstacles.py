@@ -30,7 +30,7 @@ def is_inside(obstacle, points):
 
 
 def surface(obstacle, step=0.02):
-    """Points all over the surface, about `step` apart."""
+    """Points on the whole surface, about `step` apart."""
 
     def grid(a, b):
         u, v = (np.linspace(-x, x, max(3, round(2.0 * x / step))) for x in (a, b))
@@ -60,14 +60,14 @@ def centers(obstacles, count):
 
 
 @pytest.mark.parametrize("obstacle", [WALL, MAST])
-def test_distances_are_those_from_points_all_over_the_surface(obstacle):
+def test_distances_agree_with_dense_samples_of_the_surface(obstacle):
     points = np.random.default_rng(0).uniform((-2.5, -2.5, -1.0), (2.5, 2.5, 3.0), (4000, 3))
     distance, vector = nearest_obstacle([obstacle], centers([obstacle], len(points)), points)
     sampled, _ = cKDTree(surface(obstacle)).query(points)
     inside = is_inside(obstacle, points)
     assert 50 < inside.sum() < 3000
     np.testing.assert_array_equal(distance < 0.0, inside)
-    # the sampled one is never nearer, and is off by half a diagonal of the grid at most
+    # the sampled distance is too large, by half a diagonal of the grid at most
     assert (sampled - np.abs(distance) > -1e-9).all()
     assert (sampled - np.abs(distance) < 0.02).all()
     np.testing.assert_allclose(np.linalg.norm(vector, axis=1), np.abs(distance), atol=1e-12)
@@ -75,7 +75,7 @@ def test_distances_are_those_from_points_all_over_the_surface(obstacle):
     np.testing.assert_allclose(there, 0.0, atol=1e-12)
 
 
-def test_distances_by_hand():
+def test_distances_agree_with_hand_computed_values():
     box, mast = Wall(size=(4.0, 2.0, 6.0)), Cylinder(radius=1.0, height=2.0)
     for obstacle, point, distance, vector in (
         (box, (-4.0, 4.0, 9.0), 7.0, (2.0, -3.0, -6.0)),  # a corner
@@ -87,11 +87,11 @@ def test_distances_by_hand():
         np.testing.assert_allclose(found[0], distance, atol=1e-12)
         np.testing.assert_allclose(found[1][0], vector, atol=1e-12)
     length, _ = nearest_obstacle([mast], np.zeros((1, 1, 3)), np.zeros((1, 3)))
-    assert length[0] == -1.0  # in the very middle
+    assert length[0] == -1.0  # at the center
 
 
 @pytest.mark.parametrize("obstacle", [WALL, MAST])
-def test_lines_of_sight_are_those_that_samples_of_the_line_say(obstacle):
+def test_lines_of_sight_agree_with_dense_samples_of_the_line(obstacle):
     rng = np.random.default_rng(1)
     eyes = rng.uniform((-3.0, -3.0, -1.0), (3.0, 3.0, 3.0), (60, 3))
     points = rng.uniform((-3.0, -3.0, -1.0), (3.0, 3.0, 3.0), (50, 3))
@@ -130,7 +130,7 @@ TRUTH = {"source": Source.TRUTH, "threads": 1}
 
 
 def circling(world, **options):
-    """Flights on the truth around the origin, through whatever stands there."""
+    """Flights on the true state around the origin, also through obstacles."""
     task = quad_gym.TaskParams(start="hover", randomize_reference=True, duration=0.0)
     return batch_of(8, world=world, task=task, **{**TRUTH, **options})
 
@@ -170,7 +170,7 @@ def test_collision_in_a_step_ends_the_episode_after_it():
 
 
 @pytest.mark.parametrize(("gap", "touches"), [(0.0, True), (2.0**-40, False)])
-def test_contact_is_contact_to_the_last_bit(gap, touches):
+def test_distance_of_exactly_the_vehicle_radius_is_a_collision(gap, touches):
     # at rest on its pad, at (4, 0, 0); the wall's face is at x = 4.5
     wall = Wall(center_I=(4.75, 0.0, 0.0), size=(0.5, 2.0, 2.0))
     world = WorldParams(obstacles=(wall,), vehicle_radius=0.5 - gap)
@@ -221,7 +221,7 @@ def test_obstacles_hide_features_and_change_nothing_else():
     assert behind > 50
 
 
-def test_late_images_lack_what_was_hidden_when_they_were_taken():
+def test_late_images_lack_features_hidden_at_their_time_stamp():
     suite = quad_gym.sensor_suite("lab")
     late = suite.replace(camera=suite.camera.replace(rate=40.0, latency=0.035))
     prompt = suite.replace(camera=suite.camera.replace(rate=40.0))
@@ -269,7 +269,7 @@ def test_shifts_are_uniform_and_shared_by_followers():
     )
 
 
-def test_a_new_episode_has_new_places_and_has_touched_nothing():
+def test_reset_draws_new_obstacle_positions_and_clears_collisions():
     batch = batch_of(4, world=SHIFTED, **TRUTH)
     before = batch.record("obstacle_center")
     batch._blocks["collided"] = 1.0
@@ -306,12 +306,12 @@ def test_starts_in_the_way_are_refused_before_anything_changes():
 
 
 def test_starts_where_a_shift_may_put_an_obstacle_are_refused():
-    """Against the nearest of many shifts."""
+    """The reference is the nearest of many shifts."""
     rng = np.random.default_rng(3)
     for obstacle in (
         MAST.replace(shift_I=(1.0, 0.5, 0.0)),
         WALL.replace(yaw=0.0, shift_I=(0.5, 1.0, 0.2)),
-        WALL.replace(shift_I=(0.3, 0.3, 0.0)),  # aslant: the answer may be too careful
+        WALL.replace(shift_I=(0.3, 0.3, 0.0)),  # rotated: the check may be too strict
     ):
         world = WorldParams(obstacles=(obstacle,))
         shifts = np.linspace(-1.0, 1.0, 9)

@@ -1,4 +1,4 @@
-"""GNSS with one antenna: no baseline; the magnetometer tells the heading of the filter's start."""
+"""GNSS with one antenna: no baseline; the magnetometer gives the filter's initial heading."""
 
 import numpy as np
 import pytest
@@ -19,14 +19,14 @@ JOINT = [*range(15), *(15 + IRON + np.arange(3)), 15 + DELTA]
 
 
 def nees_of(errors, factors):
-    """Of states, hard iron and declination, from factors (n, 24, 24) of the joint covariance."""
+    """NEES of states, hard iron and declination, by factors (n, 24, 24) of the joint covariance."""
     P = (factors @ factors.transpose(0, 2, 1))[:, JOINT][:, :, JOINT]
     return (errors * np.linalg.solve(P, errors[..., np.newaxis])[..., 0]).sum(axis=1)
 
 
 @pytest.mark.parametrize("start", ["ground", "hover"])
-def test_flights_start_as_well_as_their_covariance_says(start):
-    """The mean of 2,000 NEES deviates by 0.14 where errors are Gaussian."""
+def test_initial_errors_agree_with_the_initial_covariance(start):
+    """The mean of 2,000 NEES has a standard deviation of 0.14 if errors are Gaussian."""
     batch = fly(CONSUMER, 2000, task="hover", start=start)
     errors = np.zeros((2000, 19))
     errors[:, :15] = state_errors(batch)
@@ -38,11 +38,11 @@ def test_flights_start_as_well_as_their_covariance_says(start):
     assert 0.03 < heading.mean() < 0.08
     mean = nees_of(errors, factors).mean()
     assert mean < 19.7
-    # standing vehicles are stiller and more level than the filter takes them for
+    # standing vehicles are more level and move less than the filter assumes
     assert mean > (18.3 if start == "hover" else 12.0)
 
 
-def test_the_sample_that_starts_a_filter_counts_once():
+def test_sample_that_initializes_the_filter_is_used_once():
     suite = CONSUMER.replace(
         barometer=CONSUMER.barometer.replace(phase=0.0),
         magnetometer=MAGNETOMETER.replace(phase=0.0),
@@ -55,7 +55,7 @@ def test_the_sample_that_starts_a_filter_counts_once():
         assert np.isfinite(nis).all() == (start == "warm")
 
 
-def test_there_is_no_baseline():
+def test_one_antenna_measures_no_baseline():
     batch = fly(CONSUMER, 16)
     for _ in range(30):
         steps(batch, 0.05)
@@ -70,7 +70,7 @@ def test_there_is_no_baseline():
     assert np.isfinite(batch.record("block_nis")[:, 0]).all()
 
 
-def test_mark_of_the_start_gives_the_heading_without_a_field():
+def test_initial_pose_gives_the_heading_without_a_magnetometer():
     alone = CONSUMER.replace(magnetometer=None)
     batch = fly(alone, 1000, task="hover")
     heading = state_errors(batch)[:, 8]
@@ -79,7 +79,7 @@ def test_mark_of_the_start_gives_the_heading_without_a_field():
     np.testing.assert_allclose(np.linalg.norm(batch.record("L")[:, 8], axis=1), sigma, rtol=1e-3)
 
 
-def test_what_belongs_to_two_antennas_is_refused():
+def test_inputs_for_the_wrong_number_of_antennas_are_refused():
     ukf, fix, field = UnscentedKalmanFilter(CONSUMER), np.zeros(3), MAGNETOMETER.field_I
     with pytest.raises(ValueError, match="gnss_baseline_G must be None"):
         ukf.initialize(fix, (1.0, 0.0, 0.0), magnetometer=field)

@@ -19,7 +19,7 @@ GROUND = quad_gym.WorldParams().ground_height
 
 
 def expected(r, v, R_BI, w):
-    """(4,) flow, distance and cosine of the tilt of a state, without noise."""
+    """Flow, distance and cosine of the tilt of a state (4,), without noise."""
     cosine = R_BI[2, 2]
     distance = (r[2] - GROUND) / cosine
     x, y, _ = R_BI @ v / distance
@@ -40,11 +40,11 @@ def test_measurements_have_the_closed_form_and_their_noise():
         rows = zip(*states, R_BI, strict=True)
         truth = np.array([expected(r, v, R, w)[:3] for r, v, w, R in rows])
         measured = batch.record("aid_measurement")
-        valid = batch.record("block_valid")[:, AID_BLOCKS + FLOW :].all(axis=1)  # not too fast
+        valid = batch.record("block_valid")[:, AID_BLOCKS + FLOW :].all(axis=1)  # flow in range
         error = np.column_stack([measured[:, FLOW, :2], measured[:, RANGE, :1]]) - truth
         noise.append(error[valid])
     sigma = np.sqrt(np.mean(np.concatenate(noise) ** 2, axis=0))
-    np.testing.assert_allclose(sigma, (0.2, 0.2, 0.01), rtol=0.06)  # 4 sigma of 2,500
+    np.testing.assert_allclose(sigma, (0.2, 0.2, 0.01), rtol=0.06)  # 4 sigma of 2,500 samples
 
 
 @pytest.mark.parametrize(("height", "flow", "distance"), [(0.0, True, True), (-0.07, False, False)])
@@ -59,7 +59,7 @@ def test_nothing_is_measured_below_the_least_height(height, flow, distance):
 
 
 def filter_in_flight(kind):
-    """A filter of GNSS, flow and range finder that moves, and is tilted and turned."""
+    """A filter with GNSS, flow and range finder, whose state is moving, tilted and turned."""
     suite = quad_gym.sensor_suite("rtk").simplified()
     suite = suite.replace(
         optical_flow=quad_gym.OpticalFlowParams(), range_finder=quad_gym.RangeFinderParams()
@@ -73,7 +73,7 @@ def filter_in_flight(kind):
 
 
 def numerical_update(kf, suite, flow, distance):
-    """The linear update by the same measurements, with numerical derivatives."""
+    """The linear update with numerical derivatives."""
     state = [kf._engine.read(name)[0] for name in ("r_hat", "v_hat", "R_hat")]
     P = kf.covariance.copy()
     w = kf._engine.read("w_meas")[0] - kf._engine.read("b_g_hat")[0]
@@ -101,12 +101,12 @@ def numerical_update(kf, suite, flow, distance):
 
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
-def test_an_update_is_the_linear_one_with_numerical_derivatives(kind):
+def test_update_agrees_with_a_linear_update_by_numerical_derivatives(kind):
     kf, suite = filter_in_flight(kind)
     flow, distance = (0.6, -0.2), 1.43
     (r, v, _), dx, P = numerical_update(kf, suite, flow, distance)
     kf.update(optical_flow=flow, range_finder=distance)
-    tolerance = 1e-6 if kind is ExtendedKalmanFilter else 3e-2  # higher orders
+    tolerance = 1e-6 if kind is ExtendedKalmanFilter else 3e-2  # higher-order terms
     scale = np.sqrt(np.diag(P))
     np.testing.assert_allclose((kf.position - r - dx[:3]) / scale[:3], 0.0, atol=tolerance)
     np.testing.assert_allclose((kf.velocity - v - dx[3:6]) / scale[3:6], 0.0, atol=tolerance)
@@ -130,7 +130,7 @@ def test_wrong_measurements_are_rejected(kind):
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 def test_filters_are_consistent(kind, start, late):
-    """Mean NEES of 150 flights, of deviation 0.45, and NIS of their last measurements."""
+    """The mean of 150 NEES has a standard deviation of 0.45. NIS is of the last measurements."""
     suite = CRAZYFLIE.replace(estimator=CRAZYFLIE.estimator.replace(kind=kind))
     if late:
         suite = suite.replace(

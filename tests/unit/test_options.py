@@ -1,4 +1,4 @@
-"""Options of dataclasses, parsed."""
+"""Command-line options parsed into dataclasses."""
 
 import shlex
 from dataclasses import dataclass, field
@@ -46,7 +46,7 @@ class Args:
             raise ValueError("seeds must be at least 1")
 
 
-def test_all_types():
+def test_options_of_all_types_are_parsed():
     line = (
         "QuadGym/Hover-v0 --seeds 3 --rate 2.5 --gains 3 4 --no-camera --kind b "
         "--output some/where --sensors rtk lab --env a=1 b=(2,3) c=true d=none e=x=y f=1e-3"
@@ -67,7 +67,7 @@ def test_help_has_defaults_and_texts(capsys):
     assert "or an id such as QuadGym/Hover-v0 (default: circle)" in text
 
 
-def test_whole_numbers_may_be_written_as_others(capsys):
+def test_integers_may_be_written_as_floats(capsys):
     for word, seeds in (("1e3", 1000), ("2.0", 2), ("1_000", 1000)):
         given = parse(Args, ["--seeds", word]).seeds
         assert (type(given), given) == (int, seeds)
@@ -101,14 +101,14 @@ def test_usage_errors_end_with_one_line(error, capsys):
     assert capsys.readouterr().err == "error: why\n"
 
 
-def test_keywords_with_an_option_of_their_own_are_refused():
+def test_env_keywords_with_a_dedicated_option_are_refused():
     keywords = {"radius": 2.0, "sensors": "rtk"}
     assert leave(keywords, faults="--fault") == keywords
     with pytest.raises(ValueError, match=r"^--env must not contain sensors: use --sensors"):
         leave(keywords, "sensors", faults="--fault")
 
 
-def test_keywords_become_options_that_are_parsed_as_they_were():
+def test_keywords_are_formatted_as_command_line_options():
     assert flying_options({}) == ""
     assert flying_options({"sensors": "rtk"}) == " --sensors rtk"
     keywords = {"camera": False, "faults": "gnss_jump+rotor_loss", "observation": "noisy"}

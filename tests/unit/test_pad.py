@@ -33,7 +33,7 @@ def test_a_start_with_a_velocity_is_not_on_the_pad():
     assert flights.record("on_pad").tolist() == [1.0, 0.0]
 
 
-def test_an_environment_has_a_pad_and_the_reports_has_not():
+def test_vehicle_stays_on_the_pad_by_default_and_sinks_without_it():
     given = {"observation": "truth", "start": "ground"}
     for pad in (True, False):
         env = gymnasium.make_vec("QuadGym/Circle-v0", 2, **given, **({} if pad else {"pad": False}))
@@ -50,7 +50,7 @@ def test_a_reference_out_of_bounds_of_the_pad_is_refused(task, start):
     options = {"start": start, "out_of_bounds": 1.6}
     env = QuadVectorEnv(16, task, height=1.6, **options)
     env.reset(seed=1)
-    if task == "hover":  # elsewhere the reference moves away from the limit
+    if task == "hover":  # in other tasks the reference moves away from the limit
         ending = env.step(np.tile([-1.0, 0.0, 0.0, 0.0], (16, 1)))[4]["ending"]
         assert (ending == 0).all()
     message = rf"out_of_bounds must be at least 1\.61 m.*start='{start}'.*got out_of_bounds=1\.6 m"

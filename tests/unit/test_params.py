@@ -1,4 +1,4 @@
-"""The parameter classes: frozen, keyword-only, checked, and the field named in every complaint."""
+"""Parameter classes are frozen, keyword-only and checked; error messages name the field."""
 
 from dataclasses import FrozenInstanceError, fields
 
@@ -19,7 +19,7 @@ NO_VECTORS = [(1.0, 2.0), 1.0, "abc", None, (1.0, 2.0, float("nan")), (1.0, 2.0,
 NO_VECTORS += [("1", "2", "3"), (True, 1.0, 1.0), (None, 1.0, 1.0), np.ones(3, bool)]
 NO_MATRICES = [np.zeros((3, 2)), np.zeros(3), "abc", None, np.full((3, 3), np.nan)]
 MAYBE = [0.0, -1.0, "fast", float("nan")]
-"""Not for numbers that may be None."""
+"""Invalid values of numbers that may be None."""
 SENSOR = {"rate": NOT_POSITIVE, "phase": NO_PHASES, "latency": BELOW_ZERO}
 OBSTACLE = {"center_I shift_I": [*NO_VECTORS, (0.0, 1e5, 0.0)], "follows": ["first", -1, 0.5]}
 FAR = 1e5
@@ -187,7 +187,7 @@ def test_every_field_but_flags_is_tried():
         assert not names - set(CASES)
 
 
-def test_arrays_become_tuples_so_that_nobody_can_change_them():
+def test_arrays_are_stored_as_immutable_tuples():
     inertia = np.diag([1.0, 2.0, 3.0])
     vehicle = quad_gym.VehicleParams(inertia=inertia)
     inertia[0, 0] = -1.0
@@ -199,7 +199,7 @@ PRESETS |= {"gains": quad_gym.pd_gains}
 
 
 @pytest.mark.parametrize("argument", PRESETS)
-def test_presets_are_known_by_name(argument):
+def test_unknown_presets_are_refused_with_the_valid_names(argument):
     for unknown in ("garage", None, ["lab"]):
         with pytest.raises(ValueError, match=rf"^{argument} must be one of (standard, )?lab"):
             PRESETS[argument](unknown)
@@ -230,7 +230,7 @@ def test_sensors_take_other_rates():
     assert suite.with_rates() == suite
     blind = quad_gym.SensorSuite(camera=None).with_rates(imu=100.0, gnss=50.0)
     assert (blind.imu.rate, blind.gnss.rate, blind.camera) == (100.0, 50.0, None)
-    fast = quad_gym.sensor_suite("lab").with_rates(imu=400.0)  # those at every tick follow
+    fast = quad_gym.sensor_suite("lab").with_rates(imu=400.0)  # sensors at every tick follow
     assert (fast.imu.rate, fast.gnss.rate, fast.camera.rate) == (400.0, 400.0, 400.0)
     slow = quad_gym.sensor_suite("lab").with_rates(gnss=10.0).with_rates(imu=100.0)
     assert (slow.gnss.rate, slow.camera.rate) == (10.0, 100.0)

@@ -1,4 +1,4 @@
-"""PD control that plans by predicted covariances."""
+"""PD control that plans with predicted covariances."""
 
 import gymnasium
 import numpy as np
@@ -31,7 +31,7 @@ def test_plan_that_waits_crashes_less_than_flying_on():
     assert crash_rate(DASH, "pd:planning", 60) < crash_rate(DASH, "pd", 60) - 0.1
 
 
-def test_heading_without_uncertainty_is_the_rewarded_one_and_the_markers_with_a_large_one():
+def test_heading_is_the_rewarded_one_if_certain_and_toward_markers_if_uncertain():
     env = make(LOOK, 4)
     observation, _ = env.reset(seed=0)
     policy = load_policy("pd:planning", env)
@@ -62,7 +62,7 @@ def test_predicted_covariances_are_the_matrix_product():
     np.testing.assert_allclose(_measured(P[places], 0.3, 5.0), updated[places], rtol=1e-9)
 
 
-def test_geometry_of_the_markers_is_the_map():
+def test_marker_geometry_agrees_with_the_map():
     (angles, share), variance = _markers(quad_gym.sensor_suite("one_wall").camera)
     found = np.interp(np.radians([0.0, 9.0, 11.0, 38.0, 52.0, 180.0]), angles, share)
     np.testing.assert_allclose(found, [1.0, 1.0, 0.75, 0.25, 0.0, 0.0])  # 7.1 and 20.6 degrees

@@ -1,4 +1,4 @@
-"""Replays name implausible units and axes, and suites that do not describe the log."""
+"""Replays report implausible units and axes, and suites that do not describe the log."""
 
 import json
 import math
@@ -19,7 +19,7 @@ RATE, RADIUS, COUNT, DT = 0.4, 3.0, 1000, 0.005
 
 
 def turntable():
-    """Five seconds on a turntable, as docs/logs.md has them, with a compass and a barometer."""
+    """Five seconds on a turntable, as in docs/logs.md, with a compass and a barometer."""
     rng, time = np.random.default_rng(1), DT * np.arange(COUNT)
 
     def noise(sigma):
@@ -158,7 +158,7 @@ def test_a_suite_without_the_sensors_of_the_log_is_refused():
 
 
 def written(table, file):
-    """A table as a CSV."""
+    """Write a table as a CSV."""
     columns = {}
     axes = {"gnss_enu": ("gnss_east", "gnss_north", "gnss_up")}
     axes["gnss_velocity_enu"] = tuple(f"gnss_velocity_{a}" for a in ("east", "north", "up"))

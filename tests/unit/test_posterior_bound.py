@@ -15,7 +15,7 @@ Q = 0.04 * np.outer([0.005, 0.1], [0.005, 0.1])  # of rank one
 H = np.array([[1.0, 0.0]])
 
 
-def test_bound_of_a_linear_system_is_the_riccati_equations_solution():
+def test_bound_of_a_linear_system_solves_the_riccati_equation():
     recursion = Recursion(np.tile(np.eye(2), (2, 1, 1)))
     for _ in range(400):
         recursion.predict(F[np.newaxis], Q[np.newaxis])
@@ -26,8 +26,8 @@ def test_bound_of_a_linear_system_is_the_riccati_equations_solution():
     assert (np.diag(recursion.P[0]) > 1.0).all()  # never measured
 
 
-def test_delayed_measurements_of_a_system_without_noise_bound_as_punctual_ones_do():
-    """With x' = F x, a measurement of an earlier state is one of H F^-3 x now."""
+def test_delayed_and_equivalent_undelayed_measurements_give_equal_bounds():
+    """With x' = F x, a measurement H x of three steps ago is one of H F^-3 x now."""
     late, punctual = (Recursion(np.eye(2)[np.newaxis]) for _ in range(2))
     rows = np.array([0])
     for _ in range(50):

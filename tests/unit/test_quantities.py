@@ -1,4 +1,4 @@
-"""Quantities by their public names: the same words, and the same numbers, in all interfaces."""
+"""Quantities have equal public names and equal values in all interfaces."""
 
 import gymnasium
 import numpy as np
@@ -24,7 +24,7 @@ def flown(task="circle", **keywords):
     return builders.flown(task, **{"steps": 30, "task": quad_gym.Task(), **keywords}).flights.batch
 
 
-def test_flights_and_views_have_the_words_of_the_table():
+def test_flights_and_views_use_the_names_of_the_table():
     assert {column.name for column in COLUMNS} - set(QUANTITIES) == ONLY_IN_FLIGHTS
     views = {field.name for field in VIEW_FIELDS}
     for name in QUANTITIES:
@@ -66,7 +66,7 @@ def test_attitudes_agree_with_scipy():
         *("look_around", "outage_dash"),
     ],
 )
-def test_the_reference_is_the_one_that_tasks_are_shown(task):
+def test_reference_quantities_equal_the_view_of_tasks(task):
     batch = flown(task, steps=40)
     view = batch.view
     for name in ("position", "velocity", "acceleration", "heading"):
@@ -77,7 +77,7 @@ def test_the_reference_is_the_one_that_tasks_are_shown(task):
     np.testing.assert_array_equal(batch.read("time"), view.time)
 
 
-def test_measurements_are_those_of_a_view_or_nan():
+def test_measurements_equal_the_view_and_are_nan_if_absent():
     suite = AIDED.with_rates(gnss=10.0, camera=20.0)
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=quad_gym.Task(), sensors=suite)
     env.reset(seed=2)

@@ -1,4 +1,4 @@
-"""The random streams: published answers of Threefry, and what is made of them."""
+"""The random streams: published answers of Threefry, and the draws made from its words."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_floats_and_lanes_draw_the_same(words, draw):
 
 
 @given(st.tuples(*[st.integers(0, 2**64 - 1)] * 3), st.integers(0, 200))
-def test_a_draw_is_named_by_the_second_counter_word(words, draw):
+def test_second_counter_word_selects_the_draw(words, draw):
     key, instant = np.array([words[:2]], np.uint64), words[2]
     counter = np.array([(instant, draw)], np.uint64)
     got = generator.on_floats(draw, word_key=key, word_counter=counter)
@@ -63,8 +63,8 @@ def test_a_draw_is_named_by_the_second_counter_word(words, draw):
     np.testing.assert_allclose(got["normals"][0], expected, rtol=1e-13, atol=1e-14)
 
 
-def test_one_instant_of_many_keys_is_as_random_as_one_key():
-    """What makes of the words of Threefry, which are sound, is tested to the bit above."""
+def test_normals_of_consecutive_keys_are_independent():
+    """The computation of normals from words is tested above."""
     keys = np.zeros((400_000, 2), np.uint64)
     keys[:, 0] = np.arange(len(keys))
     counter = np.full((len(keys), 2), 7, np.uint64)

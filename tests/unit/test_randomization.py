@@ -1,4 +1,4 @@
-"""Draws against SciPy's distributions, drawn flights against flights that are told the draws."""
+"""Draws against SciPy's distributions; flights with draws against flights with the parameters."""
 
 import math
 
@@ -36,7 +36,7 @@ quantiles = Compiled(quantile, p=(), x=())
 
 
 @given(st.floats(1e-300, 1.0 - 2.0**-53))
-def test_the_normal_quantile_is_that_of_scipy(p):
+def test_normal_quantile_agrees_with_scipy(p):
     got = quantiles.on_floats(p=[p])["x"][0]
     np.testing.assert_allclose(got, special.ndtri(p), rtol=2e-13, atol=1e-15)
 
@@ -79,7 +79,7 @@ def test_draws_have_their_distribution(drawn, name):
 
 
 def test_all_draws_are_independent(drawn):
-    """Of parameters, components, flights and episodes."""
+    """Draws of parameters, components, flights and episodes are not correlated."""
     columns = [np.reshape(part[name], (20_000, -1)).T for part in drawn for name in sorted(DRAWS)]
     ranks = stats.rankdata(np.concatenate(columns), axis=1)
     scores = np.corrcoef(ranks)[np.triu_indices(len(ranks), 1)] * math.sqrt(20_000)
@@ -112,12 +112,12 @@ def test_a_parameter_does_not_depend_on_which_others_are_drawn():
         for randomization in ({"mass": mass}, {"mass": mass, "inertia": inertia})
     )
     np.testing.assert_array_equal(few.read("mass"), many.read("mass"))
-    drawn = many.read("inertia")  # whose other components stay
+    drawn = many.read("inertia")  # the other components stay
     assert [len(np.unique(column)) for column in drawn.T] == [1, 12, 1]
 
 
-def told(name, value):
-    """Vehicle, sensors and world with a parameter set in the dataclass that holds it."""
+def parameters_with(name, value):
+    """Vehicle, sensors and world, with the parameter set in the dataclass that has it."""
     scalar = float(value[0]) if value.size == 1 else tuple(value)
     imu, gnss, camera, battery = SUITE.imu, SUITE.gnss, SUITE.camera, WORLD.battery
     vehicle, sensors, world = LAB, SUITE, WORLD
@@ -192,12 +192,12 @@ TOLD = [d.name for d in DRAWABLES if d.name not in OTHERS and not d.name.startsw
 
 
 @pytest.mark.parametrize("name", TOLD)
-def test_flight_that_draws_a_parameter_is_the_one_that_has_it(name):
+def test_flight_with_drawn_parameter_equals_flight_with_given_parameter(name):
     drawing = flown(seeds=(2, 3), world=WORLD, randomization={name: some_distribution(name)})
     value = np.atleast_1d(drawing.read(name)[1])
     nominal = nominal_values(LAB, SUITE, WORLD)[COLUMNS[name]]
     assert (value != nominal).any()
-    vehicle, sensors, world = told(name, value)
+    vehicle, sensors, world = parameters_with(name, value)
     told_so = flown(true_vehicle=vehicle, true_sensors=sensors, world=world)
     assert_alike(drawing, told_so, flight=1)
     if name in ("max_voltage", "battery_resistance"):
@@ -213,7 +213,7 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
     heavy = {"vehicle": LAB.replace(mass=2.5), "control": Control.MOTOR, "task": task}
     given = Uniform(0.01, 0.03) if name == "battery_resistance" else some_distribution(name)
     drawing = batch(2, 2, **heavy, world=WORLD, randomization={name: given})
-    vehicle, _, world = told(name, np.atleast_1d(drawing.read(name)[1]))
+    vehicle, _, world = parameters_with(name, np.atleast_1d(drawing.read(name)[1]))
     telling = batch(1, 3, **heavy, world=world, true_vehicle=vehicle.replace(mass=2.5))
     for _ in range(100):
         drawing.step(np.ones((2, 4)))
@@ -227,15 +227,15 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
     "name", ["mass", "inertia", "thrust_coefficient", "torque_coefficient", "motor_speed_per_volt",
              "position_sigma_I", "accel_bias_tau", "primary_antenna_B", "center_of_mass_B"]
 )  # fmt: skip
-def test_what_is_known_is_what_filter_and_controller_believe(name):
+def test_known_draws_are_used_by_filter_and_controller(name):
     given = Randomization({name: some_distribution(name)}, known=True)
     drawing = flown(seeds=(2, 3), world=WORLD, randomization=given)
-    vehicle, sensors, world = told(name, np.atleast_1d(drawing.read(name)[1]))
+    vehicle, sensors, world = parameters_with(name, np.atleast_1d(drawing.read(name)[1]))
     assert_alike(drawing, flown(vehicle=vehicle, sensors=sensors, world=world), flight=1)
 
 
 def test_each_rotor_has_its_efficiency():
-    """After a tick the body turns and climbs as these forces say."""
+    """Body rates and velocity after a tick follow from the rotors' forces."""
     task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0)
     still = {"source": Source.TRUTH, "control": Control.MOTOR, "task": task}
     start_v = batch(1, 1, **still).record("v")[0]
@@ -262,7 +262,7 @@ def test_drawn_camera_rotation_turns_the_image():
         np.testing.assert_allclose(flight.record("pixels")[0, i], expected, atol=1e-6)
 
 
-def test_the_start_is_spread_as_told():
+def test_start_is_shifted_by_the_draws():
     given = {
         "start_position_I": Uniform(-1.0, 1.0),
         "start_velocity_I": Normal(0.0, 2.0),
@@ -284,5 +284,5 @@ def test_the_start_is_spread_as_told():
     change = np.stack([drawn[f"start_{n}"] for n in ("roll", "pitch", "yaw")], axis=1)
     turned = (eulers[1] - eulers[0] - change + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(turned, 0.0, atol=1e-9)
-    spread.reset(seeds=range(20), position=(0.5, 0.6, 0.7))  # what a caller gives stays
+    spread.reset(seeds=range(20), position=(0.5, 0.6, 0.7))  # a caller's position is kept
     np.testing.assert_array_equal(spread.record("r"), [[0.5, 0.6, 0.7]] * 20)

@@ -1,4 +1,4 @@
-"""Excerpts of real flights: a suite that describes the sensors has no problems, all others do.
+"""Excerpts of real flights: a replay reports problems unless the suite describes the sensors.
 Sources and licenses are in tests/data/flights."""
 
 import gzip
@@ -40,8 +40,8 @@ def replayed(flight, sensors):
     return replay(table(flight), sensors=sensors, start=STARTS[flight])
 
 
-def test_suite_of_the_air_describes_the_flight_of_a_hobby_vehicle():
-    """At its own field, far from the default one, and with time stamps that are 0.2 s late."""
+def test_flown_suite_describes_the_ardupilot_flight():
+    """The magnetic field is local, far from the default one; time stamps are 0.2 s late."""
     result = replayed("ardupilot", "flown")
     assert result.problems == ()
     assert result.sensors.magnetometer.inclination == pytest.approx(np.radians(-68.6), abs=0.01)
@@ -60,8 +60,8 @@ def test_command_with_a_wrong_suite_ends_with_a_sentence_and_exit_code_1(flight,
     assert re.search(r"does not describe|do not describe|uses no measurement|diverged", sentences)
 
 
-def test_estimates_of_the_rtk_flight_fit_with_its_clock_lever_arm_and_noise():
-    """Numbers of `quad-gym calibrate` on the whole flight, rounded."""
+def test_calibrated_suite_describes_the_rtk_flight():
+    """The suite has rounded results of `quad-gym calibrate` on the whole flight."""
     rtk = quad_gym.sensor_suite("rtk")
     suite = rtk.replace(
         imu=rtk.imu.replace(

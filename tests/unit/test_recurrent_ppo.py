@@ -1,4 +1,4 @@
-"""The compiled recurrent PPO against torch, and on a task that needs memory."""
+"""The compiled recurrent PPO, compared with torch and trained on a task that needs memory."""
 
 import math
 
@@ -99,7 +99,7 @@ def pieces(params, row):
 
 @pytest.mark.parametrize("critic_only", [0, 1])
 def test_gradient_through_time_agrees_with_torch_to_1e_12(critic_only):
-    """A tile is full, one is not; episodes end within sequences, at their ends, and twice."""
+    """One tile is full, one is not. Episodes end within and at the end of sequences, and twice."""
     torch = pytest.importorskip("torch")
     draw, flights = np.random.default_rng(0), 64
     recipe = recurrent(parameters={**LOSS, "critic_only": critic_only})
@@ -135,7 +135,7 @@ def test_gradient_through_time_agrees_with_torch_to_1e_12(critic_only):
 
 
 def test_memory_is_empty_at_the_start_of_each_episode():
-    """Rollout and policy agree, over episodes of 20 steps in sequences of 8."""
+    """Rollout and policy agree over episodes of 20 steps in sequences of 8."""
     model = CompiledPPO(sliders(), recurrent(parameters={"n_steps": 48}), seed=0)
     model.prepare()
     model._roll_out()
@@ -157,7 +157,7 @@ def test_memory_is_empty_at_the_start_of_each_episode():
 
 
 def _means(model):
-    """Actions of the policy in a rollout, from memories that the rollout kept."""
+    """Mean actions of the policy in a rollout that began with empty memory."""
     memory, means = np.zeros_like(model._memory), []
     for x, ended in zip(model._observations, model._ended, strict=True):
         mean, _, memory = model.networks.evaluate(x, memory)

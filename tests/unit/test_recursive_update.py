@@ -1,4 +1,4 @@
-"""Images in steps: the same filter where the model is linear, a consistent one where it is not."""
+"""Updates by images in steps equal one update if the model is linear, and are consistent if not."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def with_recursive(above, kind="ukf"):
 
 
 def started(above, sigma, gate=0.0):
-    """A filter before its first image, with an attitude known to `sigma`, and what it sees."""
+    """A filter before its first image, with attitude uncertainty `sigma`, and that image."""
     suite = with_recursive(above)
     suite = suite.replace(estimator=suite.estimator.replace(false_alarm_probability=gate))
     ukf = quad_gym.UnscentedKalmanFilter(suite)
@@ -31,7 +31,7 @@ def started(above, sigma, gate=0.0):
     return ukf, camera.measure((0.53, -0.35, 1.22), np.eye(3))
 
 
-def test_steps_of_a_linear_measurement_add_up_to_it():
+def test_update_in_steps_equals_one_update_if_the_measurement_is_linear():
     whole, pixels = started(None, 1e-5)
     parts, _ = started(1e-6, 1e-5)
     before = whole.covariance
@@ -40,7 +40,7 @@ def test_steps_of_a_linear_measurement_add_up_to_it():
     scale = np.sqrt(np.diag(whole.covariance))
     assert (scale[:3] < 0.3 * np.sqrt(np.diag(before))[:3]).all()
     off = np.abs(parts.position - whole.position) / scale[:3]
-    assert off.max() < 0.05  # what is left is the curvature of the position
+    assert off.max() < 0.05  # the rest is the curvature of the position
     np.testing.assert_allclose(
         parts.covariance / np.outer(scale, scale),
         whole.covariance / np.outer(scale, scale),
@@ -66,7 +66,7 @@ def test_rejected_feature_is_left_out_of_every_step():
 
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-def test_vague_start_is_consistent_after_an_image_in_steps_only(kind):
+def test_vague_start_is_consistent_only_if_images_update_in_steps(kind):
     sums = {}
     for above in (0.01, None):
         batch = fly(with_recursive(above, kind), 2000, task="hover")
@@ -81,8 +81,8 @@ def test_vague_start_is_consistent_after_an_image_in_steps_only(kind):
 
 
 @pytest.mark.parametrize("distance", [3.0, 30.0])
-def test_a_filter_without_a_gate_leaves_out_what_it_cannot_place(distance):
-    """A meter off at 3 m, a direction tells a distance that is wrong; at 30 m it is made use of."""
+def test_filter_without_a_gate_omits_features_of_uncertain_direction(distance):
+    """With a position uncertain by 1 m, directions at 3 m are left out; at 30 m they are used."""
     suite = quad_gym.sensor_suite("standard")
     points = ((distance, 0.0, 0.0), (distance, 0.2, 0.0))
     camera = suite.camera.replace(features_I=points, attitude=INDOOR.camera.attitude)
@@ -93,7 +93,7 @@ def test_a_filter_without_a_gate_leaves_out_what_it_cannot_place(distance):
     pixels = Camera(camera, rng=np.random.default_rng(3)).measure((0.1, 0.4, 0.2), np.eye(3))
     assert np.isfinite(pixels).all()
     for name in ("innovation", "innovation_sigma", "block_nis"):
-        ukf._engine.blocks[name] = 1.0  # of an image before
+        ukf._engine.blocks[name] = 1.0  # from an earlier image
     ukf.update(pixels=pixels)
     left_out = distance < 10.0
     kept = ukf.last_update

@@ -1,4 +1,4 @@
-"""References: closed forms, exact derivatives, headings, and the bounds of random ones."""
+"""References: closed forms, exact derivatives, headings, and bounds of random trajectories."""
 
 import numpy as np
 import pytest
@@ -115,7 +115,7 @@ def test_random_trajectories_respect_their_bounds(speed, acceleration, radius, p
     assert fast.max() <= speed * slack
     assert hard.max() <= acceleration * slack
     assert away.max() <= radius * slack
-    # and they are not timid: each comes within a factor of a few of one of the bounds
+    # each trajectory reaches a fifth of at least one bound
     assert np.max([fast / speed, hard / acceleration, away / radius], axis=0).min() > 0.2
     np.testing.assert_allclose(r[:, 0], r[:, -1], rtol=0.0, atol=1e-9)
     gaps = np.linalg.norm(r[:64, np.newaxis, 1] - r[:64, 1], axis=-1)[np.triu_indices(64, 1)]
@@ -123,7 +123,7 @@ def test_random_trajectories_respect_their_bounds(speed, acceleration, radius, p
 
 
 @pytest.mark.parametrize("gate_count", [1, 3, 8])
-def test_gates_lie_around_the_origin_and_apart(gate_count):
+def test_drawn_gates_stay_within_bounds_and_apart(gate_count):
     flights = drawn(200, kind="waypoints", gate_count=gate_count, radius=3.0, height=2.0)
     gates = flights["gates"]
     distance = np.linalg.norm(gates[..., :2], axis=-1)

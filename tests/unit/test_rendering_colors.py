@@ -1,4 +1,4 @@
-"""Pictures can be read with any kind of color vision: contrast, and colors told apart."""
+"""Pictures are readable with any kind of color vision: contrast, and differences of colors."""
 
 from itertools import combinations
 
@@ -60,18 +60,18 @@ def lab(light):
 
 
 @pytest.mark.parametrize("name", TEXT)
-def test_text_stands_out_from_white(name):
+def test_text_has_sufficient_contrast_to_white(name):
     assert contrast(TEXT[name], colors.WHITE) >= 4.5  # WCAG 2.1, level AA
 
 
 @pytest.mark.parametrize("background", BACKGROUNDS)
 @pytest.mark.parametrize("name", [name for name in THINGS if name != "ray"])
-def test_things_stand_out_from_what_lies_behind_them(name, background):
+def test_graphical_objects_have_sufficient_contrast_to_each_background(name, background):
     assert contrast(THINGS[name], BACKGROUNDS[background]) >= 3.0  # WCAG 2.1, graphical objects
 
 
 @pytest.mark.parametrize("vision", VISIONS)
 @pytest.mark.parametrize("pair", list(combinations(THINGS, 2)), ids=" ".join)
-def test_things_are_told_apart(pair, vision):
+def test_colors_of_objects_differ_for_every_kind_of_color_vision(pair, vision):
     a, b = (lab(VISIONS[vision] @ linear(THINGS[name])) for name in pair)
     assert np.linalg.norm(a - b) > 18.0  # a just noticeable difference is 2.3

@@ -1,4 +1,4 @@
-"""Pictures show things where they are: hand-computed pixels, sampled surfaces, the camera model."""
+"""Projection in pictures, against hand-computed pixels, sampled surfaces and the camera model."""
 
 import itertools
 
@@ -62,7 +62,7 @@ def test_things_behind_the_eye_are_cut_off():
     start, end = np.array([[4.0, -1.0, 0.0]]), np.array([[-4.0, -1.0, 0.0]])
     ((near, far),) = view.segments(start, end)
     np.testing.assert_allclose(near, view.project(start[0])[0])
-    assert far[1] == pytest.approx(near[1])  # the line lies level with the eye
+    assert far[1] == pytest.approx(near[1])  # the line is level with the eye
     assert far[0] > near[0]  # and comes closer on the right
     assert not len(view.segments(end, end + 0.1))
 
@@ -82,7 +82,7 @@ def test_a_fitted_view_shows_all_points_and_could_not_be_closer(seed):
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_the_outline_is_that_of_the_ellipsoids_surface(seed):
+def test_outline_agrees_with_samples_of_the_ellipsoid_surface(seed):
     rng = np.random.default_rng(seed)
     P, center = a_covariance(rng), rng.normal(size=3)
     view = look_at(np.array([0.0, -15.0, 5.0]), rng.normal(size=3), 400.0, CENTER)
@@ -139,7 +139,7 @@ def test_features_are_drawn_where_the_camera_measures_them():
     assert compared > 100
 
 
-def test_the_frustum_holds_exactly_what_the_camera_sees():
+def test_frustum_contains_exactly_the_features_seen_by_the_camera():
     flight = a_flight()
     camera = Camera(CameraParams(), np.random.default_rng(0))
     for place, R_BI in poses(100, 2):
@@ -189,7 +189,7 @@ def test_polygon_behind_the_eye_is_cut_off():
 
 @pytest.mark.parametrize("size", [(320, 240), (480, 270), (640, 480), (1280, 720)])
 @pytest.mark.parametrize("task", ["circle", "waypoints"])
-def test_no_words_of_the_strip_cross_others(monkeypatch, size, task):
+def test_texts_of_the_strip_do_not_overlap(monkeypatch, size, task):
     written = []
 
     def text(self, words, x, y, size, color=(0, 0, 0), anchor=0.0):

@@ -1,4 +1,4 @@
-"""Videos of flights, and frames that show what they should."""
+"""Videos of flights, and the content of their frames."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ pygame = pytest.importorskip("pygame")
 
 
 class Still:
-    """Does nothing."""
+    """A policy whose actions are zero."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         return np.zeros((len(observation), 4)), None
@@ -26,7 +26,7 @@ def flight():
 
 
 def color_near(frame, at, radius, color):
-    """Whether a color is found within a distance of a pixel."""
+    """Return true if a color occurs within `radius` of a pixel."""
     x, y = np.round(at).astype(int)
     part = frame[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
     return bool((abs(part.astype(int) - color) < 40).all(axis=-1).any())
@@ -38,7 +38,7 @@ def test_features_and_reference_are_drawn_where_they_project(flight):
     for feature in flight.scene.features_I:
         assert color_near(frame, view.project(feature)[0], 3, colors.INK)
     assert color_near(frame, view.project(flight["position"][-1])[0], 25, colors.BLUE)
-    start = record_flight(Still(), "QuadGym/Circle-v0", max_episode_steps=1)  # 1 m below it
+    start = record_flight(Still(), "QuadGym/Circle-v0", max_episode_steps=1)  # 1 m too low
     frame = Renderer("fixed", (640, 480)).draw(start)
     at = fixed_view(start, 640, round(0.765 * 480)).project(start["reference_position"][-1])[0]
     assert color_near(frame, at, 8, colors.GREEN)
@@ -64,7 +64,7 @@ def test_an_image_is_shown_until_the_next_one_is_due():
         assert shown["time"] == flight["time"][k - k % 5]
 
 
-def test_what_the_gate_rejects_is_gray():
+def test_rejected_fix_is_drawn_in_gray():
     faults = GnssOutliers(share=1.0, size=100.0, start=0.3)
     options = {"sensors": "rtk", "faults": faults, "max_episode_steps": 30}
     flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
@@ -79,7 +79,7 @@ def test_what_the_gate_rejects_is_gray():
         assert color_near(frame, at, 3, colors.GREY) or is_purple
 
 
-def test_a_replay_shows_what_was_seen_live(flight):
+def test_replayed_frames_equal_live_frames(flight):
     import gymnasium
 
     for view in ("fixed", "chase"):
@@ -113,7 +113,7 @@ def test_an_mp4_has_the_frames_of_the_flight(flight, tmp_path):
     assert about["fps"] == pytest.approx(20.0)
     assert len(frames) == round(20.0 * flight["time"][-1]) + 1
     drawn = Renderer("fixed", (320, 240)).draw(flight)
-    assert abs(frames[-1].astype(int) - drawn).mean() < 6.0  # but for the compression
+    assert abs(frames[-1].astype(int) - drawn).mean() < 6.0  # compression is lossy
 
 
 @pytest.mark.parametrize("ending", ["gif", "webp"])
@@ -129,7 +129,7 @@ def test_animations_have_the_frames_of_the_flight(flight, tmp_path, ending):
 
 
 @pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
-def test_an_interrupted_video_leaves_what_was_there_before(flight, tmp_path, ending):
+def test_interrupted_video_leaves_an_earlier_file_unchanged(flight, tmp_path, ending):
     def interrupted(times):
         for k, time in enumerate(times):
             if k == 3:
@@ -157,7 +157,7 @@ def test_an_interrupted_video_leaves_what_was_there_before(flight, tmp_path, end
         ("render_size", {"size": (321, 240)}),
     ],
 )
-def test_nonsense_is_refused_before_anything_is_written(flight, tmp_path, name, keywords):
+def test_invalid_video_options_are_refused_before_writing(flight, tmp_path, name, keywords):
     path = tmp_path / "folder" / keywords.pop("path", "hover.gif")
     with pytest.raises(ValueError, match=name):
         save_video(flight, path, **keywords)

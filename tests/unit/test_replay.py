@@ -1,4 +1,4 @@
-"""Logs of simulated flights, as tables and as PX4's files, replay as they were flown."""
+"""Replays of simulated flights, from tables and PX4 files, against the filter in flight."""
 
 import dataclasses
 import json
@@ -35,12 +35,12 @@ def table(recorded):
 
 
 def sizes(errors):
-    """Root mean squares of position, velocity and attitude."""
+    """Root mean square errors of position, velocity and attitude."""
     return np.array([math.sqrt((errors[:, i : i + 3] ** 2).sum(axis=1).mean()) for i in (0, 3, 6)])
 
 
 def compare(recorded, result, settle, boot=0.0):
-    """Sizes of errors in replay over those in flight."""
+    """Root mean square errors in replay over errors in flight."""
     shifted = result.time - boot
     k = np.rint(shifted * recorded.suite.imu.rate).astype(int)
     replayed = errors_in_replay(recorded, result, k)
@@ -50,8 +50,8 @@ def compare(recorded, result, settle, boot=0.0):
 
 
 @pytest.mark.parametrize("estimator", ["ukf", "ekf"])
-def test_a_csv_replays_to_the_errors_of_the_flight(recorded, tmp_path, estimator):
-    """Irregular times, 1 % lost, 50 ms of jitter: within 10 % (4 % were seen)."""
+def test_replay_of_a_csv_has_the_errors_of_the_flight(recorded, tmp_path, estimator):
+    """Errors agree within 10 % (measured: 4 %) with irregular times, 1 % lost, 50 ms of jitter."""
     assert len(np.unique(np.diff([s[0] for s in recorded.imu]).round(6))) > 3
     recorded.write_csv(tmp_path / "flight.csv")
     result = replay(tmp_path / "flight.csv", sensors=RTK, estimator=estimator)
@@ -60,12 +60,12 @@ def test_a_csv_replays_to_the_errors_of_the_flight(recorded, tmp_path, estimator
     assert not result.status
     assert set(result.measured) >= {"gnss_position", "gnss_baseline", "gnss_velocity", "feature_3"}
     count = len(result.measured["gnss_position"].time)
-    assert count == len(recorded.gnss) - 1  # less the one that started it
+    assert count == len(recorded.gnss) - 1  # without the one that started the filter
     assert (result.measured["gnss_position"].received > result.measured["gnss_position"].time).all()
 
 
-def test_a_log_of_px4_replays_to_the_errors_of_the_flight(tmp_path):
-    """As above; its filter starts by a compass, and needs some seconds to know the heading."""
+def test_replay_of_a_px4_log_has_the_errors_of_the_flight(tmp_path):
+    """The filter starts by a compass, and its heading converges within some seconds."""
     pytest.importorskip("pyulog")
     recorded = Recorded(flown(PX4, SECONDS), PX4)
     recorded.write_ulog(tmp_path / "flight.ulg", boot=12.0)
@@ -91,8 +91,8 @@ def test_a_log_of_px4_replays_to_the_errors_of_the_flight(tmp_path):
 
 @pytest.mark.slow  # three flights of 5 s, each replayed
 def test_baselines_added_to_a_px4_log_give_the_attitude(tmp_path):
-    """With the baselines that its messages cannot hold, attitude errors are within 10 %, too. From
-    1 s on, over all flights together; 6 % were seen. Without baselines it is 20 to 50 %."""
+    """With baselines, for which PX4 has no message, attitude errors after 1 s agree within 10 %
+    over all flights (measured: 6 %; 20 to 50 % without baselines)."""
     pytest.importorskip("pyulog")
     R_GI = quad_gym.frames.ecef_to_enu(PX4.gnss.reference_antenna_G).T
     sums = np.zeros(2)
@@ -111,7 +111,7 @@ def test_baselines_added_to_a_px4_log_give_the_attitude(tmp_path):
     assert abs(math.sqrt(sums[0] / sums[1]) - 1.0) < 0.1
 
 
-def test_late_aiding_sensors_find_a_heading_that_nothing_told(tmp_path):
+def test_late_aiding_sensors_find_an_unknown_heading(tmp_path):
     """Barometer and magnetometer arrive late, and the first magnetic field comes after 3 s."""
     pytest.importorskip("pyulog")
     kinds = {"barometer": quad_gym.BarometerParams, "magnetometer": quad_gym.MagnetometerParams}
@@ -135,7 +135,7 @@ def test_late_aiding_sensors_find_a_heading_that_nothing_told(tmp_path):
 
 
 def test_a_regular_log_replays_as_it_was_flown(flight):
-    """Nothing lost, no jitter: the flight goes back by another way, exact to first order."""
+    """Without losses and jitter, replay and retrodiction in flight agree to first order."""
     recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, most_ticks=1)
     result = replay(recorded.table(), sensors=RTK)
     k = np.rint(result.time * RTK.imu.rate).astype(int)
@@ -152,7 +152,7 @@ def test_late_and_unused_measurements_are_counted(table):
     assert result.unused == ("barometer",)
 
 
-def test_tables_of_any_kind_are_the_same_log(recorded, table, tmp_path):
+def test_all_kinds_of_tables_give_the_same_replay(recorded, table, tmp_path):
     pandas = pytest.importorskip("pandas")
     short = {name: column[:900] for name, column in table.items()}
     first = replay(short, sensors=RTK)
@@ -202,7 +202,7 @@ def test_a_log_from_elsewhere_has_its_origin_at_the_first_fix(table):
     assert np.abs(result.position[:20]).max() < 0.2
 
 
-def test_reported_noise_counts_unless_it_is_told_not_to(table):
+def test_reported_noise_is_used_unless_disabled(table):
     short = {name: column[:900] for name, column in table.items() if "pixel" not in name}
     suite = RTK.replace(camera=None)
     fixes = np.isfinite(short["gnss_east"])
@@ -214,7 +214,7 @@ def test_reported_noise_counts_unless_it_is_told_not_to(table):
     np.testing.assert_array_equal(ignored.position, plain.position)
 
 
-def test_starts_may_be_told(table):
+def test_start_options_set_the_heading_or_the_state(table):
     short = {n: c[:900] for n, c in table.items() if not n.startswith(("pixel", "gnss_base"))}
     suite = RTK.replace(camera=None)
     assert not replay(short, sensors=suite).heading_known[0]
@@ -229,7 +229,7 @@ def test_starts_may_be_told(table):
 
 
 def latitude(degrees):
-    """Columns of fixes there."""
+    """Columns of fixes at a latitude."""
     return {"gnss_lat": np.full(4, degrees), "gnss_lon": np.zeros(4), "gnss_alt": np.zeros(4)}
 
 
@@ -262,14 +262,14 @@ def small(**changes):
         ({"gnss_enu": None, **latitude(-90.5)}, r"^gnss_lat \[deg\] must be at least -90, got"),
     ],
 )  # fmt: skip
-def test_bad_logs_raise_by_name(changes, message):
+def test_invalid_logs_raise_errors_that_name_the_column(changes, message):
     with pytest.raises((ValueError, TypeError), match=message):
         replay(small(**changes), sensors=RTK)
 
 
-@pytest.mark.parametrize("name", ["rtk", "lab"])  # averages, and instants
+@pytest.mark.parametrize("name", ["rtk", "lab"])  # averaged and instant samples
 def test_fixes_long_before_the_imu_start_no_filter(name):
-    """Delays, such as those that a calibration tries, move fixes to before the log."""
+    """Delays, such as the ones that a calibration tries, move fixes to before the log."""
     suite = quad_gym.sensor_suite(name).replace(camera=None)
     suite = suite.replace(log_delays=suite.log_delays.replace(gnss=0.995))
     log = small(time=0.01 * np.arange(200), gyro=np.zeros((200, 3)))
@@ -293,12 +293,12 @@ def test_fixes_long_before_the_imu_start_no_filter(name):
         ({"start": {"course": True}}, "must have a GNSS velocity, but the first fix of the log"),
     ],
 )
-def test_bad_options_raise_by_name(options, message):
+def test_invalid_options_raise_errors_that_name_them(options, message):
     with pytest.raises(ValueError, match=message):
         replay(small(), **{"sensors": RTK} | options)
 
 
-def test_files_that_are_none_are_refused(tmp_path):
+def test_missing_or_invalid_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="must be a DataFrame"):
         replay(3, sensors=RTK)
     with pytest.raises(OSError, match="missing"):
@@ -358,8 +358,7 @@ def test_the_figure_has_a_picture_for_each_sensor(table):
     assert any("features" in title for title in titles)
 
 
-def test_unknown_zero_of_the_barometer_is_its_first_height():
-    """An offset of all heights changes no estimate."""
+def test_offset_of_a_barometer_with_unknown_zero_changes_no_estimate():
     table = Recorded(flown(CONSUMER, 3.0), CONSUMER).table()
     log = read_log({name: np.asarray(column, float) for name, column in table.items()})
     coarse, found = np.round(256.0 * log.barometer.values["barometer"]) / 256.0, []

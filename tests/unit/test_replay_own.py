@@ -1,4 +1,4 @@
-"""Logs through a user's estimator."""
+"""Replays with a user's estimator."""
 
 import json
 
@@ -16,7 +16,7 @@ EKF = gallery("invariant_ekf").InvariantEKF
 
 @pytest.fixture(scope="module")
 def flight():
-    """A flight on the invariant EKF."""
+    """A flight on the estimate of the invariant EKF."""
     return flown(seconds=6.0, estimator=EKF())
 
 
@@ -26,7 +26,7 @@ def table(flight):
 
 
 def test_regular_log_gives_the_estimates_of_the_flight(flight, table):
-    """The starts differ, as a flight begins without a velocity."""
+    """Estimates agree after 3 s; the starts differ, as a flight begins without a velocity."""
     result = replay(table, sensors=RTK, estimator=EKF())
     rows = np.searchsorted(flight["time"], result.time - 1e-6)
     late = result.time > 3.0
@@ -38,7 +38,7 @@ def test_regular_log_gives_the_estimates_of_the_flight(flight, table):
 
 
 def test_irregular_log_gives_the_errors_of_the_flight(flight):
-    """One to three ticks a sample, 1 % lost, 50 ms of jitter."""
+    """Samples are means over one to three ticks, with 1 % losses and 50 ms of jitter."""
     recorded = Recorded(flight)
     result = replay(recorded.table(), sensors=RTK, estimator=EKF)
     assert result.estimator == "InvariantEKF"
@@ -55,7 +55,7 @@ def test_irregular_log_gives_the_errors_of_the_flight(flight):
 
 
 class Seen(Simple):
-    """The measurements of all ticks."""
+    """An estimator that records its measurements."""
 
     def __init__(self):
         self.seen = []
@@ -113,7 +113,7 @@ def test_command_writes_the_estimates_of_an_own_estimator(flight, table, tmp_pat
     own = ("--estimator", "tests.estimators:Certain")
     ended = run("replay", *options, *own, where=tmp_path)
     assert ended.returncode == 1, ended.stderr
-    assert "yro: estimated bias 0.02 rad/s" in ended.stdout  # which is all that is wrong
+    assert "yro: estimated bias 0.02 rad/s" in ended.stdout  # the only problem
     names = {"estimates.csv", "innovations.csv", "replay.json", "replay.png", "replay.svg"}
     assert {file.name for file in (tmp_path / "out").iterdir()} == names
     rows = np.genfromtxt(tmp_path / "out/estimates.csv", delimiter=",", names=True)

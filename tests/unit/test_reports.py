@@ -1,4 +1,4 @@
-"""Figures: that they show what they are given; how they look is for eyes."""
+"""Figures, tables and files contain the given data; the look of figures is not tested."""
 
 import dataclasses
 import json
@@ -81,7 +81,7 @@ class Point:
     where: Path
 
 
-def test_json_of_everything(tmp_path):
+def test_json_holds_values_of_all_types(tmp_path):
     value = {1: Point(np.nan, Path("a/b")), "array": np.arange(2), "flag": np.bool_(True)}
     file = write_json(tmp_path / "a.json", value)
     want = {"1": {"x": None, "where": "a/b"}, "array": [0, 1], "flag": True}
@@ -96,7 +96,7 @@ def test_csv_leaves_unknown_cells_empty(tmp_path):
         write_csv(tmp_path / "a.csv", {"a": [1, 2], "b": [1]})
 
 
-def test_table():
+def test_text_table_aligns_columns_under_their_headings():
     table = text_table(
         {"": ["name"], "a long heading": ["x", "y"], "z": ["value"]},
         [["one", "1", "2", "3.25"], ["three", "10", "20", "-"]],

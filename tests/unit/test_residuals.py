@@ -1,4 +1,4 @@
-"""The model of what estimates are off by: fitted to draws of a known one, and to flights."""
+"""The model of estimation errors, fitted to draws of a known model, and errors from flights."""
 
 import gymnasium
 import numpy as np
@@ -23,7 +23,7 @@ def drawn(model, rng, steps=400, flights=100):
     return errors, velocities
 
 
-def test_a_fit_finds_the_model_that_has_drawn_its_data(tmp_path):
+def test_fit_recovers_the_model_that_generated_the_errors(tmp_path):
     rng = np.random.default_rng(0)
     model = known(rng)
     errors, velocities = drawn(model, rng)
@@ -45,7 +45,7 @@ def test_growing_or_too_few_errors_are_refused():
         fit(np.zeros((3, 4, SIZE)), np.zeros((3, 4, 3)))
 
 
-def test_what_is_recorded_is_the_error_of_the_estimate():
+def test_record_returns_the_errors_of_the_estimate():
     env = gymnasium.make_vec("QuadGym/StaleRace-v0", num_envs=4, duration=0.4)
     errors, velocities = record(PDPolicy(env), env)
     assert errors.shape == (21, 4, SIZE)

@@ -1,5 +1,5 @@
-"""Flights take the memory that their configuration uses, and touch nothing beyond it: neither what
-lies beside them nor the parts of a record that they lack."""
+"""Flights take only the memory that their configuration uses. They access neither memory outside
+nor parts that their record lacks."""
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,7 @@ TRUTH = {"source": Source.TRUTH, "run_filter": False}
 
 
 def flown(case, steps=4):
-    """The batch of some flights of a golden case, whose episodes end and begin on the way."""
+    """The batch of three flights of a golden case, in which episodes end and begin."""
     keywords = dict(case)
     name = f"QuadGym/{keywords.pop('id', 'Circle')}-v0"
     env = gymnasium.make_vec(name, num_envs=3, duration=0.06, threads=1, **keywords)
@@ -30,8 +30,8 @@ def flown(case, steps=4):
 
 
 @pytest.mark.parametrize("name", cases())
-def test_memory_beside_the_flights_is_neither_written_nor_read(monkeypatch, name):
-    """Room lies between guards of zeros or NaN, which stay as they are and make no difference."""
+def test_memory_around_the_flights_is_neither_written_nor_read(monkeypatch, name):
+    """Flights lie between guards of zeros or NaN, which stay as they are and change no flight."""
     found, size = [], FLIGHT_BLOCK.itemsize // 64 * 64 + 64
     for filling in (0x00, 0xFF):
         guards = []
@@ -53,7 +53,7 @@ def test_memory_beside_the_flights_is_neither_written_nor_read(monkeypatch, name
 
 @pytest.mark.parametrize("name", cases())
 def test_parts_that_a_record_lacks_are_neither_written_nor_read(monkeypatch, name):
-    """The same flights in full records, of which what there was no room for is filled before."""
+    """Flights in full records are equal, and the extra parts, filled before, stay unchanged."""
     small = flown(cases()[name], steps=12)
     kept = set(small._blocks.dtype.names)
     monkeypatch.setattr(flight_batch, "room_of", lambda used: room_of(EVERYTHING))
@@ -84,7 +84,7 @@ def test_the_parts_make_the_record():
     assert room_of(EVERYTHING) == (FLIGHT_BLOCK, 0)
 
 
-def test_what_is_not_used_takes_no_memory():
+def test_unused_features_take_no_memory():
     def size(**options):
         return FlightBatch(8, threads=1, **options).snapshot().nbytes
 
@@ -95,7 +95,7 @@ def test_what_is_not_used_takes_no_memory():
     assert truth < drawn < size(**TRUTH, faults=["rotor_loss"])
 
 
-def test_fields_without_room_read_as_nothing():
+def test_fields_without_room_read_as_zero_or_nan():
     batch = flown_batch(range(11), 60, **TRUTH)
     assert batch.record("L").shape == (11, 15, 15)
     assert (batch.record("L") == 0.0).all()

@@ -1,4 +1,4 @@
-"""Attitude conversions against SciPy's rotations; a rotation's even and odd parts."""
+"""Attitude conversions against SciPy's rotations; even and odd parts of rotations."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from tests.unit.compiled import Compiled
 
 @kernel
 def store_rows(array, matrix):
-    """Like `store` for a matrix some of whose entries are plain zeros."""
+    """Store a matrix in which some entries are plain zeros."""
     store(array[0], matrix[0])
     store(array[1], matrix[1])
     store(array[2], matrix[2])
@@ -90,7 +90,7 @@ def test_euler_angles_are_yaw_then_roll_then_pitch():
         ((0.0, np.pi / 2, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)),  # nose down
     ],
 )
-def test_the_sense_of_each_angle(e, x_I, x_B):
+def test_each_euler_angle_has_its_documented_sign(e, x_I, x_B):
     np.testing.assert_allclose(rotations.euler_to_dcm(e) @ x_I, x_B, rtol=0.0, atol=1e-15)
 
 
@@ -132,7 +132,7 @@ def test_a_quaternion_survives_the_way_through_a_rotation(q):
 @given(unit_quaternions)
 def test_quaternions_are_hamiltons_from_body_to_inertial(q):
     R_IB = Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix()
-    stacked = rotations.quaternion_to_dcm([[q, 1e-3 * q]])  # which need not be normalized
+    stacked = rotations.quaternion_to_dcm([[q, 1e-3 * q]])  # q need not be normalized
     np.testing.assert_allclose(stacked, np.tile(R_IB.T, (1, 2, 1, 1)), rtol=0.0, atol=1e-15)
     assert rotations.dcm_to_euler(stacked).shape == (1, 2, 3)
     assert rotations.dcm_to_quaternion(stacked).shape == (1, 2, 4)
@@ -161,7 +161,7 @@ def test_the_even_and_odd_parts_add_up_to_the_rotation(instance, size):
 
 @pytest.mark.parametrize("instance", INSTANCES)
 @pytest.mark.parametrize("size", [0.02, np.pi])
-def test_a_pair_of_turned_vectors_is_that_of_the_rotations(instance, size):
+def test_turned_pair_agrees_with_scipy_rotations(instance, size):
     e, rng = size / np.pi * random_eulers(8, 200), np.random.default_rng(9)
     x, d = rng.normal(size=(2, 200, 3))
     got = getattr(kernels, instance)(e=e, x=x, d=d)

@@ -1,4 +1,4 @@
-"""Sensor suites: rates and phases, GNSS that drifts, velocity, flights without GNSS."""
+"""Sensor suites: rates and phases, GNSS drift, velocity, flights without GNSS."""
 
 import numpy as np
 import pytest
@@ -18,15 +18,15 @@ RTK, CONSUMER = (quad_gym.sensor_suite(name).simplified() for name in ("rtk", "c
 
 
 @pytest.mark.parametrize("suite", FIELD)
-def test_errors_at_a_level_start_are_as_claimed(suite):
-    """All 15 together: the position depends on the attitude: the antenna's is measured."""
+def test_errors_at_level_start_match_covariance(suite):
+    """The 15 errors are tested jointly: GNSS measures the antenna, which couples them."""
     batch = fly(suite, 4000)
     errors, L = state_errors(batch), batch.record("L")
     assert_normal(np.linalg.solve(L, errors[..., np.newaxis])[..., 0], np.zeros(15), np.eye(15))
 
 
-def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
-    """Flights turn hard toward their reference at first; a rate half a tick old would show."""
+def test_gnss_velocity_update_uses_current_body_rate_for_lever_arm():
+    """Flights turn fast toward their reference at first, so a rate half a tick old would fail."""
     batch = fly(RTK, 2000)
     batch.reset(seeds=range(2000), position=(1.0, -1.0, 2.0))
     squares = []
@@ -65,7 +65,7 @@ def test_sensors_measure_at_their_phase_and_rate():
 
 def test_random_phases_are_uniform_and_new_in_each_episode():
     flags = ticks_of_fixes(RTK, 2000, 40)
-    assert not flags[0].any()  # the fix that starts the filter is no measurement
+    assert not flags[0].any()  # the fix that starts the filter does not count
     first = flags[1:].argmax(axis=0) + 1
     assert set(first) <= set(range(1, 21))
     np.testing.assert_array_equal(flags[1:21].sum(axis=0), 1)  # one in every period
@@ -73,7 +73,7 @@ def test_random_phases_are_uniform_and_new_in_each_episode():
     assert stats.chisquare(counts).pvalue > ALARM
 
 
-def test_the_slow_error_grows_as_a_gauss_markov_process():
+def test_gnss_drift_grows_as_gauss_markov_process():
     gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=2.0, phase=0.0)
     batch = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover")
     np.testing.assert_array_equal(batch.record("gnss_drift"), 0.0)
@@ -88,7 +88,7 @@ def test_the_slow_error_grows_as_a_gauss_markov_process():
     assert_normal(np.hstack([early, late]), np.zeros(6), covariance)
 
 
-def test_a_receiver_measures_white_noise_and_the_slow_error():
+def test_gnss_error_is_white_noise_plus_drift():
     gnss = CONSUMER.gnss.replace(drift_tau=1.0)
     receiver = GnssReceiver(gnss, np.random.default_rng(5))
     R_IG = east_north_up(gnss.reference_antenna_G)
@@ -96,11 +96,11 @@ def test_a_receiver_measures_white_noise_and_the_slow_error():
     errors = fixes @ R_IG.T - gnss.primary_antenna_B
     expected = np.hypot(gnss.position_sigma_I, gnss.drift_sigma_I)
     np.testing.assert_allclose(errors[100:].std(axis=0), expected, rtol=0.1)
-    lag = (errors[100:-10] * errors[110:]).mean(axis=0)  # a second later the white part is gone
+    lag = (errors[100:-10] * errors[110:]).mean(axis=0)  # after 1 s the white part is gone
     np.testing.assert_allclose(lag, np.square(gnss.drift_sigma_I) * np.exp(-1.0), rtol=0.3)
 
 
-def test_gnss_velocity_is_that_of_the_antenna_with_its_noise():
+def test_gnss_velocity_is_antenna_velocity_plus_noise():
     gnss = RTK.gnss.replace(rate=200.0, phase=0.0, primary_antenna_B=(0.3, 0.0, 0.1))
     batch = fly(RTK.replace(gnss=gnss), 500, task="hover")
     steps(batch, 0.2)
@@ -112,7 +112,7 @@ def test_gnss_velocity_is_that_of_the_antenna_with_its_noise():
     assert_normal(measured - truth, np.zeros(3), np.eye(3) * gnss.velocity_sigma**2)
 
 
-def test_velocity_is_measured_by_suites_that_have_it_only():
+def test_velocity_is_measured_only_by_suites_with_gnss_velocity():
     assert fly("rtk", 2, task="hover").record("block_valid")[:, VELOCITY_BLOCK].shape == (2,)
     lab = fly("lab", 2, task="hover")
     steps(lab, 0.1)
@@ -127,7 +127,7 @@ def test_velocity_is_measured_by_suites_that_have_it_only():
         CONSUMER.with_rates(camera=25.0)
 
 
-def test_indoor_filter_starts_from_its_mark_without_fixes():
+def test_indoor_filter_starts_from_initial_pose_without_fixes():
     batch = fly("indoor", 2000, task="hover")
     off = batch.record("r_hat") - batch.record("r")
     assert_normal(off, np.zeros(3), np.eye(3) * 0.05**2)
@@ -156,22 +156,22 @@ def test_velocity_is_observed_together_with_the_position():
     assert "gnss_velocity" not in {field.name for field in without.flights.table}
 
 
-def test_errors_of_the_start_are_those_of_the_true_sensors():
-    believed = quad_gym.sensor_suite("indoor").simplified()
-    believed = believed.replace(camera=believed.camera.replace(phase=0.5))
-    true = believed.replace(initial_pose=InitialPoseParams(position_sigma=0.2, heading_sigma=0.15))
-    batch = fly(believed, 4000, task="hover", true_sensors=true, start="ground")
+def test_start_errors_come_from_true_sensors_covariance_from_assumed_ones():
+    assumed = quad_gym.sensor_suite("indoor").simplified()
+    assumed = assumed.replace(camera=assumed.camera.replace(phase=0.5))
+    true = assumed.replace(initial_pose=InitialPoseParams(position_sigma=0.2, heading_sigma=0.15))
+    batch = fly(assumed, 4000, task="hover", true_sensors=true, start="ground")
     errors = state_errors(batch)
     assert_normal(errors[:, :3], np.zeros(3), np.eye(3) * 0.2**2)
     claimed = np.sqrt(np.diagonal(batch.covariance(), axis1=1, axis2=2))
     np.testing.assert_allclose(claimed[:, :3], 0.05, rtol=1e-9)
     np.testing.assert_allclose(claimed[:, 8], 0.05, rtol=1e-9)
-    # the heading of a direction of which two components are wrong by 0.15: within some per cent
+    # two components of a direction have errors of 0.15: its heading agrees within some percent
     np.testing.assert_allclose(errors[:, 8].std(), 0.15, rtol=0.06)
 
 
 @pytest.mark.parametrize("name", ["lab", "rtk"])
-def test_steep_baseline_takes_the_heading_of_the_mark(name):
+def test_heading_comes_from_initial_pose_if_baseline_is_vertical(name):
     suite = quad_gym.sensor_suite(name)
     up = {"primary_antenna_B": (0.0, 0.0, 0.05), "secondary_antenna_B": (0.0, 0.0, 0.24)}
     suite = suite.replace(gnss=suite.gnss.replace(**up, phase=0.5, rate=10.0), camera=None)
@@ -183,7 +183,7 @@ def test_steep_baseline_takes_the_heading_of_the_mark(name):
     np.testing.assert_allclose(np.sqrt(batch.covariance()[:, 8, 8]), claimed, rtol=1e-9)
 
 
-def test_fixes_come_from_the_true_antenna_with_its_true_noise():
+def test_gnss_measurements_use_true_antennas_and_true_noise():
     antennas = {"primary_antenna_B": (0.3, -0.2, 0.1), "secondary_antenna_B": (-0.2, 0.1, 0.1)}
     noise = {"position_sigma_I": (0.1, 0.2, 0.3), "velocity_sigma": 0.4}
     true = RTK.replace(gnss=RTK.gnss.replace(**antennas, **noise))
@@ -206,7 +206,7 @@ def test_fixes_come_from_the_true_antenna_with_its_true_noise():
 
 
 @pytest.mark.parametrize("name", ["rtk", "consumer", "indoor"])
-def test_field_suites_measure_late_and_imperfectly_by_default(name):
+def test_field_suites_have_latency_and_sensor_errors_by_default(name):
     suite, plain = quad_gym.sensor_suite(name), quad_gym.sensor_suite(name).simplified()
     for one, real in ((suite, True), (plain, False)):
         assert one.imu.errs is one.imu.vibrates is real

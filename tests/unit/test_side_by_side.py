@@ -1,4 +1,4 @@
-"""Flights side by side: what each half shows, when it stops, and words that do not cross."""
+"""Films of flights side by side: frames, ends, refused arguments and file formats."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ pytest.importorskip("pygame")
 
 
 class Still:
-    """Commands the same all the time."""
+    """A policy with a constant command."""
 
     def __init__(self, thrust):
         self.thrust = thrust
@@ -33,7 +33,7 @@ def has(frame, color):
     return bool((abs(frame.astype(int) - color) < 8).all(axis=-1).any())
 
 
-def test_a_flight_that_is_over_stays_as_it_ended(sides):
+def test_flight_that_has_ended_keeps_its_last_frame(sides):
     film = SideBySide(sides)
     assert film.end == sides[1].end > sides[0].end
     width = SIDE[0]

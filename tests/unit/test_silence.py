@@ -1,4 +1,4 @@
-"""Filters that are wrong say so: without being asked where faults are flown, and long enough."""
+"""Consistency monitoring: it runs wherever faults are simulated, and few errors go undetected."""
 
 import math
 
@@ -20,7 +20,7 @@ from tests.unit.test_inflation import R_BI, R_IG, SUITE, started
 STEP = GyroBiasStep(start=0.5, size=math.radians(3.0))
 NEVER = STEP.replace(start=1e6)
 RIGHT = stats.chi2.ppf(0.9973, 9)
-"""As `quad-gym consistency --recovery` has it, of position, velocity and attitude."""
+"""Bound on the NEES of position, velocity and attitude, as in `quad-gym consistency --recovery`."""
 
 
 def hovering(**keywords):
@@ -30,12 +30,12 @@ def hovering(**keywords):
 
 
 def silent(batch):
-    """(n,) whether a flight is neither right nor told."""
+    """Return (n,) flags of filters that are wrong and not flagged as diverged."""
     return (nees(batch, slice(0, 9)) > RIGHT) & ~(batch.record("diverged") > 0.0)
 
 
 def share_silent(batch, times, every):
-    """Mean share of flights that are, at the end of each of so many spans of `every` seconds."""
+    """Return the mean share of undetected errors at `times` instants, `every` seconds apart."""
     found = []
     for _ in range(times):
         steps(batch, every)
@@ -43,7 +43,7 @@ def share_silent(batch, times, every):
     return np.mean(found)
 
 
-def test_flights_of_the_default_suite_with_faults_are_lost():
+def test_gyro_bias_step_sets_filter_diverged_in_default_suite():
     env = QuadVectorEnv(16, "hover", faults=STEP, start="hover", filter_start="warm")
     _, info = env.reset(seed=0)
     assert not info["filter_diverged"].any()
@@ -56,7 +56,7 @@ def test_flights_of_the_default_suite_with_faults_are_lost():
 
 
 @pytest.mark.parametrize("suite", ["standard", "lab"])
-def test_watching_changes_no_bit_of_a_flight(suite):
+def test_consistency_monitoring_does_not_change_flight(suite):
     plain, watching = hovering(sensors=suite), hovering(sensors=suite, faults=NEVER)
     for batch in (plain, watching):
         steps(batch, 1.0)
@@ -72,8 +72,8 @@ def test_watching_changes_no_bit_of_a_flight(suite):
 
 
 @pytest.mark.parametrize("tau", [100.0, 1e6])
-def test_filter_is_lost_about_as_long_as_it_is_wrong(tau):
-    """Of biases that hardly change, the filter becomes surer and surer, and its errors last."""
+def test_diverged_flag_lasts_about_as_long_as_error(tau):
+    """If biases hardly change, their standard deviations keep falling, and errors last."""
     suite = quad_gym.sensor_suite("standard")
     imu = suite.imu.replace(accel_bias_tau=tau, gyro_bias_tau=tau)
     jump = GnssJump(start=1.0, duration=0.3, size=0.5)
@@ -84,13 +84,13 @@ def test_filter_is_lost_about_as_long_as_it_is_wrong(tau):
         lost.append(batch.record("diverged") > 0.0)
         wrong.append(nees(batch, slice(0, 9)) > RIGHT)
         held = (batch.record("alarm_tick") - batch.record("tick")) * imu.dt
-        assert held.max() < 60.0  # not P/Q of biases that hardly change, 1e5 s
+        assert held.max() < 60.0  # not P/Q of nearly constant biases, 1e5 s
     assert np.mean(lost[1:4]) == 1.0
     assert np.mean(np.array(wrong) & ~np.array(lost)) <= 0.02
     assert np.mean(lost[65:]) <= 0.02 + 2.0 * np.mean(wrong[30:])
 
 
-def test_jump_of_gnss_does_not_go_undetected_without_a_gate():
+def test_gnss_jump_is_detected_without_gate():
     fault = GnssJump(start=1.0, duration=2.0, size=0.5)
     batch = fly(quad_gym.sensor_suite("standard"), 128, filter_start="warm", faults=fault)
     steps(batch, 5.0)
@@ -98,8 +98,8 @@ def test_jump_of_gnss_does_not_go_undetected_without_a_gate():
 
 
 def test_few_jumps_of_the_vehicle_go_undetected():
-    """Some six of a hundred were, as their doubts fell short of the jump; 0.75 % are. Of 320
-    flights more than eight are so with a probability of 1e-3 then."""
+    """The rate is 0.75 %, so more than 8 of 320 flights have a probability of 1e-3. With inflations
+    smaller than the jump, the rate was some 6 %."""
     fault = PositionJump(start=1.0, size=(1.0, 2.0))
     batch = fly(quad_gym.sensor_suite("consumer"), 320, filter_start="warm", faults=fault)
     steps(batch, 8.0)
@@ -107,7 +107,7 @@ def test_few_jumps_of_the_vehicle_go_undetected():
 
 
 class AtRest:
-    """The filter of `consumer` at rest, with measurements that are off as they are told."""
+    """The filter of `consumer` at rest, with given errors of measurements."""
 
     def __init__(self):
         suite = quad_gym.sensor_suite("consumer").simplified()
@@ -118,7 +118,7 @@ class AtRest:
         self.rng = np.random.default_rng(0)
 
     def measure(self, off=0.0, altitude=0.0, field=0.0):
-        """All sensors once, with a fix that is `off` in x, and 0.1 s of rest."""
+        """Update once with all sensors, the fix `off` in x [m], and predict 0.1 s of rest."""
         gnss, rng = self.suite.gnss, self.rng
         fix = np.array(gnss.primary_antenna_B) + rng.normal(size=3) * gnss.position_sigma_I
         noise = rng.normal(size=3) * self.suite.magnetometer.noise_sigma
@@ -139,7 +139,7 @@ class AtRest:
         assert np.sqrt(self.ukf.covariance[0, 0]) < 0.2
 
 
-def test_a_wrong_position_is_mended_however_far_off_it_is():
+def test_filter_recovers_from_position_error_of_2000_m():
     flight = AtRest()
     for _ in range(10):
         flight.measure()
@@ -149,7 +149,7 @@ def test_a_wrong_position_is_mended_however_far_off_it_is():
     assert np.sqrt(flight.ukf.covariance[0, 0]) < 20.0
 
 
-def test_outlier_of_a_fix_is_no_jump_after_rejected_fields():
+def test_fix_outlier_is_rejected_after_rejected_magnetometer_readings():
     flight = AtRest()
     for _ in range(20):
         flight.measure()
@@ -163,7 +163,7 @@ def test_outlier_of_a_fix_is_no_jump_after_rejected_fields():
 
 
 @pytest.mark.parametrize("fits", [True, False], ids=["fits", "does not"])
-def test_rejected_fixes_raise_nothing_while_the_camera_fits(fits):
+def test_rejected_fixes_inflate_covariance_unless_camera_fits(fits):
     flight = AtRest()
     for _ in range(20):
         flight.measure()
@@ -180,9 +180,9 @@ def test_rejected_fixes_raise_nothing_while_the_camera_fits(fits):
         assert np.sqrt(flight.ukf.covariance[0, 0]) > 30.0
 
 
-def test_doubts_of_rejections_do_not_add_up():
-    """Velocities ever farther off along x, each rejected for the last time; along y they are not.
-    The variance of what is doubted becomes that of the largest innovation, not the sum of all."""
+def test_variance_after_repeated_alarms_is_square_of_largest_innovation():
+    """Each velocity raises an alarm. The error along x grows tenfold each time, and along y it is
+    constant."""
     ukf = started(np.repeat([0.1, 0.05, 0.02, 0.05, 0.005], 3))
     off = np.array([5.0, 1.0, 0.0])
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""A batch of flights: nothing that a flight does depends on which others it flies with."""
+"""Batches of flights: motor actions, resets, fields, memory, and switched sensors and faults."""
 
 import tracemalloc
 
@@ -35,7 +35,7 @@ def hundred():
     return fly(SEEDS)
 
 
-def test_a_batch_flies_on_the_motors_it_is_told():
+def test_motor_actions_set_voltages_of_each_flight():
     task = TaskParams(duration=0, pad=False)
     batch = new_batch(2, control=Control.MOTOR, source=Source.TRUTH, task=task)
     batch.reset(seeds=[1, 1])
@@ -45,7 +45,7 @@ def test_a_batch_flies_on_the_motors_it_is_told():
     assert (voltages[0] == 0.0).all()
     assert (voltages[1] == voltages[1, 0]).all()
     assert batch.record("v")[0, 2] < -0.5 < 0.5 < batch.record("v")[1, 2]
-    batch.step()  # keeps the present actions
+    batch.step()  # keeps the last actions
     np.testing.assert_array_equal(batch.record("voltages"), voltages)
 
 
@@ -56,7 +56,7 @@ UNFIT += [{"seeds": [1, 2, 3, 4], "mask": mask} for mask in MASKS]
 
 
 @pytest.mark.parametrize("arguments", UNFIT, ids=str)
-def test_a_reset_that_does_not_fit_raises_and_changes_nothing(arguments):
+def test_invalid_reset_raises_value_error_and_changes_nothing(arguments):
     batch = fly(SEEDS[:4], steps=3)
     before, results = batch.snapshot(), batch.results.copy()
     with pytest.raises(ValueError, match=r"seeds|keys|mask|non-negative"):

@@ -55,7 +55,7 @@ def least_squares(table):
     imu = LINEAR.imu
     F = np.eye(15)
     F[6:9, 12:15] = -DT * np.eye(3)
-    of_states = {6: -cross(E3), 9: -np.eye(3), 12: 0.5 * DT * cross(E3)}  # in the acceleration
+    of_states = {6: -cross(E3), 9: -np.eye(3), 12: 0.5 * DT * cross(E3)}  # d(accel)/d(state)
     for column, block in of_states.items():
         F[0:3, column : column + 3] = 0.5 * DT**2 * block
         F[3:6, column : column + 3] = DT * block
@@ -73,7 +73,7 @@ def least_squares(table):
         decay = np.exp(-DT / tau)
         F[at] *= decay
         noise[at, 6 + 3 * k : 9 + 3 * k] = sigma * np.sqrt(1.0 - decay**2) * np.eye(3)
-    # white noise moves the position by less than the bound below
+    # white noise of 1e-8 m on the position is small compared with the bound below
     W = np.linalg.inv(np.linalg.cholesky(noise @ noise.T + np.diag([1e-16] * 3 + [0.0] * 12)))
     size = 15 * (STEPS + 1)
     A, b = [], []
@@ -107,7 +107,7 @@ def least_squares(table):
 
 @pytest.mark.parametrize("estimator", ["ukf", "ekf"])
 def test_linear_case_equals_least_squares(estimator):
-    """Means within 0.2 % of their standard deviations, covariances within 0.2 %."""
+    """Means agree within 0.2 % of the standard deviations, covariances within 0.2 %."""
     table = log_at_rest()
     start = at_rest(covariance=P0, time=0.0)
     result = smooth(table, sensors=LINEAR, estimator=estimator, start=start)
@@ -133,7 +133,7 @@ def root_mean_squares(errors):
 
 @pytest.fixture(scope="module")
 def flights():
-    """Flights with late, lost and irregular data: errors of both, and the smoother's results."""
+    """Return errors of filter and smoother for late, lost and irregular data, and the results."""
     found = []
     for seed in SEEDS:
         recorded = Recorded(flown(PX4, 8.0, seed=seed), PX4, seed=seed)
@@ -154,7 +154,7 @@ def test_smoothed_errors_are_smaller(flights):
 
 
 def test_smoothed_errors_are_consistent(flights):
-    """NEES of nine states at times two seconds apart; outside by chance 2 times in 1000."""
+    """The NEES of nine states, sampled every two seconds, is in its 99.8 % interval."""
     nees = []
     for _, errors, result in flights:
         for time in np.arange(result.time[0] + 0.5, result.time[-1], APART):
@@ -171,8 +171,8 @@ def test_covariances_are_positive(flights):
         assert np.isfinite(result.difference).mean() > 0.95
 
 
-def test_covariances_are_positive_after_first_turns():
-    """Drift of GNSS begins without variance, and the first magnetic headings are far off."""
+def test_covariances_are_positive_after_large_first_corrections():
+    """GNSS drift starts with zero variance, and the first magnetic headings have large errors."""
     suite = CONSUMER.replace(barometer=PX4.barometer, magnetometer=PX4.magnetometer)
     result = smooth(Recorded(flown(suite, 2.0, seed=42), suite, seed=42).table(), sensors=suite)
     units = result.sigma[:, :, np.newaxis] * result.sigma[:, np.newaxis]

@@ -1,4 +1,4 @@
-"""Who draws which numbers: no two quantities share a draw, so that all of them are independent."""
+"""Draws of random numbers: no two quantities share a draw, so they are independent."""
 
 import ast
 import importlib
@@ -49,7 +49,7 @@ def test_no_two_ranges_share_a_draw():
 
 
 @pytest.mark.parametrize("end", ["first", "last"])
-def test_a_draw_that_is_taken_is_refused(end):
+def test_overlapping_range_of_draws_raises_value_error(end):
     before, taken = list(DRAW_RANGES), DRAW_RANGES[0]
     first = taken.first - 2 if end == "first" else taken.first + taken[2] - 1
     with pytest.raises(ValueError, match="'a test' overlap those of 'driving noise"):
@@ -64,26 +64,26 @@ DRAWS_OF = {
     "_any_direction": 1,
     "_signed_pair": 1,
 }
-"""How many draws a function takes from the one on that is its second argument."""
+"""Number of draws that a function takes, starting with the draw in its second argument."""
 LARGEST = {
     "feature_count": MAX_FEATURES,
     "settings.feature_count": MAX_FEATURES,
     "settings.obstacle_count": MAX_OBSTACLES,
     "slow.slow_states": MAX_SLOW,
 }
-"""What kernels are told while they run, at its largest."""
+"""Largest values of arguments that kernels read at run time."""
 FAULTS = range(FAULT_KINDS)
 
 
 def loops_around(function, call):
-    """The loops of a function that a call stands in: (variable, its end as source)."""
+    """Yield the loops of a function that enclose a call: (variable, end as source)."""
     for node in ast.walk(function):
         if isinstance(node, ast.For) and call in ast.walk(node):
             yield node.target.id, ast.unparse(node.iter.args[-1])
 
 
 def draws_of_kernels():
-    """Every place where a kernel draws: (place, the sets of draws that it can be, one by one)."""
+    """Yield each place where a kernel draws: (place, list of its possible sets of draws)."""
     for file in sorted(KERNELS.rglob("*.py")):
         name = ".".join(file.relative_to(KERNELS.parents[1]).with_suffix("").parts)
         for function in ast.walk(ast.parse(file.read_text())):
@@ -96,7 +96,7 @@ def draws_of_kernels():
 
 
 def draws_of_call(name, function, call):
-    """The draws that a call takes, for each value of the variables around it."""
+    """Return the set of draws of a call for each value of the variables around it."""
     scope = dict(vars(importlib.import_module(name)))
     if "_draw_of" in scope:
         scope["_draw_of"] = scope["_draw_of"].py_func
@@ -105,8 +105,8 @@ def draws_of_call(name, function, call):
         values[variable] = range(LARGEST.get(end) or eval(end, scope))
     if "_draw_of(k" in source:
         values["k"] = FAULTS
-        assert len(values) == 1  # so that the places of kinds are told apart
-    elif name.endswith("sensors.aid"):  # of sensor s, or of the slow state k
+        assert len(values) == 1  # one set of draws for each kind of fault
+    elif name.endswith("sensors.aid"):  # sensor s, or slow state k
         names = {node.id for node in ast.walk(call.args[1]) if isinstance(node, ast.Name)}
         values |= {"s": range(AIDS)} if "s" in names else {}
         values |= {"k": range(0, MAX_SLOW, 3)} if "k" in names else {}
@@ -128,7 +128,7 @@ def range_of(draw):
 def test_a_kernel_draws_within_the_range_of_one_quantity(place):
     ranges = {range_of(draw) for draws in PLACES[place] for draw in draws}
     assert len(ranges) == 1
-    if "faults:" in place and ranges.pop().first == DRAW_FAULTS:  # each kind within its own
+    if "faults:" in place and ranges.pop().first == DRAW_FAULTS:  # each kind in its own range
         for kind, draws in enumerate(PLACES[place]):
             first = DRAW_FAULTS + DRAWS_OF_FAULT * kind
             assert draws <= set(range(first, first + DRAWS_OF_FAULT))
@@ -139,11 +139,11 @@ def test_every_range_is_drawn_from():
     for quantity, first, count in DRAW_RANGES:
         taken = drawn & set(range(first, first + count))
         assert first in taken, quantity
-        assert len(taken) >= 0.6 * count, quantity  # a fault leaves some of its draws to others
+        assert len(taken) >= 0.6 * count, quantity  # most faults do not use all draws
 
 
 def quantities_of(batch):
-    """All that an episode draws when it begins, each by itself, by name: (COUNT,)."""
+    """Return each number that an episode draws at its start, by name: (COUNT,)."""
     R = Rotation.from_quat(batch.record("q")[:, [1, 2, 3, 0]]).as_matrix()  # body to inertial
     gates = batch.record("gates")
     turns = np.diff(np.unwrap(np.arctan2(gates[..., 1], gates[..., 0]), axis=1))
@@ -170,8 +170,8 @@ def quantities_of(batch):
 
 
 def features_of(quantities):
-    """Functions of the ranks of each quantity, centered, of unit length: (COUNT, n, 4). They see
-    whether one quantity is a function of another, be it an angle or its double."""
+    """Return functions of the ranks of each quantity, centered, of unit length: (COUNT, n, 4). They
+    are correlated if one quantity is a function of another, even of an angle or twice an angle."""
     columns = []
     for values in quantities.values():
         u = (stats.rankdata(values) - 0.5) / len(values)
@@ -183,7 +183,7 @@ def features_of(quantities):
 
 
 def assert_independent(one, other, names, same):
-    """No feature of a quantity correlates with one of another; `same`: is it one and the same?"""
+    """Check that features of quantities are uncorrelated; `same`: leave out each with itself."""
     scores = np.einsum("nia,njb->ijab", one, other) * np.sqrt(COUNT)
     if same:
         scores[np.arange(len(names)), np.arange(len(names))] = 0.0
@@ -192,7 +192,7 @@ def assert_independent(one, other, names, same):
     assert np.abs(scores).max() < alarm_score(scores.size), pair
 
 
-def test_what_an_episode_begins_with_is_independent():
+def test_initial_values_of_episodes_are_independent():
     batch = begun(
         COUNT,
         sensors="consumer",
@@ -232,7 +232,7 @@ INSTANTS = 10_000
 
 @pytest.fixture(scope="module")
 def readings():
-    """All sensors and biases of one flight at rest, over many instants: (INSTANTS, n), scaled."""
+    """Return standardized sensor readings and biases of one flight at rest: (INSTANTS, n)."""
     # features spread over the image, straight ahead of a camera that looks along x
     features = [(10.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (-2.0, 0.0, 1.0, 2.0)]
     camera = quad_gym.CameraParams(attitude=np.radians((90.0, 0.0, 90.0)), features_I=features)

@@ -1,4 +1,4 @@
-"""Sensor suites in files: the same after reading, from a base, with errors that say where."""
+"""Sensor suites in files: saving and reading, bases, and messages that name the mistake."""
 
 import dataclasses
 import math
@@ -58,7 +58,7 @@ def test_every_field_is_in_the_file_by_name(tmp_path):
     assert 'secondary_antenna_B = "none"' in text
 
 
-def test_a_base_gives_what_the_file_leaves_out(tmp_path):
+def test_fields_missing_in_file_come_from_its_base(tmp_path):
     base = quad_gym.sensor_suite("consumer")
     mine = read(
         tmp_path,
@@ -99,12 +99,12 @@ def test_a_base_gives_what_the_file_leaves_out(tmp_path):
         ("", r"there must be a table \[imu\]"),
     ],
 )
-def test_a_wrong_file_is_refused_by_file_and_field(text, message, tmp_path):
+def test_error_message_of_invalid_file_names_file_and_field(text, message, tmp_path):
     with pytest.raises(ValueError, match=f"mine.toml:? .*{message}"):
         read(tmp_path, text)
 
 
-def test_bytes_missing_files_and_other_endings_are_refused(tmp_path):
+def test_binary_missing_and_wrongly_named_files_are_refused(tmp_path):
     (tmp_path / "mine.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=r"mine.toml must be a file of TOML"):
         quad_gym.sensor_suite(str(tmp_path / "mine.toml"))
@@ -161,7 +161,7 @@ def test_the_record_of_a_training_has_the_contents_of_the_file(tmp_path):
     assert "suite_files" not in description(Plan(environment={"sensors": "rtk"}))
 
 
-def test_comparison_refuses_names_twice_and_a_changed_file(tmp_path):
+def test_comparison_refuses_duplicate_names_and_changed_suite_file(tmp_path):
     (tmp_path / "b").mkdir()
     file, other = (
         str(quad_gym.sensor_suite("rtk").save(tmp_path / folder / "mine.toml"))

@@ -1,4 +1,4 @@
-"""Helper threads of a batch: the same flights, awake or asleep, copied, forked and dismissed."""
+"""Helper threads of a batch: equal flights with any number of threads, forks, errors and ends."""
 
 import gc
 import multiprocessing
@@ -35,11 +35,11 @@ def helpers():
 
 @pytest.mark.parametrize("pause", [0.0, 0.003])
 @pytest.mark.parametrize("threads", [2, 3])
-def test_flights_are_the_same_whether_helpers_watch_or_sleep(threads, pause):
+def test_flights_are_equal_with_busy_or_sleeping_helper_threads(threads, pause):
     assert flown(batch_of(threads), pause=pause) == flown(batch_of(1))
 
 
-def test_two_batches_take_turns():
+def test_two_batches_stepped_in_turn_equal_single_thread():
     one, other = batch_of(2), batch_of(3)
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -55,7 +55,7 @@ def child(parent, pipe):
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_after_a_fork_the_child_flies_with_threads_of_its_own():
+def test_forked_child_flies_with_new_threads_like_parent():
     parent = batch_of(2)
     flown(parent, 3)
     context = multiprocessing.get_context("fork")
@@ -93,7 +93,7 @@ def crew_of(fly):
 
 
 def post(words):
-    """What a caller does first in compiled code: post a step, of which nothing is finished."""
+    """Post a step of which no block is finished, as a caller does first in compiled code."""
     words[board.FINISHED] = 0
     words[board.TICKET] += 1
 
@@ -102,17 +102,17 @@ def finish(words):
     words[board.FINISHED] = 2 * MIN_BLOCKS_PER_THREAD
 
 
-def test_what_goes_wrong_in_a_helper_is_raised():
+def test_exception_in_helper_thread_is_raised_in_caller():
     def fly(words, number, command, serving):
         if serving:
             raise MemoryError("no more")
         if command != POSTED_BEFORE:
             post(words)
-        return False  # some blocks are the helper's
+        return False  # some blocks are left to the helper
 
     crew = crew_of(fly)
     crew.gather()
-    for _ in range(2):  # it has no helper from then on
+    for _ in range(2):  # the second run has no helper
         with pytest.raises(MemoryError, match="no more"):
             crew.run(0)
 
@@ -141,7 +141,7 @@ def test_step_after_an_interrupted_one_waits_for_it():
         time.sleep(0.01)
     crew.gather()
     crew.run(8)
-    assert [what for what in seen if what != "helper"] == [8]
+    assert [entry for entry in seen if entry != "helper"] == [8]
 
 
 @pytest.mark.parametrize("blocks", [1, 7, 64, 1000])
@@ -155,7 +155,7 @@ def test_the_ranges_of_a_board_hold_every_block_once(blocks, parts):
     assert 1 <= words[board.CHUNK] <= blocks
 
 
-def test_a_batch_is_flown_by_one_thread_at_a_time():
+def test_run_during_another_run_raises_runtime_error():
     crew = None
 
     def fly(words, number, command, serving):

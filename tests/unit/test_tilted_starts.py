@@ -11,7 +11,7 @@ from tests.level_flights import GRAVITY, MAGNETIC, R_IG, LevelFlight
 from tests.unit.test_filter_starts import share
 
 SAMPLES = 100
-"""Of which the mean is taken."""
+"""Number of accelerometer samples in a mean."""
 WHITE = MAGNETIC.imu.accel_noise_density / math.sqrt(MAGNETIC.imu.dt * SAMPLES)
 BASELINE = MAGNETIC.gnss.baseline_B
 FIX = np.zeros(3)
@@ -21,7 +21,7 @@ UPRIGHT = MAGNETIC.gnss.replace(
 
 
 def resting(seed, roll=0.6, pitch=-0.4):
-    """A vehicle on a steep slope, with a heading of its own."""
+    """Return a vehicle at rest on a steep slope, with a random heading."""
     flight = LevelFlight(MAGNETIC, np.random.default_rng(seed), amplitude=0.0)
     flight.R = euler_to_dcm([roll, pitch, flight.yaw])
     return flight
@@ -32,33 +32,33 @@ def force(flight, white=WHITE):
 
 
 def nose(R):
-    """Heading of the body x axis."""
+    """Return the heading of the body x axis."""
     return math.atan2(R[0, 1], R[0, 0])
 
 
 def start(kf, flight, how):
     position, _ = flight.gnss(0.0)
-    told = {}
+    given = {}
     if how == "heading":
-        told = {"heading": nose(flight.R) + flight.rng.normal(0.0, 0.05), "heading_sigma": 0.05}
+        given = {"heading": nose(flight.R) + flight.rng.normal(0.0, 0.05), "heading_sigma": 0.05}
     elif how == "magnetometer":
-        told = {"magnetometer": flight.field()}
+        given = {"magnetometer": flight.field()}
     elif how == "baseline":
         u = flight.R.T @ BASELINE / np.linalg.norm(BASELINE)
         noise = flight.rng.normal(0.0, MAGNETIC.gnss.first_baseline_sigma, 3)
-        told = {"gnss_baseline_G": R_IG.T @ (u + noise - u * (u @ noise))}
+        given = {"gnss_baseline_G": R_IG.T @ (u + noise - u * (u @ noise))}
     elif how == "course":
         angle = nose(flight.R) + flight.rng.normal(0.0, 0.1)
         flight.drift = 6.0 * np.array([math.cos(angle), math.sin(angle), 0.0])
         flight.speed = np.zeros(3)
-        told = {"gnss_velocity_G": flight.gnss(0.0)[1], "course": True, "heading_sigma": 0.1}
-    kf.initialize(position, accel=force(flight), accel_sigma=WHITE, **told)
+        given = {"gnss_velocity_G": flight.gnss(0.0)[1], "course": True, "heading_sigma": 0.1}
+    kf.initialize(position, accel=force(flight), accel_sigma=WHITE, **given)
     return kf
 
 
 @pytest.mark.parametrize("how", ["heading", "magnetometer", "baseline", "course"])
 def test_errors_of_a_tilted_start_match_the_covariance(how):
-    """Mean NEES of the state and its first three parts over 300 draws; each fails 1 in 1,000."""
+    """The mean NEES over 300 draws, of the state and three parts, is in its 99.9 % interval."""
     squares, kf = [], UnscentedKalmanFilter(MAGNETIC)
     for seed in range(300):
         flight = resting(seed)
@@ -76,13 +76,13 @@ def test_errors_of_a_tilted_start_match_the_covariance(how):
 def test_without_errors_the_attitude_is_exact(how):
     flight = resting(1)
     flight.b_a, flight.iron, flight.turn = np.zeros(3), np.zeros(3), 0.0
-    told = {
+    given = {
         "heading": {"heading": nose(flight.R)},
         "magnetometer": {"magnetometer": flight.R @ MAGNETIC.magnetometer.field_I},
         "baseline": {"gnss_baseline_G": R_IG.T @ flight.R.T @ BASELINE},
     }[how]
     kf = ExtendedKalmanFilter(MAGNETIC)
-    kf.initialize(FIX, accel=force(flight, white=0.0), **told)
+    kf.initialize(FIX, accel=force(flight, white=0.0), **given)
     np.testing.assert_allclose(kf.R_BI, flight.R, atol=1e-12)
     antenna = kf.position + kf.R_BI.T @ MAGNETIC.gnss.primary_antenna_B
     np.testing.assert_allclose(antenna, 0.0, atol=1e-12)

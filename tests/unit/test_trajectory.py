@@ -19,15 +19,15 @@ def random_points(n, seed=0):
 
 
 def row(order, x, length, degree):
-    """A derivative at x in [-1, 1] of the Legendre series of a segment, as a row."""
+    """Return a derivative of a segment's Legendre series at x in [-1, 1], as a row."""
     basis = legendre.legder(np.eye(degree + 1), order) if order else np.eye(degree + 1)
     return legendre.legval(x, basis) * (2.0 / length) ** order
 
 
 def minimum(points, times, order, closed, at_rest, degree=9):
-    """Positions halfway and at a third, by the KKT system of min c'Qc under Ac = b. The basis is
-    larger than the minimum needs, and continuity is asked for below `order` alone: the rest is the
-    minimum's own doing."""
+    """Solve the KKT system of min c'Qc under Ac = b; return positions halfway and at a third. The
+    basis is larger than the minimum needs, and only derivatives below `order` are required to be
+    continuous: the continuity of higher ones follows from the minimum."""
     lengths = np.diff(times)
     m, n = len(lengths), degree + 1
     x, weights = legendre.leggauss(12)
@@ -59,7 +59,7 @@ def minimum(points, times, order, closed, at_rest, degree=9):
     A, b = np.array(A), np.array(b)
     kkt = np.block([[Q, A.T], [A, np.zeros((len(A), len(A)))]])
     right = np.concatenate([np.zeros((m * n, 3)), b])
-    scale = 1.0 / np.sqrt(np.abs(kkt).max(axis=1))  # rows and columns of like size
+    scale = 1.0 / np.sqrt(np.abs(kkt).max(axis=1))  # rows and columns of similar size
     solution = np.linalg.solve(kkt * np.outer(scale, scale), right * scale[:, np.newaxis])
     c = (solution * scale[:, np.newaxis])[: m * n].reshape(m, n, 3)
     return np.array([[legendre.legval(at, c[j]) for at in (0.0, -1.0 / 3.0)] for j in range(m)])
@@ -68,13 +68,13 @@ def minimum(points, times, order, closed, at_rest, degree=9):
 @pytest.mark.parametrize("minimize", ["snap", "jerk"])
 @pytest.mark.parametrize("ends", ["rest", "free", "closed"])
 @pytest.mark.parametrize("count", [2, 3, 5, 8])
-def test_it_is_the_minimum(minimize, ends, count):
+def test_trajectory_minimizes_snap_or_jerk(minimize, ends, count):
     points, times = random_points(count, seed=count)
     closed = ends == "closed"
     times = (times if closed else times[:count]) - times[0]
     order = {"snap": 4, "jerk": 3}[minimize]
     options = {"minimize": minimize, "closed": closed, "at_rest": ends == "rest"}
-    if ends == "free" and count < order:  # many polynomials cost nothing
+    if ends == "free" and count < order:  # many polynomials have zero cost
         with pytest.raises(ValueError, match=f"fewer than {order} points"):
             Trajectory.through(points, times, **options)
         return
@@ -87,20 +87,20 @@ def test_it_is_the_minimum(minimize, ends, count):
     np.testing.assert_allclose(path(path.times[: len(points)]), points, rtol=0.0, atol=1e-12)
 
 
-def test_derivatives_are_continuous_and_those_of_the_position():
+def test_derivatives_are_continuous_and_match_position():
     path, h = Trajectory.through(FIVE, TIMES), 1e-4
     inner = np.linspace(0.01, path.duration - 0.01, 301)
     for k in range(4):
         slope = (path(inner + h, k) - path(inner - h, k)) / (2.0 * h)
         np.testing.assert_allclose(path(inner, k + 1), slope, rtol=0.0, atol=3e-5)
-    for k in range(7):  # snap's own minimum has six
+    for k in range(7):  # minimum snap has six continuous derivatives
         before, after = path(TIMES[1:-1] - 1e-9, k), path(TIMES[1:-1] + 1e-9, k)
         np.testing.assert_allclose(before, after, rtol=0.0, atol=1e-5)
     for k in (1, 2, 3):
         assert np.abs(path([0.0, path.duration], k)).max() < 1e-11
 
 
-def test_it_stands_still_beyond_its_ends_or_repeats():
+def test_trajectory_holds_its_ends_or_repeats_if_closed():
     path = Trajectory.through(FIVE, TIMES)
     np.testing.assert_array_equal(path([-1.0, 0.0]), FIVE[[0, 0]])
     np.testing.assert_allclose(path([8.0, 99.0]), FIVE[[4, 4]], rtol=0.0, atol=1e-12)
@@ -116,7 +116,7 @@ def test_it_stands_still_beyond_its_ends_or_repeats():
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("bounds", [(2.5, 3.0), (2.0, 50.0), (50.0, 4.0)])
 @pytest.mark.parametrize("minimize", ["snap", "jerk"])
-def test_the_bounds_are_reached_and_not_exceeded(closed, bounds, minimize):
+def test_speed_or_acceleration_reaches_its_bound_and_none_is_exceeded(closed, bounds, minimize):
     points, _ = random_points(6, seed=3)
     path = Trajectory.through(
         points, max_speed=bounds[0], max_acceleration=bounds[1], closed=closed, minimize=minimize
@@ -129,7 +129,7 @@ def test_the_bounds_are_reached_and_not_exceeded(closed, bounds, minimize):
     assert max(shares) > 0.999
 
 
-def test_chosen_times_are_better_than_those_by_distance():
+def test_optimized_times_are_shorter_than_times_proportional_to_distance():
     for closed in (False, True):
         path = Trajectory.through(FIVE, closed=closed)
         around = np.vstack([FIVE, FIVE[:1]]) if closed else FIVE
@@ -142,7 +142,7 @@ def test_chosen_times_are_better_than_those_by_distance():
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_yaw_and_its_derivatives(closed):
+def test_yaw_derivatives_match_yaw(closed):
     angles = np.array([0.0, 1.0, 2.5, 4.0, 5.0])
     when = np.append(TIMES, 10.0) if closed else TIMES
     t, h = np.linspace(0.3, when[-1] - 0.3, 200), 1e-5
@@ -160,7 +160,7 @@ def test_yaw_and_its_derivatives(closed):
     np.testing.assert_allclose(path.yaw(t), np.arctan2(gap[:, 1], gap[:, 0]), rtol=0, atol=1e-12)
 
 
-def test_a_whole_turn_in_each_round_goes_on():
+def test_yaw_of_closed_trajectory_accumulates_full_turns():
     path = Trajectory.through(FIVE, np.append(TIMES, 10.0), closed=True, yaw=[0, 1.3, 2.6, 4, 5.2])
     np.testing.assert_allclose(path.yaw(23.0) - path.yaw(3.0), 4.0 * np.pi, rtol=1e-12)
     np.testing.assert_allclose(path.yaw(9.9999999, 1), path.yaw(0.0, 1), rtol=0.0, atol=1e-5)
@@ -190,7 +190,7 @@ SLOPES = {"velocity": eight_velocity, "acceleration": eight_acceleration}
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_function_is_met_with_its_derivatives(closed):
+def test_trajectory_of_function_matches_function_and_its_derivatives(closed):
     path = Trajectory.of(eight, 2.0 * np.pi, **SLOPES, closed=closed, yaw=lambda t: t)
     t = np.linspace(0.0, path.duration, 1003)[:-1]
     for k, (function, miss) in enumerate(
@@ -202,7 +202,7 @@ def test_a_function_is_met_with_its_derivatives(closed):
     np.testing.assert_allclose(finer(t), np.transpose(eight(t)), rtol=0.0, atol=2e-9)
 
 
-def test_a_table_is_passed_at_its_times(tmp_path):
+def test_trajectory_from_csv_passes_points_at_given_times(tmp_path):
     file = tmp_path / "path.csv"
     lines = ["Time, X, y, z, note, yaw"]
     for t, p in zip(TIMES + 12.3, FIVE, strict=True):
@@ -314,7 +314,7 @@ def test_bad_coefficients_are_refused():
             path(**options)
 
 
-def test_trajectories_are_values():
+def test_trajectories_are_immutable_and_compare_by_value():
     path = figure_of_eight()
     copy = pickle.loads(pickle.dumps(path))
     assert copy == path
@@ -331,7 +331,7 @@ def test_trajectories_are_values():
     assert (own(0.5) == 0.0).all()
 
 
-def test_turning():
+def test_turned_trajectory_rotates_position_and_yaw():
     path = Trajectory.through(FIVE, look_at=(1.0, 2.0))
     turned, t = path.turned(np.pi / 2), np.linspace(0.0, 5.0, 20)
     x, y, z = path(t).T

@@ -1,4 +1,4 @@
-"""The filter equals the plain augmented filter of the equations, computed in 40 digits."""
+"""The UKF agrees with a plain augmented filter, computed from the equations in 40 digits."""
 
 import decimal
 from decimal import Decimal
@@ -20,18 +20,18 @@ def estimator(**choices):
 
 
 def distance(value, truth):
-    """Largest difference, taken in 40 digits."""
+    """Return the largest difference, computed in 40 digits."""
     return float(abs(array_of(Decimal, value) - truth).max())
 
 
 def compare(
     sensors, ticks, seed, *, present=0.8, filter_class=UnscentedKalmanFilter, plain_class=PlainUKF
 ):
-    """The largest deviations from the reference over a flight with measurements coming and going.
+    """Find the largest differences from the reference over a flight with intermittent measurements.
 
     Returns:
-        Deviations by name, the covariance's relative to the standard deviations; how many cycles
-        had which measurements, by (position, baseline, features).
+        Differences by name, for the covariance relative to the standard deviations; the number of
+        cycles with each combination of measurements, by (position, baseline, features).
     """
     recording = record_circle(sensors, ticks, seed)
     has = np.random.default_rng(seed).random((ticks, 2)) < present
@@ -70,7 +70,7 @@ def note_deviations(ours, reference, worst):
 
 
 def assert_equal(worst):
-    """Promised are 1e-10 m, 1e-10 in R_BI, 1e-8 in the covariance; the filter does better."""
+    """Check bounds at or below the requirement: 1e-10 m, 1e-10 in R_BI, 1e-8 in the covariance."""
     bounds = (3e-11, 3e-10, 1e-10, 3e-9, 3e-12, 1e-9)
     for name, bound in zip((*QUANTITIES, "covariance"), bounds, strict=True):
         assert worst[name] < bound, name
@@ -103,7 +103,7 @@ def test_filter_with_other_choices_equals_the_plain_filter(choices):
 
 
 def test_filter_of_other_measurements_equals_the_plain_filter():
-    """Without a camera and at another rate; with every measurement and with few."""
+    """Cases: no camera and a rate of 100 Hz; all measurements; few measurements."""
     assert_equal(compare(LAB.replace(camera=None).with_rates(imu=100.0), 50, seed=5)[0])
     assert_equal(compare(LAB, 30, seed=6, present=1.1)[0])
     assert_equal(compare(LAB, 30, seed=7, present=0.1)[0])

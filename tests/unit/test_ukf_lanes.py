@@ -1,4 +1,4 @@
-"""Eight filters in lanes: each does what it does by itself, whatever its neighbors do."""
+"""Eight filters in lanes: each equals a single filter and is independent of its neighbors."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def measure_all(filters, k, present=PRESENT):
 
 
 def fly(filters, ticks=50, upset=None):
-    """Fly all lanes and return their states on the way; `upset(filters, k)` acts before a cycle."""
+    """Fly all lanes, return their states after each cycle; `upset(filters, k)` runs before each."""
     measure_all(filters, 0, np.ones((1, EIGHT, 3), bool))
     filters.initialize()
     states = []
@@ -51,7 +51,7 @@ def calm():
 
 
 def alone(lane):
-    """A filter by itself that has met the first measurement of a lane."""
+    """Return a single filter that starts from the first measurement of a lane."""
     recording, ukf = RECORDINGS[lane], UnscentedKalmanFilter(LAB)
     ukf.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
     return ukf
@@ -75,8 +75,8 @@ def assert_equal(filters, lane, ukf):
     assert filters.get("filter_status")[lane] == ukf.status == 0
 
 
-def test_eight_different_flights_are_what_each_is_by_itself():
-    """To the bit, whatever they measure."""
+def test_eight_lanes_equal_eight_single_filters():
+    """States are bitwise equal for any set of measurements."""
     filters, alones = LaneFilter(LAB), [alone(lane) for lane in range(EIGHT)]
     measure_all(filters, 0, np.ones((1, EIGHT, 3), bool))
     filters.initialize()
@@ -99,7 +99,7 @@ RUINED = [(name, value) for name in STATES for value in (np.nan, np.inf, 0.0, -1
 
 
 @pytest.mark.parametrize(("name", "value"), [*WILD, *RUINED])
-def test_wild_measurements_and_states_move_no_neighbor(calm, name, value):
+def test_invalid_measurements_or_states_of_one_lane_leave_others_unchanged(calm, name, value):
     def upset(filters, k):
         if k == 7:
             valid = {"block_valid": ALL_VALID} if name in MEASURED else {}

@@ -1,4 +1,4 @@
-"""Vague starts: refused, warned of, or carried by a filter that stays consistent."""
+"""Starts with large uncertainty: an error, a warning, or a filter that stays consistent."""
 
 import warnings
 
@@ -34,7 +34,7 @@ def warnings_of(suite, **keywords):
     return [str(warning.message) for warning in caught if warning.category is UserWarning]
 
 
-def test_a_hovering_accelerometer_measures_its_thrust_at_any_tilt():
+def test_accelerometer_in_hover_measures_force_along_body_z_at_any_tilt():
     suite = quad_gym.sensor_suite("consumer").simplified()
     anywhere = {"start_roll": Uniform(-0.8, 0.8), "start_pitch": Uniform(-0.8, 0.8)}
     batch = fly(suite, 64, start="hover", filter_start="warm", randomization=anywhere)
@@ -54,7 +54,7 @@ def test_a_cold_filter_refuses_large_tilts_by_name(name, drawn):
     FlightBatch(1, sensors=name, randomization=wide, filter_start="warm")
 
 
-def test_a_magnetic_heading_bears_less_tilt():
+def test_tilt_limit_is_lower_with_magnetic_heading():
     tilt = {"start_roll": Normal(0.0, 0.12)}
     FlightBatch(1, sensors="standard", randomization=tilt)
     with pytest.raises(ValueError, match=r"at most 0\.0913 rad \(uniform within \+-0\.158 rad\)"):
@@ -71,7 +71,7 @@ def test_the_largest_tilt_leaves_the_filter_consistent(name, kind):
 
 
 @pytest.mark.parametrize("name", quad_gym.params.suites.ALL_SUITES)
-def test_no_suite_by_name_warns(name):
+def test_named_suites_raise_no_warning(name):
     assert not warnings_of(quad_gym.sensor_suite(name))
 
 
@@ -85,18 +85,18 @@ def test_no_suite_by_name_warns(name):
         (vague_suites(2.0)["hard iron, consumer"], "MagnetometerParams.hard_iron_sigma is 4.81e-0"),
     ],
 )
-def test_a_suite_that_starts_too_vaguely_warns_once_by_name(suite, message):
+def test_excessive_start_uncertainty_warns_once_and_names_parameter(suite, message):
     (found,) = warnings_of(suite)
     assert found.startswith(message)
     assert warnings_of(suite, source=Source.TRUTH) == []  # runs no filter
 
 
 @pytest.mark.parametrize("vague", vague_suites())
-def test_a_suite_at_its_bound_does_not_warn(vague):
+def test_start_uncertainty_at_bound_does_not_warn(vague):
     assert not warnings_of(vague_suites()[vague])
 
 
-def test_a_baseline_that_is_partly_vertical_has_a_lower_bound():
+def test_partly_vertical_baseline_allows_less_noise():
     suite = with_baseline("standard", 0.1)
     half_up = suite.gnss.replace(
         primary_antenna_B=(0.0, 0.0, 0.0), secondary_antenna_B=(0.1, 0.0, 0.1 * np.sqrt(3.0))
@@ -109,13 +109,13 @@ def test_a_baseline_that_is_partly_vertical_has_a_lower_bound():
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("vague", VAGUE)
-def test_a_filter_that_starts_vaguely_is_consistent(vague, kind):
+def test_filter_with_large_start_uncertainty_is_consistent(vague, kind):
     for found in mean_nees(of_kind(vague_suites()[vague], kind), (0.2, 0.5)):
         assert BAND[0] < found < BAND[1]
 
 
 def test_coarse_baselines_leave_the_filter_consistent():
-    """Noise of 0.3 rad, which shortens the part along the baseline by 0.09."""
+    """Noise of 0.3 rad shortens the component along the baseline by 0.09."""
     with pytest.warns(UserWarning, match="baseline_sigma"):
         means = mean_nees(with_baseline("standard", 0.3), (0.2, 0.5))
     for found in means:

@@ -21,7 +21,7 @@ def combine(f, option):
     store(f.vectors[2], -(m.T @ u))
     store(f.vectors[3], (1.0, 2.0, f.s) - u)
     store(f.vectors[4], vector(f.s, 0.0, 1.0) + vector(0.0, f.s, 0.0))
-    for axis in (u, v):  # as other tuples, vectors are iterated over, indexed and unpacked
+    for axis in (u, v):  # vectors are iterated over, indexed and unpacked like other tuples
         x, y, z = axis
         store(f.vectors[5], load3(f.vectors[5]) + vector(x, y, axis[2] + 0.0 * z))
     store(f.vectors[6], linalg.cross(u, v))
@@ -77,7 +77,7 @@ def test_operators_agree_with_numpy(instance):
 
 
 @pytest.mark.parametrize("instance", INSTANCES)
-def test_a_vector_without_direction_takes_the_fallback(instance):
+def test_normalizing_vector_of_almost_zero_length_returns_fallback(instance):
     u = np.array([[0.0, 0.0, 0.0], [1e-31, 0.0, 0.0], [0.0, 1e-20, 0.0]])
     got = getattr(combined, instance)(u=u, v=np.array([[1.0, 2.0, 3.0]] * 3))["vectors"][:, 7]
     np.testing.assert_allclose(got, [[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 1.0, 0.0]], rtol=1e-15)

@@ -1,4 +1,4 @@
-"""The equations of motion, written again in NumPy, and what physics says of them."""
+"""The equations of motion agree with a NumPy version and with physical laws."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def cross_matrix(w):
 
 
 def newton_and_euler(state, voltages, d_I, p):
-    """The laboratory's model as it is printed, term by term."""
+    """Return the derivative by the laboratory's published equations, term by term."""
     v, R_BI, w, W = (state[k] for k in ("velocity", "R_BI", "body_rates", "rotor_speeds"))
     J, e3 = np.array(p.inertia), np.array([0.0, 0.0, 1.0])
     z_I = R_BI.T @ e3
@@ -53,7 +53,7 @@ def newton_and_euler(state, voltages, d_I, p):
 
 
 @pytest.mark.parametrize("params", [LAB, SKEWED], ids=["lab", "skewed"])
-def test_the_derivative_is_that_of_the_printed_equations(params):
+def test_state_derivative_equals_published_equations(params):
     rng = np.random.default_rng(1)
     for seed in range(50):
         state, voltages, d_I = random_state(seed), rng.uniform(0, 12, 4), rng.normal(size=3)
@@ -65,7 +65,7 @@ def test_the_derivative_is_that_of_the_printed_equations(params):
             np.testing.assert_allclose(got[name], value, rtol=0.0, atol=1e-13 * scale, err_msg=name)
 
 
-def test_the_laboratory_numbers():
+def test_lab_coefficients_equal_laboratory_values_in_rpm():
     per_rpm = 60.0 / (2.0 * np.pi)
     assert LAB.thrust_coefficient == pytest.approx(6.11e-8 * per_rpm**2, rel=1e-7)
     assert LAB.torque_coefficient == pytest.approx(1.5e-9 * per_rpm**2, rel=1e-7)
@@ -93,7 +93,7 @@ def test_at_hover_voltage_nothing_moves(params, yaw):
         (3, (-1, +1, +1)),  # rear right
     ],
 )
-def test_the_sign_of_each_rotors_torque(rotor, signs):
+def test_torque_of_each_rotor_has_expected_signs_and_sizes(rotor, signs):
     speeds = np.zeros(4)
     speeds[rotor] = 1000.0
     rates = state_derivative(at_rest(rotor_speeds=speeds), np.zeros(4), NO_FORCE, LAB)

@@ -1,4 +1,4 @@
-"""The vehicle of a simulated log is found, and kept in a file."""
+"""Vehicle parameters fitted to a simulated log, and saved to a file."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ TRUE = LAB.replace(
 
 @pytest.fixture(scope="module")
 def table():
-    """A log with a row for each change of the motor voltages."""
+    """Return a log with a row for each change of the motor voltages."""
     flight = flown(RTK, 12.0, task="lemniscate", vehicle=TRUE)
     table = Recorded(flight, lost=0.0, jitter=0.0).table()
     times, voltages = flight["time"][:-1], flight.about["voltages"][1:]
@@ -46,17 +46,17 @@ def found(table):
         ("hover_voltage", TRUE.hover_voltage, 0.05),
     ],
 )
-def test_number_of_a_simulated_vehicle_is_within_a_narrow_interval(found, name, true, width):
+def test_fitted_interval_is_narrow_and_contains_true_value(found, name, true, width):
     number = getattr(found, name)
     assert number.low < true < number.high
     assert number.high - number.low < width * true
 
 
-def test_battery_of_a_simulation_does_not_sag(found):
+def test_fitted_interval_of_battery_sag_contains_zero(found):
     assert found.sag.low < 0.0 < found.sag.high
 
 
-def test_vehicle_that_was_found_flies_from_a_file(found, tmp_path):
+def test_fitted_vehicle_flies_after_saving_and_reading(found, tmp_path):
     file = found.vehicle.save(tmp_path / "mine.toml")
     assert vehicle_params(file) == vehicle_params(str(file)) == found.vehicle
     env = quad_gym.QuadEnv("circle", vehicle=str(file))
@@ -82,7 +82,7 @@ def test_command_writes_the_vehicle_of_a_log_in_a_file(table, found, tmp_path):
         ('base = "la"\n', "base must be one of"),
     ],
 )
-def test_file_of_a_vehicle_with_a_mistake_is_refused(text, message, tmp_path):
+def test_invalid_vehicle_file_is_refused(text, message, tmp_path):
     (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(ValueError, match=message):
         vehicle_params(tmp_path / "mine.toml")

@@ -1,4 +1,4 @@
-"""Wahba's problem: the report's grid, SciPy's solution, and data that leave it open."""
+"""Wahba's problem: the report's grid, SciPy's solution, and data without a unique solution."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def noisy_problem(seed, count, noise):
     return rng.uniform(0.1, 2.0, count), v_I, v_B, R_BI
 
 
-def test_the_reports_grid_over_all_euler_angles():
+def test_rotation_is_exact_over_grid_of_all_euler_angles():
     rng = np.random.default_rng(2024)
     steps = np.pi * np.linspace(-1.0, 1.0, 21)
     eulers = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -97,7 +97,7 @@ OPEN = "v_I and v_B"
 
 @pytest.mark.parametrize(
     ("name", "weights", "v_I", "v_B"),
-    [  # the first leave the rotation open
+    [  # the first do not determine the rotation
         (OPEN, [1.0], [X], [Y]),
         (OPEN, [1.0, 1.0], [X, X], [Y, Y]),
         (OPEN, [1.0, 2.0, 1.0], [X, -2 * X, 3 * X], [Z, -2 * Z, 3 * Z]),
@@ -131,7 +131,7 @@ def solve(f, option):
 compiled = Compiled(solve, B=(3, 3), R=(3, 3), uniqueness=())
 
 
-def test_lanes_solve_eight_problems_at_once_as_floats_do():
+def test_lanes_and_floats_give_equal_rotations():
     rng = np.random.default_rng(5)
     B = rng.normal(size=(800, 3, 3))
     B[::8] = np.einsum("ni,nj->nij", *rng.normal(size=(2, 100, 3)))  # rank 1: no unique solution

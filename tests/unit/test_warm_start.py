@@ -1,4 +1,4 @@
-"""Warm starts: from the first instant on, errors are as the covariance says, everywhere."""
+"""Warm starts: errors match the covariance from the first instant, for all suites and starts."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ ESTIMATES = (
 
 
 def unmeasured(name):
-    """A suite that measures nothing at the first instant, so that the start is seen as it is."""
+    """Return a suite without measurements at the first instant, so that the start is observed."""
     suite = quad_gym.sensor_suite(name)
     changes = {"estimator": suite.estimator.replace(reuse_first_fix=False)}
     for sensor in ("gnss", "camera"):
@@ -54,7 +54,7 @@ def test_whitened_errors_of_the_start_are_standard_normal(name, start):
 
 def test_covariance_of_a_start_turns_with_the_vehicle():
     anywhere = {"start_yaw": Uniform(-np.pi, np.pi), "start_roll": Uniform(-0.3, 0.3)}
-    suite = unmeasured("lab")  # whose camera has two features ahead: uneven in the horizontal
+    suite = unmeasured("lab")  # two features ahead of its camera: unequal horizontal axes
     batch = fly(suite, 4000, task="hover", filter_start="warm", randomization=anywhere)
     assert_normal(whitened_errors(batch), np.zeros(15), np.eye(15))
     ahead = attitudes(batch.record("q"))[:, 0]
@@ -73,14 +73,14 @@ def test_covariance_of_a_start_turns_with_the_vehicle():
 
 @pytest.mark.parametrize("name", SUITES)
 def test_the_estimated_biases_are_independent_of_their_errors(name):
-    """As of a filter that started from their stationary distribution."""
+    """A filter that starts from the stationary distribution of the biases has this property."""
     suite = unmeasured(name)
     batch = fly(suite, 4000, task="hover", filter_start="warm")
     S = np.diag(np.repeat([suite.imu.accel_bias_sigma, suite.imu.gyro_bias_sigma], 3) ** 2)
     P = batch.covariance()[:, BIASES, BIASES].mean(axis=0)
     assert_normal(biases(batch), np.zeros(6), S)
     errors = state_errors(batch)[:, BIASES]
-    floor = 1e-6 * S  # what is known of a bias may be next to nothing
+    floor = 1e-6 * S  # S - P may be almost zero
     joint = np.hstack([estimated_biases(batch), errors])
     noise = np.random.default_rng(0).normal(size=(4000, 6)) * np.sqrt(np.diag(floor))
     joint[:, :6] += noise
@@ -90,10 +90,10 @@ def test_the_estimated_biases_are_independent_of_their_errors(name):
 
 
 @pytest.mark.parametrize("name", SUITES)
-def test_covariance_is_that_of_a_filter_that_has_run_as_long(name):
-    """Of other flights, under another controller. Simplified: a heading with a constant error is
-    known better after the moves of a flight than after hovering. So is hard iron, and with the
-    heading tilt and level accelerometer bias."""
+def test_warm_start_covariance_matches_cold_filter_after_warm_up(name):
+    """The cold filter runs in other flights, under another controller. Suites are simplified, as a
+    constant heading error is estimated better after maneuvers than after hovering. So is hard iron,
+    and with it heading, tilt and horizontal accelerometer bias, which are left out."""
     suite = quad_gym.sensor_suite(name).simplified()
     cold = fly(suite, 40, task="hover")
     steps(cold, WARM_UP)
@@ -108,8 +108,8 @@ def test_covariance_is_that_of_a_filter_that_has_run_as_long(name):
 
 
 @pytest.mark.parametrize("name", ["rtk", "consumer", "indoor"])
-def test_nees_is_right_from_the_first_instant_on(name):
-    """Means over 500 flights, five deviations wide; the band itself is for longer flights."""
+def test_mean_nees_is_15_from_first_instant(name):
+    """The bound is 5 standard deviations of a mean over 500 flights; the band is for long ones."""
     suite = quad_gym.sensor_suite(name)
     batch = fly(suite, 500, filter_start="warm")
     means = [nees(batch).mean()]
@@ -121,7 +121,7 @@ def test_nees_is_right_from_the_first_instant_on(name):
     assert not batch.record("filter_status").any()
 
 
-def test_cold_is_the_default_and_the_truth_is_the_same():
+def test_cold_start_is_default_and_warm_start_leaves_truth_unchanged():
     default, cold, warm = (
         fly(quad_gym.sensor_suite("rtk").simplified(), 20, task="hover", **keywords)
         for keywords in ({}, {"filter_start": "cold"}, {"filter_start": "warm"})
@@ -142,7 +142,7 @@ def test_first_fix_is_a_measurement_unless_it_starts_the_filter():
     assert (warm.record("nis_dimension") == 9.0).all()
 
 
-def test_nonsense_and_a_start_without_a_filter_are_refused():
+def test_invalid_filter_start_and_warm_start_without_filter_are_refused():
     with pytest.raises(ValueError, match="filter_start needs a filter, and none runs here"):
         FlightBatch(4, filter_start="warm", source=quad_gym.records.Source.TRUTH)
     with pytest.raises(ValueError, match="filter_start must be one of cold, warm, got 'hot'"):
@@ -152,19 +152,19 @@ def test_nonsense_and_a_start_without_a_filter_are_refused():
 
 
 @pytest.mark.parametrize("camera", [True, False])
-def test_filter_that_cannot_know_its_heading_starts_cold(camera):
-    """It claims some degrees after a while, and is wrong by up to half a turn."""
+def test_warm_start_without_heading_source_raises_value_error(camera):
+    """After a while the filter claims a few degrees, but is wrong by up to half a turn."""
     rtk = quad_gym.sensor_suite("rtk").simplified()
     up = {"primary_antenna_B": (0.0, 0.0, 0.05), "secondary_antenna_B": (0.0, 0.0, 0.24)}
     suite = rtk.replace(gnss=rtk.gnss.replace(**up), camera=rtk.camera if camera else None)
-    FlightBatch(1, sensors=suite, filter_start="warm")  # the mark of the start has told it
+    FlightBatch(1, sensors=suite, filter_start="warm")  # the initial pose provides the heading
     suite = suite.replace(initial_pose=quad_gym.InitialPoseParams(heading_sigma=2.0))
     with pytest.raises(ValueError, match=r"filter_start must be 'cold' .* baseline"):
         FlightBatch(1, sensors=suite, filter_start="warm")
-    FlightBatch(1, sensors=suite)  # cold it may fly
+    FlightBatch(1, sensors=suite)  # a cold start is allowed
 
 
-def test_every_episode_starts_warm_anew():
+def test_each_episode_draws_new_warm_start():
     env = QuadVectorEnv(
         2, "hover", sensors="indoor", filter_start="warm", duration=0.1, autoreset_mode="SameStep"
     )

@@ -27,7 +27,7 @@ HOVERING = {"voltage": LAB.hover_voltage, "speed": HOVER_SPEED}
 
 
 def in_world(state, voltages, d_I, p, world):
-    """The world's forces added to the printed model of calm air, term by term."""
+    """Add the world's forces to the published model of calm air, term by term."""
     v_air = state["velocity"] - world.wind_I
     R_BI, W = state["R_BI"], state["rotor_speeds"]
     k = np.array(world.linear_drag_B) + np.array(world.rotor_drag_B) * W.sum()
@@ -47,7 +47,7 @@ def in_world(state, voltages, d_I, p, world):
 
 
 @pytest.mark.parametrize("params", [LAB, SKEWED], ids=["lab", "skewed"])
-def test_the_derivative_is_that_of_the_printed_forces(params):
+def test_state_derivative_equals_model_of_wind_drag_and_ground_effect(params):
     rng = np.random.default_rng(1)
     for seed in range(100):
         state, voltages, d_I = random_state(seed), rng.uniform(0, 12, 4), rng.normal(size=3)
@@ -60,7 +60,7 @@ def test_the_derivative_is_that_of_the_printed_forces(params):
 
 
 def motors_only(world, *, vehicle=LAB, voltage=0.0, speed=0.0, velocity=(0, 0, 0), yaw=0.0, **more):
-    """One vehicle, level, at a steady voltage; nothing ends its episode."""
+    """Return a batch of one level vehicle, whose episode never ends, and an action of a voltage."""
     far = {"duration": 0.0, "out_of_bounds": 1e9, "min_height": -1e9}
     task = quad_gym.TaskParams(kind="hover", start="ground", pad=False, **far)
     options = {"vehicle": vehicle, "task": task, "world": world, **more}
@@ -79,8 +79,8 @@ def flown(batch, action, seconds):
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
 @pytest.mark.parametrize("by_rotor_speed", [False, True])
-def test_a_hovering_vehicle_drifts_off_with_the_wind(yaw, by_rotor_speed):
-    """Along each body axis v = wind (1 - exp(-D t / m))."""
+def test_hovering_vehicle_approaches_wind_velocity_exponentially(yaw, by_rotor_speed):
+    """Along each body axis, v = wind (1 - exp(-D t / m))."""
     D = np.array([0.5, 0.3, 0.2])
     drag = {"linear_drag_B": D}
     if by_rotor_speed:
@@ -110,8 +110,8 @@ def test_a_flight_in_a_wind_is_the_calm_flight_carried_along(seed):
     np.testing.assert_allclose(blown.record("q"), calm.record("q"), atol=1e-10)
 
 
-def test_the_accelerometer_feels_what_the_air_does():
-    """Without noise it reads R (a + g e3) with the derivative of the present instant."""
+def test_accelerometer_measures_aerodynamic_forces():
+    """Without noise, the reading is R (a + g e3) with the acceleration of the present instant."""
     quiet = dict.fromkeys(
         ("accel_noise_density", "gyro_noise_density", "accel_bias_sigma", "gyro_bias_sigma"),
         Uniform(1e-14, 1e-14),
@@ -133,7 +133,7 @@ def test_the_accelerometer_feels_what_the_air_does():
 
 
 def battery_law(charge, speeds, battery, vehicle=LAB):
-    """U from U = U0 - R P / U, the larger root, or less where V I is all that there is."""
+    """Return U and P <= P_max; U is the larger root of U = U0 - R P / U, at most P_max / I."""
     torque = vehicle.torque_coefficient * speeds**2 / battery.motor_efficiency
     power, current = torque @ speeds, vehicle.motor_speed_per_volt * torque.sum()
     empty = battery.empty_voltage
@@ -148,14 +148,14 @@ def battery_law(charge, speeds, battery, vehicle=LAB):
     ("mass", "resistance", "speed", "limited"),
     [
         (0.78, 0.01, 0.0, False),
-        (3.3, 0.005, 0.0, False),  # hovers at 6.03 V, so that full action asks for 12 V
+        (3.3, 0.005, 0.0, False),  # hovers at 6.03 V, so full action requests 12 V
         (0.78, 0.1, 0.0, True),
         (0.78, 0.24, 0.0, True),
         (0.78, 0.2, 2.0 * HOVER_SPEED, True),
     ],
     ids=["enough power", "loaded", "too little", "least", "rotors too fast"],
 )
-def test_the_battery_gives_what_it_has_and_no_more(mass, resistance, speed, limited):
+def test_battery_limits_voltage_and_power(mass, resistance, speed, limited):
     battery, vehicle = BatteryParams(energy=5000.0, resistance=resistance), LAB.replace(mass=mass)
     batch, _ = motors_only(WorldParams(battery=battery), vehicle=vehicle, speed=speed)
     taken, most = 0.0, 12.0**2 / (4.0 * resistance)
@@ -170,7 +170,7 @@ def test_the_battery_gives_what_it_has_and_no_more(mass, resistance, speed, limi
     assert (power > 0.9 * most * (0.83 + 0.17 * charge) ** 2) == limited
 
 
-def test_a_resistance_with_which_it_cannot_hover_is_refused():
+def test_battery_resistance_too_high_to_hover_is_refused():
     power = 4.0 * LAB.torque_coefficient * HOVER_SPEED**3 / 0.75
     limit = 12.0**2 / (4.0 * power)
     for resistance in (1.001 * limit, 5.0, 1e6):
@@ -193,14 +193,14 @@ def test_an_empty_battery_cuts_off():
     np.testing.assert_array_equal(batch.record("voltages"), 0.0)
 
 
-def test_true_vehicles_largest_voltage_holds():
+def test_max_voltage_of_true_vehicle_limits_motor_voltages():
     weak = LAB.replace(max_voltage=4.0)
     batch, _ = motors_only("calm", true_vehicle=weak)
     batch.step(np.ones((1, 4)))
     np.testing.assert_array_equal(batch.record("voltages"), 4.0)
 
 
-def test_a_calm_world_flies_the_same_bits():
+def test_calm_world_leaves_flight_bitwise_unchanged():
     plain = flown_batch(range(9), 100).snapshot()
     for world in ("calm", WorldParams(), WorldParams(rotor_radius=0.3, ground_height=-5.0)):
         calm = flown_batch(range(9), 100, world=world, randomization={}).snapshot()
@@ -208,19 +208,19 @@ def test_a_calm_world_flies_the_same_bits():
         assert calm.tobytes() == plain.tobytes()
 
 
-def test_air_that_does_nothing_changes_nothing_but_rounding():
+def test_wind_without_drag_changes_flight_only_by_rounding():
     vehicle = LAB.replace(disc_area=0.0)
     plain = flown_batch(range(9), 100, vehicle=vehicle)
     world = WorldParams(wind_I=(5.0, 0.0, 0.0), gust_wind_speed=5.0)
     blown = flown_batch(range(9), 100, vehicle=vehicle, world=world)
-    for name in ("b_a", "b_g", "key", "instant"):  # random draws are those of the calm flight
+    for name in ("b_a", "b_g", "key", "instant"):  # random draws are equal
         np.testing.assert_array_equal(blown.record(name), plain.record(name))
     for name in ("r", "v", "q", "w", "r_hat", "accel", "pixels"):
         np.testing.assert_allclose(blown.record(name), plain.record(name), rtol=1e-6, atol=1e-7)
     assert np.ptp(blown.record("wind")[:, 0]) > 0.1
 
 
-def test_presets_are_known_by_name_and_fly():
+def test_world_presets_fly_and_unknown_worlds_raise_value_error():
     for name in ("calm", "breeze", "fresh_breeze"):
         batch = flown_batch(range(9), 100, world=name)
         assert batch.world == quad_gym.world_params(name)

@@ -1,4 +1,4 @@
-"""A small module of entries that tells when it is compiled, and processes that compile it."""
+"""A small module of entries that records its compilations, and processes that compile it."""
 
 import os
 import subprocess
@@ -90,7 +90,7 @@ RIGHT = "[11.0, 12.0, 13.0]"
 
 
 class Parts:
-    """The module in a folder of its own, and what was compiled of it."""
+    """The module in a separate folder, with a record of its compilations."""
 
     def __init__(self, folder):
         self.folder = Path(folder)
@@ -98,7 +98,7 @@ class Parts:
         (self.folder / "parts_of_test.py").write_text(SOURCE)
 
     def start(self, code=PREPARE, processes=2, **environment):
-        """A process that compiles and flies the parts, in a session of its own."""
+        """Start a process that compiles and calls the parts, in a separate session."""
         root = Path(__file__).parents[3]
         variables = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
         variables |= {
@@ -117,30 +117,30 @@ class Parts:
         )
 
     def run(self, code=PREPARE, processes=2, **environment):
-        """Its output, when it has ended well, and what it said on standard error."""
+        """Run a process; return its output and its standard error if it succeeds."""
         process = self.start(code, processes, **environment)
         output, said = process.communicate(timeout=600)
         assert process.returncode == 0, said
         return output.strip(), said
 
     def compiled(self):
-        """Names of the parts that were compiled, in order, once for each time."""
+        """Sorted names of the compiled parts, one for each compilation."""
         return sorted(line.split()[0] for line in self._lines())
 
     def compilers(self):
-        """The processes that compiled."""
+        """Identifiers of the processes that compiled."""
         return {int(line.split()[1]) for line in self._lines()}
 
     def _lines(self):
         return self.notes.read_text().splitlines() if self.notes.exists() else []
 
     def files(self, kind):
-        """What lies in the cache."""
+        """Files of a kind in the cache."""
         return sorted(self.cache.glob(f"parts_of_test.*.{kind}"))
 
 
 def alive(process):
-    """Whether a process runs; one that has ended, and whose parent has not noticed, does not."""
+    """Return true if a process runs; a zombie does not."""
     try:
         state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
     except FileNotFoundError:
@@ -149,7 +149,7 @@ def alive(process):
 
 
 def wait_until(true, seconds=600.0):
-    """Wait until something is true; fail if it does not become so."""
+    """Wait until a condition is true; fail if that takes too long."""
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "it did not happen in time"

@@ -1,4 +1,4 @@
-"""Compiled code on disk: damaged files, folders that cannot be written, a disk that is full."""
+"""Compiled code on disk: damaged files, folders that cannot be written, a full disk."""
 
 import importlib
 import os
@@ -32,7 +32,7 @@ def module(parts, monkeypatch):
 
 
 def call(function):
-    """What an entry of the module makes of (0, 5)."""
+    """Result of an entry of the module for (0, 5)."""
     x = np.array([0.0, 5.0])
     function(x)
     return x[0]
@@ -117,7 +117,7 @@ def test_a_damaged_file_is_compiled_again_and_replaced(module, parts, damage, ca
     assert "compiling a (once; cached in" in capfd.readouterr().err
     assert parts.compiled() == ["a", "a"]
     assert fresh._cache.holds(module.SIGNATURE, fresh.targetctx)
-    # not to the byte: names in the code have numbers, of one digit more now and then
+    # sizes differ: names in the code have numbers, sometimes of one digit more
     assert len(file.read_bytes()) == pytest.approx(len(sound), abs=50)
     assert call(entry(module.sources["a"], module.SIGNATURE)) == 11.0
     assert parts.compiled() == ["a", "a"]
@@ -133,7 +133,7 @@ def test_stale_files_of_a_function_are_deleted(module, parts):
     left = file.with_name(f"{file.name[: -len('.code') - 33]}.tmp")
     left.write_bytes(b"of a killed process")
     call(module.b)
-    assert len(parts.files("code")) == 14  # another function's files are none of its business
+    assert len(parts.files("code")) == 14  # no files of another function are deleted
     file.unlink()
     call(entry(module.sources["a"], module.SIGNATURE))
     files = [path for path in parts.files("code") if ".a." in path.name]
@@ -156,7 +156,7 @@ def test_without_a_folder_parts_are_compiled_in_the_process(parts):
     assert len(said.splitlines()) == 2
 
 
-def test_code_goes_to_the_users_folder_beside_a_read_only_package(parts):
+def test_code_is_cached_in_the_users_folder_if_the_package_is_read_only(parts):
     parts.cache.write_text("a file where the folder should be")
     elsewhere = parts.folder / "elsewhere"
     for _ in range(2):
@@ -169,7 +169,7 @@ def test_code_goes_to_the_users_folder_beside_a_read_only_package(parts):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no limits on the size of files")
 @pytest.mark.slow  # five processes; folders that cannot be written are tested above
-def test_a_full_disk_costs_one_line_and_the_cache(parts):
+def test_full_disk_gives_one_warning_and_no_cached_code(parts):
     output, said = parts.run(FULL_DISK)
     assert output == RIGHT
     lines = [line for line in said.splitlines() if "compiled code cannot be cached in" in line]

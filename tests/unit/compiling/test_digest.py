@@ -1,4 +1,4 @@
-"""What compiled code depends on: every source that it reaches, and nothing else."""
+"""Compiled code depends on every source that it reaches, and on no other."""
 
 import json
 import os
@@ -43,7 +43,7 @@ MOVE, UPDATE, HELPER = (
 STATEMENT, COMMENT = "\n_MORE = 1\n", "\n# a comment\n"
 DOCSTRING = '"""Another docstring."""'
 EDITS = {
-    # what: (file, old, new, whether the code of MOVE, UPDATE and HELPER depends on it)
+    # edit: (file, old, new, 1 or 0 if the code of MOVE, UPDATE and HELPER depends on it or not)
     "a leaf kernel": ("quad_gym/kernels/maths/linalg.py", "", STATEMENT, (1, 1, 1)),
     "the number type": ("quad_gym/kernels/simd/lanes.py", "", STATEMENT, (1, 1, 1)),
     "a constant": (MOVE, "h / 6.0", "h / 7.0", (1, 0, 0)),
@@ -87,7 +87,7 @@ TESTS = {
 
 @pytest.fixture(scope="module")
 def digests(tmp_path_factory):
-    """Digests of the three files in a copy of the package: as it is, then after each edit."""
+    """Digests of the three files in a copy of the package, first unchanged, then for each edit."""
     folder = tmp_path_factory.mktemp("copy")
     ignored = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "quad_gym", folder / "quad_gym", ignore=ignored)
@@ -111,7 +111,7 @@ def digests(tmp_path_factory):
 
 
 @pytest.mark.parametrize("what", EDITS)
-def test_an_edit_makes_stale_what_depends_on_it_alone(digests, what):
+def test_edit_changes_the_digests_of_dependent_code_only(digests, what):
     first, edited = digests
     stale = tuple(int(old != new) for old, new in zip(first, edited[what], strict=True))
     assert stale == EDITS[what][-1]
@@ -152,7 +152,7 @@ def minus(x):
     ],
     ids=["kinds", "floats", "tuples", "functions"],
 )
-def test_functions_differ_in_what_they_close_over(values):
+def test_digests_of_functions_differ_with_their_closures(values):
     digests = [digest_of_function(holding(value)) for value in values]
     assert len(set(digests)) == len(values)
     assert digests == [digest_of_function(holding(value)) for value in values]

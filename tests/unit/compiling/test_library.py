@@ -1,4 +1,4 @@
-"""The library of compiled kernels: when it is used, and that it flies the same flights."""
+"""The library of compiled kernels: conditions of its use, and flights equal to Numba's."""
 
 import os
 import subprocess
@@ -27,7 +27,7 @@ assert "numba" not in sys.modules and "llvmlite" not in sys.modules
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """The folder of libraries, empty, and nothing chosen by the environment."""
+    """An empty folder of libraries, with no choice of kernels in the environment."""
     monkeypatch.setattr(libraries, "FOLDER", tmp_path)
     monkeypatch.delenv("QUAD_GYM_KERNELS", raising=False)
     library.cache_clear()
@@ -39,12 +39,12 @@ def write_stale():
     file_of(WIDTH).write_bytes(b"code" + MARK + b"0" * 64 + b"\0code")
 
 
-def test_numba_compiles_in_silence_where_there_is_no_library(folder, capsys):
+def test_missing_library_falls_back_to_numba_without_a_message(folder, capsys):
     assert library() is None
     assert capsys.readouterr().err == ""
 
 
-def test_library_of_other_sources_is_not_used_in_silence(folder, capsys):
+def test_stale_library_falls_back_to_numba_with_a_message(folder, capsys):
     write_stale()
     assert library() is None
     said = capsys.readouterr().err
@@ -67,7 +67,7 @@ def test_message_names_the_extra_where_numba_is_missing(folder, monkeypatch):
         library()
 
 
-def test_choice_of_kernels_is_checked(folder, monkeypatch):
+def test_invalid_choice_of_kernels_raises_value_error(folder, monkeypatch):
     monkeypatch.setenv("QUAD_GYM_KERNELS", "other")
     with pytest.raises(ValueError, match="QUAD_GYM_KERNELS must be library or numba, got 'other'"):
         library()
@@ -94,7 +94,7 @@ def test_digest_depends_on_the_sources_of_kernels_and_records(tmp_path):
     assert digest_in(b"none") == ""
 
 
-def test_numbers_of_lanes_without_a_library_are_refused():
+def test_building_for_an_unsupported_number_of_lanes_is_refused():
     with pytest.raises(ValueError, match=r"there are libraries for .* got .* with \[3\]"):
         building.build([3])
 
@@ -106,7 +106,7 @@ def test_missing_compiler_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize("lanes", ["3", "16", "eight"])
-def test_a_number_of_lanes_that_there_is_not_is_refused(lanes):
+def test_unsupported_number_of_lanes_in_the_environment_is_refused(lanes):
     done = subprocess.run(
         [sys.executable, "-c", "import quad_gym.records"],
         env=os.environ | {"PYTHONPATH": str(PACKAGE.parent), "QUAD_GYM_LANES": lanes},

@@ -1,4 +1,4 @@
-"""Processes that compile side by side: what they share, and what is left when one of them dies."""
+"""Processes that compile at the same time: shared parts, and the state after one of them dies."""
 
 import signal
 import sys
@@ -36,7 +36,7 @@ def parts(tmp_path):
     return Parts(tmp_path)
 
 
-def test_parts_are_compiled_once_and_by_processes_of_their_own(parts):
+def test_parts_are_compiled_once_and_by_worker_processes(parts):
     output, said = parts.run()
     assert output == RIGHT
     assert parts.compiled() == ["a", "b", "c"]
@@ -55,7 +55,7 @@ def test_parts_are_compiled_once_and_by_processes_of_their_own(parts):
     "what", ["prepare(parts.NAMES, processes=2)", pytest.param("pass", marks=pytest.mark.slow)]
 )
 def test_six_processes_that_begin_at_once_compile_each_part_once(parts, what):
-    """By `prepare`, or by calls that find nothing prepared."""
+    """Parts are compiled by `prepare`, or by calls without it."""
     output, said = parts.run(MANY.replace("{what}", what))
     assert output == RIGHT
     assert parts.compiled() == ["a", "b", "c"]
@@ -90,8 +90,8 @@ def test_a_part_that_cannot_be_compiled_raises_in_the_parent(parts):
         *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGKILL)),
     ],
 )
-def test_no_worker_outlives_a_parent_that_is_told_to_end(parts, how):
-    """Ctrl-C, a request to end, and a kill: no process and no damaged file is left."""
+def test_no_worker_outlives_a_parent_ended_by_a_signal(parts, how):
+    """SIGINT (Ctrl-C), SIGTERM and SIGKILL leave no process and no damaged file."""
     process = parts.start(MOOD="dawdle")
     wait_until(lambda: len(parts.compilers()) == 2)
     workers = parts.compilers()
@@ -101,7 +101,7 @@ def test_no_worker_outlives_a_parent_that_is_told_to_end(parts, how):
     wait_until(lambda: not any(alive(worker) for worker in workers))
     if how == signal.SIGINT:
         assert said.rstrip().endswith("KeyboardInterrupt")
-        assert said.count("Traceback") == 1  # the workers say nothing
+        assert said.count("Traceback") == 1  # workers print nothing
     assert not parts.files("code")
     assert not parts.files("tmp")
     assert parts.run(processes=1)[0] == RIGHT
