@@ -28,7 +28,7 @@ SUITES = {
 
 MEMORY = {
     "look_around": "--steps 1000000 --arms certainty certainty_recurrent",
-    "stale_race": "--steps 1000000 --arms std std_recurrent",
+    "stale_race": "--steps 1000000 --arms std std_recurrent --seeds 10",
     "outage_dash": "--env control_rate=4.0 --steps 600000 --arms std std_recurrent",
 }
 """Budgets and arms of the comparisons of policies with and without memory, by task."""
