@@ -77,7 +77,7 @@ def main(folder, file):
     folder = Path(folder)
     if (folder / "GT.csv").is_file():
         rows, heading = rtk_flight(folder)
-        print(f"--heading {heading:.3f}")
+        print(f"--heading {np.degrees(heading):.1f}")
     else:
         rows = ardupilot_flight(folder)
     columns = table(rows)

@@ -6,10 +6,13 @@
     quad-gym calibrate flight.csv --vehicle mine-vehicle.toml
 
 The first part of the log is for the search, the rest for validation. The result is a suite
-with the rates, delays and noise of this vehicle, for `replay`, `train` and all other commands.
+with the rates, delays and noise of this vehicle, for `replay`, `train` and all other commands. If
+the result does not describe the validation part, the last lines report it and the exit code is 1.
 """
 
 import math
+import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
 
 SUITE, RESULT = "suite.toml", "calibration.json"
+MISFIT = 1  #: exit code if the result does not describe the validation part of the log
 
 
 @dataclass(frozen=True)
@@ -42,8 +46,8 @@ class CalibrateArgs:
     body: Literal["flu", "frd"] = "flu"
     """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
     vehicle: Path | None = None
-    """file for a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the
-    log"""
+    """write a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the log to
+    this file"""
     output: Path | None = None
     """folder for the results, created if it is missing; if not given, results/calibrate/LOG"""
     overwrite: bool = False
@@ -150,7 +154,8 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     if calibration.notes or calibration.after.problems:
         report.add_bullets([*calibration.after.problems, *calibration.notes])
     with house_style():
-        report.add_figure("numbers", numbers_figure(calibration), "Numbers and intervals")
+        caption = "Positive numbers and their intervals"
+        report.add_figure("numbers", numbers_figure(calibration), caption)
         caption = "Innovations before and after; crosses are rejected"
         report.add_figure("innovations", innovations_figure(calibration), caption)
     return report.write()
@@ -176,6 +181,14 @@ def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -
     )
 
 
+def next_command(args: CalibrateArgs, folder: Path) -> list[str]:
+    """Return the words of a replay of the same log."""
+    words = ["quad-gym", "replay", str(args.log), "--sensors", str(folder / SUITE)]
+    if args.heading is not None:
+        words += ["--heading", f"{args.heading:g}"]
+    return words + ["--course"] * args.course + ["--body", args.body] * (args.body != "flu")
+
+
 def main(args: CalibrateArgs) -> None:
     """Search, validate and write."""
     from quad_gym.analysis.plots import require_matplotlib
@@ -192,6 +205,7 @@ def main(args: CalibrateArgs) -> None:
             if args.vehicle.suffix != ".toml":
                 raise ValueError(f"--vehicle must end with .toml, got {args.vehicle}")
             refuse_overwriting(args.vehicle, args.overwrite)
+            require_writable("--vehicle", args.vehicle.parent)
         require_writable("--output", folder)
         start: dict[str, Any] = {"course": True} if args.course else {}
         if args.heading is not None:
@@ -220,4 +234,6 @@ def main(args: CalibrateArgs) -> None:
     print(f"\nWrote {len(files)} files to {folder}; open {folder / 'report.html'}.")
     if args.vehicle is not None:
         print(fit_body(args, found.suite, start))
-    print(f"Next: quad-gym replay {args.log} --sensors {folder / SUITE}")
+    if found.after.problems:
+        sys.exit(MISFIT)
+    print(f"Next: {shlex.join(next_command(args, folder))}")

@@ -12,6 +12,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.numbers import has
+from quad_gym.estimation.plausibility import implausible
 from quad_gym.estimation.replaying import origin_of
 from quad_gym.estimation.search import Calibrated, NumberSearch
 from quad_gym.estimation.tables import read_log
@@ -26,6 +27,17 @@ in flight."""
 _DRIFT, _DRIFT_TAU = 3.0, 5.0
 """Prior drift of GNSS in a suite without, in standard deviations of its noise, and its correlation
 time [s]: receivers filter their positions."""
+
+
+_AIDS = {
+    "gnss": "GNSS",
+    "camera": "camera",
+    "barometer": "barometer",
+    "magnetometer": "magnetometer",
+    "optical_flow": "optical flow",
+    "range_finder": "range finder",
+}
+"""Sensors in sentences."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +59,16 @@ class Calibration:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on numbers that the log does not determine."""
-        return tuple(
-            f"the log does not determine {n.number.name} ({n.value:.3g}, {n.prior:.3g} before)"
-            for n in self.numbers
-            if not n.determined
+        """Sentences on numbers that the log does not determine, and on sensors that it lacks."""
+        silent = [n for n in self.numbers if not n.determined]
+        found = {n.number.sensor for n in self.numbers}
+        absent = [name for name in _AIDS if getattr(self.suite, name) and name not in found]
+        return (
+            *(
+                f"the log does not determine {n.number.name} ({n.value:.3g}, {n.prior:.3g} before)"
+                for n in silent
+            ),
+            *(f"the log has no {_AIDS[name]}: the suite keeps its own" for name in absent),
         )
 
 
@@ -79,13 +96,16 @@ def calibrate(
         progress: Called with a sentence before each step.
 
     Raises:
-        ValueError: If the log or an argument is invalid, or the heading at the start is unknown.
+        ValueError: If the log or an argument is invalid, units or axes of the log are implausible,
+            or the heading at the start is unknown.
     """
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
     check.number("share", share, least=0.05, most=0.95)
     check.flag("delays", delays)
     whole = read_log(log, body=body)
+    if wrong := list(implausible(whole, body, suite)):
+        raise ValueError(f"a calibration must have a log in SI units: {'; '.join(wrong)}")
     prior = _prior_of(origin_of(whole, suite), whole)
     time = whole.imu.time
     split = float(time[0] + share * (time[-1] - time[0]))

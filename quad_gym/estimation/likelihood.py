@@ -129,10 +129,11 @@ class Likelihood:
                 f"{SETTLING:g} s after the start on, got {counts[0]}: use a longer part of the log "
                 "(share=, --share)"
             )
-        self._logs[0].weights = {
-            name_of(block): 1.0 if name_of(block) in white else counts[1] / counts[0]
-            for block in blocks_of(suite)
-        }
+        names = {name_of(block): block for block in blocks_of(suite)}
+        colored = [block for name, block in names.items() if name not in white]
+        many, few = (each.counted(colored) for each in self._logs)
+        share = few / max(many, 1)
+        self._logs[0].weights = {name: 1.0 if name in white else share for name in names}
 
     def losses(self, suites: Sequence[SensorSuite]) -> Floats:
         """Return the losses of parts in time, (parts, suites), of the log and the thinned one.
@@ -169,6 +170,10 @@ class _LogLosses:
         self._parts = ((received[self.counts] - span[0]) // PART).astype(int)
         self._count = max(int((span[1] - span[0]) // PART) + 1, 1)
         self._valid = self._tape.valid
+
+    def counted(self, blocks: Sequence[int]) -> int:
+        """Return the number of measurements that count, of blocks of innovations."""
+        return int((self.counts & self._valid[:, blocks].any(axis=1)).sum())
 
     def losses(self, suites: Sequence[SensorSuite]) -> Floats:
         """Return the losses of the parts, (parts, suites)."""

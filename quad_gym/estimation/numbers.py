@@ -26,17 +26,20 @@ class Number:
     positive: bool = True  #: False: the number may have either sign
     unit: str = "-"
     step: float = 0.1  #: step of numerical derivatives, in coordinates
+    limit: float = math.inf  #: largest absolute value
 
     @property
     def of_log(self) -> bool:
         """True if the number changes the log before the filter: a delay, or the mounting."""
         return self.field == _MOUNTING or self.sensor == _DELAYS
 
-    @property
-    def least(self) -> float:
-        """Lower bound of the coordinate: a sensor in flight is hardly better than at rest."""
-        bounded = self.noise and self.field != "drift_sigma_I"
-        return _LEAST / self.spread if bounded else -MOST
+    def ends(self, prior: float) -> tuple[float, float]:
+        """Return bounds of the coordinate: a sensor in flight is hardly better than at rest."""
+        if self.positive:
+            bounded = self.noise and self.field != "drift_sigma_I"
+            return _LEAST / self.spread if bounded else -MOST, MOST
+        low, high = (self.coordinate(prior, end) for end in (-self.limit, self.limit))
+        return max(-MOST, low), min(MOST, high)
 
     @property
     def noise(self) -> bool:
@@ -95,7 +98,9 @@ MOST, _LEAST = 3.0, -0.3
 # fmt: off
 NUMBERS = (
     *(
-        Number(sensor=_DELAYS, field=name, spread=0.3, positive=False, unit="s", step=1 / 30)
+        Number(
+            sensor=_DELAYS, field=name, spread=0.3, positive=False, unit="s", step=1 / 30, limit=1.8
+        )
         for name in ("gnss", "camera", "magnetometer", "barometer")
     ),
     *(
@@ -124,7 +129,8 @@ NUMBERS = (
     Number(sensor="magnetometer", field="hard_iron_sigma", spread=_WIDE, unit="T"),
     Number(sensor="magnetometer", field="hard_iron_tau", spread=_NARROW, unit="s"),
     Number(sensor="magnetometer", field="declination", spread=0.3, positive=False, unit="rad"),
-    Number(sensor="magnetometer", field="inclination", spread=0.1, positive=False, unit="rad"),
+    Number(sensor="magnetometer", field="inclination", spread=0.1, positive=False, unit="rad",
+           limit=1.5),
     Number(sensor="magnetometer", field="strength", spread=0.2, unit="T"),
 )
 # fmt: on

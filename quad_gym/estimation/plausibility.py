@@ -63,8 +63,7 @@ class MisfitError(ValueError):
 
 def problems_of(log: Log, body: str, suite: SensorSuite, result: Replay) -> tuple[str, ...]:
     """Return sentences on units and axes of a log, and on a suite that does not fit."""
-    gyro, accel = (log.imu.values[name] for name in ("gyro", "accel"))
-    found = [*_force(accel, body), *_rates(gyro), *_aids(log, suite)]
+    found = [*implausible(log, body, suite)]
     if result.status:
         found.append(f"the filter failed in some cycles ({result.status.name})")
     diverged = float(np.mean(result.diverged))
@@ -76,6 +75,14 @@ def problems_of(log: Log, body: str, suite: SensorSuite, result: Replay) -> tupl
     if not result.measured and result.unused:
         found.append(f"{nothing_in_common(result.unused)}: the estimates are dead reckoning")
     return (*found, *_misfits(result.measured), *_biases(result, suite))
+
+
+def implausible(log: Log, body: str, suite: SensorSuite) -> Iterator[str]:
+    """Sentences on units and axes of a log."""
+    gyro, accel = (log.imu.values[name] for name in ("gyro", "accel"))
+    yield from _force(accel, body)
+    yield from _rates(gyro)
+    yield from _aids(log, suite)
 
 
 def nothing_in_common(unused: tuple[str, ...]) -> str:

@@ -168,9 +168,11 @@ class Player:
         if step <= SAME_TIME or chosen is None:
             return
         if step > max(LONGEST_STEP, self.suite.imu.dt):
+            usual = float(np.median(np.diff(self.imu_times)))
+            cause = "cut the log there" if usual < LONGEST_STEP else "time in ms?"
             raise ValueError(
                 f"samples of the IMU must be at most {LONGEST_STEP:g} s apart, got none from "
-                f"{now:.3f} s to {time:.3f} s: cut the log there"
+                f"{now:.3f} s to {time:.3f} s: {cause}"
             )
         gyro, accel = self.gyros[chosen], self.accels[chosen]
         sample = Sample(gyro, accel, step, gyro if self.gyro is None else self.gyro)

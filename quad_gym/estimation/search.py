@@ -22,7 +22,7 @@ import numpy as np
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log
-from quad_gym.estimation.numbers import MOST, Number, numbers_in
+from quad_gym.estimation.numbers import Number, numbers_in
 from quad_gym.estimation.replaying import replay
 from quad_gym.params.sensors import SensorSuite
 
@@ -42,12 +42,13 @@ _RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are 
 _SHORT = 45.0  #: time of flight that is enough for the first search [s]
 _CLUSTER, _CLUSTERS = 5.0, 20
 """Length of independent parts of a log [s], shorter in short logs; their least number."""
-_INSIGNIFICANT = 1.92  #: log likelihood ratio that one number exceeds by chance in 5 % of logs
+_CLOSE = 2.0  #: rise of the loss with which undetermined numbers move back to their priors
 _WIDEST = math.log(2.0)
-"""Largest logarithm of a standard deviation over the most likely one. It becomes wider by exp(2
-s^2), where s is the standard deviation of its logarithm if the other numbers are known: the root of
-the mean squared variance, as noise that is too small costs more than noise that is too large."""
-_FEWEST_TAILS = 30  #: number of innovations that determines their tails
+"""Largest logarithm of the factor by which a standard deviation exceeds the best fit. The factor is
+exp(2 s^2), where s is the standard deviation of its logarithm if the other numbers are known. Its
+square is then the root mean square of the variance: noise that is too small costs more than noise
+that is too large."""
+_FEWEST = 30  #: number of innovations that describes their tails and correlations
 _COARSE = np.arange(-1.0, 1.01, 0.1)  #: first grid of a delay [s]
 _MARGIN = 0.2  #: time at the end of the log that changes of delays may reach [s]
 _WHITE = {
@@ -58,9 +59,9 @@ _WHITE = {
 }
 """White noise that is inflated where innovations are correlated: their sensor, its axes, and the
 largest factor, which is smaller where the filter estimates a correlated error of the sensor."""
-_SMALL = 0.16
-"""Mean squared innovation over its variance below which noise is not inflated: its lower bound
-makes it large enough then."""
+_SMALL = 0.13
+"""Mean squared innovation over its variance below which noise is not inflated, because the filter
+already assumes much more noise than the innovations have."""
 
 
 class Calibrated(NamedTuple):
@@ -69,7 +70,7 @@ class Calibrated(NamedTuple):
     number: Number
     prior: float
     value: float
-    """as in the suite; of a standard deviation up to twice the most likely one where the log hardly
+    """number in the suite; a standard deviation is up to twice the best fit where the log hardly
     determines it"""
     low: float  #: lower end of its 95 % interval
     high: float
@@ -86,11 +87,12 @@ class NumberSearch:
         self.numbers = numbers_in(prior, log, delays)
         self.kept = np.zeros(len(self.numbers), bool)  #: numbers that keep their priors
         self.values = np.array([number.of(prior) for number in self.numbers])
-        self.low = np.array([number.least for number in self.numbers])
+        ends = [number.ends(number.of(prior)) for number in self.numbers]
+        self.low, self.high = np.array(ends).reshape(-1, 2).T.copy()
         self.of_log = np.array([number.of_log for number in self.numbers])
         period = float(np.median(np.diff(log.imu.time)))
         self.steps = np.diag([number.step_for(period) for number in self.numbers])
-        self.x = np.clip(self._first(), self.low, MOST)
+        self.x = np.clip(self._first(), self.low, self.high)
         self._margin = _MARGIN
         self._known: dict[bytes, Likelihood] = {}
 
@@ -159,6 +161,7 @@ class NumberSearch:
                 self._margin = max(0.0, -float((self.values[k] + _COARSE).min())) + _MARGIN
                 self._known = {}
                 places = self.x[k] + _COARSE / number.spread
+                places = places[(places >= self.low[k]) & (places <= self.high[k])]
                 points = [np.where(np.arange(len(self.x)) == k, x, self.x) for x in places]
                 self.x[k] = _lowest(places, self.total(points))
         little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
@@ -189,11 +192,12 @@ class NumberSearch:
             scores, bends = _derivatives(losses, np.diag(self.steps)[index])
             slope, place = scores.sum(axis=0) + x[index], x[index]
             H = _curvature(scores, bends) + np.eye(len(index))
-            held = ((place <= self.low[index]) & (slope > 0.0)) | ((place >= MOST) & (slope < 0.0))
+            held = (place <= self.low[index]) & (slope > 0.0)
+            held |= (place >= self.high[index]) & (slope < 0.0)
             free, step = np.flatnonzero(~held), np.zeros(len(x))
             step[index[free]] = -np.linalg.solve(H[np.ix_(free, free)], slope[free])
             step /= max(1.0, float(np.abs(step).max()))
-            points = [np.clip(x + share * step, self.low, MOST) for share in shares]
+            points = [np.clip(x + share * step, self.low, self.high) for share in shares]
             totals = self.total(points)
             best = int(np.argmin(totals))
             gain = loss - float(totals[best])
@@ -208,14 +212,14 @@ class NumberSearch:
         scaled = self._describe()
         for k, number in enumerate(self.numbers):
             sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
-            if sensor not in scaled:
+            if len(scaled.get(sensor, ())) <= _FEWEST:
                 continue
             factor = widening(scaled[sensor][:, axes], most)
             if factor == 1.0:
                 continue
             value = factor * number.value(self.values[k], float(self.x[k]))
             wide = number.coordinate(self.values[k], value)
-            self.low[k] = min(max(self.low[k], wide), MOST - 0.1)
+            self.low[k] = min(max(self.low[k], wide), self.high[k] - 0.1)
         self.x = np.maximum(self.x, self.low)
 
     def _describe(self) -> dict[str, Floats]:
@@ -227,12 +231,12 @@ class NumberSearch:
             counts = in_flight(self.log, m.time) & np.isfinite(m.nis)
             counts &= m.time > m.time[0] + SETTLING
             scaled[name] = (m.innovation / m.sigma)[counts]
-            if len(scaled[name]) > _FEWEST_TAILS:
+            if len(scaled[name]) > _FEWEST:
                 self.nu[name] = tails(m.nis[counts], scaled[name].shape[1])
         self.white = {
             name
             for name, values in scaled.items()
-            if len(values) > _FEWEST_TAILS and max(map(correlation_time, values.T)) == 1.0
+            if len(values) > _FEWEST and max(map(correlation_time, values.T)) == 1.0
         }
         self._known = {}
         return scaled
@@ -257,15 +261,17 @@ class NumberSearch:
         H = np.diag(bends)
         H[row, column] = (both - ahead[row] - ahead[column] + total[0]) / (h[row] * h[column])
         H[column, row] = H[row, column]
-        silent = self.kept | (bends <= 0.0)  # at a bound, where the loss has no minimum
+        silent = bends <= 0.0  # at a bound, where the loss has no minimum
         H[silent], H[:, silent], scores[:, silent] = 0.0, 0.0, 0.0
         values, vectors = np.linalg.eigh(H)
         information = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.eye(n)
         length = max(1, round(min(_CLUSTER / PART, len(scores) / _CLUSTERS)))
         sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
+        sums -= sums.mean(axis=0)  # not zero at a bound
         root = np.linalg.solve(information, np.linalg.cholesky(sums.T @ sums + np.eye(n)))
-        sigmas = np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0)
-        alone = np.sqrt((sums**2).sum(axis=0) + 1.0) / (np.maximum(bends, 0.0) + 1.0)
+        sigmas = np.where(self.kept, 1.0, np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0))
+        curved = np.maximum(bends, 0.0)
+        alone = np.sqrt(np.maximum((sums**2).sum(axis=0), curved) + 1.0) / (curved + 1.0)
         reach = float(t.ppf(0.975, len(sums) - 1))
         found, priors = [], self.values.tolist()
         for k, (number, prior) in enumerate(zip(self.numbers, priors, strict=True)):
@@ -277,16 +283,17 @@ class NumberSearch:
         return tuple(found)
 
     def keep_priors(self, found: Sequence[Calibrated]) -> bool:
-        """Move angles, delays and lever arms of which the log says nothing back to their priors.
+        """Move angles, delays and lever arms back to their priors if the loss hardly grows.
 
         The other numbers of the suite are fitted again. Return True if any number moved.
         """
-        loose = [k for k, n in enumerate(found) if not (n.determined or n.number.positive)]
-        priors = [np.where(np.arange(len(self.x)) == k, 0.0, self.x) for k in loose]
-        losses = self.total([self.x, *priors])
-        self.kept[loose] = losses[1:] - losses[0] < _INSIGNIFICANT
+        limit = float(self.total([self.x])[0]) + _CLOSE
+        for k in [k for k, n in enumerate(found) if not (n.determined or n.number.positive)]:
+            moved = np.where(np.arange(len(self.x)) == k, 0.0, self.x)
+            if float(self.total([moved])[0]) < limit:
+                self.x, self.kept[k] = moved, True
         if self.kept.any():
-            self.x, self._known = np.where(self.kept, 0.0, self.x), {}
+            self._known = {}
             self.x, _ = self._descend(self.x, ~(self.of_log | self.kept), _FEW_STEPS)
         return bool(self.kept.any())
 
@@ -332,7 +339,8 @@ def _lowest(places: Floats, losses: Floats) -> float:
 def widening(scaled: Floats, most: float) -> float:
     """Return the factor of noise whose innovations (n, axes), over their sigmas, are correlated.
 
-    It is sqrt(tau), at most `most`, and as large as leaves the innovations at `_SMALL` at least.
+    It is sqrt(tau), but at most `most`, and not so large that the mean squared innovation over its
+    variance falls below `_SMALL`.
     """
     tau = max(correlation_time(column) for column in scaled.T)
     return math.sqrt(max(1.0, min(tau, most**2, float((scaled**2).mean()) / _SMALL)))

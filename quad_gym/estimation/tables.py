@@ -79,6 +79,8 @@ def _csv_columns(path: Path) -> dict[str, Floats]:
             raise ValueError(f"{path.name} must be a table of text (.csv)") from None
     if len(set(names)) < len(names):
         raise ValueError(f"{path.name} must have distinct column names, got {names}")
+    if not cells:
+        raise ValueError(f"{path.name} must have at least one row of numbers, got none")
     table = np.empty((len(cells), len(names)))
     for k, row in enumerate(cells):
         if len(row) != len(names):

@@ -73,20 +73,24 @@ def validate(
 def _held_out(
     log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
 ) -> tuple[Any, Any, Any]:
-    """Return errors, mean NIS and ratios of the first fixes after gaps."""
+    """Return errors, mean NIS and ratios of the first fixes after a second without."""
     gnss = log.gnss
-    if gnss is None or suite.gnss is None:
+    if gnss is None or suite.gnss is None or len(gnss) < 3:
         return None, None, None
     errors, sigmas, nis = [], [], []
+    period = float(np.median(np.diff(gnss.time)))
     for first in range(0, _PERIOD, _GAP):
         since = gnss.time - split - first
-        kept = gnss.rows((since < 0.0) | (since % _PERIOD >= _GAP))
-        result = replay(replace(log, gnss=kept), sensors=suite, start=start, reported_noise=False)
+        kept = np.flatnonzero((since < 0.0) | (since % _PERIOD >= _GAP))
+        skipped = np.diff(kept, prepend=kept[:1]) > 1
+        gaps = np.diff(gnss.time[kept], prepend=gnss.time[kept[:1]])
+        skipped &= gaps <= _GAP + 2.0 * period  # longer ones are outages of the log
+        some = replace(log, gnss=gnss.rows(kept))
+        result = replay(some, sensors=suite, start=start, reported_noise=False)
         fixes = result.measured.get("gnss_position")
         if fixes is None:
             return None, None, None
-        gaps = np.diff(fixes.time, prepend=fixes.time[0]) > 0.9 * _GAP
-        after = gaps & (fixes.time > split) & np.isfinite(fixes.nis)
+        after = np.isin(fixes.received, gnss.received[kept[skipped]]) & np.isfinite(fixes.nis)
         errors.append(fixes.innovation[after])
         sigmas.append(fixes.sigma[after])
         nis.append(fixes.nis[after])

@@ -128,6 +128,8 @@ def _commands(motors: Mapping[str, ArrayLike]) -> tuple[Floats, Floats]:
     voltages = check.array("motors['voltages']", motors["voltages"], (len(times), 4))
     if len(times) < 2 or not (np.diff(times) > 0.0).all():
         raise ValueError("motors['time'] must increase")
+    if not np.ptp(voltages, axis=0).any():
+        raise ValueError("motors['voltages'] must change in flight, got constant ones")
     return times, voltages
 
 

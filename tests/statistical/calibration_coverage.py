@@ -50,7 +50,7 @@ def drawn(prior, log, rng):
     for number in numbers_in(prior, log, delays=True):
         before = number.of(prior)
         if number.positive:
-            low = -0.2 if number.least > -1.0 else -1.0
+            low = -0.2 if number.ends(before)[0] > -1.0 else -1.0
             value = before * math.exp(rng.uniform(low, max(0.3, min(0.8 * number.spread, 1.5))))
             if number.field == "strength":
                 value = before * math.exp(0.1 * rng.normal())

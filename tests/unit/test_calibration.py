@@ -1,6 +1,8 @@
 """Calibration finds the numbers with which a log was simulated."""
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +11,12 @@ import pytest
 import quad_gym
 from quad_gym import estimation
 from quad_gym.estimation import calibrate, read_log, replay
-from quad_gym.estimation.likelihood import NU, SETTLING, Likelihood, in_flight, tails
+from quad_gym.estimation.likelihood import NU, SETTLING, SPACING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
-from quad_gym.estimation.numbers import NUMBERS
+from quad_gym.estimation.numbers import MOST, NUMBERS
 from quad_gym.estimation.search import NumberSearch, correlation_time, widening
+from quad_gym.estimation.validation import validate
+from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import euler_to_dcm
 from tests.console_commands import run
@@ -154,10 +158,11 @@ def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
     names = ["time", *(f"{name}_{axis}" for name in ("gyro", "accel") for axis in "xyz")]
     rows = [f"0.{k},0,0,0,0,0,9.8" for k in range(3)]
     (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *rows]))
-    options = ["--no-delays", "--output", "mine", "--vehicle", "body.toml"]
+    options = ["--no-delays", "--output", "mine", "--vehicle", "body.toml", "--body", "frd"]
     ended = run("calibrate", "flight.csv", *options, where=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert "Wrote no body.toml: the log has no motor voltages" in ended.stdout
+    assert "Next: quad-gym replay flight.csv --sensors mine/suite.toml --body frd" in ended.stdout
     assert asked == [(Path("flight.csv"), "consumer", False)]
     summary = json.loads((tmp_path / "mine/calibration.json").read_text())
     without = ("camera", "log_delays.camera", "gnss.baseline", "gnss.primary_antenna")
@@ -196,13 +201,13 @@ def test_noise_is_widened_for_correlated_innovations_that_are_not_small():
         values[k] = 0.5 * values[k - 1] + np.sqrt(0.75) * rng.normal()
     assert widening(values, 2.0) == pytest.approx(np.sqrt(3.0), rel=0.1)
     assert widening(values, 1.5) == 1.5
-    assert widening(0.5 * values, 2.0) == pytest.approx(np.sqrt(0.25 / 0.16), rel=0.05)
+    assert widening(0.5 * values, 2.0) == pytest.approx(np.sqrt(0.25 / 0.13), rel=0.05)
     assert widening(0.2 * values, 2.0) == 1.0
     assert widening(rng.normal(size=(40_000, 3)), 2.0) == 1.0
 
 
 def test_loss_counts_every_measurement_of_sensors_with_white_innovations():
-    """The loss grows by the terms of Student's t, less those that count in any case."""
+    """The loss grows by the terms of Student's t, minus one in each half second."""
     late = Recorded(flown(TRUE, 16.0), TRUE, lost=0.0, jitter=0.0).table()
     order = np.argsort(late["time"], kind="stable")
     log = read_log({name: c[order] for name, c in late.items()} | {"received": late["time"][order]})
@@ -220,11 +225,69 @@ def test_loss_counts_every_measurement_of_sensors_with_white_innovations():
         some = 0.5 * (NU[0] + d) * np.log1p(nis / (NU[0] - 2.0)) + np.log(sigma).sum(axis=1)
         return float(some[rows].sum())
 
-    shares = [
-        (loss(name) - loss()) / terms(measured[name]) for name in ("barometer", "magnetometer")
-    ]
-    assert 0.5 < shares[0] < 0.99
-    assert shares[1] == pytest.approx(shares[0], rel=1e-3)
+    for name in ("barometer", "magnetometer"):
+        others = set(measured) - {name}
+        share = (loss(*measured) - loss(*others)) / terms(measured[name])
+        every = math.ceil(SPACING * getattr(suite, name).rate)  # of which one counts in any case
+        assert share == pytest.approx(1.0 - 1.0 / every, abs=0.03)
+
+
+def test_log_in_other_units_is_refused_before_the_search(table):
+    in_g = {n: c / 9.8 if n.startswith("accel") else c for n, c in table.items()}
+    with pytest.raises(ValueError, match=r"SI units: mean specific force .* in g\?"):
+        calibrate(in_g, sensors="consumer")
+
+
+def test_suite_that_does_not_describe_the_validation_part_exits_with_one(
+    found, tmp_path, monkeypatch
+):
+    after = replace(found.after, problems=("GNSS velocity: mean NIS 53, 3 expected",))
+    wrong = replace(found, after=after, suite=found.suite.replace(range_finder=RangeFinderParams()))
+    monkeypatch.setattr(estimation, "calibrate", lambda log, **options: wrong)
+    (tmp_path / "flight 1.csv").write_text("time")
+    ended = run("calibrate", "flight 1.csv", "--output", "mine", where=tmp_path)
+    assert ended.returncode == 1
+    assert "GNSS velocity: mean NIS 53, 3 expected." in ended.stdout
+    assert "The log has no range finder: the suite keeps its own." in ended.stdout
+    assert "Next" not in ended.stdout
+    assert (tmp_path / "mine/suite.toml").is_file()
+
+
+def test_outage_of_a_log_is_no_second_left_out(table):
+    """Predictions over three seconds of outage do not count in any of the five replays."""
+    gone = (table["time"] > 16.0) & (table["time"] < 19.0)
+    outage = {name: c.copy() for name, c in table.items()}
+    for name in outage:
+        if name.startswith("gnss"):
+            outage[name][gone] = np.nan
+    suite = TRUE.replace(log_delays=TRUE.log_delays.replace(gnss=DELAY), log_rotation=MOUNTING)
+    whole, short = (
+        validate(read_log(each), suite, {}, 12.0).held_out_error for each in (table, outage)
+    )
+    assert short[0] < 1.3 * whole[0]
+
+
+def test_sensor_that_stops_early_does_not_stop_a_calibration(table, found):
+    stopped = {name: c.copy() for name, c in table.items()}
+    for name in stopped:
+        if name.startswith("magnet"):
+            stopped[name][table["time"] > 4.5] = np.nan
+    search = NumberSearch(read_log(stopped), found.prior, {}, delays=True)
+    before = search.low.copy()
+    search.adapt()
+    noise = [n.name for n in search.numbers].index("magnetometer.noise_sigma")
+    assert search.low[noise] == before[noise]
+    assert "magnetometer" not in search.white
+
+
+def test_search_near_the_largest_delay_and_inclination_stays_below_it():
+    for number in NUMBERS:
+        if math.isfinite(number.limit):
+            prior = 0.9 * number.limit
+            low, high = number.ends(prior)
+            assert number.value(prior, high) == pytest.approx(number.limit)
+            assert number.value(prior, low) == pytest.approx(prior + number.spread * low)
+            assert low == -MOST
 
 
 def test_vehicle_at_rest_is_not_in_flight():
