@@ -117,7 +117,10 @@ def _columns(given: Mapping[Any, Any]) -> dict[str, Floats]:
             found.update({n: array[:, i].astype(np.float64) for i, n in enumerate(names)})
         else:
             if name not in known and _pixel_of(name) is None:
-                check.keywords([name], sorted(known), "logs")
+                raise ValueError(
+                    f"columns of a log must be {', '.join(sorted(known))} or pixels, got {name}: "
+                    "remove it"
+                )
             found[name] = check.array(f"column {name}", array, (None,), allow_nan=True)
     lengths = {len(column) for column in found.values()}
     if len(lengths) > 1:

@@ -252,7 +252,7 @@ def small(**changes):
         ({"gyro": np.zeros((4, 2))}, "gyro must have shape"),
         ({"accel": np.full((4, 3), np.inf)}, "accel must be finite"),
         ({"accel": np.full((4, 3), np.nan)}, "at least two IMU samples"),
-        ({"gyros": np.zeros(4)}, "gyros is not a keyword of logs"),
+        ({"gyros": np.zeros(4)}, "columns of a log must be .*, got gyros: remove it"),
         ({"gnss": np.zeros((4, 3))}, "must have one of gnss, gnss_enu"),
         ({"gnss_enu": None}, "must have a GNSS position to start from"),
         ({"gnss_enu": None, "gnss_east": np.zeros(4)}, "must have a column gnss_north with"),
