@@ -308,7 +308,8 @@ def test_missing_or_invalid_files_are_refused(tmp_path):
         ("time,gyro_x\n0.0\n", "2 cells in each row, got 1 in row 1"),
         ("time,gyro_x\n0.0,x\n", "must hold numbers"),
         ("time,time\n0.0,1.0\n", "must have distinct column names"),
-        ("", "must have a column time"),
+        ("", "must have at least one row of numbers"),
+        ("time,gyro_x\n", "must have at least one row of numbers"),
     ):
         file.write_text(text)
         with pytest.raises(ValueError, match=message):
