@@ -12,12 +12,17 @@ the result does not describe the validation part, the last lines report it and t
 
 import math
 import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from quad_gym.commands.options import LogFile, SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.options import (
+    MISFIT,
+    LogFile,
+    SuiteName,
+    refuse_overwriting,
+    usage_errors,
+)
 
 if TYPE_CHECKING:
     from quad_gym.estimation.calibration import Calibration
@@ -25,7 +30,6 @@ if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
 
 SUITE, RESULT = "suite.toml", "calibration.json"
-MISFIT = 1  #: exit code if the result does not describe the validation part of the log
 
 
 @dataclass(frozen=True)
@@ -235,5 +239,5 @@ def main(args: CalibrateArgs) -> None:
     if args.vehicle is not None:
         print(fit_body(args, found.suite, start))
     if found.after.problems:
-        sys.exit(MISFIT)
+        raise SystemExit(MISFIT)
     print(f"Next: {shlex.join(next_command(args, folder))}")

@@ -28,6 +28,7 @@ from quad_gym.params.suites import ALL_SUITES, SUITES
 _Args = TypeVar("_Args")
 
 USAGE_ERROR = 2  #: exit code of a program that was called with invalid options
+MISFIT = 1  #: exit code if a suite does not describe a log, or the filter diverged or failed
 
 _REGISTRY = ConstructorRegistry()
 

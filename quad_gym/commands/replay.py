@@ -19,7 +19,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from quad_gym.commands.options import LogFile, SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.options import (
+    MISFIT,
+    LogFile,
+    SuiteName,
+    refuse_overwriting,
+    usage_errors,
+)
 
 if TYPE_CHECKING:
     from quad_gym.estimation import Replay
@@ -27,8 +33,6 @@ if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
 
 RESULT = "replay.json"
-MISFIT = 1
-"""Exit code if the suite does not describe the log, or the filter has diverged or failed."""
 
 
 @dataclass(frozen=True)

@@ -27,17 +27,7 @@ in flight."""
 _DRIFT, _DRIFT_TAU = 3.0, 5.0
 """Prior drift of GNSS in a suite without, in standard deviations of its noise, and its correlation
 time [s]: receivers filter their positions."""
-
-
-_AIDS = {
-    "gnss": "GNSS",
-    "camera": "camera",
-    "barometer": "barometer",
-    "magnetometer": "magnetometer",
-    "optical_flow": "optical flow",
-    "range_finder": "range finder",
-}
-"""Sensors in sentences."""
+_AIDS = ("gnss", "camera", "barometer", "magnetometer", "optical_flow", "range_finder")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +58,10 @@ class Calibration:
                 f"the log does not determine {n.number.name} ({n.value:.3g}, {n.prior:.3g} before)"
                 for n in silent
             ),
-            *(f"the log has no {_AIDS[name]}: the suite keeps its own" for name in absent),
+            *(
+                f"the log has no {name.replace('_', ' ')}: the suite keeps its own"
+                for name in absent
+            ),
         )
 
 

@@ -78,7 +78,7 @@ def problems_of(log: Log, body: str, suite: SensorSuite, result: Replay) -> tupl
 
 
 def implausible(log: Log, body: str, suite: SensorSuite) -> Iterator[str]:
-    """Sentences on units and axes of a log."""
+    """Yield sentences on units and axes of a log."""
     gyro, accel = (log.imu.values[name] for name in ("gyro", "accel"))
     yield from _force(accel, body)
     yield from _rates(gyro)

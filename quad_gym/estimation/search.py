@@ -288,7 +288,9 @@ class NumberSearch:
         The other numbers of the suite are fitted again. Return True if any number moved.
         """
         limit = float(self.total([self.x])[0]) + _CLOSE
-        for k in [k for k, n in enumerate(found) if not (n.determined or n.number.positive)]:
+        for k, each in enumerate(found):
+            if each.determined or each.number.positive:
+                continue
             moved = np.where(np.arange(len(self.x)) == k, 0.0, self.x)
             if float(self.total([moved])[0]) < limit:
                 self.x, self.kept[k] = moved, True

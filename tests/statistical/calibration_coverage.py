@@ -42,6 +42,22 @@ SPREADS = {
     **{"gnss": 0.2, "magnetometer": 0.08, "barometer": 0.1, "camera": 0.05},
 }
 """Standard deviations of numbers of either sign; the means are the suite's numbers."""
+GROUPS = {
+    "log_delays": "delays",
+    "log_rotation": "mounting of the IMU",
+    "imu.accel_noise": "noise of the IMU",
+    "imu.gyro_noise": "noise of the IMU",
+    "imu": "bias spreads of the IMU",
+    "gnss.drift": "GNSS: drift",
+    "gnss.primary": "lever arm",
+    "gnss": "GNSS: white noise",
+    "barometer": "barometer",
+    "camera": "camera",
+    "magnetometer.noise": "magnetometer: noise, hard iron",
+    "magnetometer.hard": "magnetometer: noise, hard iron",
+    "magnetometer": "magnetometer: field",
+}
+"""Rows of the table by the beginnings of names."""
 
 
 def drawn(prior, log, rng):
@@ -124,6 +140,11 @@ def run(index):
     return {"suite": SUITES[index % len(SUITES)], "numbers": numbers, "nis": nis, "seconds": took}
 
 
+def group_of(name):
+    """Return the row of a number in the table."""
+    return next(row for start, row in GROUPS.items() if name.startswith(start))
+
+
 def table_of(folder):
     """Return the lines of a table of all results."""
     results = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
@@ -131,21 +152,28 @@ def table_of(folder):
     nis = {}
     for result in results:
         for name, (true, _, _, low, high, determined) in result["numbers"].items():
-            inside.setdefault(name, []).append((low <= true <= high, determined))
+            inside.setdefault(group_of(name), []).append((low <= true <= high, determined))
         for name, (count, d, mean) in result["nis"].items():
             nis.setdefault(name, []).append((count * d, mean))
-    lines += ["| number | within | logs | determined |", "|---|---:|---:|---:|"]
+    lines += ["| numbers | in their intervals | of the determined ones |", "|---|---:|---:|"]
+    inside["all"] = [row for rows in inside.values() for row in rows]
     for name, rows in inside.items():
-        within, known = np.array(rows, float).sum(axis=0)
-        lines.append(f"| {name} | {within:.0f} | {len(rows)} | {known:.0f} |")
-    every = np.array([row for rows in inside.values() for row in rows])
-    for label, rows in (("all", every), ("determined", every[every[:, 1]])):
-        lines.append(f"| {label} | {100.0 * rows[:, 0].mean():.0f} % of {len(rows)} | | |")
+        within, known = np.array(rows).T
+        lines.append(
+            f"| {name} | {within.sum()} of {len(rows)} | {within[known].sum()} of {known.sum()} |"
+        )
     lines += ["", "| sensor | NIS / degrees of freedom | range over logs |", "|---|---:|---:|"]
     for name, rows in nis.items():
         freedoms, means = np.array(rows).T
         pooled = (freedoms * means).sum() / freedoms.sum()
         lines.append(f"| {name} | {pooled:.2f} | {means.min():.2f} to {means.max():.2f} |")
+    alone = [np.array(list(result["nis"].values())) for result in results]
+    means = np.array([np.average(nis[:, 2], weights=nis[:, 0] * nis[:, 1]) for nis in alone])
+    lines += [
+        "",
+        f"All sensors of a log: {means.min():.2f} to {means.max():.2f}; "
+        f"{(np.abs(means - 1.0) <= 0.1).sum()} logs within 10 % of one.",
+    ]
     took = [result["seconds"] for result in results]
     lines += [
         "",
