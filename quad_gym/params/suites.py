@@ -10,10 +10,10 @@
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
 | `crazyflie` | none: starts from a mark; optical flow, range finder | none | as `indoor` |
-| `flown` | as `consumer`, with noise and delay of a real flight | none | noise of that flight |
+| `field` | as `consumer`, with noise and delay of a real flight | none | noise of that flight |
 
 `one_wall` and `stale` were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in
-one direction only, and a filter that ignores time stamps. They, `crazyflie` and `flown` are not
+one direction only, and a filter that ignores time stamps. They, `crazyflie` and `field` are not
 among SUITES, on which results for all tasks are based.
 
 The IMU runs at 200 Hz, so cameras of 30 Hz run at 25 Hz, which divides that rate. Except in `lab`,
@@ -267,7 +267,7 @@ CRAZYFLIE = SensorSuite(
 """A small vehicle indoors that navigates by optical flow and a range finder: nothing observes its
 heading and horizontal position, whose errors grow."""
 
-FLOWN = _changed(
+FIELD = _changed(
     CONSUMER,
     # noise that explains real flights of a small quadrotor: "quad122a" of P. Riseborough's
     # InertialNav (BSD-3-Clause), an ArduPilot vehicle with a disturbed compass, replayed with the
@@ -296,7 +296,7 @@ FLOWN = _changed(
 _ALL = {
     **{"standard": STANDARD, "lab": SensorSuite(), "rtk": RTK, "consumer": CONSUMER},
     **{"indoor": INDOOR, "one_wall": ONE_WALL, "stale": STALE, "crazyflie": CRAZYFLIE},
-    "flown": FLOWN,
+    "field": FIELD,
 }
 ALL_SUITES = tuple(_ALL)  #: names of all sensor suites
 SUITES = ALL_SUITES[:5]  #: names of the sensor suites for all tasks

@@ -71,7 +71,7 @@ def test_suites_section_gives_ratios_to_standard_suite_and_to_few_flights(tmp_pa
     options = ("--only", "suites", "--n-envs", "8", "--threads", "2")
     rows = run(tmp_path, *options)["sections"]["suites"]
     of = {(row["suite"], row["flights"], row["threads"]): row["seconds"] for row in rows}
-    names = {"standard", "rtk", "consumer", "indoor", "flown", "crazyflie", "truth"}
+    names = {"standard", "rtk", "consumer", "indoor", "field", "crazyflie", "truth"}
     assert of.keys() == {
         (name, n, threads) for name in names for n in (8, 512) for threads in (1, 2)
     }

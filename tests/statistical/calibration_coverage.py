@@ -26,13 +26,13 @@ from tests.logged_flights import Recorded, flown
 SUITES = (
     "consumer",
     "rtk",
-    "flown",
+    "field",
     "stale",
     "indoor",
     "standard",
     "consumer",
     "rtk",
-    "flown",
+    "field",
     "lab",
 )
 SECONDS = {"standard": 26.0, "lab": 26.0}

@@ -55,15 +55,15 @@ def fit_texts(validation):
 
 
 def hobby_vehicle(folder):
-    """Print the results of `consumer`, the calibrated suite and `flown` for the flight."""
+    """Print the results of `consumer`, the calibrated suite and `field` for the flight."""
     log = read_log(real_flights.table(real_flights.ardupilot_flight(folder)))
     found = calibrate(log, sensors="consumer")
     for number in found.numbers:
         interval = f"[{number.low:.3g}, {number.high:.3g}]" if number.determined else "-"
         print(f"  {number.number.name} {number.value:.3g} {interval}")
     first = float(log.imu.time[0]) + SETTLED
-    flown = validate(log, quad_gym.sensor_suite("flown"), None, first)
-    for name, seen in (("consumer", found.before), ("calibrated", found.after), ("flown", flown)):
+    field = validate(log, quad_gym.sensor_suite("field"), None, first)
+    for name, seen in (("consumer", found.before), ("calibrated", found.after), ("field", field)):
         angles = attitude_errors(seen.replay, folder)
         print(name, *fit_texts(seen), f"roll, pitch, yaw {angles.round(2)} deg", sep="; ")
 

@@ -42,14 +42,14 @@ def replayed(flight, sensors):
 
 def test_flown_suite_describes_the_ardupilot_flight():
     """The magnetic field is local, far from the default one; time stamps are 0.2 s late."""
-    result = replayed("ardupilot", "flown")
+    result = replayed("ardupilot", "field")
     assert result.problems == ()
     assert result.sensors.magnetometer.inclination == pytest.approx(np.radians(-68.6), abs=0.01)
     rejected = [m.rejected.mean() for m in result.measured.values()]
     assert max(rejected) < 0.02
 
 
-@pytest.mark.parametrize(("flight", "suite"), [c for c in CASES if c != ("ardupilot", "flown")])
+@pytest.mark.parametrize(("flight", "suite"), [c for c in CASES if c != ("ardupilot", "field")])
 def test_command_with_a_wrong_suite_ends_with_a_sentence_and_exit_code_1(flight, suite, tmp_path):
     (tmp_path / "flight.csv").write_bytes(gzip.decompress(packed(flight).read_bytes()))
     start = [f"--{name}={math.degrees(angle)}" for name, angle in STARTS[flight].items()]

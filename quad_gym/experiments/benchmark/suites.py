@@ -11,7 +11,7 @@ from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.stages import hovering
 from quad_gym.records import Source
 
-SUITES = ("standard", "rtk", "consumer", "indoor", "flown", "crazyflie")
+SUITES = ("standard", "rtk", "consumer", "indoor", "field", "crazyflie")
 TRUTH = "truth"  #: row of flights without sensors and filter
 MANY = 64  #: ratio of the large to the small number of flights
 MOST_BUSY = 4
