@@ -8,12 +8,11 @@ from quad_gym.estimation.filters import (
     UnscentedKalmanFilter,
 )
 from quad_gym.estimation.first_fix import FARTHEST_FIX, FirstFix
-from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Stream
+from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Stream, read_log
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Measured, Replay, Smoothed
 from quad_gym.estimation.search import Calibrated
 from quad_gym.estimation.smoothing import smooth
-from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.vehicle_fit import FittedNumber, FittedVehicle, fit_vehicle
 from quad_gym.estimation.wahba import solve_wahba
 

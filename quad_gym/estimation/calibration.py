@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.logs import Log
+from quad_gym.estimation.logs import Log, read_log
 from quad_gym.estimation.numbers import has
 from quad_gym.estimation.plausibility import implausible
 from quad_gym.estimation.replaying import origin_of
 from quad_gym.estimation.search import Calibrated, NumberSearch
-from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.validation import Validation, validate
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite

@@ -9,13 +9,12 @@ import numpy as np
 
 from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
-from quad_gym.estimation.logs import Log
+from quad_gym.estimation.logs import Log, read_log
 from quad_gym.estimation.own import Estimator
 from quad_gym.estimation.own_player import OwnPlayer
 from quad_gym.estimation.plausibility import problems_of
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.results import Replay
-from quad_gym.estimation.tables import read_log
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite

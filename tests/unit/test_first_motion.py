@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation.first_motion import with_wide_start
-from quad_gym.estimation.tables import read_log
+from quad_gym.estimation.logs import read_log
 
 RTK = quad_gym.sensor_suite("rtk")
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats, Log, Stream
+from quad_gym.estimation.logs.log import Floats, Log, Stream
 
 _FROM_X_UP = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats, Log, Stream, ecef_of, reading
+from quad_gym.estimation.logs.log import Floats, Log, Stream, ecef_of, reading
 
 GNSS_DELAY = 0.11  #: delay of receivers if the log does not contain it [s]: PX4's default
 

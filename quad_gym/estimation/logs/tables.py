@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.euroc import is_euroc, read_euroc
-from quad_gym.estimation.logs import LOG_COLUMNS, Floats, Log, Stream, ecef_of
+from quad_gym.estimation.logs.euroc import is_euroc, read_euroc
+from quad_gym.estimation.logs.log import LOG_COLUMNS, Floats, Log, Stream, ecef_of
 from quad_gym.params import checks as check
 
 _FORMS = {
@@ -26,8 +26,8 @@ def read_log(log: Any, *, body: str = "flu") -> Log:
         log: A pandas DataFrame, a mapping of columns, or a path: of a comma-separated table with a
             line of names (.csv), of a log of PX4 (.ulg) or ArduPilot (.bin), of a bag of ROS 1
             (.bag) or ROS 2 (a folder), or of a folder in the format of EuRoC; see the modules
-            `px4`, `ardupilot`, `ros` and `euroc` of `quad_gym.estimation`. A mapping may hold the
-            numbers of a quantity together, such as `"gyro"` (n, 3). See LOG_COLUMNS.
+            of `quad_gym.estimation.logs`. A mapping may hold the numbers of a quantity together,
+            such as `"gyro"` (n, 3). See LOG_COLUMNS.
         body: Axes of IMU and magnetometer in a table: "flu" (x forward, y left, z up), or "frd" (x
             forward, y right, z down).
 
@@ -43,15 +43,15 @@ def read_log(log: Any, *, body: str = "flu") -> Log:
     if isinstance(log, (str, Path)):
         path = Path(log)
         if path.suffix.lower() in (".ulg", ".ulog"):
-            from quad_gym.estimation.px4 import read_ulog
+            from quad_gym.estimation.logs.px4 import read_ulog
 
             return read_ulog(path)
         if path.suffix.lower() == ".bin":
-            from quad_gym.estimation.ardupilot import read_bin
+            from quad_gym.estimation.logs.ardupilot import read_bin
 
             return read_bin(path)
         if path.suffix.lower() == ".bag" or (path / "metadata.yaml").is_file():
-            from quad_gym.estimation.ros import read_bag
+            from quad_gym.estimation.logs.ros import read_bag
 
             return read_bag(path)
         if is_euroc(path):

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats, Log, Stream, ecef_of, reading
+from quad_gym.estimation.logs.log import Floats, Log, Stream, ecef_of, reading
 
 _OTHER_CLOCK = 10.0  #: [s]
 _SEA_LEVEL, _SCALE, _EXPONENT = 101325.0, 44330.77, 0.190263
