@@ -77,51 +77,27 @@ class MlpPolicy:
 
     def save(self, file: str | Path | IO[bytes]) -> None:
         """Write the policy and its record to one file."""
-        self.save_with(file, FORMAT, {})
-
-    def save_with(self, file: str | Path | IO[bytes], kind: str, more: Mapping[str, Any]) -> None:
-        """Write the layers, their record and more arrays, as a file of some format."""
         layers: dict[str, Any] = {f"W{i}": W for i, W in enumerate(self.weights)}
         layers |= {f"b{i}": b for i, b in enumerate(self.biases)}
-        about = {"format": kind, "activations": self.activations, "record": self.record}
-        np.savez_compressed(file, about=np.array(json.dumps(about)), **layers, **more)
+        about = {"format": FORMAT, "activations": self.activations, "record": self.record}
+        np.savez_compressed(file, about=np.array(json.dumps(about)), **layers)
 
     @classmethod
     def load(cls, file: str | Path) -> "MlpPolicy":
         """Read a policy; a ValueError if the file does not exist or is no policy in this format."""
-        about, arrays = contents(file)
-        require_format(file, about, FORMAT)
-        return cls.of(about, arrays)
-
-    @classmethod
-    def of(cls, about: Mapping[str, Any], arrays: Mapping[str, Any]) -> "MlpPolicy":
-        """Make a policy from the contents of a file."""
-        count = range(len(about["activations"]))
-        weights, biases = ([arrays[f"{name}{i}"] for i in count] for name in "Wb")
+        file = Path(file)
+        if not file.exists():
+            raise ValueError(f"there is no policy {file}")
+        try:
+            with np.load(file, allow_pickle=False) as stored:
+                about: dict[str, Any] = json.loads(str(stored["about"]))
+                count = range(len(about["activations"]))
+                weights, biases = ([stored[f"{name}{i}"] for i in count] for name in "Wb")
+        except (zipfile.BadZipFile, OSError, EOFError, KeyError, ValueError, TypeError):
+            raise ValueError(f"{file} is not a policy, or is damaged") from None
+        if about.get("format") != FORMAT:
+            raise ValueError(f"{file} must be a {FORMAT!r}, got {about.get('format')!r}")
         return cls(weights, biases, about["activations"], about["record"])
-
-
-def contents(file: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Description and arrays of a file of a policy; a ValueError if it is damaged, or missing."""
-    file = Path(file)
-    if not file.exists():
-        raise ValueError(f"there is no policy {file}")
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            about: dict[str, Any] = json.loads(str(stored["about"]))
-            names = [name for name in stored.files if name[:1] in "WbUc" and name[1:].isdecimal()]
-            arrays = {name: stored[name] for name in (*names, *"WbUc") if name in stored.files}
-            for i in range(len(about["activations"])):
-                arrays[f"W{i}"], arrays[f"b{i}"]
-    except (zipfile.BadZipFile, OSError, EOFError, KeyError, ValueError, TypeError):
-        raise ValueError(f"{file} is not a policy, or is damaged") from None
-    return about, arrays
-
-
-def require_format(file: str | Path, about: Mapping[str, Any], kind: str) -> None:
-    """Raise a ValueError if a file has another format."""
-    if about.get("format") != kind:
-        raise ValueError(f"{file} must be a {kind!r}, got {about.get('format')!r}")
 
 
 def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:

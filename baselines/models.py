@@ -59,8 +59,6 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
         "activation_fn": activations[chosen.activation],
         **chosen.policy,
     }
-    if chosen.algorithm == "recurrent_ppo":
-        policy["lstm_hidden_size"] = chosen.memory_units
     kind = "MultiInput" if isinstance(env.observation_space, gymnasium.spaces.Dict) else "Mlp"
     kind += "LstmPolicy" if chosen.algorithm == "recurrent_ppo" else "Policy"
     try:

@@ -10,7 +10,6 @@ from typing import Any
 
 import gymnasium
 
-from baselines.gru import load_network
 from baselines.mlp import MlpPolicy
 from baselines.pd import REACH_OF_GAPS, PDPolicy
 from baselines.planning import PlanningPolicy
@@ -86,7 +85,7 @@ def load_policy(name: str, env: Any) -> Policy:
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
     if file.suffix == ".npz":
-        policy: Any = load_network(file)
+        policy: Any = MlpPolicy.load(file)
         _require_agreement(file, policy.record, env)
         _require_size(file, policy.inputs, env)
         trained_on = policy.record.get("plan", {}).get("env_id", task_of(env))

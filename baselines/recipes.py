@@ -19,8 +19,6 @@ ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
 environments."""
 
-COMPILED = ("ppo", "recurrent_ppo")  #: algorithms of the compiled engine
-
 ACTIVATIONS = ("relu", "tanh", "elu")  #: activations between the layers of a policy
 
 
@@ -56,9 +54,6 @@ class Recipe(Checked):
     """Number of units in each hidden layer of the policy"""
     critic_layers: Annotated[tuple[int, ...], _sizes] = (64, 64)
     """Number of units in each hidden layer of the value function, or of each critic"""
-    memory_units: Annotated[int, check.whole] = 64
-    """Number of units of the memory of recurrent PPO, for the policy and for the value function: a
-    GRU with the compiled engine, an LSTM with SB3-Contrib"""
     activation: Annotated[str, partial(check.choice, choices=ACTIVATIONS)] = "relu"
     """Activation of hidden layers, one of `ACTIVATIONS`"""
     reward_scale: check.Positive = 0.2
@@ -156,9 +151,12 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
 def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
     """Included recipe for a task, by its id, and one of `ALGORITHMS`.
 
-    Recurrent PPO has the recipe of PPO, so that they differ in the memory only.
+    Recurrent PPO has the recipe of PPO, and an LSTM of 64 units.
     """
     check.choice("env_id", env_id, tuple(IDS))
     check.choice("algorithm", algorithm, ALGORITHMS)
-    base = "ppo" if algorithm == "recurrent_ppo" else algorithm
-    return _SPECIAL.get((env_id, base), _DEFAULTS[base]).replace(algorithm=algorithm)
+    if algorithm == "recurrent_ppo":
+        base = recipe(env_id)
+        memory = {**base.policy, "lstm_hidden_size": 64}
+        return base.replace(algorithm=algorithm, policy=memory)
+    return _SPECIAL.get((env_id, algorithm), _DEFAULTS[algorithm])

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines.gru import GruPolicy, load_network
 from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint, locked
 from baselines.mlp import MlpPolicy, mlp_of
 from baselines.plans import Plan, description
@@ -164,7 +163,7 @@ def export(training: TrainingResult, file: Path) -> None:
     """
     record = json.loads((training.folder / "training.json").read_text(encoding="utf-8"))
     if training.best_policy.suffix == ".npz":
-        policy: MlpPolicy | GruPolicy = load_network(training.best_policy)
+        policy = MlpPolicy.load(training.best_policy)
         policy.record = record
     else:
         from baselines.models import algorithm_class

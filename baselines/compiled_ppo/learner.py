@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo.kernels import common as kernels
+from baselines.compiled_ppo import kernels
 from baselines.compiled_ppo.networks import Networks
 from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
 
@@ -14,17 +14,14 @@ PARTS = 2 * MIN_BLOCKS_PER_THREAD
 are added in order, so that the sum does not depend on the number of threads."""
 
 Samples = tuple[NDArray[Any], ...]
-"""Observations (n, o), actions (n, a), their log probabilities (n,) in the rollout, returns (n,) as
-targets of the critic; True if an episode ended with the step (n,), and the memories at the
-beginnings of all sequences, (sequences in time, 2, flights, units). Samples are ordered by time,
-then by flight."""
+"""Observations (n, o), actions (n, a), their log probabilities (n,) in the rollout, returns (n,)
+as targets of the critic."""
 
 
 class Learner:
     """Training on samples with advantages (n,), as in `stable_baselines3.PPO.train`.
 
-    Each `learn` reads samples and advantages again; `parameters` are a recipe's complete ones. The
-    units of a minibatch are samples, or the sequences of networks with memory.
+    Each `learn` reads samples and advantages again; `parameters` are a recipe's complete ones.
     """
 
     def __init__(
@@ -37,12 +34,8 @@ class Learner:
     ) -> None:
         self.networks, self.parameters, self._advantages = networks, parameters, advantages
         self.moments, self.steps = np.zeros((2, networks.params.size), np.float32), 0
-        length, flights = networks.sequence_length, samples[5].shape[2]
-        # of each unit the first sample, and the distances of its samples from this one
-        self._first = np.arange(len(advantages)).reshape(-1, length, flights)[:, 0].reshape(-1)
-        self._later = flights * np.arange(length)
-        self.span, self.order = np.zeros(2, np.int64), self._first.copy()
-        self.normalized = np.zeros((len(self.order), length), np.float32)
+        self.span, self.order = np.zeros(2, np.int64), np.arange(len(advantages))
+        self.normalized = np.zeros(len(advantages), np.float32)
         self.gradients = np.zeros((PARTS, networks.params.size), np.float32)
         self.sums = np.zeros((PARTS, len(kernels.SUMS)))
         minibatch, rooms = (self.span, self.order, self.normalized), networks.rooms(PARTS)
@@ -52,7 +45,7 @@ class Learner:
         def differentiate(
             board: NDArray[np.int64], number: int, command: int, serving: bool
         ) -> bool:
-            return bool(networks.differentiate(board, number, command, serving, *fixed))
+            return bool(kernels.differentiate(board, number, command, serving, *fixed))
 
         self._differentiate = differentiate
         self._crew = Crew(differentiate, PARTS, threads)
@@ -69,18 +62,17 @@ class Learner:
 
         Raises a FloatingPointError if a gradient is not finite because the training has diverged.
         """
-        count, length = self.normalized.shape
-        size = max(1, self.parameters["batch_size"] // length)
+        count, size = len(self.order), self.parameters["batch_size"]
         for _ in range(self.parameters["n_epochs"]):
             sums = np.zeros(len(kernels.SUMS))
-            self.order[:] = self._first[rng.permutation(count)]
-            self.normalized[:] = self._advantages[self.order[:, np.newaxis] + self._later]
+            self.order[:] = rng.permutation(count)
+            self.normalized[:] = self._advantages[self.order]
             for first in range(0, count, size):
                 if self.parameters["normalize_advantage"]:
-                    _normalize(self.normalized[first : first + size].reshape(-1))
+                    _normalize(self.normalized[first : first + size])
                 sums += self.differentiate(first, min(first + size, count))
                 self.descend(rate)
-        return dict(zip(kernels.SUMS, (sums / (count * length)).tolist(), strict=True))
+        return dict(zip(kernels.SUMS, (sums / count).tolist(), strict=True))
 
     def differentiate(self, first: int, last: int) -> NDArray[np.float64]:
         """Compute the gradient of a minibatch of this epoch, in parts; returns its `SUMS`."""

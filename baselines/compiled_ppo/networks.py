@@ -1,6 +1,5 @@
-"""Common part of both kinds of networks: actor and critic in one vector of parameters."""
+"""Actor and critic of PPO: multilayer perceptrons in one vector of parameters."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -8,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo.kernels.common import INPUTS, OUTPUTS, STORED, TILE, flip
-from baselines.gru import GruPolicy
+from baselines.compiled_ppo import kernels
+from baselines.compiled_ppo.kernels import INPUTS, OUTPUTS, STORED, TILE
 from baselines.mlp import MlpPolicy
 from baselines.recipes import ACTIVATIONS, Recipe
 
@@ -17,31 +16,35 @@ Floats = NDArray[np.float32]
 Table = NDArray[np.int64]
 
 
-class Networks(ABC):
+class Networks:
     """Gaussian policy and value function of a recipe, for observations and actions of some lengths.
 
-    The vector of parameters contains the logarithms of the policy's standard deviations directly
-    after the actor's layers. Initial values of layers are drawn as in Stable-Baselines3.
+    `critic_only` inputs, at the end of an observation, are for the critic only. The vector of
+    parameters contains the logarithms of the policy's standard deviations directly after the
+    actor's layers. Initial values of layers are drawn as in Stable-Baselines3.
     """
 
-    differentiate: Any
-    """Entry made by `kernels.differentiating`"""
-    memory_units = 0
-    """Number of units that remember, of the actor, and of the critic"""
-    sequence_length = 1
-    """Number of successive samples of a flight that are learned together"""
-    model: tuple[Any, ...]
-    """`net`, and the tables of actor and critic"""
-
-    def __init__(self, recipe: Recipe, count: int, tables: Sequence[Table], actor: Table) -> None:
-        """Allocate `count` parameters of networks with some tables, one of which is the actor's."""
-        self.actor, self._tables, self._activation = actor, tables, recipe.activation
-        self.params = np.zeros(count, np.float32)
-        number = ACTIVATIONS.index(recipe.activation)
-        self.net = (self.params, np.zeros_like(self.params), number)
-        first = int(actor[-1, STORED - 1] + actor[-1, OUTPUTS])
-        self.log_std = self.params[first : first + int(actor[-1, OUTPUTS])]
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        recipe: Recipe,
+        rng: np.random.Generator,
+        critic_only: int = 0,
+    ) -> None:
+        self.actor, first = _table_of((inputs - critic_only, *recipe.layers, outputs), 0)
+        self.critic, count = _table_of((inputs, *recipe.critic_layers, 1), first + outputs)
+        self._activation, self.params = recipe.activation, np.zeros(count, np.float32)
+        self.net = (self.params, np.zeros_like(self.params), ACTIVATIONS.index(recipe.activation))
+        self.model = (self.net, self.actor, self.critic)
+        self.log_std = self.params[first : first + outputs]
         self.log_std[:] = recipe.policy.get("log_std_init", 0.0)
+        for table, last_gain in ((self.actor, 0.01), (self.critic, 1.0)):
+            for W, _ in self.layers(table)[:-1]:
+                W[:] = np.sqrt(2.0) * orthogonal(W.shape, rng)
+            W, _ = self.layers(table)[-1]
+            W[:] = last_gain * orthogonal(W.shape, rng)
+        self._room = tuple(room[0] for room in self.rooms(1)[:2])
 
     def layers(self, table: Table) -> list[tuple[Any, Any]]:
         """Weights (outputs, inputs) and biases (outputs,) of each layer, as views."""
@@ -52,62 +55,44 @@ class Networks(ABC):
 
     def flip(self) -> None:
         """Update the flipped weights from the parameters."""
-        for table in self._tables:
-            flip(self.net, table)
+        for table in (self.actor, self.critic):
+            kernels.flip(self.net, table)
 
-    @abstractmethod
     def rooms(self, parts: int) -> tuple[Floats, ...]:
-        """Work memory for `differentiate`."""
+        """Work memory of `kernels.differentiate`: inputs, outputs, deltas, and a matrix product."""
+        tables = (self.actor, self.critic)
+        sizes = (
+            (2, TILE, int(self.critic[0, INPUTS])),
+            (TILE * max(int(t[-1, STORED] + t[-1, OUTPUTS]) for t in tables),),
+            (2, TILE * max(int(t[:, OUTPUTS].max()) for t in tables)),
+            (max(int((t[:, INPUTS] * t[:, OUTPUTS]).max()) for t in tables),),
+        )
+        return tuple(np.zeros((parts, *size), np.float32) for size in sizes)
 
-    @abstractmethod
-    def evaluate(self, x: Floats, memory: Floats) -> tuple[Floats, Floats, Floats]:
-        """Evaluate both networks on observations x (n, o) and their memories (2, n, units).
+    def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
+        """Means of actions (n, a) and values (n,) for observations x (n, o)."""
+        means = np.empty((len(x), len(self.log_std)), np.float32)
+        values = np.empty(len(x), np.float32)
+        kernels.evaluate(x, self.model, *self._room, means, values)
+        return means, values
 
-        Returns means of actions (n, a), values (n,), and the next memories.
-        """
-
-    @abstractmethod
-    def policy(self, record: Mapping[str, Any]) -> MlpPolicy | GruPolicy:
+    def policy(self, record: Mapping[str, Any]) -> MlpPolicy:
         """Copy the actor to a policy that requires only NumPy."""
-
-    def _perceptron(self, record: Mapping[str, Any]) -> MlpPolicy:
-        """Copy the actor's layers."""
         layers = self.layers(self.actor)
         activations = [self._activation] * (len(layers) - 1) + ["none"]
         return MlpPolicy(
             [W.copy() for W, _ in layers], [b.copy() for _, b in layers], activations, record
         )
 
-    def _draw_layers(self, table: Table, last_gain: float, rng: np.random.Generator) -> None:
-        """Draw initial weights of layers."""
-        for W, _ in self.layers(table)[:-1]:
-            W[:] = np.sqrt(2.0) * orthogonal(W.shape, rng)
-        W, _ = self.layers(table)[-1]
-        W[:] = last_gain * orthogonal(W.shape, rng)
 
-
-def table_of(sizes: Sequence[int], first: int) -> tuple[Table, int]:
+def _table_of(sizes: Sequence[int], first: int) -> tuple[Table, int]:
     """Table of a network whose parameters begin at `first`, and the end of its parameters."""
-    return table_of_maps(list(pairwise(sizes)), first)
-
-
-def table_of_maps(maps: Sequence[tuple[int, int]], first: int) -> tuple[Table, int]:
-    """Table of linear maps (inputs, outputs), and the end of their parameters."""
     rows, stored = [], 0
-    for inputs, outputs in maps:
+    for inputs, outputs in pairwise(sizes):
         rows.append((inputs, outputs, first, first + inputs * outputs, stored))
         first += (inputs + 1) * outputs
         stored += outputs
     return np.array(rows, np.int64), first
-
-
-def layer_rooms(tables: Sequence[Table], product: int = 0) -> tuple[tuple[int, ...], ...]:
-    """Sizes of the work memory of layers: outputs, deltas, and a product of `product` or more."""
-    return (
-        (TILE * max(int(t[-1, STORED] + t[-1, OUTPUTS]) for t in tables),),
-        (2, TILE * max(int(t[:, OUTPUTS].max()) for t in tables)),
-        (max(product, *(int((t[:, INPUTS] * t[:, OUTPUTS]).max()) for t in tables)),),
-    )
 
 
 def orthogonal(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[Any]:

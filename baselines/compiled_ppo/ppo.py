@@ -10,13 +10,10 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo.feed_forward import FeedForward
 from baselines.compiled_ppo.learner import Learner
 from baselines.compiled_ppo.networks import Networks
-from baselines.compiled_ppo.recurrent import Recurrent
-from baselines.gru import GruPolicy
 from baselines.mlp import MlpPolicy
-from baselines.recipes import COMPILED, Recipe
+from baselines.recipes import Recipe
 from quad_gym.batch.threads import resolve_threads
 from quad_gym.params import checks as check
 
@@ -36,10 +33,6 @@ PARAMETERS = {
 """Parameters of a recipe, with the defaults of Stable-Baselines3, which lacks `critic_only`: the
 number of values at the end of an observation for the critic only, such as the true state."""
 
-SEQUENCE_LENGTH = 32
-"""Default of `sequence_length`, a parameter of recurrent PPO that divides `n_steps`: the number of
-steps through which the gradient goes back. It is at most `n_steps`."""
-
 _EPISODES = 100  #: number of latest episodes whose mean return is `training_return`
 
 
@@ -47,8 +40,7 @@ class CompiledPPO:
     """PPO (Schulman et al. 2017) as in `stable_baselines3.PPO`, except for the random numbers.
 
     The same seed gives bitwise the same policy, with any number of threads. With `critic_only`
-    among the recipe's parameters, the policy takes observations without this part. With the
-    algorithm "recurrent_ppo", actor and critic have memory, see `recurrent`.
+    among the recipe's parameters, the policy takes observations without this part.
 
     Args:
         env: Vector environment with vectors as observations, vectors in [-1, 1] as actions, and
@@ -77,12 +69,8 @@ class CompiledPPO:
         self.losses: dict[str, float] = {}
         self._env_seed = seed if env_seed is None else env_seed
         self._rng = np.random.default_rng(seed)
-        about = (inputs, outputs, recipe, self._rng, self.parameters["critic_only"])
-        self.networks: Networks
-        if recipe.algorithm == "ppo":
-            self.networks = FeedForward(*about)
-        else:
-            self.networks = Recurrent(*about, self.parameters["sequence_length"])
+        critic_only = self.parameters["critic_only"]
+        self.networks = Networks(inputs, outputs, recipe, self._rng, critic_only)
         shape = (self.parameters["n_steps"], env.num_envs)
         self._observations = np.zeros((*shape, inputs), np.float32)
         self._actions = np.zeros((*shape, outputs), np.float32)
@@ -90,13 +78,10 @@ class CompiledPPO:
             np.zeros(shape, np.float32) for _ in range(5)
         )
         self._ended = np.zeros(shape, bool)
-        self._memory = np.zeros((2, env.num_envs, self.networks.memory_units), np.float32)
-        sequences = shape[0] // self.networks.sequence_length
-        self._begun = np.zeros((sequences, *self._memory.shape), np.float32)
-        samples = (self._observations, self._actions, self._log_probs, self._targets, self._ended)
+        samples = (self._observations, self._actions, self._log_probs, self._targets)
         self.learner = Learner(
             self.networks,
-            (*(a.reshape(-1, *a.shape[2:]) for a in samples), self._begun),
+            tuple(a.reshape(-1, *a.shape[2:]) for a in samples),
             self._advantages.reshape(-1),
             self.parameters,
             resolve_threads(threads),
@@ -134,7 +119,7 @@ class CompiledPPO:
         """Begin the first episodes, and compile all kernels."""
         if self._seen is None:
             self._seen = _floats(self.env.reset(seed=self._env_seed)[0])
-        self.networks.evaluate(self._seen[:1], self._memory[:, :1])
+        self.networks.evaluate(self._seen[:1])
         self.learner.prepare()
 
     def predict(
@@ -143,16 +128,13 @@ class CompiledPPO:
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], Any]:
-        """Return deterministic actions for observations (..., n), with or without critic's part.
-
-        The second result is the state of a policy with memory, otherwise None.
-        """
+    ) -> tuple[NDArray[np.float32], None]:
+        """Return deterministic actions for observations (..., n), with or without critic's part."""
         policy, x = self.policy(), np.asarray(observation, np.float32)
         whole = x.shape[-1:] == self._observations.shape[-1:]
         return policy.predict(x[..., : policy.inputs] if whole else x, state, episode_start)
 
-    def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy | GruPolicy:
+    def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy:
         """Copy the present policy to one that requires only NumPy."""
         return self.networks.policy(record or {"interface": {}})
 
@@ -180,13 +162,11 @@ class CompiledPPO:
         actions = self._actions.shape[-1]
         log_std = self.networks.log_std
         spread, peak = np.exp(log_std), log_std.sum() + 0.5 * actions * np.log(2.0 * np.pi)
-        evaluate, length = self.networks.evaluate, self.networks.sequence_length
+        evaluate = self.networks.evaluate
         assert self._seen is not None
         for t in range(len(self._actions)):
             self._observations[t] = self._seen
-            if t % length == 0:
-                self._begun[t // length] = self._memory
-            means, self._values[t], self._memory = evaluate(self._seen, self._memory)
+            means, self._values[t] = evaluate(self._seen)
             noise = self._rng.standard_normal(means.shape, np.float32)
             self._actions[t] = means + spread * noise
             self._log_probs[t] = -0.5 * (noise * noise).sum(axis=1) - peak
@@ -199,21 +179,20 @@ class CompiledPPO:
             cut = np.flatnonzero(truncated & ~terminated)
             if cut.size:  # bootstrap truncated episodes with the critic's value
                 last = _floats(np.stack(info["final_obs"][cut]))
-                value = evaluate(last, self._memory[:, cut])[1]
+                value = evaluate(last)[1]
                 self._rewards[t, cut] += self.parameters["gamma"] * value
-            self._memory[:, self._ended[t]] = 0.0
             self._returns += reward
             self._finished += self._returns[self._ended[t]].tolist()
             self._returns[self._ended[t]] = 0.0
         self.num_timesteps += self._ended.size
         discounts = (self.parameters["gamma"], self.parameters["gae_lambda"])
-        ahead = evaluate(self._seen, self._memory)[1]
+        ahead = evaluate(self._seen)[1]
         rollout = (self._rewards, self._values, self._ended, ahead)
         self._advantages[:] = advantages(*rollout, *discounts)
         self._targets[:] = self._advantages + self._values
 
 
-_STATE = ("env", "num_timesteps", "losses", "_rng", "_seen", "_memory", "_returns", "_finished")
+_STATE = ("env", "num_timesteps", "losses", "_rng", "_seen", "_returns", "_finished")
 """Attributes of the state of a training, in addition to the networks."""
 
 
@@ -267,23 +246,12 @@ def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
 
 def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:
     """Check a recipe for a number of inputs; return its parameters with defaults."""
-    check.choice("algorithm of the compiled engine", recipe.algorithm, COMPILED)
-    known: dict[str, Any] = dict(PARAMETERS)
-    if recipe.algorithm == "recurrent_ppo":
-        known["sequence_length"] = None
-    check.keywords(recipe.parameters, tuple(known), "the compiled PPO")
+    check.choice("algorithm of the compiled engine", recipe.algorithm, ("ppo",))
+    check.keywords(recipe.parameters, tuple(PARAMETERS), "the compiled PPO")
     check.keywords(recipe.policy, ("log_std_init",), "the policy of the compiled PPO")
-    found = {**known, **recipe.parameters}
+    found: dict[str, Any] = {**PARAMETERS, **recipe.parameters}
     for name in ("n_steps", "batch_size", "n_epochs"):
         found[name] = check.whole(name, found[name])
-    if "sequence_length" in known:
-        given = found["sequence_length"]
-        length = min(SEQUENCE_LENGTH, found["n_steps"]) if given is None else given
-        found["sequence_length"] = check.whole("sequence_length", length)
-        if found["n_steps"] % length:
-            raise ValueError(
-                f"sequence_length must divide n_steps = {found['n_steps']}, got {length}"
-            )
     for name in ("gamma", "gae_lambda"):
         check.number(name, found[name], least=0.0, most=1.0)
     for name in ("clip_range", "max_grad_norm"):

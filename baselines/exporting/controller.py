@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.exporting.actions import ActionField, action_fields
-from baselines.gru import GruPolicy, load_network
 from baselines.mlp import MlpPolicy, mlp_of
 from baselines.policies import load_policy, pretrained_file
 from quad_gym.envs import keywords_of
@@ -27,7 +26,7 @@ _AGREEMENT = 1e-4
 class Controller:
     """Network with descriptions of its observations and actions."""
 
-    policy: MlpPolicy | GruPolicy
+    policy: MlpPolicy
     source: str
     """Name or file of the policy"""
     env_id: str
@@ -46,28 +45,13 @@ class Controller:
         low, high = layout_bounds(self.table)
         return low.astype(np.float32), high.astype(np.float32)
 
-    @property
-    def gru(self) -> GruPolicy | None:
-        """The policy if it has memory; otherwise None."""
-        return self.policy if isinstance(self.policy, GruPolicy) else None
-
-    @property
-    def layers(self) -> MlpPolicy:
-        """Layers, which receive the observation, and the memory if there is one."""
-        return self.policy.layers if isinstance(self.policy, GruPolicy) else self.policy
-
     def act(self, observations: Any) -> NDArray[np.float32]:
         """Return the actions (..., 4) in [-1, 1] that an exported controller must return.
 
-        Observations (..., n), described by `table`, are clipped to bounds. A policy with memory
-        acts as in the first step of an episode.
+        Observations (..., n), described by `table`, are clipped to bounds.
         """
-        return self.step(observations, None)[0]
-
-    def step(self, observations: Any, memory: Any) -> tuple[NDArray[np.float32], Any]:
-        """Return the actions as `act`, and the next memory, for a memory (..., units) or None."""
         within = np.clip(np.asarray(observations, np.float32), *self.bounds)
-        return self.policy.predict(within, memory)
+        return self.policy.predict(within)[0]
 
     def samples(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Draw observations (count, n) for comparing controllers.
@@ -92,9 +76,8 @@ def controller_of(
         keywords: Keywords of the environment; None: from the training record.
 
     Raises:
-        ValueError: If the policy does not exist, is neither a multilayer perceptron nor a recurrent
-            policy of the compiled engine, has no training record while `env_id` is None, or does
-            not fit the environment.
+        ValueError: If the policy does not exist, is no multilayer perceptron, has no training
+            record while `env_id` is None, or does not fit the environment.
         ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
     """
     if policy == "pd" or policy.startswith("pd:"):
@@ -111,7 +94,7 @@ def controller_of(
         raise ValueError(f"policy must be pretrained, or a .npz or .zip file, got {policy!r}")
     record: dict[str, Any] = {}  # in a .npz, or next to a .zip
     if file.suffix == ".npz":
-        record = load_network(file).record
+        record = MlpPolicy.load(file).record
     elif (stored := file.parent / "training.json").exists():
         record = json.loads(stored.read_text(encoding="utf-8"))
     plan = record.get("plan", {})
@@ -132,7 +115,7 @@ def controller_of(
         batch = flights.batch
         params = params_record(batch.vehicle, batch.sensors, action_params=batch.action_params)[0]
         controller = Controller(
-            policy=found if isinstance(found, MlpPolicy | GruPolicy) else mlp_of(found, record),
+            policy=found if isinstance(found, MlpPolicy) else mlp_of(found, record),
             source=policy if policy == "pretrained" else file.name,
             env_id=env_id,
             keywords=dict(keywords),

@@ -40,8 +40,6 @@ def policy_values(controller: Controller) -> dict[str, Any]:
             "policy must have observation='estimate' and layout='relative' to be exported with a "
             f"filter, got an observation of {', '.join(unknown or names)}"
         )
-    if controller.gru is not None:
-        raise ValueError("policy must have no memory to be exported with a filter")
     network = re.sub(r"\b([Wb]\d+|low|high|dot)\b", r"qgi_\1", c_source(controller, "qg_policy"))
     fields = "\n    ".join(_FIELDS[name] for name in names)
     return {**descriptions(controller), "POLICY": True, "FIELDS": fields, "NETWORK": network}

@@ -8,7 +8,6 @@ import numpy as np
 
 import quad_gym
 from baselines.exporting.controller import Controller
-from baselines.gru import GruPolicy
 from quad_gym.params import checks as check
 
 OPSET = 17  #: version of the operator set, old enough for runtimes on companion computers
@@ -24,8 +23,7 @@ _ACTIVATIONS = {"relu": "Relu", "tanh": "Tanh", "elu": "Elu"}
 def onnx_model(controller: Controller) -> Any:
     """Convert a controller to an `onnx.ModelProto`, from `observation` (batch, n) to `action`.
 
-    A recurrent policy also has the input `memory` (batch, units), zeros at the start of a flight,
-    and the output `next_memory`. The metadata describe observation and action, as JSON.
+    The metadata describe observation and action, as JSON.
     """
     onnx = check.package("onnx", "ONNX", "export")
     from onnx import TensorProto, helper, numpy_helper
@@ -37,24 +35,7 @@ def onnx_model(controller: Controller) -> Any:
         helper.make_node("Min", ["above", "high"], ["x0"]),
     ]
     sizes_in, sizes_out = {"observation": controller.policy.inputs}, {"action": 4}
-    if (gru := controller.gru) is not None:
-        sizes_in["memory"] = sizes_out["next_memory"] = gru.units
-        constants |= _gru_constants(gru)
-        nodes[1] = helper.make_node("Min", ["above", "high"], ["within"])
-        nodes += [
-            helper.make_node("Unsqueeze", ["within", "time"], ["sequence"]),
-            helper.make_node("Unsqueeze", ["memory", "time"], ["before"]),
-            helper.make_node(
-                "GRU",
-                ["sequence", "W", "U", "biases", "", "before"],
-                ["", "after"],
-                hidden_size=gru.units,
-                linear_before_reset=1,
-            ),
-            helper.make_node("Squeeze", ["after", "time"], ["next_memory"]),
-            helper.make_node("Concat", ["within", "next_memory"], ["x0"], axis=1),
-        ]
-    policy = controller.layers
+    policy = controller.policy
     layers = zip(policy.weights, policy.biases, policy.activations, strict=True)
     for k, (W, b, activation) in enumerate(layers):
         constants |= {f"W{k}": W, f"b{k}": b}
@@ -99,29 +80,12 @@ def save_onnx(controller: Controller, file: Path) -> float:
     runtime = check.package("onnxruntime", "ONNX", "export")
     session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
     seen = controller.samples(1000, np.random.default_rng(0))
-    given, wanted = {"observation": seen}, [controller.act(seen)]
-    if controller.gru is not None:
-        shape = (len(seen), controller.gru.units)
-        given["memory"] = np.random.default_rng(1).uniform(-1.0, 1.0, shape).astype(np.float32)
-        wanted = list(controller.step(seen, given["memory"]))
-    found = session.run(None, given)
-    error = max(float(np.abs(a - b).max()) for a, b in zip(found, wanted, strict=True))
+    (found,) = session.run(None, {"observation": seen})
+    error = float(np.abs(found - controller.act(seen)).max())
     if not error <= AGREEMENT:
         raise RuntimeError(f"the ONNX model's actions differ from the policy's by {error:.1e}")
     file.write_bytes(content)
     return error
-
-
-def _gru_constants(gru: GruPolicy) -> dict[str, Any]:
-    """Constants of the operator GRU, whose gates have the order update, reset, candidate."""
-    k = gru.units
-    order = np.r_[k : 2 * k, :k, 2 * k : 3 * k]
-    biases = np.concatenate([gru.b[order], gru.c[order]])
-    return {
-        "time": np.array([0]),
-        **{"W": gru.W[np.newaxis, order], "U": gru.U[np.newaxis, order]},
-        "biases": biases[np.newaxis],
-    }
 
 
 def _metadata(controller: Controller) -> dict[str, Any]:

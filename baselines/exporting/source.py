@@ -32,12 +32,11 @@ def c_source(controller: Controller, name: str) -> str:
     """Generate C99 code of a controller that requires only the math library.
 
     It has no static state and allocates no memory; arithmetic is single precision, as on processors
-    of autopilots. `name` of the function must be a C identifier. A recurrent policy has a structure
-    with its state, and functions `name_reset` and `name_step`.
+    of autopilots. `name` of the function must be a C identifier.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a C identifier, got {name!r}")
-    policy, (low, high) = controller.layers, controller.bounds
+    policy, (low, high) = controller.policy, controller.bounds
     arrays: dict[str, NDArray[np.float32]] = {}
     layers = ""
     for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
@@ -48,12 +47,8 @@ def c_source(controller: Controller, name: str) -> str:
         layers += f"        out[i] = {_ACTIVATIONS[policy.activations[k]]};\n    }}\n"
         if k + 1 < len(policy.weights):
             layers += f"    for (i = 0; i < {outputs}; i++)\n        in[i] = out[i];\n"
-    units = 0
-    if (gru := controller.gru) is not None:
-        units = gru.units
-        arrays |= {"W": gru.W, "b": gru.b, "U": gru.U, "c": gru.c}
     arrays |= {"low": low, "high": high}
-    widest = max(units, *(len(b) for b in policy.biases))
+    widest = max(len(b) for b in policy.biases)
     values = {
         **descriptions(controller),
         "NAME": name,
@@ -61,9 +56,6 @@ def c_source(controller: Controller, name: str) -> str:
         "LAYERS": layers,
         "LONGEST": max(widest, policy.inputs),
         "WIDEST": widest,
-        "UNITS": units,
-        "MEMORY": units > 0,
-        "PLAIN": units == 0,
     }
     return filled("controller.c", values)
 

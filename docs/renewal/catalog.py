@@ -201,17 +201,6 @@ CATALOG = {
             texts=texts.study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),
             figures=texts.film_and_figures("outage_dash", "pace"),
         ),
-        *(
-            Result(
-                name=f"memory_{task}",
-                commands=[f"study {task} --output OUT --first-episode 100000 {options}"],
-                flights=(golden,),
-                texts=texts.memory(f"memory_{task}"),
-            )
-            for (task, options), golden in zip(
-                texts.MEMORY.items(), ("LookAround", "StaleRace", "OutageDash"), strict=True
-            )
-        ),
         Result(
             name="sb3_defaults",
             commands=[_DEFAULTS.format(t, s) for t in ("Hover", "Circle") for s in range(3)],

@@ -25,14 +25,6 @@ SUITES = {
 }
 """Options of the rows of the table of consistency, by label."""
 
-
-MEMORY = {
-    "look_around": "--steps 1000000 --arms certainty certainty_recurrent",
-    "stale_race": "--steps 1000000 --arms std std_recurrent --seeds 10",
-    "outage_dash": "--env control_rate=4.0 --steps 600000 --arms std std_recurrent",
-}
-"""Budgets and arms of the comparisons of policies with and without memory, by task."""
-
 HEADINGS = {
     "return": "return",
     "success": "success",
@@ -266,18 +258,6 @@ def flown(estimators: Sequence[str]) -> Texts:
                 cells[name].append(f"{crashed} of {case['episodes']:.0f}")
         heads = ["filter", *(f"{task}, {who}" for task in FLOWN for who in ("PD", "included"))]
         return {"filters_flown": table(heads, [[name, *row] for name, row in cells.items()])}
-
-    return texts
-
-
-def memory(name: str) -> Texts:
-    """Arms with and without memory, and the verdict."""
-
-    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
-        summary = _read(folder / "0/summary.json")
-        verdict = next(each for each in summary["conclusions"] if each.startswith("Memory"))
-        rows = study_rows(summary, "trained on", (), ("return", "success", "crashed"))
-        return {name: f"{rows}\n{verdict}\n"}
 
     return texts
 

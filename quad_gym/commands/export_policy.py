@@ -94,11 +94,8 @@ def export(args: ExportPolicyArgs, file: Path) -> str:
         return f"Its actions in onnxruntime differ from the policy's by at most {error:.1g}."
     name = function_name(file)
     file.write_text(c_source(controller, name), encoding="utf-8")
-    call = f"{name}(observation, action)"
-    if controller.gru is not None:
-        call = f"{name}_reset(state) before a flight, and {name}_step(state, observation, action)"
     return (
-        f"Call {call} {controller.control_rate:g} times per second; "
+        f"Call {name}(observation, action) {controller.control_rate:g} times per second; "
         "the comment at the top of the file explains both arguments."
     )
 

@@ -87,9 +87,8 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     plan = Plan(environment=environment, recipe=chosen, **values)
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
-    exportable = args.engine == "compiled" or args.algorithm != "recurrent_ppo"
-    if args.export is not None and not exportable:
-        raise ValueError("--export of recurrent_ppo needs --engine compiled")
+    if args.export is not None and args.algorithm == "recurrent_ppo":
+        raise ValueError("--export is not possible for a policy with memory (recurrent_ppo)")
     task = IDS[args.env_id]
     name = f"compiled_{args.algorithm}" if args.engine == "compiled" else args.algorithm
     folder = args.output or Path("results/train") / task / f"{name}_seed_{args.seed}"
@@ -136,5 +135,5 @@ def main(args: TrainArgs) -> None:
         print(f"Wrote {args.export}.")
     policy = f"--policy {done.best_policy}{options.flying_options(plan.environment)}"
     print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")
-    if plan.engine == "compiled" or plan.recipe.algorithm != "recurrent_ppo":
+    if plan.recipe.algorithm != "recurrent_ppo":
         print(f"Export it: quad-gym export policy {done.best_policy} --to c")

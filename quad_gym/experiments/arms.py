@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from baselines.recipes import ALGORITHMS, COMPILED, ReadOnly
+from baselines.recipes import ALGORITHMS, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
@@ -44,8 +44,8 @@ class Arm(Checked, kw_only=False):
     """Keywords that override both in training, but not in the selection of the best policy, such as
     another reward"""
     algorithm: Annotated[str, partial(check.choice, choices=ALGORITHMS)] = "ppo"
-    """Algorithm, one of `baselines.recipes.ALGORITHMS`; PPO and recurrent PPO are trained with the
-    compiled engine, the others with Stable-Baselines3"""
+    """Algorithm, one of `baselines.recipes.ALGORITHMS`; PPO is trained with the compiled engine,
+    others are with Stable-Baselines3"""
     parameters: ReadOnly = field(default_factory=dict)
     """Parameters of the algorithm that override the recipe's"""
 
@@ -68,7 +68,7 @@ class Arm(Checked, kw_only=False):
     @property
     def engine(self) -> str:
         """Training engine of the arm, one of `baselines.plans.ENGINES`."""
-        return "compiled" if self.algorithm in COMPILED else "sb3"
+        return "compiled" if self.algorithm == "ppo" else "sb3"
 
 
 def _task(name: str, module: str = "arm_tasks") -> dict[str, str]:
@@ -126,21 +126,6 @@ ARMS = (
         learning=_task("WithStdCertaintyRewardForCritic", "arm_critics"),
         parameters={"critic_only": 15},
     ),
-    # rewarded for certainty like `certainty` and `std_certainty`, so that they differ only in the
-    # information available to the policy
-    Arm(
-        "certainty_recurrent",
-        "estimate, memory, reward for certainty",
-        learning=_task("CertaintyReward"),
-        algorithm="recurrent_ppo",
-    ),
-    Arm(
-        "std_certainty_recurrent",
-        "estimate + standard deviation, memory, reward for certainty",
-        environment=_WITH_STD,
-        learning=_task("WithStdCertaintyReward"),
-        algorithm="recurrent_ppo",
-    ),
 )
 """Arms of `QuadGym/LookAround-v0`."""
 
@@ -158,12 +143,6 @@ STALE_RACE = (
     Arm("truth", "truth", training=_TRUTH),
     Arm("std", "estimate + 15 standard deviations", environment=_STD),
     Arm("std_history", "estimate + 15 standard deviations + history", environment=_WITH_HISTORY),
-    Arm(
-        "std_recurrent",
-        "estimate + 15 standard deviations, memory",
-        environment=_STD,
-        algorithm="recurrent_ppo",
-    ),
     Arm(
         "residual",
         "truth + residual model",
@@ -201,20 +180,6 @@ OUTAGE_DASH = (
         "estimate + normalized uncertainty",
         environment=_WITH_UNCERTAINTY,
         learning=_task("ConstantCrashCostWithUncertainty"),
-    ),
-    Arm(
-        "estimate_recurrent",
-        "estimate, memory",
-        environment=_SCALED,
-        learning=_CONSTANT_CRASH_COST,
-        algorithm="recurrent_ppo",
-    ),
-    Arm(
-        "std_recurrent",
-        "estimate + normalized uncertainty, memory",
-        environment=_WITH_UNCERTAINTY,
-        learning=_task("ConstantCrashCostWithUncertainty"),
-        algorithm="recurrent_ppo",
     ),
     Arm(
         "std_privileged",

@@ -17,9 +17,6 @@ from quad_gym.experiments.pages import Report
 from quad_gym.experiments.study import StudyResults
 from quad_gym.experiments.study_films import CHOICES, label_of, pair_of
 
-MEMORY = "_recurrent"
-"""End of the name of an arm with memory; the rest is the name of the arm without."""
-
 FEW = 5  #: number of seeds below which intervals over trainings are wide
 
 
@@ -50,10 +47,6 @@ def conclusions(results: StudyResults) -> list[str]:
     for first, second in (("std", "estimate"), ("std_history", "std")):
         if seeds > 1 and {first, second} <= set(trained):
             found.append(_of_pair(results, first, second))
-    for name in trained:
-        without = name.removesuffix(MEMORY)
-        if seeds > 1 and without != name and without in trained:
-            found.append(_of_memory(results, name, without))
     if trained and seeds < FEW:
         wide = "so few that the intervals are wide"
         if seeds == 1:
@@ -113,22 +106,6 @@ def _of_pair(results: StudyResults, first: str, second: str) -> str:
     return (
         f"A training of {a} returns more than one of {b} with probability {number(chance, 2)}"
         + (", which is not significant." if chance.low <= 0.5 <= chance.high else ".")
-    )
-
-
-def _of_memory(results: StudyResults, name: str, without: str) -> str:
-    """Compare an arm with memory with the same arm without."""
-    a, b = results.rows[name], results.rows[without]
-    returns, successes = (difference(a[k], b[k]) for k in ("return", "success"))
-    points = number(Estimated(*(100.0 * value for value in successes)), 0)
-    verdict = "Memory makes no significant difference in return"
-    if not returns.holds(0.0):
-        verdict = f"Memory {'raises' if returns.value > 0.0 else 'lowers'} the return"
-    return (
-        f"{verdict}: {_label(results, name)} returns {number(a['return'], 1)}, and without memory "
-        f"{number(b['return'], 1)}, a difference of {number(returns, 1)}. It succeeds in "
-        f"{share(a['success'])}, and without memory in {share(b['success'])}: a difference of "
-        f"{points} percentage points."
     )
 
 

@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 
 from baselines.compiled_ppo import CompiledPPO
-from baselines.gru import load_network
 from baselines.keeping import STATE
 from baselines.mlp import MlpPolicy
 from baselines.plans import Plan
 from baselines.policies import PRETRAINED, load_policy
 from baselines.recipes import recipe
 from baselines.training import export, train
-from quad_gym.evaluation import roll_out
 from tests import console_commands
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -162,25 +160,6 @@ def test_best_policy_is_loaded_from_file_and_exported(tmp_path):
     exported = MlpPolicy.load(tmp_path / "out" / "policy.npz")
     assert exported.record["finished"]
     np.testing.assert_array_equal(exported.weights[0], policy.weights[0])
-
-
-def test_a_policy_with_memory_resumes_flies_and_is_exported(tmp_path, monkeypatch):
-    chosen = small_plan().recipe.replace(algorithm="recurrent_ppo", memory_units=8)
-    plan = small_plan(recipe=chosen)
-    done = run(plan, tmp_path / "whole")
-    die_after(3, plan, tmp_path / "cut", monkeypatch)
-    assert run(plan, tmp_path / "cut", resume=True).finished
-    whole, cut = (load_network(tmp_path / name / "last.npz") for name in ("whole", "cut"))
-    for first, second in ((whole.U, cut.U), (whole.layers.weights[0], cut.layers.weights[0])):
-        np.testing.assert_array_equal(first, second)
-    assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "cut")
-    many, one = (gymnasium.make_vec(CIRCLE, num_envs=n, duration=1.0) for n in (3, 1))
-    policy = load_policy(str(done.best_policy), many)
-    assert policy.inputs == 28
-    alone = [roll_out(policy, one, seed=7 + i).returns[0] for i in range(3)]
-    np.testing.assert_allclose(roll_out(policy, many, seed=7).returns, alone, rtol=1e-4)
-    export(done, tmp_path / "policy.npz")
-    assert load_network(tmp_path / "policy.npz").record["finished"]
 
 
 class SameDraws:

@@ -99,7 +99,7 @@ REFUSED = [
     ("study stale_race --arms truth_delay_compensated", "--arms must name truth, whose policies"),
     ("study QuadGym/Circle-v0", "ENV_ID must be one of QuadGym/LookAround-v0"),
     ("study --env observation=truth", "must not contain observation: use --arms instead"),
-    ("study --arms certainty_recurrent --set clip=1", "clip is not a keyword of the compiled PPO"),
+    ("study --arms certainty --set clip=1", "clip is not a keyword of the compiled PPO"),
     ("study --arms truth --set critic_only=3", "critic_only must be the number of values"),
     ("study --video webp --arms std estimate", "needs the arm truth and another trained one"),
     # ---- exports

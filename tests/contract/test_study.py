@@ -73,21 +73,6 @@ def test_study_of_each_task_flies_all_arms(task, arms, tmp_path, capsys):
     assert (folder / "pace.png").stat().st_size > 1000
 
 
-def test_one_study_trains_arms_with_and_without_memory(tmp_path, capsys):
-    words = [*QUICK, "--set", "n_steps=8", "batch_size=512", "n_epochs=1"]
-    arms = ["std_certainty_privileged", "certainty_recurrent"]
-    words += ["--arms", *arms, "--output", str(tmp_path / "out")]
-    assert main(words) == 0
-    assert "4 trainings of 4,096 steps" in capsys.readouterr().out
-    runs = tmp_path / "out" / "runs"
-    plans = {
-        name: json.loads((runs / name / "seed_0/training.json").read_text())["plan"]
-        for name in arms
-    }
-    assert plans["certainty_recurrent"]["recipe"]["algorithm"] == "recurrent_ppo"
-    assert {plan["engine"] for plan in plans.values()} == {"compiled"}
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -33,7 +33,7 @@ def test_critic_only_input_gives_gradients_of_actor_with_zero_weights(activation
         model._log_probs[:], model._targets[:] = samples["_lp"] - 2.0, samples["_targets"]
         model.prepare()
         model.learner.order[:size] = np.arange(size)
-        model.learner.normalized[:size, 0] = advantages
+        model.learner.normalized[:size] = advantages
         model.learner.differentiate(0, size)
         gradients = model.learner.gradients.sum(axis=0)
         parts = []
@@ -147,8 +147,8 @@ def test_input_of_the_critic_alone_changes_no_action():
     x = draw.normal(size=(150, 3)).astype(np.float32)  # more than two tiles
     other = x.copy()
     other[:, 2] += 1.0
-    means, values, memory = model.networks.evaluate(x, model._memory)
-    moved = model.networks.evaluate(other, memory)
+    means, values = model.networks.evaluate(x)
+    moved = model.networks.evaluate(other)
     np.testing.assert_array_equal(moved[0], means)
     assert abs(moved[1] - values).min() > 1e-4
     policy = model.policy()

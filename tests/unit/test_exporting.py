@@ -107,7 +107,7 @@ def compiled_ppo_file(folder, algorithm="ppo"):
     from baselines.plans import Plan, description
     from baselines.recipes import recipe
 
-    chosen = recipe(CIRCLE, algorithm).replace(n_envs=2)
+    chosen = recipe(CIRCLE).replace(n_envs=2)
     plan = Plan(recipe=chosen, threads=1, engine="compiled")
     model = make_compiled(plan)
     model.networks.layers(model.networks.actor)[-1][0][:] *= 50.0
@@ -137,50 +137,6 @@ def test_c_acts_as_the_policy_in_flight(source, tmp_path):
     assert actions.std(axis=0).min() > 1e-2
     np.testing.assert_allclose(actions, controller.policy.predict(seen)[0], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(actions, exact(controller, seen), rtol=0.0, atol=1e-6)
-
-
-def recurrent(folder):
-    """Return a policy with memory, observations of ten flights (100, 10, n), actions, memories."""
-    controller = controller_of(str(compiled_ppo_file(folder, "recurrent_ppo")))
-    seen = observations_in_flight(controller, 1000).reshape(100, 10, -1)
-    memory, steps = None, []
-    for x in seen:
-        action, memory = controller.step(x, memory)
-        steps.append((action, memory))
-    actions, memories = (np.array(part) for part in zip(*steps, strict=True))
-    assert abs(controller.act(seen[-1]) - actions[-1]).max() > 1e-2  # the memory matters
-    return controller, seen, actions, memories
-
-
-@needs_compiler
-def test_c_with_memory_acts_as_the_policy_in_flight(tmp_path):
-    controller, seen, actions, memories = recurrent(tmp_path)
-    library, state = library_of(controller, tmp_path), (ctypes.c_float * controller.gru.units)()
-    action, pointer = np.empty(4, np.float32), ctypes.c_void_p
-    for flight in range(2):
-        library.it_reset(state)
-        for t in range(100):
-            args = [a.ctypes.data_as(pointer) for a in (seen[t, flight].copy(), action)]
-            assert library.it_step(state, *args) == 0
-            np.testing.assert_allclose(action, actions[t, flight], rtol=0.0, atol=2e-6)
-            np.testing.assert_allclose(list(state), memories[t, flight], rtol=0.0, atol=1e-6)
-    before, bad = list(state), np.full(28, np.nan, np.float32)
-    assert library.it_step(state, *(a.ctypes.data_as(pointer) for a in (bad, action))) == 1
-    assert list(state) == before
-    np.testing.assert_array_equal(action, 0.0)
-
-
-def test_onnx_with_memory_acts_as_the_policy_in_flight(tmp_path):
-    pytest.importorskip("onnx")
-    onnxruntime = pytest.importorskip("onnxruntime")
-    controller, seen, actions, memories = recurrent(tmp_path)
-    assert save_onnx(controller, tmp_path / "it.onnx") < 1e-5
-    session = onnxruntime.InferenceSession(tmp_path / "it.onnx")
-    memory = np.zeros((10, controller.gru.units), np.float32)
-    for t in range(100):
-        action, memory = session.run(None, {"observation": seen[t], "memory": memory})
-        np.testing.assert_allclose(action, actions[t], rtol=0.0, atol=2e-6)
-        np.testing.assert_allclose(memory, memories[t], rtol=0.0, atol=1e-6)
 
 
 @needs_compiler

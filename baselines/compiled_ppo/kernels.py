@@ -1,4 +1,4 @@
-"""Compiled parts that both kinds of networks share: layers, the loss, threads, and Adam.
+"""Compiled parts of PPO: layers, the loss and its gradient in threads, and Adam.
 
 A network is a table with one row per layer, and a part of one vector of float32 parameters: weights
 (outputs, inputs) of each layer, followed by its biases. `flipped` contains the transposed weights,
@@ -185,67 +185,108 @@ def log_std_of(vector, actor):
     return vector[first : first + actor[-1, OUTPUTS]]
 
 
-def differentiating(differentiate_tile, tile):
-    """Make the entry that computes gradients from a routine for `tile` units or fewer.
+@routine
+def _seen_by(table, x, spare):
+    """Inputs of a network in samples x: the first columns, as a contiguous array."""
+    size = table[0, INPUTS]
+    if size == x.shape[1]:
+        return x
+    seen = spare.reshape(-1)[: len(x) * size].reshape((len(x), size))
+    for i in range(len(x)):
+        for j in range(size):
+            seen[i, j] = x[i, j]
+    return seen
 
-    A unit is a sample, or a sequence of samples, see `differentiate`.
+
+@routine
+def _differentiate_tile(
+    chosen, advantages, share, model, samples, recipe, rooms, part, gradient, sums
+):
+    """Add the gradient of the loss of a tile; each sample has the weight `share`."""
+    net, actor, critic = model
+    observations, returns = samples[0], samples[3]
+    inputs, outputs, deltas, product = rooms
+    room = (outputs[part], deltas[part], product[part])
+    x = inputs[part, 0, : len(chosen)]
+    for i in range(len(chosen)):
+        sample = chosen[i]
+        for j in range(x.shape[1]):
+            x[i, j] = observations[sample, j]
+    seen = _seen_by(actor, x, inputs[part, 1])
+    mean = forward(seen, actor, net, room[0])
+    log_std, slope = log_std_of(net[0], actor), log_std_of(gradient, actor)
+    d = room[1][0, : mean.size].reshape(mean.shape)
+    policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, slope, sums)
+    backward(seen, actor, net, room, gradient)
+    value = forward(x, critic, net, room[0])
+    value_loss(value, chosen, returns, recipe, share, room[1][0], sums)
+    backward(x, critic, net, room, gradient)
+
+
+@routine
+def _differentiate_part(part, minibatch, model, samples, recipe, rooms, written):
+    """Compute the gradient of one part of a minibatch, and its `SUMS`."""
+    span, order, advantages = minibatch
+    gradient, sums = written[0][part], written[1][part]
+    count, parts = span[1] - span[0], len(written[0])
+    share = _ONE / np.float32(count)
+    gradient[:] = _ZERO
+    sums[:] = 0.0
+    end = span[0] + count * (part + 1) // parts
+    for a in range(span[0] + count * part // parts, end, TILE):
+        b = min(a + TILE, end)
+        tile = (order[a:b], advantages[a:b], share)
+        _differentiate_tile(*tile, model, samples, recipe, rooms, part, gradient, sums)
+
+
+@entry
+def differentiate(
+    board, number, command, serving, minibatch, model, samples, recipe, rooms, written
+):
+    """Compute the gradient of the loss of a minibatch, in parts that threads share on a board.
+
+    Args:
+        board: Board whose blocks are the parts, see `quad_gym.kernels.board`.
+        number: Number of this thread; 0 posts the minibatches.
+        command: 0 to post a minibatch; negative to wait for the last one that was posted.
+        serving: True to work on minibatches posted by others, until none is posted for a while.
+        minibatch: Begin and end in the order of this epoch, (2,); this order of the samples,
+            (n,); advantages in this order, normalized, (n,).
+        model: `net`, and the tables of actor and critic.
+        samples: Observations (n, o), of which the actor uses the first columns; actions (n, a),
+            log probabilities (n,), returns (n,).
+        recipe: Clip range, weight of the entropy, and weight of the value loss, (3,).
+        rooms: Work memory of each part.
+        written: Results of each part: gradient (p,) and `SUMS` (4,).
+
+    Returns:
+        True if all parts are finished; False if another thread is still working.
     """
+    if not serving and command >= 0:
+        post(board, command)
+    while True:  # once, unless serving
+        seen = read_shared(board, TICKET)
+        while True:
+            first, last = take(board, number)
+            if first == last:
+                break
+            for part in range(first, last):
+                _differentiate_part(part, minibatch, model, samples, recipe, rooms, written)
+            add_shared(board, FINISHED, last - first)
+        if not serving:
+            return finished(board)
+        if not comes(board, number, seen):
+            return True
 
-    @routine
-    def differentiate_part(part, minibatch, model, samples, recipe, rooms, written):
-        """Compute the gradient of one part of a minibatch, and its `SUMS`."""
-        span, order, advantages = minibatch
-        gradient, sums = written[0][part], written[1][part]
-        count, parts = span[1] - span[0], len(written[0])
-        share = _ONE / np.float32(count * advantages.shape[1])
-        gradient[:] = _ZERO
-        sums[:] = 0.0
-        end = span[0] + count * (part + 1) // parts
-        for a in range(span[0] + count * part // parts, end, tile):
-            b = min(a + tile, end)
-            units = (order[a:b], advantages[a:b], share)
-            differentiate_tile(units, model, samples, recipe, rooms, part, gradient, sums)
 
-    @entry
-    def differentiate(
-        board, number, command, serving, minibatch, model, samples, recipe, rooms, written
-    ):
-        """Compute the gradient of the loss of a minibatch, in parts that threads share on a board.
-
-        Args:
-            board: Board whose blocks are the parts, see `quad_gym.kernels.board`.
-            number: Number of this thread; 0 posts the minibatches.
-            command: 0 to post a minibatch; negative to wait for the last one that was posted.
-            serving: True to work on minibatches posted by others, until none is posted for a while.
-            minibatch: Begin and end in the order of this epoch, (2,); this order: the first sample
-                of each unit, (k,); advantages in this order, normalized, (k, samples in a unit).
-            model: `net`, and the tables of actor and critic.
-            samples: Observations (n, o), of which the actor uses the first columns; actions (n, a),
-                log probabilities (n,), returns (n,), and more for networks with memory.
-            recipe: Clip range, weight of the entropy, and weight of the value loss, (3,).
-            rooms: Work memory of each part.
-            written: Results of each part: gradient (p,) and `SUMS` (4,).
-
-        Returns:
-            True if all parts are finished; False if another thread is still working.
-        """
-        if not serving and command >= 0:
-            post(board, command)
-        while True:  # once, unless serving
-            seen = read_shared(board, TICKET)
-            while True:
-                first, last = take(board, number)
-                if first == last:
-                    break
-                for part in range(first, last):
-                    differentiate_part(part, minibatch, model, samples, recipe, rooms, written)
-                add_shared(board, FINISHED, last - first)
-            if not serving:
-                return finished(board)
-            if not comes(board, number, seen):
-                return True
-
-    return differentiate
+@entry
+def evaluate(x, model, inputs, outputs, means, values):
+    """Evaluate both networks on observations x (n, o); writes means (n, a) and values (n,)."""
+    net, actor, critic = model
+    for a in range(0, len(x), TILE):
+        b = min(a + TILE, len(x))
+        means[a:b] = forward(_seen_by(actor, x[a:b], inputs[1]), actor, net, outputs)
+        values[a:b] = forward(x[a:b], critic, net, outputs)[:, 0]
 
 
 @entry

@@ -1,1 +1,0 @@
-"""Compiled parts: `common` ones, and those of networks without and with memory."""
