@@ -1,1 +1,1 @@
-"""The commands of `quad-gym`, a module each; a file in `scripts/` runs the same."""
+"""The commands of `quad-gym`, a module each."""

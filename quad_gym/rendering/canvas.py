@@ -67,11 +67,9 @@ class Canvas:
         """Store the picture so far, as the background of later pictures."""
         self._background = self._large.copy()
 
-    def show_background(self, top: float = 0.0) -> None:
-        """Copy the stored background, from a height downward [pixels]."""
-        first = round(OVERSAMPLING * top)
-        box = (0, first, OVERSAMPLING * self.width, OVERSAMPLING * self.height - first)
-        self._large.blit(self._background, (0, first), box)
+    def show_background(self) -> None:
+        """Copy the stored background."""
+        self._large.blit(self._background, (0, 0))
 
     def line(self, points: Floats, color: Color, width: float = 1.0, closed: bool = False) -> None:
         """Draw a line through points (n, 2) [pixels], interrupted at points that are NaN."""

@@ -1,5 +1,7 @@
 """Inset with the image plane of the vehicle's camera and the features in it."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,10 +10,19 @@ from quad_gym.flights.record import Flight
 from quad_gym.records import GateDecision
 from quad_gym.rendering import colors
 from quad_gym.rendering.canvas import Canvas
-from quad_gym.rendering.strip import Box
 from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Rectangle [pixels]."""
+
+    left: float
+    top: float
+    width: float
+    height: float
 
 
 def place_in_inset(pixels: Floats, scene: FlightScene, box: Box) -> Floats:

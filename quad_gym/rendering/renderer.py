@@ -16,7 +16,6 @@ from quad_gym.rendering.colors import Color
 from quad_gym.rendering.geometry import Perspective, chase_view, course_view, fixed_view
 from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.scene import Scene, ellipsoid_scale
-from quad_gym.rendering.strip import WINDOW_SECONDS, Box, Strip
 
 VIEWS = ("fixed", "chase")  #: names of the views of a flight
 MOVING_VIEWS = {"chase": chase_view, "course": course_view}
@@ -37,27 +36,18 @@ class Renderer:
         view: "fixed" (the whole reference from outside), "chase" (from behind the vehicle) or
             "course" (from above and behind, along a course of obstacles).
         size: Width and height [pixels].
-        seconds: Duration of the past in the plots of errors [s].
 
     Raises:
         ValueError: If an argument is invalid.
         ImportError: If pygame is not installed.
     """
 
-    def __init__(
-        self,
-        view: str = "fixed",
-        size: tuple[int, int] = (640, 480),
-        seconds: float = WINDOW_SECONDS,
-    ) -> None:
+    def __init__(self, view: str = "fixed", size: tuple[int, int] = (640, 480)) -> None:
         self.view = check.choice("render_view", view, ("fixed", *MOVING_VIEWS))
-        self.size, self.seconds = checked_size(size), check.positive("seconds", seconds)
+        self.size = checked_size(size)
         width, height = self.size
         self._canvas = Canvas(width, height)
         self._text = max(14, round(18 * min(width / 640, height / 480)))
-        self._scene_height = round(0.765 * height)
-        strip = Box(0.0, self._scene_height, width, height - self._scene_height)
-        self._strip = Strip(self._canvas, strip, self._text, self.seconds)
         self._scene: FlightScene | None = None
         """Scene of the flight to which the stored view and background belong."""
         self._fixed: Perspective
@@ -71,51 +61,42 @@ class Renderer:
         Returns:
             Picture in red, green, blue, (height, width, 3).
         """
-        canvas, (width, _), small = self._canvas, self.size, self._text - 2
+        canvas, (width, height), small = self._canvas, self.size, self._text - 2
         spacing = 4.0 if self.view == "course" else 1.0
         scene = Scene(canvas, flight, self._view_of(flight), self.view != "fixed", spacing)
         self._draw_background(flight, scene)
-        canvas.inside((0.0, 0.0, width, self._scene_height))
         labels = scene.draw()
         inset = None
         if flight.scene.has_camera and flight.estimated:
             box = inset_box(flight.scene, width - 8.0, 8.0, 0.27 * width)
             inset = Inset(canvas, flight, box, small)
             inset.draw()
-        canvas.inside(None)
-        self._strip.draw(flight)
         canvas.finish()
 
-        canvas.write_labels(labels, small, self._scene_height)
+        canvas.write_labels(labels, small, height)
         if inset is not None:
             inset.write()
-        self._strip.write(flight)
         self._write_legend(flight)
         return canvas.pixels()
 
     def __reduce__(self) -> Any:
-        return Renderer, (self.view, self.size, self.seconds)
+        return Renderer, (self.view, self.size)
 
     def _view_of(self, flight: Flight) -> Perspective:
-        width = self.size[0]
         if self.view != "fixed":
-            return MOVING_VIEWS[self.view](flight, width, self._scene_height)
+            return MOVING_VIEWS[self.view](flight, *self.size)
         if self._scene is not flight.scene:
-            self._fixed = fixed_view(flight, width, self._scene_height)
+            self._fixed = fixed_view(flight, *self.size)
         return self._fixed
 
     def _draw_background(self, flight: Flight, scene: Scene) -> None:
-        """Draw the unchanging parts: of a fixed view all of the background, of others the strip."""
-        known, moves = self._scene is flight.scene, self.view != "fixed"
-        if known:
-            self._canvas.show_background(self._scene_height if moves else 0.0)
-        if moves or not known:
-            self._canvas.inside((0.0, 0.0, self.size[0], self._scene_height))
-            scene.draw_background()
-            self._canvas.inside(None)
-        if not known:
-            flown = self._scene = flight.scene
-            self._strip.draw_background(flown.hover_rotor_speed / flown.max_rotor_speed)
+        """Draw the background, which a fixed view stores."""
+        if self._scene is flight.scene and self.view == "fixed":
+            self._canvas.show_background()
+            return
+        scene.draw_background()
+        if self.view == "fixed":
+            self._scene = flight.scene
             self._canvas.keep_background()
 
     def _write_legend(self, flight: Flight) -> None:
@@ -126,7 +107,7 @@ class Renderer:
         policy = flight.about.get("policy")
         lines: list[tuple[str, Color | None]] = []
         lines += [(f"flown by {short_name(str(policy))}", None)] if policy else []
-        lines += _legend(flight)
+        lines += [*_legend(flight), (_errors(flight), None)]
         lines += [(words, None) for words in _warnings(flight)]
         width = max(26 + canvas.width_of(words, small) for words, _ in lines)
         width = max(width, canvas.width_of(f"{title}   {clock}", large) + 12)
@@ -158,6 +139,24 @@ def _legend(flight: Flight) -> list[tuple[str, Color]]:
     elif scene.observation == "noisy":
         found.append(("observed position", colors.VERMILLION))
     return found
+
+
+def _errors(flight: Flight) -> str:
+    """Errors of tracking, and of the estimated position."""
+    row, scene = flight.rows[-1], flight.scene
+    found = f"{'to the gate' if len(scene.gates_I) else 'error'} {_length(row['position_error'])}"
+    if scene.observation == "truth":
+        return found
+    return f"{found}, of the estimate {_length(row['estimation_error'])}"
+
+
+def _length(meters: float) -> str:
+    """Format a length in millimeters, centimeters or meters."""
+    if not np.isfinite(meters):
+        return "-"
+    if meters < 0.01:
+        return f"{1e3 * meters:.1f} mm"
+    return f"{1e2 * meters:.1f} cm" if meters < 0.995 else f"{meters:.2f} m"
 
 
 def _warnings(flight: Flight) -> list[str]:

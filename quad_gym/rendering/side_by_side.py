@@ -78,7 +78,7 @@ class SideBySide:
         width, height = SIDE
         # a course of obstacles is too long for one picture
         views = ["course" if len(side.flight.scene.obstacles) else "fixed" for side in sides]
-        self._renderers = [Renderer(v, (width, height - _BAND), seconds=self.end) for v in views]
+        self._renderers = [Renderer(v, (width, height - _BAND)) for v in views]
         self._band = Canvas(width, _BAND)
 
     def draw(self, time: float) -> NDArray[np.uint8]:

@@ -1,16 +1,12 @@
 """Projection in pictures, against hand-computed pixels, sampled surfaces and the camera model."""
 
-import itertools
-
 import numpy as np
 import pytest
 
-import quad_gym
 from quad_gym import CameraParams
 from quad_gym.envs.flights import Flights
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import Autoreset
-from quad_gym.rendering.canvas import Canvas
 from quad_gym.rendering.geometry import (
     chase_view,
     ellipsoid_axes,
@@ -185,28 +181,3 @@ def test_polygon_behind_the_eye_is_cut_off():
     assert view.outline(floor - (0.0, 20.0, 0.0)).shape == (0, 2)
     before = floor - (0.0, -9.0, 0.0)
     np.testing.assert_array_equal(view.outline(before), view.project(before)[0])
-
-
-@pytest.mark.parametrize("size", [(320, 240), (480, 270), (640, 480), (1280, 720)])
-@pytest.mark.parametrize("task", ["circle", "waypoints"])
-def test_texts_of_the_strip_do_not_overlap(monkeypatch, size, task):
-    written = []
-
-    def text(self, words, x, y, size, color=(0, 0, 0), anchor=0.0):
-        width = self.width_of(words, size)
-        left = x - anchor * width
-        written.append((words, left, left + width, y, y + 0.6 * self.line_height(size)))
-        return width
-
-    monkeypatch.setattr(Canvas, "text", text)
-    env = quad_gym.QuadEnv(task, render_mode="rgb_array", render_size=size)
-    env.reset(seed=0)
-    for _ in range(30):
-        env.step(np.zeros(4, np.float32))
-    env.render()
-    strip = [entry for entry in written if entry[3] > 0.765 * size[1] and entry[0]]
-    assert len(strip) > 10
-    for a, b in itertools.combinations(strip, 2):
-        apart = a[2] <= b[1] or b[2] <= a[1] or a[4] <= b[3] or b[4] <= a[3]
-        assert apart, (a, b)
-    assert all(left >= 0.0 and right <= size[0] for _, left, right, _, _ in strip), strip

@@ -1,8 +1,0 @@
-"""Run `quad-gym evaluate`; see `quad_gym/commands`."""
-
-import sys
-
-from quad_gym.commands.main import main
-
-if __name__ == "__main__":
-    sys.exit(main(["evaluate", *sys.argv[1:]]))

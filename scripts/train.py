@@ -1,8 +1,0 @@
-"""Run `quad-gym train`; see `quad_gym/commands`."""
-
-import sys
-
-from quad_gym.commands.main import main
-
-if __name__ == "__main__":
-    sys.exit(main(["train", *sys.argv[1:]]))
