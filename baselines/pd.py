@@ -109,7 +109,7 @@ class PDPolicy:
     Args:
         env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be
             "estimate", "truth" or "noisy".
-        gains: "lab" (the report's gains), "tuned", or `PDGains`.
+        gains: "lab" (the report's gains) or "tuned", scaled to the vehicle, or `PDGains`.
         max_position_error: Limit of the norm of position errors [m], which determines the speed.
             None: 1 m on `Waypoints`, whose gates are far apart, `REACH_OF_GAPS` if the environment
             observes gaps, as OutageDash does, and unlimited otherwise.
@@ -162,10 +162,11 @@ class PDPolicy:
                 'env must have layout="absolute" for action="velocity", because the relative '
                 "layout contains no velocity"
             )
-        self.gains = pd_gains(gains) if isinstance(gains, str) else gains
+        vehicle = flights.batch.vehicle
+        self.gains = pd_gains(gains, vehicle) if isinstance(gains, str) else gains
         if flights.action in ("motor", "wrench"):
-            self._warn_if_too_slow(flights.control_rate, flights.batch.vehicle.inertia)
-        self._vehicle, self._scales = flights.batch.vehicle, flights.batch.action_params
+            self._warn_if_too_slow(flights.control_rate, vehicle.inertia)
+        self._vehicle, self._scales = vehicle, flights.batch.action_params
         self._action, self._absolute = flights.action, flights.layout == "absolute"
         self._slices = {field.name: field.slice for field in flights.table}
         self._widths = policy_size(flights.table), flights.table[-1].slice.stop

@@ -27,6 +27,7 @@ from quad_gym.packing.settings import settings_record
 from quad_gym.params import checks as check
 from quad_gym.params.resolved import taking
 from quad_gym.params.trajectories import Trajectory
+from quad_gym.params.world import WorldParams
 from quad_gym.records import (
     EXCHANGE_BLOCK,
     FLIGHT_BLOCK,
@@ -78,7 +79,8 @@ class FlightBatch(FlightMemory):
             check_cold_start(c.sensors, c.draws)
         check_reference(c.task, c.vehicle, c.actions, c.control)
         check_standing(c.task, c.flown_vehicle, c.world, c.draws)
-        model = params_record(c.vehicle, c.sensors, c.pd_gains, c.actions)
+        ground = WorldParams(ground_height=c.world.ground_height)  # what a filter models of it
+        model = params_record(c.vehicle, c.sensors, c.pd_gains, c.actions, ground)
         true = params_record(c.flown_vehicle, c.flown_sensors, c.pd_gains, c.actions, c.world)
         true["action_delay"] = c.action_delay
         self._model, self._world = params_block(model), params_block(true)

@@ -60,6 +60,7 @@ class Measurements:
         dt: Duration of a tick [s].
         sensors: The suite that an estimator may assume.
         vehicle: The vehicle that it may assume.
+        ground_height: Height of the ground in I, for optical flow and range finder [m].
     """
 
     def __init__(self, batch: FlightMemory, sample: NDArray[Any]) -> None:
@@ -67,6 +68,7 @@ class Measurements:
         self.count, self.dt = batch.count, batch.sensors.imu.dt
         self.sensors: SensorSuite = batch.sensors
         self.vehicle: VehicleParams = batch.vehicle
+        self.ground_height = batch.world.ground_height
 
     @cached_property
     def gyro(self) -> Floats:

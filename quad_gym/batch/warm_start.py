@@ -22,6 +22,7 @@ from quad_gym.params.gnss import LEAST_DRIFT, GnssParams
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import MAX_STATES, WARM_DRAWS, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
@@ -40,8 +41,15 @@ Floats = NDArray[np.float64]
 
 def pack_warm_start(settings: Any, make: Callable[..., Any], c: FlightConfiguration) -> None:
     """Fill the fields of a warm start in a SETTINGS record; `make` makes a `FlightBatch`."""
+    height, ground = c.world.ground_height, c.world.ground
     P = converged_covariance(
-        make, vehicle=c.vehicle, sensors=c.sensors, task=c.task, substeps=c.substeps
+        make,
+        vehicle=c.vehicle,
+        sensors=c.sensors,
+        task=c.task,
+        world=WorldParams(ground_height=height),
+        standing=0.0 if ground is None else height - ground.feet_B[0][2],
+        substeps=c.substeps,
     )
     W = root_with_truth(P, c.sensors)
     settings["warm"] = True
@@ -59,6 +67,8 @@ def converged_covariance(
     vehicle: VehicleParams,
     sensors: SensorSuite,
     task: TaskParams,
+    world: WorldParams,
+    standing: float,
     substeps: int,
 ) -> Floats:
     """Return the mean covariance that filters reach from a cold start in `WARM_UP` of hovering.
@@ -73,6 +83,7 @@ def converged_covariance(
             vehicle=vehicle,
             sensors=sensors,
             task=task.replace(start="hover"),
+            world=world,
             source=Source.TRUTH,
             control=Control.VELOCITY,
             control_rate=sensors.imu.rate / round(WARM_UP * sensors.imu.rate),
@@ -83,10 +94,9 @@ def converged_covariance(
         )
     batch.reset(seeds=range(FLIGHTS))
     if task.start == "ground":
-        at_rest = np.zeros((FLIGHTS, 3))
-        batch.reset(
-            seeds=range(FLIGHTS), position=batch.record("r") * (1.0, 1.0, 0.0), velocity=at_rest
-        )
+        r = batch.record("r")
+        r[:, 2] = standing
+        batch.reset(seeds=range(FLIGHTS), position=r, velocity=np.zeros((FLIGHTS, 3)))
     batch.step(np.zeros((FLIGHTS, 4)))  # one step, as long as the whole
     if batch.record("filter_status").any():
         raise ValueError(

@@ -85,7 +85,8 @@ def configure(args: TuneArgs) -> Search:
     require_writable("--output", args.output)
     torques = args.env.get("action") in ("motor", "wrench")
     first = first_seed("training", args.seed, args.episodes)
-    return Search(envs, pd_gains(args.gains), torques, first)
+    vehicle = next(iter(envs.values())).unwrapped.flights.batch.vehicle
+    return Search(envs, pd_gains(args.gains, vehicle), torques, first)
 
 
 def main(args: TuneArgs) -> None:

@@ -146,7 +146,7 @@ class Flights:
         flown["faults"] = _faults(keywords, suite)
         drawn = flown["randomization"] = Randomization.of(keywords["randomization"])
         place = resolving(WorldParams, world_params)("world", flown["world"])
-        flown["world"], own_task = place, keywords.get("task")
+        own_task = keywords.get("task")
         if place.ground is None and own_task is None and "start_position_I" not in drawn.names:
             check_pad(self.task)  # a user-defined task may set where vehicles start
         privileged, raw = flown["privileged"], self.observation == "measurements"

@@ -61,7 +61,8 @@ class Engine:
         self.sensors = sensors
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         params = params_record(VehicleParams(), sensors)
-        params["gravity"] = sensors.estimator.gravity
+        for name in ("gravity", "ground_height"):
+            params[name] = getattr(sensors.estimator, name)
         pack_tick(params[0], sensors)  # which depends on gravity
         self.params, self._ticks = params_block(params), params_block(params)
         self.steps = aligned_zeros(1, STEP_BLOCK)

@@ -175,6 +175,7 @@ class OwnPlayer:
             dt=self._suite.imu.dt,
             sensors=self._suite,
             vehicle=self._vehicle,
+            ground_height=self._suite.estimator.ground_height,
             gyro=gyro[np.newaxis].copy(),
             accel=accel[np.newaxis].copy(),
             gyro_now=now[np.newaxis].copy(),

@@ -35,6 +35,16 @@ _WITHOUT = {
 """Arguments of controllers, and the meanings of an action with which they have no effect."""
 
 
+class _World(Resolved[WorldParams | str, WorldParams]):
+    """Field for a world; a preset is that of the flown vehicle."""
+
+    def __set__(self, instance: "FlightConfiguration", given: WorldParams | str) -> None:
+        if isinstance(given, str):
+            vehicle = check.instance("true_vehicle", instance.flown_vehicle, VehicleParams)
+            given = world_params(given, vehicle)
+        super().__set__(instance, given)
+
+
 @dataclass(frozen=True, eq=False)
 class FlightConfiguration:
     """Arguments of `FlightBatch`: number of flights, and everything that they have in common.
@@ -88,7 +98,7 @@ class FlightConfiguration:
     threads: int | None = None
     true_vehicle: VehicleParams | None = None
     true_sensors: SensorSuite | None = None
-    world: Resolved[WorldParams | str, WorldParams] = Resolved(
+    world: Resolved[WorldParams | str, WorldParams] = _World(
         resolving(WorldParams, world_params), "calm"
     )
     randomization: Resolved[Randomization | Mapping[str, Drawn] | None, Randomization] = Resolved(
@@ -166,7 +176,9 @@ class FlightConfiguration:
     @property
     def pd_gains(self) -> PDGains:
         """Gains of `Control.PD`."""
-        return pd_gains(self.gains or "lab") if isinstance(self.gains, str | None) else self.gains
+        if isinstance(self.gains, str | None):
+            return pd_gains(self.gains or "lab", self.vehicle)
+        return self.gains
 
     @property
     def actions(self) -> ActionParams:

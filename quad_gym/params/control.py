@@ -2,8 +2,11 @@
 
 import math
 
+import numpy as np
+
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
+from quad_gym.params.vehicle import VehicleParams
 
 
 class PDGains(Checked):
@@ -51,6 +54,20 @@ _GAINS = {
 }
 
 
-def pd_gains(name: str) -> PDGains:
-    """Return PD gains: "lab", the report's, or "tuned", for small errors on all tracking tasks."""
-    return _GAINS[check.choice("gains", name, tuple(_GAINS))]
+def pd_gains(name: str, vehicle: VehicleParams | None = None) -> PDGains:
+    """Return PD gains: "lab", the report's, or "tuned", for small errors on all tracking tasks.
+
+    Those for another vehicle than the laboratory's give the same accelerations: gains of the
+    position loop grow with the mass, gains of the attitude loop with the moments of inertia.
+    """
+    gains = _GAINS[check.choice("gains", name, tuple(_GAINS))]
+    if vehicle is None:
+        return gains
+    lab = VehicleParams()
+    mass, turn = vehicle.mass / lab.mass, np.diag(vehicle.inertia) / np.diag(lab.inertia)
+    return PDGains(
+        position=mass * gains.position,
+        velocity=mass * gains.velocity,
+        attitude=tuple(turn * gains.attitude),
+        body_rates=tuple(turn * gains.body_rates),
+    )

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 from quad_gym.params.gravity import GRAVITY
+from quad_gym.params.ground import GROUND_HEIGHT
 
 
 class FilterParams(Checked):
@@ -74,6 +75,9 @@ class FilterParams(Checked):
     gravity: check.Positive = GRAVITY
     """gravitational acceleration in the prediction of a filter on its own [m/s^2]; in flights the
     vehicle's value is used"""
+    ground_height: float = GROUND_HEIGHT
+    """height of the ground in I that optical flow and range finder of a filter on its own measure
+    [m]; in flights the world's value is used"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

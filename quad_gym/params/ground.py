@@ -10,6 +10,8 @@ from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
 FARTHEST_FOOT = 10.0  #: largest distance of a foot from the center of mass [m]
+GROUND_HEIGHT = -0.1
+"""Height of the ground in I [m]: a vehicle that stands on the laboratory's legs is at height 0."""
 
 
 class GroundParams(Checked):

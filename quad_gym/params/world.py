@@ -13,8 +13,9 @@ import numpy as np
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Matrix
-from quad_gym.params.ground import GroundParams
+from quad_gym.params.ground import GROUND_HEIGHT, GroundParams
 from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import MAX_OBSTACLES
 
 MAX_WIND = 200.0  #: largest wind speed [m/s]; the strongest tornadoes reach some 135 m/s
@@ -51,7 +52,7 @@ class WorldParams(Checked):
     """Wind, drag, ground, battery and obstacles.
 
     Drag of the disc and of the rotors depends on the velocity of the vehicle relative to the air.
-    Neither the filter nor the controller models this world.
+    The filter models the height of the ground; filter and controller model nothing else of it.
     """
 
     wind_I: check.Vector3 = (0.0, 0.0, 0.0)
@@ -75,9 +76,9 @@ class WorldParams(Checked):
     cosine of the tilt"""
     rotor_radius: check.Positive = 0.127
     """radius of the rotors, for the ground effect [m]; ten-inch propellers"""
-    ground_height: float = -0.1
-    """height of the ground in I, for contact, ground effect and gusts [m]; the center of mass of a
-    vehicle that stands on its legs is at height 0"""
+    ground_height: float = GROUND_HEIGHT
+    """height of the ground in I, for contact, ground effect, gusts, optical flow and range finder
+    [m]; the center of mass of a vehicle that stands on its legs is at height 0"""
     ground: GroundParams | None = None
     """ground contact: a plane at `ground_height` that supports a vehicle anywhere, with a crash if
     the vehicle touches down too fast or too tilted; None: only a launch pad supports vehicles, at
@@ -129,7 +130,6 @@ def _windy(speed: float) -> WorldParams:
     return WorldParams(
         wind_I=(speed, 0.0, 0.0),
         gust_wind_speed=speed,
-        linear_drag_B=(0.78 * 0.544, 0.78 * 0.386, 0.0),  # Faessler et al., the laboratory's mass
         ground_effect=True,
         battery=BatteryParams(),
     )
@@ -148,6 +148,52 @@ _WORLDS = {
 }
 
 
-def world_params(name: str) -> WorldParams:
-    """Return a world: "calm" as in the report, "breeze", "fresh_breeze", or "slalom" with walls."""
-    return _WORLDS[check.choice("world", name, tuple(_WORLDS))]
+def world_params(name: str, vehicle: VehicleParams | None = None) -> WorldParams:
+    """Return a world by its name, for a vehicle.
+
+    Except in "calm", the vehicle determines its drag, battery and size:
+
+    - linear drag is the mass times (0.544, 0.386, 0) 1/s, Faessler et al. (see `WorldParams`); a
+      Crazyflie has 0.2 1/s (J. Foerster, "System identification of the Crazyflie 2.0 nano
+      quadrocopter", ETH Zurich 2015: 9.2e-7 N s/m per rad/s of its rotors' sum);
+    - the battery has the laboratory's energy per mass of the vehicle, 113 kJ/kg; a Crazyflie's, of
+      one cell with 0.25 A h and 3.7 V, has 116. Its resistance lowers the voltage by the same
+      share in hover, 3 %;
+    - rotor and vehicle radius grow with the distance of the hubs from the center of mass; a
+      Crazyflie's propellers have a radius of 23 mm and reach 69 mm, here 20 mm and 65 mm.
+
+    Args:
+        name: "calm" as in the report, "breeze", "fresh_breeze", or "slalom" with walls.
+        vehicle: The true vehicle; None: the laboratory's. Environments pass theirs.
+
+    Raises:
+        ValueError: If there is no such world.
+    """
+    world = _WORLDS[check.choice("world", name, tuple(_WORLDS))]
+    if name == "calm":
+        return world
+    lab, vehicle = VehicleParams(), vehicle or VehicleParams()
+    size, mass = _reach(vehicle) / _reach(lab), vehicle.mass
+    world = world.replace(
+        rotor_radius=size * world.rotor_radius, vehicle_radius=size * world.vehicle_radius
+    )
+    if world.battery is None:
+        return world
+    return world.replace(
+        linear_drag_B=(mass * 0.544, mass * 0.386, 0.0),
+        battery=world.battery.replace(
+            energy=mass / lab.mass * world.battery.energy,
+            resistance=_load(vehicle) / _load(lab) * world.battery.resistance,
+        ),
+    )
+
+
+def _reach(vehicle: VehicleParams) -> float:
+    """Return the mean distance of the rotor hubs from the center of mass [m]."""
+    return float(np.linalg.norm(vehicle.rotor_positions_B, axis=1).mean())
+
+
+def _load(vehicle: VehicleParams) -> float:
+    """Return the resistance of the hovering rotors at the largest voltage [ohm]."""
+    speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
+    return vehicle.max_voltage**2 / (4.0 * vehicle.torque_coefficient * speed**3)

@@ -31,6 +31,7 @@ TASK = TaskParams(start="hover")
 
 ELSEWHERE = {
     "estimator.gravity": "of a filter without flights, as its docstring says",
+    "estimator.ground_height": "of a filter without flights, too",
     "initial_pose.position_sigma": "of suites without GNSS",
 }
 """Parameters with an effect elsewhere."""

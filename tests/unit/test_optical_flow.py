@@ -18,10 +18,10 @@ FLOW, RANGE = int(Aid.OPTICAL_FLOW), int(Aid.RANGE_FINDER)
 GROUND = quad_gym.WorldParams().ground_height
 
 
-def expected(r, v, R_BI, w):
+def expected(r, v, R_BI, w, ground=GROUND):
     """Flow, distance and cosine of the tilt of a state (4,), without noise."""
     cosine = R_BI[2, 2]
-    distance = (r[2] - GROUND) / cosine
+    distance = (r[2] - ground) / cosine
     x, y, _ = R_BI @ v / distance
     return np.array([x - w[1], y + w[0], distance, cosine])
 
@@ -58,15 +58,17 @@ def test_nothing_is_measured_below_the_least_height(height, flow, distance):
     assert (valid[FLOW], valid[RANGE]) == (flow, distance)
 
 
-def filter_in_flight(kind):
+def filter_in_flight(kind, ground=GROUND):
     """A filter with GNSS, flow and range finder, whose state is moving, tilted and turned."""
     suite = quad_gym.sensor_suite("rtk").simplified()
     suite = suite.replace(
-        optical_flow=quad_gym.OpticalFlowParams(), range_finder=quad_gym.RangeFinderParams()
+        optical_flow=quad_gym.OpticalFlowParams(),
+        range_finder=quad_gym.RangeFinderParams(),
+        estimator=suite.estimator.replace(ground_height=ground),
     )
     kf = kind(suite)
     kf.initialize((0.0, 0.0, 0.0), suite.gnss.baseline_B, heading=0.3)
-    kf._engine.fill("r_hat", np.array([1.0, -2.0, 1.3]))
+    kf._engine.fill("r_hat", np.array([1.0, -2.0, ground + 1.4]))
     kf._engine.fill("v_hat", np.array([0.8, -0.5, 0.3]))
     kf.predict((0.1, -0.2, 0.3), (0.5, 1.0, 9.5), 0.005)
     return kf, suite
@@ -80,7 +82,8 @@ def numerical_update(kf, suite, flow, distance):
 
     def predicted(dx):
         R_BI = euler_dcm(dx[6:9]) @ state[2]
-        return expected(state[0] + dx[:3], state[1] + dx[3:6], R_BI, w)[:3]
+        ground = suite.estimator.ground_height
+        return expected(state[0] + dx[:3], state[1] + dx[3:6], R_BI, w, ground)[:3]
 
     H = np.zeros((3, 15))
     for i in range(9):
@@ -100,9 +103,10 @@ def numerical_update(kf, suite, flow, distance):
     return state, dx, P - K @ S @ K.T
 
 
+@pytest.mark.parametrize("ground", [GROUND, -1.0, 2.5])
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
-def test_update_agrees_with_a_linear_update_by_numerical_derivatives(kind):
-    kf, suite = filter_in_flight(kind)
+def test_update_agrees_with_a_linear_update_by_numerical_derivatives(kind, ground):
+    kf, suite = filter_in_flight(kind, ground)
     flow, distance = (0.6, -0.2), 1.43
     (r, v, _), dx, P = numerical_update(kf, suite, flow, distance)
     kf.update(optical_flow=flow, range_finder=distance)
@@ -144,6 +148,28 @@ def test_filters_are_consistent(kind, start, late):
     nis = batch.record("block_nis")[:, AID_BLOCKS:].mean(axis=0)
     assert nis[FLOW] == pytest.approx(2.0, abs=0.7)
     assert nis[RANGE] == pytest.approx(1.0, abs=0.5)
+
+
+@pytest.mark.parametrize("start", ["cold", "warm"])
+@pytest.mark.parametrize("ground", [0.4, -1.0])
+def test_filters_are_consistent_over_ground_of_any_height(ground, start):
+    """The mean of 100 NEES has a standard deviation of 0.55."""
+    world = quad_gym.WorldParams(ground_height=ground)
+    batch = fly(CRAZYFLIE, 100, task="circle", start="hover", world=world, filter_start=start)
+    steps(batch, 1.5)
+    assert not batch.record("filter_status").any()
+    assert nees(batch).mean() == pytest.approx(15.0, abs=2.2)
+    assert batch.record("block_valid")[:, AID_BLOCKS + RANGE].any()
+
+
+def test_warm_start_on_ground_of_any_height_is_the_same():
+    """Heights above the ground are the same, and so are covariances."""
+    found = []
+    for height in (GROUND, 1.9):
+        world = quad_gym.WorldParams(ground_height=height, ground=quad_gym.GroundParams())
+        batch = fly(CRAZYFLIE, 2, task="hover", start="ground", world=world, filter_start="warm")
+        found.append(batch.covariance())
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6, atol=1e-12)
 
 
 def test_a_crazyflie_hovers_on_its_estimate():

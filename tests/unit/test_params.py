@@ -90,6 +90,7 @@ BAD_VALUES = {
         "initial_tilt_sigma recursive_update_threshold": MAYBE,
         "beta": BELOW_ZERO,
         "kappa": [-14.5, *NO_NUMBERS],
+        "ground_height": NO_NUMBERS,
         "kind integration bearing_noise_at delay_compensation": ["other", None, 1],
         "attitude_reset": ["turn", 1, None],
         "false_alarm_probability": [0.5, 1.0, *BELOW_ZERO],

@@ -6,13 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import quad_gym
+from baselines import PDPolicy
 from quad_gym import BatteryParams, Uniform, WorldParams
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Control, Source
 from quad_gym.rotations import quaternion_to_dcm
 from quad_gym.vehicle import state_derivative
 from tests.body_states import random_state, state_of
-from tests.builders import flown_batch
+from tests.builders import flown_batch, vec_env
 from tests.unit.test_vehicle import LAB, NO_FORCE, SKEWED, newton_and_euler
 
 FULL = WorldParams(
@@ -229,3 +230,47 @@ def test_world_presets_fly_and_unknown_worlds_raise_value_error():
         FlightBatch(1, world="storm")
     with pytest.raises(ValueError, match="world must be a WorldParams"):
         FlightBatch(1, world=3.0)
+
+
+def test_worlds_scale_with_the_vehicle():
+    """Energy, propellers and reach of a Crazyflie are from its data sheet: within 15 %."""
+    crazyflie = quad_gym.vehicle_params("crazyflie")
+    lab, small = (quad_gym.world_params("breeze", vehicle) for vehicle in (LAB, crazyflie))
+    assert lab.linear_drag_B == (0.78 * 0.544, 0.78 * 0.386, 0.0)
+    assert (lab.battery, lab.rotor_radius, lab.vehicle_radius) == (BatteryParams(), 0.127, 0.42)
+    np.testing.assert_allclose(
+        np.divide(small.linear_drag_B, crazyflie.mass), np.divide(lab.linear_drag_B, LAB.mass)
+    )
+    assert small.battery.energy == pytest.approx(3600 * 0.25 * 3.7, rel=0.15)
+    assert small.rotor_radius == pytest.approx(0.023, rel=0.15)
+    assert small.vehicle_radius == pytest.approx(0.069, rel=0.15)
+    for world, vehicle in ((lab, LAB), (small, crazyflie)):
+        force = vehicle.mass * vehicle.gravity / 4.0
+        power = 4.0 * vehicle.torque_coefficient * (force / vehicle.thrust_coefficient) ** 1.5
+        sag = world.battery.resistance * power / world.battery.motor_efficiency
+        assert sag / vehicle.max_voltage**2 == pytest.approx(0.0305, abs=1e-4)
+    assert quad_gym.world_params("slalom", crazyflie).vehicle_radius == small.vehicle_radius
+
+
+@pytest.mark.parametrize("vehicle", ["lab", "crazyflie"])
+def test_no_vehicle_crashes_in_a_breeze(vehicle):
+    """PD control, whose preset gains are scaled to the vehicle, too."""
+    env = vec_env("hover", 60, seed=0, vehicle=vehicle, world="breeze", observation="truth")
+    assert env.flights.batch.world == quad_gym.world_params("breeze", env.flights.batch.vehicle)
+    policy, observations = PDPolicy(env), env.reset(seed=0)[0]
+    for _ in range(250):
+        observations, _, terminated, _, _ = env.step(policy.predict(observations)[0])
+        assert not terminated.any()
+
+
+def test_preset_gains_give_every_vehicle_the_same_accelerations():
+    crazyflie = quad_gym.vehicle_params("crazyflie")
+    lab, small = (quad_gym.pd_gains("tuned", vehicle) for vehicle in (LAB, crazyflie))
+    assert lab == quad_gym.pd_gains("tuned")
+    for name, of_lab, of_small in (
+        ("position", LAB.mass, crazyflie.mass),
+        ("velocity", LAB.mass, crazyflie.mass),
+        ("attitude", np.diag(LAB.inertia), np.diag(crazyflie.inertia)),
+        ("body_rates", np.diag(LAB.inertia), np.diag(crazyflie.inertia)),
+    ):
+        np.testing.assert_allclose(getattr(lab, name) / of_lab, getattr(small, name) / of_small)
