@@ -20,6 +20,11 @@ $(VENV)/.user: pyproject.toml constraints.txt | $(BIN)/python
 	$(BYTECODE)
 	touch $@
 
+$(VENV)/.viewer: $(VENV)/.user
+	$(INSTALL) ".[plot,render]"
+	$(BYTECODE)
+	touch $@
+
 $(VENV)/.trainer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,render]"
 	$(BYTECODE)
@@ -28,7 +33,7 @@ $(VENV)/.trainer: $(VENV)/.user
 $(VENV)/.developer: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) ".[train,plot,render,pandas,ulog,ardupilot,ros,rerun,export,dev]"
 	$(BYTECODE)
-	touch $(VENV)/.user $(VENV)/.trainer $@  # which it holds
+	touch $(VENV)/.user $(VENV)/.viewer $(VENV)/.trainer $@  # which it holds
 
 $(VENV)/.sweeper: $(VENV)/.developer
 	$(INSTALL) ".[sweep]"  # Ray is large: no part of the setup
@@ -39,8 +44,26 @@ $(VENV)/.writer: $(VENV)/.user
 	$(BYTECODE)
 	touch $@
 
-demo: $(VENV)/.user  ## train on truth, noise and the estimate, one seed each, and compare: a minute or two
-	$(BIN)/quad-gym compare --quick --engine compiled
+demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then two trainings on the circle: two minutes
+	@echo "1. LookAround: the only markers are on one wall, and there is no GNSS. Three controllers"
+	@echo "   are evaluated on the true state and on the filter's estimate: PD control, a policy"
+	@echo "   trained on the true state, and one trained on the estimate with its standard deviation."
+	@$(BIN)/quad-gym evaluate look_around --policy pd pretrained:truth pretrained --episodes 200 \
+		--video webp --overwrite --output results/demo/look_around
+	@echo
+	@echo "2. The control experiment: on the circle, good sensors determine the state, so training on"
+	@echo "   the estimate is expected to make no difference. Two short trainings, one seed:"
+	@$(BIN)/quad-gym compare --quick --engine compiled --train-on truth estimate --steps 1e6 \
+		--output results/demo/circle
+	@echo
+	@echo "Open:"
+	@echo "  results/demo/look_around/video.webp   one episode; the policy on the right looks at the markers"
+	@echo "  results/demo/look_around/errors.png   errors and crashes over time"
+	@echo "  results/demo/circle/report.html       the control experiment"
+	@echo "Next:"
+	@echo "  $(BIN)/quad-gym evaluate look_around --policy pd:features_when_uncertain pretrained"
+	@echo "  $(BIN)/quad-gym fly look_around --policy pretrained --output results/flight.webp"
+	@echo "  $(BIN)/quad-gym train circle --engine compiled"
 
 circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
 	$(BIN)/quad-gym circle --output results/circle

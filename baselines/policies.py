@@ -32,7 +32,9 @@ _PD: dict[str, dict[str, Any]] = {
 
 _PLANNING = "pd:planning"
 
-NAMES = (*_PD, _PLANNING, "pretrained")  #: names of policies, see `load_policy`
+_INCLUDED = "pretrained"
+
+NAMES = (*_PD, _PLANNING, _INCLUDED, f"{_INCLUDED}:truth")  #: names of policies, see `load_policy`
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",
@@ -66,8 +68,10 @@ def load_policy(name: str, env: Any) -> Policy:
             "pd:waiting" (for courses with gaps: half the speed, or waiting when uncertain),
             "pd:planning" (plans by predicted covariances, on LookAround and OutageDash),
             "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
-            the task of the environment), or a file: `.npz` with plain arrays, or `.zip`
-            written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
+            the task of the environment), "pretrained:truth" (the included one that was trained on
+            the true state, for Circle and LookAround), or a file: `.npz` with plain arrays, or
+            `.zip` written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted
+            files.
         env: Environment of this package: single, vector or Stable-Baselines3.
 
     Raises:
@@ -83,7 +87,7 @@ def load_policy(name: str, env: Any) -> Policy:
         return PlanningPolicy(env)
     if name.startswith("pd:"):
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
-    file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
+    file = pretrained_file(task_of(env), name) if is_included(name) else Path(name)
     if file.suffix == ".npz":
         policy: Any = MlpPolicy.load(file)
         _require_agreement(file, policy.record, env)
@@ -105,13 +109,13 @@ def load_policy(name: str, env: Any) -> Policy:
 def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
     """Keywords that an environment needs for a policy, in addition to the defaults of its id.
 
-    Raises a ValueError if the name is "pretrained" and no policy is included for the task.
+    Raises a ValueError if no policy of this name is included for the task.
     """
     if name in ("pd:features_when_uncertain", "pd:waiting", _PLANNING):
         return {"include_std": True}
-    if name != "pretrained":
+    if not is_included(name):
         return {}
-    trained = MlpPolicy.load(pretrained_file(env_id)).record["plan"]["environment"]
+    trained = MlpPolicy.load(pretrained_file(env_id, name)).record["plan"]["environment"]
     return {key: trained[key] for key in ("task", "include_std") if key in trained}
 
 
@@ -126,13 +130,20 @@ def _gains_of(file: Path) -> PDGains:
         raise ValueError(f"{file} does not contain PD gains: {error!r}") from None
 
 
-def pretrained_file(env_id: str) -> Path:
-    """File of the included policy for a task; a ValueError if there is none."""
-    file = PRETRAINED / f"{IDS[env_id]}.npz"
+def is_included(name: str) -> bool:
+    """True for names of included policies: "pretrained", or one such as "pretrained:truth"."""
+    return name.partition(":")[0] == _INCLUDED
+
+
+def pretrained_file(env_id: str, name: str = _INCLUDED) -> Path:
+    """File of the included policy of a name for a task; a ValueError if there is none."""
+    ending = name.removeprefix(_INCLUDED).replace(":", "_")
+    file = PRETRAINED / f"{IDS[env_id]}{ending}.npz"
     if not file.exists():
-        known = sorted(f.stem for f in PRETRAINED.glob("*.npz"))
+        known = [task for task in IDS.values() if (PRETRAINED / f"{task}{ending}.npz").exists()]
+        what = "no policy" if name == _INCLUDED else f"no policy {name}"
         raise ValueError(
-            f"no policy is included for {env_id}, only for {', '.join(known) or 'no task'}"
+            f"{what} is included for {env_id}, only for {', '.join(sorted(known)) or 'no task'}"
         )
     return file
 

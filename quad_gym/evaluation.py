@@ -7,15 +7,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.analysis.metrics import NO_CRASHES
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs import keywords_of
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params import checks as check
-from quad_gym.records import Ending
-
-NO_CRASHES = (Ending.LAST_GATE, Ending.TASK)
-"""Endings of terminated episodes that do not count as crashes: the last gate, and endings of a
-user-defined task."""
 
 
 class Policy(Protocol):
@@ -33,16 +29,20 @@ class Policy(Protocol):
 
 
 class Episodes(NamedTuple):
-    """Results of n episodes; each field is an array (n,)."""
+    """Results of n episodes; each field is an array (n,).
+
+    From a crash to the time limit, the tracking error counts as the bound `out_of_bounds` of the
+    task, at which episodes end. A crash therefore never makes a mean error smaller.
+    """
 
     returns: NDArray[np.float64]  #: sums of rewards
     lengths: NDArray[np.int64]  #: steps
     mean_error: NDArray[np.float64]  #: true position error, mean over the episode [m]
     late_error: NDArray[np.float64]
     """True position error, mean over the second half of the time limit [m]; NaN for episodes that
-    crashed or ended before the time limit"""
+    ended before the time limit without a crash"""
     estimation_error: NDArray[np.float64]
-    """Distance between observed and true position, mean over the episode [m]"""
+    """Distance between observed and true position, mean up to the end of the episode [m]"""
     crashed: NDArray[np.bool_]  #: True for episodes that ended in a crash
     gates_passed: NDArray[np.int64]  #: number of gates passed on a course of gates
     ending: NDArray[Any]  #: name of the ending, as text
@@ -90,12 +90,12 @@ def roll_out(
     quads = env.unwrapped
     if not isinstance(quads, QuadVectorEnv):
         raise ValueError(f"env must be a QuadVectorEnv, got {type(env).__name__}")
-    limit = quads.flights.batch.max_steps
+    limit, bound = quads.flights.batch.max_steps, quads.flights.batch.task.out_of_bounds
     if limit == 0:
         raise ValueError("env must have a time limit: a duration or max_episode_steps above 0")
     count = env.num_envs
     returns, errors, late, estimation = (np.zeros(count) for _ in range(4))
-    lengths, gates, late_steps = (np.zeros(count, np.int64) for _ in range(3))
+    lengths, gates = (np.zeros(count, np.int64) for _ in range(2))
     crashed, flying = np.zeros(count, bool), np.ones(count, bool)
     ending = np.full(count, "none", object)
 
@@ -116,7 +116,6 @@ def roll_out(
         lengths += flying
         if step > limit // 2:
             late[flying] += info["position_error"][flying]
-            late_steps += flying
         over = flying & (terminated | truncated)
         ending[over] = [str(reason) for reason in info["ending"][over]]
         crashed |= over & terminated & ~np.isin(info["ending"], NO_CRASHES)
@@ -126,11 +125,14 @@ def roll_out(
             watch(step, quads.flights.batch, flying | (over & (lengths == limit)))
         if not flying.any():
             break
-    complete = (lengths == limit) & ~crashed
-    late_error = np.where(complete, late / np.maximum(late_steps, 1), np.nan)
-    return Episodes(
-        returns, lengths, errors / lengths, late_error, estimation / lengths, crashed, gates, ending
-    )
+    lost = (lengths < limit) & ~np.isin(ending, [str(reason) for reason in NO_CRASHES])
+    half = limit // 2
+    errors += bound * np.where(lost, limit - lengths, 0)
+    late += bound * np.where(lost, limit - np.maximum(lengths, half), 0)
+    mean_error = errors / np.where(lost, limit, lengths)
+    late_error = np.where(lost | (lengths == limit), late / (limit - half), np.nan)
+    estimation /= lengths
+    return Episodes(returns, lengths, mean_error, late_error, estimation, crashed, gates, ending)
 
 
 def _info_of_step(info: dict[str, Any]) -> dict[str, Any]:

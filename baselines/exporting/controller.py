@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from baselines.exporting.actions import ActionField, action_fields
 from baselines.mlp import MlpPolicy, mlp_of
-from baselines.policies import load_policy, pretrained_file
+from baselines.policies import is_included, load_policy, pretrained_file
 from quad_gym.envs import keywords_of
 from quad_gym.envs.spaces import ObservationField, layout_bounds
 from quad_gym.packing.flight import params_record
@@ -82,11 +82,11 @@ def controller_of(
     """
     if policy == "pd" or policy.startswith("pd:"):
         raise ValueError(f"policy must be a trained network, got {policy!r}")
-    if policy == "pretrained" and env_id is None:
-        raise ValueError("policy pretrained needs an ENV_ID: several tasks have one")
+    if is_included(policy) and env_id is None:
+        raise ValueError(f"policy {policy} needs an ENV_ID: several tasks have one")
     if env_id is not None:
         keywords_of(env_id)  # rejects unknown ids
-    file = pretrained_file(env_id) if policy == "pretrained" and env_id else Path(policy)
+    file = pretrained_file(env_id, policy) if is_included(policy) and env_id else Path(policy)
     if not file.exists():
         meant = check.did_you_mean(policy, ("pretrained", "filter"))
         raise ValueError(f"there is no policy {file}{meant}")
@@ -116,7 +116,7 @@ def controller_of(
         params = params_record(batch.vehicle, batch.sensors, action_params=batch.action_params)[0]
         controller = Controller(
             policy=found if isinstance(found, MlpPolicy) else mlp_of(found, record),
-            source=policy if policy == "pretrained" else file.name,
+            source=policy if is_included(policy) else file.name,
             env_id=env_id,
             keywords=dict(keywords),
             table=flights.table,

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 _HERE = Path(__file__).parent
-POLICIES = _HERE / "policies"
-"""Policies trained on the true state, for this page."""
 _BASE = 1 << 20
 """Address of the first record, above code's constants and the stack."""
 _ONE_LANE = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
@@ -48,7 +46,7 @@ def _policies(names: set[str]) -> tuple[dict[str, Any], bytes]:
     layers: dict[str, Any] = {}
     weights = b""
     for name in sorted(names):
-        files = {"truth": POLICIES / f"{name}_truth.npz", "estimate": PRETRAINED / f"{name}.npz"}
+        files = {"truth": PRETRAINED / f"{name}_truth.npz", "estimate": PRETRAINED / f"{name}.npz"}
         layers[name] = {}
         for source, file in files.items():
             policy = MlpPolicy.load(file)

@@ -1,4 +1,4 @@
-"""Figures that compare controllers: errors over time, learning curves, matrices, paths.
+"""Figures that compare controllers: errors over time, learning curves, intervals, paths.
 
 Each curve has its own color and line style.
 """
@@ -24,23 +24,49 @@ _STYLES: tuple[dict[str, Any], ...] = (
 )
 """Colors and dash patterns of the curves, in order."""
 
+_AT_HEIGHT: dict[str, Any] = {
+    "xycoords": ("axes fraction", "data"),
+    "textcoords": "offset points",
+}
+"""Coordinates of a remark at the left end of a horizontal line."""
+
 _LEVELS = ((0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))  #: dash patterns of horizontal lines
 
 
 @plots.house_style()
-def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Any:
+def error_over_time_figure(
+    recorded: Mapping[str, Mapping[str, Floats]], bound: float, title: str = ""
+) -> Any:
     """Figure of errors over time by label: median over episodes, and a band from 5 to 95 %.
 
-    Curves are times (k,) [s], and the 5th, 50th and 95th percentile of the errors, (3, k) [m].
+    If episodes crashed, the share of the others is drawn below.
+
+    Args:
+        recorded: Arrays of `quad_gym.experiments.flown.PathRecorder` by label.
+        bound: Error of an episode from its crash on [m].
+        title: Title.
     """
-    figure, ((axes,),) = plots.panels(1, 1, (7.0, 3.8), title)
-    for k, (label, (time, (low, middle, high))) in enumerate(curves.items()):
+    crashes = any(each["not_crashed"][-1] < 1.0 for each in recorded.values())
+    rows = {"height_ratios": (3.0, 1.0), "sharex": True} if crashes else {}
+    size = (7.0, 5.0 if crashes else 3.8)
+    figure, grid = plots.panels(1 + crashes, 1, size, title, **rows)
+    axes, end = grid[0, 0], max(each["time"][-1] for each in recorded.values())
+    for k, (label, each) in enumerate(recorded.items()):
         style = _STYLES[k % len(_STYLES)]
+        time = np.append(each["time"], end)  # the last values stay
+        low, middle, high = np.pad(each["percentiles"], ((0, 0), (0, 1)), "edge")
         axes.fill_between(time, low, high, color=style["color"], alpha=0.15, linewidth=0)
         axes.plot(time, middle, label=label, **style)
+        if crashes:
+            grid[1, 0].plot(time, 100.0 * np.pad(each["not_crashed"], (0, 1), "edge"), **style)
     plots.logarithmic(axes)
-    axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))
-    axes.set(xlabel="time [s]", ylabel="position error [m]\nmedian, 5 to 95 % of episodes")
+    axes.set_xlim(0.0, end)
+    axes.set_ylabel("position error [m]\nmedian, 5 to 95 % of episodes")
+    if crashes:
+        axes.axhline(bound, color=plots.GREY, linewidth=0.8)
+        axes.annotate("crashed", (0.01, bound), (0, -3), va="top", color=plots.GREY, **_AT_HEIGHT)
+        grid[1, 0].set(ylabel="not crashed [%]", ylim=(-3.0, 103.0))
+    grid[-1, 0].set_xlabel("time [s]")
     _legend_below(figure, axes)
     return figure
 
@@ -53,11 +79,14 @@ def learning_figure(
     *,
     score: str = "mean position error [m]",
     linear: bool = False,
+    tests: Mapping[str, float] | None = None,
 ) -> Any:
     """Figure of scores during training by label: a thin line per seed, a bold one for the median.
 
     Curves are training steps (k,) and scores (k,) of each seed; the median ends with the shortest
-    one. Levels are horizontal lines to compare with.
+    one. Levels are horizontal lines to compare with. `tests` has the score of each label in the
+    test on the estimate, which is drawn behind the end of the training: validation during training
+    uses the observation of the training, and scores of different observations do not compare.
     """
     figure, ((axes,),) = plots.panels(1, 1, (7.0, 4.0), title)
     for k, (label, seeds) in enumerate(curves.items(), start=1):
@@ -67,6 +96,11 @@ def learning_figure(
         shortest = min(len(steps) for steps, _ in seeds)
         middle = np.median([scores[:shortest] for _, scores in seeds], axis=0)
         axes.plot(seeds[0][0][:shortest] / 1e6, middle, linewidth=2.0, label=label, **style)
+        if tests:
+            end = 1.04 * max(steps[-1] for steps, _ in seeds) / 1e6
+            words = "test on the estimate" if k == len(curves) else "_"
+            dot: dict[str, Any] = {"markeredgecolor": plots.INK, "linestyle": "none"}
+            axes.plot(end, tests[label], "o", color=style["color"], label=words, **dot)
     for k, (label, level) in enumerate(levels.items()):
         dashes = _LEVELS[k % len(_LEVELS)]
         axes.axhline(level, color=plots.INK, linewidth=1.0, linestyle=dashes, label=label)
@@ -79,28 +113,31 @@ def learning_figure(
 
 
 @plots.house_style()
-def matrix_figure(
-    values: Floats,
-    cells: Sequence[Sequence[str]],
-    rows: Sequence[str],
-    columns: Sequence[str],
+def intervals_figure(
+    values: Mapping[str, Mapping[str, tuple[float, tuple[float, float] | None]]],
+    unit: str,
     title: str = "",
 ) -> Any:
-    """Table of texts whose cells are colored by values (rows, columns), on a logarithmic scale."""
-    size = (2.6 + 2.1 * len(columns), 1.2 + 0.55 * len(rows))
-    figure, ((axes,),) = plots.panels(1, 1, size, title)
-    shades = np.log10(values)
-    axes.imshow(shades, cmap="cividis_r", aspect="auto", alpha=0.75)
-    middle = 0.5 * (np.nanmin(shades) + np.nanmax(shades))
-    for (i, j), shade in np.ndenumerate(shades):
-        color = "white" if shade > middle else plots.INK
-        axes.text(j, i, cells[i][j], ha="center", va="center", color=color)
-    axes.set_xticks(range(len(columns)), columns)
-    axes.set_yticks(range(len(rows)), rows)
-    axes.xaxis.tick_top()
-    axes.tick_params(length=0)
-    axes.grid(False)
-    axes.spines[:].set_visible(False)
+    """Figure of values with intervals: a line for each row, and a color for each column.
+
+    Args:
+        values: Value and interval, or None, by row and column.
+        unit: Label of the values.
+        title: Title.
+    """
+    columns = list(next(iter(values.values())))
+    figure, ((axes,),) = plots.panels(1, 1, (7.0, 1.4 + 0.5 * len(values)), title)
+    for k, column in enumerate(columns):
+        color, height = _STYLES[3 - 2 * (k % 2)]["color"], 0.3 * (k - 0.5 * (len(columns) - 1))
+        for row, (value, interval) in enumerate(each[column] for each in values.values()):
+            label = column if row == 0 else "_"
+            if interval is not None:
+                axes.plot(interval, [row + height] * 2, color=color, linewidth=2.0, alpha=0.6)
+            axes.plot(value, row + height, "o", color=color, label=label)
+    axes.set_yticks(range(len(values)), values)
+    axes.set_ylim(len(values) - 0.5, -0.5)
+    axes.set_xlabel(unit)
+    _legend_below(figure, axes)
     return figure
 
 

@@ -13,9 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.records import Ending
 from quad_gym.rotations import dcm_to_euler
 
 STATE_DIMENSION = 15  #: number of coordinates of the filter's error
+
+NO_CRASHES = (Ending.LAST_GATE, Ending.TASK)
+"""Endings before the time limit that do not count as crashes: the last gate, and endings of a
+user-defined task."""
 
 Floats = NDArray[np.float64]
 

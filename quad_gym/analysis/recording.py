@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.consistency import flight_errors
-from quad_gym.analysis.metrics import RunningSummary, TrackingSummary, nees
+from quad_gym.analysis.metrics import NO_CRASHES, RunningSummary, TrackingSummary, nees
 from quad_gym.analysis.plots import Band, Trace
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Ending, Source
@@ -35,7 +35,7 @@ class Recording:
     trace: Trace
     """First flight, up to its ending"""
     band: Band
-    """5th to 95th percentile of the tracking errors of flights in progress"""
+    """5th to 95th percentile of the tracking errors, see `Tracer.percentiles`"""
     nees_time: Floats
     """Times at which NEES was computed, (k,) [s]"""
     nees: Floats
@@ -130,6 +130,7 @@ class Tracer:
 
     def __init__(self) -> None:
         self._percentiles: list[Floats] = []
+        self._shares: list[float] = []
         self._path: list[tuple[Floats, Floats, Floats, Floats]] = []
         self._gates: Floats | None = None
         self._control_rate = 0.0
@@ -139,10 +140,17 @@ class Tracer:
         first, errors = np.zeros(1, np.intp), batch.record("position_error")
         if step == 0:
             self._control_rate = batch.clocks.control_rate
+            self._flying, self._crashed = flying.copy(), np.zeros(len(flying), bool)
             if batch.task.kind == "waypoints":
                 self._gates = batch.record("gates", first)[0, : batch.task.gate_count]
-        shares = np.percentile(errors[flying], (5.0, 50.0, 95.0)) if flying.any() else [np.nan] * 3
+        ended = self._flying & ~flying
+        regular = (Ending.TIME_LIMIT, *NO_CRASHES)
+        self._crashed[ended] = ~np.isin(batch.result("ending")[ended], regular)
+        self._flying = flying.copy()
+        counted = np.where(self._crashed, batch.task.out_of_bounds, errors)[flying | self._crashed]
+        shares = np.percentile(counted, (5.0, 50.0, 95.0)) if counted.size else [np.nan] * 3
         self._percentiles.append(np.asarray(shares))
+        self._shares.append(1.0 - float(self._crashed.mean()))
         if flying[0]:
             heading = quaternion_to_dcm(batch.record("q", first)[0])[0, :2]
             place, reference = batch.record("r", first)[0], batch.read("reference_position", first)
@@ -155,8 +163,17 @@ class Tracer:
 
     @property
     def percentiles(self) -> Floats:
-        """5th, 50th and 95th percentile of the errors of episodes in progress, (3, k) [m]."""
+        """5th, 50th and 95th percentile of the errors, (3, k) [m].
+
+        A crashed episode counts with the bound `out_of_bounds` of the task from its crash on, so
+        that crashes never lower a percentile. Episodes that ended otherwise are left out.
+        """
         return np.stack(self._percentiles, axis=1)
+
+    @property
+    def not_crashed(self) -> Floats:
+        """Share of the episodes that have not crashed, (k,)."""
+        return np.array(self._shares)
 
     def trace(self) -> Trace:
         """Path of the first flight, up to its end."""

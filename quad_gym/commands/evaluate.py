@@ -25,10 +25,20 @@ from quad_gym.analysis.reports import require_writable, short_name
 from quad_gym.commands import options
 from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Policy
-from quad_gym.experiments.evaluated import evaluation_table, write_evaluation
+from quad_gym.experiments.evaluated import (
+    Evaluated,
+    evaluation_table,
+    remark_on_crashes,
+    side_of,
+    telling_episode,
+    write_evaluation,
+)
 from quad_gym.experiments.flown import fly
 from quad_gym.params.suites import contents_of_suite_files
-from quad_gym.rendering.video import checked_video_path, flight_of, save_video
+from quad_gym.rendering.side_by_side import save_side_by_side
+from quad_gym.rendering.video import checked_video_path
+
+VIDEO_RATE = 10.0  #: frames per second of a video
 
 
 @dataclass(frozen=True)
@@ -38,8 +48,9 @@ class EvaluateArgs:
     env_id: options.EnvId = "QuadGym/Circle-v0"
     policy: tuple[str, ...] | None = None
     """policies: pd (tuned gains), pd:lab (gains of the report), pd:FILE.json (gains of quad-gym
-    tune), pretrained (the included policy for the task), or files of quad-gym train (.zip or .npz);
-    if not given, pd, and pretrained if it fits"""
+    tune), pretrained (the included policy for the task), pretrained:truth (for Circle and
+    LookAround: the included one that was trained on the true state), or files of quad-gym train
+    (.zip or .npz); defaults to pd, and pretrained if it fits"""
     observation: tuple[str, ...] = ("truth", "estimate")
     """observations on which the policies fly: truth, estimate, noisy, or measurements (for policies
     trained on raw measurements)"""
@@ -56,7 +67,8 @@ class EvaluateArgs:
     """seed of the first episode; the others have consecutive seeds; trainings use different ones"""
     threads: options.Threads = None
     video: Literal["none", "mp4", "gif", "webp"] = "none"
-    """format of a video of the first episode of each case; none: no video"""
+    """format of a video of all policies on the last observation, side by side in one episode: the
+    first one in which some of them crash and others do not, or else the first; none: no video"""
     output: Path | None = None
     """folder for figures and numbers; if not given, results/evaluate/TASK, or TASK_2 and so on
     if there are results already"""
@@ -138,19 +150,22 @@ def keywords_of_flights(args: EvaluateArgs, observation: str, policy: str) -> di
     return with_effect(keywords)
 
 
-def write_videos(
-    cases: dict[Pairing, tuple[Policy, Any]], args: EvaluateArgs, folder: Path
-) -> list[Path]:
-    """Write a video of the first episode of each case."""
-    files = []
-    for name, observation in tqdm(cases, desc="filming", unit=" videos"):
-        policy, env = policy_and_flights(args, observation, 1, name)
-        about = {"env_id": args.env_id, "policy": name, "observation": observation}
-        flight = flight_of(policy, env, seed=args.seed, about=about)
-        stem = short_name(name).replace("/", "_").replace(":", "_")
-        files.append(folder / f"video_{stem}_{observation}.{args.video}")
-        save_video(flight, files[-1])
-    return files
+def write_video(
+    cases: dict[Pairing, tuple[Policy, Any]], results: Evaluated, args: EvaluateArgs, folder: Path
+) -> Path:
+    """Write a video of all policies on the last observation, side by side in one episode."""
+    shown = {case: found for case, found in cases.items() if case[1] == args.observation[-1]}
+    episode = telling_episode({case: results[case] for case in shown})
+    sides = [
+        side_of(short_name(name), *found, args.seed, episode, {"env_id": args.env_id})
+        for (name, _), found in shown.items()
+    ]
+    return save_side_by_side(
+        sides,
+        folder / f"video.{args.video}",
+        fps=VIDEO_RATE,
+        progress=lambda times: tqdm(times, desc="rendering", unit=" frames"),
+    )
 
 
 def main(args: EvaluateArgs) -> None:
@@ -165,11 +180,14 @@ def main(args: EvaluateArgs) -> None:
         f"\n{args.env_id}, sensors {options.sensors_of(args.env_id, args.sensors)}; "
         f"{args.episodes:,} episodes in each case, from seed {args.seed}.\n"
     )
-    print(evaluation_table(results, next(iter(cases.values()))[1]))
+    _, env = next(iter(cases.values()))
+    print(evaluation_table(results, env))
     print("In brackets: 95 % interval over episodes, Student's t or Clopper and Pearson's.")
+    if remark := remark_on_crashes(results, env):
+        print(remark)
     flown = tuple(dict.fromkeys(name for name, _ in results))
     about = {**contents_of_suite_files(args.sensors), "arguments": replace(args, policy=flown)}
-    written = write_evaluation(results, args.seed, folder, about)
+    written = write_evaluation(results, env, args.seed, folder, about)
     if args.video != "none":
-        written += write_videos(cases, args, folder)
+        written.append(write_video(cases, results, args, folder))
     print(f"\nWrote {len(written)} files to {folder} after {time.perf_counter() - began:.1f} s.")

@@ -29,13 +29,14 @@ NAMES = {
 """Rows of the matrix."""
 
 FLOWN_ON = ("truth", "estimate")  #: observations of the flights: columns of the matrix
+_ON = {"truth": "evaluated on the truth", "estimate": "evaluated on the estimate"}
 
 _ENGINES = {"sb3": "Stable-Baselines3", "compiled": "the compiled engine"}
 MANY_CRASHES = 0.01  #: share of crashes above which mean errors are not compared
 ONE_SEED = (
-    "One training seed proves nothing: another seed could reverse any of these differences. "
-    "Run with five for intervals. Where good sensors determine the state, as on the circle, no "
-    "difference is expected; quad-gym study look_around shows where it matters."
+    "A single training seed is not conclusive: another seed could reverse any of these "
+    "differences. Use five seeds for intervals. With good sensors, as on the circle, no difference "
+    "is expected; quad-gym evaluate look_around shows a task in which the estimate matters."
 )
 
 
@@ -108,6 +109,11 @@ class MatrixCell:
         error = in_brackets(float(np.mean(self.errors)), self.interval, ".1f", 1e3)
         return error, f"{1e3 * np.mean(self.late_errors):.1f}", f"{np.mean(self.crash_rates):.1%}"
 
+    def in_mm(self) -> tuple[float, tuple[float, float] | None]:
+        """Mean error and its interval [mm]."""
+        limits = None if self.interval is None else tuple(1e3 * x for x in self.interval)
+        return 1e3 * float(np.mean(self.errors)), limits  # type: ignore[return-value]
+
     def description(self) -> dict[str, Any]:
         """Numbers for JSON."""
         error, late, crashed = map(np.mean, (self.errors, self.late_errors, self.crash_rates))
@@ -133,6 +139,12 @@ class ComparisonResults:
         interval = mean_interval(sample) if len(sample) > 1 else None
         return MatrixCell(errors, late, crashes, interval)
 
+    @property
+    def bound(self) -> float:
+        """Tracking error with which a crashed episode counts from its crash on [m]."""
+        trial = next(iter(self.comparison.trials().values()))
+        return float(trial.make(1).unwrapped.flights.task.out_of_bounds)
+
     def cells(self, suite: str) -> dict[str, list[MatrixCell]]:
         """Rows of the matrix of a suite."""
         rows = self.comparison.rows
@@ -149,7 +161,8 @@ class ComparisonResults:
 def matrix_text(matrix: ComparisonResults, suite: str) -> str:
     """Matrix of a sensor suite, for the screen."""
     flown = ["on truth", "on estimate"]
-    groups = {"": ["policy"], "mean error [mm]": flown, "second half [mm]": flown, "crashed": flown}
+    means = {"mean error [mm]": flown, "second half [mm]": flown}
+    groups = {"": ["policy"], **means, "crashed": flown}
     return text_table(groups, matrix.texts(suite))
 
 
@@ -162,17 +175,17 @@ def conclusions(matrix: ComparisonResults) -> list[str]:
                 continue
             cells = [matrix.cell(suite, *way) for way in (ours, other)]
             if max(float(cell.crash_rates.max()) for cell in cells) > MANY_CRASHES:
-                continue  # errors of crashed episodes end early
+                continue  # the means describe the crashes, not the tracking
             # PD has no training seed: its one number is repeated
             errors = [np.resize(cell.errors, len(comparison.seeds)) for cell in cells]
-            both = " Both flown on the estimate." if other[1] == "estimate" else ""
+            both = " Both evaluated on the estimate." if other[1] == "estimate" else ""
             sentences.append(f"Sensors {suite}: {_sentence(first, second, *errors)}{both}")
         for source in comparison.rows:
             share = float(matrix.cell(suite, source, "estimate").crash_rates.max())
             if share > MANY_CRASHES:
                 sentences.append(
                     f"Sensors {suite}: {NAMES[source]}, up to {share:.0%} of the episodes crashed "
-                    "on the estimate, so that the errors are not compared."
+                    "on the estimate, so the errors are not compared."
                 )
     return [*sentences, ONE_SEED] if len(comparison.seeds) == 1 else sentences
 
@@ -200,7 +213,7 @@ def _sentence(first: str, second: str, errors: Floats, others: Floats) -> str:
     low, high = (1e3 * x for x in found.interval)
     span = f"{found.spread.count} seeds, 95 % interval {low:+.2f} to {high:+.2f} mm"
     if not found.significant:
-        return f"{first} and {second} cannot be told apart ({span})."
+        return f"{first} and {second} are statistically indistinguishable ({span})."
     return f"{first} gives {more} error than {second} ({span})."
 
 
@@ -218,7 +231,8 @@ def write_report(matrix: ComparisonResults) -> list[Path]:
         f"{recipe.algorithm.upper()} ({_ENGINES[comparison.engine]}), {recipe.steps:,} "
         f"steps for each of {len(trainings)} policies, training seeds "
         f"{', '.join(map(str, comparison.seeds))}; {seconds / 60:.1f} minutes of training. "
-        f"Each policy flew {comparison.episodes:,} episodes on the truth and on the estimate.",
+        f"Each policy was evaluated in {comparison.episodes:,} episodes on the truth and on the "
+        "estimate.",
     )
     report.add_bullets(conclusions(matrix))
     shown = ("error [mm]", "second half [mm]", "crashed")
@@ -267,26 +281,33 @@ def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
     figure = comparison_plots.learning_figure(
         curves,
         {"PD, tuned, on the estimate": float(cells["PD"][1].errors[0])},
-        f"Evaluated on what is trained on, sensors {suite}",
+        f"Validation error on the training observation, sensors {suite}",
+        tests={NAMES[s]: float(np.mean(cells[s][1].errors)) for s in comparison.sources},
     )
-    caption = "Error during training; thin lines are single seeds, bold ones their median."
+    caption = "Error during training, on the observation of the training"
+    if len(comparison.seeds) > 1:
+        caption += "; thin lines are single seeds, bold ones their median"
+    caption += ". Dots: error in the test on the estimate."
     report.add_figure(f"learning_{label}", figure, caption)
-    figure = comparison_plots.matrix_figure(
-        np.array([[float(np.mean(cell.errors)) for cell in row] for row in cells.values()]),
-        [[cell.texts()[0] for cell in row] for row in cells.values()],
-        [NAMES[source] for source in cells],
-        ["flown on truth", "flown on the estimate"],
-        f"Mean position error [mm], sensors {suite}",
+    figure = comparison_plots.intervals_figure(
+        {
+            NAMES[source]: {_ON[on]: cell.in_mm() for on, cell in zip(FLOWN_ON, row, strict=True)}
+            for source, row in cells.items()
+        },
+        "mean position error [mm]",
+        f"Policies on truth and estimate, sensors {suite}",
     )
     caption = "Mean error over whole episodes, with the 95 % interval over training seeds "
-    report.add_figure(f"matrix_{label}", figure, caption + "(Student's t); for PD, over episodes.")
+    caption += "(Student's t), if there are several; for PD, over episodes."
+    report.add_figure(f"matrix_{label}", figure, caption)
     first = {NAMES[s]: matrix.flown[case_of(suite, s, "estimate")][0] for s in comparison.rows}
-    errors = {name: (f.recorded["time"], f.recorded["percentiles"]) for name, f in first.items()}
-    title = f"Flown on the estimate, first training seed, sensors {suite}"
-    figure = comparison_plots.error_over_time_figure(errors, title)
-    caption = "Error over time: median and middle nine tenths of the episodes."
+    errors = {name: flown.recorded for name, flown in first.items()}
+    title = f"Evaluated on the estimate, first training seed, sensors {suite}"
+    figure = comparison_plots.error_over_time_figure(errors, matrix.bound, title)
+    caption = "Error over time: median and middle nine tenths of the episodes. "
+    caption += f"A crashed episode counts with {matrix.bound:g} m from its crash on."
     report.add_figure(f"errors_{label}", figure, caption)
     paths = {name: path_of(flown) for name, flown in first.items()}
-    title = f"From above, flown on the estimate, sensors {suite}"
+    title = f"Seen from above, evaluated on the estimate, sensors {suite}"
     figure = comparison_plots.paths_figure(paths, title)
     report.add_figure(f"paths_{label}", figure, "The first episode of the first training seed.")

@@ -4,12 +4,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from quad_gym.analysis import reports
 from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_interval
 from quad_gym.analysis.plots import save_figure
-from quad_gym.evaluation import Episodes
-from quad_gym.experiments.flown import Flown, path_of
+from quad_gym.evaluation import Episodes, Policy
+from quad_gym.experiments.flown import Flown, flight_of_episode, path_of
+from quad_gym.rendering.side_by_side import Side
 
 Evaluated = Mapping[tuple[str, str], Flown]  #: episodes by policy and observation
 
@@ -36,6 +39,43 @@ def evaluation_table(results: Evaluated, env: Any) -> str:
     )
 
 
+def telling_episode(results: Evaluated) -> int:
+    """Index of the first episode in which some policies crash and others do not; or else 0."""
+    crashed = np.mean([flown.episodes.crashed for flown in results.values()], axis=0)
+    return int(np.argmax((crashed > 0.0) & (crashed < 1.0)))
+
+
+def side_of(
+    label: str, policy: Policy, env: Any, seed: int, episode: int, about: Mapping[str, Any]
+) -> Side:
+    """Fly the episodes again, and return one of them for a video."""
+    flight, episodes = flight_of_episode(policy, env, seed, episode, about)
+    ending = str(episodes.ending[episode])
+    course = ("gates", env.unwrapped.flights.task.gate_count)
+    return Side(
+        flight=flight,
+        label=label,
+        ending="finish" if ending == "task" else ending,
+        crashed=bool(episodes.crashed[episode]),
+        course=course if env.unwrapped.flights.name == "waypoints" else None,
+    )
+
+
+def bound_of(env: Any) -> float:
+    """Tracking error with which a crashed episode counts from its crash on [m]."""
+    return float(env.unwrapped.flights.task.out_of_bounds)
+
+
+def remark_on_crashes(results: Evaluated, env: Any) -> str:
+    """Describe how crashed episodes count in the table; empty without crashes."""
+    if not any(flown.episodes.crashed.any() for flown in results.values()):
+        return ""
+    return (
+        f"A crashed episode counts with a tracking error of {bound_of(env):g} m, the bound of the "
+        "task, from its crash to its time limit."
+    )
+
+
 def _progress(episodes: Episodes, flights: Any) -> list[str]:
     """Share of the gates passed, and mean time of complete courses."""
     done = episodes.ending == "last_gate"
@@ -58,9 +98,12 @@ def _rate(happened: Any) -> str:
 
 
 def write_evaluation(
-    results: Evaluated, seed: int, folder: Path, about: Mapping[str, Any]
+    results: Evaluated, env: Any, seed: int, folder: Path, about: Mapping[str, Any]
 ) -> list[Path]:
-    """Write numbers and figures; the summary also contains `about`."""
+    """Write numbers and figures; the summary also contains `about`.
+
+    `env` is an environment of the same task.
+    """
     count = len(next(iter(results.values())).episodes.returns)
     tables = (
         {
@@ -83,11 +126,11 @@ def write_evaluation(
     labeled = {
         f"{reports.short_name(policy)} on {seen}": f for (policy, seen), f in results.items()
     }
-    curves = {k: (f.recorded["time"], f.recorded["percentiles"]) for k, f in labeled.items()}
+    curves = {label: flown.recorded for label, flown in labeled.items()}
     paths = paths_figure({label: path_of(flown) for label, flown in labeled.items()})
     return [
         reports.write_csv(folder / "episodes.csv", reports.stacked(tables)),
         reports.write_json(folder / "summary.json", summary),
         *save_figure(paths, folder / "paths"),
-        *save_figure(error_over_time_figure(curves), folder / "errors"),
+        *save_figure(error_over_time_figure(curves, bound_of(env)), folder / "errors"),
     ]

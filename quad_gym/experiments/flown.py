@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.policies import load_policy
+from quad_gym import Flight, FlightRecorder
 from quad_gym.analysis.plots import Trace
 from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import as_json
@@ -109,12 +110,34 @@ def fly(policy: Policy, env: Any, seed: int, traced: Sequence[str] = ()) -> Flow
 
 
 class PathRecorder(Tracer):
-    """Recorder of percentiles of the errors, "percentiles" (3, t) [m], and of the first path."""
+    """Recorder of the first path, and of errors: "percentiles" (3, t) [m], "not_crashed" (t,)."""
 
     def arrays(self) -> dict[str, Floats]:
         """Recorded arrays; the path is in those named "path.FIELD", see `path_of`."""
         path = {f"path.{name}": values for name, values in vars(self.trace()).items()}
-        return {"time": self.time, "percentiles": self.percentiles, **path}
+        errors = {"percentiles": self.percentiles, "not_crashed": self.not_crashed}
+        return {"time": self.time, **errors, **path}
+
+
+def flight_of_episode(
+    policy: Policy, env: Any, seed: int, episode: int, about: Mapping[str, Any] | None = None
+) -> tuple[Flight, Episodes]:
+    """Fly the episodes of `fly` once more, and return one of them as a flight, and all results.
+
+    In a smaller batch, the matrix products of a policy would round differently, and a flight that
+    diverges could end elsewhere.
+    """
+    recorder = FlightRecorder(env.unwrapped.flights.batch, episode, about=dict(about or {}))
+    flying = True
+
+    def keep(step: int, batch: Any, which: NDArray[np.bool_]) -> None:
+        nonlocal flying
+        if flying:  # including the instant at which it ends
+            recorder.keep()
+        flying = bool(which[episode])
+
+    episodes = roll_out(policy, env, seed=seed, watch=keep)
+    return recorder.flight, episodes
 
 
 def path_of(flown: Flown) -> Trace:

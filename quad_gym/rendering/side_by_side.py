@@ -63,16 +63,13 @@ class SideBySide:
         sides: Flights, from left to right.
 
     Raises:
-        ValueError: If there is no flight, or one without a filter.
+        ValueError: If there is no flight.
         ImportError: If pygame is not installed.
     """
 
     def __init__(self, sides: Sequence[Side]) -> None:
         if not sides:
             raise ValueError("sides must be at least one, got none")
-        for side in sides:
-            if not side.flight.estimated:
-                raise ValueError(f"sides must have an estimate, {side.label!r} has none")
         self.sides = tuple(sides)
         self.end = max(side.end for side in sides)
         width, height = SIDE

@@ -162,7 +162,7 @@ def test_controllers_give_same_actions_as_in_package(reported, replayed, name):
     env = gymnasium.make("QuadGym/Circle-v0", sensors=scenes.SCENES[name].sensors)
     controllers = {0: PDPolicy(env)}
     if name == "circle":
-        controllers[1] = MlpPolicy.load(build.POLICIES / "circle_truth.npz")
+        controllers[1] = MlpPolicy.load(pretrained_file("QuadGym/Circle-v0", "pretrained:truth"))
         controllers[2] = MlpPolicy.load(pretrained_file("QuadGym/Circle-v0"))
     for k, controller in controllers.items():
         steps = aloft(flight)[k]

@@ -74,7 +74,7 @@ def compare(where, *more):
 def test_compare_writes_report_and_continues(tmp_path):
     done = compare(tmp_path)
     assert done.returncode == 0, done.stderr
-    for part in ("trained on the estimate", "PD, tuned", "One training seed proves nothing"):
+    for part in ("trained on the estimate", "PD, tuned", "A single training seed is not concl"):
         assert part in done.stdout
     policies = read_csv(tmp_path / "out/policies.csv")
     assert len(policies) == (1 + 3) * 2

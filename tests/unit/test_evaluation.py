@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from baselines import PDPolicy
-from baselines.policies import load_policy, pretrained_file
+from baselines.policies import keywords_of_policy, load_policy, pretrained_file
+from quad_gym.analysis.comparison_plots import error_over_time_figure
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.evaluation import evaluate, roll_out
+from quad_gym.experiments.flown import PathRecorder, fly
 from quad_gym.records import Ending
 
 LIMIT = 41
@@ -52,14 +54,17 @@ def plain_loop(task, policy, seed, **keywords):
         estimation.append(info["estimation_error"])
         if terminated or truncated:
             break
-    complete = len(errors) == LIMIT and not (terminated and info["ending"] != Ending.LAST_GATE)
+    crashed = terminated and info["ending"] != Ending.LAST_GATE
+    measured = len(errors)
+    if crashed:
+        errors += [env.flights.task.out_of_bounds] * (LIMIT - len(errors))
     return {
         "returns": sum(rewards),
-        "lengths": len(rewards),
+        "lengths": measured,
         "mean_error": np.mean(errors),
-        "late_error": np.mean(errors[LIMIT // 2 :]) if complete else np.nan,
+        "late_error": np.mean(errors[LIMIT // 2 :]) if len(errors) == LIMIT else np.nan,
         "estimation_error": np.mean(estimation),
-        "crashed": terminated and info["ending"] != Ending.LAST_GATE,
+        "crashed": crashed,
         "gates_passed": info["gates_passed"],
         "ending": str(info["ending"]),
     }
@@ -87,6 +92,63 @@ def test_roll_out_measures_same_values_as_plain_loop(task, size, kind, mode):
     assert summary["return"] == pytest.approx(episodes.returns.mean())
     assert summary["crash_rate"] == pytest.approx(episodes.crashed.sum() / 24)
     assert summary["late_error"] == pytest.approx(np.nanmean(episodes.late_error))
+
+
+class Quitting:
+    """PD control that turns the rotors off in some flights, once their error is small."""
+
+    def __init__(self, env, share):
+        self.pd, self.step = PDPolicy(env), 0
+        self.quits = np.arange(env.num_envs) < share * env.num_envs
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        action, _ = self.pd.predict(observation)
+        self.step += 1
+        if self.step > 60:
+            action[self.quits] = -1.0
+        return action, None
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_crashes_on_purpose_raise_errors_and_percentiles(share):
+    found = {}
+    for name in ("pd", "quitting"):
+        env = QuadVectorEnv(20, "hover", duration=4.0)
+        policy = PDPolicy(env) if name == "pd" else Quitting(env, share)
+        recorder = PathRecorder()
+        episodes = roll_out(policy, env, seed=0, watch=recorder.add)
+        found[name] = (episodes, recorder.arrays(), env.flights.task.out_of_bounds)
+    (pd, flown, _), (quitting, dropped, bound) = found.values()
+    few = int(20 * share)
+    assert quitting.crashed.sum() == few
+    assert not pd.crashed.any()
+    for field in ("mean_error", "late_error"):
+        assert (getattr(quitting, field)[:few] > getattr(pd, field)[:few]).all()
+        assert quitting.summary()[field] > pd.summary()[field]
+    low, middle, high = dropped["percentiles"]
+    after = np.flatnonzero(dropped["not_crashed"] < 1.0)
+    for worse, better in zip(dropped["percentiles"], flown["percentiles"], strict=True):
+        assert (worse[after] >= better[after]).all()
+    assert high[-1] == bound
+    assert dropped["not_crashed"][-1] == pytest.approx(1.0 - share)
+    assert (np.diff(dropped["not_crashed"]) <= 0.0).all()
+    if share == 1.0:
+        assert low[-1] == middle[-1] == bound
+        assert len(dropped["time"]) < len(flown["time"])
+
+
+def test_figure_of_errors_ends_at_the_bound_and_shows_crashes():
+    pytest.importorskip("matplotlib")
+    env = QuadVectorEnv(10, "hover", duration=3.0)
+    cases = {"pd": PDPolicy(env), "quitting": Quitting(env, 1.0)}
+    flown = {name: fly(policy, env, 0).recorded for name, policy in cases.items()}
+    errors, crashes = error_over_time_figure(flown, 1.6).axes
+    kept, lost = errors.lines[:2]
+    assert lost.get_xdata()[-1] == kept.get_xdata()[-1] == 3.0
+    assert lost.get_ydata()[-1] == 1.6 > kept.get_ydata()[-1]
+    assert [line.get_ydata()[-1] for line in crashes.lines] == [100.0, 0.0]
+    (only,) = error_over_time_figure({"pd": flown["pd"]}, 1.6).axes
+    assert only.get_xlabel() == "time [s]"
 
 
 def test_a_course_that_is_finished_is_no_crash():
@@ -126,3 +188,12 @@ def test_a_policy_of_another_task_flies_with_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_policy("pretrained", env)
+
+
+def test_policies_trained_on_the_truth_load_by_name():
+    env_id = "QuadGym/LookAround-v0"
+    assert keywords_of_policy("pretrained:truth", env_id) == {}
+    policy = load_policy("pretrained:truth", gymnasium.make_vec(env_id, num_envs=2))
+    assert policy.record["plan"]["environment"] == {"observation": "truth"}
+    with pytest.raises(ValueError, match=r"no policy pretrained:truth is included for QuadGym/Hov"):
+        load_policy("pretrained:truth", gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2))

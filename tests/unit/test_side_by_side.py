@@ -47,9 +47,6 @@ def test_flight_that_has_ended_keeps_its_last_frame(sides):
 def test_wrong_arguments_are_refused(sides, tmp_path):
     with pytest.raises(ValueError, match="sides must be at least one"):
         SideBySide([])
-    blind = record_flight(Still(0.0), "QuadGym/Hover-v0", observation="truth", max_episode_steps=3)
-    with pytest.raises(ValueError, match="sides must have an estimate, 'a' has none"):
-        SideBySide([Side(blind, "a", "time_limit", False)])
     for wrong in ({"fps": 0.0}, {"speed": -1.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             save_side_by_side(sides, tmp_path / "film.webp", **wrong)
