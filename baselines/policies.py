@@ -12,7 +12,6 @@ import gymnasium
 
 from baselines.mlp import MlpPolicy
 from baselines.pd import REACH_OF_GAPS, PDPolicy
-from baselines.planning import PlanningPolicy
 from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
 from quad_gym.params import checks as check
@@ -30,11 +29,9 @@ _PD: dict[str, dict[str, Any]] = {
 }
 """Arguments of `PDPolicy` by name, see `load_policy`."""
 
-_PLANNING = "pd:planning"
-
 _INCLUDED = "pretrained"
 
-NAMES = (*_PD, _PLANNING, _INCLUDED, f"{_INCLUDED}:truth")  #: names of policies, see `load_policy`
+NAMES = (*_PD, _INCLUDED, f"{_INCLUDED}:truth")  #: names of policies, see `load_policy`
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",
@@ -66,7 +63,6 @@ def load_policy(name: str, env: Any) -> Policy:
         name: "pd" (tuned gains), "pd:lab" (gains of the report), "pd:features" and
             "pd:features_when_uncertain" (tuned gains, facing the features), "pd:slow" and
             "pd:waiting" (for courses with gaps: half the speed, or waiting when uncertain),
-            "pd:planning" (plans by predicted covariances, on LookAround and OutageDash),
             "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
             the task of the environment), "pretrained:truth" (the included one that was trained on
             the true state, for Circle and LookAround), or a file: `.npz` with plain arrays, or
@@ -83,8 +79,6 @@ def load_policy(name: str, env: Any) -> Policy:
     """
     if name in _PD:
         return PDPolicy(env, **_PD[name])
-    if name == _PLANNING:
-        return PlanningPolicy(env)
     if name.startswith("pd:"):
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env), name) if is_included(name) else Path(name)
@@ -111,7 +105,7 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
 
     Raises a ValueError if no policy of this name is included for the task.
     """
-    if name in ("pd:features_when_uncertain", "pd:waiting", _PLANNING):
+    if name in ("pd:features_when_uncertain", "pd:waiting"):
         return {"include_std": True}
     if not is_included(name):
         return {}

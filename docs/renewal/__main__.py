@@ -33,7 +33,8 @@ def measure(result: Result) -> dict[str, object]:
     began = time.monotonic()
     for number, command in enumerate(result.commands):
         words = [word.replace("OUT", str(folder / str(number))) for word in command.split()]
-        program = ["-m", "quad_gym"] if not words[0].endswith(".py") else []
+        module = words[0].startswith("scripts.")
+        program = ["-m"] if module else [] if words[0].endswith(".py") else ["-m", "quad_gym"]
         print(f"  {' '.join(words)}", flush=True)
         done = subprocess.run(
             [sys.executable, *program, *words], stdout=subprocess.PIPE, text=True, check=True

@@ -17,7 +17,7 @@ class Result:
     name: str
     """name of the result, and of its folder in results/renewal"""
     commands: list[str]
-    """options of `quad-gym`, or a script; OUT is a separate folder for each command"""
+    """options of `quad-gym`, a script or a module of scripts; OUT is a folder for each command"""
     flights: tuple[str, ...]
     """patterns of the golden flights of its tasks and suites; none for times"""
     texts: Texts
@@ -140,9 +140,9 @@ CATALOG = {
         Result(
             name="look_around",
             commands=[
-                "study look_around --video webp --output OUT --first-episode 100000 --arms "
-                "pd_reference pd_features pd_features_when_uncertain truth noisy noisier certainty "
-                "std std_certainty std_certainty_privileged"
+                "scripts.studies look_around --video webp --output OUT --first-episode 100000 "
+                "--arms pd_reference pd_features pd_features_when_uncertain truth noisy noisier "
+                "certainty std std_certainty std_certainty_privileged"
             ],
             flights=("LookAround", "LookAround, truth"),
             texts=texts.study(
@@ -163,7 +163,7 @@ CATALOG = {
         Result(
             name="miscalibrated",
             commands=[
-                "study look_around --arms-file quad_gym/experiments/arms_miscalibrated.py "
+                "scripts.studies look_around --arms-file scripts/studies/arms_miscalibrated.py "
                 "--output OUT --first-episode 100000 --episodes 1000"
             ],
             flights=("LookAround",),
@@ -172,8 +172,8 @@ CATALOG = {
         Result(
             name="stale_race",
             commands=[
-                "study stale_race --video webp --output OUT --first-episode 100000 --arms pd truth "
-                "residual std std_history truth_on_truth truth_delay_compensated "
+                "scripts.studies stale_race --video webp --output OUT --first-episode 100000 "
+                "--arms pd truth residual std std_history truth_on_truth truth_delay_compensated "
                 "std_delay_compensated"
             ],
             flights=("StaleRace", "StaleRace, truth"),
@@ -185,7 +185,7 @@ CATALOG = {
         Result(
             name="masked",
             commands=[
-                "study stale_race --arms-file quad_gym/experiments/arms_masked.py "
+                "scripts.studies stale_race --arms-file scripts/studies/arms_masked.py "
                 "--output OUT --first-episode 100000"
             ],
             flights=("StaleRace",),
@@ -194,8 +194,8 @@ CATALOG = {
         Result(
             name="outage_dash",
             commands=[
-                "study outage_dash --video webp --output OUT --first-episode 100000 --arms pd "
-                "pd_slow pd_waiting truth std std_privileged truth_on_truth"
+                "scripts.studies outage_dash --video webp --output OUT --first-episode 100000 "
+                "--arms pd pd_slow pd_waiting truth std std_privileged truth_on_truth"
             ],
             flights=("OutageDash", "OutageDash, truth"),
             texts=texts.study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),

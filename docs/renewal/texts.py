@@ -10,7 +10,7 @@ from typing import Any
 from docs.renewal.pages import console as block
 from docs.renewal.pages import table
 from quad_gym.analysis.intervals import Estimated
-from quad_gym.experiments.study_report import number, share
+from scripts.studies.report import number, share
 
 Texts = Callable[[Path, Sequence[str]], dict[str, str]]
 TRACKING = ("Hover", "Circle", "Lemniscate", "RandomTrajectory")

@@ -15,7 +15,6 @@ COMMANDS = {
     "train": "train a controller on the estimate, the truth, or another observation",
     "evaluate": "evaluate policies over many episodes: errors, crashes, videos",
     "compare": "train on the truth, on noise and on the estimate, and compare",
-    "study": "train variants of policies on a benchmark task with several seeds, and compare",
     "sweep": "run sets of trainings on this machine, on a Slurm cluster, or with Ray",
     "tune": "tune the gains of the PD controller",
     "fly": "show a flight in a window, or render a video",
@@ -27,7 +26,6 @@ COMMANDS = {
     "export policy": "export a trained policy to an autopilot: C or ONNX",
     "export filter": "export a filter to an autopilot: a C library with the same estimates",
     "compile": "compile the kernels before their first use, or build libraries of them",
-    "completion": "print a script for the completion of commands and options in a shell",
     "version": "print the version",
 }
 """Commands, of one or two words, and their descriptions."""

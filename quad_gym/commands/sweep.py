@@ -1,4 +1,4 @@
-"""Train all combinations of environments, arms, keywords, parameters and seeds.
+"""Train all combinations of environments, keywords, parameters and seeds.
 
     quad-gym sweep sweep.toml
     quad-gym sweep sweep.toml --executor slurm --options slurm_partition=long mem_gb=4
@@ -30,7 +30,6 @@ from quad_gym.commands.options import (
     usage_errors,
     value_of,
 )
-from quad_gym.experiments.arms import ARMS, chosen_arms, read_arms
 from quad_gym.experiments.driver import RETRIES, train_all
 from quad_gym.experiments.executors import make_executor
 from quad_gym.experiments.experiment import Training, check_trainings
@@ -47,10 +46,6 @@ class SweepArgs:
     ] = None
     env_ids: tuple[str, ...] = ()
     """ids of environments, or their short names; if not given, circle"""
-    arms: tuple[str, ...] = ()
-    """names of arms, as in quad-gym study; if not given, the environment defined by --env"""
-    arms_file: Path | None = None
-    """a file with a tuple ARMS; if not given, quad_gym/experiments/arms.py"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=standard,rtk"""
     algorithm: tuple[Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"], ...] = ()
@@ -98,9 +93,7 @@ def configure(args: SweepArgs) -> tuple[list[Training], Path]:
     given["env_ids"] = [known_id("env_ids", name) for name in given.get("env_ids", ["circle"])]
     name = IDS[given["env_ids"][0]] if args.file is None else args.file.stem
     folder = args.output or Path("results/sweep") / name
-    known = ARMS if args.arms_file is None else read_arms(args.arms_file)
-    arms = {arm.name: arm for arm in chosen_arms(known, given.get("arms", []))}
-    trainings = expand(given, arms, folder, threads=args.threads)
+    trainings = expand(given, folder, threads=args.threads)
     check_trainings(trainings)
     return trainings, folder
 
@@ -113,7 +106,7 @@ def _given(args: SweepArgs, found: dict[str, Any]) -> dict[str, Any]:
             more = {key: _listed(each) for key, each in value.items()}
             found[name] = {**found.get(name, {}), **more}
         elif isinstance(value, tuple) and value:
-            listed = len(value) > 1 or name in ("env_ids", "arms")
+            listed = len(value) > 1 or name == "env_ids"
             found[name] = list(value) if listed else value[0]
         elif value not in ((), None):
             found[name] = value

@@ -8,6 +8,7 @@ import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.spaces import PRIVILEGED_NAMES, ObservationField, policy_size
+from quad_gym.params.world import world_params
 from quad_gym.tasks.batch import TaskBatch
 from quad_gym.tasks.observing import Part
 from quad_gym.tasks.task import ObservationSpec, resolve_task
@@ -24,7 +25,10 @@ def with_task(
     purpose. Parts with names of built-in parts are refused.
     """
     task = resolve_task(given)
-    task._require(make.keywords["sensors"], make.keywords["world"])
+    world = make.keywords["world"]
+    task._require(
+        make.keywords["sensors"], world_params(world) if isinstance(world, str) else world
+    )
     split = policy_size(table)
     under: Callable[..., TaskBatch] = partial(
         TaskBatch, **make.keywords, own_task=task, split=split

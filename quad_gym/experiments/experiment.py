@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +99,7 @@ class Experiment(ABC):
     """Keywords of the environment in training and test"""
     folder: Path
     threads: int | None = None
+    trial_kind: ClassVar[type[Trial]] = Trial
 
     @abstractmethod
     def cases(self) -> dict[str, Plan]:
@@ -113,7 +114,7 @@ class Experiment(ABC):
         names = ("env_id", "episodes", "first_episode", "threads")
         shared: dict[str, Any] = {name: getattr(self, name) for name in names}
         keywords = {**self.environment, **keywords}
-        return Trial(keywords=keywords, policy=policy, traced=traced, **shared)
+        return self.trial_kind(keywords=keywords, policy=policy, traced=traced, **shared)
 
     @cached_property
     def trainings(self) -> list[Training]:

@@ -95,8 +95,12 @@ class Trial:
         """Flights of a policy, by name or file; read from their file in a folder if it exists."""
         file = folder / f"{self.digest(policy)}.npz"
         if not file.exists():
-            fly(load_policy(policy, self.env), self.env, self.first_episode, self.traced).save(file)
+            fly(self.load(policy), self.env, self.first_episode, self.traced).save(file)
         return Flown.load(file)
+
+    def load(self, policy: str) -> Policy:
+        """Load a policy by name or file."""
+        return load_policy(policy, self.env)
 
 
 def fly(policy: Policy, env: Any, seed: int, traced: Sequence[str] = ()) -> Flown:

@@ -10,13 +10,11 @@ from typing import Any
 from baselines.plans import Plan
 from baselines.recipes import Recipe, recipe
 from quad_gym import IDS
-from quad_gym.experiments.arms import Arm
 from quad_gym.experiments.experiment import Training, make_trainings
 from quad_gym.params import checks as check
 
 DEFAULTS: Mapping[str, Any] = {
     "env_ids": ["QuadGym/Circle-v0"],
-    "arms": [],
     "algorithm": "ppo",
     "steps": None,
     "n_envs": None,
@@ -50,18 +48,13 @@ def read(file: Path) -> dict[str, Any]:
         if name in TABLES and not isinstance(value, dict):
             raise ValueError(f"{name} in {file} must be a table, got {value!r}")
         names = isinstance(value, list) and all(isinstance(each, str) for each in value)
-        if name in ("env_ids", "arms") and not names:
+        if name == "env_ids" and not names:
             raise ValueError(f"{name} must be a list of names, got {value!r}")
     return found
 
 
-def expand(
-    given: Mapping[str, Any], arms: Mapping[str, Arm], folder: Path, *, threads: int = 1
-) -> list[Training]:
-    """All trainings of a sweep, the first seed of every combination first.
-
-    `given` has keys of `DEFAULTS`, and `arms` the arms in it by name.
-    """
+def expand(given: Mapping[str, Any], folder: Path, *, threads: int = 1) -> list[Training]:
+    """All trainings of a sweep, with keys of `DEFAULTS`; the first seed of each is first."""
     spec = {**DEFAULTS, **given}
     axes: dict[Axis, Any] = {(table, k): v for table in TABLES for k, v in spec[table].items()}
     axes |= {("", key): spec[key] for key in _SINGLE if spec[key] is not None}
@@ -70,13 +63,10 @@ def expand(
         empty = ".".join(filter(None, list(axes)[tried.index([])]))
         raise ValueError(f"{empty} must have at least one value")
     cases: dict[str, Plan] = {}
-    for env_id, arm, values in itertools.product(
-        spec["env_ids"], spec["arms"] or [None], itertools.product(*tried)
-    ):
+    for env_id, values in itertools.product(spec["env_ids"], itertools.product(*tried)):
         chosen = dict(zip(axes, values, strict=True))
         engine = "compiled_" if spec["engine"] == "compiled" else ""
         words = [IDS[env_id], f"{engine}{chosen['', 'algorithm']}"]
-        words += [] if arm is None else [arm]
         words += [  # values from lists, so that further values do not change it
             f"{axis[1]}={_word(value)}"
             for axis, value in chosen.items()
@@ -85,7 +75,7 @@ def expand(
         name = ",".join(words)
         if name in cases:
             raise ValueError(f"every value of a sweep must be given once, got {name} twice")
-        cases[name] = _plan(spec, env_id, arms.get(arm), chosen, threads)
+        cases[name] = _plan(spec, env_id, chosen, threads)
     return make_trainings(cases, _seeds(spec["seeds"]), folder)
 
 
@@ -97,13 +87,8 @@ def _seeds(given: Any) -> Sequence[int]:
     return [check.whole("seeds", seed, least=0) for seed in given]
 
 
-def _plan(
-    spec: Mapping[str, Any], env_id: str, arm: Arm | None, chosen: Mapping[Axis, Any], threads: int
-) -> Plan:
+def _plan(spec: Mapping[str, Any], env_id: str, chosen: Mapping[Axis, Any], threads: int) -> Plan:
     tables = {t: {k: _frozen(v) for (u, k), v in chosen.items() if u == t} for t in (*TABLES, "")}
-    arm = arm or Arm(name="none", label="none")
-    if arm.policy is not None:
-        raise ValueError(f"arms must be trained, got {arm.name}, whose policy is {arm.policy}")
     for name in tables["recipe"]:
         if name in _ELSEWHERE:
             raise ValueError(f"recipe must not hold {name}: use {_ELSEWHERE[name]} instead")
@@ -111,12 +96,11 @@ def _plan(
     base = recipe(env_id, tables[""].pop("algorithm"))
     return Plan(
         env_id=env_id,
-        environment={**tables["env"], **arm.environment, **arm.training},
-        learning=arm.learning,
+        environment=tables["env"],
         recipe=base.replace(
             **tables[""],
             **tables["recipe"],
-            parameters={**base.parameters, **arm.parameters, **tables["set"]},
+            parameters={**base.parameters, **tables["set"]},
         ),
         threads=threads,
         **{name: spec[name] for name in ("engine", "evaluations", "episodes")},

@@ -110,7 +110,7 @@ def asymmetric_plan(critic_only=15, **changes):
         **{
             "env_id": "QuadGym/LookAround-v0",
             "environment": {"duration": 1.0, "task": "baselines.arm_tasks:WithStd"},
-            "learning": {"task": "baselines.arm_critics:WithStdCertaintyRewardForCritic"},
+            "learning": {"task": "scripts.studies.arm_critics:WithStdCertaintyRewardForCritic"},
             "recipe": plan.recipe.replace(parameters=parameters),
             **changes,
         }

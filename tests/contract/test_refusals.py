@@ -15,13 +15,12 @@ from tests import console_commands
 from tests.console_commands import plain
 
 NEEDS = {"compare": "stable_baselines3", "evaluate": "matplotlib", "fly": "pygame"}
-NEEDS |= {"circle": "matplotlib", "study": "matplotlib", "train": "stable_baselines3"}
+NEEDS |= {"circle": "matplotlib", "train": "stable_baselines3"}
 
 REFUSED = [
     ("trian", "trian"),
     ("replay", "LOG"),
     ("replay binary.npz", "binary.npz must be a table of text (.csv)"),
-    ("completion fish", "invalid choice 'fish'"),
     ("version extra", "extra"),
     ("ablation --output text.toml", "cannot write to --output text.toml: File exists"),
     # ---- training
@@ -92,16 +91,6 @@ REFUSED = [
     ("compare --sensors sonar", "sensors must be one of"),
     ("compare --env observation=truth", "must not contain observation: use --train-on"),
     ("compare --engine compiled --algorithm sac", "engine"),
-    ("study --arms", "--arms must have at least one value, got none"),
-    ("study --arms nobody", "--arms must be one of"),
-    ("study --arms-file text.toml", "--arms-file must be a Python file, got text.toml"),
-    ("study stale_race --success-within 1", "--success-within belongs to LookAround"),
-    ("study stale_race --arms truth_delay_compensated", "--arms must name truth, whose policies"),
-    ("study QuadGym/Circle-v0", "ENV_ID must be one of QuadGym/LookAround-v0"),
-    ("study --env observation=truth", "must not contain observation: use --arms instead"),
-    ("study --arms certainty --set clip=1", "clip is not a keyword of the compiled PPO"),
-    ("study --arms truth --set critic_only=3", "critic_only must be the number of values"),
-    ("study --video webp --arms std estimate", "needs the arm truth and another trained one"),
     # ---- exports
     ("export", "{policy, filter}"),
     ("export filters", "policy, filter"),
@@ -132,7 +121,6 @@ NAMED = {
         *("--seed -1 --output it.npz", "--speed 0 --output it.npz", "--duration 0 --output it.npz"),
         *("--fault-time 2 3 --output it.npz", "--gnss-rate 77 --output it.npz"),
     ),
-    "study": ("--seeds 0", "--episodes 1", "--success-within -1", "--video avi"),
     "sweep": ("--jobs 0 --engine compiled", "--retries -1 --engine compiled"),
     "train": ("--steps abc", "--output"),
     "tune": ("--candidates 0", "--output /dev/null/x"),
@@ -183,7 +171,7 @@ def test_help_has_all_commands_and_their_descriptions(command):
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
 def test_completion_script_has_all_commands_and_options(shell):
-    done = console_commands.run("completion", shell)
+    done = console_commands.run("--tyro-print-completion", shell)
     assert done.returncode == 0
     for word in (*" ".join(COMMANDS).split(), "--algorithm", "--filter-start"):
         assert word in done.stdout

@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import binomtest
 
 from baselines.plans import description
-from quad_gym.experiments.arms import ARMS
 from quad_gym.experiments.sweep_plan import expand
 from quad_gym.experiments.sweep_table import FILES, groups_of, row_of, write_tables
 from tests import console_commands
@@ -34,7 +33,7 @@ def test_every_combination_has_own_folder_and_is_ordered_by_seed(tmp_path):
         "recipe": {"layers": [[32, 32]]},
         "set": {"gamma": [0.9, 0.99]},
     }
-    found = expand(given, {}, tmp_path, threads=2)
+    found = expand(given, tmp_path, threads=2)
     assert len(found) == len({t.folder for t in found}) == 2 * 2 * 2 * 2
     first = found[0]
     assert first.folder == tmp_path / "runs/hover,ppo,sensors=lab,gamma=0.9,layers=32x32/seed_3"
@@ -44,20 +43,8 @@ def test_every_combination_has_own_folder_and_is_ordered_by_seed(tmp_path):
     assert first.plan.recipe.parameters["gamma"] == 0.9
     assert first.plan.recipe.parameters["n_epochs"] == 5  # from the recipe
     assert (first.plan.engine, first.plan.threads) == ("sb3", 2)
-    fewer = expand({**given, "set": {"gamma": [0.9]}, "seeds": [3]}, {}, tmp_path)
+    fewer = expand({**given, "set": {"gamma": [0.9]}, "seeds": [3]}, tmp_path)
     assert {t.folder for t in fewer} < {t.folder for t in found}
-
-
-def test_arms_define_observation_and_reward_of_trainings(tmp_path):
-    arms = {arm.name: arm for arm in ARMS}
-    given = {"env_ids": ["QuadGym/LookAround-v0"], "engine": "compiled"}
-    given["arms"] = ["truth", "std_certainty"]
-    truth, sure = expand(given, arms, tmp_path)
-    assert truth.case == "look_around,compiled_ppo,truth"
-    assert truth.plan.environment["observation"] == "truth"
-    assert sure.plan.learning == arms["std_certainty"].learning
-    with pytest.raises(ValueError, match="arms must be trained, got pd_reference"):
-        expand({**given, "arms": ["pd_reference"]}, arms, tmp_path)
 
 
 def test_options_override_the_file(tmp_path):
@@ -75,12 +62,11 @@ def test_options_override_the_file(tmp_path):
     ("text", "message"),
     [
         ("seeds = [", "is no valid TOML"),
-        ("sedes = 3", "must be one of env_ids, arms"),
+        ("sedes = 3", "must be one of env_ids, algorithm"),
         ("env = 3", "env in bad.toml must be a table, got 3"),
         ("seeds = [1, 1]", "seeds must be different numbers, at least one, got [1, 1]"),
         ("set = {gamma = [0.9, 0.9]}", "every value of a sweep must be given once"),
         ('env_ids = "QuadGym/Hover-v0"', "env_ids must be a list of names"),
-        ('arms = ["nobody"]', "--arms must be one of"),
         ('algorithm = ["alphago"]', "algorithm must be one of ppo"),
         ("episodes = 1.5", "episodes must be a whole number"),
         ("set = {gamma = []}", "set.gamma must have at least one value"),
@@ -121,7 +107,7 @@ def pretend(training, error):
 
 
 def test_tables_contain_records_of_folders(tmp_path):
-    trainings = expand({"seeds": 5, "env": TRUTH}, {}, tmp_path)
+    trainings = expand({"seeds": 5, "env": TRUTH}, tmp_path)
     for training, error in zip(trainings, (0.1, 0.2, 0.6, None), strict=False):
         pretend(training, error)
     rows = [row_of(training) for training in trainings]
@@ -146,7 +132,7 @@ def test_tables_contain_records_of_folders(tmp_path):
 
 
 def test_folder_with_another_training_is_rejected(tmp_path):
-    (training,) = expand({"env": TRUTH}, {}, tmp_path / "out")
+    (training,) = expand({"env": TRUTH}, tmp_path / "out")
     pretend(training, 0.1)
     options = ["--env", "duration=2.0", "--output", "out"]
     done = console_commands.run("sweep", *options, where=tmp_path)

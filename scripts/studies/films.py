@@ -18,10 +18,10 @@ from tqdm import tqdm
 from baselines.policies import load_policy
 from quad_gym import FlightRecorder
 from quad_gym.evaluation import roll_out
-from quad_gym.experiments.study import Study, StudyResults
 from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
 from quad_gym.rendering.video import checked_video_path
+from scripts.studies.study import Study, StudyResults
 
 RATE = 10.0  #: pictures per second of a film
 

@@ -12,14 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.arm_tasks import (
-    ConstantCrashCostWithUncertainty,
-    Parts,
-    WithStdCertaintyReward,
-    scaled_parts,
-)
+from baselines.arm_tasks import Parts, scaled_parts
 from quad_gym.tasks.outage_dash import gaps_behind, gaps_of
 from quad_gym.tasks.task import ObservationSpec
+from scripts.studies.arm_tasks import ConstantCrashCostWithUncertainty, WithStdCertaintyReward
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View

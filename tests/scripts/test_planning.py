@@ -5,36 +5,37 @@ import numpy as np
 import pytest
 
 import quad_gym
-from baselines.planning import PlanningPolicy, _markers, _measured
-from baselines.policies import keywords_of_policy, load_policy
+from baselines.policies import load_policy
 from quad_gym.evaluation import roll_out
+from scripts.studies.planning import PlanningPolicy, _markers, _measured
 from tests.builders import vec_env
 
 LOOK, DASH = "QuadGym/LookAround-v0", "QuadGym/OutageDash-v0"
 
 
 def make(env_id, count):
-    return gymnasium.make_vec(env_id, num_envs=count, **keywords_of_policy("pd:planning", env_id))
+    return gymnasium.make_vec(env_id, num_envs=count, include_std=True)
 
 
 def crash_rate(env_id, policy, count, **keywords):
     env = make(env_id, count)
-    return roll_out(load_policy(policy, env), env, seed=0).crashed.mean()
+    flown = PlanningPolicy(env) if policy == "planning" else load_policy(policy, env)
+    return roll_out(flown, env, seed=0).crashed.mean()
 
 
 def test_plan_that_looks_at_the_markers_crashes_less_than_tracking_of_the_heading():
     assert crash_rate(LOOK, "pd", 24) > 0.4
-    assert crash_rate(LOOK, "pd:planning", 24) < 0.15
+    assert crash_rate(LOOK, "planning", 24) < 0.15
 
 
 def test_plan_that_waits_crashes_less_than_flying_on():
-    assert crash_rate(DASH, "pd:planning", 60) < crash_rate(DASH, "pd", 60) - 0.1
+    assert crash_rate(DASH, "planning", 60) < crash_rate(DASH, "pd", 60) - 0.1
 
 
 def test_heading_is_the_rewarded_one_if_certain_and_toward_markers_if_uncertain():
     env = make(LOOK, 4)
     observation, _ = env.reset(seed=0)
-    policy = load_policy("pd:planning", env)
+    policy = PlanningPolicy(env)
     parts = {f.name: f.slice for f in env.unwrapped.flights.table}
     rows = np.array(observation, np.float64)
     for name in parts:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from baselines import PDPolicy
-from baselines.residuals import SIZE, ResidualModel, fit, record
+from scripts.studies.residuals import SIZE, ResidualModel, fit, record
 
 
 def known(rng):

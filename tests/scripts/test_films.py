@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from quad_gym.commands import study as command
-from quad_gym.commands.main import main
-from quad_gym.experiments.study_films import RATE, pair_of, side_of
 from quad_gym.rendering.side_by_side import HOLD, SIDE
+from scripts.studies import __main__ as command
+from scripts.studies.films import RATE, pair_of, side_of
+from tests.scripts.running import run
 
 pytest.importorskip("pygame")
 Image = pytest.importorskip("PIL.Image")
@@ -19,8 +19,8 @@ QUICK = ["--quick", "--steps", "4096", "--env", f"duration={DURATION}", "--arms"
 def filmed(tmp_path_factory):
     """Return the folder of a tiny study with a film, and its command line."""
     folder = tmp_path_factory.mktemp("film")
-    words = ["study", "look_around", *QUICK, "--video", "webp", "--output", str(folder / "out")]
-    assert main(words) == 0
+    words = ["look_around", *QUICK, "--video", "webp", "--output", str(folder / "out")]
+    run(words)
     return folder, words
 
 

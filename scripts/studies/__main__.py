@@ -1,22 +1,20 @@
 """Train the arms of a benchmark task with several seeds, and fly the same episodes.
 
-    quad-gym study                                   # LookAround, 5 seeds
-    quad-gym study stale_race
-    quad-gym study outage_dash --arms truth estimate std --seeds 10
-    quad-gym study --video webp                      # with a film of two policies side by side
-    quad-gym study --quick                           # minutes: a check that it works, not a result
-    quad-gym study --arms-file my_arms.py --arms truth mine
+    python -m scripts.studies look_around                  # 5 seeds
+    python -m scripts.studies outage_dash --arms truth estimate std --seeds 10
+    python -m scripts.studies stale_race --video webp      # with a film of two policies
+    python -m scripts.studies look_around --quick          # minutes: a check, not a result
+    python -m scripts.studies look_around --arms-file my_arms.py --arms truth mine
 
-Arms of quad_gym/experiments/arms.py (or of a file like it) are trained with the compiled PPO, with
-or without memory, or with another algorithm of Stable-Baselines3 that they name, and every policy
+Arms of scripts/studies/arms.py (or of a file like it) are trained with the compiled PPO, or
+with another algorithm of Stable-Baselines3 that they name, and every policy
 flies the same test episodes on the estimate. Prints a table with means over the seeds and 95 %
 intervals over seeds and episodes, and conclusions, and writes figures, numbers and a report. Each
 training is a folder: an interrupted study continues where it stopped.
 """
 
 import time
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,13 +27,12 @@ from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
-from quad_gym.experiments.arms import Arm, chosen_arms, read_arms
 from quad_gym.experiments.driver import train_here
-from quad_gym.experiments.study import Study
-from quad_gym.experiments.study_films import require_film, write_film
-from quad_gym.experiments.study_report import conclusions, table_text, write_report
-from quad_gym.experiments.study_tasks import STUDIED, WITHIN, StudiedTask, stays
-from quad_gym.params import checks as check
+from scripts.studies.arms import Arm, chosen_arms, read_arms
+from scripts.studies.films import require_film, write_film
+from scripts.studies.report import conclusions, table_text, write_report
+from scripts.studies.study import Study
+from scripts.studies.tasks import STUDIED
 
 STUDIED_IDS = tuple(env_id for env_id, task in IDS.items() if task in STUDIED)
 QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
@@ -51,7 +48,7 @@ class StudyArgs:
     arms: tuple[str, ...] = ()
     """names of arms; if not given, the arms behind the conclusions, or all of --arms-file"""
     arms_file: Path | None = None
-    """a file with a tuple ARMS, as quad_gym/experiments/arms.py has; if not given, that one"""
+    """a file with a tuple ARMS, as scripts/studies/arms.py has; if not given, that one"""
     seeds: int = 5
     """number of training seeds"""
     steps: int | None = None
@@ -69,9 +66,6 @@ class StudyArgs:
     first_episode: int = 0
     """seed of the first test episode; use other test episodes than those on which you tuned rewards
     and parameters"""
-    success_within: float | None = None
-    """for LookAround: largest mean position error in the second half of a successful episode [m];
-    if not given, 0.5"""
     threads: options.Threads = None
     video: Literal["none", "webp", "gif", "mp4"] = "none"
     """also write a film of this kind: policies trained on truth and on the estimate, side by side
@@ -80,22 +74,9 @@ class StudyArgs:
     """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
 
 
-def studied(args: StudyArgs) -> StudiedTask:
-    """Definition of the task, with the options that change it."""
-    args = options.with_full_id(args, STUDIED_IDS)
-    about = STUDIED[IDS[args.env_id]]
-    if args.success_within is None:
-        return about
-    within = check.positive("--success-within", args.success_within)
-    if about.success is not stays:
-        raise ValueError(f"--success-within belongs to LookAround, got it with {args.env_id!r}")
-    meaning = about.meaning.replace(f"{WITHIN:g} m", f"{within:g} m")
-    return replace(about, success=partial(stays, within=within), meaning=meaning)
-
-
 def arms_of(args: StudyArgs) -> tuple[Arm, ...]:
     """Arms of the study, in the order of their file."""
-    about = studied(args)
+    about = STUDIED[IDS[args.env_id]]
     if args.arms_file is None:
         return chosen_arms(about.arms, args.arms or about.carrying)
     known = read_arms(args.arms_file)
@@ -118,7 +99,7 @@ def configure(args: StudyArgs) -> Study:
         environment=dict(args.env),
         episodes=QUICK_EPISODES if args.quick else args.episodes,
         first_episode=first_seed("test", args.first_episode, args.episodes),
-        about=studied(args),
+        about=STUDIED[IDS[args.env_id]],
         folder=args.output or Path("results/study") / name,
         threads=args.threads,
     )
@@ -157,3 +138,7 @@ def main(args: StudyArgs) -> None:
         f"\nWrote {len(written)} files to {study.folder} after "
         f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."
     )
+
+
+if __name__ == "__main__":
+    main(options.parse(StudyArgs, prog="python -m scripts.studies", description=__doc__))

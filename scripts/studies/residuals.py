@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 
 SIZE = 12  #: number of components of an error
 
-FITTED = Path(__file__).resolve().parent / "residuals"  #: folder of the included models, by task
+FITTED = Path(__file__).resolve().parent / "fitted"  #: folder of the included models, by task
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,18 +8,19 @@ import pytest
 
 from baselines.recipes import recipe
 from quad_gym import IDS
-from quad_gym.commands import study as command
-from quad_gym.commands.main import main
 from quad_gym.evaluation import Episodes
 from quad_gym.experiments import flown as flights
-from quad_gym.experiments.arms import Arm, chosen_arms
 from quad_gym.experiments.flown import Flown
-from quad_gym.experiments.study import Study
-from quad_gym.experiments.study_tasks import STUDIED, stays
+from scripts.studies import __main__ as command
+from scripts.studies.arms import Arm, chosen_arms
+from scripts.studies.study import Study
+from scripts.studies.tasks import STUDIED, stays
+from tests.console_commands import plain
+from tests.scripts.running import run
 
-QUICK = ["study", "--quick", "--steps", "4096", "--env", "duration=0.6"]
+QUICK = ["look_around", "--quick", "--steps", "4096", "--env", "duration=0.6"]
 MINE = """
-from quad_gym.experiments.arms import Arm
+from scripts.studies.arms import Arm
 ARMS = (
     Arm(name="facing", label="PD, facing the features", policy="pd:features"),
     Arm(name="truth", label="truth", training={"observation": "truth"}),
@@ -32,7 +33,7 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     (tmp_path / "mine.py").write_text(MINE)
     folder = tmp_path / "out"
     words = [*QUICK, "--arms-file", str(tmp_path / "mine.py"), "--output", str(folder)]
-    assert main(words) == 0
+    run(words)
     text = capsys.readouterr().out
     assert "PD, facing the features" in text
     assert "so few that the intervals are wide" in text
@@ -46,7 +47,7 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     before = kept.stat().st_mtime_ns, (gone / "best.npz").read_bytes()
     for file in gone.iterdir():
         file.unlink()
-    assert main(words) == 0
+    run(words)
     assert kept.stat().st_mtime_ns == before[0]
     again = json.loads((folder / "summary.json").read_text())
     assert again["rows"] == summary["rows"]  # the repeated training is bitwise equal
@@ -62,7 +63,7 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
 def test_study_of_each_task_flies_all_arms(task, arms, tmp_path, capsys):
     folder = tmp_path / "out"
     short = ["--quick", "--steps", "4096", "--env", "duration=0.6", "--arms", *arms]
-    assert main(["study", task, *short, "--output", str(folder)]) == 0
+    run([task, *short, "--output", str(folder)])
     summary = json.loads((folder / "summary.json").read_text())
     assert set(summary["rows"]) == set(arms)
     assert set(summary["rows"]["truth"]) >= {"success", "crashed", "gates", "speed"}
@@ -151,3 +152,34 @@ def test_success_needs_a_complete_episode_and_a_small_late_error():
     some = flown([1.0, 1.0, 1.0], [False, True, False], 0.3)
     np.testing.assert_array_equal(stays(some, 0.5), [True, False, True])
     np.testing.assert_array_equal(stays(some, 0.3), [False, False, False])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("look_around --arms", "--arms must have at least one value, got none"),
+        ("look_around --arms nobody", "--arms must be one of"),
+        ("look_around --arms-file text.toml", "--arms-file must be a Python file, got text.toml"),
+        ("stale_race --arms truth_delay_compensated", "--arms must name truth, whose policies"),
+        ("QuadGym/Circle-v0", "ENV_ID must be one of QuadGym/LookAround-v0"),
+        ("look_around --env observation=truth", "must not contain observation: use --arms instead"),
+        ("look_around --arms certainty --set clip=1", "clip is not a keyword of the compiled PPO"),
+        (
+            "look_around --arms truth --set critic_only=3",
+            "critic_only must be the number of values",
+        ),
+        (
+            "look_around --video webp --arms std estimate",
+            "needs the arm truth and another",
+        ),
+        ("look_around --seeds 0", "--seeds must be at least 1"),
+        ("look_around --video avi", "invalid choice 'avi'"),
+    ],
+)
+def test_wrong_options_end_with_exit_code_2(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.toml").write_text("steps 3 [")
+    with pytest.raises(SystemExit) as end:
+        run(words.split())
+    assert end.value.code == 2
+    assert message in plain(capsys.readouterr().err)

@@ -1,6 +1,6 @@
 """Arms of a study of policies with a miscalibrated covariance.
 
-    quad-gym study --arms-file quad_gym/experiments/arms_miscalibrated.py
+    python -m scripts.studies --arms-file scripts/studies/arms_miscalibrated.py
 
 All arms fly LookAround with the pretrained policy, which was trained with a consistent filter. No
 arm is trained.
@@ -9,7 +9,7 @@ arm is trained.
 from typing import Any
 
 from quad_gym import sensor_suite
-from quad_gym.experiments.arms import Arm
+from scripts.studies.arms import Arm
 
 _SUITE = sensor_suite("one_wall")
 _WITH_STD = "baselines.arm_tasks:WithStd"
@@ -42,7 +42,7 @@ ARMS = (
         _flown(
             f"reported_std_x{name}",
             f"reported standard deviation x {words}",
-            f"baselines.arm_tasks:REPORTED_STD_X{name}",
+            f"scripts.studies.arm_tasks:REPORTED_STD_X{name}",
         )
         for name, words in _FACTORS.items()
     ),

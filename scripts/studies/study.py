@@ -20,16 +20,27 @@ from quad_gym.analysis.intervals import (
 )
 from quad_gym.analysis.reports import as_json
 from quad_gym.envs.effects import with_effect
-from quad_gym.experiments.arms import Arm
+from quad_gym.evaluation import Policy
 from quad_gym.experiments.experiment import Experiment, Floats
 from quad_gym.experiments.flown import Flown, Trial
-from quad_gym.experiments.study_tasks import StudiedTask
+from scripts.studies.arms import Arm
+from scripts.studies.planning import PlanningPolicy
+from scripts.studies.tasks import StudiedTask
+
+
+class StudyTrial(Trial):
+    """Test episodes that also the policy "planning" flies."""
+
+    def load(self, policy: str) -> Policy:
+        """Load a policy by name or file."""
+        return PlanningPolicy(self.env) if policy == "planning" else super().load(policy)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Study(Experiment):
     """Trainings and flights of the arms of a task."""
 
+    trial_kind = StudyTrial
     arms: tuple[Arm, ...]
     recipes: Mapping[str, Recipe]
     """Recipe of each algorithm that trains an arm"""

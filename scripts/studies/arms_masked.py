@@ -1,13 +1,13 @@
 """Arms of a study of the standard deviations that matter to a policy.
 
-    quad-gym study stale_race --arms-file quad_gym/experiments/arms_masked.py
+    python -m scripts.studies stale_race --arms-file scripts/studies/arms_masked.py
 
 All arms fly StaleRace with the pretrained policy, which was trained with all fifteen standard
 deviations in its observation. No arm is trained. Masked standard deviations are replaced by their
 constant medians.
 """
 
-from quad_gym.experiments.arms import Arm
+from scripts.studies.arms import Arm
 
 _BLOCKS = {
     "POSITION": "the position's",
@@ -23,7 +23,7 @@ def _flown(task: str, label: str) -> Arm:
         task.lower(),
         label,
         policy="pretrained",
-        environment={"task": f"baselines.arm_tasks:{task}"},
+        environment={"task": f"scripts.studies.arm_tasks:{task}"},
     )
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.intervals import Score, mean, worst_tenth
-from quad_gym.experiments.arms import ARMS, OUTAGE_DASH, STALE_RACE, Arm
 from quad_gym.experiments.flown import Flown
+from scripts.studies.arms import ARMS, OUTAGE_DASH, STALE_RACE, Arm
 
 
 @dataclass(frozen=True)

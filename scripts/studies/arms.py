@@ -2,7 +2,7 @@
 
 A study trains each arm with several seeds, and tests every policy on the estimate in the same
 episodes. To define your own arms, write a file like this one with a tuple `ARMS`, and pass it to
-`quad-gym study --arms-file`.
+`python -m scripts.studies --arms-file`.
 """
 
 import runpy
@@ -71,9 +71,9 @@ class Arm(Checked, kw_only=False):
         return "compiled" if self.algorithm == "ppo" else "sb3"
 
 
-def _task(name: str, module: str = "arm_tasks") -> dict[str, str]:
-    """Keyword of an environment with a task of `baselines`."""
-    return {"task": f"baselines.{module}:{name}"}
+def _task(name: str, module: str = "scripts.studies.arm_tasks") -> dict[str, str]:
+    """Keyword of an environment with a task of a module."""
+    return {"task": f"{module}:{name}"}
 
 
 _FAR_SIGHTED = {"gamma": 0.995}
@@ -86,7 +86,7 @@ _NOISIER = _ONE_WALL.replace(
 """Noise as large as the errors of the estimate: root mean squares of position and velocity over 300
 episodes of `pd_features_when_uncertain`, attitude in proportion. The suite's own noise, 8 mm, has
 the size of the errors of a filter that always has features in view."""
-_WITH_STD = _task("WithStd")
+_WITH_STD = _task("WithStd", "baselines.arm_tasks")
 
 ARMS = (
     Arm("pd_reference", "PD, facing as rewarded", policy="pd"),
@@ -95,6 +95,12 @@ ARMS = (
         "pd_features_when_uncertain",
         "PD, facing the features when uncertain",
         policy="pd:features_when_uncertain",
+        environment={"include_std": True},
+    ),
+    Arm(
+        "pd_planning",
+        "PD that plans by covariances",
+        policy="planning",
         environment={"include_std": True},
     ),
     Arm("truth", "truth", training={"observation": "truth"}),
@@ -123,7 +129,7 @@ ARMS = (
         "std_certainty_privileged",
         "estimate + standard deviation, reward for certainty, privileged critic",
         environment=_WITH_STD,
-        learning=_task("WithStdCertaintyRewardForCritic", "arm_critics"),
+        learning=_task("WithStdCertaintyRewardForCritic", "scripts.studies.arm_critics"),
         parameters={"critic_only": 15},
     ),
 )
@@ -165,14 +171,15 @@ STALE_RACE = (
 )
 """Arms of `QuadGym/StaleRace-v0`."""
 
-_SCALED = _task("Scaled")
-_WITH_UNCERTAINTY = _task("WithUncertainty")
+_SCALED = _task("Scaled", "baselines.arm_tasks")
+_WITH_UNCERTAINTY = _task("WithUncertainty", "baselines.arm_tasks")
 _CONSTANT_CRASH_COST = _task("ConstantCrashCost")
 
 OUTAGE_DASH = (
     Arm("pd", "PD at 4.7 m/s", policy="pd"),
     Arm("pd_slow", "PD at 2.4 m/s", policy="pd:slow"),
     Arm("pd_waiting", "PD that waits when uncertain", policy="pd:waiting", environment=_STD),
+    Arm("pd_planning", "PD that plans by covariances", policy="planning", environment=_STD),
     Arm("truth", "truth", environment=_SCALED, training=_TRUTH, learning=_CONSTANT_CRASH_COST),
     Arm("estimate", "estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
     Arm(
@@ -185,7 +192,7 @@ OUTAGE_DASH = (
         "std_privileged",
         "estimate + normalized uncertainty, privileged critic",
         environment=_WITH_UNCERTAINTY,
-        learning=_task("ConstantCrashCostWithUncertaintyForCritic", "arm_critics"),
+        learning=_task("ConstantCrashCostWithUncertaintyForCritic", "scripts.studies.arm_critics"),
         parameters={"critic_only": 16},
     ),
     Arm(

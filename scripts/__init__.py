@@ -1,0 +1,1 @@
+"""Programs of a clone: to read and copy, and for the results of the documentation."""
