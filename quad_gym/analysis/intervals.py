@@ -5,7 +5,7 @@
 | a mean of independent values, or of paired differences | Student's t |
 | a mean over trainings that fly the same episodes | Student's t of each, added in squares |
 | a rate over episodes | Clopper and Pearson's |
-| a rate over trainings that fly the same episodes | the same with an effective number |
+| a rate over trainings that fly the same episodes | the Bayesian bootstrap's, with a floor |
 | a difference of two estimates | MOVER, from the limits of both |
 | the probability of improvement | Newcombe's |
 
@@ -16,8 +16,9 @@ averaged with equal weights: an interquartile mean of five discards two of them,
 (Yuen's) is half as wide again for normal values.
 
 Where numbers have the shape (s, e), rows are trainings, one for each seed, and columns are
-episodes; column i is the same episode in every row and in every arm. Intervals over both cover 95 %
-where trainings differ, and up to 99 % where they are equal.
+episodes; column i is the same episode in every row and in every arm. Intervals of means over both
+cover 95 % of scores that vary smoothly, and up to 99 % of equal ones; those of rates also hold
+where a share of the trainings fails, 93 % or more (`tests.statistical.interval_coverage`).
 """
 
 import math
@@ -35,6 +36,7 @@ Floats = NDArray[np.float64]
 Score = Callable[[Floats], Floats]  #: from numbers (..., e) of episodes to one number (...)
 
 TAIL = 0.025  #: probability beyond either end of an interval
+FLOOR = 0.5  #: weight of a training with rate 0, and of one with rate 1, in `rate_over_trainings`
 
 
 class Estimated(NamedTuple):
@@ -66,7 +68,10 @@ def mean(values: Floats) -> Floats:
 
 
 def worst_tenth(values: Floats) -> Floats:
-    """Mean of the lowest tenth along the last axis, of at least one number (CVaR at 10 %)."""
+    """Mean of the lowest tenth along the last axis, of at least one number (CVaR at 10 %).
+
+    Of n normal values it is too high by 0.22 sigma (n = 10), 0.12 (20) or 0.02 (100).
+    """
     count = max(1, round(0.1 * values.shape[-1]))
     return np.asarray(np.partition(values, count - 1, axis=-1)[..., :count].mean(axis=-1))
 
@@ -84,7 +89,7 @@ def rate_interval(count: float, trials: float) -> Interval:
     """Clopper and Pearson's interval of a rate; it covers at least 95 %.
 
     Args:
-        count: Events, such as crashes; not necessarily whole, see `rate_over_trainings`.
+        count: Events, such as crashes; not necessarily whole.
         trials: Independent episodes.
     """
     from scipy.special import betaincinv
@@ -101,7 +106,9 @@ def mean_over_trainings(values: ArrayLike, score: Score = mean) -> Estimated:
 
     Its half width is the root of the sum of squares of two: Student's t of the trainings' scores,
     and Student's t of the episodes, by the jackknife over them. With one training, as of a fixed
-    rule, the interval covers the episodes alone.
+    rule, the interval covers the episodes alone. Of `worst_tenth`, the degrees of freedom are the
+    episodes in the tenth: the interval then covers 91 % (10 normal episodes), 88 % (20), 92 % (50),
+    93 % (100) and 94 % (200).
 
     Args:
         values: (s, e) one finite number for each training and episode, at least two.
@@ -112,7 +119,8 @@ def mean_over_trainings(values: ArrayLike, score: Score = mean) -> Estimated:
         raise ValueError(f"values must be finite numbers (trainings, episodes), got {x.shape}")
     scores, (s, e) = score(x), x.shape
     between = _half_width(_variance(scores) / s, s - 1) if s > 1 else 0.0
-    within = _half_width(_variance_over_episodes(x, score), e - 1) if e > 1 else 0.0
+    freedom = max(1, round(0.1 * e)) if score is worst_tenth else e - 1
+    within = _half_width(_variance_over_episodes(x, score), freedom) if e > 1 else 0.0
     value, half = _center(scores), math.hypot(between, within)
     return Estimated(value, value - half, value + half)
 
@@ -120,11 +128,12 @@ def mean_over_trainings(values: ArrayLike, score: Score = mean) -> Estimated:
 def rate_over_trainings(rates: ArrayLike, episodes: int) -> Estimated:
     """Mean over trainings of a rate, with an interval that covers trainings and episodes.
 
-    It is Clopper and Pearson's interval with an effective number of episodes (E. L. Korn and B. I.
-    Graubard, Survey Methodology 24, 1998): the number with which a normal interval has the half
-    width of Student's t of the trainings and of the episodes, added as in `mean_over_trainings`.
-    All trainings fly the same episodes, which count once: no crash in any of five trainings has the
-    interval of no crash in one.
+    It is the interval of the Bayesian bootstrap (D. B. Rubin, The Annals of Statistics 9, 1981)
+    over trainings, with two further trainings of half a weight each, whose rates are 0 and 1: the
+    floor, Jeffreys' prior of a proportion, as trainings of equal rates do not exclude that others
+    fail. No crash in any of five trainings has the interval from 0 to 37 %. A beta distribution
+    with the same mean and variance stands for the bootstrap's; the variance over episodes, which
+    all trainings share, is added. One rate has Clopper and Pearson's interval over episodes.
 
     Args:
         rates: (s,) the rate of each training, from 0 to 1; one for a fixed rule.
@@ -134,12 +143,20 @@ def rate_over_trainings(rates: ArrayLike, episodes: int) -> Estimated:
     if x.size == 0 or not ((x >= 0.0) & (x <= 1.0)).all():
         raise ValueError(f"rates must be at least one number between 0 and 1, got {rates!r}")
     check.whole("episodes", episodes)
-    value, effective = _center(x), float(episodes)
-    of_one = _half_width(value * (1.0 - value), math.inf)  # of an interval from one episode
-    if x.size > 1 and of_one > 0.0:
-        between = _half_width(_variance(x) / x.size, x.size - 1)
-        effective = of_one**2 / (between**2 + of_one**2 / episodes)
-    return Estimated(value, *rate_interval(value * effective, effective))
+    from scipy.special import betaincinv
+
+    value = _center(x)
+    if x.size == 1:
+        return Estimated(value, *rate_interval(value * episodes, episodes))
+    weight = x.size + 2.0 * FLOOR
+    center = (x.sum() + FLOOR) / weight
+    of_one = center * (1.0 - center)
+    trainings = ((x @ x + FLOOR) / weight - center**2) / (weight + 1.0)
+    total = of_one / (trainings + of_one / episodes) - 1.0
+    low, high = (
+        float(betaincinv(center * total, (1.0 - center) * total, p)) for p in (TAIL, 1.0 - TAIL)
+    )
+    return Estimated(value, min(low, value) if value else 0.0, max(high, value) if value < 1 else 1)
 
 
 def difference(first: Estimated, second: Estimated) -> Estimated:

@@ -1,6 +1,5 @@
 """`OwnFilter`: the calls of a user's estimator by the flights that fly on it."""
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.measurements import Measurements, StartView
 from quad_gym.batch.memory import FlightMemory
-from quad_gym.estimation.own import Estimator, checked_estimate, factors
+from quad_gym.estimation.own import Estimator, checked_estimate, factors, own_copy
 from quad_gym.params import checks as check
 from quad_gym.records import (
     EXCHANGE_BLOCK,
@@ -43,7 +42,7 @@ class OwnFilter:
 
     def __init__(self, given: Estimator, count: int) -> None:
         self.name = type(given).__name__
-        self._estimator = copy.copy(given)
+        self._estimator = own_copy(given)
         self.state = self._estimator.state = State(count, given.state)
         self.state.lock(False)
         self._failed, self._has_covariance = False, True

@@ -1,5 +1,6 @@
 """`Estimator`: a user's own filter in place of the built-in one, and checks of its estimates."""
 
+import copy
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,7 +29,10 @@ ESTIMATES: dict[str, tuple[int, ...]] = {
 }
 """Names in an estimate, and the shape of each for one flight."""
 
-_NORM_ERROR = 1e-2  #: largest error of the sum of the squares of a quaternion, or of R_BI
+_NORM_ERROR = 1e-2  #: largest error of the squared norm of a quaternion, or of R_BI R_BI^T
+_ASYMMETRY = 1e-4
+"""Largest difference of covariances P_ij and P_ji over the standard deviations of both; sums in
+float32 reach 1e-5."""
 
 
 class Reading(NamedTuple):
@@ -63,7 +67,7 @@ class Estimator:
     videos use the covariance at the end of a control period; without one, they have NaN, and
     `include_std=True` is refused.
 
-    An environment has its own copy of the estimator. Variables that change from tick to tick
+    An environment has its own deep copy of the estimator. Variables that change from tick to tick
     belong in `state`: a class attribute with initial values by name, which define shape and type
     for one flight: {"position": np.zeros(3), "P": np.eye(15)}. In the methods `self.state.P` is the
     array (n, 15, 15) of all flights. It is saved, restored, copied and pickled with the flights,
@@ -123,24 +127,50 @@ def checked_estimate(method: str, given: Any, count: int, rows: Truths) -> dict[
     for name in ("position", "velocity"):
         if name not in found:
             raise ValueError(f'{method} must return "{name}"')
-    attitude = "R_BI" if "R_BI" in found else "quaternion"
-    values = found[attitude].reshape(count, -1)
-    squares = np.einsum("ni,ni->n", values, values)
-    norm = 3.0 if attitude == "R_BI" else 1.0
-    good = np.asarray(np.abs(squares - norm) < _NORM_ERROR)
+    if "R_BI" in found:
+        R = found["R_BI"]
+        with np.errstate(all="ignore"):  # of flights that are not in `rows`
+            skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+            good = (skew < _NORM_ERROR) & (np.linalg.det(R) > 0.0)
+        if not good.all():
+            _require(method, 'rotations for "R_BI"', good, R, rows)
+        return found
+    quaternion = found.pop("quaternion")
+    squares = np.einsum("ni,ni->n", quaternion, quaternion)
+    good = np.asarray(np.abs(squares - 1.0) < _NORM_ERROR)
     if not good.all():
-        _require(method, f'rotations for "{attitude}"', good, found[attitude], rows)
-    if attitude == "quaternion":
-        found["R_BI"] = quaternion_to_dcm(found.pop("quaternion") / np.sqrt(squares)[:, None])
+        _require(method, 'rotations for "quaternion"', good, quaternion, rows)
+    found["R_BI"] = quaternion_to_dcm(quaternion / np.sqrt(squares)[:, None])
     return found
+
+
+def own_copy(given: Estimator) -> Estimator:
+    """Return a copy that shares nothing with the estimator.
+
+    Raises:
+        ValueError: If it holds something that cannot be copied.
+    """
+    try:
+        return copy.deepcopy(given)
+    except Exception as error:  # of any library whose objects it holds
+        raise ValueError(
+            f"estimator must be one that copy.deepcopy can copy, got {type(given).__name__}: "
+            f"{error}"
+        ) from None
 
 
 def _checked(method: str, name: str, value: Any, count: int, rows: Truths) -> Floats:
     """Return one array of an estimate."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(f'{method} must return arrays without a mask for "{name}"')
     try:
-        array = np.asarray(value, np.float64)
+        given = np.asarray(value)
+        if given.dtype.kind not in "biufO":
+            raise TypeError(given.dtype.name)
+        array = given.astype(np.float64, copy=False)
     except (TypeError, ValueError):
-        raise ValueError(f'{method} must return numbers for "{name}", got {value!r:.60}') from None
+        must = f'{method} must return real numbers for "{name}"'
+        raise ValueError(f"{must}, got {value!r:.60}") from None
     if array.shape != (count, *ESTIMATES[name]):
         raise ValueError(
             f'{method} must return shape {(count, *ESTIMATES[name])} for "{name}", got '
@@ -166,8 +196,17 @@ def factors(method: str, covariances: Floats, rows: Truths) -> Floats:
     """Return lower Cholesky factors of covariances; NaN where not in `rows`.
 
     Raises:
-        ValueError: If a covariance in `rows` is not positive definite.
+        ValueError: If a covariance in `rows` is not symmetric positive definite.
     """
+    variances = np.einsum("nii->ni", covariances)
+    with np.errstate(invalid="ignore"):  # of negative variances, which are refused below
+        most = _ASYMMETRY * np.sqrt(variances[:, :, np.newaxis] * variances[:, np.newaxis])
+    uneven = (np.abs(covariances - covariances.transpose(0, 2, 1)) > most).any(axis=(1, 2)) & rows
+    if uneven.any():
+        raise ValueError(
+            f'{method} must return a symmetric "covariance", got another for flight '
+            f"{np.flatnonzero(uneven)[0]}"
+        )
     found = np.tril(np.full_like(covariances, np.nan))
     try:
         found[rows] = np.linalg.cholesky(covariances[rows])

@@ -1,6 +1,5 @@
 """A user's estimator that processes a log, in ticks of constant length."""
 
-import copy
 from collections import deque
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.own import Estimator, Reading, checked_estimate, factors
+from quad_gym.estimation.own import Estimator, Reading, checked_estimate, factors, own_copy
 from quad_gym.estimation.player import Player, name_of
 from quad_gym.estimation.results import Measured, Replay
 from quad_gym.estimation.samples import Measurement
@@ -47,7 +46,7 @@ class OwnPlayer:
 
     def __init__(self, player: Player, estimator: Estimator) -> None:
         self._player, self._suite = player, player.suite
-        self._name, self._estimator = type(estimator).__name__, copy.copy(estimator)
+        self._name, self._estimator = type(estimator).__name__, own_copy(estimator)
         self._estimator.state = State(1, estimator.state)
         self._estimator.state.lock(False)
         self._arrived: dict[int, list[tuple[float, float]]] = {}  # stamps and arrivals by block

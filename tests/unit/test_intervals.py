@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest, mannwhitneyu, norm, ttest_1samp
+from scipy.stats import beta, binomtest, mannwhitneyu, norm, ttest_1samp
 
 from quad_gym.analysis.intervals import (
     Estimated,
@@ -16,6 +16,7 @@ from quad_gym.analysis.intervals import (
     rate_over_trainings,
     worst_tenth,
 )
+from tests.statistical.interval_coverage import DESIGNS, SEEDS, coverage
 
 DRAWS = 2000
 
@@ -44,13 +45,13 @@ def test_interval_over_trainings_covers_95_percent(seeds, of_seeds, of_episodes,
     assert 0.93 < np.mean(held) <= highest
 
 
-@pytest.mark.parametrize("seeds", [2, 3, 5])
-@pytest.mark.parametrize(("rate", "alike"), [(0.05, 20.0), (0.5, 4.0), (0.9, 10.0), (0.5, 1e6)])
-def test_rate_over_trainings_covers_at_least_95_percent(seeds, rate, alike):
-    rng = np.random.default_rng(seeds)
-    own = rng.beta(alike * rate, alike * (1.0 - rate), (DRAWS, seeds))  # rate of each training
-    found = [rate_over_trainings(rates, 100) for rates in rng.binomial(100, own) / 100]
-    assert np.mean([each.holds(rate) for each in found]) > 0.935
+@pytest.mark.parametrize("seeds", SEEDS)
+@pytest.mark.parametrize("design", DESIGNS)
+def test_rate_over_trainings_covers_95_percent_even_where_some_trainings_fail(design, seeds):
+    """The lowest coverage, of "half 95 %", is 92.9 %; 1,000 draws have sigma 0.8 %."""
+    held, width = coverage(design, seeds)
+    assert held > (0.905 if design.startswith("half") else 0.925)
+    assert width < (0.8, 0.7, 0.6)[SEEDS.index(seeds)]
 
 
 @pytest.mark.parametrize("seeds", [3, 5, 10])
@@ -64,9 +65,12 @@ def test_probability_of_improvement_covers_90_percent(seeds, apart):
 
 def test_interval_of_worst_tenth_of_a_fixed_policy_covers_95_percent():
     exact = -norm.pdf(norm.ppf(0.1)) / 0.1
-    samples = np.random.default_rng(1).normal(size=(200, 1, 200))
-    held = [mean_over_trainings(x, worst_tenth).holds(exact) for x in samples]
-    assert 0.86 < np.mean(held) < 0.99
+    for count, stated in ((10, 0.91), (20, 0.88), (100, 0.93)):
+        samples = np.random.default_rng(1).normal(size=(200, 1, count))
+        held = [mean_over_trainings(x, worst_tenth).holds(exact) for x in samples]
+        assert np.mean(held) == pytest.approx(stated, abs=0.06)
+        bias = worst_tenth(np.random.default_rng(2).normal(size=(20_000, count))).mean() - exact
+        assert bias == pytest.approx({10: 0.22, 20: 0.12, 100: 0.02}[count], abs=0.02)
 
 
 def test_interval_of_a_mean_is_student_t():
@@ -95,7 +99,18 @@ def test_interval_over_trainings_is_student_t_if_only_one_source_varies():
     np.testing.assert_allclose(other, mean_over_trainings(values))
     for rate in (0.0, 0.1, 1.0):
         assert rate_over_trainings([rate], 20) == (rate, *rate_interval(20 * rate, 20))
-    assert rate_over_trainings(np.zeros(5), 20) == rate_over_trainings([0.0], 20)
+    none = rate_over_trainings(np.zeros(5), 10**9)  # Beta(1/2, 5 + 1/2)
+    assert none == (0.0, 0.0, pytest.approx(beta.ppf(0.975, 0.5, 5.5), abs=1e-6))
+    all_crash = rate_over_trainings(np.ones(5), 10**9)
+    assert all_crash == (1.0, pytest.approx(1.0 - none.high), 1.0)
+
+
+def test_interval_of_a_rate_is_the_bayesian_bootstrap():
+    rates = np.array([0.1, 0.3, 0.25, 0.7])
+    weights = np.random.default_rng(3).dirichlet([1, 1, 1, 1, 0.5, 0.5], 100_000)
+    drawn = weights @ [*rates, 0.0, 1.0]
+    found = rate_over_trainings(rates, 10**9)
+    np.testing.assert_allclose(found[1:], np.quantile(drawn, [0.025, 0.975]), atol=0.02)
 
 
 @pytest.mark.parametrize(

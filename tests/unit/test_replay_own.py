@@ -55,10 +55,9 @@ def test_irregular_log_gives_the_errors_of_the_flight(flight):
 
 
 class Seen(Simple):
-    """An estimator that records its measurements."""
+    """An estimator that records its measurements, in its class: instances are copied."""
 
-    def __init__(self):
-        self.seen = []
+    seen = []  # noqa: RUF012
 
     def reset(self, view, mask):
         self.seen.append(view)
@@ -81,9 +80,9 @@ def test_measurements_arrive_with_their_ages_and_samples_are_averaged():
         "accel": np.vstack([accel, np.full((3, 3), np.nan)]),
         "gnss_enu": np.vstack([np.full((n, 3), np.nan), [[0, 0, 0], [1, 2, 3], [4, 5, 6]]]),
     }
-    given = Seen()
-    result = replay(log, sensors=suite, estimator=given, start={"heading": 0.3})
-    start, *ticks = given.seen
+    Seen.seen.clear()
+    result = replay(log, sensors=suite, estimator=Seen, start={"heading": 0.3})
+    start, *ticks = Seen.seen
     assert (start.gnss_position.new.any(), start.barometer) == (False, None)
     assert len(ticks) == len(result) - 1 == 40
     np.testing.assert_allclose([m.gyro[0, 2] for m in ticks], np.repeat(np.arange(1, n), 4))
