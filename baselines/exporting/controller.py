@@ -77,7 +77,8 @@ def controller_of(
 
     Raises:
         ValueError: If the policy does not exist, is no multilayer perceptron, has no training
-            record while `env_id` is None, or does not fit the environment.
+            record while `env_id` is None, or does not fit the environment; or its record names
+            modules, which are imported only if `env_id` or `keywords` name them.
         ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
     """
     if policy == "pd" or policy.startswith("pd:"):
@@ -102,8 +103,11 @@ def controller_of(
         if "env_id" not in plan:
             raise ValueError(f"{file} has no training record with an ENV_ID: specify ENV_ID")
         env_id = plan["env_id"]
+        _require_no_module(file, "ENV_ID", env_id)
     if keywords is None:
         keywords = plan.get("environment", {}) if plan.get("env_id") == env_id else {}
+        for name in ("task", "estimator"):
+            _require_no_module(file, f"--env {name}", keywords.get(name))
     env = gymnasium.make_vec(env_id, num_envs=1, threads=1, **keywords)
     try:
         found: Any = load_policy(str(file), env)
@@ -128,6 +132,12 @@ def controller_of(
         env.close()
     _require_same(controller, found, file)
     return controller
+
+
+def _require_no_module(file: Path, what: str, name: Any) -> None:
+    """Refuse the name of a module in a training record: importing it would run its code."""
+    if isinstance(name, str) and ":" in name:
+        raise ValueError(f"{file} names a module, {name}: if you trust it, specify {what} yourself")
 
 
 def _require_same(controller: Controller, model: Any, file: Path) -> None:

@@ -13,8 +13,6 @@ from quad_gym.params.world import WorldParams
 MAX_SPEED = 1e4
 """Largest initial speed [m/s]: several times faster than any bullet, with drag still integrable."""
 
-MAX_YAW = 1e4  #: largest initial yaw [rad], some thousand turns: larger ones are mistakes
-
 
 def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
     """Draw the key of a flight's random stream, (2,) words."""
@@ -59,7 +57,7 @@ def checked_start(
     """Return initial values (count, 7), NaN where they are to be drawn; None if all are.
 
     Positions of `chosen` flights (count,) have to be free of the world's obstacles. Starts from
-    which no flight can begin are refused, as are speeds above MAX_SPEED and yaws above MAX_YAW.
+    which no flight can begin are refused, as are speeds above MAX_SPEED and yaws beyond a turn.
     """
     if position is None and velocity is None and yaw is None:
         return None
@@ -100,8 +98,8 @@ def checked_start(
         require_room("position", given[:, :3] if chosen is None else given[chosen, :3], world)
     if speed > MAX_SPEED:
         raise ValueError(f"velocity must be at most {MAX_SPEED:g} m/s, got {speed:g} m/s")
-    if np.abs(given[:, 6]).max() > MAX_YAW:
-        raise ValueError(f"yaw must be at most {MAX_YAW:g} rad either way, got {yaw!r}")
+    if yaw is not None:
+        check.angle("yaw", float(given[np.abs(given[:, 6]).argmax(), 6]))
     return given
 
 

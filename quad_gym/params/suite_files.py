@@ -84,7 +84,7 @@ def read_params(file: Path, kind: type, base_of: Callable[[Any], Any]) -> Any:
     """
     try:
         given = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{file} must be a file of TOML: {error}") from None
     try:
         base = base_of(given.pop("base")) if "base" in given else None

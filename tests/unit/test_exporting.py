@@ -246,3 +246,29 @@ def test_export_of_privileged_policy_raises_value_error(tmp_path):
     file = stable_baselines_file(tmp_path, "ppo", keywords)
     with pytest.raises(ValueError, match="observes the truth"):
         controller_of(str(file), CIRCLE, keywords)
+
+
+@pytest.mark.parametrize(
+    ("plan", "named"),
+    [
+        ({"env_id": CIRCLE, "environment": {"estimator": "evil:E"}}, "--env estimator"),
+        ({"env_id": CIRCLE, "environment": {"task": "evil:T"}}, "--env task"),
+        ({"env_id": f"evil:{CIRCLE}"}, "ENV_ID"),
+    ],
+)
+def test_module_that_a_policy_file_names_is_not_imported(plan, named, tmp_path, monkeypatch):
+    (tmp_path / "evil.py").write_text("open('ran', 'w').close()")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    included = Path(quad_gym.__file__).parents[1] / "baselines" / "pretrained" / "circle.npz"
+    policy = MlpPolicy.load(included)
+    policy.record = {"plan": plan}
+    policy.save(tmp_path / "policy.npz")
+    with pytest.raises(ValueError, match=f"names a module, evil:.*specify {named} yourself"):
+        controller_of("policy.npz")
+    assert not Path("ran").exists()
+    if named != "ENV_ID":
+        with pytest.raises(ValueError, match="specify --env"):
+            controller_of("policy.npz", CIRCLE)
+        assert not Path("ran").exists()
+    controller_of("policy.npz", CIRCLE, {})  # which the user names

@@ -176,3 +176,8 @@ def test_comparison_refuses_duplicate_names_and_changed_suite_file(tmp_path):
     quad_gym.sensor_suite("consumer").save(file)
     with pytest.raises(ValueError, match=r"another plan \(different: suite_files\)"):
         configure(args)
+
+
+def test_deeply_nested_toml_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="must be a file of TOML"):
+        read(tmp_path, "a = " + "[" * 100_000)
