@@ -21,13 +21,14 @@ from baselines.policies import keywords_of_policy, load_policy
 from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis.plots import require_matplotlib
-from quad_gym.analysis.reports import require_writable, short_name
+from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Policy
 from quad_gym.experiments.evaluated import (
     Evaluated,
     evaluation_table,
+    label_of,
     remark_on_crashes,
     side_of,
     telling_episode,
@@ -38,7 +39,7 @@ from quad_gym.params.suites import contents_of_suite_files
 from quad_gym.rendering.side_by_side import save_side_by_side
 from quad_gym.rendering.video import checked_video_path
 
-VIDEO_RATE = 10.0  #: frames per second of a video
+VIDEO_RATE, VIDEO_SECONDS = 10.0, 6.5  #: frames per second of a video, and its longest duration
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class EvaluateArgs:
     threads: options.Threads = None
     video: Literal["none", "mp4", "gif", "webp"] = "none"
     """format of a video of all policies on the last observation, side by side in one episode: the
-    first one in which some of them crash and others do not, or else the first; none: no video"""
+    first one in which some of them crash and others do not, or else the first. Long episodes are
+    shown in 6.5 s. none: no video"""
     output: Path | None = None
     """folder for figures and numbers; if not given, results/evaluate/TASK, or TASK_2 and so on
     if there are results already"""
@@ -157,13 +159,14 @@ def write_video(
     shown = {case: found for case, found in cases.items() if case[1] == args.observation[-1]}
     episode = telling_episode({case: results[case] for case in shown})
     sides = [
-        side_of(short_name(name), *found, args.seed, episode, {"env_id": args.env_id})
+        side_of(label_of(name), *found, args.seed, episode, {"env_id": args.env_id})
         for (name, _), found in shown.items()
     ]
     return save_side_by_side(
         sides,
         folder / f"video.{args.video}",
         fps=VIDEO_RATE,
+        speed=max(1.0, max(side.end for side in sides) / VIDEO_SECONDS),
         progress=lambda times: tqdm(times, desc="rendering", unit=" frames"),
     )
 

@@ -16,6 +16,14 @@ from quad_gym.rendering.side_by_side import Side
 
 Evaluated = Mapping[tuple[str, str], Flown]  #: episodes by policy and observation
 
+_LABELS = {
+    "pd": "PD control",
+    "pd:features_when_uncertain": "PD control, facing markers when uncertain",
+    "pretrained": "policy trained on the estimate",
+    "pretrained:truth": "policy trained on the true state",
+}
+"""Names of policies for figures and videos"""
+
 
 def evaluation_table(results: Evaluated, env: Any) -> str:
     """Format a table of errors and endings; `env` is an environment of the same task."""
@@ -37,6 +45,11 @@ def evaluation_table(results: Evaluated, env: Any) -> str:
     return reports.text_table(
         {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
     )
+
+
+def label_of(policy: str) -> str:
+    """Name of a policy for figures and videos."""
+    return _LABELS.get(policy, reports.short_name(policy))
 
 
 def telling_episode(results: Evaluated) -> int:
@@ -123,9 +136,7 @@ def write_evaluation(
         **about,
         "versions": reports.versions("numpy", "numba", "torch", "stable_baselines3"),
     }
-    labeled = {
-        f"{reports.short_name(policy)} on {seen}": f for (policy, seen), f in results.items()
-    }
+    labeled = {f"{label_of(policy)}, on {seen}": f for (policy, seen), f in results.items()}
     curves = {label: flown.recorded for label, flown in labeled.items()}
     paths = paths_figure({label: path_of(flown) for label, flown in labeled.items()})
     return [

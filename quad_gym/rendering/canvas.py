@@ -2,7 +2,7 @@
 
 No window, display or audio device is opened, and no environment variable is needed or set: a
 surface is memory. Lines and areas are drawn at twice their size and then halved for anti-aliasing;
-text is drawn at its own size, which keeps it sharp.
+text is drawn at four times its size, which spaces letters evenly.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from quad_gym.rendering.colors import Color
 Floats = NDArray[np.float64]
 Label = tuple[str, Floats, Color]  #: text, its place (2,) [pixels], and its color
 
-OVERSAMPLING = 2
+OVERSAMPLING, TEXT_OVERSAMPLING = 2, 4
 _RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
 _RGBA = (0xFF, 0xFF00, 0xFF0000, 0xFF000000)
 """Bytes of a pixel in memory: red, green, blue, and an unused one, or the opacity. Pygame blends
@@ -202,7 +202,7 @@ class Canvas:
 
     def line_height(self, size: int) -> int:
         """Distance between lines of text [pixels]."""
-        return int(self._font(size).get_linesize())
+        return -(-int(self._font(TEXT_OVERSAMPLING * size).get_linesize()) // TEXT_OVERSAMPLING)
 
     def _font(self, size: int) -> Any:
         if size not in self._fonts:
@@ -214,8 +214,10 @@ class Canvas:
         if key not in self._words:
             if len(self._words) > 500:
                 self._words.clear()
-            word = self._font(size).render(words, True, color)
-            self._words[key] = word.convert(self._layer)
+            large = self._font(TEXT_OVERSAMPLING * size).render(words, True, color)
+            small = [-(-side // TEXT_OVERSAMPLING) for side in large.get_size()]
+            word = self._pygame.transform.smoothscale(large.convert(self._layer), small)
+            self._words[key] = word
         return self._words[key]
 
     def pixels(self) -> NDArray[np.uint8]:

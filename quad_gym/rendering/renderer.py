@@ -1,5 +1,6 @@
 """`Renderer`: pictures of the last instant of a flight."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,13 +37,17 @@ class Renderer:
         view: "fixed" (the whole reference from outside), "chase" (from behind the vehicle) or
             "course" (from above and behind, along a course of obstacles).
         size: Width and height [pixels].
+        legend: True to show task, time, legend and errors, and the image of the camera.
 
     Raises:
         ValueError: If an argument is invalid.
         ImportError: If pygame is not installed.
     """
 
-    def __init__(self, view: str = "fixed", size: tuple[int, int] = (640, 480)) -> None:
+    def __init__(
+        self, view: str = "fixed", size: tuple[int, int] = (640, 480), *, legend: bool = True
+    ) -> None:
+        self._legend = legend
         self.view = check.choice("render_view", view, ("fixed", *MOVING_VIEWS))
         self.size = checked_size(size)
         width, height = self.size
@@ -67,7 +72,7 @@ class Renderer:
         self._draw_background(flight, scene)
         labels = scene.draw()
         inset = None
-        if flight.scene.has_camera and flight.estimated:
+        if self._legend and flight.scene.has_camera and flight.estimated:
             box = inset_box(flight.scene, width - 8.0, 8.0, 0.27 * width)
             inset = Inset(canvas, flight, box, small)
             inset.draw()
@@ -76,11 +81,12 @@ class Renderer:
         canvas.write_labels(labels, small, height)
         if inset is not None:
             inset.write()
-        self._write_legend(flight)
+        if self._legend:
+            self._write_legend(flight)
         return canvas.pixels()
 
     def __reduce__(self) -> Any:
-        return Renderer, (self.view, self.size)
+        return partial(Renderer, legend=self._legend), (self.view, self.size)
 
     def _view_of(self, flight: Flight) -> Perspective:
         if self.view != "fixed":
@@ -106,8 +112,8 @@ class Renderer:
         title, clock = f"{name} on {_SEEN[flight.scene.observation]}", f"{flight['time'][-1]:.2f} s"
         policy = flight.about.get("policy")
         lines: list[tuple[str, Color | None]] = []
-        lines += [(f"flown by {short_name(str(policy))}", None)] if policy else []
-        lines += [*_legend(flight), (_errors(flight), None)]
+        lines += [(f"controller: {short_name(str(policy))}", None)] if policy else []
+        lines += [*legend_of(flight), (errors_of(flight), None)]
         lines += [(words, None) for words in _warnings(flight)]
         width = max(26 + canvas.width_of(words, small) for words, _ in lines)
         width = max(width, canvas.width_of(f"{title}   {clock}", large) + 12)
@@ -123,11 +129,13 @@ class Renderer:
             y += step
 
 
-def _legend(flight: Flight) -> list[tuple[str, Color]]:
+def legend_of(flight: Flight) -> list[tuple[str, Color]]:
     """Names and colors of the parts of a picture."""
     scene = flight.scene
-    aim = "reference, next second" if scene.reference_period else "reference"
-    found = [("next gate" if len(scene.gates_I) else aim, colors.GREEN), ("truth", colors.BLUE)]
+    found = [("next gate" if len(scene.gates_I) else "reference", colors.GREEN)]
+    if scene.reference_period and not len(scene.gates_I):
+        found = [("reference", colors.GREY), ("its next second", colors.GREEN)]
+    found += [("truth", colors.BLUE)]
     if flight.estimated:
         scale = ellipsoid_scale(flight)
         size = "3-sigma ellipsoid, true size"
@@ -141,13 +149,14 @@ def _legend(flight: Flight) -> list[tuple[str, Color]]:
     return found
 
 
-def _errors(flight: Flight) -> str:
+def errors_of(flight: Flight) -> str:
     """Errors of tracking, and of the estimated position."""
     row, scene = flight.rows[-1], flight.scene
-    found = f"{'to the gate' if len(scene.gates_I) else 'error'} {_length(row['position_error'])}"
+    what = "distance to the gate" if len(scene.gates_I) else "tracking error"
+    found = f"{what} {_length(row['position_error'])}"
     if scene.observation == "truth":
         return found
-    return f"{found}, of the estimate {_length(row['estimation_error'])}"
+    return f"{found}, estimation error {_length(row['estimation_error'])}"
 
 
 def _length(meters: float) -> str:

@@ -34,6 +34,8 @@ _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
 _RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
 
 HARDLY_VISIBLE = 30.0  #: scale below which a vehicle is marked by a disc [pixels/m]
+SMALLEST_SPAN = 44.0  #: distance between opposite rotors below which a vehicle is enlarged [pixels]
+MAX_ENLARGEMENT = 4.0
 SOLID, GLASS = 0.55, 0.12  #: opacity of obstacles behind the vehicle, and in front of it
 EDGES = (
     *((0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3)),
@@ -273,10 +275,11 @@ class Scene:
         if self._flight.estimated and np.isfinite(covariance).all():  # estimators may have none
             scale = ellipsoid_scale(self._flight)
             axes = scale * ellipsoid_axes(covariance, SIGMAS)
-            outline = ellipsoid_outline(believed, axes, view)
-            canvas.polygon(outline, colors.VERMILLION, 0.16)
-            canvas.line(outline, colors.VERMILLION, 1.2, closed=True)
-            self._lines(believed - axes, believed + axes, colors.VERMILLION, 0.8)
+            if np.linalg.norm(axes, axis=1).max() * view.scale_at(believed) < canvas.width:
+                outline = ellipsoid_outline(believed, axes, view)
+                canvas.polygon(outline, colors.VERMILLION, 0.16)
+                canvas.line(outline, colors.VERMILLION, 1.2, closed=True)
+                self._lines(believed - axes, believed + axes, colors.VERMILLION, 0.8)
         self._body(np.array(believed), self._attitude(attitude), ghost=True)
         if self._flight.estimated and scale > 1.0:
             # the error has the scale of the ellipsoid, which shows if the truth is inside
@@ -289,7 +292,10 @@ class Scene:
     def _body(self, r_I: Floats, R_BI: Floats, ghost: bool) -> None:
         """Draw arms and rotors; a ghost is drawn in outline."""
         view, canvas, scene = self._view, self._canvas, self._scene
-        hubs_B = scene.rotor_positions_B
+        span = 2.0 * float(np.linalg.norm(scene.rotor_positions_B, axis=1).max())
+        larger = max(1.0, SMALLEST_SPAN / max(span * view.scale_at(r_I), 1.0))
+        larger = 1.0 if self._moving else min(larger, MAX_ENLARGEMENT)
+        hubs_B = larger * scene.rotor_positions_B
         hubs = r_I + hubs_B @ R_BI
         thickness = float(np.clip(0.035 * view.scale_at(r_I), 1.6, 6.0))
         color = colors.VERMILLION if ghost else colors.BLUE
@@ -297,7 +303,7 @@ class Scene:
             canvas.disc(view.project(r_I)[0], 6.0 if ghost else 4.0, color, 2.0 if ghost else 0.0)
         self._lines(r_I, hubs, color if ghost else colors.INK, 1.2 if ghost else thickness)
         speeds = np.nan_to_num(self._now["rotor_speeds"]) / scene.max_rotor_speed
-        discs = view.project(hubs[:, np.newaxis] + (ROTOR_RADIUS * _RING) @ R_BI)[0]
+        discs = view.project(hubs[:, np.newaxis] + (larger * ROTOR_RADIUS * _RING) @ R_BI)[0]
         for disc, hub_B, speed in zip(discs, hubs_B, speeds, strict=True):
             front = hub_B[0] > 1e-9
             if not ghost:

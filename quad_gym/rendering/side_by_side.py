@@ -1,6 +1,5 @@
 """Videos of one episode flown by several policies, side by side."""
 
-import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +10,13 @@ from numpy.typing import NDArray
 from quad_gym.flights.record import Flight
 from quad_gym.rendering import colors
 from quad_gym.rendering.canvas import Canvas
-from quad_gym.rendering.renderer import Renderer
+from quad_gym.rendering.renderer import Renderer, errors_of, legend_of
 from quad_gym.rendering.video import Progress, checked_video_path, times_of, write_frames
 
-SIDE = (480, 460)  #: width and height of one flight [pixels]
+SIDE = (480, 470)  #: width and height of one flight [pixels]
 HOLD = 1.5  #: duration of the last picture, to read how the flights ended [s]
-_BAND = 70  #: height of the label above a picture [pixels]
-_TEXT = 19
-_COLUMNS = 54  #: characters of a label per line
+BAND, LEGEND = 64, 34  #: heights of the label above a flight, and of the legend below [pixels]
+_LARGE, _SMALL = 24, 20  #: sizes of text
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +43,12 @@ class Side:
         return float(self.flight["time"][-1])
 
     def status(self, time: float) -> str:
-        """Progress on the course at a time [s] or, after the end of the flight, its ending."""
+        """Errors or progress on the course at a time [s]; after the end, how the flight ended."""
         if time > self.end - 1e-9:
             how = "crashed" if self.crashed else "ended"
             return f"{how} at {self.end:.1f} s: {self.ending.replace('_', ' ')}"
         if self.course is None:
-            return ""
+            return errors_of(self.flight.until(time))
         now, (what, total) = self.flight.until(time).rows[-1], self.course
         speed = np.linalg.norm(now["velocity"])
         return f"{int(now['gates_passed'])} of {total} {what}, {speed:.1f} m/s"
@@ -75,32 +73,45 @@ class SideBySide:
         width, height = SIDE
         # a course of obstacles is too long for one picture
         views = ["course" if len(side.flight.scene.obstacles) else "fixed" for side in sides]
-        self._renderers = [Renderer(v, (width, height - _BAND)) for v in views]
-        self._band = Canvas(width, _BAND)
+        size = (width, height - BAND - LEGEND)
+        self._renderers = [Renderer(view, size, legend=False) for view in views]
+        self._band = Canvas(width, BAND)
+        self._legend = Canvas(width * len(sides), LEGEND)
 
     def draw(self, time: float) -> NDArray[np.uint8]:
         """Draw a picture (height, width, 3) of red, green, blue at a time [s]."""
         parts = []
         for side, renderer in zip(self.sides, self._renderers, strict=True):
             picture = renderer.draw(side.flight.until(time))
+            if side.crashed and time > side.end - 1e-9:  # pale
+                picture = (picture // 2 + 127).astype(np.uint8)
             parts.append(np.concatenate([self._label(side, time), picture]))
             parts[-1][:, -2:] = colors.GREY
-        return np.concatenate(parts, axis=1)
+        return np.concatenate([np.concatenate(parts, axis=1), self._footer(time)])
 
     def _label(self, side: Side, time: float) -> NDArray[np.uint8]:
         """Draw the band above a flight: its label, and its status below."""
-        band, step = self._band, self._band.line_height(_TEXT) + 2
-        over = time > side.end - 1e-9
-        band.clear(colors.PALE)
-        if over:
-            ending = colors.VERMILLION if side.crashed else colors.GREEN
-            band.box(0.0, _BAND - step - 4.0, band.width, step + 4.0, ending)
+        band, over = self._band, time > side.end - 1e-9
+        ending = colors.VERMILLION if side.crashed else colors.GREEN
+        band.clear(ending if over else colors.PALE)
         band.finish()
-        for k, line in enumerate(textwrap.wrap(side.label, _COLUMNS)[:2]):
-            band.text(line, 10.0, 5.0 + k * step, _TEXT)
         ink = colors.WHITE if over else colors.INK
-        band.text(side.status(time), 10.0, _BAND - step, _TEXT, ink)
+        band.text(band.fitting([side.label], _LARGE, band.width), 12.0, 8.0, _LARGE, ink)
+        band.text(side.status(time), 12.0, 14.0 + band.line_height(_LARGE), _SMALL, ink)
         return band.pixels()
+
+    def _footer(self, time: float) -> NDArray[np.uint8]:
+        """Draw the time and the legend below all flights."""
+        canvas, flight = self._legend, self.sides[0].flight
+        canvas.clear(colors.WHITE)
+        canvas.finish()
+        x = 12.0 + canvas.text(f"{time:4.1f} s", 12.0, 9.0, _SMALL) + 20.0
+        legend = legend_of(flight.until(min(time, self.sides[0].end)))
+        legend += [("marker in view", colors.INK)] if flight.scene.has_camera else []
+        for words, color in legend:
+            canvas.mark(color, x, 9.0, _SMALL)
+            x += 34.0 + canvas.text(words, x + 16.0, 9.0, _SMALL)
+        return canvas.pixels()
 
 
 def save_side_by_side(

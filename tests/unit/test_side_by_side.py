@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quad_gym.rendering import Side, SideBySide, record_flight, save_side_by_side
-from quad_gym.rendering.side_by_side import SIDE
+from quad_gym.rendering.side_by_side import LEGEND, SIDE
 
 pytest.importorskip("pygame")
 
@@ -38,7 +38,7 @@ def test_flight_that_has_ended_keeps_its_last_frame(sides):
     assert film.end == sides[1].end > sides[0].end
     width = SIDE[0]
     early, first_end, last_end = (film.draw(t) for t in (0.1, sides[0].end, film.end))
-    np.testing.assert_array_equal(first_end[:, :width], last_end[:, :width])
+    np.testing.assert_array_equal(first_end[:-LEGEND, :width], last_end[:-LEGEND, :width])
     assert (first_end[:, width:] != last_end[:, width:]).any()
     assert (early[:, :width] != first_end[:, :width]).any()
     assert film.draw(film.end).shape == (SIDE[1], 2 * width, 3)
