@@ -52,6 +52,9 @@ class CalibrateArgs:
     vehicle: Path | None = None
     """write a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the log to
     this file"""
+    vehicle_from: str | None = None
+    """vehicle whose mass, inertia and arms that file has: lab, crazyflie or a .toml file; if not
+    given, lab"""
     output: Path | None = None
     """folder for the results, created if it is missing; if not given, results/calibrate/LOG"""
     overwrite: bool = False
@@ -176,7 +179,8 @@ def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -
             f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
         )
     with usage_errors():
-        fitted = fit_vehicle(log, sensors=suite, start=start)
+        begin = args.vehicle_from or "lab"
+        fitted = fit_vehicle(log, sensors=suite, start=start, vehicle=begin)
         file = fitted.vehicle.save(args.vehicle)
     lag, hover = fitted.motor_time_constant, fitted.hover_voltage
     return (
@@ -195,6 +199,7 @@ def next_command(args: CalibrateArgs, folder: Path) -> list[str]:
 
 def main(args: CalibrateArgs) -> None:
     """Search, validate and write."""
+    from quad_gym import vehicle_params
     from quad_gym.analysis.plots import require_matplotlib
     from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
     from quad_gym.estimation import calibrate
@@ -205,6 +210,10 @@ def main(args: CalibrateArgs) -> None:
             raise ValueError("--heading must not be given with --course")
         require_matplotlib()
         refuse_overwriting(folder / RESULT, args.overwrite)
+        if args.vehicle_from is not None:
+            if args.vehicle is None:
+                raise ValueError("--vehicle-from needs --vehicle")
+            vehicle_params(args.vehicle_from)
         if args.vehicle is not None:
             if args.vehicle.suffix != ".toml":
                 raise ValueError(f"--vehicle must end with .toml, got {args.vehicle}")

@@ -32,6 +32,9 @@ _FIRST_LAG, _FIRST_DRAG = 0.05, 0.01
 """Values at which the search begins: time constant of the rotors [s], drag over mass [1/m]."""
 
 
+_SINGULAR = 1e-9  #: relative size of a pivot below which a number is not determined
+
+
 class FittedNumber(NamedTuple):
     """A number with its 95 % interval."""
 
@@ -77,7 +80,8 @@ def fit_vehicle(
         body: Axes of a table, see `read_log`.
 
     Raises:
-        ValueError: If the log or an argument is invalid, or the commands are not during the flight.
+        ValueError: If the log or an argument is invalid, the commands are not during the flight, or
+            do not determine the numbers.
     """
     from scipy.linalg import solve_triangular
     from scipy.optimize import least_squares
@@ -115,6 +119,11 @@ def fit_vehicle(
     tau = max(correlation_time(column) for column in errors.T)
     variance = tau * float((errors**2).sum()) / (errors.size - len(begin))
     factor = np.linalg.qr(found.jac, mode="r")  # (J^T J)^-1 = R^-1 R^-T
+    if abs(np.diag(factor)).min() <= _SINGULAR * np.linalg.norm(factor, axis=0).max():
+        raise ValueError(
+            "a log must determine thrust, rotor lag, drag and sag: its motor commands must change, "
+            "and the vehicle must move"
+        )
     rows_of_inverse = solve_triangular(factor, np.eye(len(begin)))
     spread = math.sqrt(variance) * np.linalg.norm(rows_of_inverse, axis=1)
     return _result(known, found.x, 1.96 * spread)
@@ -174,15 +183,31 @@ def _motion(smoothed: Any, times: Floats) -> tuple[Floats, Floats, Floats]:
 def _mean_squares(
     times: Floats, voltages: Floats, spans: tuple[Floats, Floats], lag: float, sag: float
 ) -> Floats:
-    """Return means over spans of the sum of u_i^2, the squared speeds of the rotors in volts."""
+    """Return means over spans of the sum of u_i^2, the squared speeds of the rotors in volts.
+
+    While a command e holds, u = e + d exp(-t / lag), so the integral of u^2 is
+    e^2 t + 2 e d lag (1 - exp(-t / lag)) + d^2 lag / 2 (1 - exp(-2 t / lag)).
+    """
     reached = voltages * (1.0 - sag * (times - times[0]))[:, np.newaxis]
     decay = np.exp(-np.diff(times) / lag)
-    u = np.empty_like(reached)
-    u[0] = reached[0]
+    away = np.zeros_like(reached)  # of the speed from the command, d
     for k, keep in enumerate(decay):
-        u[k + 1] = reached[k] + keep * (u[k] - reached[k])
-    squares = (u**2).sum(axis=1)
-    steps = 0.5 * (squares[1:] + squares[:-1]) * np.diff(times)
+        away[k + 1] = keep * away[k] + reached[k] - reached[k + 1]
+    square, twice, rest = (
+        x.sum(axis=1) for x in (reached**2, 2.0 * lag * reached * away, 0.5 * lag * away**2)
+    )
+
+    def since(k: Any, t: Floats) -> Floats:
+        """Integral over a time t since command k."""
+        return np.asarray(
+            square[k] * t - twice[k] * np.expm1(-t / lag) - rest[k] * np.expm1(-2.0 * t / lag)
+        )
+
+    steps = since(slice(-1), np.diff(times))
     total = np.concatenate([[0.0], np.cumsum(steps)])
-    begins, ends = (np.interp(span, times, total) for span in spans)
+    begins, ends = (
+        total[k] + since(k, span - times[k])
+        for span in spans
+        for k in [np.searchsorted(times, span, side="right") - 1]
+    )
     return np.asarray((ends - begins) / (spans[1] - spans[0]))
