@@ -14,11 +14,12 @@ import math
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from quad_gym.commands.options import (
     MISFIT,
     LogFile,
+    ReadingArgs,
     SuiteName,
     refuse_overwriting,
     usage_errors,
@@ -33,7 +34,7 @@ SUITE, RESULT = "suite.toml", "calibration.json"
 
 
 @dataclass(frozen=True)
-class CalibrateArgs:
+class CalibrateArgs(ReadingArgs):
     """Options of the calibration."""
 
     log: LogFile
@@ -47,8 +48,6 @@ class CalibrateArgs:
     baseline or a magnetometer"""
     course: bool = False
     """use the direction of the first GNSS velocity as heading"""
-    body: Literal["flu", "frd"] = "flu"
-    """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
     vehicle: Path | None = None
     """write a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the log to
     this file"""
@@ -173,7 +172,7 @@ def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -
     from quad_gym.estimation import fit_vehicle, read_log
 
     assert args.vehicle is not None
-    log = read_log(args.log, body=args.body)
+    log = read_log(args.log, **args.reading())
     if log.motors is None:
         return (
             f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
@@ -194,7 +193,7 @@ def next_command(args: CalibrateArgs, folder: Path) -> list[str]:
     words = ["quad-gym", "replay", str(args.log), "--sensors", str(folder / SUITE)]
     if args.heading is not None:
         words += ["--heading", f"{args.heading:g}"]
-    return words + ["--course"] * args.course + ["--body", args.body] * (args.body != "flu")
+    return words + ["--course"] * args.course + args.words()
 
 
 def main(args: CalibrateArgs) -> None:
@@ -229,7 +228,7 @@ def main(args: CalibrateArgs) -> None:
             start=start,
             share=args.share,
             delays=args.delays,
-            body=args.body,
+            **args.reading(),
             progress=lambda sentence: print(f"{sentence} ...", flush=True),
         )
     numbers = text_table({"": list(NUMBER_HEADINGS)}, number_rows(found))

@@ -11,9 +11,9 @@ import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import tyro
 from tyro.conf import Positional, arg
@@ -24,6 +24,9 @@ from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
+
+if TYPE_CHECKING:
+    from quad_gym.estimation import Reading
 
 _Args = TypeVar("_Args")
 
@@ -78,10 +81,10 @@ def option_name(field: str) -> str:
 
 def require_at_least(args: Any, **least: int) -> None:
     """Reject numbers that are too small; options that were not given (None) are accepted."""
-    for field, limit in least.items():
-        value = getattr(args, field)
+    for name, limit in least.items():
+        value = getattr(args, name)
         if value is not None and value < limit:
-            raise ValueError(f"{option_name(field)} must be at least {limit}, got {value}")
+            raise ValueError(f"{option_name(name)} must be at least {limit}, got {value}")
 
 
 @contextmanager
@@ -277,7 +280,47 @@ LogFile = Positional[
         Path,
         arg(
             metavar="LOG",
-            help="table (.csv), log of PX4 (.ulg) or ArduPilot (.bin), ROS bag, or EuRoC folder",
+            help="table (.csv, .csv.gz), log of PX4 (.ulg) or ArduPilot (.bin), bag, EuRoC folder",
         ),
     ]
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingArgs:
+    """Options of commands that read logs."""
+
+    body: Literal["flu", "frd"] = "flu"
+    """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
+    instance: Keywords = field(default_factory=dict)
+    """sensors to take where the log has several, such as magnetometer=1; if not given, those that
+    the autopilot used or prefers, else those with the most valid data"""
+    topic: Keywords = field(default_factory=dict)
+    """topics of a ROS bag to take, such as imu=/mavros/imu/data_raw"""
+    columns: Path | None = None
+    """file (.toml) that maps the columns of a table to those of docs/logs.md"""
+    from_: Annotated[float | None, arg(name="from")] = None
+    """time at which to begin, in the log's clock [s]"""
+    until: float | None = None
+    """time at which to end [s]"""
+
+    def reading(self) -> "Reading":
+        """Return the options as keywords of `read_log`."""
+        names = ("body", "instance", "topic", "columns", "from_", "until")
+        return cast("Reading", {name: getattr(self, name) for name in names})
+
+    def words(self) -> list[str]:
+        """Return the options as words of a command line, as far as they are not the defaults."""
+        found = ["--body", self.body] if self.body != "flu" else []
+        for name in ("instance", "topic"):
+            if pairs := getattr(self, name):
+                found += [f"--{name}", *(f"{key}={value}" for key, value in pairs.items())]
+        for name in ("columns", "from_", "until"):
+            if (value := getattr(self, name)) is not None:
+                found += [f"--{name.rstrip('_')}", str(value)]
+        return found
+
+
+def told(notes: Sequence[str]) -> str:
+    """Format sentences on what was taken of a log and left out, a line each."""
+    return "\n".join(f"{note[0].upper()}{note[1:]}." for note in notes)

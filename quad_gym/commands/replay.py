@@ -15,15 +15,17 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from quad_gym.commands.options import (
     MISFIT,
     LogFile,
+    ReadingArgs,
     SuiteName,
     refuse_overwriting,
+    told,
     usage_errors,
 )
 
@@ -36,7 +38,7 @@ RESULT = "replay.json"
 
 
 @dataclass(frozen=True)
-class ReplayArgs:
+class ReplayArgs(ReadingArgs):
     """Options of the replay."""
 
     log: LogFile
@@ -57,8 +59,6 @@ class ReplayArgs:
     without GNSS"""
     course: bool = False
     """use the direction of the first GNSS velocity as heading, for vehicles that fly nose first"""
-    body: Literal["flu", "frd"] = "flu"
-    """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
     window: float = 0.5
     """longest delay of measurements [s]"""
     reported_noise: bool = True
@@ -140,6 +140,8 @@ def report_of(result: "Replay") -> str:
         rows.append((name, f"{len(measured.time)}", f"{int(measured.gated.sum())}", mean))
     table = text_table({"measurements": ["of", "count", "rejected", "mean NIS"]}, rows)
     lines = [f"{len(result)} IMU samples from {result.time[0]:.2f} s to {result.time[-1]:.2f} s."]
+    if result.notes:
+        lines.append(told(result.notes))
     if result.too_late:
         lines.append(f"Too late for the window: {result.too_late} measurements.")
     if result.unused:
@@ -193,10 +195,9 @@ def main(args: ReplayArgs) -> None:
             "estimator": args.estimator,
             "start": start_of(args),
             "reported_noise": args.reported_noise,
-            "body": args.body,
         }
         try:
-            log = read_log(args.log, body=args.body)
+            log = read_log(args.log, **args.reading())
             result = replay(log, window=args.window, **options)
             if args.smooth:
                 smoothed = smooth(log, **options)

@@ -8,7 +8,7 @@ from quad_gym.estimation.filters import (
     UnscentedKalmanFilter,
 )
 from quad_gym.estimation.first_fix import FARTHEST_FIX, FirstFix
-from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Stream, read_log
+from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Reading, Stream, read_log
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Measured, Replay, Smoothed
 from quad_gym.estimation.search import Calibrated
@@ -30,6 +30,7 @@ __all__ = [
     "Log",
     "LogColumn",
     "Measured",
+    "Reading",
     "Replay",
     "Smoothed",
     "Stream",

@@ -6,14 +6,16 @@ The first part of the log is for the search (`search.py`), the rest validates it
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from quad_gym.estimation.logs import Log, read_log
+from quad_gym.estimation.logs import Log, Reading, read_log
+from quad_gym.estimation.logs.parts import longest_part, naming
+from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.numbers import has
 from quad_gym.estimation.plausibility import implausible
-from quad_gym.estimation.replaying import origin_of
+from quad_gym.estimation.replaying import origin_in, origin_of
 from quad_gym.estimation.search import Calibrated, NumberSearch
 from quad_gym.estimation.validation import Validation, validate
 from quad_gym.params import checks as check
@@ -71,8 +73,8 @@ def calibrate(
     start: Mapping[str, Any] | None = None,
     share: float = 0.5,
     delays: bool = True,
-    body: str = "flu",
     progress: Callable[[str], None] | None = None,
+    **reading: Unpack[Reading],
 ) -> Calibration:
     """Find the numbers of a sensor suite from the log of a flight.
 
@@ -84,8 +86,8 @@ def calibrate(
         share: Share of the log, from its beginning, that the search uses; the rest is for
             validation.
         delays: True: find delays of time stamps, too; False: keep the suite's.
-        body: Axes of a table, see `read_log`.
         progress: Called with a sentence before each step.
+        **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
         ValueError: If the log or an argument is invalid, units or axes of the log are implausible,
@@ -95,14 +97,31 @@ def calibrate(
     check.instance("sensors", suite, SensorSuite)
     check.number("share", share, least=0.05, most=0.95)
     check.flag("delays", delays)
-    whole = read_log(log, body=body)
-    if wrong := list(implausible(whole, body, suite)):
+    whole = longest_part(read_log(log, **reading))
+    with naming(whole):
+        return _calibrated(whole, suite, dict(start or {}), share, delays, reading, progress)
+
+
+def _calibrated(
+    whole: Log,
+    suite: SensorSuite,
+    start: dict[str, Any],
+    share: float,
+    delays: bool,
+    reading: Reading,
+    progress: Callable[[str], None] | None,
+) -> Calibration:
+    """Search and validate, see `calibrate`."""
+    placed = origin_of(whole, suite)
+    whole = compared(whole, origin_in(placed))
+    wrong = [*whole.problems, *implausible(whole, reading.get("body", "flu"), suite)]
+    if wrong:
         raise ValueError(f"a calibration must have a log in SI units: {'; '.join(wrong)}")
-    prior = _prior_of(origin_of(whole, suite), whole)
+    prior = _prior_of(placed, whole)
     time = whole.imu.time
     split = float(time[0] + share * (time[-1] - time[0]))
     report = progress or (lambda _: None)
-    search = NumberSearch(whole.until(split), prior, dict(start or {}), delays)
+    search = NumberSearch(whole.until(split), prior, start, delays)
     report(f"Search for {len(search.numbers)} numbers in a part of the flight")
     search.begin()
     report("Search in all of the first part")

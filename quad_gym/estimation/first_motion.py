@@ -33,8 +33,11 @@ def _first_speed(log: Log, suite: SensorSuite) -> float | None:
     gnss = log.gnss
     if gnss is None or suite.gnss is None:
         return None
-    positions = next(v for k in "GI" if (v := gnss.values.get(f"position_{k}")) is not None)
-    rows = np.isfinite(positions).all(axis=1)
+    known = (gnss.values[n] for n in ("position_G", "position_I") if n in gnss.values)
+    positions = next(known, np.empty((len(gnss), 0)))
+    rows = np.isfinite(positions).all(axis=1) & (positions.shape[1] > 0)
+    if not rows.any():
+        return None
     time, positions = gnss.time[rows], positions[rows]
     rows = time < time[0] + SPAN
     nearest = int(np.argmin(np.abs(log.imu.time - time[0])))

@@ -118,7 +118,7 @@ class Likelihood:
         white: Collection[str],
         margin: float,
     ) -> None:
-        first, last = (log.imu if log.gnss is None else log.gnss).received[0], log.imu.time[-1]
+        first, last = log.streams.get("gnss", log.imu).received[0], log.imu.time[-1]
         span = (first + SETTLING, last - margin)
         right = log.corrected(suite)
         self._logs = [_LogLosses(each, suite, start, nu, span) for each in (right, thinned(right))]

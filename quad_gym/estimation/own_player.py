@@ -68,6 +68,7 @@ class OwnPlayer:
                 invalid.
         """
         player, dt = self._player, self._suite.imu.dt
+        player.tilted = False  # an estimator of a user's knows no unknown heading
         player.write_tape()
         kf = player.filter
         if not kf.heading_known:

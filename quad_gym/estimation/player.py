@@ -23,7 +23,7 @@ from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
 from quad_gym.estimation.results import Measured, Replay
 from quad_gym.estimation.running import run_filter
 from quad_gym.estimation.samples import Measurement, Sample, checked_measurement
-from quad_gym.estimation.starts import state_at_rest
+from quad_gym.estimation.starts import level, state_at_rest
 from quad_gym.estimation.tape import Tape, TapeWriter
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import blocks_of
@@ -31,11 +31,13 @@ from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
-from quad_gym.rotations import dcm_to_quaternion
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
 
 _OF_GNSS = ("gnss_position_G", "gnss_baseline_G", "gnss_velocity_G")
+
+UNMEASURED = 1e4  #: standard deviation along an axis that was not measured [m]
 
 PATIENCE = 2.0  #: time for which a start waits for the first magnetic field [s]
 
@@ -58,7 +60,10 @@ class Player:
         self.log, self.suite, self.estimator = log, suite, estimator
         self.in_order, window = window is None, window or 0.0
         self.start, self.reported = start, reported_noise
-        self.filter = ESTIMATORS[estimator](with_wide_start(suite, log), window=window)
+        wide = with_wide_start(suite, log)
+        self.filter = ESTIMATORS[estimator](wide, window=window)
+        self.tilted = wide is not suite and not self.in_order
+        """True: roll and pitch at the start are too uncertain for a heading by a magnetic field"""
         self.window = window
         self.averages = suite.imu.samples == "average"
         self.imu_times: list[float] = log.imu.time.tolist()
@@ -87,7 +92,11 @@ class Player:
         for name, stream in log.streams.items():
             if name == "imu":
                 continue
-            if getattr(suite, name) is None:
+            if name == "attitude":
+                used = self._baselines_of_attitudes()
+            else:
+                used = getattr(suite, name) is not None
+            if not used:
                 unused.append(name)
             else:
                 self.streams[name] = stream
@@ -109,6 +118,12 @@ class Player:
         if suite.gnss is not None:
             self.origin = np.array(suite.gnss.reference_antenna_G)
             self.R_GI = ecef_to_enu(self.origin).T
+
+    def _baselines_of_attitudes(self) -> bool:
+        """Return True if attitudes act as baselines, which the suite has and the log lacks."""
+        gnss, given = self.suite.gnss, self.log.gnss
+        told = given is not None and {"baseline_G", "baseline_I"} & set(given.values)
+        return gnss is not None and gnss.has_baseline and not told
 
     # ---- the log, event by event ---------------------------------------------------------------
 
@@ -222,10 +237,34 @@ class Player:
             return checked_measurement(self.suite, position, baseline, None, velocity, given)
         if name == "camera":
             return Measurement(pixels=stream.values["pixels"][k])
+        if name == "attitude":
+            assert self.suite.gnss is not None
+            baseline = turned(self._attitude(k).T, self.suite.gnss.baseline_B)
+            return checked_measurement(
+                self.suite, None, turned(self.R_GI, baseline), None, None, {}
+            )
         value = stream.values[name][k]
         if not np.isfinite(value).all():
             return None
         return Measurement(aids={Aid[name.upper()]: np.atleast_1d(value)})
+
+    def _attitude(self, k: int) -> Floats:
+        """Return an attitude R_BI of the log, level if only its heading is known."""
+        assert self.log.attitude is not None
+        values = self.log.attitude.values
+        if "quaternion" in values:
+            return quaternion_to_dcm(values["quaternion"][k])
+        return level(float(values["heading"][k]))
+
+    def _first_heading(self, time: float) -> float | None:
+        """Return the heading in the log nearest to a time, within `LONGEST_STEP`; None: none."""
+        attitude = self.log.attitude
+        if attitude is None or not len(attitude):
+            return None
+        k = int(np.argmin(np.abs(attitude.time - time)))
+        R_BI = self._attitude(k)
+        near = abs(attitude.time[k] - time) < LONGEST_STEP
+        return math.atan2(R_BI[0, 1], R_BI[0, 0]) if near else None
 
     def _fix(self, stream: Stream, k: int) -> dict[str, Any]:
         """Return the GNSS measurements of one instant as keywords of `update`."""
@@ -257,8 +296,15 @@ class Player:
         self, found: dict[str, Any], keyword: str, stream: Stream, name: str, k: int
     ) -> None:
         values = stream.values.get(name)
-        if self.reported and values is not None and np.isfinite(values[k]).all():
-            found[keyword] = values[k] if values.ndim > 1 else float(values[k])
+        if values is None:
+            return
+        sigma, suites = values[k], self.suite.gnss
+        if name == "position_sigma_I" and np.isinf(sigma).any() and suites is not None:
+            known = sigma if self.reported else np.full(3, np.nan)
+            known = np.where(np.isnan(known), suites.position_sigma_I, known)
+            found[keyword] = np.where(np.isinf(sigma), UNMEASURED, known)
+        elif self.reported and np.isfinite(sigma).all():
+            found[keyword] = sigma if values.ndim > 1 else float(sigma)
 
     # ---- the start -----------------------------------------------------------------------------
 
@@ -273,8 +319,15 @@ class Player:
         first = self.imu_times[0 if self.averages else 1]  # an instant needs the sample before
         if "gnss_position_G" not in fix or time < first - LONGEST_STEP:
             return
-        known = "gnss_baseline_G" in fix or {"heading", "course", "magnetometer"} & set(self.start)
-        if not known and "magnetometer" in self.streams:
+        if not {"heading", "course"} & set(self.start) and "gnss_baseline_G" not in fix:
+            heading = self._first_heading(time)
+            fix |= {} if heading is None else {"heading": heading}
+        known = {"gnss_baseline_G", "heading"} & set(fix) or {
+            "heading",
+            "course",
+            "magnetometer",
+        } & set(self.start)
+        if not known and "magnetometer" in self.streams and not self.tilted:
             if self.in_order:  # the nearest one, even if it is later
                 fields = self.streams["magnetometer"].time
                 self.field = int(np.argmin(np.abs(fields - time)))
@@ -319,7 +372,8 @@ class Player:
         if {"R_BI", "covariance"} & set(state):
             return state
         check.keywords(state, ("position", "heading", "time"), "a start at a position")
-        if "heading" not in state:
+        heading = state.setdefault("heading", self._first_heading(state["time"]))
+        if heading is None:
             raise ValueError(
                 "start must have a heading in addition to the position, or all keywords of "
                 "set_state"

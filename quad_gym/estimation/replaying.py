@@ -1,23 +1,26 @@
 """Replay: a filter processes a log in the same way as in flight."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar, Unpack
 
 import numpy as np
 
 from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
-from quad_gym.estimation.logs import Log, read_log
+from quad_gym.estimation.logs import Floats, Log, Reading, read_log
+from quad_gym.estimation.logs.parts import naming, parts_of
+from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.own import Estimator
 from quad_gym.estimation.own_player import OwnPlayer
 from quad_gym.estimation.plausibility import problems_of
 from quad_gym.estimation.player import ESTIMATORS, Player
-from quad_gym.estimation.results import Replay
+from quad_gym.estimation.results import Estimates, Replay, joined
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
+from quad_gym.rotations import quaternion_to_dcm
 
 
 def replay(
@@ -28,7 +31,7 @@ def replay(
     start: Mapping[str, Any] | None = None,
     reported_noise: bool = True,
     window: float = 0.5,
-    body: str = "flu",
+    **reading: Unpack[Reading],
 ) -> Replay:
     """Filter a log.
 
@@ -37,6 +40,9 @@ def replay(
 
     Check `problems` of the result before you use its estimates: it has a sentence for each sensor
     that the suite does not describe, and for implausible units and axes.
+
+    A log with pauses is flown in parts, each with a start: by GNSS, or without it where the part
+    before has ended.
 
     The origin of I is the suite's reference antenna if the first fix is within 100 km of it, and
     the first fix otherwise.
@@ -56,35 +62,96 @@ def replay(
         reported_noise: True: use the accuracy that the receiver reports, if the log has it, in
             place of the suite's. An own estimator does not receive it.
         window: Longest delay of measurements beyond the suite's `log_delays` [s].
-        body: Axes of a table, see `read_log`.
+        **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
-        ValueError: If the log or an argument is invalid, the log has no fix to start from, images
-            have other features than the suite, or the IMU samples have a gap longer than
-            LONGEST_STEP.
+        ValueError: If the log or an argument is invalid, the log has no fix to start from, or
+            images have other features than the suite.
     """
     own = None
     if not isinstance(estimator, str) or ":" in estimator:
         own, estimator = check.own("estimator", estimator, Estimator), "ukf"
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
-    whole, suite = prepared(log, sensors, body)
+    whole, suite = prepared(log, sensors, reading)
     reach = window + max(0.0, *vars(suite.log_delays).values())
-    player = Player(whole, suite, estimator, named_start(start), reported_noise, reach)
-    result = player.play() if own is None else OwnPlayer(player, own).play()
-    return replace(result, problems=problems_of(whole, body, suite, result))
+
+    def fly(part: Log, begin: dict[str, Any]) -> Replay:
+        player = Player(part, suite, estimator, begin, reported_noise, reach)
+        return player.play() if own is None else OwnPlayer(player, own).play()
+
+    result = in_parts(whole, named_start(start), fly)
+    problems = (*whole.problems, *problems_of(whole, reading.get("body", "flu"), suite, result))
+    return replace(result, problems=problems)
 
 
-def prepared(log: Any, sensors: SensorSuite | str, body: str) -> tuple[Log, SensorSuite]:
+_Found = TypeVar("_Found", bound=Estimates)
+
+
+def in_parts(
+    log: Log, start: dict[str, Any], fly: Callable[[Log, dict[str, Any]], _Found]
+) -> _Found:
+    """Return the results of a function for the parts of a log, one after the other.
+
+    Args:
+        log: The log.
+        start: Start of the first part; later ones keep its keywords except for the heading, and
+            without GNSS begin where the part before has ended.
+        fly: Returns the estimates for a part and its start.
+    """
+    found: list[_Found] = []
+    notes = list(log.notes)
+    first_error: ValueError | None = None
+    parts = parts_of(log)
+    with naming(log):
+        for part in parts:
+            begin, end = part.imu.time[[0, -1]]
+            try:
+                found.append(fly(part, _start_of(start, found[-1] if found else None)))
+            except ValueError as error:
+                if len(parts) == 1:
+                    raise
+                first_error = first_error or error
+                notes.append(f"the part from {begin:.2f} s to {end:.2f} s is left out: {error}")
+        if not found:
+            assert first_error is not None
+            raise first_error
+    if len(parts) > 1:
+        spans = ", ".join(f"{each.time[0]:.2f} to {each.time[-1]:.2f} s" for each in found)
+        notes.insert(0, f"the log has pauses, and is flown in {len(found)} parts: {spans}")
+    notes += found[0].notes
+    return replace(joined(found), notes=tuple(notes), sources=log.sources)
+
+
+def _start_of(start: dict[str, Any], before: Estimates | None) -> dict[str, Any]:
+    """Return the start of a part: a heading holds for the first one only."""
+    if before is None:
+        return start
+    if "position" not in start:
+        return {name: value for name, value in start.items() if name not in ("heading", "time")}
+    R_BI = quaternion_to_dcm(before.quaternion[-1])
+    return {"position": before.position[-1], "heading": float(np.arctan2(R_BI[0, 1], R_BI[0, 0]))}
+
+
+def prepared(log: Any, sensors: SensorSuite | str, reading: Reading) -> tuple[Log, SensorSuite]:
     """Return a log without its delays, in the axes of B, and a suite with the origin of I.
+
+    Quantities that other sensors contradict are left out.
 
     Raises:
         ValueError: As `replay`.
     """
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
-    whole = read_log(log, body=body).corrected(suite)
-    return whole, origin_of(whole, suite)
+    whole = read_log(log, **reading).corrected(suite)
+    with naming(whole):
+        suite = origin_of(whole, suite)
+        return compared(whole, origin_in(suite)), suite
+
+
+def origin_in(suite: SensorSuite) -> Floats | None:
+    """Return the origin of I of a suite for a log, in ECEF; None: the suite has none."""
+    return None if suite.gnss is None else np.array(suite.gnss.reference_antenna_G)
 
 
 def origin_of(log: Log, suite: SensorSuite) -> SensorSuite:

@@ -1,9 +1,9 @@
 """Results of a replay: estimates, innovations and problems; smoothed estimates."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -62,6 +62,10 @@ class Estimates:
     bias"""
     status: FilterStatus
     """numerical failures; 0 does not imply that the suite fits the log, see `Replay.problems`"""
+    sources: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    """sources in the log, see `Log.sources`"""
+    notes: tuple[str, ...] = field(default=(), kw_only=True)
+    """sentences on the choice of sources and on dropped rows"""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -105,7 +109,7 @@ class Replay(Estimates):
         return super().columns() | {"diverged": self.diverged.astype(np.float64)}
 
     def summary(self) -> dict[str, Any]:
-        """Return counts and mean NIS per measurement, the diverged fraction, and `problems`."""
+        """Return counts and mean NIS per measurement, the diverged fraction, and all sentences."""
         kinds = {}
         for name, m in self.measured.items():
             used = np.isfinite(m.nis)
@@ -125,6 +129,8 @@ class Replay(Estimates):
             "diverged": float(np.mean(self.diverged)),
             "problems": self.problems,
             "heading_known": bool(self.heading_known[-1]),
+            "sources": self.sources,
+            "notes": self.notes,
         }
 
 
@@ -165,7 +171,39 @@ def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
     found = {name: m for name, m in measured.items() if not name.startswith("feature_")}
     features = [m for name, m in measured.items() if name.startswith("feature_")]
     if features:
-        names = [field.name for field in fields(Measured)]
-        parts = (np.concatenate([getattr(m, name) for m in features]) for name in names)
-        found["features"] = Measured(*parts)
+        found["features"] = stacked(features)
     return found
+
+
+_Found = TypeVar("_Found", bound=Estimates)
+
+
+def joined(parts: Sequence[_Found]) -> _Found:
+    """Return the estimates for the parts of a log as of one log."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    changes: dict[str, Any] = {"status": first.status}
+    for each in parts[1:]:
+        changes["status"] |= each.status
+    for name in (f.name for f in fields(first)):
+        values = [getattr(part, name) for part in parts]
+        if isinstance(values[0], np.ndarray):
+            changes[name] = np.concatenate(values)
+        elif name == "measured":
+            changes[name] = _joined_innovations(values)
+        elif name == "too_late":
+            changes[name] = sum(values)
+    return replace(first, **changes)
+
+
+def _joined_innovations(parts: Sequence[Mapping[str, Measured]]) -> dict[str, Measured]:
+    """Return the innovations of all parts by kind of measurement."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: stacked([part[name] for part in parts if name in part]) for name in names}
+
+
+def stacked(parts: Sequence[Measured]) -> Measured:
+    """Return innovations one after the other."""
+    columns = [f.name for f in fields(Measured)]
+    return Measured(*(np.concatenate([getattr(m, name) for m in parts]) for name in columns))

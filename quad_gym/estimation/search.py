@@ -104,7 +104,8 @@ class NumberSearch:
             if number.positive:
                 x[k] = number.coordinate(value, wide.get(number.name, 1.0) * value)
             if number.name in _COARSE_NOISE:  # of the largest that the samples admit
-                x[k] = max(0.0, number.coordinate(value, self._roughness(number)))
+                rough = self._roughness(number)
+                x[k] = max(0.0, number.coordinate(value, rough)) if rough > 0.0 else 0.0
         return x
 
     def _roughness(self, number: Number) -> float:

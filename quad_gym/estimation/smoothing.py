@@ -22,15 +22,15 @@ data using sequential smoothing techniques for discrete systems, AIAA/AAS Astrod
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from scipy.linalg import cho_solve
 
 from quad_gym.estimation.filters import KalmanFilter
-from quad_gym.estimation.logs import Floats
+from quad_gym.estimation.logs import Floats, Log, Reading
 from quad_gym.estimation.player import ESTIMATORS, Player
-from quad_gym.estimation.replaying import named_start, prepared
+from quad_gym.estimation.replaying import in_parts, named_start, prepared
 from quad_gym.estimation.results import Smoothed
 from quad_gym.estimation.running import run_while_unknown
 from quad_gym.estimation.tape import Tape
@@ -53,7 +53,7 @@ def smooth(
     estimator: str = "ukf",
     start: Mapping[str, Any] | None = None,
     reported_noise: bool = True,
-    body: str = "flu",
+    **reading: Unpack[Reading],
 ) -> Smoothed:
     """Return the best trajectory of a log, with its covariance.
 
@@ -66,15 +66,23 @@ def smooth(
         estimator: Filter of the forward pass, "ukf" or "ekf".
         start: Keywords of `initialize`.
         reported_noise: True: use the accuracy that the receiver reports.
-        body: Axes of a table, see `read_log`.
+        **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
         ValueError: As `replay`, or if the heading is never known.
     """
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
-    whole, suite = prepared(log, sensors, body)
-    player = Player(whole, suite, estimator, named_start(start), reported_noise, None)
+    whole, suite = prepared(log, sensors, reading)
+
+    def fly(part: Log, begin: dict[str, Any]) -> Smoothed:
+        return _smoothed(Player(part, suite, estimator, begin, reported_noise, None))
+
+    return in_parts(whole, named_start(start), fly)
+
+
+def _smoothed(player: Player) -> Smoothed:
+    """Return the smoothed trajectory of one part of a log."""
     forward = _filter_forward(player)
     x, R_BI, P = _smooth_back(forward)
     rows = forward.rows
@@ -83,7 +91,7 @@ def smooth(
     difference = forward.x[rows, :15] - x[:, :15]
     difference[:, _E] = dcm_to_euler(forward.R_BI[rows] @ R_BI.swapaxes(1, 2))
     return Smoothed(
-        sensors=suite,
+        sensors=player.suite,
         time=forward.time,
         position=x[:, :3],
         velocity=x[:, 3:6],

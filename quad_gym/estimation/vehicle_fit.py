@@ -13,12 +13,13 @@ their autocorrelation time.
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_gym.estimation.logs import Floats, Log, read_log
+from quad_gym.estimation.logs import Floats, Log, Reading, read_log
+from quad_gym.estimation.logs.parts import longest_part
 from quad_gym.estimation.replaying import prepared
 from quad_gym.estimation.search import correlation_time
 from quad_gym.estimation.smoothing import smooth
@@ -63,7 +64,7 @@ def fit_vehicle(
     motors: Mapping[str, ArrayLike] | None = None,
     vehicle: VehicleParams | str = "lab",
     start: Mapping[str, Any] | None = None,
-    body: str = "flu",
+    **reading: Unpack[Reading],
 ) -> FittedVehicle:
     """Find thrust, rotor lag, drag and battery sag of a vehicle from a log.
 
@@ -77,7 +78,7 @@ def fit_vehicle(
             (n, 4) [V]; None: the columns `motors` of the log.
         vehicle: The vehicle to begin with, or its name.
         start: Keywords of `initialize`, such as `{"heading": 0.5}`.
-        body: Axes of a table, see `read_log`.
+        **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
         ValueError: If the log or an argument is invalid, the commands are not during the flight, or
@@ -88,9 +89,10 @@ def fit_vehicle(
 
     known = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
     check.instance("vehicle", known, VehicleParams)
-    whole = read_log(log, body=body) if motors is None else log
-    times, voltages = _commands(_in_log(whole) if motors is None else motors)
-    whole, suite = prepared(whole, sensors, body)
+    given = None if motors is None else _commands(motors)
+    whole = longest_part(read_log(log, **reading))
+    times, voltages = given or _commands(_in_log(whole))
+    whole, suite = prepared(whole, sensors, {})
     suite = suite.replace(log_delays=LogDelays(), log_rotation=(0.0, 0.0, 0.0))  # now corrected
     smoothed = smooth(whole, sensors=suite, start=start)
     first, last = max(smoothed.time[0], times[0]) + _SETTLING, min(smoothed.time[-1], times[-1])
@@ -142,12 +144,21 @@ def _commands(motors: Mapping[str, ArrayLike]) -> tuple[Floats, Floats]:
 
 
 def _in_log(log: Log) -> dict[str, ArrayLike]:
-    """Return the commands of the motors in a log."""
+    """Return the commands of the motors in a log; of the battery's voltage if it is known."""
     if log.motors is None:
         raise ValueError(
             "a log must have the columns motor_0 to motor_3 to fit a vehicle, or motors="
         )
-    return {"time": log.motors.time, "voltages": log.motors.values["motors"]}
+    times, values = log.motors.time, log.motors.values
+    if "motors" in values:
+        return {"time": times, "voltages": values["motors"]}
+    if log.battery is None or not len(log.battery):
+        raise ValueError(
+            "a log with commands of the motors from 0 to 1 must have the voltage of the battery to "
+            "fit a vehicle"
+        )
+    full = np.interp(times, log.battery.time, log.battery.values["battery"])
+    return {"time": times, "voltages": values["commands"] * full[:, np.newaxis]}
 
 
 def _result(known: VehicleParams, x: Floats, reach: Floats) -> FittedVehicle:

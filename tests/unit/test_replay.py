@@ -246,7 +246,7 @@ def small(**changes):
     [
         ({"time": None}, "must have a column time"),
         ({"gyro": None}, "must have a column gyro_x"),
-        ({"time": np.array([0.0, 0.02, 0.01, 0.03])}, r"must increase, got 0\.010000 s after"),
+        ({"time": np.array([0.0, 10.0, 20.0, 30.0])}, "at most 1 s apart, got none from 0.000 s"),
         ({"time": np.zeros(3)}, "equal lengths"),
         ({"time": np.array(["a", "b", "c", "d"])}, "column time must hold numbers"),
         ({"gyro": np.zeros((4, 2))}, "gyro must have shape"),
@@ -257,8 +257,6 @@ def small(**changes):
         ({"gnss_enu": None}, "must have a GNSS position to start from"),
         ({"gnss_enu": None, "gnss_east": np.zeros(4)}, "must have a column gnss_north with"),
         ({"pixel_0_u": np.zeros(4), "pixel_0_v": np.zeros(4)}, "12 features of the suite, got 1"),
-        ({"time": np.array([0.0, 0.01, 1.5, 1.51])}, "at most 1 s apart, got none from 0.010 s"),
-        ({"time": np.array([0.0, np.nan, 0.02, 0.03])}, "must increase|must be finite"),
         ({"gnss_enu": None, **latitude(-90.5)}, r"^gnss_lat \[deg\] must be at least -90, got"),
     ],
 )  # fmt: skip

@@ -3,24 +3,30 @@
 | file | contents used |
 |---|---|
 | `imu0/data.csv` | gyro and accelerometer |
-| `leica0/data.csv`, else `vicon0/data.csv` | position in the room, as a GNSS position in I |
+| `leica0`, `vicon0`, `mocap0` or others with positions | positions in I, as of GNSS; attitudes |
 
-A rotation `T_BS` of `imu0/sensor.yaml` is applied. EuRoC's body has x up and z forward; if the mean
-specific force points along x, the axes become x forward, y left, z up: (z, -y, x). The estimated
-ground truth (`state_groundtruth_estimate0`) is not read.
+A rotation `T_BS` of `sensor.yaml` is applied. EuRoC's body has x up and z forward; if the mean
+specific force points along x, the axes become x forward, y left, z up: (z, -y, x). Estimated ground
+truth (`state_groundtruth_estimate0`) is not read.
 
 Source: M. Burri et al., The EuRoC micro aerial vehicle datasets, Int. J. Robotics Research 35(10),
 2016.
 """
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from quad_gym.estimation.logs.log import Floats, Log, Stream
+from quad_gym.estimation.logs.log import Floats
+from quad_gym.estimation.logs.source import Recording, Source
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 _FROM_X_UP = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+_POSITION = re.compile(r"\bp_\w*x\b|\bp_\w*_x|\bpos\w*x\b|\bx\s*\[m\]")
+"""Heading of the column with the first coordinate of a position."""
+_QUATERNION = re.compile(r"\bq\w*_w\b|\bq\w*w\b")
 
 
 def is_euroc(path: Path) -> bool:
@@ -28,7 +34,7 @@ def is_euroc(path: Path) -> bool:
     return _root(path).joinpath("imu0", "data.csv").is_file()
 
 
-def read_euroc(path: Path | str) -> Log:
+def read_euroc(path: Path | str) -> Recording:
     """Read a folder, `mav0` or the one that contains it.
 
     Raises:
@@ -36,21 +42,34 @@ def read_euroc(path: Path | str) -> Log:
         OSError: If there are no IMU samples.
     """
     root = _root(Path(path))
-    time, samples = _table(root / "imu0" / "data.csv", 6)
-    gyro, accel = samples[:, :3] @ (R_BS := _rotation(root)).T, samples[:, 3:] @ R_BS.T
-    mean = accel.mean(axis=0)
-    if mean[0] == np.abs(mean).max():
-        gyro, accel = gyro @ _FROM_X_UP.T, accel @ _FROM_X_UP.T
-    gnss = None
-    for name in ("leica0", "vicon0"):
-        if gnss is None and (root / name / "data.csv").is_file():
-            stamps, places = _table(root / name / "data.csv", 3)
-            gnss = Stream(stamps, stamps, {"position_I": places})
-    return Log(
-        imu=Stream(time, time, {"gyro": gyro, "accel": accel}),
-        gnss=gnss,
-        about={"file": Path(path).name},
-    )
+    time, samples = _table(root / "imu0" / "data.csv", 7)
+    R_BS = _rotation(root / "imu0")
+    gyro, accel = samples[:, :3] @ R_BS.T, samples[:, 3:6] @ R_BS.T
+    mean = np.nanmean(accel, axis=0) if len(accel) else np.zeros(3)
+    turn = _FROM_X_UP if mean[0] == np.abs(mean).max() and mean.any() else np.eye(3)
+    values = {"gyro": gyro @ turn.T, "accel": accel @ turn.T}
+    imu = Source(sensor="imu", topic="imu0", time=time, values=values)
+    return Recording(file=Path(path).name, sources=[imu, *_places(root, turn)])
+
+
+def _places(root: Path, turn: Floats) -> Iterator[Source]:
+    """Yield positions and attitudes of motion capture."""
+    for file in sorted(root.glob("*/data.csv")):
+        name = file.parent.name
+        with file.open(encoding="utf-8", errors="replace") as lines:
+            heading = lines.readline().lower()
+        known = name.rstrip("0123456789") in ("leica", "vicon", "mocap")
+        if "estimate" in name or not (known or _POSITION.search(heading)):
+            continue
+        time, numbers = _table(file, 8 if _QUATERNION.search(heading) else 4)
+        values = {"position_I": numbers[:, :3]}
+        yield Source(sensor="gnss", topic=name, time=time, values=values)
+        if numbers.shape[1] >= 7:
+            known_rows = np.linalg.norm(numbers[:, 3:7], axis=1) > 0.5
+            R_SI = quaternion_to_dcm(numbers[known_rows, 3:7])
+            q = dcm_to_quaternion(turn @ _rotation(file.parent) @ R_SI)
+            stamps = time[known_rows]
+            yield Source(sensor="attitude", topic=name, time=stamps, values={"quaternion": q})
 
 
 def _root(path: Path) -> Path:
@@ -58,22 +77,25 @@ def _root(path: Path) -> Path:
 
 
 def _table(file: Path, count: int) -> tuple[Floats, Floats]:
-    """Return times [s] and the first numbers of each row."""
+    """Return times [s] and the other numbers of the first columns."""
     try:
-        rows = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, usecols=range(1 + count))
-    except (ValueError, UnicodeDecodeError) as error:
+        rows = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, usecols=range(count))
+    except (ValueError, IndexError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} must be a table of numbers: {error}") from None
     return 1e-9 * rows[:, 0], rows[:, 1:]
 
 
-def _rotation(root: Path) -> Floats:
-    """Return the rotation from the IMU to the body."""
-    file = root / "imu0" / "sensor.yaml"
+def _rotation(folder: Path) -> Floats:
+    """Return the rotation from a sensor to the body."""
+    file = folder / "sensor.yaml"
     text = file.read_text(encoding="utf-8") if file.is_file() else ""
     found = re.search(r"T_BS:.*?data:\s*\[([^\]]*)\]", text, re.DOTALL)
     if found is None:
         return np.eye(3)
-    numbers = np.array([float(word) for word in found.group(1).replace(",", " ").split()])
+    try:
+        numbers = np.array([float(word) for word in found.group(1).replace(",", " ").split()])
+    except ValueError as error:
+        raise ValueError(f"{file} must have numbers in T_BS: {error}") from None
     if len(numbers) != 16:
         raise ValueError(f"{file} must have 16 numbers in T_BS, got {len(numbers)}")
     return numbers.reshape(4, 4)[:3, :3]

@@ -6,10 +6,8 @@ Missing values are NaN, or empty cells in a file. Rows are in the order of arriv
 delayed.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,7 +38,7 @@ def _enu(name: str) -> tuple[str, ...]:
     return tuple(f"{name}_{axis}" for axis in ("east", "north", "up"))
 
 
-_MOTORS = tuple(f"motor_{k}" for k in range(4))
+_MOTORS, _COMMANDS = (tuple(f"{word}_{k}" for k in range(4)) for word in ("motor", "command"))
 
 # fmt: off
 LOG_COLUMNS = {
@@ -59,7 +57,13 @@ LOG_COLUMNS = {
     "gnss_baseline_enu": LogColumn(_enu("gnss_baseline"), "m", "I", "between the antennas"),
     "barometer": LogColumn(("barometer",), "m", "I", "height by static pressure"),
     "magnetometer": LogColumn(_xyz("magnetometer"), "T", "B", "magnetic field"),
+    "optical_flow": LogColumn(_xyz("optical_flow")[:2], "rad/s", "B", "motion of the ground"),
+    "range_finder": LogColumn(("range_finder",), "m", "B", "distance to the ground"),
+    "heading": LogColumn(("heading",), "rad", "I", "of the body x axis, from east toward north"),
+    "attitude": LogColumn(tuple(f"attitude_{a}" for a in "wxyz"), "-", "B to I", "quaternion"),
     "motors": LogColumn(_MOTORS, "V", "-", "voltages of the motors, up to the next row with them"),
+    "commands": LogColumn(_COMMANDS, "-", "-", "commands of the motors from 0 to 1, as `motors`"),
+    "battery": LogColumn(("battery",), "V", "-", "voltage of the battery"),
 }
 # fmt: on
 """Columns of a table, by the keys under which a dictionary may hold their numbers together.
@@ -85,12 +89,12 @@ class Stream:
         values = {name: value[chosen] for name, value in self.values.items()}
         return Stream(self.time[chosen], self.received[chosen], values)
 
-    def increasing(self) -> "Stream":
-        """Return the measurements that are finite and later than all before them."""
-        good = np.diff(np.maximum.accumulate(self.time), prepend=-np.inf) > 0.0
-        for values in self.values.values():
-            good &= np.isfinite(values).all(axis=1)
-        return self.rows(good)
+
+MEASURED = (
+    *("imu", "gnss", "camera", "barometer", "magnetometer", "optical_flow", "range_finder"),
+    "attitude",
+)
+"""Sensors of a log, in the order in which measurements that arrive together are processed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +108,30 @@ class Log:
     gnss: Stream | None = None
     """GNSS measurements: position_G (n, 3) from the center of the Earth, or position_I from the
     origin [m]; velocity_G or velocity_I [m/s]; baseline_G or baseline_I [m]; reported standard
-    deviations position_sigma_I (n, 3) [m] and velocity_sigma (n,) [m/s]"""
+    deviations position_sigma_I (n, 3) [m], infinite along an axis that was not measured, and
+    velocity_sigma (n,) [m/s]"""
     camera: Stream | None = None  #: images: pixels (n, features, 2) from the image's center
     barometer: Stream | None = None  #: heights: barometer (n,) in I [m]
     magnetometer: Stream | None = None  #: magnetic fields: magnetometer (n, 3) in B [T]
+    optical_flow: Stream | None = None
+    """rates of the ground: optical_flow (n, 2) as `OpticalFlowParams` describes them [rad/s]"""
+    range_finder: Stream | None = None
+    """distances to the ground along the body's -z: range_finder (n,) [m]"""
+    attitude: Stream | None = None
+    """attitudes by motion capture: heading (n,) [rad], or quaternion (n, 4), body to inertial"""
     motors: Stream | None = None
-    """commands, no measurements: motors (n, 4), voltages that hold until the next [V]"""
+    """commands, no measurements, that hold until the next: motors (n, 4), voltages [V]; or commands
+    (n, 4) from 0 to 1"""
+    battery: Stream | None = None  #: voltages of the battery: battery (n,) [V]
     barometer_from_start: bool = False
     """True: heights from pressure refer to another level, so that only their changes are used"""
     about: dict[str, Any] = field(default_factory=dict)
-    """additional information, such as the source of the log"""
+    """additional information, such as the file of the log"""
+    sources: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """by sensor: `taken`, the source in the file; `rows` with measurements; `dropped`, numbers of
+    rows by reason; `others`, further sources"""
+    notes: tuple[str, ...] = ()  #: sentences on the choice of sources and on dropped rows
+    problems: tuple[str, ...] = ()  #: sentences on wrong quantities
 
     def __post_init__(self) -> None:
         if len(self.imu) < 2:
@@ -132,8 +150,7 @@ class Log:
     @property
     def streams(self) -> dict[str, Stream]:
         """Streams of all sensors with measurements, by name."""
-        names = ("imu", "gnss", "camera", "barometer", "magnetometer")
-        found = {name: getattr(self, name) for name in names}
+        found = {name: getattr(self, name) for name in MEASURED}
         return {name: s for name, s in found.items() if s is not None and len(s)}
 
     def corrected(self, suite: SensorSuite) -> "Log":
@@ -151,11 +168,30 @@ class Log:
             )
         return replace(self, **changes) if changes else self
 
+    def between(self, first: float | None, last: float | None) -> "Log":
+        """Return the log from a time of arrival [s] to another; None: from its start, to its end.
+
+        Raises:
+            ValueError: If nothing is between them.
+        """
+        low, high = (-np.inf if first is None else first), (np.inf if last is None else last)
+        time = self.imu.time
+        if not ((time >= low) & (time <= high)).any():
+            raise ValueError(
+                f"a log must have samples of the IMU from {low:g} s to {high:g} s, got some from "
+                f"{time[0]:.3f} s to {time[-1]:.3f} s"
+            )
+        streams = {**self.streams, "motors": self.motors, "battery": self.battery}
+        changes: dict[str, Any] = {
+            name: s.rows((s.received >= low) & (s.received <= high))
+            for name, s in streams.items()
+            if s is not None
+        }
+        return replace(self, **changes)
+
     def until(self, time: float) -> "Log":
         """Return the log up to a time of arrival [s]."""
-        streams = self.streams.items()
-        changes: dict[str, Any] = {name: s.rows(s.received <= time) for name, s in streams}
-        return replace(self, **changes)
+        return self.between(None, time)
 
     def origin(self, near_G: Floats | None, within: float = 1e5) -> Floats | None:
         """Return the origin of I in ECEF: `near_G` if the first fix is close to it, else that fix.
@@ -180,24 +216,3 @@ def ecef_of(lat: Floats, lon: Floats, height: Floats) -> Floats:
         check.number("gnss_lat [deg]", float(lat[k]), least=-90.0, most=90.0)
         found[k] = geodetic_to_ecef(np.radians(lat[k]), np.radians(lon[k]), height[k])
     return found
-
-
-@contextmanager
-def reading(path: Path | str, kind: str, logs: str, library: str, extra: str) -> Iterator[Path]:
-    """Name file and library in errors of a library that reads a log.
-
-    Raises:
-        ImportError: If the library is not installed.
-        ValueError: If it cannot read the file.
-        OSError: If there is no such file.
-    """
-    file = Path(path)
-    try:
-        yield file
-    except ImportError:
-        install = f"install it with pip install 'quad-gym[{extra}]'"
-        raise ImportError(f"{logs} need {library}: {install}") from None
-    except Exception as error:  # a library raises what it meets in a damaged file
-        if not file.exists():
-            raise FileNotFoundError(f"there is no file {file}") from None
-        raise ValueError(f"{file.name} must be {kind}: {error}") from None
