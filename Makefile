@@ -53,7 +53,7 @@ demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then two trainings o
 	@echo
 	@echo "2. The control experiment: on the circle, good sensors determine the state, so training on"
 	@echo "   the estimate is expected to make no difference. Two short trainings, one seed:"
-	@$(BIN)/quad-gym compare --quick --engine compiled --train-on truth estimate --steps 1e6 \
+	@$(BIN)/quad-gym compare --quick --engine compiled --train-on truth estimate --steps 8e5 \
 		--output results/demo/circle
 	@echo
 	@echo "Open:"

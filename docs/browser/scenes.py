@@ -37,6 +37,13 @@ class Scene(NamedTuple):
 
 _ENDLESS: dict[str, Any] = {"start": "hover", "duration": 0.0}
 SCENES = {
+    "look_around": Scene(
+        "LookAround: markers on one wall, no GNSS",
+        BENCHMARKS["look_around"].task.replace(**_ENDLESS),
+        "one_wall",
+        "look_around",
+        1,
+    ),
     "circle": Scene(
         "Circle: RTK GNSS and a camera",
         TASK_DEFAULTS["circle"].replace(**_ENDLESS),
@@ -49,13 +56,6 @@ SCENES = {
         TASK_DEFAULTS["circle"].replace(**_ENDLESS),
         "consumer",
         "circle",
-        1,
-    ),
-    "look_around": Scene(
-        "LookAround: markers on one wall, no GNSS",
-        BENCHMARKS["look_around"].task.replace(**_ENDLESS),
-        "one_wall",
-        "look_around",
         1,
     ),
 }

@@ -24,7 +24,17 @@ def write_page(app: "Sphinx", error: Exception | None) -> None:
         Path(app.outdir, "_static", "fly.html").write_text(text, encoding="utf-8")
 
 
+_LINK = '<p><strong><a href="_static/fly.html">Open the page</a></strong></p>'
+
+
+def show_link(app: "Sphinx", name: str, source: list[str]) -> None:
+    """Put the link into the guide, which a repository shows without it."""
+    if name == "fly":
+        source[0] = source[0].replace("<!-- link -->", _LINK)
+
+
 def setup(app: "Sphinx") -> dict[str, bool]:
     """Register the extension."""
     app.connect("build-finished", write_page)
+    app.connect("source-read", show_link)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -158,7 +158,17 @@ CATALOG = {
                 ),
                 "std_certainty_privileged",
             ),
-            figures=texts.film_and_figures("look_around", "glance"),
+            figures=texts.figures_of("look_around", "learning.png", "glance.png"),
+        ),
+        Result(
+            name="look_around_film",
+            commands=[
+                "evaluate look_around --policy pretrained:truth pretrained --observation estimate "
+                "--episodes 20 --video webp --output OUT"
+            ],
+            flights=("LookAround",),
+            texts=lambda _, __: {},
+            figures={"0/video.webp": "docs/images/look_around_film.webp"},
         ),
         Result(
             name="miscalibrated",
@@ -180,7 +190,7 @@ CATALOG = {
             texts=texts.study(
                 "stale_race", "pd", "truth", "residual", "std", "truth_delay_compensated"
             ),
-            figures=texts.film_and_figures("stale_race", "pace"),
+            figures=texts.figures_of("stale_race", "film.webp", "learning.png", "pace.png"),
         ),
         Result(
             name="masked",
@@ -199,7 +209,7 @@ CATALOG = {
             ],
             flights=("OutageDash", "OutageDash, truth"),
             texts=texts.study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),
-            figures=texts.film_and_figures("outage_dash", "pace"),
+            figures=texts.figures_of("outage_dash", "film.webp", "learning.png", "pace.png"),
         ),
         Result(
             name="sb3_defaults",
@@ -258,7 +268,7 @@ CATALOG = {
                 "tick": texts.console("speed_tick"),
                 "suites": texts.console("speed_suites"),
                 "busy": texts.console("speed_busy"),
-                "peers": texts.console("speed_peers"),
+                "peers": texts.peers,
                 "interfaces": texts.speeds,
                 "options": texts.console("speed_options"),
                 "compile": texts.compiling,

@@ -294,8 +294,7 @@ def compiling(folder: Path, printed: Sequence[str]) -> dict[str, str]:
     return {"speed.compile": f"{row['seconds']:.0f} s", **console("speed_compile")(folder, printed)}
 
 
-def film_and_figures(study: str, figure: str) -> dict[str, str]:
-    names = ("film.webp", "learning.png", f"{figure}.png")
+def figures_of(study: str, *names: str) -> dict[str, str]:
     return {f"0/{name}": f"docs/images/{study}_{name}" for name in names}
 
 
@@ -306,6 +305,31 @@ def defaults(_: Path, printed: Sequence[str]) -> dict[str, str]:
         "sb3_defaults.hover": ", ".join(each[:3]) + " mm",
         "sb3_defaults.circle": ", ".join(each[3:]) + " mm",
     }
+
+
+_SHORT = {
+    ("vector, truth", "1,024", "2"): "1,024 environments, on the truth",
+    ("vector, estimate", "1,024", "2"): "1,024 environments, on the estimate",
+    ("single, estimate", "1", "1"): "one environment, on the estimate, one core",
+    ("Pendulum-v1", "1", "1"): "Pendulum-v1 of Gymnasium, one core",
+}
+"""Rows of README's table of speed, by those of the page."""
+
+
+def short_speeds(cells: Mapping[tuple[str, ...], str]) -> str:
+    rows = [[words, cells[key]] for key, words in _SHORT.items()]
+    return table(("", "steps per second"), rows)
+
+
+def peers(_: Path, printed: Sequence[str]) -> dict[str, str]:
+    """Table of simulators and filters, and the number of our filter cycles in one of filterpy."""
+    found, rates = console("speed_peers")(_, printed), {}
+    for line in printed[0].splitlines():
+        if line.startswith("filter cycle, "):
+            name, _count, rate, *_rest = line.removeprefix("filter cycle, ").rsplit(maxsplit=6)
+            rates[name.strip()] = float(rate.replace(",", ""))
+    ratio = rates["UnscentedKalmanFilter"] / rates["filterpy"]
+    return {**found, "speed.filterpy": f"{ratio:.0f}"}
 
 
 def speeds(folder: Path, _: Sequence[str]) -> dict[str, str]:
@@ -325,6 +349,7 @@ def speeds(folder: Path, _: Sequence[str]) -> dict[str, str]:
     }
     heads = ("interface, observation", "environments", "threads", "steps per second")
     found = {"speed_interfaces": table(heads, [[*key, value] for key, value in cells.items()])}
+    found["speed.short"] = short_speeds(cells)
     for mark, name in SPEEDS.items():
         best = max(1.0 / r["seconds"] for r in rows if r["name"] == name and r["envs"] == 1024)
         thousands = f"{best / 1e3:,.0f},000"
