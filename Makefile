@@ -106,7 +106,7 @@ lint: setup  ## style, types, import rules and words
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.dialect
 
-benchmark: setup  ## steps per second of every face and the cost of each part
+benchmark: setup  ## steps per second of every interface and with each suite
 	$(BIN)/quad-gym benchmark --output results/benchmark
 
 docs: $(VENV)/.writer  ## the site in docs/_build/html/index.html; runs the tutorials, some minutes

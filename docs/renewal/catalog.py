@@ -36,6 +36,14 @@ _FLOWN_ON = {
     "ErrorStateEKF": f"{_GALLERY}.error_state_ekf:ErrorStateEKF",
     "InvariantEKF": f"{_GALLERY}.invariant_ekf:InvariantEKF",
 }
+
+
+def _benchmark(section: str) -> str:
+    """Command of a section of the benchmark."""
+    package = section in ("interfaces", "suites")
+    return f"benchmark --only {section}" if package else f"scripts.benchmarks {section}"
+
+
 _DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
 
 CATALOG = {
@@ -110,14 +118,14 @@ CATALOG = {
         ),
         Result(
             name="matrix",
-            commands=["consistency --matrix --episodes 256 --output OUT"],
+            commands=["scripts.consistency matrix --episodes 256 --output OUT"],
             flights=("*",),
             texts=texts.matrix,
             figures={"0/matrix.csv": "docs/data/consistency_matrix.csv"},
         ),
         Result(
             name="recovery",
-            commands=["consistency --recovery --episodes 400 --output OUT"],
+            commands=["scripts.consistency recovery --episodes 400 --output OUT"],
             flights=("fault *", "RandomTrajectory, *"),
             texts=texts.recovery,
             figures={
@@ -127,13 +135,13 @@ CATALOG = {
         ),
         Result(
             name="ablation_filters",
-            commands=["ablation filters --output OUT"],
+            commands=["scripts.consistency filters --output OUT"],
             flights=("RandomTrajectory, rtk",),
             texts=texts.ablation("filters"),
         ),
         Result(
             name="ablation_models",
-            commands=["ablation models --output OUT"],
+            commands=["scripts.consistency models --output OUT"],
             flights=("RandomTrajectory, rtk", "breeze"),
             texts=texts.ablation("models"),
         ),
@@ -219,7 +227,7 @@ CATALOG = {
         ),
         Result(
             name="learning",
-            commands=["benchmark --only learning --output OUT"],
+            commands=["scripts.benchmarks learning --output OUT"],
             flights=("Circle, standard", "Circle, mixed"),
             texts=texts.console("learning"),
         ),
@@ -237,8 +245,9 @@ CATALOG = {
         Result(
             name="filters",
             commands=[
-                f"benchmark --only filters --batch 64 --sensors {suite} --output OUT --estimators "
-                f"{_GALLERY}.error_state_ekf:ErrorStateEKF {_GALLERY}.invariant_ekf:InvariantEKF"
+                f"scripts.benchmarks filters --batch 64 --sensors {suite} --output OUT "
+                f"--estimators {_GALLERY}.error_state_ekf:ErrorStateEKF "
+                f"{_GALLERY}.invariant_ekf:InvariantEKF"
                 + ("" if suite == "indoor" else f" {_GALLERY}.complementary:Complementary")
                 + (f" {_GALLERY}.learned:Learned" if suite == "rtk" else "")
                 for suite in ("standard", "rtk", "consumer", "indoor")
@@ -259,7 +268,7 @@ CATALOG = {
         *(
             Result(
                 name=f"speed_{section}",
-                commands=[f"benchmark --only {section} --output OUT"],
+                commands=[f"{_benchmark(section)} --output OUT"],
                 flights=(),
                 texts=made,
             )

@@ -1,83 +1,38 @@
-"""Measure the speed of all parts: filter, tick, options, environments, tasks, compilation, peers.
+"""Measure the speed of flights on this machine: environments, and a tick with each sensor suite.
 
     quad-gym benchmark
     quad-gym benchmark --only interfaces --n-envs 256
-    quad-gym benchmark --only compile
 
 A time is the best of several repeats, because other load on the machine can only increase it;
-"spread" is the excess of the median. All ratios are measured within one run. The sections suites,
-compile, filters and learning take minutes and run only with `--only`. Learning trains the compiled
-PPO with ten seeds, and reports when each was first better than tuned PD control; filters compares
-the built-in filters and `--estimators` on the same flights.
-
-Progress goes to stderr, tables go to stdout, and everything goes to benchmark.json with the
-configuration, the versions and the processor. Run it on an idle machine.
+"spread" is the excess of the median. The suites take a minute. Progress goes to stderr, tables go
+to stdout, and everything goes to benchmark.json with the configuration, the versions and the
+processor. Run it on an idle machine.
 """
 
 import dataclasses
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from quad_gym.analysis.linear_sensors import SuiteModel
 from quad_gym.analysis.reports import require_writable, versions, write_json
-from quad_gym.commands.options import SuiteNames, require_at_least, usage_errors
-from quad_gym.estimation.own import Estimator
-from quad_gym.experiments.benchmark import (
-    comparison,
-    compiling,
-    filter,
-    filters,
-    interfaces,
-    learning,
-    machine,
-    options,
-    own_task,
-    stages,
-    suites,
-)
-from quad_gym.experiments.benchmark.timing import Effort, Row, Scope
+from quad_gym.commands.options import require_at_least, usage_errors
+from quad_gym.experiments.benchmark import interfaces, machine, suites
+from quad_gym.experiments.benchmark.timing import Effort, Row, Scope, Section
 from quad_gym.kernels.cores import available_cores
-from quad_gym.params import checks as check
-from quad_gym.params.suites import sensor_suite
-from quad_gym.records import WIDTH
-
-ALONE = ("suites", "compile", "filters", "learning")  #: sections that take minutes
 
 
 @dataclass(frozen=True)
 class BenchmarkArgs:
     """Options of the benchmark."""
 
-    only: Literal[
-        "all",
-        "filter",
-        "filters",
-        "tick",
-        "suites",
-        "busy",
-        "peers",
-        "options",
-        "interfaces",
-        "tasks",
-        "compile",
-        "learning",
-    ] = "all"
-    """section to run; all: every section but suites, compile, filters and learning"""
-    batch: int = 256
-    """number of flights in the batches of filter, filters, tick and options, a multiple of eight"""
+    only: Literal["all", "interfaces", "suites"] = "all"
+    """section to run"""
     n_envs: int = 1024
-    """number of environments in the batches of interfaces, of flights in suites and busy"""
+    """number of environments in the batches of interfaces, of flights in suites"""
     threads: int | None = None
     """largest number of threads; if not given, one per core"""
-    seeds: int = 10
-    """number of training seeds of learning"""
-    steps: int | None = None
-    """number of environment steps of each training of learning; if not given, the recipe's"""
-    sensors: SuiteNames = ("standard", "rtk", "consumer", "indoor")
-    estimators: tuple[str, ...] = ()
-    """own estimators among filters, module:Class each"""
     quick: bool = False
     """two short repeats instead of --repeats and --seconds, to check that it runs"""
     repeats: int = 7
@@ -89,66 +44,40 @@ class BenchmarkArgs:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        require_at_least(self, batch=1, n_envs=1, repeats=1, seeds=1, steps=1, threads=1)
-        if self.batch % WIDTH:
-            raise ValueError(f"--batch must be a multiple of {WIDTH}, got {self.batch}")
+        require_at_least(self, n_envs=1, repeats=1, threads=1)
         if not self.seconds > 0.0:
             raise ValueError(f"--seconds must be above 0, got {self.seconds}")
 
     @property
-    def scope(self) -> Scope:
-        """Extent of the measurements."""
-        return Scope(
-            batch=self.batch,
-            envs=self.n_envs,
-            threads=available_cores() if self.threads is None else self.threads,
-            seeds=self.seeds,
-            steps=self.steps,
-            effort=Effort(2, 0.01) if self.quick else Effort(self.repeats, self.seconds),
-            quick=self.quick,
-            suites=self.sensors,
-            estimators=self.estimators,
-        )
+    def extent(self) -> dict[str, Any]:
+        """Fields of the `Scope`."""
+        threads = available_cores() if self.threads is None else self.threads
+        effort = Effort(2, 0.01) if self.quick else Effort(self.repeats, self.seconds)
+        return {"envs": self.n_envs, "threads": threads, "effort": effort}
 
 
-SECTIONS = {
-    "filter": filter.SECTION,
-    "filters": filters.SECTION,
-    "tick": stages.SECTION,
-    "suites": suites.SECTION,
-    "busy": suites.BUSY,
-    "peers": comparison.SECTION,
-    "options": options.SECTION,
-    "interfaces": interfaces.SECTION,
-    "tasks": own_task.SECTION,
-    "compile": compiling.SECTION,
-    "learning": learning.SECTION,
-}
-
-
-def chosen_sections(args: BenchmarkArgs) -> list[str]:
-    """Names of the sections to run."""
-    whole = [name for name in SECTIONS if name not in ALONE]
-    return whole if args.only == "all" else [args.only]
+SECTIONS = {"interfaces": interfaces.SECTION, "suites": suites.SECTION}
 
 
 def main(args: BenchmarkArgs) -> None:
     """Run the chosen sections."""
+    names = list(SECTIONS) if args.only == "all" else [args.only]
     with usage_errors():
         require_writable("--output", args.output)
-        for name in args.sensors:
-            SuiteModel(sensor_suite(name))
-        for name in args.estimators:
-            check.own("--estimators", name, Estimator)
+    run_sections({name: SECTIONS[name] for name in names}, Scope(**args.extent), args)
+
+
+def run_sections(sections: Mapping[str, Section], scope: Scope, args: BenchmarkArgs) -> None:
+    """Run sections, print their tables, and write benchmark.json."""
     cpu = machine.processor()
     print(f"{cpu['model']}, {cpu['cores']} cores for this process.\n")
-    sections: dict[str, list[Row]] = {}
-    for name in chosen_sections(args):
+    rows: dict[str, list[Row]] = {}
+    for name, section in sections.items():
         print(f"{name}:", file=sys.stderr, flush=True)
-        sections[name] = SECTIONS[name].measure(args.scope)
-        print(SECTIONS[name].table(sections[name]), end="\n\n", flush=True)
+        rows[name] = section.measure(scope)
+        print(section.table(rows[name]), end="\n\n", flush=True)
     found = {
-        "sections": sections,
+        "sections": rows,
         "configuration": dataclasses.asdict(args),
         "processor": cpu,
         "versions": versions("numpy", "numba", "gymnasium", "stable-baselines3", "filterpy"),

@@ -15,19 +15,9 @@ normalized innovation squared (NIS) for each sensor. For a consistent filter, me
 flights are inside known bands at 95 % of the instants, and innovations are white. Prints tables and
 a verdict, and writes figures (PNG and SVG) and all numbers with the configuration and the seeds
 (consistency.json).
-
-  quad-gym consistency --matrix                    many configurations: some 200 cells
-  quad-gym consistency --matrix --cells suites     the suites on all tasks
-  quad-gym consistency --recovery                  recovery from faults
-
-With --matrix, every suite flies every task from a cold and from a warm start, and one task with
-faults, latencies, mountings, randomization, random starts and wind; the result is one table of all
-means. With --recovery, every suite flies every fault that it can have; the table shows how many
-filters are consistent 10 s later, how many flag their divergence, and the rate of false alarms. An
-interrupted run of either continues when it is started again.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,8 +27,7 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.envs import IDS
 from quad_gym.envs.flights import own_estimator
-from quad_gym.experiments.consistency import matrix, recovery
-from quad_gym.experiments.consistency.cases import Case, CaseFlights, run_cases, unexpected
+from quad_gym.experiments.consistency.cases import Case, CaseFlights
 from quad_gym.experiments.consistency.single import run_single
 from quad_gym.params import checks as check
 from quad_gym.params.suites import FIELD_FILTER
@@ -51,8 +40,8 @@ class ConsistencyArgs:
 
     env_id: options.TrackingId = "QuadGym/RandomTrajectory-v0"
 
-    episodes: int | None = None
-    """number of flights; if not given, 4000, or 400 in each cell of a table"""
+    episodes: int = 4000
+    """number of flights"""
     seed: int = 0
     """seed of the first flight; the others have consecutive seeds"""
     duration: float = 10.0
@@ -66,17 +55,8 @@ class ConsistencyArgs:
     """time between two evaluations of the errors [s]"""
     settle: float = 0.0
     """time at the start that is left out of the means [s]"""
-    output: Path | None = None
-    """folder for figures and numbers; if not given, results/consistency, with --matrix
-    results/consistency_matrix, with --recovery results/consistency_recovery"""
-    matrix: bool = False
-    """fly the matrix of configurations; uses only the options episodes, seed, duration, output,
-    cells and threads"""
-    recovery: bool = False
-    """fly faults and evaluate the recovery; uses only the options episodes, seed, output and
-    threads"""
-    cells: Literal["all", "suites", "conditions"] = "all"
-    """with --matrix: the suites on all tasks, other conditions on one task, or both"""
+    output: Path = Path("results/consistency")
+    """folder for figures and numbers"""
     threads: options.Threads = None
 
     sensors: options.SuiteName = "standard"
@@ -114,10 +94,6 @@ class ConsistencyArgs:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.matrix and self.recovery:
-            raise ValueError("--matrix and --recovery must not be given together")
-        if self.cells != "all" and not self.matrix:
-            raise ValueError("--cells needs --matrix")
         options.require_at_least(self, episodes=2, seed=0, threads=1)
         full_id = options.known_id("ENV_ID", self.env_id, options.TRACKING)
         object.__setattr__(self, "env_id", full_id)
@@ -137,18 +113,6 @@ class ConsistencyArgs:
     def own_estimator(self) -> str | None:
         """A user's estimator; None for built-in filters."""
         return own_estimator(self.estimator)
-
-    @property
-    def flights(self) -> CaseFlights:
-        """Number, seeds and length of the flights."""
-        count = self.episodes or (400 if self.matrix or self.recovery else 4000)
-        return CaseFlights(count, self.seed, self.duration, self.threads)
-
-    @property
-    def folder(self) -> Path:
-        """Output folder."""
-        table = "_matrix" if self.matrix else "_recovery" if self.recovery else ""
-        return self.output or Path("results") / f"consistency{table}"
 
 
 _CHOICES = ("integration", "attitude_reset", "bearing_noise_at")
@@ -213,31 +177,17 @@ def title_of(suite: SensorSuite, args: ConsistencyArgs) -> str:
 
 def main(args: ConsistencyArgs) -> None:
     """Run the experiment."""
-    if args.matrix or args.recovery:
-        fly_table(args)
-        return
     with options.usage_errors():
         require_matplotlib()
         case = case_of(args)
         case.batch(8, 1)  # rejects an invalid configuration
-        require_writable("--output", args.folder)
+        require_writable("--output", args.output)
     run_single(
         case,
-        args.flights,
-        args.folder,
+        CaseFlights(args.episodes, args.seed, args.duration, args.threads),
+        args.output,
         every=args.every,
         settle=args.settle,
         matched=args.filter_start == "matched",
-        configuration=replace(args, episodes=args.flights.count, output=args.folder),
+        configuration=args,
     )
-
-
-def fly_table(args: ConsistencyArgs) -> None:
-    """Fly the cases of a table, and print where it is."""
-    with options.usage_errors():
-        require_writable("--output", args.folder)
-    table, name = (matrix, "matrix") if args.matrix else (recovery, "recovery")
-    files, duration = args.folder / name, {"duration": args.duration} if args.matrix else {}
-    cases = matrix.cases_of(args.cells) if args.matrix else recovery.cases()
-    found = run_cases(cases, files, args.flights, table.measure, table.table_of, **duration)
-    print(f"{len(found)} cells, {unexpected(found)} unexpected misses; see {files}.md.")

@@ -1,4 +1,4 @@
-"""Tests of the commands `consistency` and `ablation`: files, verdicts and tables."""
+"""The command `consistency`: files and verdicts."""
 
 import json
 from dataclasses import replace
@@ -64,32 +64,3 @@ def test_nis_of_constant_error_is_consistent_unless_too_large(mean, consistent):
     findings = Findings(nees, nis, {}, one, one, some, one > 2.0, 0, frozenset({"baseline"}))
     assert findings.consistent == consistent
     assert not replace(findings, nis={}, failed=1).consistent
-
-
-def tables(output, *options):
-    common = ("--episodes", "48", "--duration", "1.1", "--output", str(output))
-    done = console_commands.run("ablation", *options, *common)
-    assert done.returncode == 0, done.stderr
-    return done.stdout, json.loads((output / f"{options[0]}.json").read_text())
-
-
-def test_models_table_compares_wrong_models_with_nominal_model(tmp_path):
-    printed, found = tables(tmp_path, "models")
-    rows = found["rows"]
-    assert next(iter(rows)) == "nominal"
-    assert {"mass 20 % more", "mass 20 % less", "steady wind of 8 m/s"} < set(rows)
-    assert all(name in printed for name in rows)
-    assert rows["GNSS noise doubled"]["nees_state"] > 1.2 * rows["nominal"]["nees_state"]
-    masses = [case["true_vehicle"]["mass"] for case in found["cases"] if "mass" in case["name"]]
-    assert masses == pytest.approx([0.8 * 0.78, 1.2 * 0.78])
-    assert found["seeds"] == [0, 47]
-
-
-def test_filters_table_compares_forms_of_the_filter(tmp_path):
-    printed, found = tables(tmp_path, "filters", "--sensors", "indoor")
-    rows = found["rows"]
-    assert list(rows)[:2] == ["UKF", "EKF"]
-    assert all(name in printed for name in rows)
-    assert rows["UKF"]["relative_cost"] == 1.0
-    whole = rows["UKF, no recursive image update"]["nees_state"]
-    assert whole > 1.05 * rows["UKF"]["nees_state"]

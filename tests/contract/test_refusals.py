@@ -22,7 +22,7 @@ REFUSED = [
     ("replay", "LOG"),
     ("replay binary.npz", "binary.npz must be a table of text (.csv)"),
     ("version extra", "extra"),
-    ("ablation --output text.toml", "cannot write to --output text.toml: File exists"),
+    ("consistency --output text.toml", "cannot write to --output text.toml: File exists"),
     # ---- training
     ("train --stepz 4", "Unrecognized options: --stepz"),
     ("train --algorithm pp", "invalid choice 'pp' for argument '--algorithm'"),
@@ -103,17 +103,11 @@ REFUSED = [
     ("export filter --sensors gps", "sensors must be one of"),
 ]
 NAMED = {
-    "benchmark": (
-        *("--batch 9", "--n-envs 0", "--repeats 0", "--seeds 0", "--seconds nan", "--threads 0"),
-        "--only speed",
-    ),
+    "benchmark": (*("--n-envs 0", "--repeats 0", "--seconds nan", "--threads 0", "--only speed"),),
     "circle": ("--attitude-gain 1 2", "--episodes 0", "--threads 0", "--output text.toml"),
     "compare": ("--seeds 0",),
     "compile": ("--stages most", "--stages", "--jobs 0"),
-    "consistency": (
-        *("--seed -1", "--episodes 1", "--settle 5 --duration 1", "--sensors none"),
-        *("--cells suites", "--recovery --matrix"),
-    ),
+    "consistency": (*("--seed -1", "--episodes 1", "--settle 5 --duration 1", "--sensors none"),),
     "evaluate": ("--episodes 0", "--output /dev/null/x", "--observation"),
     "export filter": ("--to c",),
     "export policy": ("--to json pretrained QuadGym/Hover-v0",),

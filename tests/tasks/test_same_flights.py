@@ -6,7 +6,7 @@ import pytest
 
 import quad_gym
 from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.experiments.benchmark.own_task import OwnCircle
+from scripts.benchmarks.own_task import OwnCircle
 from tests.builders import SHORT, actions_for, vec_env
 from tests.contract.comparing import assert_same
 from tests.contract.configurations import CONFIGURATIONS

@@ -17,27 +17,15 @@ class Effort(NamedTuple):
     seconds: float  #: length of a repeat [s]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scope:
     """Extent of the measurements."""
 
-    batch: int
-    """Number of flights in the batches of filter, filters, tick and options"""
     envs: int
     """Number of environments in the batches of interfaces, and of flights in those of all suites"""
     threads: int
     """Largest number of threads"""
-    seeds: int
-    """Number of training seeds"""
-    steps: int | None
-    """Environment steps of a training; None: as in the recipe"""
     effort: Effort
-    quick: bool
-    """True for a check that the sections run"""
-    suites: Sequence[str] = ()
-    """Suites of filters"""
-    estimators: Sequence[str] = ()
-    """Own estimators among filters, "module:Class" each"""
 
 
 class Timing(NamedTuple):
@@ -137,7 +125,7 @@ NAME, SPREAD = column("name"), percent("spread")
 class Section:
     """Section of the benchmark."""
 
-    measure: Callable[[Scope], list[Row]]
+    measure: Callable[[Any], list[Row]]
     groups: Mapping[str, Mapping[str, CellText]]
     """Columns of the table by heading, in groups by heading"""
     summary: Callable[[list[Row]], str] = lambda rows: ""

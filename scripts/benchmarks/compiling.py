@@ -14,6 +14,7 @@ from pathlib import Path
 
 import quad_gym
 from quad_gym.experiments.benchmark import timing
+from scripts.benchmarks.scope import Scope
 
 PACKAGE = Path(quad_gym.__file__).resolve().parent
 ENVS = 1024
@@ -71,7 +72,7 @@ def empty_cache(package: Path) -> None:
         file.unlink()
 
 
-def time_compile(scope: timing.Scope) -> list[timing.Row]:
+def time_compile(scope: Scope) -> list[timing.Row]:
     """Time the first reset with an empty and a full cache, and a step after an edit.
 
     With `scope.quick`, only the fastest configuration and one edit are measured.

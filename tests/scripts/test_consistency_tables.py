@@ -8,12 +8,15 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery
-from quad_gym.experiments.consistency import cases as runs
-from quad_gym.experiments.consistency import matrix, recovery
-from quad_gym.experiments.consistency.cases import CaseFlights, run_cases
+from quad_gym.commands.options import parse
+from quad_gym.experiments.consistency.cases import CaseFlights
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.suites import SUITES
+from scripts.consistency import __main__ as script
+from scripts.consistency import matrix, recovery
+from scripts.consistency import tables as runs
+from scripts.consistency.recovered import CONSISTENT, Recovery, follow_recovery
+from scripts.consistency.tables import run_cases
 from tests.field_flights import fly, nees
 
 SMALL = CaseFlights(64, duration=1.0)
@@ -171,3 +174,31 @@ def test_recovery_table_is_written_with_misses_marked(tmp_path):
     assert "| *5.0* |" in text
     assert "| why" in text
     assert "| c | 0.2 | 0.0 | 6.0 |" in text
+
+
+def tables(capsys, output, *options):
+    common = ("--episodes", "48", "--duration", "1.1", "--output", str(output))
+    script.main(parse(script.TableArgs, [*options, *common]))
+    return capsys.readouterr().out, json.loads((output / f"{options[0]}.json").read_text())
+
+
+def test_models_table_compares_wrong_models_with_nominal_model(tmp_path, capsys):
+    printed, found = tables(capsys, tmp_path, "models")
+    rows = found["rows"]
+    assert next(iter(rows)) == "nominal"
+    assert {"mass 20 % more", "mass 20 % less", "steady wind of 8 m/s"} < set(rows)
+    assert all(name in printed for name in rows)
+    assert rows["GNSS noise doubled"]["nees_state"] > 1.2 * rows["nominal"]["nees_state"]
+    masses = [case["true_vehicle"]["mass"] for case in found["cases"] if "mass" in case["name"]]
+    assert masses == pytest.approx([0.8 * 0.78, 1.2 * 0.78])
+    assert found["seeds"] == [0, 47]
+
+
+def test_filters_table_compares_forms_of_the_filter(tmp_path, capsys):
+    printed, found = tables(capsys, tmp_path, "filters", "--sensors", "indoor")
+    rows = found["rows"]
+    assert list(rows)[:2] == ["UKF", "EKF"]
+    assert all(name in printed for name in rows)
+    assert rows["UKF"]["relative_cost"] == 1.0
+    whole = rows["UKF, no recursive image update"]["nees_state"]
+    assert whole > 1.05 * rows["UKF"]["nees_state"]

@@ -21,7 +21,6 @@ from quad_gym.analysis.consistency_flights import ASTRAY, endless
 from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_over_trainings
 from quad_gym.analysis.metrics import nees
 from quad_gym.analysis.posterior_bound import posterior_bound
-from quad_gym.analysis.recovery import MOTION
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.evaluation import roll_out
@@ -29,6 +28,8 @@ from quad_gym.experiments.benchmark import timing
 from quad_gym.faults.presets import possible
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import Source
+from scripts.benchmarks.scope import Scope
+from scripts.consistency.recovered import MOTION
 
 BUILT_IN = ("ukf", "ekf")
 FAULTS = ("none", "gnss_outage", "gnss_outliers", "wrong_associations")
@@ -41,7 +42,7 @@ HEADINGS = ("none", "GNSS outage", "GNSS outliers", "wrong features")
 Floats = NDArray[np.float64]
 
 
-def time_filters(scope: timing.Scope) -> list[timing.Row]:
+def time_filters(scope: Scope) -> list[timing.Row]:
     """Fly every filter with every suite, and compute the bound of each suite."""
     rows = []
     for suite in scope.suites:
@@ -83,12 +84,12 @@ def name_of(estimator: str) -> str:
     return estimator.upper() if estimator in BUILT_IN else estimator.rpartition(":")[2]
 
 
-def length_of(scope: timing.Scope) -> float:
+def length_of(scope: Scope) -> float:
     """Length of the flights on the true state [s]."""
     return SETTLE + 2.0 * EVERY if scope.quick else DURATION
 
 
-def flights_on_truth(suite: str, estimator: str, scope: timing.Scope) -> FlightBatch:
+def flights_on_truth(suite: str, estimator: str, scope: Scope) -> FlightBatch:
     """Random trajectories flown on the true state, with a filter that observes them."""
     built_in, sensors = estimator in BUILT_IN, sensor_suite(suite)
     if built_in:
@@ -106,7 +107,7 @@ def flights_on_truth(suite: str, estimator: str, scope: timing.Scope) -> FlightB
     )
 
 
-def on_truth(suite: str, estimator: str, scope: timing.Scope) -> timing.Row:
+def on_truth(suite: str, estimator: str, scope: Scope) -> timing.Row:
     """Errors, consistency and time of a filter."""
     batch, stop = flights_on_truth(suite, estimator, scope), length_of(scope)
     batch.reset(seeds=range(scope.batch))
@@ -139,7 +140,7 @@ def on_truth(suite: str, estimator: str, scope: timing.Scope) -> timing.Row:
     return row
 
 
-def on_estimate(suite: str, estimator: str, scope: timing.Scope) -> timing.Row:
+def on_estimate(suite: str, estimator: str, scope: Scope) -> timing.Row:
     """Circles flown on the estimate: the tracking error, and the shares of lost flights."""
     row: timing.Row = {"lost": {}}
     for fault in FAULTS:

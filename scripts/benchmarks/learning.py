@@ -16,11 +16,12 @@ from baselines.training import train
 from quad_gym.evaluation import roll_out
 from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.experiment import read_evaluations
+from scripts.benchmarks.scope import Scope
 
 ENV_ID = "QuadGym/Circle-v0"
 
 
-def time_learning(scope: timing.Scope) -> list[timing.Row]:
+def time_learning(scope: Scope) -> list[timing.Row]:
     """Train with each seed; with `scope.quick`, one short training."""
     quick, rows = scope.quick, list[timing.Row]()
     chosen = recipe(ENV_ID)

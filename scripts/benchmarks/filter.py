@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.peers import Estimate, MeasuredTick, peers
-from quad_gym.experiments.benchmark.stages import Staged, hovering
+from quad_gym.experiments.benchmark.suites import hovering
 from quad_gym.kernels.stages import Stage
 from quad_gym.records import FEATURE_SLICE, WIDTH, aligned_zeros
 from quad_gym.rotations import quaternion_to_dcm
+from scripts.benchmarks.peers import Estimate, MeasuredTick, peers
+from scripts.benchmarks.scope import Scope
+from scripts.benchmarks.stages import Staged
 
 
 def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[MeasuredTick]:
@@ -37,7 +39,7 @@ def repeated(batch: FlightBatch, flights: NDArray[np.intp], count: int) -> NDArr
     return blocks
 
 
-def time_filter(scope: timing.Scope) -> list[timing.Row]:
+def time_filter(scope: Scope) -> list[timing.Row]:
     """Time cycles of update and prediction on one core."""
     rows: list[timing.Row] = []
     count, effort, recorded_ticks = scope.batch, scope.effort, 5 if scope.quick else 40

@@ -12,11 +12,12 @@ import numpy as np
 
 import quad_gym
 from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.filter import record_one
 from quad_gym.experiments.benchmark.interfaces import time_batch, time_env, time_single
-from quad_gym.experiments.benchmark.peers import Estimate, MeasuredTick, peers
-from quad_gym.experiments.benchmark.stages import hovering
+from quad_gym.experiments.benchmark.suites import hovering
 from quad_gym.records import WIDTH
+from scripts.benchmarks.filter import record_one
+from scripts.benchmarks.peers import Estimate, MeasuredTick, peers
+from scripts.benchmarks.scope import Scope
 
 TICKS = 1000  #: ticks of a flight on which filters are compared, in its second half by their errors
 Make = Callable[[int], Any]
@@ -31,7 +32,7 @@ SIMULATORS: dict[str, tuple[str, Make]] = {
 """Module that registers an environment, and the function that makes it, or many of them."""
 
 
-def _time_simulators(scope: timing.Scope) -> list[timing.Row]:
+def _time_simulators(scope: Scope) -> list[timing.Row]:
     """Time steps of this package at 50 Hz and of the others with their own rates."""
     rows = list[timing.Row]()
     for observation in ("estimate", "truth"):
@@ -69,7 +70,7 @@ def _error(found: list[Estimate], flight: list[MeasuredTick]) -> tuple[float, fl
     return position, attitude
 
 
-def _time_filters(scope: timing.Scope) -> list[timing.Row]:
+def _time_filters(scope: Scope) -> list[timing.Row]:
     """Time cycles of filters on fixes and baselines, and compare estimates with the truth."""
     sensors, rows = quad_gym.sensor_suite("lab").replace(camera=None), list[timing.Row]()
     # the filters start in motion: with the suite's 3 cm/s they would take velocity for tilt
@@ -88,7 +89,7 @@ def _time_filters(scope: timing.Scope) -> list[timing.Row]:
     return rows
 
 
-def time_peers(scope: timing.Scope) -> list[timing.Row]:
+def time_peers(scope: Scope) -> list[timing.Row]:
     """Time other simulators and other filters."""
     return _time_simulators(scope) + _time_filters(scope)
 

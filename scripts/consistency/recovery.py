@@ -2,7 +2,7 @@
 
 Every suite flies each preset fault that it can have. A fault starts at `FAULT_START` and, unless it
 is instantaneous, ends after `FAULT_DURATION`; flights are evaluated `RECOVERY_TIME` later. See
-`quad_gym.analysis.recovery` for the definitions. For the rate of false alarms, every suite also
+`scripts.consistency.recovered` for the definitions. For the rate of false alarms, every suite also
 flies without a fault.
 """
 
@@ -10,11 +10,12 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from quad_gym.analysis.recovery import REQUIRED, Recovery, follow_recovery
-from quad_gym.experiments.consistency.cases import Case, CaseFlights, CaseResults, case_table
+from quad_gym.experiments.consistency.cases import Case, CaseFlights
 from quad_gym.faults import AccelBiasStep, Fault, GnssOutage, GyroBiasStep, PositionJump
 from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.suites import SUITES, sensor_suite
+from scripts.consistency.recovered import REQUIRED, Recovery, follow_recovery
+from scripts.consistency.tables import CaseResults, case_table
 
 FAULT_START, FAULT_DURATION, RECOVERY_TIME = 3.0, 5.0, 10.0
 """Start and duration of faults, and time that filters have to recover [s]."""

@@ -12,6 +12,7 @@ from quad_gym import rewards
 from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.interfaces import random_actions
 from quad_gym.tasks.task import Task
+from scripts.benchmarks.scope import Scope
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
@@ -53,7 +54,7 @@ class OwnCircle(Task):
         }
 
 
-def time_own_task(scope: timing.Scope) -> list[timing.Row]:
+def time_own_task(scope: Scope) -> list[timing.Row]:
     """Time steps of both tasks in alternation, at 50 Hz on the estimate."""
     rows, effort = list[timing.Row](), scope.effort
     options: dict[str, Any] = {"control_rate": 50.0, "threads": scope.threads}

@@ -11,6 +11,7 @@ from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import timing
 from quad_gym.params.suites import SUITES
 from quad_gym.records import Control
+from scripts.benchmarks.scope import Scope
 
 LAB = quad_gym.sensor_suite("lab")
 OFF = "everything off"
@@ -90,7 +91,7 @@ TICKS = 10
 that some turns are undisturbed."""
 
 
-def time_options(scope: timing.Scope) -> list[timing.Row]:
+def time_options(scope: Scope) -> list[timing.Row]:
     """Time a tick of a flight with each option, and a reset with each start, on one core."""
     count, effort = scope.batch, scope.effort
     task = TASK_DEFAULTS["hover"].replace(duration=0.0)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from quad_gym import SensorSuite
 from quad_gym.estimation import UnscentedKalmanFilter
 
-REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "reference_ukf.py"
-"""The plain filter, present in a checkout only."""
+REFERENCE = Path(__file__).resolve().parents[2] / "tests" / "reference_ukf.py"
+"""The plain filter."""
 
 
 class Estimate(NamedTuple):

@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.experiments.benchmark import timing
+from quad_gym.experiments.benchmark.suites import hovering
 from quad_gym.kernels.entries import run_stage
 from quad_gym.kernels.linked import linked_table
 from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.records import Act, Sensor
+from scripts.benchmarks.scope import Scope
 
 SUITES = ("standard", "lab")
 FILTER = (Stage.PREDICT, Stage.UPDATE)
@@ -30,16 +31,6 @@ AT_THE_START = frozenset(
     }
 )
 """Stages of the first instant of an episode; all others belong to a tick."""
-
-
-def hovering(count: int, threads: int = 1, **options: Any) -> FlightBatch:
-    """Batch that hovers by PD control, half a second after its start."""
-    task = TASK_DEFAULTS["hover"].replace(duration=0.0)
-    batch = FlightBatch(count, task=task, gains="tuned", threads=threads, **options)
-    batch.reset(seeds=range(count))
-    for _ in range(round(0.5 * batch.clocks.control_rate)):
-        batch.step()
-    return batch
 
 
 class Staged:
@@ -82,7 +73,7 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
     return blocks
 
 
-def time_tick(scope: timing.Scope) -> list[timing.Row]:
+def time_tick(scope: Scope) -> list[timing.Row]:
     """Time a whole tick on one core, per flight, and its stages, with `SUITES`."""
     return [row for suite in SUITES for row in _time_suite(suite, scope.batch, scope.effort)]
 

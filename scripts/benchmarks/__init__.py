@@ -1,0 +1,1 @@
+"""Benchmarks of parts: filters, stages of a tick, options, compilation, learning, peers."""

@@ -1,0 +1,1 @@
+"""Tables of consistency: many configurations, recovery from faults, ablations of the filter."""
