@@ -263,12 +263,18 @@ def flown(estimators: Sequence[str]) -> Texts:
 
 
 def study(name: str, *arms: str) -> Texts:
-    """The whole table, success and crashes of some arms, and each arm's crashes."""
+    """Conclusions, success and crashes of some arms, and each arm's crashes; a CSV has the table."""
 
     def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
         summary = _read(folder / "0/summary.json")
+        lines = (folder / "0/table.md").read_text(encoding="utf-8").splitlines()
+        first, _rule, *rows = (line for line in lines if line.startswith("|"))
+        with (folder / "0/arms.csv").open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerows([each.strip() for each in r.split("|")[1:-1]] for r in (first, *rows))
+        concluded = "\n".join(line for line in lines if line.startswith("- "))
         found = {
-            name: "\n" + (folder / "0/table.md").read_text(encoding="utf-8").strip() + "\n",
+            f"{name}.conclusions": f"\n{concluded}\n",
             f"{name}.short": study_rows(summary, "trained on", arms, ("success", "crashed")),
         }
         for arm, row in summary["rows"].items():
@@ -295,7 +301,8 @@ def compiling(folder: Path, printed: Sequence[str]) -> dict[str, str]:
 
 
 def figures_of(study: str, *names: str) -> dict[str, str]:
-    return {f"0/{name}": f"docs/images/{study}_{name}" for name in names}
+    pictures = {f"0/{name}": f"docs/images/{study}_{name}" for name in names}
+    return {**pictures, "0/arms.csv": f"docs/data/{study}.csv"}
 
 
 def defaults(_: Path, printed: Sequence[str]) -> dict[str, str]:
