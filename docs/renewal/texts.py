@@ -263,7 +263,7 @@ def flown(estimators: Sequence[str]) -> Texts:
 
 
 def study(name: str, *arms: str) -> Texts:
-    """Conclusions, success and crashes of some arms, and each arm's crashes; a CSV has the table."""
+    """Conclusions, success and crashes of arms, crashes of each; a CSV file has all columns."""
 
     def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
         summary = _read(folder / "0/summary.json")
