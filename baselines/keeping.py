@@ -222,6 +222,11 @@ def replace_file(file: Path, content: bytes) -> None:
         stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
+    for wait in (0.01, 0.1, 1.0):  # Windows refuses while another process reads the file
+        with suppress(PermissionError):
+            part.replace(file)
+            return
+        time.sleep(wait)
     part.replace(file)
 
 

@@ -13,6 +13,7 @@ The folder contains
 A resumed run continues exactly from its last checkpoint.
 """
 
+import importlib.util
 import json
 import time
 from collections.abc import Mapping
@@ -58,7 +59,7 @@ def train(
         plan: Plan of the training.
         folder: Folder of the run, created if it is missing.
         resume: True to continue from the folder's last checkpoint, if it has one.
-        tensorboard: True to write files for TensorBoard.
+        tensorboard: True to write files for TensorBoard, if it is installed.
         quiet: True to hide the progress bar.
 
     Returns:
@@ -68,8 +69,8 @@ def train(
         ValueError: If the plan is invalid, the folder contains a run and `resume` is not set, it
             contains the run of another plan, or another process trains in it.
         OSError: If the folder is not writable.
-        ImportError: If `tensorboard` is set and TensorBoard is not installed.
     """
+    tensorboard = tensorboard and importlib.util.find_spec("tensorboard") is not None
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         return _train(plan, folder, resume, {"tensorboard": tensorboard, "quiet": quiet})

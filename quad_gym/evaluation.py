@@ -12,6 +12,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs import keywords_of
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params import checks as check
+from quad_gym.records import Ending
 
 
 class Policy(Protocol):
@@ -117,7 +118,7 @@ def roll_out(
         if step > limit // 2:
             late[flying] += info["position_error"][flying]
         over = flying & (terminated | truncated)
-        ending[over] = [str(reason) for reason in info["ending"][over]]
+        ending[over] = [str(Ending(number)) for number in info["ending"][over]]
         crashed |= over & terminated & ~np.isin(info["ending"], NO_CRASHES)
         gates[over] = info["gates_passed"][over]
         flying &= ~over

@@ -1,33 +1,63 @@
-"""Build hook of wheels: `make wheel` includes compiled kernels; other wheels need Numba."""
+"""Build hooks: the metadata of wheel and sdist, and the compiled kernels that wheels may hold.
+
+QUAD_GYM_WHEEL: family of processors whose libraries the wheel holds, as `make wheel` sets it; it
+then does not depend on Numba. QUAD_GYM_URL: address of the repository, as a release sets it.
+"""
 
 import os
+import re
 import runpy
 from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 LOWEST_GLIBC = "2_17"
 """Lowest version of glibc that the libraries run with; `make wheel` verifies it."""
+FAMILY = "QUAD_GYM_WHEEL"
+
+
+class MetadataHook(MetadataHookInterface):
+    """Dependencies, addresses and README, which every installer reads before a wheel is built."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set the dynamic fields."""
+        compiling = metadata["optional-dependencies"]["compile"]
+        needed = [] if os.environ.get(FAMILY) else compiling
+        metadata["dependencies"] = [*self.config["dependencies"], *needed]
+        url, tag = os.environ.get("QUAD_GYM_URL", "").rstrip("/"), f"v{metadata['version']}"
+        pages = {"Issues": "issues", "Changelog": f"blob/{tag}/CHANGELOG.md"}
+        pages["Documentation"] = f"tree/{tag}/docs"
+        named = {name: f"{url}/{page}" for name, page in pages.items()}
+        metadata["urls"] = {"Source": url, **named} if url else {}
+        text = Path(self.root, "README.md").read_text(encoding="utf-8")
+        if url:
+            text = absolute_links(text, f"{url}/blob/{tag}/", f"{url}/raw/{tag}/")
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}
+
+
+def absolute_links(text: str, pages: str, pictures: str) -> str:
+    """Return Markdown with addresses in place of relative links to pages and pictures."""
+    text = re.sub(r"(!\[[^\]]*\]\()(?!\w+:)", rf"\g<1>{pictures}", text)
+    return re.sub(r"(\]\()(?!\w+:|#)", rf"\g<1>{pages}", text)
 
 
 class KernelsHook(BuildHookInterface[Any]):
-    """Wheels with the libraries for one family of processors, or with Numba as a dependency."""
+    """Wheels with the libraries for one family of processors."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Set files, tag and dependencies of a wheel.
+        """Set files and tag of a wheel.
 
         Raises:
             RuntimeError: If a library belongs to other sources, or there is none.
         """
-        family = os.environ.get("QUAD_GYM_WHEEL")
+        family = os.environ.get(FAMILY)
         if version == "editable" or not family:
-            compiling = self.metadata.core.optional_dependencies["compile"]
-            build_data["dependencies"] += compiling
             return
         package = Path(self.root, "quad_gym")
         functions = runpy.run_path(str(package / "kernels" / "sources.py"))
-        libraries = sorted((package / "kernels" / "libraries").glob(f"kernels_{family}_*.so"))
+        libraries = sorted((package / "kernels" / "libraries").glob(f"kernels_linux_{family}_*.so"))
         digest = functions["sources_digest"](package)
         stale = [f.name for f in libraries if functions["digest_in"](f.read_bytes()) != digest]
         if stale or not libraries:

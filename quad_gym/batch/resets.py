@@ -30,7 +30,7 @@ def checked_keys(
 ) -> NDArray[np.uint64] | None:
     """Return keys (count, 2): of the seeds if given, else `keys`; None without either."""
     if seeds is not None:
-        if isinstance(seeds, str) or not hasattr(seeds, "__len__"):
+        if isinstance(seeds, str) or not hasattr(seeds, "__len__"):  # type: ignore[unreachable]
             raise ValueError(f"seeds must hold {count} seeds, got {seeds!r}")
         if len(seeds) != count:
             raise ValueError(f"seeds must hold {count} seeds, got {len(seeds)}")

@@ -14,8 +14,9 @@ Functions that are in the cache are not compiled again. Cached code is valid onl
 processor, versions of Python and Numba, and sources; otherwise it is compiled again on first use.
 
 `--library` instead builds the libraries of compiled kernels, with which nothing is compiled and
-Numba is not even imported, for each number of lanes that processors like this one have. It takes
-minutes, and a C compiler. Libraries belong to the sources; after an edit, Numba compiles again.
+Numba is not even imported, for each number of lanes that processors like this one have, or those of
+another `--family`. It takes minutes, and a C compiler. Libraries belong to the sources; after an
+edit, Numba compiles again.
 
 The exit code is 1 if code cannot be written to the cache.
 """
@@ -46,15 +47,19 @@ class CompileArgs:
     library: bool = False
     """build the libraries of compiled kernels"""
     lanes: tuple[int, ...] = ()
-    """numbers of lanes of the libraries; if not given, all of this family of processors"""
+    """numbers of lanes of the libraries; if not given, all of the family of processors"""
+    family: Literal["x86_64", "aarch64"] | None = None
+    """family of processors of the libraries; if not given, this machine's; for another one, CC must
+    name a compiler that links for it, such as aarch64-linux-gnu-gcc"""
 
     def __post_init__(self) -> None:
         """Check the numbers of stages and processes."""
         if not self.stages:
             raise ValueError("--stages must have at least one value, got none")
         require_at_least(self, jobs=1)
-        if self.lanes and not self.library:
-            raise ValueError("--lanes must come with --library")
+        if (self.lanes or self.family) and not self.library:
+            name = "lanes" if self.lanes else "family"
+            raise ValueError(f"--{name} must come with --library")
 
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
@@ -118,7 +123,7 @@ def _build(args: CompileArgs) -> int:
     """Build the libraries, and list them with their sizes."""
     from quad_gym.kernels.compiling.building import build
 
-    for file in build(args.lanes, args.jobs):
+    for file in build(args.lanes, args.jobs, args.family):
         print(f"{file.stat().st_size / 1e6:.1f} MB  {file}")
     return 0
 

@@ -4,8 +4,8 @@
     quad-gym evaluate --policy results/train/circle/ppo_seed_0/best.zip --sensors rtk
 
 Every policy flies the same episodes (the same seeds) on each observation. Prints a table, and
-writes episodes.csv (one row per episode), summary.json (all numbers and the configuration), and
-figures of paths and errors over time (PNG and SVG).
+writes episodes.csv (one row per episode), summary.json (all numbers and the configuration), and, if
+matplotlib is installed, figures of paths and errors over time (PNG and SVG).
 """
 
 import itertools
@@ -20,7 +20,6 @@ from tqdm import tqdm
 from baselines.policies import keywords_of_policy, load_policy
 from baselines.seeds import first_seed
 from quad_gym import IDS
-from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.envs.effects import with_effect
@@ -33,6 +32,7 @@ from quad_gym.experiments.evaluated import (
     side_of,
     telling_episode,
     write_evaluation,
+    write_figures,
 )
 from quad_gym.experiments.flown import fly
 from quad_gym.params.suites import contents_of_suite_files
@@ -94,7 +94,6 @@ def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Pa
             "--policy that was trained on measurements"
         )
     first_seed("test", args.seed, args.episodes)  # rejects seeds of trainings
-    require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     if args.output is None and not args.overwrite:
         folder = options.free_folder(folder, "summary.json")
@@ -190,7 +189,11 @@ def main(args: EvaluateArgs) -> None:
         print(remark)
     flown = tuple(dict.fromkeys(name for name, _ in results))
     about = {**contents_of_suite_files(args.sensors), "arguments": replace(args, policy=flown)}
-    written = write_evaluation(results, env, args.seed, folder, about)
+    written = write_evaluation(results, args.seed, folder, about)
+    try:
+        written += write_figures(results, env, folder)
+    except ImportError as error:
+        print(f"{error}.")
     if args.video != "none":
         written.append(write_video(cases, results, args, folder))
     print(f"\nWrote {len(written)} files to {folder} after {time.perf_counter() - began:.1f} s.")

@@ -12,7 +12,6 @@ with --engine compiled), which quad-gym evaluate can fly. The folder also contai
 run continues exactly from its last checkpoint with --resume.
 """
 
-import importlib.util
 import sys
 import time
 from dataclasses import dataclass, field
@@ -113,12 +112,9 @@ def main(args: TrainArgs) -> None:
         f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
         f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
     )
-    tensorboard = args.tensorboard and importlib.util.find_spec("tensorboard") is not None
-    if args.tensorboard and not tensorboard:
-        print("TensorBoard is not installed; evaluations.csv contains the errors.")
     with options.usage_errors((RunError,)):
         done = train(
-            plan, folder, resume=args.resume, tensorboard=tensorboard, quiet=not args.progress
+            plan, folder, resume=args.resume, tensorboard=args.tensorboard, quiet=not args.progress
         )
     total = time.perf_counter() - from_start
     print(

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import innovations_of
 from quad_gym.faults.presets import named_faults
-from quad_gym.records import Ending
 
 Parts = dict[str, dict[str, NDArray[Any]]]
 
@@ -19,7 +18,7 @@ def start_info(batch: FlightBatch) -> dict[str, Any]:
     return {
         "position_error": batch.record("position_error"),
         "estimation_error": batch.record("estimation_error"),
-        "ending": np.full(batch.count, Ending.NONE, object),
+        "ending": np.zeros(batch.count, np.int64),
         "filter_status": batch.record("filter_status").astype(np.int64),
         "filter_diverged": batch.record("diverged") > 0.0,
         "gates_passed": np.zeros(batch.count, np.int64),

@@ -16,7 +16,7 @@ from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset, Ending, Result
+from quad_gym.records import Autoreset, Result
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -144,7 +144,7 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         return {
             "terminal_observation": self.flights.split(final),
             "TimeLimit.truncated": bool(row[Result.TRUNCATED] > row[Result.TERMINATED]),
-            "ending": Ending(int(row[Result.ENDING])),
+            "ending": int(row[Result.ENDING]),
             "filter_status": int(row[Result.FILTER_STATUS]),
             "filter_diverged": bool(row[Result.FILTER_DIVERGED] > 0.0),
             "gates_passed": int(row[Result.GATES_PASSED]),

@@ -14,7 +14,7 @@ from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset, Ending, Result
+from quad_gym.records import Autoreset, Result
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -100,7 +100,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     when the filter has failed numerically (`info["filter_status"]`), or, with
     `truncate_when_diverged=True`, when its consistency monitor flags divergence. A step can do
     both, as with Gymnasium's `TimeLimit`. `info["ending"]` is the reason, the termination if both:
-    a `quad_gym.Ending`, which equals its name as text.
+    the number of a `quad_gym.Ending`.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, with the
@@ -277,7 +277,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         info = {
             "position_error": row[Result.POSITION_ERROR],
             "estimation_error": row[Result.ESTIMATION_ERROR],
-            "ending": Ending(int(row[Result.ENDING])),
+            "ending": int(row[Result.ENDING]),
             "filter_status": int(row[Result.FILTER_STATUS]),
             "filter_diverged": row[Result.FILTER_DIVERGED] > 0.0,
             "gates_passed": int(row[Result.GATES_PASSED]),

@@ -16,7 +16,7 @@ from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset, Ending, Result
+from quad_gym.records import Autoreset, Result
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -27,7 +27,6 @@ _MODES = {
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
 _OTHERS = ("num_envs", "autoreset_mode", "threads", "render_mode", "render_flights")
-_ENDINGS = np.array(list(Ending), object)
 
 
 class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
@@ -81,7 +80,6 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._over = np.zeros(self.num_envs, bool)
         self._everyone = np.ones(self.num_envs, bool)
-        self._no_ending = np.full(self.num_envs, Ending.NONE, object)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -202,7 +200,7 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         infos: dict[str, Any] = {
             "position_error": results[:, Result.POSITION_ERROR].copy(),
             "estimation_error": results[:, Result.ESTIMATION_ERROR].copy(),
-            "ending": self._no_ending.copy(),
+            "ending": results[:, Result.ENDING].astype(np.int64),
             "filter_status": results[:, Result.FILTER_STATUS].astype(np.int64),
             "filter_diverged": results[:, Result.FILTER_DIVERGED] > 0.0,
             "gates_passed": results[:, Result.GATES_PASSED].astype(np.int64),
@@ -214,9 +212,6 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
             infos |= flight_info(batch, results[:, Result.FAULTS])
         if self.flights.reward_terms:
             infos["reward_terms"] = batch.reward_terms()
-        ended = np.flatnonzero(self._over)
-        if ended.size:  # rare: members for every flight would cost more than the rest
-            infos["ending"][ended] = _ENDINGS[results[ended, Result.ENDING].astype(np.int64)]
         return infos
 
     def _with_finals(
@@ -229,7 +224,7 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         for i in np.flatnonzero(over):
             final_obs[i] = self.flights.split(finals[i].copy())
         final_info: dict[str, Any] = {
-            name: np.where(over, values, None if values.dtype == object else values.dtype.type(0))
+            name: np.where(over, values, values.dtype.type(0))
             for name, values in infos.items()
             if not (name.startswith("_") or isinstance(values, dict))
         }
@@ -240,7 +235,7 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = batch.record(name, began)
         infos["filter_diverged"][began] = batch.record("diverged", began) > 0.0
-        infos["ending"][began], infos["gates_passed"][began] = Ending.NONE, 0
+        infos["ending"][began] = infos["gates_passed"][began] = 0
         replace_faults(infos, batch, began)
         infos |= {
             "final_obs": final_obs,

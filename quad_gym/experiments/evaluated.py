@@ -111,12 +111,9 @@ def _rate(happened: Any) -> str:
 
 
 def write_evaluation(
-    results: Evaluated, env: Any, seed: int, folder: Path, about: Mapping[str, Any]
+    results: Evaluated, seed: int, folder: Path, about: Mapping[str, Any]
 ) -> list[Path]:
-    """Write numbers and figures; the summary also contains `about`.
-
-    `env` is an environment of the same task.
-    """
+    """Write the numbers; the summary also contains `about`."""
     count = len(next(iter(results.values())).episodes.returns)
     tables = (
         {
@@ -136,12 +133,21 @@ def write_evaluation(
         **about,
         "versions": reports.versions("numpy", "numba", "torch", "stable_baselines3"),
     }
+    return [
+        reports.write_csv(folder / "episodes.csv", reports.stacked(tables)),
+        reports.write_json(folder / "summary.json", summary),
+    ]
+
+
+def write_figures(results: Evaluated, env: Any, folder: Path) -> list[Path]:
+    """Write the figures, or raise an ImportError if matplotlib is missing.
+
+    `env` is an environment of the same task.
+    """
     labeled = {f"{label_of(policy)}, on {seen}": f for (policy, seen), f in results.items()}
     curves = {label: flown.recorded for label, flown in labeled.items()}
     paths = paths_figure({label: path_of(flown) for label, flown in labeled.items()})
     return [
-        reports.write_csv(folder / "episodes.csv", reports.stacked(tables)),
-        reports.write_json(folder / "summary.json", summary),
         *save_figure(paths, folder / "paths"),
         *save_figure(error_over_time_figure(curves, bound_of(env)), folder / "errors"),
     ]

@@ -105,7 +105,8 @@ class _LocalJob:
 
 
 def _in_process(plan: Plan, folder: Path, sender: Any, log: Path) -> None:
-    os.setsid()  # Ctrl-C is for the driver alone, which then asks each training to stop
+    if hasattr(os, "setsid"):  # Ctrl-C is for the driver alone, which asks each training to stop
+        os.setsid()
     with suppress(OSError):  # no log on a full disk
         file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
         os.dup2(file, 1)

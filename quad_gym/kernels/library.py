@@ -27,9 +27,9 @@ def machine() -> str:
     return {"amd64": "x86_64", "arm64": "aarch64"}.get(name, name)
 
 
-def file_of(lanes: int) -> Path:
-    """Return the file of this machine's library with a number of lanes."""
-    return FOLDER / f"kernels_{machine()}_{lanes}.so"
+def file_of(lanes: int, family: str = "") -> Path:
+    """Return the file of the library for this system, a family of processors and lanes."""
+    return FOLDER / f"kernels_{sys.platform}_{family or machine()}_{lanes}.so"
 
 
 def core_symbol(name: str) -> str:
@@ -90,26 +90,30 @@ def library() -> Library | None:
     if choice == "numba":
         return None
     file = file_of(WIDTH)
-    found = file.is_file()
-    problem = _problem(file) if found else f"there is no {file.name}"
-    if not problem:
-        return Library(file)
+    found = _load(file)
+    if isinstance(found, Library):
+        return found
     if choice == "library":
-        raise ImportError(f"the library of compiled kernels cannot be used: {problem}")
+        raise ImportError(f"the library of compiled kernels cannot be used: {found}")
     if importlib.util.find_spec("numba") is None:
         raise ImportError(
             "quad_gym has no compiled kernels for this machine, and Numba, which would compile "
-            f'them, is not installed ({problem}): pip install "quad-gym[compile]"'
+            f'them, is not installed ({found}): pip install "quad-gym[compile]"'
         )
-    if found:
-        say(f"quad_gym: Numba compiles, as {problem}; `quad-gym compile --library` renews it")
+    if file.is_file():
+        say(f"quad_gym: Numba compiles, as {found}")
     return None
 
 
-def _problem(file: Path) -> str:
-    """Return why a library cannot be used; empty: it can."""
+def _load(file: Path) -> Library | str:
+    """Return a library, or why it cannot be used."""
+    if not file.is_file():
+        return f"there is no {file.name}"
     if not runs_lanes(WIDTH):
         return f"this processor does not run {file.name}"
     if digest_in(file.read_bytes()) != sources_digest(Path(__file__).parents[1]):
-        return f"{file.name} belongs to other sources"
-    return ""
+        return f"{file.name} belongs to other sources; `quad-gym compile --library` renews it"
+    try:
+        return Library(file)
+    except OSError as error:  # such as a folder from which no code may be executed
+        return f"{file.name} cannot be loaded: {error}"

@@ -158,10 +158,10 @@ class Autoreset(IntEnum):
 
 
 class Ending(IntEnum):
-    """Reason for the end of an episode, in `info["ending"]`.
+    """Reason for the end of an episode.
 
-    The value is a number, as libraries that store infos in tensors expect. It prints as its name in
-    lower case and compares equal to it: `Ending.COLLISION == "collision"`.
+    `info["ending"]` is its number, as libraries that store infos in tensors expect:
+    `info["ending"] == Ending.COLLISION`. Its name is `str(Ending(info["ending"]))`, as "collision".
     """
 
     NONE = 0  #: the episode has not ended
@@ -178,12 +178,6 @@ class Ending(IntEnum):
 
     def __str__(self) -> str:
         return self.name.lower()
-
-    def __eq__(self, other: object) -> bool:
-        return str(self) == other if isinstance(other, str) else int(self) == other
-
-    def __hash__(self) -> int:
-        return hash(str(self))
 
 
 class Shape(IntEnum):

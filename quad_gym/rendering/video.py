@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.flights.record import Flight, FlightRecorder
 from quad_gym.params import checks as check
+from quad_gym.records import Ending
 from quad_gym.rendering.renderer import Renderer, checked_size
 
 VIDEO_ENDINGS = (".mp4", ".gif", ".webp")  #: file name endings of the videos that can be written
@@ -86,7 +87,7 @@ def fly_steps(
         observation, _, terminated, truncated, info = env.step(action)
         starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
         recorder.keep()
-        yield recorder.flight, str(info["ending"][0])
+        yield recorder.flight, str(Ending(info["ending"][0]))
 
 
 def times_of(

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -44,6 +45,17 @@ def test_evaluate_writes_the_printed_numbers(tmp_path):
     for name in ("paths", "errors"):
         for ending in ("png", "svg"):
             assert (tmp_path / f"out/{name}.{ending}").stat().st_size > 1000
+
+
+def test_evaluate_without_matplotlib_prints_and_writes_its_numbers(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    few = ["--episodes", 2, "--observation", "truth", "--policy", "pd", "--threads", 1]
+    done = run("evaluate", "hover", *few, where=tmp_path)
+    assert done.returncode == 0
+    assert "pd on truth" in done.stdout
+    assert 'A figure needs matplotlib: pip install "quad-gym[plot]".' in done.stdout
+    files = {file.name for file in (tmp_path / "results/evaluate/hover").iterdir()}
+    assert files == {"episodes.csv", "summary.json"}
 
 
 def test_evaluate_without_included_policy_flies_pd(tmp_path, capsys):

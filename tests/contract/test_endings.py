@@ -76,7 +76,7 @@ def test_crash_at_time_limit_is_terminated_and_truncated(crash, own_task):
     limited = ended_after(name, {**keywords, "max_episode_steps": steps}, action)
     assert limited == (steps, True, True, ending)
     cut = ended_after(name, {**keywords, "max_episode_steps": steps - 1}, action)
-    assert cut == (steps - 1, False, True, "time_limit")
+    assert cut == (steps - 1, False, True, quad_gym.Ending.TIME_LIMIT)
 
 
 DRAWN = {"randomize_reference": True}

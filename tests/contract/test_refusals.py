@@ -14,7 +14,7 @@ from quad_gym.commands.main import COMMANDS, main
 from tests import console_commands
 from tests.console_commands import plain
 
-NEEDS = {"compare": "stable_baselines3", "evaluate": "matplotlib", "fly": "pygame"}
+NEEDS = {"compare": "stable_baselines3", "fly": "pygame"}
 NEEDS |= {"circle": "matplotlib", "train": "stable_baselines3"}
 
 REFUSED = [

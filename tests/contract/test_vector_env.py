@@ -33,9 +33,9 @@ def masked_infos(infos):
             kept[name] = masked_infos(values)
         elif mask is None:
             kept[name] = values
-        elif values.dtype == object and name != "ending":
+        elif values.dtype == object:
             kept[name] = [value for value, said in zip(values, mask, strict=True) if said]
-        else:  # endings are objects in Gymnasium's infos and numbers in ours
+        else:
             kept[name] = values[mask].astype(float)
     return kept
 

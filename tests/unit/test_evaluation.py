@@ -66,7 +66,7 @@ def plain_loop(task, policy, seed, **keywords):
         "estimation_error": np.mean(estimation),
         "crashed": crashed,
         "gates_passed": info["gates_passed"],
-        "ending": str(info["ending"]),
+        "ending": str(Ending(info["ending"])),
     }
 
 

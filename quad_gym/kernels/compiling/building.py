@@ -42,34 +42,39 @@ _WITH_LIBM = {("x86_64", 2)}
 _TYPES = {int: "int64_t", bool: "uint8_t", float: "double"}
 
 
-def build(lanes: Sequence[int] = (), jobs: int | None = None) -> list[Path]:
-    """Build the libraries of this machine that do not belong to the present sources.
+def build(
+    lanes: Sequence[int] = (), jobs: int | None = None, family: str | None = None
+) -> list[Path]:
+    """Build the libraries that do not belong to the present sources.
 
     Args:
-        lanes: Numbers of lanes; none: all of this family of processors.
+        lanes: Numbers of lanes; none: all of the family.
         jobs: Number of processes that compile; None: one for each core.
+        family: Family of processors; None: this machine's. CC must name a compiler for another one.
 
     Returns:
         All libraries, the new ones and those that are up to date.
 
     Raises:
-        ValueError: If there are no libraries for this machine, or with so many lanes.
+        ValueError: If there are no libraries for the family, or with so many lanes.
         RuntimeError: If there is no C compiler, or a library cannot be built.
     """
-    known = PROCESSORS.get(machine(), {})
+    family = family or machine()
+    known = PROCESSORS.get(family, {}) if sys.platform == "linux" else {}
     if not known or not set(lanes) <= known.keys():
         have = ", ".join(f"{name} with {sorted(p)} lanes" for name, p in PROCESSORS.items())
-        raise ValueError(f"there are libraries for {have}; got {machine()} with {list(lanes)}")
+        got = f"{sys.platform} on {family} with {list(lanes)}"
+        raise ValueError(f"there are libraries for linux on {have}; got {got}")
     require_compiler()
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
     digest = sources_digest(Path(__file__).parents[2])
     FOLDER.mkdir(exist_ok=True)
     files = []
     for count in lanes or known:
-        files.append(file_of(count))
+        files.append(file_of(count, family))
         if files[-1].is_file() and digest_in(files[-1].read_bytes()) == digest:
             continue
-        call = f"_build({digest!r}, {jobs or available_cores()})"
+        call = f"_build({digest!r}, {jobs or available_cores()}, {family!r})"
         done = subprocess.run(
             [sys.executable, "-c", f"from {__name__} import _build; {call}"],
             env={**os.environ, **_GENERIC, "QUAD_GYM_LANES": str(count), "PYTHONPATH": path},
@@ -95,20 +100,21 @@ def require_compiler() -> str:
     return name
 
 
-def _build(digest: str, jobs: int) -> None:
+def _build(digest: str, jobs: int, family: str) -> None:
     """Build the library with the lanes of this process."""
     names = part_names()
-    began, output = time.monotonic(), file_of(WIDTH).with_suffix(f".{os.getpid()}.tmp")
+    file, began = file_of(WIDTH, family), time.monotonic()
+    output = file.with_suffix(f".{os.getpid()}.tmp")
     say(f"quad_gym: compiling {len(names)} parts of the library with {WIDTH} lanes")
     with tempfile.TemporaryDirectory() as folder:
-        for k, content in enumerate(objects_of(names, PROCESSORS[machine()][WIDTH], jobs)):
+        for k, content in enumerate(objects_of(names, PROCESSORS[family][WIDTH], jobs)):
             Path(folder, f"{k}.o").write_bytes(content)
         Path(folder, "entries.c").write_text(calls(digest), encoding="ascii")
         objects = [f"{k}.o" for k in range(len(names))]
-        needed = ["-lm"] if (machine(), WIDTH) in _WITH_LIBM else []  # any other needs nothing
+        needed = ["-lm"] if (family, WIDTH) in _WITH_LIBM else []  # any other needs nothing
         command = [require_compiler(), *_LINK, "entries.c", *objects, *needed, "-o", str(output)]
         subprocess.run(command, cwd=folder, check=True)
-    output.replace(file_of(WIDTH))  # whole, even if another process loads or builds it
+    output.replace(file)  # whole, even if another process loads or builds it
     say(f"quad_gym: compiled the library in {time.monotonic() - began:.0f} s")
 
 

@@ -191,7 +191,8 @@ class CodeCache:
             temporary.replace(self.folder / self._name(sig, data.target_context))
             files = self.folder.glob(f"{self._stem}.*.code")
             for old in sorted(files, key=lambda file: file.stat().st_mtime)[:-KEPT]:
-                old.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # Windows keeps a file that is being read
+                    old.unlink()
         except OSError as error:
             if CodeCache.complaining:
                 CodeCache.complaining = False

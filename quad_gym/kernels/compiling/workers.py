@@ -1,7 +1,7 @@
 """Parallel compilation of functions that are not in the cache, in separate processes.
 
-Each worker goes through the names of the functions, claims those that no other worker has claimed,
-by making a file of that name in a folder, and compiles them into the cache. It ends with its
+Each worker goes through the functions, claims those that no other worker has claimed, by making a
+file in a folder, named by their number, and compiles them into the cache. It ends with its
 parent; a function that it was compiling is then not in the cache.
 
 `multiprocessing` would not do: a process that it spawns runs the user's script again, and daemonic
@@ -97,7 +97,7 @@ def _compile_in_processes(names: Sequence[str], workers: int, progress: "_Progre
                 running.callback(process.kill)
                 processes.append(process)
         while any(process.poll() is None for process in processes):
-            progress.show(os.listdir(claims))
+            progress.show([names[int(number)] for number in os.listdir(claims)])
             time.sleep(0.1)
 
 
@@ -105,9 +105,9 @@ def work(names: Sequence[str], claims: str) -> None:
     """Run a worker."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     gc.disable()  # compiling makes few cycles, and looking for them takes a tenth of the time
-    for name in names:
+    for number, name in enumerate(names):
         with contextlib.suppress(FileExistsError):
-            Path(claims, name).touch(exist_ok=False)
+            Path(claims, str(number)).touch(exist_ok=False)
             dispatcher_of(name).compile(dispatcher_of(name).signature)
             if _missing([name]):  # it cannot write: the parent finds out why
                 return

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.params import checks as check
-from quad_gym.params import portable
+from quad_gym.params import checks, portable
 from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
 from quad_gym.params.trajectories.feasibility import check_trajectory
@@ -60,10 +59,10 @@ class Trajectory(Checked, eq=False):
     Trajectories compare by their numbers, and can be pickled.
     """
 
-    times: Annotated[Floats, partial(check.array, shape=(None,))]
+    times: Annotated[Floats, partial(checks.array, shape=(None,))]
     """(m + 1,) times at which segments begin, the first at 0, and the end of the last segment
     [s]"""
-    coefficients: Annotated[Floats, partial(check.array, shape=(TERMS, None, 4))]
+    coefficients: Annotated[Floats, partial(checks.array, shape=(TERMS, None, 4))]
     """(8, m, 4) coefficients of x, y, z in I [m] and yaw [rad], the highest power first, as in
     SciPy's `PPoly`"""
     closed: bool = False
@@ -71,7 +70,7 @@ class Trajectory(Checked, eq=False):
     heading: HeadingRule = "given"
     """direction of body x: "given": by the yaw polynomial; "along": along the horizontal velocity;
     "toward": toward a point"""
-    point: Annotated[Vector, partial(check.vector, length=2)] = (0.0, 0.0)
+    point: Annotated[Vector, partial(checks.vector, length=2)] = (0.0, 0.0)
     """(2,) point in I that body x faces with `heading="toward"` [m]"""
 
     def __post_init__(self) -> None:
@@ -106,7 +105,7 @@ class Trajectory(Checked, eq=False):
         Returns:
             (..., 3) in I [m/s^derivative].
         """
-        order = check.whole("derivative", derivative, least=0)
+        order = checks.whole("derivative", derivative, least=0)
         time = np.asarray(t, np.float64)
         inside, beyond = self._within(time)
         values = np.asarray(self._polynomials(0, 3)(inside, order))
@@ -122,7 +121,7 @@ class Trajectory(Checked, eq=False):
         Returns:
             (...) [rad/s^derivative].
         """
-        order = check.whole("derivative", derivative, least=0, most=2)
+        order = checks.whole("derivative", derivative, least=0, most=2)
         return self._yaw_angles(np.asarray(t, np.float64))[order]
 
     def _yaw_angles(self, times: Floats) -> tuple[Floats, Floats, Floats]:
@@ -157,7 +156,7 @@ class Trajectory(Checked, eq=False):
         Args:
             angle: Angle of the rotation, from east toward north [rad].
         """
-        turn = check.number("angle", angle)
+        turn = checks.number("angle", angle)
         if turn == 0.0:
             return self
         c, s = math.cos(turn), math.sin(turn)

@@ -51,6 +51,23 @@ def test_stale_library_falls_back_to_numba_with_a_message(folder, capsys):
     assert f"Numba compiles, as {file_of(WIDTH).name} belongs to other sources" in said
 
 
+def test_library_that_cannot_be_loaded_falls_back_to_numba_with_a_message(folder, capsys):
+    digest = sources_digest(PACKAGE).encode()
+    file_of(WIDTH).write_bytes(b"not a library" + MARK + digest + b"\0")
+    assert library() is None
+    said = capsys.readouterr().err
+    assert f"Numba compiles, as {file_of(WIDTH).name} cannot be loaded: " in said
+    assert "\n" not in said[:-1]
+
+
+def test_name_of_library_has_system_processor_and_lanes(monkeypatch):
+    monkeypatch.setattr("platform.machine", lambda: "ARM64")
+    monkeypatch.setattr("sys.platform", "darwin")
+    assert file_of(2).name == "kernels_darwin_aarch64_2.so"
+    with pytest.raises(ValueError, match=r"libraries for linux on .*; got darwin on aarch64"):
+        building.build()
+
+
 @pytest.mark.parametrize("stale", [False, True])
 def test_missing_or_stale_library_is_an_error_where_it_is_demanded(folder, monkeypatch, stale):
     if stale:
