@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
-.PHONY: setup demo circle results test test-oldest test-clients test-arm test-slow soak golden lint benchmark docs reference kernels wheel clean
+.PHONY: setup demo circle results test test-oldest test-clients test-arm test-slow soak golden lint benchmark docs reference kernels wheel wheel-arm clean
 
 setup: $(VENV)/.developer
 
@@ -119,15 +119,27 @@ reference: setup  ## the tables of docs/reference, from the code
 kernels: $(VENV)/.user  ## libraries of compiled kernels for this checkout, which then needs no Numba
 	$(BIN)/quad-gym compile --library
 
-wheel: kernels  ## build sdist and a wheel with the libraries into dist, and check what they hold
-	rm -rf dist
+$(VENV)/.builder: $(VENV)/.user
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt build twine check-wheel-contents auditwheel
-	$(BIN)/python -m build --installer pip --sdist
-	QUAD_GYM_WHEEL=$$(uname -m) $(BIN)/python -m build --installer pip --wheel
+	touch $@
+
+define check-dist
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
-	$(BIN)/auditwheel show dist/*.whl | tee /dev/stderr | grep -q '"manylinux_2_'
-	$(BIN)/python -m tests.wheel dist/*.whl
+	for wheel in dist/*.whl; do $(BIN)/auditwheel show $$wheel | tee /dev/stderr | grep -q '"manylinux_2_' || exit 1; done
+endef
+
+wheel: kernels $(VENV)/.builder  ## build sdist and a wheel with the libraries into dist, and check what they hold; needs gcc and cmake
+	rm -rf dist
+	$(BIN)/python -m build --installer pip --sdist
+	QUAD_GYM_WHEEL=$$(uname -m) $(BIN)/python -m build --installer pip --wheel
+	$(check-dist)
+	$(BIN)/python -m tests.wheel dist/*$$(uname -m).whl
+
+wheel-arm: $(VENV)/.builder  ## add a wheel for AArch64 to dist, cross-linked: needs gcc-aarch64-linux-gnu
+	CC=aarch64-linux-gnu-gcc $(BIN)/quad-gym compile --library --family aarch64
+	QUAD_GYM_WHEEL=aarch64 $(BIN)/python -m build --installer pip --wheel
+	$(check-dist)
 
 clean:
 	rm -rf quad_gym/kernels/libraries
