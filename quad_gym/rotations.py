@@ -81,6 +81,23 @@ def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
     return np.stack([roll, pitch, yaw], axis=-1)
 
 
+def dcm_to_vector(R_BI: ArrayLike) -> NDArray[np.float64]:
+    """Convert a rotation matrix to a rotation vector.
+
+    Args:
+        R_BI: (..., 3, 3) rotation matrices.
+
+    Returns:
+        (..., 3) theta, of at most half a turn, with R_BI = exp(-[theta x]) [rad].
+
+    Raises:
+        ValueError: If `R_BI` has another shape or is not finite.
+    """
+    R = _rows("R_BI", R_BI, (3, 3))
+    turns = _rotations().from_matrix(R.reshape(-1, 3, 3).transpose(0, 2, 1))
+    return turns.as_rotvec().reshape(R.shape[:-1])  # type: ignore[no-any-return]
+
+
 def quaternion_to_dcm(q: ArrayLike) -> NDArray[np.float64]:
     """Convert a quaternion, which is normalized first, to a rotation matrix.
 

@@ -1,6 +1,7 @@
 """Flights to evaluate filters: errors in the filter's coordinates, and NEES."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.flights import TASK_DEFAULTS
@@ -56,7 +57,7 @@ def state_errors(batch):
         [
             batch.record("r") - batch.record("r_hat"),
             batch.record("v") - batch.record("v_hat"),
-            small_euler_angles(R_error),
+            -Rotation.from_matrix(R_error).as_rotvec(),
             batch.record("b_a") - batch.record("b_a_hat"),
             batch.record("b_g") - batch.record("b_g_hat"),
         ],

@@ -31,7 +31,7 @@ class LaneFilter:
 
     def __init__(self, sensors):
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
-        self.form = int(form_of(sensors.estimator))
+        self.form = int(form_of(sensors))
         self.params = aligned_zeros(EIGHT // WIDTH, PARAMS_BLOCK)
         self.params[:] = params_block(params_record(VehicleParams(), sensors))
         self.blocks = aligned_zeros(EIGHT // WIDTH, FLIGHT_BLOCK)

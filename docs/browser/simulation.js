@@ -136,9 +136,8 @@ class Simulation {
     const R = attitude(f("q")), R_hat = f("R_hat");
     const row = (M, i) => [M[3 * i], M[3 * i + 1], M[3 * i + 2]];
     const E = (i, j) => dot(row(R, i), row(R_hat, j));
-    const angles = [
-      Math.atan2(E(1, 2), Math.hypot(E(1, 0), E(1, 1))), Math.atan2(-E(0, 2), E(2, 2)), Math.atan2(-E(1, 0), E(1, 1)),
-    ];
+    const axis = [E(1, 2) - E(2, 1), E(2, 0) - E(0, 2), E(0, 1) - E(1, 0)], sine = Math.hypot(...axis);
+    const angle = Math.atan2(sine, E(0, 0) + E(1, 1) + E(2, 2) - 1), angles = scaled(sine ? angle / sine : 1, axis);
     const e = [
       ...difference("r", "r_hat"), ...difference("v", "v_hat"), ...angles,
       ...difference("b_a", "b_a_hat"), ...difference("b_g", "b_g_hat"),

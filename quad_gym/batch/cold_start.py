@@ -24,6 +24,8 @@ MAX_HEADING_SIGMA = 0.1
 """Standard deviation of the heading of a mark, or due to hard iron, with GNSS [rad]."""
 MAX_HEADING_SIGMA_INDOORS = 1.0
 """Standard deviation of the heading of a mark without GNSS: images correct it in steps [rad]."""
+MAX_HEADING_SIGMA_UNSEEN = 0.05
+"""The same where neither GNSS nor images show the heading, whose error then remains [rad]."""
 MAX_POSITION_SIGMA = 1.0
 """Standard deviation of the position of a mark without GNSS, with features 8 m away [m]."""
 
@@ -72,7 +74,10 @@ def _vague(sensors: SensorSuite) -> Iterator[tuple[str, float, float, str]]:
         iron = magnetometer.hard_iron_sigma
         bounds.append(("MagnetometerParams.hard_iron_sigma", iron, most, "T"))
     else:
-        most = MAX_HEADING_SIGMA_INDOORS if gnss is None else MAX_HEADING_SIGMA
+        most = MAX_HEADING_SIGMA
+        if gnss is None:
+            unseen = sensors.camera is None
+            most = MAX_HEADING_SIGMA_UNSEEN if unseen else MAX_HEADING_SIGMA_INDOORS
         bounds.append(("InitialPoseParams.heading_sigma", pose.heading_sigma, most, "rad"))
     if gnss is None:
         sigma = pose.position_sigma

@@ -70,8 +70,8 @@ class Engine:
         self.steps["rate"][0, : len(errors)] = [[1.0 / error.tau] for error in errors]
         self.steps["sigma"][0, : len(errors)] = [[error.sigma] for error in errors]
         lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
-        estimator = sensors.estimator.replace(kind=kind)
-        self.form = form_of(estimator, innovations=True, lever_arm=lever_arm)
+        assumed = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
+        self.form = form_of(assumed, innovations=True, lever_arm=lever_arm)
         self.settings = np.zeros(1, SETTINGS)
         self.settings["run_filter"] = True
         self.settings["form"] = int(self.form)

@@ -148,10 +148,10 @@ def _filter_forward(player: Player) -> _Forward:
     for first in range(0, len(operations), _AT_ONCE):
         parts.append(_run_and_copy(kf, tape, operations[first : first + _AT_ONCE]))
     kf.warn_of_news(status)
-    x, R_BI, factor = (np.concatenate(values) for values in zip(*parts, strict=True))
+    x, R_BI, factor, changes = (np.concatenate(values) for values in zip(*parts, strict=True))
     predicts = operations["code"] == Operation.PREDICT
     sample = np.where(predicts, operations["index"], -1)
-    jacobian, decay = _jacobians(kf, tape.samples[sample], x, R_BI)
+    jacobian, decay = _jacobians(kf, tape.samples[sample], x, R_BI, changes[:-1])
     rows = np.cumsum(inputs)[~inputs]
     last = np.diff(rows, append=len(codes)) > 0  # the first sample may be the start
     return _Forward(
@@ -162,8 +162,8 @@ def _filter_forward(player: Player) -> _Forward:
     )
 
 
-def _run_and_copy(kf: KalmanFilter, tape: Tape, operations: Any) -> tuple[Floats, Floats, Floats]:
-    """Run operations; return x, R_BI and factors after each, or the present ones if none."""
+def _run_and_copy(kf: KalmanFilter, tape: Tape, operations: Any) -> tuple[Floats, ...]:
+    """Run operations; return x, R_BI, factors and v_corrected after each, or the present ones."""
     engine, count = kf._engine, len(operations)
     slots = engine.words[0].reshape(1, -1)
     if count:
@@ -180,10 +180,12 @@ def _run_and_copy(kf: KalmanFilter, tape: Tape, operations: Any) -> tuple[Floats
     factor = np.zeros((len(x), 15 + slow, 15 + slow))
     factor[:, :15, :15] = L
     factor[:, 15:] = L_slow[:, :slow, : 15 + slow]
-    return x, R_BI.copy(), np.tril(factor)
+    return x, R_BI.copy(), np.tril(factor), engine.of_copies(slots, "v_corrected").copy()
 
 
-def _jacobians(kf: KalmanFilter, samples: Any, x: Floats, R_BI: Floats) -> tuple[Floats, Floats]:
+def _jacobians(
+    kf: KalmanFilter, samples: Any, x: Floats, R_BI: Floats, changes: Floats
+) -> tuple[Floats, Floats]:
     """Return the Jacobians (n, 15, 15) of predictions, and the decay (n, N - 15) of slow errors.
 
     The force in I follows from the change of the velocity; it contains the lever arm.
@@ -214,6 +216,9 @@ def _jacobians(kf: KalmanFilter, samples: Any, x: Floats, R_BI: Floats) -> tuple
     for column, block in of_states.items():
         found[:, 0:3, column : column + 3] = 0.5 * dt * dt * block
         found[:, 3:6, column : column + 3] = dt * block
+    of_change = -_cross(changes) @ R_IB  # with first estimates, else zero
+    found[:, 0:3, 6:9] += dt * of_change
+    found[:, 3:6, 6:9] += of_change
     for column, k in ((9, 0), (12, 1)):
         found[:, column : column + 3, column : column + 3] *= decay[:, k, np.newaxis, np.newaxis]
     return found, decay[:, 2 : 2 + engine.slow_states]

@@ -12,7 +12,6 @@ from quad_gym.packing.aids import decay_and_drive, gate_limit, pack_aids, slow_s
 from quad_gym.params import portable
 from quad_gym.params.aids import SlowError
 from quad_gym.params.control import ActionParams, PDGains
-from quad_gym.params.filter import FilterParams
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.randomization import nominal_values
@@ -163,13 +162,16 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
     p["gate_uncertainty"] = np.inf if sensors.gnss is None else estimator.max_direction_sigma**2
 
 
-def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
+def form_of(sensors: SensorSuite, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
     """Return the options of a filter as flags; it may store innovations, and model a lever arm."""
+    estimator = sensors.estimator
+    moves_in_body = sensors.optical_flow is not None and sensors.gnss is sensors.camera is None
     options = {
         FilterForm.INNOVATIONS: innovations,
         FilterForm.EKF: estimator.kind == "ekf",
         FilterForm.MIDPOINT: estimator.integration == "midpoint",
         FilterForm.TURN: estimator.attitude_reset,
+        FilterForm.FIRST_ESTIMATES: estimator.attitude_reset and moves_in_body,
         FilterForm.GATE: estimator.false_alarm_probability > 0.0,
         FilterForm.GRADUAL: estimator.recursive_update_threshold is not None,
     }

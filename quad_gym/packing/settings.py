@@ -47,7 +47,7 @@ def settings_record(c: FlightConfiguration) -> NDArray[Any]:
     s["own_estimator"] = c.estimator is not None
     draws_lever = {"lever_arm_B", "center_of_mass_B"} & set(c.randomization.names)
     lever_arm = lever_form(assumed.imu, c.randomization.known and bool(draws_lever))
-    s["form"] = form_of(assumed.estimator, c.keeps_innovations, lever_arm)
+    s["form"] = form_of(assumed, c.keeps_innovations, lever_arm)
     _pack_task(s, task)
     s["reward_scale"] = c.clocks.control_rate if task.reward_per == "step" else 1.0
     s["max_steps"] = round(task.duration * c.clocks.control_rate)

@@ -27,6 +27,8 @@ class FilterForm(IntFlag):
     LEVER_SAMPLES = 128
     """the accelerometer is off the center of mass, and a sample is the value at a tick's start"""
     GRADUAL = 32  #: images are processed in several steps while the attitude is uncertain
+    FIRST_ESTIMATES = 256
+    """derivatives at the first estimate of an instant, which keep an unobservable heading so"""
 
 
 class GateDecision(IntEnum):

@@ -69,6 +69,7 @@ WORK_FIELDS = (
     # the estimate before a late update
     Field("kept_r", (3,), "m", "r_hat"),
     Field("kept_v", (3,), "m/s", "v_hat"),
+    Field("kept_v_corrected", (3,), "m/s", "v_corrected"),
     Field("kept_R", (3, 3), "-", "R_hat"),
     Field("kept_b_a", (3,), "m/s^2", "b_a_hat"),
     Field("kept_b_g", (3,), "rad/s", "b_g_hat"),

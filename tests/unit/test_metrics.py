@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from quad_gym.analysis import metrics
@@ -94,7 +95,8 @@ def test_estimate_plus_error_is_the_truth(shape):
     for name, first in zip(names, (0, 3, 9, 12), strict=True):
         error = x[..., first : first + 3]
         np.testing.assert_allclose(estimate[name] + error, truth[name], atol=1e-15)
-    R_BI = euler_to_dcm(x[..., 6:9]) @ estimate["R_BI"]
+    e = x[..., 6:9].reshape(-1, 3)  # SciPy rotates from B to I
+    R_BI = Rotation.from_rotvec(-e).as_matrix().reshape(*shape, 3, 3) @ estimate["R_BI"]
     np.testing.assert_allclose(R_BI, truth["R_BI"], atol=1e-14)
 
 

@@ -15,6 +15,7 @@ measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 4
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.filter.error_state import E, V, velocity_error
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.filter.measurements import (
@@ -35,10 +36,10 @@ from quad_gym.kernels.filter.slow import (
 )
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import keep, load3, load33, outer, store
-from quad_gym.kernels.maths.matrices import load_column3, store_block, sum_of_outers
+from quad_gym.kernels.maths.matrices import load_column3, store_block, store_column3, sum_of_outers
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import SENSORS, FilterStatus
+from quad_gym.records import SENSORS, FilterForm, FilterStatus
 
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
@@ -48,6 +49,7 @@ def _keep_estimate(flight, work, slow):
     """Copy the estimate, for lanes in which nothing arrives or an update fails."""
     store(work.kept_r, load3(flight.r_hat))
     store(work.kept_v, load3(flight.v_hat))
+    store(work.kept_v_corrected, load3(flight.v_corrected))
     store(work.kept_R, load33(flight.R_hat))
     store(work.kept_b_a, load3(flight.b_a_hat))
     store(work.kept_b_g, load3(flight.b_g_hat))
@@ -116,16 +118,22 @@ def _factor_columns(flight, p, work, noise, slow, back):
 
 
 @kernel
-def _load_factor(flight, work):
+def _load_factor(flight, work, form):
     """Fill the first fifteen columns of work.columns with L."""
     zero = 0.0 * work.since_time
     for i in range(15):
         for j in range(15):
             work.columns[i, j] = flight.L[i, j] if j <= i else zero
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        R_BI, change = load33(flight.R_hat), load3(flight.v_corrected)
+        for j in range(9):
+            v, e = load_column3(work.columns, V, j), load_column3(work.columns, E, j)
+            store_column3(work.columns, V, j, velocity_error(v, e, R_BI, change))
+        store(flight.v_corrected, (zero, zero, zero))
 
 
 @kernel
-def _carry(flight, p, work, back, ticks, slow):
+def _carry(flight, p, work, form, back, ticks, slow):
     """Propagate the estimate to the time stamp of the arrival, or from there to the present.
 
     Where the noise to be removed on the way back exceeds the uncertainty, none is removed.
@@ -134,6 +142,7 @@ def _carry(flight, p, work, back, ticks, slow):
         flight: Record.
         p: Parameters assumed by the filter.
         work: Workspace.
+        form: Options of the filter.
         back: True to propagate back in time.
         ticks: Ticks between the time stamp and the present.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
@@ -141,7 +150,7 @@ def _carry(flight, p, work, back, ticks, slow):
     Returns:
         Lanes in which the covariance stays positive definite.
     """
-    _load_factor(flight, work)
+    _load_factor(flight, work, form)
     R_s, dR, dv, dr = take_mean(flight, p, work, back)
     put_noise(p, work, R_s, dR, dv)
     take_columns(work, R_s, dR, dv, dr, back)
@@ -171,6 +180,7 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     old = logical_not(arrived & good)
     keep(flight.r_hat, old, load3(work.kept_r))
     keep(flight.v_hat, old, load3(work.kept_v))
+    keep(flight.v_corrected, old, load3(work.kept_v_corrected))
     keep(flight.R_hat, old, load33(work.kept_R))
     keep(flight.b_a_hat, old, load3(work.kept_b_a))
     keep(flight.b_g_hat, old, load3(work.kept_b_g))
@@ -219,7 +229,7 @@ def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
         good = arrived
         for leg in range(2 if delayed else 1):  # a loop, so that `_carry` is compiled once
             if delayed:
-                good = good & _carry(flight, p, work, leg == 0, delay, slow)
+                good = good & _carry(flight, p, work, settings.form, leg == 0, delay, slow)
             if leg == 0:
                 work.mask = select(good, 1.0, 0.0)
                 call_stage(stages, Stage.UPDATE, flight, p, p, settings, work, 0)

@@ -9,13 +9,21 @@ Since `de = S(e) w` maps body rates to Euler rates and S(0) is the identity,
 so the covariance is transformed, too: P_e <- S^-1 P_e S^-T, and the correlations with e
 accordingly. The report leaves the covariance unchanged.
 
-Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for the reset in general.
+With FIRST_ESTIMATES (optical flow, neither GNSS nor camera) the heading is unobservable. The error
+e is then a rotation vector, R_BI = exp(-[e x]) R_hat, and keeps its direction in I when an update
+corrects the attitude; a correction dv of the velocity adds R_hat^T e x dv to the velocity's error
+in the next prediction. So an update gives no information about a rotation about the vertical
+(docs/filter-equations.md, "Unobservable heading").
+
+Sources: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for the reset in general; M.
+Li and A. I. Mourikis, Int. J. Robotics Research 32(6), 2013, for first estimates.
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.linalg import cross
 from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
@@ -40,6 +48,12 @@ def reset_matrix(m):
         (zero, zero + 1.0, s_phi),
         (s_th, zero, c_phi * c_th),
     )
+
+
+@kernel
+def velocity_error(v, e, R_BI, change):
+    """Velocity error v with error angles e when an update has changed v_hat."""
+    return v + cross(R_BI.T @ e, change)
 
 
 @kernel

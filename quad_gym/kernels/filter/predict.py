@@ -27,7 +27,16 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
-from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
+from quad_gym.kernels.filter.error_state import (
+    BA,
+    BG,
+    E,
+    R,
+    V,
+    reset_matrix,
+    turn_covariance,
+    velocity_error,
+)
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.filter.preintegration import accel_variance, gyro_sigma
 from quad_gym.kernels.filter.slow import decay_slow, keep_factor, predict_slow, turn_slow
@@ -53,6 +62,7 @@ from quad_gym.kernels.maths.matrices import (
 from quad_gym.kernels.maths.rotation import (
     euler_to_dcm,
     split_rotation,
+    split_turn,
     turn_pair_back,
     vector_to_dcm,
 )
@@ -108,6 +118,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
     dt = p.dt
     half_dt, half_dt2 = 0.5 * dt, 0.5 * dt * dt
     midpoint, extended = (form & FilterForm.MIDPOINT.value) != 0, (form & FilterForm.EKF.value) != 0
+    first = (form & FilterForm.FIRST_ESTIMATES.value) != 0
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
     inverse_c = 1.0 / c
     zero = 0.0 * c
@@ -128,6 +139,10 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
             even, odd, parts = split_rotation(d)
             # a_I = R^T R(e)^T (f - b_a) - g: parts odd and even in the offset, minus the center
             odd_B, even_B = turn_pair_back(even, odd, f_start, df)
+            if first:
+                even, odd = split_turn(d)
+                odd_B = odd.T @ f_start - df - even.T @ df
+                even_B = even.T @ f_start - odd.T @ df
             a_odd = inverse_c * (R_BI.T @ odd_B)
             a_even = inverse_c * (R_BI.T @ even_B)
             e_odd, e_even = nothing, nothing
@@ -139,6 +154,8 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
             e_odd = _turned_angles(L, j, full, half, dt)
 
         v_j = load_column3(L, V, j)
+        if first:
+            v_j = velocity_error(v_j, load_column3(L, E, j), R_BI, load3(flight.v_corrected))
         store_column3(F, R, j, load_column3(L, R, j) + dt * v_j + half_dt2 * a_odd)
         store_column3(F, V, j, v_j + dt * a_odd)
         store_column3(F, E, j, e_odd)
@@ -296,6 +313,8 @@ def predict(flight, p, work, form, slow):
 
     keep(flight.r_hat, ok, r_pred)
     keep(flight.v_hat, ok, v_pred)
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        keep(flight.v_corrected, ok, dt * mean_a)
     keep(flight.R_hat, ok, R_pred)
     keep(flight.b_a_hat, ok, p.accel_bias_decay * load3(flight.b_a_hat))
     keep(flight.b_g_hat, ok, p.gyro_bias_decay * load3(flight.b_g_hat))

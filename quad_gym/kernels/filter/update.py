@@ -48,16 +48,19 @@ from quad_gym.kernels.maths.matrices import (
     sum_of_outers_of_rows,
     sum_of_squares,
 )
-from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation
+from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation, split_turn, vector_to_dcm
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import FEATURE_BLOCKS, Act, FilterForm, GateDecision
 
 
 @kernel
-def _split_turns(flight, work, c):
+def _split_turns(flight, work, c, form):
     """Fill work.odd and work.even with the rotations of the sigma points."""
     for j in range(9):
-        even, odd, _ = split_rotation(c * load_column3(flight.L, E, j))
+        d = c * load_column3(flight.L, E, j)
+        even, odd, _ = split_rotation(d)
+        if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+            even, odd = split_turn(d)
         store(work.odd[j], odd)
         store(work.even[j], even)
 
@@ -252,12 +255,17 @@ def _keep(flight, p, work, form, columns, ok, slow):
     L, L9, dx, last = flight.L, work.L9, work.dx, columns - 1
     keep(flight.r_hat, ok, load3(flight.r_hat) + load3(dx[R:]))
     keep(flight.v_hat, ok, load3(flight.v_hat) + load3(dx[V:]))
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        keep(flight.v_corrected, ok, load3(flight.v_corrected) + load3(dx[V:]))
     if (form & MONITORED) != 0:
         if slow is not None:
             if slow.estimates_drift:
                 follow_drift_corrections(flight, p, L9, dx, columns, ok)
         follow_corrections(flight, p, L, L9, dx, columns, ok)
-    keep(flight.R_hat, ok, euler_to_dcm(load3(dx[E:])) @ load33(flight.R_hat))
+    turn = euler_to_dcm(load3(dx[E:]))
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        turn = vector_to_dcm(load3(dx[E:]))
+    keep(flight.R_hat, ok, turn @ load33(flight.R_hat))
     keep(flight.b_a_hat, ok, load3(flight.b_a_hat) + load3(dx[BA:]))
     keep(flight.b_g_hat, ok, load3(flight.b_g_hat) + load3(dx[BG:]))
     for i in range(15):
@@ -284,7 +292,7 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
     work.spread, work.inverse_spread = c, 1.0 / c
     if (form & FilterForm.EKF.value) == 0:
-        _split_turns(flight, work, c)
+        _split_turns(flight, work, c, form)
     call_measured(flight, p, work, settings, stages, Act.EXPECT)
     _innovate(work, n, c)
     if (form & MONITORED) != 0:
@@ -296,6 +304,8 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     if (form & FilterForm.TURN.value) != 0:
         correction = load3(work.dx[E:])
         T = reset_matrix(correction)
+        if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+            T = vector_to_dcm(correction)
         if slow is not None:
             turn_iron(flight, slow, p, work.L9, T, correction, columns)
         turn_factor(work.L9, T, states, columns)

@@ -15,6 +15,7 @@ from quad_gym.kernels.maths.linalg import diagonal, keep, load3, load4, store, u
 from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of
 from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import (
     AIDS,
@@ -112,6 +113,7 @@ def _start_warm(flight, settings, work, slow):
     n_d = _draw_errors(settings, stream_of(flight), work, slow, T)
     keep(flight.r_hat, mask, load3(flight.r) - T @ load3(d[R : R + 3]))
     keep(flight.v_hat, mask, load3(flight.v) - T @ load3(d[V : V + 3]))
+    reset(flight, mask, 0.0, "v_corrected")
     keep(flight.R_hat, mask, euler_to_dcm(load3(d[E : E + 3])).T @ R_BI)
     keep(flight.b_a_hat, mask, load3(flight.b_a) - load3(d[BA : BA + 3]))
     keep(flight.b_g_hat, mask, load3(flight.b_g) - load3(d[BG : BG + 3]))

@@ -47,6 +47,24 @@ def split_rotation(e):
 
 
 @kernel
+def split_turn(d):
+    """exp(-[d x]) = I + even(d) + odd(d) for a rotation vector d, likewise free of cancellation."""
+    x, y, z = d
+    angle = math.sqrt(x * x + y * y + z * z)
+    sine, cosine = sin_cos(0.5 * angle)
+    turned = angle > 1e-100
+    per_angle = select(turned, sine / select(turned, angle, 1.0), 0.5)
+    q, k = 2.0 * per_angle * cosine, 2.0 * per_angle * per_angle
+    even = (
+        (-k * (y * y + z * z), k * x * y, k * x * z),
+        (k * x * y, -k * (x * x + z * z), k * y * z),
+        (k * x * z, k * y * z, -k * (x * x + y * y)),
+    )
+    odd = ((0.0, q * z, -q * y), (-q * z, 0.0, q * x), (q * y, -q * x, 0.0))
+    return even, odd
+
+
+@kernel
 def turn_pair(even, odd, x, d):
     """The odd and even parts of (I + even +- odd) (x -+ d) - x, with the parts of `split_rotation`.
 
