@@ -21,11 +21,9 @@ thrust, which is along the body z axis at any tilt."""
 
 MAX_BASELINE_SIGMA = 0.15  #: standard deviation of the heading from the first baseline [rad]
 MAX_HEADING_SIGMA = 0.1
-"""Standard deviation of the heading of a mark, or due to hard iron, with GNSS [rad]."""
+"""Standard deviation of the heading of a mark, or due to hard iron, with GNSS or flow [rad]."""
 MAX_HEADING_SIGMA_INDOORS = 1.0
-"""Standard deviation of the heading of a mark without GNSS: images correct it in steps [rad]."""
-MAX_HEADING_SIGMA_UNSEEN = 0.05
-"""The same where neither GNSS nor images show the heading, whose error then remains [rad]."""
+"""The same with a camera and without GNSS: images correct it in steps [rad]."""
 MAX_POSITION_SIGMA = 1.0
 """Standard deviation of the position of a mark without GNSS, with features 8 m away [m]."""
 
@@ -75,9 +73,8 @@ def _vague(sensors: SensorSuite) -> Iterator[tuple[str, float, float, str]]:
         bounds.append(("MagnetometerParams.hard_iron_sigma", iron, most, "T"))
     else:
         most = MAX_HEADING_SIGMA
-        if gnss is None:
-            unseen = sensors.camera is None
-            most = MAX_HEADING_SIGMA_UNSEEN if unseen else MAX_HEADING_SIGMA_INDOORS
+        if gnss is None and sensors.camera is not None:
+            most = MAX_HEADING_SIGMA_INDOORS
         bounds.append(("InitialPoseParams.heading_sigma", pose.heading_sigma, most, "rad"))
     if gnss is None:
         sigma = pose.position_sigma

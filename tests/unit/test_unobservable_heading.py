@@ -13,6 +13,8 @@ from quad_gym.params.vehicle import vehicle_params
 from quad_gym.rotations import euler_to_dcm
 from tests.field_flights import attitudes, fly, nees
 
+pytestmark = pytest.mark.filterwarnings("ignore:InitialPoseParams.heading_sigma")
+
 SUITE = quad_gym.sensor_suite("crazyflie").simplified()
 SIGMA, GRAVITY = 0.2, 9.80665
 GROUND = quad_gym.WorldParams().ground_height
