@@ -6,6 +6,8 @@ therefore written to a tape first, which compiled code then runs.
 
 import bisect
 import math
+from array import array
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -21,10 +23,10 @@ from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
 from quad_gym.estimation.results import Measured, Replay
-from quad_gym.estimation.running import run_filter
+from quad_gym.estimation.running import Results, run_filter
 from quad_gym.estimation.samples import Measurement, Sample, checked_measurement
 from quad_gym.estimation.starts import level, state_at_rest
-from quad_gym.estimation.tape import Tape, TapeWriter
+from quad_gym.estimation.tape import TapeWriter
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
@@ -38,6 +40,8 @@ ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
 _OF_GNSS = ("gnss_position_G", "gnss_baseline_G", "gnss_velocity_G")
 
 UNMEASURED = 1e4  #: standard deviation along an axis that was not measured [m]
+
+_AT_ONCE = 8192  #: events whose numbers are Python's at a time
 
 PATIENCE = 2.0  #: time for which a start waits for the first magnetic field [s]
 
@@ -66,8 +70,7 @@ class Player:
         """True: roll and pitch at the start are too uncertain for a heading by a magnetic field"""
         self.window = window
         self.averages = suite.imu.samples == "average"
-        self.imu_times: list[float] = log.imu.time.tolist()
-        self.gyros, self.accels = list(log.imu.values["gyro"]), list(log.imu.values["accel"])
+        self.gyros, self.accels = log.imu.values["gyro"], log.imu.values["accel"]
         self.running = False
         self.held: list[int] = []  # samples before the start
         self.waiting: list[tuple[float, str, int]] = []  # time stamps after the filter's time
@@ -76,10 +79,10 @@ class Player:
         self.first_fix = math.inf
         self.first_state: dict[str, Any] = {}
         self.too_late = 0
-        self.times: list[float] = []
-        self.stamps: list[tuple[float, float]] = []  # of all updates, with their arrival
+        self.times = array("d")
+        self.stamps = array("d")  # of all updates, each with its arrival
         self.gyro: Floats | None = None  # of the prediction before
-        self.writer = TapeWriter()
+        self.writer = TapeWriter(self._made)
         writer = self.writer
         self.history = InputHistory(window, writer.apply, writer.copy, writer.restore)
         self._choose_streams()
@@ -134,7 +137,9 @@ class Player:
             MisfitError: If the suite has no sensor of the log.
             ValueError: If the log has no fix to start from, or its IMU samples have a gap.
         """
-        names = list(self.streams)  # the IMU first: it comes before what arrives with it
+        names = self.names = list(
+            self.streams
+        )  # the IMU first: it comes before what arrives with it
         arrivals = "time" if self.in_order else "received"
         received = np.concatenate([getattr(self.streams[name], arrivals) for name in names])
         kinds = np.concatenate([np.full(len(self.streams[n]), k) for k, n in enumerate(names)])
@@ -142,11 +147,13 @@ class Player:
         if "position" in self.start:
             self._start_from_state()
         order = np.lexsort((places, kinds, received))
-        for kind, place in zip(kinds[order].tolist(), places[order].tolist(), strict=True):
-            if kind == 0:
-                self._take_sample(place)
-            else:
-                self._take_measurement(names[kind], place)
+        for first in range(0, len(order), _AT_ONCE):
+            some = order[first : first + _AT_ONCE]
+            for kind, place in zip(kinds[some].tolist(), places[some].tolist(), strict=True):
+                if kind == 0:
+                    self._take_sample(place)
+                else:
+                    self._take_measurement(names[kind], place)
         self._keep_row()
         if not self.times:
             if self.unused and len(self.streams) == 1:
@@ -164,8 +171,7 @@ class Player:
         self.write_tape()
         if self.log.barometer_from_start:  # relative to the height of the vehicle
             self.filter._engine.steps["level"] = np.nan
-        tape = self.writer.tape()
-        return self._result(tape, *run_filter(self.filter, self.writer, tape))
+        return self._result(run_filter(self.filter, self.writer))
 
     def _take_sample(self, i: int) -> None:
         if not self.running:
@@ -176,14 +182,14 @@ class Player:
 
     def _predict(self, i: int) -> None:
         """Propagate the estimate to the time of a sample."""
-        time, now = self.imu_times[i], self.history.time
+        time, now = float(self.log.imu.time[i]), self.history.time
         chosen = i if self.averages else self.before
         self.before = i
         step = time - now
         if step <= SAME_TIME or chosen is None:
             return
         if step > max(LONGEST_STEP, self.suite.imu.dt):
-            usual = float(np.median(np.diff(self.imu_times)))
+            usual = float(np.median(np.diff(self.log.imu.time)))
             cause = "cut the log there" if usual < LONGEST_STEP else "time in ms?"
             raise ValueError(
                 f"samples of the IMU must be at most {LONGEST_STEP:g} s apart, got none from "
@@ -220,12 +226,19 @@ class Player:
         if measurement is None:
             return
         stamp = float(stream.time[k])
-        self.writer.awaited = measurement
+        self.writer.awaited, self.writer.place = measurement, (self.names.index(name), k)
         if stamp >= history.time - SAME_TIME:
             history.add(measurement)
         else:
             history.insert(measurement, stamp)
-        self.stamps.append((stamp, float(stream.received[k])))
+        self.stamps.extend((stamp, float(stream.received[k])))
+
+    def _made(self, number: int, k: int) -> Measurement:
+        """Return a measurement by the number of its stream."""
+        name = self.names[number]
+        found = self._measurement(name, self.streams[name], k)
+        assert found is not None
+        return found
 
     def _measurement(self, name: str, stream: Stream, k: int) -> Measurement | None:
         """Return a measurement of a stream; None: nothing was measured."""
@@ -316,7 +329,9 @@ class Player:
             return
         stream = self.streams["gnss"]
         fix, time = self._fix(stream, k), float(stream.time[k])
-        first = self.imu_times[0 if self.averages else 1]  # an instant needs the sample before
+        first = float(
+            self.log.imu.time[0 if self.averages else 1]
+        )  # an instant needs the sample before
         if "gnss_position_G" not in fix or time < first - LONGEST_STEP:
             return
         if not {"heading", "course"} & set(self.start) and "gnss_baseline_G" not in fix:
@@ -399,43 +414,74 @@ class Player:
             self.times.append(self.history.time)
             self.writer.keep()
 
-    def _result(self, tape: Tape, kept: Floats, reported: Floats) -> Replay:
-        r, v, R, b_a, b_g, variances, state = np.split(kept, np.cumsum((3, 3, 9, 3, 3, 15)), 1)
+    def _result(self, pieces: Iterable[Results]) -> Replay:
+        """Return the estimates of all pieces of the tape."""
+        found: dict[str, Any] = {}
+        first, blocks = (
+            0,
+            {block: Counted(FREEDOMS[block]) for block in blocks_of(self.filter.sensors)},
+        )
+        updates = 0
+        stamps = np.frombuffer(self.stamps).reshape(-1, 2) if self.stamps else np.empty((0, 2))
+        for kept, reported, valid in pieces:
+            for name, values in _columns_of(kept).items():
+                shape = (len(self.times), *values.shape[1:])
+                found.setdefault(name, np.empty(shape, values.dtype))[first : first + len(kept)] = (
+                    values
+                )
+            first += len(kept)
+            times = stamps[updates : updates + len(valid)]
+            updates += len(valid)
+            for row, (block, counted) in enumerate(blocks.items()):
+                have = valid[:, block]
+                if have.any():
+                    counted.add(times[have], reported[have, row])
         return Replay(
             estimator=self.estimator,
             sensors=self.suite,
             time=np.array(self.times),
-            position=r,
-            velocity=v,
-            quaternion=dcm_to_quaternion(R.reshape(-1, 3, 3)),
-            accel_bias=b_a,
-            gyro_bias=b_g,
-            sigma=np.sqrt(variances),
-            heading_known=state[:, 1] > 0.0,
-            diverged=state[:, 0] > 0.0,
+            **found,
             status=self.filter.status,
-            measured=self._measured(tape, reported),
+            measured={name_of(b): c.measured() for b, c in blocks.items() if c.rows},
             too_late=self.too_late,
             unused=self.unused,
         )
 
-    def _measured(self, tape: Tape, reported: Floats) -> dict[str, Measured]:
-        """Return innovations by kind of measurement, for the kinds that occurred."""
-        found, valid = {}, tape.valid
-        time, received = np.array(self.stamps).reshape(-1, 2).T
-        for row, block in enumerate(blocks_of(self.suite)):
-            have, freedoms = valid[:, block], FREEDOMS[block]
-            if have.any():
-                values = reported[have, row]
-                found[name_of(block)] = Measured(
-                    time[have],
-                    received[have],
-                    values[:, :freedoms],
-                    values[:, 3 : 3 + freedoms],
-                    values[:, 6],
-                    values[:, 7],
-                )
-        return found
+
+def _columns_of(kept: Floats) -> dict[str, Any]:
+    """Return fields of `Replay` from stored estimates."""
+    r, v, R, b_a, b_g, variances, state = np.split(kept, np.cumsum((3, 3, 9, 3, 3, 15)), 1)
+    return {
+        "position": r,
+        "velocity": v,
+        "quaternion": dcm_to_quaternion(R.reshape(-1, 3, 3)),
+        "accel_bias": b_a,
+        "gyro_bias": b_g,
+        "sigma": np.sqrt(variances),
+        "heading_known": state[:, 1] > 0.0,
+        "diverged": state[:, 0] > 0.0,
+    }
+
+
+class Counted:
+    """Innovations of one kind of measurement, from the pieces of a tape."""
+
+    def __init__(self, freedoms: int) -> None:
+        self._freedoms = freedoms
+        self.rows: list[Floats] = []
+
+    def add(self, times: Floats, reported: Floats) -> None:
+        """Add innovations (m, REPORTED) with their times of measurement and arrival (m, 2)."""
+        self.rows.append(np.column_stack([times, reported]))
+
+    def measured(self) -> Measured:
+        """Return all innovations."""
+        table, d = np.concatenate(self.rows), self._freedoms
+        values = table[:, 2:]
+        return Measured(
+            *(table[:, 0], table[:, 1], values[:, :d], values[:, 3 : 3 + d]),
+            *(values[:, 6], values[:, 7]),
+        )
 
 
 def name_of(block: int) -> str:

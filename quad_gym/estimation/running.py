@@ -1,66 +1,86 @@
 """Runs a tape with a filter: in compiled code, except while the heading is unknown."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.filters import KalmanFilter
-from quad_gym.estimation.samples import Measurement
+from quad_gym.estimation.samples import Measurement, Sample
 from quad_gym.estimation.tape import Tape, TapeWriter
 from quad_gym.records import KEPT, WIDTH, Operation
 
 
-def run_filter(kf: KalmanFilter, writer: TapeWriter, tape: Tape) -> tuple[Floats, Floats]:
-    """Run a tape from the present state of a filter.
+class Results(NamedTuple):
+    """Results of a piece of a tape."""
+
+    estimates: Floats
+    """(n, KEPT + 1) estimates, whose last number is 1 where the heading is known"""
+    innovations: Floats  #: (m, blocks, REPORTED)
+    valid: Any  #: (m, MAX_BLOCKS) True where a block was measured
+
+
+def run_filter(kf: KalmanFilter, writer: TapeWriter) -> Iterator[Results]:
+    """Run a tape from the present state of a filter, piece by piece.
 
     Args:
         kf: The filter.
-        writer: The inputs.
-        tape: The tape with them.
-
-    Returns:
-        Estimates (n, KEPT + 1), whose last number is 1 where the heading is known, and innovations
-        (m, blocks, REPORTED).
+        writer: The tape, and its measurements.
     """
     status = kf.status
-    first, copies, estimates, innovations = run_while_unknown(kf, writer, tape)
-    if first < len(tape.operations):
-        slots = np.zeros((tape.slots, kf._engine.words[0].size), np.uint64)
-        for slot, (words, _) in ((slots[k], copy) for k, copy in copies.items()):
-            slot.reshape(-1, WIDTH)[:] = words[0]
-        rest = tape.after(first)
-        kept, reported = (rows[0, ..., 0] for rows in kf._engine.run(rest, slots))
-        kept = np.column_stack([kept, np.ones(len(kept))])
-        kept[: len(estimates)] = np.reshape(estimates, (-1, KEPT + 1))
-        if innovations:
-            reported[: len(innovations)] = innovations
-    else:
-        kept, reported = np.array(estimates).reshape(-1, KEPT + 1), np.array(innovations)
+    copies: dict[int, Any] = {}
+    slots: NDArray[Any] | None = None
+    for piece in writer.pieces():
+        first, estimates, innovations = 0, _no_rows(KEPT + 1), _no_rows(0)
+        if slots is None:
+            first, before, reports = run_while_unknown(kf, writer, piece, copies)
+            estimates = np.reshape(before, (-1, KEPT + 1))
+            innovations = np.array(reports)
+        if first < len(piece.operations):
+            if slots is None:
+                slots = np.zeros((piece.slots, kf._engine.words[0].size), np.uint64)
+                for k, (words, _) in copies.items():
+                    slots[k].reshape(-1, WIDTH)[:] = words[0]
+            kept, reported = (rows[0, ..., 0] for rows in kf._engine.run(piece.after(first), slots))
+            kept = np.column_stack([kept, np.ones(len(kept))])
+            kept[: len(estimates)] = estimates
+            if len(innovations):
+                reported[: len(innovations)] = innovations
+            estimates, innovations = kept, reported
+        yield Results(estimates, innovations, piece.valid)
     kf.warn_of_news(status)
-    return kept, reported
+
+
+def _no_rows(width: int) -> Floats:
+    return np.empty((0, width))
 
 
 def run_while_unknown(
-    kf: KalmanFilter, writer: TapeWriter, tape: Tape
-) -> tuple[int, dict[int, Any], list[Floats], list[Floats]]:
+    kf: KalmanFilter, writer: TapeWriter, tape: Tape, copies: dict[int, Any]
+) -> tuple[int, list[Floats], list[Floats]]:
     """Run a tape until the heading is known, also in all copies that may be restored.
 
+    Args:
+        kf: The filter.
+        writer: The measurements.
+        tape: The tape.
+        copies: Copies of the filter's memory by number; further ones are added.
+
     Returns:
-        Number of operations that were run, the copies, estimates and innovations.
+        Number of operations that were run, estimates and innovations.
     """
-    copies: dict[int, Any] = {}
     estimates: list[Floats] = []
     innovations: list[Floats] = []
     for k, (code, index, target) in enumerate(tape.operations.tolist()):
         if kf.heading_known and all(weights is None for _, weights in copies.values()):
-            return k, copies, estimates, innovations
+            return k, estimates, innovations
         match code:
             case Operation.PREDICT:
-                kf._apply(writer.samples[index])
+                kf._apply(Sample.of_record(tape.samples[index]))
             case Operation.UPDATE:
-                measurement = writer.measurements[index]
+                measurement = writer.measurement(tape.first + index)
                 kf._apply(measurement)
                 if target >= 0:
                     innovations.append(_innovations(kf, measurement))
@@ -70,7 +90,7 @@ def run_while_unknown(
                 kf._restore(copies[target])
             case Operation.KEEP:
                 estimates.append(_estimate(kf))
-    return len(tape.operations), copies, estimates, innovations
+    return len(tape.operations), estimates, innovations
 
 
 def _innovations(kf: KalmanFilter, measurement: Measurement) -> Floats:

@@ -23,7 +23,7 @@ SIGMA_KEYWORDS = (
 """Keywords of `update` for the noise of its measurements."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sample:
     """An IMU sample that propagates the estimate over a time."""
 
@@ -33,6 +33,11 @@ class Sample:
     gyro_before: Floats
     """(3,) angular rate of the sample before; the lever arm's acceleration follows from both
     [rad/s]"""
+
+    @classmethod
+    def of_record(cls, record: Any) -> "Sample":
+        """Return the sample of a record of a tape."""
+        return cls(record["gyro"], record["accel"], float(record["dt"]), record["gyro_before"])
 
     def split(self, first: float) -> tuple["Sample", "Sample"]:
         """Return this sample over the first part [s] of its time, and over the rest.
@@ -45,7 +50,7 @@ class Sample:
         return one, two
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """Measurements of one instant; None: not measured."""
 

@@ -135,7 +135,7 @@ def _filter_forward(player: Player) -> _Forward:
     if player.log.barometer_from_start:
         engine.steps["level"] = np.nan
     tape, status = player.writer.tape(), kf.status
-    tape = tape.after(run_while_unknown(kf, player.writer, tape)[0])
+    tape = tape.after(run_while_unknown(kf, player.writer, tape, {})[0])
     codes = tape.operations["code"]
     if not (kf.heading_known and len(codes)):
         raise ValueError(

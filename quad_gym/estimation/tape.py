@@ -1,8 +1,10 @@
 """Tapes: the operations of a filter on a log, as a list that compiled code runs."""
 
-from collections.abc import Sequence
+from array import array
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ _TRIPLES = (
     ("velocity_G", "gnss_velocity", VELOCITY_BLOCK),
 )
 _NOISE = (*NOISE_FIELDS, "aid_sigma")
+_SAMPLE_SIZE = SAMPLE.itemsize // 8  #: numbers of a sample
 _PREDICT, _UPDATE = int(Operation.PREDICT), int(Operation.UPDATE)
 
 BLANK = np.zeros(1, MEASUREMENT)
@@ -45,6 +48,7 @@ class Tape:
     slots: int = 1  #: number of copies of the filter's memory that exist at a time
     kept: int = 0  #: number of estimates to store
     reported: int = 0  #: number of updates whose innovations are stored
+    first: int = 0  #: number of the first measurement in the writer
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -61,23 +65,6 @@ class Tape:
     def after(self, first: int) -> "Tape":
         """Return the tape without its first operations."""
         return replace(self, operations=self.operations[first:])
-
-
-def samples_record(samples: Sequence[Sample]) -> NDArray[Any]:
-    """Return samples as records."""
-    found = np.empty(len(samples), SAMPLE)
-    for name in SAMPLE.names or ():
-        if samples:
-            found[name] = [getattr(sample, name) for sample in samples]
-    return found
-
-
-def measurements_record(measurements: Sequence[Measurement]) -> NDArray[Any]:
-    """Return measurements as records."""
-    found = np.repeat(BLANK, len(measurements))
-    for row, measurement in zip(found, measurements, strict=True):
-        write_measurement(row, measurement)
-    return found
 
 
 def write_measurement(row: Any, m: Measurement) -> None:
@@ -102,69 +89,117 @@ def write_measurement(row: Any, m: Measurement) -> None:
             row[name] = value
 
 
+_AT_ONCE = 4096  #: operations of a piece of a tape
+
+
 @dataclass(eq=False)
 class TapeWriter:
     """Writes the operations that process inputs in the order of their arrival.
 
-    Its methods `apply`, `copy` and `restore` are those that an `InputHistory` asks for.
+    Its methods `apply`, `copy` and `restore` are those that an `InputHistory` asks for. It keeps
+    numbers, not objects: a long log has millions of inputs. A measurement is made from the log
+    again when its piece of the tape is run.
     """
 
-    samples: list[Sample] = field(default_factory=list)
-    measurements: list[Measurement] = field(default_factory=list)
-    operations: list[tuple[int, int, int]] = field(default_factory=list)
+    make: Callable[[int, int], Measurement]
+    """returns a measurement by the numbers of its stream and row"""
+    place: tuple[int, int] = (0, 0)  #: stream and row of the next new measurement
     awaited: Measurement | None = None  #: measurement whose next update is reported
     kept: int = 0
     reported: int = 0
-    _places: dict[int, int] = field(default_factory=dict)
+    _samples: "array[float]" = field(default_factory=lambda: array("d"))
+    _rows: "array[int]" = field(default_factory=lambda: array("i"))
+    _operations: "array[int]" = field(default_factory=lambda: array("i"))
+    _numbers: WeakKeyDictionary[Sample | Measurement, int] = field(
+        default_factory=WeakKeyDictionary
+    )
     _copies: int = 0
     _oldest: int = 1  #: age of the oldest copy that was restored, in copies
 
     def apply(self, given: Sample | Measurement) -> None:
         """Process a sample or a measurement."""
-        index = self._places.get(id(given))
-        if index is None:
-            known: list[Any] = self.samples if isinstance(given, Sample) else self.measurements
-            index = self._places[id(given)] = len(known)
-            known.append(given)  # which keeps it alive, and its identity unique
+        index = self._numbers.get(given)
         if isinstance(given, Sample):
-            self.operations.append((_PREDICT, index, -1))
+            if index is None:
+                index = self._numbers[given] = len(self._samples) // _SAMPLE_SIZE
+                for values in (given.gyro, given.accel, (given.dt,), given.gyro_before):
+                    self._samples.extend(values)
+            self._operations.extend((_PREDICT, index, -1))
             return
+        if index is None:
+            index = self._numbers[given] = len(self._rows) // 2
+            self._rows.extend(self.place)
         target = -1
         if given is self.awaited:
             self.awaited, target = None, self.reported
             self.reported += 1
-        self.operations.append((_UPDATE, index, target))
+        self._operations.extend((_UPDATE, index, target))
 
     def copy(self) -> int:
         """Copy the memory; return the number of the copy."""
-        self.operations.append((Operation.COPY, 0, self._copies))
+        self._operations.extend((Operation.COPY, 0, self._copies))
         self._copies += 1
         return self._copies - 1
 
     def restore(self, number: int) -> None:
         """Restore a copy."""
         self._oldest = max(self._oldest, self._copies - number)
-        self.operations.append((Operation.RESTORE, 0, number))
+        self._operations.extend((Operation.RESTORE, 0, number))
 
     def keep(self) -> None:
         """Store the estimate."""
-        self.operations.append((Operation.KEEP, 0, self.kept))
+        self._operations.extend((Operation.KEEP, 0, self.kept))
         self.kept += 1
+
+    def measurement(self, index: int) -> Measurement:
+        """Return a measurement of the tape."""
+        return self.make(*self._rows[2 * index : 2 * index + 2])
 
     def tape(self) -> Tape:
         """Return the tape; a copy overwrites the oldest one that is not restored any more."""
-        operations = np.array(self.operations, np.int64).reshape(-1, 3).view(OPERATION).ravel()
-        copies = (operations["code"] == Operation.COPY) | (operations["code"] == Operation.RESTORE)
+        return self._piece(0, len(self._operations) // 3)
+
+    def pieces(self) -> Iterator[Tape]:
+        """Yield the tape in pieces, each with its own inputs and numbers of results."""
+        count = len(self._operations) // 3
+        for first in range(0, max(count, 1), _AT_ONCE):
+            yield self._piece(first, min(first + _AT_ONCE, count))
+
+    def _piece(self, first: int, end: int) -> Tape:
+        """Return the operations from one up to another, with numbers that begin at zero."""
+        numbers = np.array(self._operations[3 * first : 3 * end], np.int64).reshape(-1, 3)
+        codes, indices, targets = numbers.T
+        updates, keeps = codes == Operation.UPDATE, codes == Operation.KEEP
+        copies = (codes == Operation.COPY) | (codes == Operation.RESTORE)
         slots = self._oldest + 1
-        operations["target"][copies] %= slots
+        targets[copies] %= slots
+        kept = _from_zero(targets, keeps)
+        reported = _from_zero(targets, updates & (targets >= 0))
+        samples = _from_zero(indices, codes == Operation.PREDICT)
+        measured = _from_zero(indices, updates)
+        given = np.array(self._samples[_SAMPLE_SIZE * samples[0] : _SAMPLE_SIZE * samples[1]])
+        records = np.repeat(BLANK, measured[1] - measured[0])
+        for row, index in zip(records, range(*measured), strict=True):
+            write_measurement(row, self.measurement(index))
         return Tape(
-            samples_record(self.samples),
-            measurements_record(self.measurements),
-            operations,
+            given.view(SAMPLE),
+            records,
+            numbers.view(OPERATION).ravel(),
             slots,
-            self.kept,
-            self.reported,
+            kept[1] - kept[0],
+            reported[1] - reported[0],
+            measured[0],
         )
+
+
+def _from_zero(numbers: NDArray[Any], chosen: NDArray[Any]) -> tuple[int, int]:
+    """Subtract the least of some numbers from them; return it, and the end of their range."""
+    some = numbers[chosen]
+    if not len(some):
+        return 0, 0
+    least, end = int(some.min()), int(some.max()) + 1
+    numbers[chosen] -= least
+    return least, end
 
 
 ONE_PREDICTION = np.array([(_PREDICT, 0, -1)], OPERATION)
