@@ -33,7 +33,7 @@ def measure(result: Result) -> dict[str, object]:
     began = time.monotonic()
     for number, command in enumerate(result.commands):
         words = [word.replace("OUT", str(folder / str(number))) for word in command.split()]
-        module = words[0].startswith("scripts.")
+        module = words[0].startswith(("scripts.", "docs."))
         program = ["-m"] if module else [] if words[0].endswith(".py") else ["-m", "quad_gym"]
         print(f"  {' '.join(words)}", flush=True)
         done = subprocess.run(

@@ -82,7 +82,7 @@ CATALOG = {
         ),
         Result(
             name="betaflight",
-            commands=["docs/examples/betaflight.py --output OUT"],
+            commands=["docs.examples.betaflight --output OUT"],
             flights=("Circle, standard", "Hover, standard"),
             texts=texts.console("betaflight"),
             figures={"0/betaflight.png": "docs/images/betaflight.png"},

@@ -57,9 +57,6 @@ class EvaluateArgs:
     trained on raw measurements)"""
     sensors: options.OwnSuite = None
     estimator: options.EstimatorName = None
-    rate_loop: Literal["built-in", "betaflight"] = "built-in"
-    """loop that tracks the body rates of action "ctbr": built-in, or Betaflight's firmware, which
-    is built from its source package when it is first needed (Linux, gcc, make)"""
     env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
@@ -122,15 +119,9 @@ def default_policies(args: EvaluateArgs) -> tuple[str, ...]:
 def policy_and_flights(
     args: EvaluateArgs, observation: str, count: int, policy: str
 ) -> tuple[Policy, Any]:
-    """Load a policy, behind the rate loop, and make the environment in which it flies."""
+    """Load a policy, and make the environment in which it flies."""
     env = make_flights(args, observation, count, policy)
-    loaded = load_policy(policy, env)
-    if args.rate_loop == "built-in":
-        return loaded, env
-    from baselines.betaflight import BehindBetaflight, flights_behind
-
-    flown = flights_behind(env, keywords_of_flights(args, observation, policy), args.threads)
-    return BehindBetaflight(loaded, env, flown), flown
+    return load_policy(policy, env), env
 
 
 def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) -> Any:

@@ -1,6 +1,6 @@
 """Compare the built-in rate loop with Betaflight's firmware: step responses, and policies' errors.
 
-    python docs/examples/betaflight.py --output results/betaflight
+    python -m docs.examples.betaflight --output results/betaflight
 
 Draws the responses to steps of the desired body rates, and prints the errors of policies on the
 circle behind both loops. Needs Linux with gcc and make; the firmware is built on first use.
@@ -13,8 +13,8 @@ import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
 
-from baselines.betaflight import BehindBetaflight, flights_behind
 from baselines.policies import load_policy
+from docs.examples.betaflight import BehindBetaflight, flights_behind
 from quad_gym.analysis.reports import text_table
 from quad_gym.evaluation import roll_out
 
@@ -87,8 +87,10 @@ def main():
     """Draw the figure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output", type=Path, default=Path("results/betaflight"))
-    draw(parser.parse_args().output / "betaflight.png")
-    rows = [errors(name, firmware) for name in ("pd", "pretrained") for firmware in (False, True)]
+    parser.add_argument("--policy", nargs="+", default=["pd", "pretrained"], help="names or files")
+    args = parser.parse_args()
+    draw(args.output / "betaflight.png")
+    rows = [errors(name, firmware) for name in args.policy for firmware in (False, True)]
     heads = {
         "": ["policy, rate loop"],
         "tracking error [mm]": ["whole episode", "second half"],

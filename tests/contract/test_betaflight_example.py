@@ -6,17 +6,16 @@ import gymnasium
 import numpy as np
 import pytest
 
-from baselines.betaflight import BehindBetaflight, firmware, firmware_settings, flights_behind
-from baselines.betaflight.rate_loop import Motors
 from baselines.policies import load_policy
-from quad_gym.commands import evaluate
+from docs.examples.betaflight import BehindBetaflight, firmware, firmware_settings, flights_behind
+from docs.examples.betaflight.rate_loop import Motors
 from quad_gym.evaluation import roll_out
 from quad_gym.params.control import ActionParams
 from quad_gym.params.vehicle import vehicle_params
 
 needs_firmware = pytest.mark.skipif(
     not firmware.is_built(),
-    reason="Betaflight's firmware is not built; quad-gym evaluate --rate-loop betaflight builds it",
+    reason="Betaflight's firmware is not built; python -m docs.examples.betaflight builds it",
 )
 LAB = vehicle_params("lab")
 
@@ -71,16 +70,15 @@ def test_environments_that_betaflight_cannot_fly_are_refused(keywords, message):
         flights(**keywords)
 
 
-def test_evaluate_without_make_or_with_too_many_episodes_exits(monkeypatch, tmp_path, capsys):
+def test_missing_make_or_too_many_episodes_are_refused(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(firmware.shutil, "which", lambda name: None if name == "make" else name)
-    options = {"policy": ("pd",), "rate_loop": "betaflight", "output": tmp_path}
-    with pytest.raises(SystemExit):
-        evaluate.main(evaluate.EvaluateArgs(episodes=2, **options))
-    assert "Betaflight's firmware cannot be built without make" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        evaluate.main(evaluate.EvaluateArgs(episodes=1000, **options))
-    assert "episodes must be at most 200 behind Betaflight" in capsys.readouterr().err
+    env, flown = flights(2)
+    policy = load_policy("pd", env)
+    with pytest.raises(RuntimeError, match="Betaflight's firmware cannot be built without make"):
+        BehindBetaflight(policy, env, flown)
+    with pytest.raises(ValueError, match="episodes must be at most 200 behind Betaflight"):
+        flights(1000)
 
 
 class _Step:

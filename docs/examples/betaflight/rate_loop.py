@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.betaflight.firmware import Firmware, configured
+from docs.examples.betaflight.firmware import Firmware, configured
 from quad_gym.evaluation import Policy
 from quad_gym.params.control import ActionParams
 from quad_gym.params.vehicle import VehicleParams
