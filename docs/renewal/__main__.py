@@ -3,7 +3,7 @@
     python -m docs.renewal            # measure all stale results, and write the pages
     python -m docs.renewal --list     # list them, with their last durations
     python -m docs.renewal --only circle compare
-    python -m docs.renewal --only speed_tick --again   # even if it is up to date
+    python -m docs.renewal --only speed_suites --again   # even if it is up to date
 
 Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables resume where
 an interrupted run stopped.

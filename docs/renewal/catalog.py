@@ -274,12 +274,9 @@ CATALOG = {
             )
             for section, made in {
                 "filter": texts.console("speed_filter"),
-                "tick": texts.console("speed_tick"),
                 "suites": texts.console("speed_suites"),
-                "busy": texts.console("speed_busy"),
                 "peers": texts.peers,
                 "interfaces": texts.speeds,
-                "options": texts.console("speed_options"),
                 "compile": texts.compiling,
             }.items()
         ),
