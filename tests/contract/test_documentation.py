@@ -177,7 +177,7 @@ def test_links_lead_to_files_and_headings_of_the_repository(page):
 
 
 def test_functions_named_on_equation_pages_exist():
-    pages = ("filter-equations", "measurement-equations", "recovery")
+    pages = ("filter-equations", "recovery")
     text = " ".join((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in pages)
     text = " ".join(text.split())
     found = re.findall(r"((?:`\w+`(?:, | and )?)+) in `(quad_gym/[\w/]+\.py)`", text)
