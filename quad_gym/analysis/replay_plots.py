@@ -44,19 +44,19 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
 
 
 def draw_nis(axes: Any, measured: Measured, title: str) -> None:
-    """Draw normalized innovations squared, rejected measurements, and the 99 % quantile."""
+    """Draw NIS per degree of freedom, rejected measurements, and the 99 % quantile."""
     freedoms = measured.innovation.shape[1]
-    bound = chi_square_quantile(freedoms, 0.99)
-    known = np.isfinite(measured.nis)
+    bound = chi_square_quantile(freedoms, 0.99) / freedoms
+    nis, known = measured.nis / freedoms, np.isfinite(measured.nis)
     taken, left_out = known & ~measured.gated, known & measured.gated
-    top = 1.1 * max(1.3 * bound, measured.nis[taken].max(initial=0.0))
+    top = 1.1 * max(1.3 * bound, nis[taken].max(initial=0.0))
     axes.axhspan(0.0, bound, color=PALE, linewidth=0.0)
     dots: dict[str, Any] = {"linestyle": "none", "color": BLUE, "marker": ".", "markersize": 2.5}
-    axes.plot(measured.time[taken], measured.nis[taken], **dots)
+    axes.plot(measured.time[taken], nis[taken], **dots)
     # values beyond the limits are drawn at the edge
-    high = np.minimum(measured.nis[left_out], 0.97 * top)
+    high = np.minimum(nis[left_out], 0.97 * top)
     axes.plot(measured.time[left_out], high, "x", color=VERMILLION, markersize=5.0)
-    mean = f", mean {measured.nis[taken].mean():.2f} of {freedoms}" if taken.any() else ""
+    mean = f": {nis[known].mean():.2f} per degree of freedom" if known.any() else ""
     axes.set_title(f"{title}{mean}; rejected: {int(left_out.sum())}")
     axes.set_ylim(0.0, top)
 

@@ -6,9 +6,9 @@
     quad-gym replay flight.csv --sensors rtk --estimator module:Class
 
 A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
-some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. If units
-or axes are implausible, the suite does not describe the log, or the filter diverges, the last lines
-report it and the exit code is 1.
+some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. The last
+lines are the verdict. The exit code is 1 if units or axes are implausible, the suite does not
+describe the log, or the filter was lost.
 """
 
 import math
@@ -129,16 +129,18 @@ def suite_of(args: ReplayArgs) -> "SensorSuite":
 
 
 def report_of(result: "Replay") -> str:
-    """Format a table of measurements, rejections and NIS."""
+    """Format a table of measurements, rejections and NIS, and the verdict."""
     from quad_gym.analysis.replay_plots import sensors_of
     from quad_gym.analysis.reports import text_table
+    from quad_gym.estimation.findings import by_quantity
 
     rows = []
     for name, measured in sensors_of(result).items():
         nis = measured.nis[np.isfinite(measured.nis)]
-        mean = f"{nis.mean():.2f} of {measured.innovation.shape[1]}" if len(nis) else "-"
+        mean = f"{nis.mean() / measured.innovation.shape[1]:.2f}" if len(nis) else "-"
         rows.append((name, f"{len(measured.time)}", f"{int(measured.gated.sum())}", mean))
-    table = text_table({"measurements": ["of", "count", "rejected", "mean NIS"]}, rows)
+    heads = ["of", "count", "rejected", "NIS per degree of freedom"]
+    table = text_table({"measurements": heads}, rows)
     lines = [f"{len(result)} IMU samples from {result.time[0]:.2f} s to {result.time[-1]:.2f} s."]
     if result.notes:
         lines.append(told(result.notes))
@@ -148,14 +150,11 @@ def report_of(result: "Replay") -> str:
         lines.append(f"Not used, because the suite has none: {', '.join(result.unused)}.")
     if not result.heading_known[-1]:
         lines.append("The heading is still unknown at the end: use --heading or --course.")
-    return "\n".join([table, *lines])
+    return "\n".join([table, *lines, "", *map(_capital, by_quantity(result.findings))])
 
 
-def problems_in_words(result: "Replay") -> str:
-    """Format the problems, with advice."""
-    from quad_gym.estimation.plausibility import ADVICE
-
-    return "\n".join([*(f"{text[0].upper()}{text[1:]}" for text in result.problems), ADVICE])
+def _capital(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def innovations_of(result: "Replay") -> dict[str, list[Any]]:
@@ -185,6 +184,7 @@ def main(args: ReplayArgs) -> None:
     """Read, filter, draw and write."""
     from quad_gym.analysis.reports import versions, write_csv, write_json
     from quad_gym.estimation import read_log, replay, smooth
+    from quad_gym.estimation.findings import ADVICE
     from quad_gym.estimation.plausibility import MisfitError
 
     smoothed = None
@@ -226,6 +226,7 @@ def main(args: ReplayArgs) -> None:
     }
     files.append(write_json(folder / RESULT, found))
     print(f"\nWrote {len(files)} files to {folder}.")
+    print(f"\n{_capital(result.verdict)}.")
     if result.problems:
-        print(f"\n{problems_in_words(result)}")
+        print(ADVICE)
         raise SystemExit(MISFIT)

@@ -215,7 +215,7 @@ class OwnPlayer:
             diverged=~everywhere,
             status=FilterStatus(0),
             measured=self._measured(),
-            too_late=self._player.too_late,
+            late={},
             unused=self._player.unused,
         )
 

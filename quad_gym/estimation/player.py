@@ -78,7 +78,7 @@ class Player:
         self.field: int | None = None  # the last magnetic field before the start
         self.first_fix = math.inf
         self.first_state: dict[str, Any] = {}
-        self.too_late = 0
+        self.late: dict[str, list[float]] = {}  # ages of what came too late, by sensor
         self.times = array("d")
         self.stamps = array("d")  # of all updates, each with its arrival
         self.gyro: Floats | None = None  # of the prediction before
@@ -216,7 +216,8 @@ class Player:
         elif stamp > self.history.time + SAME_TIME:
             bisect.insort(self.waiting, (stamp, name, k))
         elif stamp < self.history.oldest - SAME_TIME:
-            self.too_late += 1
+            received = float(self.streams[name].received[k])
+            self.late.setdefault(name, []).append(received - stamp)
         else:
             self._update(name, k)
 
@@ -443,7 +444,7 @@ class Player:
             **found,
             status=self.filter.status,
             measured={name_of(b): c.measured() for b, c in blocks.items() if c.rows},
-            too_late=self.too_late,
+            late={name: np.array(ages) for name, ages in self.late.items()},
             unused=self.unused,
         )
 

@@ -14,9 +14,9 @@ from quad_gym.estimation.logs.parts import naming, parts_of
 from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.own import Estimator
 from quad_gym.estimation.own_player import OwnPlayer
-from quad_gym.estimation.plausibility import problems_of
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.results import Estimates, Replay, joined
+from quad_gym.estimation.verdict import with_verdict
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -38,8 +38,8 @@ def replay(
     The filter starts from the first fix. The initial heading comes from the first available of: its
     baseline, `start`, the magnetometer; without any of these it is unknown.
 
-    Check `problems` of the result before you use its estimates: it has a sentence for each sensor
-    that the suite does not describe, and for implausible units and axes.
+    Check `problems` of the result before you use its estimates: it has a sentence for each quantity
+    that the filter lost, each sensor that the suite does not describe, and implausible units.
 
     A log with pauses is flown in parts, each with a start: by GNSS, or without it where the part
     before has ended.
@@ -81,8 +81,7 @@ def replay(
         return player.play() if own is None else OwnPlayer(player, own).play()
 
     result = in_parts(whole, named_start(start), fly)
-    problems = (*whole.problems, *problems_of(whole, reading.get("body", "flu"), suite, result))
-    return replace(result, problems=problems)
+    return with_verdict(whole, reading.get("body", "flu"), suite, result)
 
 
 _Found = TypeVar("_Found", bound=Estimates)

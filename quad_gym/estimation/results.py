@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.logs import Floats
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FilterStatus, GateDecision
@@ -96,28 +97,42 @@ class Replay(Estimates):
     measured: dict[str, Measured]
     """innovations by measurement: "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0",
     ..., "barometer" and "magnetometer\""""
-    too_late: int
-    """number of measurements that were older than the window at their arrival, and were left out"""
+    late: dict[str, Floats]
+    """ages at their arrival [s] of the measurements that were older than the window, and were left
+    out, by sensor"""
     unused: tuple[str, ...]  #: sensors of the log that the suite does not use
-    problems: tuple[str, ...] = ()
-    """sentences on implausible units and axes of the log, on divergence or failure of the filter,
-    and on sensors that the suite does not describe, with likely causes; empty: no problem was
-    found"""
+    findings: tuple[Finding, ...] = ()
+    """the verdict: units and axes of the log, and the quantities that were estimated, the worst
+    first"""
+    verdict: str = ""
+    """the verdict in a line, such as "usable: NIS per degree of freedom 0.6 to 1.3\""""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Sentences of the findings that a replay must not have; empty: no problem was found."""
+        return tuple(str(f) for f in self.findings if f.severity == Severity.LOST)
+
+    @property
+    def too_late(self) -> int:
+        """Number of measurements that were older than the window, and were left out."""
+        return sum(map(len, self.late.values()))
 
     def columns(self) -> dict[str, Floats]:
         """Return the estimates as a table: columns of one number each, by name."""
         return super().columns() | {"diverged": self.diverged.astype(np.float64)}
 
     def summary(self) -> dict[str, Any]:
-        """Return counts and mean NIS per measurement, the diverged fraction, and all sentences."""
+        """Return counts and mean NIS per measurement, the verdict, and all sentences."""
         kinds = {}
         for name, m in self.measured.items():
-            used = np.isfinite(m.nis)
+            known, freedoms = m.nis[np.isfinite(m.nis)], m.innovation.shape[1]
+            mean = float(known.mean()) if len(known) else math.nan
             kinds[name] = {
                 "count": len(m.time),
                 "gated": int(m.gated.sum()),
-                "degrees_of_freedom": m.innovation.shape[1],
-                "mean_nis": float(m.nis[used].mean()) if used.any() else math.nan,
+                "degrees_of_freedom": freedoms,
+                "mean_nis": mean,
+                "nis_per_degree_of_freedom": mean / freedoms,
             }
         return {
             "duration": float(self.time[-1] - self.time[0]),
@@ -127,7 +142,12 @@ class Replay(Estimates):
             "unused": self.unused,
             "status": self.status.name or "",
             "diverged": float(np.mean(self.diverged)),
+            "verdict": self.verdict,
             "problems": self.problems,
+            "findings": [
+                {"quantity": f.quantity, "severity": f.severity.name.lower(), "text": f.text}
+                for f in self.findings
+            ],
             "heading_known": bool(self.heading_known[-1]),
             "sources": self.sources,
             "notes": self.notes,
@@ -192,8 +212,9 @@ def joined(parts: Sequence[_Found]) -> _Found:
             changes[name] = np.concatenate(values)
         elif name == "measured":
             changes[name] = _joined_innovations(values)
-        elif name == "too_late":
-            changes[name] = sum(values)
+        elif name == "late":
+            names = dict.fromkeys(sensor for late in values for sensor in late)
+            changes[name] = {n: np.concatenate([v[n] for v in values if n in v]) for n in names}
     return replace(first, **changes)
 
 
@@ -204,6 +225,7 @@ def _joined_innovations(parts: Sequence[Mapping[str, Measured]]) -> dict[str, Me
 
 
 def stacked(parts: Sequence[Measured]) -> Measured:
-    """Return innovations one after the other."""
+    """Return innovations in the order of time."""
+    order = np.argsort(np.concatenate([m.time for m in parts]), kind="stable")
     columns = [f.name for f in fields(Measured)]
-    return Measured(*(np.concatenate([getattr(m, name) for m in parts]) for name in columns))
+    return Measured(*(np.concatenate([getattr(m, name) for m in parts])[order] for name in columns))

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_gym.estimation.engine import Floats
+from quad_gym.estimation.fits import correlation_time
 from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.numbers import Number, numbers_in
@@ -347,19 +348,3 @@ def widening(scaled: Floats, most: float) -> float:
     """
     tau = max(correlation_time(column) for column in scaled.T)
     return math.sqrt(max(1.0, min(tau, most**2, float((scaled**2).mean()) / _SMALL)))
-
-
-def correlation_time(values: Floats) -> float:
-    """Return the integrated autocorrelation time of numbers, in samples; 1 if they are white.
-
-    The sum ends with the first correlation that white noise would also have, to three standard
-    deviations.
-    """
-    centered, least = values - values.mean(), max(0.05, 3.0 / math.sqrt(len(values)))
-    variance, tau = float((centered**2).mean()), 1.0
-    for lag in range(1, len(values) // 4):
-        rho = float((centered[:-lag] * centered[lag:]).mean()) / variance
-        if rho < least:
-            break
-        tau += 2.0 * rho
-    return tau

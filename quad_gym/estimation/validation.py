@@ -3,10 +3,11 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.fits import Fit, fit_of
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Replay, by_sensor
@@ -14,18 +15,6 @@ from quad_gym.params.sensors import SensorSuite
 
 _PERIOD, _GAP = 5, 1
 """Fixes are left out for a second in every five [s], in five replays that leave out each second."""
-
-
-class Fit(NamedTuple):
-    """Innovations of a sensor compared with the filter's predictions."""
-
-    measurements: int
-    freedoms: int
-    mean_nis: float  #: mean NIS over its degrees of freedom; 1 for a consistent filter
-    median_nis: float  #: median NIS over its degrees of freedom
-    rejected: float  #: share of the measurements that the gate rejects
-    correlation: float
-    """correlation of successive innovations, the largest of all axes; 0 for a consistent filter"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,20 +40,8 @@ def validate(
     result = replay(log, sensors=suite, start=start, reported_noise=False)
     sensors = {}
     for name, m in by_sensor(result.measured).items():
-        rows = (m.time > split) & np.isfinite(m.nis)
-        if rows.sum() < 3:
-            continue
-        nis, d = m.nis[rows], m.innovation.shape[1]
-        scaled = (m.innovation / m.sigma)[rows]
-        pairs = (scaled[:-1] * scaled[1:]).mean(axis=0) / (scaled**2).mean(axis=0)
-        sensors[name] = Fit(
-            len(nis),
-            d,
-            float(nis.mean() / d),
-            float(np.median(nis) / d),
-            float(m.rejected[rows].mean()),
-            float(pairs[np.argmax(np.abs(pairs))]),
-        )
+        if fit := fit_of(m, m.time > split):
+            sensors[name] = fit
     diverged = float(np.mean(result.diverged[result.time > split]))
     held_out = _held_out(log, suite, start, split)
     return Validation(sensors, *held_out, diverged, result.problems, result)

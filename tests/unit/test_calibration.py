@@ -11,10 +11,11 @@ import pytest
 import quad_gym
 from quad_gym import estimation
 from quad_gym.estimation import calibrate, read_log, replay
+from quad_gym.estimation.fits import correlation_time
 from quad_gym.estimation.likelihood import NU, SETTLING, SPACING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import MOST, NUMBERS
-from quad_gym.estimation.search import NumberSearch, correlation_time, widening
+from quad_gym.estimation.search import NumberSearch, widening
 from quad_gym.estimation.validation import validate
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suites import CONSUMER

@@ -1,0 +1,179 @@
+"""The verdict on a replay, by quantity, on simulated flights with known faults."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from quad_gym.estimation import replay
+from quad_gym.estimation.dead_reckoning import HORIZONS, changes
+from quad_gym.estimation.findings import Finding, Severity, by_quantity
+from quad_gym.estimation.fits import exceeds, fit_of, larger
+from quad_gym.estimation.logs import Log, Stream
+from quad_gym.estimation.results import Measured
+from quad_gym.estimation.verdict import in_one_line
+from quad_gym.records import GateDecision
+from tests.statistical import verdicts
+
+NAME = "consumer"
+
+
+@cache
+def flight():
+    return next(iter(verdicts.flown(NAME, 1, seed=7)))
+
+
+def judged(change):
+    return verdicts.judged(NAME, change, *flight(), seed=0)[0]
+
+
+def of(result, quantity):
+    return [f for f in result.findings if f.quantity == quantity]
+
+
+def test_a_flight_without_a_fault_is_usable_in_every_quantity():
+    result = judged(verdicts.nothing)
+    assert [line.split(";")[0] for line in by_quantity(result.findings)] == [
+        f"{quantity}: usable" for quantity in ("position", "height", "attitude", "heading")
+    ]
+    assert result.verdict.startswith("usable: NIS per degree of freedom ")
+
+
+@pytest.mark.parametrize("change", [verdicts.ramp, verdicts.jump])
+def test_gnss_that_drifts_or_jumps_makes_the_position_unusable(change):
+    result = judged(change)
+    worst = [f.text for f in of(result, "position") if f.severity == Severity.LOST]
+    assert any("which the IMU does not explain" in text or "in a row" in text for text in worst)
+    assert result.verdict.startswith("not usable, because position: ")
+
+
+def test_measurements_of_another_clock_are_named_with_the_difference():
+    log, _ = flight()
+    table = log | {"time": np.where(np.isfinite(log["gyro"][:, 0]), log["time"], log["time"] - 1.5)}
+    result = replay(table, sensors=NAME)
+    (text,) = (f.text for f in of(result, "height") if "clocks" in f.text)
+    assert "all by about 1.50 s: the clocks differ, use log_delays.barometer = -1.50" in text
+    assert any("nothing corrects it for 4" in p for p in result.problems)
+
+
+def test_an_outage_of_twelve_seconds_is_dead_reckoning_and_one_of_six_is_not():
+    assert any("dead reckoning" in p for p in judged(verdicts.silence).problems)
+    assert not judged(verdicts.outage).problems
+
+
+def test_a_compass_that_turns_makes_the_heading_unusable():
+    assert any(f.severity == Severity.LOST for f in of(judged(verdicts.compass), "heading"))
+
+
+@pytest.mark.parametrize("change", [verdicts.outliers, verdicts.biases, verdicts.vibration])
+def test_disturbances_that_a_filter_withstands_are_no_problem(change):
+    assert not judged(change).problems
+
+
+def test_noise_that_is_assumed_too_large_is_pessimistic_and_no_problem():
+    result = judged(verdicts.pessimism)
+    assert not result.problems
+    assert "pessimistic in GNSS position by a factor of " in result.verdict
+
+
+def test_noise_of_a_barometer_makes_the_height_uncertain_only():
+    log, _ = flight()
+    heights = log["barometer"] + np.random.default_rng(1).normal(0.0, 0.3, len(log["time"]))
+    result = replay(log | {"barometer": heights}, sensors=NAME)
+    assert [f.severity for f in of(result, "height")] == [Severity.UNCERTAIN]
+    assert "barometer: NIS per degree of freedom" in of(result, "height")[0].text
+    assert not result.problems
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("faulty", [False, True])
+def test_verdicts_on_sixty_flights_are_wrong_three_times_at_most(faulty):
+    kinds = verdicts.FAULTS if faulty else verdicts.HARMLESS
+    wrong = list(verdicts.run(verdicts.cases(kinds, 60), faulty))
+    assert len(wrong) <= 3, wrong
+
+
+def test_a_share_exceeds_its_limit_as_often_as_the_test_says():
+    """Of independent cases at the limit, at most 5 % are rejected, and nearly all at its double."""
+    rng = np.random.default_rng(0)
+    at, above = ([exceeds(rng.random(300) < p, 0.1) for _ in range(400)] for p in (0.1, 0.2))
+    assert np.mean(at) < 0.08
+    assert np.mean(above) > 0.95
+
+
+def test_repeated_cases_are_no_further_evidence():
+    rng = np.random.default_rng(1)
+    hits = [np.repeat(rng.random(30) < 0.1, 20) for _ in range(200)]
+    assert np.mean([exceeds(each, 0.1) for each in hits]) < 0.12
+
+
+def test_outliers_do_not_make_innovations_larger():
+    nis = chi2.rvs(3, size=500, random_state=2)
+    nis[:100] *= 1e4
+    assert not larger(nis, 3, 4.0)
+    assert larger(6.0 * nis, 3, 4.0)
+
+
+def measured(innovation, rejected):
+    gate = np.where(rejected, GateDecision.REJECTED, GateDecision.ACCEPTED)
+    time = np.arange(len(innovation), dtype=float)
+    nis = (innovation**2).sum(axis=1)
+    return Measured(time, time, innovation, np.ones_like(innovation), nis, gate)
+
+
+def test_mean_nis_is_per_degree_of_freedom_and_includes_rejected_measurements():
+    innovation = np.array([[1.0, 0.0], [0.0, 1.0], [3.0, 3.0], [1.0, 1.0]])
+    fit = fit_of(measured(innovation, [False, False, True, False]))
+    assert fit.mean_nis == pytest.approx((1.0 + 1.0 + 18.0 + 2.0) / 4.0 / 2.0)
+    assert fit.rejected == 0.25
+
+
+def test_the_estimate_changes_by_what_is_added_to_it():
+    """A vehicle on a circle, exactly as its IMU has it, with a step of position or of heading."""
+    rate, radius, dt = 0.8, 2.0, 0.005
+    time = dt * np.arange(4001)
+    result = judged(verdicts.nothing)
+    c, s, zero = np.cos(rate * time), np.sin(rate * time), 0.0 * time
+    gyro = np.tile([0.0, 0.0, rate], (len(time), 1))
+    accel = np.tile([0.0, radius * rate**2, 9.80665], (len(time), 1))
+    half = 0.5 * (rate * time + 0.5 * math.pi)  # the nose is ahead
+    sigma = np.tile(np.repeat([0.1, 0.1, 0.01, 0.01, 0.001], 3), (len(time), 1))
+    exact = replace(
+        result,
+        time=time,
+        position=radius * np.stack([c, s, zero], axis=1),
+        velocity=radius * rate * np.stack([-s, c, zero], axis=1),
+        quaternion=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
+        accel_bias=np.zeros((len(time), 3)),
+        gyro_bias=np.zeros((len(time), 3)),
+        sigma=sigma,
+    )
+    log = Log(imu=Stream(time, time, {"gyro": gyro, "accel": accel}))
+    found, count = changes(log, exact, 5.0)
+    assert count > 0
+    assert max(each.ratio for each in found) < 0.05
+    moved = exact.position + np.where(time > 12.0, 3.0, 0.0)[:, np.newaxis] * [1.0, 0.0, 0.0]
+    sizes = {c.quantity: c.size for c in changes(log, replace(exact, position=moved), 5.0)[0]}
+    assert sizes["position"] == pytest.approx(3.0, rel=1e-2)
+    turned = half + np.where(time > 12.0, 0.1, 0.0)
+    quaternion = np.stack([np.cos(turned), zero, zero, np.sin(turned)], axis=1)
+    found, _ = changes(log, replace(exact, quaternion=quaternion), 5.0)
+    (heading,) = (each for each in found if each.quantity == "heading")
+    assert heading.size == pytest.approx(0.2, rel=1e-2)
+    assert abs(heading.time - 12.0) <= max(HORIZONS)
+
+
+def test_a_line_names_the_first_problem_or_the_worst_sensors():
+    lost = Finding(quantity="heading", severity=Severity.LOST, text="turned")
+    fits = {
+        name: fit_of(measured(size * np.ones((5, 1)), np.zeros(5, bool)))
+        for name, size in (("gnss_position", 0.5), ("barometer", 1.1))
+    }
+    assert in_one_line([lost], fits) == "not usable, because heading: turned"
+    assert in_one_line([], fits) == (
+        "usable: NIS per degree of freedom 0.25 to 1.2, pessimistic in GNSS position by a factor "
+        "of 2.0"
+    )
