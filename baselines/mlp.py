@@ -109,7 +109,9 @@ def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
 
     policy = model.policy
     if hasattr(policy, "lstm_actor"):
-        raise ValueError("model must have no memory to become an MlpPolicy")
+        raise ValueError(
+            "model must be a multilayer perceptron: recurrent policies cannot be converted"
+        )
     if hasattr(policy, "action_net"):
         modules = [*policy.mlp_extractor.policy_net, policy.action_net]
     elif hasattr(policy.actor, "latent_pi"):

@@ -121,7 +121,7 @@ def _gains_of(file: Path) -> PDGains:
     try:
         return PDGains(**json.loads(file.read_text(encoding="utf-8"))["gains"])
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{file} does not contain PD gains: {error!r}") from None
+        raise ValueError(f'{file} has no valid table "gains": {error!r}') from None
 
 
 def is_included(name: str) -> bool:

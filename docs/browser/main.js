@@ -129,7 +129,7 @@ class Page {
       const last = (list) => list[list.length - 1];
       element(`state-${k}`).textContent = pilot.over
         ? `crashed after ${pilot.over.time.toFixed(1)} s`
-        : `off by ${length(last(pilot.error))}, estimate by ${length(last(pilot.estimation))}`;
+        : `tracking error ${length(last(pilot.error))}, estimation error ${length(last(pilot.estimation))}`;
     });
     element("time").textContent = `${simulation.flights.time.toFixed(1)} s`;
     for (const [id, what] of [["gnss", `off ${GNSS}`], ["camera", `off ${CAMERA}`], ["gust", "gust"]]) {

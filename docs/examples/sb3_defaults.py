@@ -31,14 +31,14 @@ class Args:
     algorithm: Literal["ppo", "sac"] = "ppo"
     env_id: str = "QuadGym/Circle-v0"
     start: Literal["ground", "hover", "mixed", "moving"] | None = None
-    """start of episodes in training and evaluation; if not given, the default of the task"""
+    """start of episodes in training and evaluation; defaults to the default of the task"""
     out_of_bounds: float | None = None
-    """distance from the reference at which episodes end [m]; if not given, the default"""
+    """distance from the reference at which episodes end [m]; defaults to the default"""
     seed: int = 0
     total_timesteps: int | None = None
-    """if not given, 1,000,000 for PPO and 300,000 for SAC"""
+    """defaults to 1,000,000 for PPO and 300,000 for SAC"""
     num_envs: int | None = None
-    """flights at a time; if not given, 16 for PPO and 1 for SAC"""
+    """flights at a time; defaults to 16 for PPO and 1 for SAC"""
     every: int = 25_000
     """steps from one evaluation to the next"""
     evaluate: int = 1000

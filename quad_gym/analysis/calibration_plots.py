@@ -11,7 +11,7 @@ from quad_gym.estimation.calibration import Calibration
 def numbers_figure(calibration: Calibration) -> Any:
     """Make a figure of the numbers with their intervals, in units of their prior values."""
     scaled = [found for found in calibration.numbers if found.number.positive]
-    title = "numbers relative to the suite before, with 95 % intervals"
+    title = "parameters relative to the initial suite, with 95 % intervals"
     figure, ((axes,),) = panels(1, 1, (8.0, 0.8 + 0.28 * len(scaled)), title)
     for row, found in enumerate(reversed(scaled)):
         low, value, high = (n / found.prior for n in (found.low, found.value, found.high))

@@ -177,12 +177,21 @@ class NeesRecorder:
         self._sigmas.append(np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)))
 
     def nees(self) -> dict[str, MeanSquare]:
-        """Mean NEES over time of each part of the state, by the names of `PARTS`."""
+        """Mean NEES over time of each part of the state, by the names of `PARTS`.
+
+        Parts for which an estimator has no covariance after its start are left out.
+        """
+        later = slice(min(1, len(self._time) - 1), None)
         time, counts = np.array(self._time), np.full(len(self._time), self._count)
         return {
             name: _mean_square(name, part.stop - part.start, time, self._means[name], counts)
             for name, part in PARTS.items()
+            if not np.isnan(self._means[name][later]).all()
         }
+
+    def time(self) -> Floats:
+        """Times of the recorded instants, (t,) [s]."""
+        return np.array(self._time)
 
     def errors(self) -> tuple[Floats, Floats]:
         """Root mean square of errors and of standard deviations over flights, (t, 15) each."""

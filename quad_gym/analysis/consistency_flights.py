@@ -39,6 +39,8 @@ class Findings:
     """Mean NIS over time, by sensor"""
     whiteness: dict[str, Whiteness]
     """Autocorrelation of the innovations, by sensor"""
+    time: Floats
+    """Times of the errors since the start, (t,) [s]"""
     errors: Floats
     """Root mean square errors over flights, (t, 15)"""
     claimed: Floats
@@ -105,7 +107,7 @@ def measure_consistency(
             estimator, whose innovations are unknown.
         seeds: Seeds of the flights.
         duration: Length of the flights [s].
-        every: Time between two evaluations of the errors [s].
+        every: Evaluation interval of the errors [s].
         settle: Time before which innovations are left out of the autocorrelation [s].
         matched: True to start the filters with errors drawn from their own covariance.
         progress: Function called repeatedly with the time flown so far [s].
@@ -145,6 +147,7 @@ def measure_consistency(
         nees=squares.nees(),
         nis={} if innovations is None else innovations.nis(),
         whiteness={} if innovations is None else innovations.whiteness(),
+        time=squares.time(),
         errors=errors,
         claimed=claimed,
         tracking=tracking.result(),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from quad_gym.params import checks as check
 
 BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
-"""Colors of the path flown, of the heading, and of further curves."""
+"""Colors of the actual path, of the heading, and of further curves."""
 INK, GREY, PALE = "#222222", "#767676", "#DDDDDD"
 """Colors of text and the reference, of axes, and of the grid."""
 
@@ -114,7 +114,7 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
     here, x_B = trace.position[chosen, :2], trace.heading[chosen]
     tips = here + 0.075 * extent * x_B / np.linalg.norm(x_B, axis=1, keepdims=True)
     rests = float(np.ptp(trace.reference[:, :2], axis=0).max()) < 1e-6
-    axes.plot(*trace.position[:, :2].T, color=BLUE, linewidth=2.2, label="flown")
+    axes.plot(*trace.position[:, :2].T, color=BLUE, linewidth=2.2, label="actual path")
     axes.plot(
         *trace.reference[:, :2].T, label="reference", **{**_REFERENCE, **(_REST if rests else {})}
     )
@@ -132,7 +132,7 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
 
 def draw_height(axes: Any, trace: Trace) -> None:
     """Draw height over time, with the reference."""
-    axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2, label="flown")
+    axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2, label="actual height")
     axes.plot(trace.time, trace.reference[:, 2], label="reference", **_REFERENCE)
     start = (trace.time[0], trace.position[0, 2])
     axes.plot(*start, label="start", clip_on=False, **_START)

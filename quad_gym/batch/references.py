@@ -58,7 +58,7 @@ def _check_period(task: TaskParams, vehicle: VehicleParams, limit: float) -> Non
     thrust = vehicle.mass * math.hypot(acceleration, vehicle.gravity)
     if thrust > limit:
         raise ValueError(
-            f"period must be one that the vehicle can fly: with radius={task.radius:g} m, "
+            f"period is infeasible for this vehicle: with radius={task.radius:g} m, "
             f"{task.period:g} s need an acceleration of {acceleration:.4g} m/s^2 and a thrust of "
             f"{thrust:.4g} N, above the limit of {limit:.4g} N"
         )

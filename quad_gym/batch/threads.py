@@ -62,9 +62,9 @@ class Crew:
         weakref.finalize(self, _dismiss, self._board, self._alarms)
 
     def run(self, command: int) -> None:
-        """Fly all blocks; a batch can be flown by one thread at a time."""
+        """Fly all blocks; one thread at a time may step a batch."""
         if self._flying:
-            raise RuntimeError("a batch can be flown by one thread at a time")
+            raise RuntimeError("this batch is already being stepped by another thread")
         self._flying = True
         try:
             if not self._fly(self._board, 0, command, False):

@@ -32,7 +32,7 @@ class BenchmarkArgs:
     n_envs: int = 1024
     """number of environments in the batches of interfaces, of flights in suites"""
     threads: int | None = None
-    """largest number of threads; if not given, one per core"""
+    """largest number of threads; defaults to one per core"""
     quick: bool = False
     """two short repeats instead of --repeats and --seconds, to check that it runs"""
     repeats: int = 7

@@ -44,7 +44,7 @@ class CalibrateArgs(ReadingArgs):
     delays: bool = True
     """find the delays of time stamps, too"""
     heading: float | None = None
-    """heading of the body x axis at the start, from east toward north [deg]; if not given, from a
+    """heading of the body x axis at the start, from east toward north [deg]; by default from a
     baseline or a magnetometer"""
     course: bool = False
     """use the direction of the first GNSS velocity as heading"""
@@ -52,10 +52,10 @@ class CalibrateArgs(ReadingArgs):
     """write a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the log to
     this file"""
     vehicle_from: str | None = None
-    """vehicle whose mass, inertia and arms that file has: lab, crazyflie or a .toml file; if not
-    given, lab"""
+    """vehicle whose mass, inertia and arms that file has: lab, crazyflie or a .toml file;
+    defaults to lab"""
     output: Path | None = None
-    """folder for the results, created if it is missing; if not given, results/calibrate/LOG"""
+    """folder for the results, created if it is missing; defaults to results/calibrate/LOG"""
     overwrite: bool = False
     """replace the results of an earlier calibration"""
 
@@ -89,7 +89,9 @@ def validation_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
             )
         rows.append((name.replace("_", " "), *cells))
     if calibration.after.held_out_nis is not None:
-        rows.append(("fixes left out for 1 s", *(c for j in pair for c in _held_out(j))))
+        rows.append(
+            ("prediction error after 1 s without GNSS", *(c for j in pair for c in _held_out(j)))
+        )
     return rows
 
 

@@ -1,4 +1,4 @@
-"""Fly the report's circle on the true state, and on estimates with and without the camera.
+"""Reproduce the report's circle experiment: true state, and estimates with and without a camera.
 
     quad-gym circle
     quad-gym circle --episodes 100 --gains tuned --gnss-rate 10
@@ -64,9 +64,11 @@ class CircleArgs:
     imu_rate: float = 200.0
     """rate of the IMU, the filter and the controller [Hz]"""
     gnss_rate: float | None = None
-    """rate of GNSS fixes [Hz]; if not given, the IMU rate"""
+    """rate of GNSS fixes [Hz]; defaults to the IMU rate"""
     camera_rate: float | None = None
-    """rate of camera images [Hz]; if not given, the IMU rate"""
+    """rate of camera images [Hz]; defaults to the IMU rate"""
+    estimator: Literal["ukf", "ekf"] = "ukf"
+    """filter: ukf, the report's, or ekf"""
     bearing_noise_at: Literal["measured", "predicted"] = "measured"
     """direction to which the filter assumes camera noise is perpendicular: measured, as in the
     report, makes it overconfident; predicted hardly does"""
@@ -93,7 +95,7 @@ def configure(args: CircleArgs) -> circle.Setup:
     suite = sensor_suite("lab").with_rates(
         imu=args.imu_rate, gnss=args.gnss_rate, camera=args.camera_rate
     )
-    estimator = suite.estimator.replace(bearing_noise_at=args.bearing_noise_at)
+    estimator = suite.estimator.replace(kind=args.estimator, bearing_noise_at=args.bearing_noise_at)
     suite = suite.replace(estimator=estimator)
     cases = {circle.TRUTH: (Source.TRUTH, suite)}
     if args.camera:
@@ -129,7 +131,7 @@ def main(args: CircleArgs) -> None:
     results = {case: setup.fly(case) for case in setup.cases}
     seconds = time.perf_counter() - began
     print(circle.error_table(results))
-    print("Mean ± standard deviation over the flights that did not end early.\n")
+    print("Mean ± standard deviation over the flights that did not end early (survivors).\n")
     print(circle.consistency_table(results), end="\n\n")
     print(circle.in_words(results, setup.cases[circle.TRUTH][1]), end="\n\n")
     written = circle.write_numbers(results, setup, seconds, args)

@@ -1,4 +1,4 @@
-"""Measure the loss of controllers on the estimate, and the gain of training on it.
+"""Measure the cost of flying on the estimate and the benefit of training on it.
 
     quad-gym compare                         # the circle, 5 seeds
     quad-gym compare --quick                 # one seed, a few minutes
@@ -56,18 +56,18 @@ class CompareArgs:
     """reinforcement learning algorithm"""
     engine: options.Engine = "sb3"
     steps: int | None = None
-    """number of environment steps of each training; if not given, the recipe's"""
+    """number of environment steps of each training; defaults to the recipe's"""
     env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as control_rate=100"""
     jobs: int | None = None
-    """number of simultaneous trainings, each with one thread; if not given, one per core"""
+    """number of simultaneous trainings, each with one thread; defaults to one per core"""
 
     episodes: int = 1000
     """number of episodes that each policy flies on each observation"""
     seed: int = 0
     """seed of the first episode, and of the first training; no training flies these episodes"""
     output: Path | None = None
-    """folder; if not given, results/compare/TASK (with --quick, .../TASK_quick)"""
+    """folder; defaults to results/compare/TASK (with --quick, .../TASK_quick)"""
 
 
 def configure(args: CompareArgs) -> compare.Comparison:

@@ -43,13 +43,13 @@ class CompileArgs:
     environments with sensors and filter), single (for single vehicles, such as
     UnscentedKalmanFilter), all (these, and every option of the environments)"""
     jobs: int | None = None
-    """number of processes that compile; if not given, one per core"""
+    """number of processes that compile; defaults to one per core"""
     library: bool = False
     """build the libraries of compiled kernels"""
     lanes: tuple[int, ...] = ()
-    """numbers of lanes of the libraries; if not given, all of the family of processors"""
+    """numbers of lanes of the libraries; defaults to all of the family of processors"""
     family: Literal["x86_64", "aarch64"] | None = None
-    """family of processors of the libraries; if not given, this machine's; for another one, CC must
+    """family of processors of the libraries; defaults to this machine's; for another one, CC must
     name a compiler that links for it, such as aarch64-linux-gnu-gcc"""
 
     def __post_init__(self) -> None:

@@ -52,9 +52,9 @@ class ConsistencyArgs:
     """start of the filter: cold (from its first fix), warm (after some seconds of hovering), or
     matched (with errors drawn from its own covariance, to test the filter without its start)"""
     every: float = 0.05
-    """time between two evaluations of the errors [s]"""
+    """evaluation interval [s]"""
     settle: float = 0.0
-    """time at the start that is left out of the means [s]"""
+    """initial transient excluded from averages [s]"""
     output: Path = Path("results/consistency")
     """folder for figures and numbers"""
     threads: options.Threads = None
@@ -63,23 +63,23 @@ class ConsistencyArgs:
     form: Literal["suite", "report", "corrected"] = "suite"
     """form of filter and IMU: the suite's, the report's, or the one with all corrections"""
     samples: Literal["instant", "average"] | None = None
-    """quantity in an IMU sample; if not given, the form's"""
+    """quantity in an IMU sample; defaults to the form's"""
     integration: Literal["euler", "midpoint"] | None = None
-    """integration of IMU samples by the filter; if not given, the form's"""
+    """integration of IMU samples by the filter; defaults to the form's"""
     attitude_reset: bool | None = None
-    """transform the covariance when the attitude is corrected; if not given, as the form does"""
+    """transform the covariance when the attitude is corrected; defaults to what the form does"""
     bearing_noise_at: Literal["measured", "predicted", "pinhole"] | None = None
-    """direction to which the filter assumes camera noise is perpendicular; if not given, the
+    """direction to which the filter assumes camera noise is perpendicular; defaults to the
     form's"""
     estimator: options.EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
     imu_rate: float | None = None
-    """IMU samples and filter cycles per second [Hz]; if not given, the suite's"""
+    """IMU samples and filter cycles per second [Hz]; defaults to the suite's"""
     gnss_rate: float | None = None
-    """GNSS fixes per second [Hz]; if not given, the suite's"""
+    """GNSS fixes per second [Hz]; defaults to the suite's"""
     camera_rate: float | None = None
-    """images per second [Hz]; if not given, the suite's"""
+    """images per second [Hz]; defaults to the suite's"""
 
     mass_factor: float = 1.0
     """true mass, relative to the mass that the controller assumes"""

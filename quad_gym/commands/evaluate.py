@@ -69,7 +69,7 @@ class EvaluateArgs:
     first one in which some of them crash and others do not, or else the first. Long episodes are
     shown in 6.5 s. none: no video"""
     output: Path | None = None
-    """folder for figures and numbers; if not given, results/evaluate/TASK, or TASK_2 and so on
+    """folder for figures and numbers; defaults to results/evaluate/TASK, or TASK_2 and so on
     if there are results already"""
     overwrite: bool = False
     """replace earlier results in the folder"""
@@ -167,7 +167,7 @@ def main(args: EvaluateArgs) -> None:
         args = options.with_full_id(args)
         cases, folder = configure(args)
     began = time.perf_counter()
-    bar = tqdm(cases.items(), desc="flying", unit=" cases")
+    bar = tqdm(cases.items(), desc="evaluating", unit=" cases")
     results = {case: fly(policy, env, args.seed) for case, (policy, env) in bar}
     print(
         f"\n{args.env_id}, sensors {options.sensors_of(args.env_id, args.sensors)}; "

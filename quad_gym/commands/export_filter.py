@@ -25,9 +25,9 @@ class ExportFilterArgs:
     policy: str | None = None
     """also export a policy that acts on the estimate: pretrained, or a file of quad-gym train"""
     env_id: str | None = None
-    """environment of the policy; if not given, from its training record"""
+    """environment of the policy; defaults to that of its training record"""
     output: Path | None = None
-    """folder to write; if not given, in results/export"""
+    """folder to write; defaults to one in results/export"""
     overwrite: bool = False
     """replace an existing library"""
 

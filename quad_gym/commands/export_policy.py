@@ -46,16 +46,16 @@ class ExportPolicyArgs:
             str | None,
             tyro.conf.arg(
                 metavar="[ENV_ID]",
-                help="environment of the policy; if not given, from its training record",
+                help="environment of the policy; defaults to that of its training record",
             ),
         ]
     ] = None
     to: Literal["c", "onnx"] = "c"
     """format of the file"""
     env: Keywords = field(default_factory=dict)
-    """keywords of the environment; if not given, from the training record"""
+    """keywords of the environment; defaults to those of the training record"""
     output: Path | None = None
-    """file to write; if not given, in results/export; its name is also the function's name"""
+    """file to write; defaults to one in results/export; its name is also the function's name"""
     overwrite: bool = False
     """replace an existing file"""
 

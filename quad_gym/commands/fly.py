@@ -53,11 +53,11 @@ class FlyArgs:
     observation: Literal["estimate", "truth", "noisy", "measurements"] = "estimate"
     """observation of the controller"""
     action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] | None = None
-    """commands of the controller; if not given, the task's default"""
+    """commands of the controller; defaults to the task's default"""
     seed: int = 0
     """seed of the episode; in the window, the next episodes have consecutive seeds"""
     duration: float | None = None
-    """time limit [s]; if not given, the task's default"""
+    """time limit [s]; defaults to the task's default"""
     env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as control_rate=100 world=breeze"""
 
@@ -66,9 +66,9 @@ class FlyArgs:
     camera: bool = True
     """measure with the camera, if the suite has one"""
     gnss_rate: float | None = None
-    """GNSS fixes per second [Hz]; if not given, the suite's"""
+    """GNSS fixes per second [Hz]; defaults to the suite's"""
     camera_rate: float | None = None
-    """images per second [Hz]; if not given, the suite's"""
+    """images per second [Hz]; defaults to the suite's"""
     faults: Annotated[
         tuple[str, ...],
         arg(
@@ -77,16 +77,16 @@ class FlyArgs:
         ),
     ] = ()
     fault_time: tuple[float, float] | None = None
-    """start and end of the faults [s]; if not given, the defaults of each fault"""
+    """start and end of the faults [s]; defaults to the defaults of each fault"""
 
     view: Literal["fixed", "chase"] = "fixed"
     """view of the whole scene from outside, or from behind the vehicle"""
     size: tuple[int, int] = (640, 480)
-    """width and height of the picture [pixels]"""
+    """width and height of a frame [pixels]"""
     speed: float = 1.0
     """playback speed, in seconds of flight per second; 0.5: slow motion"""
     fps: float = 25.0
-    """pictures per second of a video"""
+    """frames per second of a video"""
     output: Path | None = None
     """file to write instead of opening a window: a video (.mp4, .gif or .webp), saved with the
     flight as .npz; only the flight (.npz or .csv); or a recording for the Rerun viewer (.rrd)"""
@@ -223,7 +223,7 @@ def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
         return [path]
 
     def progress(times: Iterable[float]) -> Iterator[float]:
-        yield from tqdm(times, desc="drawing", unit=" pictures")
+        yield from tqdm(times, desc="rendering", unit=" frames")
         print(f"encoding {path} ...", file=sys.stderr, flush=True)
 
     look: dict[str, Any] = {name: getattr(args, name) for name in ("view", "size", "fps", "speed")}

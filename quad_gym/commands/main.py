@@ -8,7 +8,7 @@ from typing import Annotated, Any, Union, get_type_hints
 
 from tyro.conf import subcommand
 
-from quad_gym.commands.options import parse
+from quad_gym.commands.options import parse, without_empty_hints
 
 COMMANDS = {
     "circle": "reproduce the report's experiment over many seeds: tables and figures",
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
-            args = parse(subcommands(words), words, prog="quad-gym", description="")
+            args = parsed(words)
             return sys.modules[type(args).__module__].main(args) or 0
         finally:
             sys.stdout.flush()
@@ -56,6 +56,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     finally:
         if reports := sys.modules.get("quad_gym.analysis.reports"):
             reports.remove_unused_folders()
+
+
+def parsed(words: Sequence[str]) -> Any:
+    """Parse the options of the command that `words` call, or print the help of all commands."""
+    for command in COMMANDS:
+        name = command.split()
+        if list(words[: len(name)]) == name:
+            module = module_of(command)
+            about = {"prog": f"quad-gym {command}", "description": module.__doc__}
+            return parse(options_of(module), words[len(name) :], **about)
+    return parse(subcommands(words), words, prog="quad-gym", description="")
 
 
 def subcommands(words: Sequence[str]) -> Any:
@@ -89,7 +100,7 @@ def module_of(command: str) -> Any:
 
 def options_of(module: Any) -> Any:
     """Dataclass of a command's options, the argument of its `main`."""
-    return get_type_hints(module.main)["args"]
+    return without_empty_hints(get_type_hints(module.main)["args"])
 
 
 def _interrupted(error: BaseException | None) -> bool:

@@ -13,7 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_args
 
 import tyro
 from tyro.conf import Positional, arg
@@ -45,6 +46,7 @@ def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
         **options: Further options of `tyro.cli`.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    kind = without_empty_hints(kind)
     with usage_errors((ValueError,)):
         args = tyro.cli(kind, args=words, registry=_REGISTRY, **options)
         for field in dataclasses.fields(args):
@@ -52,6 +54,32 @@ def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
             if name in words and getattr(args, field.name) in ((), {}):
                 raise ValueError(f"{name} must have at least one value, got none")
     return args
+
+
+def without_empty_hints(kind: Any) -> Any:
+    """Leave "(default: None)" out of the help of a dataclass of options, which is returned."""
+    for each in dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ():
+        made = each.default_factory
+        default = each.default if made is dataclasses.MISSING else made()
+        if default is None or default in ((), {}):
+            kind.__annotations__[each.name] = Annotated[each.type, arg(help_behavior_hint="")]
+    return kind
+
+
+@_REGISTRY.primitive_rule
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Rule of tyro for options without a default, whose help does not mention None."""
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if NoneType not in get_args(info.type) or len(kinds) != 1:
+        return None
+    given = _REGISTRY.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], set(info.markers)))
+    if not isinstance(given, PrimitiveConstructorSpec):
+        return None
+    return replace(
+        given,
+        is_instance=lambda value: value is None or given.is_instance(value),
+        str_from_instance=lambda value: [] if value is None else given.str_from_instance(value),
+    )
 
 
 @_REGISTRY.primitive_rule
@@ -197,7 +225,7 @@ Engine = Annotated[
 
 Threads = Annotated[
     int | None,
-    arg(help="number of threads; if not given, one per core; it does not affect results"),
+    arg(help="number of threads; defaults to one per core; it does not affect results"),
 ]
 
 TRACKING = tuple(
@@ -260,14 +288,13 @@ SuiteName = Annotated[str, arg(help=f"sensor suite: {_OR_FILE}")]
 
 OwnSuite = Annotated[
     str | None,
-    arg(help=f"sensor suite: {_OR_FILE}; if not given, the task's default, standard for most"),
+    arg(help=f"sensor suite: {_OR_FILE}; defaults to the task's default, standard for most"),
 ]
 
 EstimatorName = Annotated[
     str | None,
     arg(
-        help="estimator: ukf, ekf, or module:Class of a quad_gym.Estimator; if not given, the "
-        "suite's"
+        help="estimator: ukf, ekf, or module:Class of a quad_gym.Estimator; defaults to the suite's"
     ),
 ]
 
@@ -293,7 +320,7 @@ class ReadingArgs:
     body: Literal["flu", "frd"] = "flu"
     """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
     instance: Keywords = field(default_factory=dict)
-    """sensors to take where the log has several, such as magnetometer=1; if not given, those that
+    """sensors to take where the log has several, such as magnetometer=1; defaults to those that
     the autopilot used or prefers, else those with the most valid data"""
     topic: Keywords = field(default_factory=dict)
     """topics of a ROS bag to take, such as imu=/mavros/imu/data_raw"""

@@ -52,7 +52,7 @@ class ReplayArgs(ReadingArgs):
     [microtesla], declination and inclination [deg] of the magnetic field, from a model of the
     Earth's field"""
     heading: float | None = None
-    """heading of the body x axis at the start, from east toward north [deg]; if not given, from a
+    """heading of the body x axis at the start, from east toward north [deg]; by default from a
     baseline or a magnetometer, or else unknown"""
     start_position: tuple[float, float, float] | None = None
     """initial position east, north and up [m], level and at rest, with --heading; required for logs
@@ -68,7 +68,7 @@ class ReplayArgs(ReadingArgs):
     figure: bool = True
     """draw a figure"""
     output: Path | None = None
-    """folder for the results, created if it is missing; if not given, results/replay/LOG"""
+    """folder for the results, created if it is missing; defaults to results/replay/LOG"""
     overwrite: bool = False
     """replace the results of an earlier replay"""
 
@@ -147,7 +147,7 @@ def report_of(result: "Replay") -> str:
     if result.too_late:
         lines.append(f"Too late for the window: {result.too_late} measurements.")
     if result.unused:
-        lines.append(f"Not used, because the suite has none: {', '.join(result.unused)}.")
+        lines.append(f"Ignored (sensors not in the suite): {', '.join(result.unused)}.")
     if not result.heading_known[-1]:
         lines.append("The heading is still unknown at the end: use --heading or --course.")
     return "\n".join([table, *lines, "", *map(_capital, by_quantity(result.findings))])

@@ -45,36 +45,36 @@ class SweepArgs:
         Annotated[Path | None, tyro.conf.arg(help="the trainings, in TOML: see docs/sweeps.md")]
     ] = None
     env_ids: tuple[str, ...] = ()
-    """ids of environments, or their short names; if not given, circle"""
+    """ids of environments, or their short names; defaults to circle"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=standard,rtk"""
     algorithm: tuple[Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"], ...] = ()
-    """reinforcement learning algorithms; if not given, ppo"""
+    """reinforcement learning algorithms; defaults to ppo"""
     engine: Literal["sb3", "compiled"] | None = None
-    """training engine; if not given, sb3"""
+    """training engine; defaults to sb3"""
     steps: tuple[int, ...] = ()
-    """number of environment steps of each training; if not given, the recipe's"""
+    """number of environment steps of each training; defaults to the recipe's"""
     n_envs: tuple[int, ...] = ()
-    """number of parallel flights; if not given, the recipe's"""
+    """number of parallel flights; defaults to the recipe's"""
     set: Keywords = field(default_factory=dict)
     """parameters of the algorithm that override the recipe's, such as gamma=0.97,0.99"""
     recipe: Keywords = field(default_factory=dict)
     """other fields of the recipe, such as reward_scale=0.1,0.2"""
     seeds: int | None = None
-    """number of training seeds; if not given, 1"""
+    """number of training seeds; defaults to 1"""
     evaluations: int | None = None
-    """number of evaluations and checkpoints of each training; if not given, 20"""
+    """number of evaluations and checkpoints of each training; defaults to 20"""
     episodes: int | None = None
-    """number of episodes in each evaluation; if not given, 100"""
+    """number of episodes in each evaluation; defaults to 100"""
 
     output: Path | None = None
-    """folder; if not given, results/sweep/NAME, with the name of the file or of the first task"""
+    """folder; defaults to results/sweep/NAME, with the name of the file or of the first task"""
     executor: Literal["local", "slurm", "ray"] = "local"
     """processes of this machine, Slurm jobs through submitit, or Ray tasks"""
     options: Keywords = field(default_factory=dict)
     """options of the executor: parameters of submitit's AutoExecutor, or of ray.init"""
     jobs: int | None = None
-    """number of simultaneous trainings; if not given, one per core, or all with Slurm and Ray"""
+    """number of simultaneous trainings; defaults to one per core, or all with Slurm and Ray"""
     threads: int = 1
     """number of threads of each training; it does not affect results"""
     retries: int = RETRIES

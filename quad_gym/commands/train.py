@@ -35,19 +35,19 @@ class TrainArgs:
     env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth action=motor camera=false"""
     steps: int | None = None
-    """number of environment steps; if not given, the recipe's"""
+    """number of environment steps; defaults to the recipe's"""
     n_envs: int | None = None
-    """number of parallel flights; if not given, the recipe's"""
+    """number of parallel flights; defaults to the recipe's"""
     set: options.Parameters = field(default_factory=dict)
     seed: int = 0
     """seed of the networks, and of the flights in training and its evaluations; other seeds use
     different flights, and so does quad-gym evaluate"""
 
     output: Path | None = None
-    """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED; ALGORITHM begins
+    """folder of the run; defaults to results/train/TASK/ALGORITHM_seed_SEED; ALGORITHM begins
     with compiled_ for the compiled engine"""
     resume: bool = False
-    """continue the run in the folder, or begin one if there is none"""
+    """resume the run in this folder, or start a new one"""
     evaluations: int = 20
     """number of evaluations and checkpoints during the run"""
     episodes: int = 100

@@ -36,7 +36,7 @@ class TuneArgs:
     env_ids: Annotated[
         tuple[str, ...],
         arg(
-            help=f"{options.one_of(options.TRACKING)}; if not given, all of them",
+            help=f"{options.one_of(options.TRACKING)}; defaults to all of them",
             help_behavior_hint="",
         ),
     ] = options.TRACKING
@@ -48,7 +48,7 @@ class TuneArgs:
     gains: Literal["lab", "tuned"] = "lab"
     """gains to start from"""
     candidates: int = 400
-    """number of gains to fly, including the initial ones"""
+    """number of candidate gain sets, including the initial one"""
     episodes: int = 32
     """number of episodes of each candidate on each task"""
     fresh_episodes: int = 500
@@ -100,7 +100,7 @@ def main(args: TuneArgs) -> None:
     text, numbers = compare_gains(make_envs(args, args.fresh_episodes), gains, seed)
     print(
         f"\nPD on the {args.observation}, sensors {args.sensors}; "
-        f"{args.fresh_episodes:,} fresh episodes of each task.\n\n{text}\n"
+        f"{args.fresh_episodes:,} held-out episodes of each task.\n\n{text}\n"
         "Change: mean over pairs of episodes that did not crash, with its 95 % interval\n"
         "(Student's t)."
     )

@@ -252,7 +252,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     if numbers.shape != shape:
         raise ValueError(f"action must have shape {shape}, got {numbers.shape}")
     if not np.isfinite(numbers).all():
-        raise ValueError("action must be finite, got NaN or infinity among its numbers")
+        raise ValueError("action must be finite: it contains NaN or infinity")
     return numbers.clip(-1.0, 1.0)
 
 

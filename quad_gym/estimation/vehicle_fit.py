@@ -139,7 +139,7 @@ def _commands(motors: Mapping[str, ArrayLike]) -> tuple[Floats, Floats]:
     if len(times) < 2 or not (np.diff(times) > 0.0).all():
         raise ValueError("motors['time'] must increase")
     if not np.ptp(voltages, axis=0).any():
-        raise ValueError("motors['voltages'] must change in flight, got constant ones")
+        raise ValueError("motors['voltages'] must vary, but they are constant")
     return times, voltages
 
 

@@ -1,4 +1,4 @@
-"""The report's circle, flown on the true state and on estimates, with and without the camera."""
+"""The report's circle, on the true state and on estimates, with and without the camera."""
 
 import textwrap
 from collections.abc import Mapping
@@ -58,7 +58,7 @@ def error_table(results: Recordings) -> str:
         return [f"{1e3 * s.mean:.1f} ± {1e3 * s.sd:.1f}".replace("nan", "-") for s in spreads]
 
     means = ["whole flight", "last half"]
-    groups = {"": ["flown on the"], "tracking error [mm]": means, "estimation error [mm]": means}
+    groups = {"": ["evaluated on"], "tracking error [mm]": means, "estimation error [mm]": means}
     rows = [
         [
             LABELS[case],
@@ -113,7 +113,7 @@ def in_words(results: Recordings, suite: SensorSuite) -> str:
     sentences = [_sentence("Flying on the estimate", found[seen, TRUTH])]
     if seen == ESTIMATE:
         camera = found[ESTIMATE, NO_CAMERA]
-        sentences.append(_sentence("Having the camera", camera))
+        sentences.append(_sentence("Using the camera", camera))
         harmful = camera.significant and camera.spread.mean > 0.0
         if harmful and suite.estimator.bearing_noise_at == "measured":
             sentences.append(
@@ -146,7 +146,7 @@ def write_figures(results: Recordings, setup: Setup) -> list[Path]:
     look: dict[str, Any] = {"label": f"seed {setup.seeds[0]}"}
     limits, figures = plots.error_limits(traces, bands), {}
     for case, flights in results.items():
-        name, trace = f"flown on the {LABELS[case]}", flights.trace
+        name, trace = f"evaluated on the {LABELS[case]}", flights.trace
         if case != TRUTH:
             title = f"Path from above, {name}"
             figures[f"path_{case}"] = plots.flight_figure(plots.draw_path, trace, title=title)
@@ -157,10 +157,10 @@ def write_figures(results: Recordings, setup: Setup) -> list[Path]:
         )
     seen = ESTIMATE if ESTIMATE in results else NO_CAMERA
     errors = {
-        f"Error, flown on the {LABELS[case]}": (results[case].trace, results[case].band)
+        f"Error, evaluated on the {LABELS[case]}": (results[case].trace, results[case].band)
         for case in (seen, TRUTH)
     }
-    title = f"Path from above, flown on the {LABELS[seen]}"
+    title = f"Path from above, evaluated on the {LABELS[seen]}"
     figures["overview"] = plots.overview_figure(results[seen].trace, errors, title=title, **look)
     saved = (plots.save_figure(figure, setup.output / name) for name, figure in figures.items())
     return [file for pair in saved for file in pair]

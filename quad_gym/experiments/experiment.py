@@ -138,7 +138,7 @@ class Experiment(ABC):
     def fly(self) -> dict[str, list[Flown]]:
         """Fly all policies; returns the flights of each policy, by name of the trial."""
         flown = {}
-        for name, trial in tqdm(self.trials().items(), desc="flying", unit=" trials"):
+        for name, trial in tqdm(self.trials().items(), desc="evaluating", unit=" runs"):
             place = self.folder / "flights" / name
             flown[name] = [trial.flown(policy, place) for policy in self.policies(trial)]
         return flown

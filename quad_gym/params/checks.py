@@ -41,7 +41,7 @@ class UnknownKeywordError(TypeError, ValueError):
 
 
 class NotResetError(RuntimeError, ValueError):
-    """A flight was to be stepped that has never been reset."""
+    """Error of a step before the first reset."""
 
 
 def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
@@ -160,7 +160,7 @@ def angle(name: str, value: Any) -> float:
     result = number(name, value)
     if abs(result) > 2.0 * math.pi:
         meant = f"; did you mean {math.radians(result):.4g}?" if abs(result) <= 360.0 else ""
-        raise ValueError(f"{name} must be in rad, at most 2 pi either way, got {result:g}{meant}")
+        raise ValueError(f"{name} must be in rad, within ±2 pi, got {result:g}{meant}")
     return result
 
 
@@ -273,7 +273,7 @@ def vector(
 def _sized(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return numbers that are all at most LARGEST in magnitude."""
     if values.size and np.abs(values).max() > LARGEST:
-        raise ValueError(f"{name} must be at most {LARGEST:g} either way, got {values}")
+        raise ValueError(f"{name} must be within ±{LARGEST:g}, got {values}")
     return values
 
 

@@ -63,7 +63,7 @@ class PartsArgs(BenchmarkArgs):
     seeds: int = 10
     """number of training seeds of learning"""
     steps: int | None = None
-    """number of environment steps of each training of learning; if not given, the recipe's"""
+    """number of environment steps of each training of learning; defaults to the recipe's"""
     sensors: SuiteNames = ("standard", "rtk", "consumer", "indoor")
     estimators: tuple[str, ...] = ()
     """own estimators among filters, module:Class each"""

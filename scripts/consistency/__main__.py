@@ -36,7 +36,7 @@ class TableArgs:
     table: Positional[Literal["matrix", "recovery", "filters", "models"]]
     """table to compute"""
     episodes: int | None = None
-    """number of flights in each case; if not given, 400, or 1000 for filters and models"""
+    """number of flights in each case; defaults to 400, or 1000 for filters and models"""
     seed: int = 0
     """seed of the first flight; the others have consecutive seeds"""
     duration: float = 10.0
@@ -48,7 +48,7 @@ class TableArgs:
     filter_start: Literal["cold", "warm"] = "cold"
     """start of the filter of filters and models"""
     output: Path | None = None
-    """folder for the numbers; if not given, results/consistency_TABLE"""
+    """folder for the numbers; defaults to results/consistency_TABLE"""
     threads: Threads = None
 
     def __post_init__(self) -> None:

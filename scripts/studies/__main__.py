@@ -46,13 +46,13 @@ class StudyArgs:
         "QuadGym/LookAround-v0"
     )
     arms: tuple[str, ...] = ()
-    """names of arms; if not given, the arms behind the conclusions, or all of --arms-file"""
+    """names of arms; defaults to the arms behind the conclusions, or all of --arms-file"""
     arms_file: Path | None = None
-    """a file with a tuple ARMS, as scripts/studies/arms.py has; if not given, that one"""
+    """a file with a tuple ARMS, as scripts/studies/arms.py has; defaults to that one"""
     seeds: int = 5
     """number of training seeds"""
     steps: int | None = None
-    """number of environment steps of each training; if not given, the recipe's"""
+    """number of environment steps of each training; defaults to the recipe's"""
     set: options.Parameters = field(default_factory=dict)
     env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as duration=30.0"""
@@ -68,10 +68,10 @@ class StudyArgs:
     and parameters"""
     threads: options.Threads = None
     video: Literal["none", "webp", "gif", "mp4"] = "none"
-    """also write a film of this kind: policies trained on truth and on the estimate, side by side
+    """also render a side-by-side video: policies trained on truth and on the estimate, side by side
     in the same episode"""
     output: Path | None = None
-    """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
+    """folder; defaults to results/study/TASK (with --quick, .../TASK_quick)"""
 
 
 def arms_of(args: StudyArgs) -> tuple[Arm, ...]:

@@ -89,7 +89,7 @@ the size of the errors of a filter that always has features in view."""
 _WITH_STD = _task("WithStd", "baselines.arm_tasks")
 
 ARMS = (
-    Arm("pd_reference", "PD, facing as rewarded", policy="pd"),
+    Arm("pd_reference", "PD, tracks the rewarded heading", policy="pd"),
     Arm("pd_features", "PD, facing the features", policy="pd:features"),
     Arm(
         "pd_features_when_uncertain",
@@ -107,7 +107,7 @@ ARMS = (
     Arm("noisy", "truth + independent noise", training={"observation": "noisy"}),
     Arm(
         "noisier",
-        "truth + independent noise as large as the errors met",
+        "truth + noise matched to observed errors",
         training={"observation": "noisy", "sensors": _NOISIER},
     ),
     Arm("estimate", "estimate", parameters=_FAR_SIGHTED),

@@ -82,7 +82,7 @@ def write_film(results: StudyResults, kind: str) -> Path:
         results.study.folder / f"film.{kind}",
         fps=RATE,
         speed=results.study.about.film_speed,
-        progress=lambda times: tqdm(times, desc="filming", unit=" pictures"),
+        progress=lambda times: tqdm(times, desc="rendering", unit=" frames"),
     )
 
 

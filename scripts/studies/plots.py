@@ -49,7 +49,7 @@ def pace_figure(episodes: Mapping[str, Episode]) -> Any:
                 style: dict[str, Any] = {"color": plots.GREY, "alpha": 0.2, "linewidth": 0}
                 axes.axvspan(failed[0], failed[-1], label=label, **style)
         _mark_end(below, time, episode["speed"], "end")
-    grid[0, 0].set_ylabel("[m/s]")
+    grid[0, 0].set_ylabel("speed [m/s]")
     grid[0, 0].set_ylim(bottom=0.0)
     _finish(grid, episodes, "speed")
     return figure
@@ -68,7 +68,7 @@ def _finish(grid: Any, episodes: Mapping[str, Episode], column: str) -> None:
     """Set limits up to the last end of a trace, labels, and legends."""
     last = max(float(e["time"][np.isfinite(e[column])][-1]) for e in episodes.values())
     grid[0, 0].set_xlim(0.0, last)
-    grid[1, 0].set_ylabel("[m]")
+    grid[1, 0].set_ylabel("error, 3 sigma [m]")
     for row in grid:
         row[0].yaxis.set_tick_params(labelleft=True)
         row[-1].legend(

