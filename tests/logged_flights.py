@@ -193,7 +193,7 @@ class ULogWriter:
     def message(kind, content):
         return struct.pack("<HB", len(content), ord(kind)) + content
 
-    def topic(self, name, fields):
+    def topic(self, name, fields, instance=0):
         """Define and subscribe to a topic; return its number."""
         number, codes = len(self.packers), "<"
         for item in fields.rstrip(";").split(";"):
@@ -202,8 +202,9 @@ class ULogWriter:
                 kind, count = kind.rstrip("]").split("[")
             codes += _CODES[kind] * int(count)
         self.packers.append(struct.Struct(codes))
-        self.head += self.message("F", f"{name}:{fields}".encode())
-        subscription = struct.pack("<BH", 0, number) + name.encode()
+        if not instance:
+            self.head += self.message("F", f"{name}:{fields}".encode())
+        subscription = struct.pack("<BH", instance, number) + name.encode()
         self.data.append((-1, self.message("A", subscription)))
         return number
 

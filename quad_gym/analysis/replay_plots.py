@@ -9,6 +9,7 @@ from quad_gym.analysis.plots import BLUE, GREEN, ORANGE, PALE, VERMILLION, house
 from quad_gym.estimation.results import Measured, Replay, by_sensor
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
+_MOST = 4000  #: points of a curve
 _AXES = (BLUE, ORANGE, GREEN)
 _SENSORS = {
     "gnss_position": "NIS of positions",
@@ -24,18 +25,20 @@ _SENSORS = {
 
 def draw_states(axes: Any, result: Replay, name: str) -> None:
     """Draw "position", "velocity" or "attitude", with bands of two standard deviations."""
+    some = slice(None, None, 1 + len(result) // _MOST)
+    time, sigmas = result.time[some], result.sigma[some]
     first, unit = {"position": (0, "m"), "velocity": (3, "m/s"), "attitude": (6, "deg")}[name]
     labels, scale = ("east", "north", "up"), 1.0
     if name == "attitude":
-        angles = dcm_to_euler(quaternion_to_dcm(result.quaternion))
+        angles = dcm_to_euler(quaternion_to_dcm(result.quaternion[some]))
         values, labels, scale = np.unwrap(angles, axis=0), ("roll", "pitch", "yaw"), 180.0 / np.pi
     else:
-        values = getattr(result, name)
+        values = getattr(result, name)[some]
     for i, (label, color) in enumerate(zip(labels, _AXES, strict=True)):
-        curve, sigma = scale * values[:, i], scale * result.sigma[:, first + i]
+        curve, sigma = scale * values[:, i], scale * sigmas[:, first + i]
         band = (curve - 2.0 * sigma, curve + 2.0 * sigma)
-        axes.fill_between(result.time, *band, color=color, alpha=0.2, linewidth=0.0)
-        axes.plot(result.time, curve, color=color, linewidth=1.1, label=label)
+        axes.fill_between(time, *band, color=color, alpha=0.2, linewidth=0.0)
+        axes.plot(time, curve, color=color, linewidth=1.1, label=label)
     low, high = np.percentile(scale * values, [0.0, 100.0])
     margin = 0.1 * max(high - low, 1e-3)
     axes.set_ylim(low - margin, high + margin)

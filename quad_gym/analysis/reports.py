@@ -87,13 +87,20 @@ def stacked(tables: Iterable[Mapping[str, Iterable[Any]]]) -> dict[str, list[Any
     return columns
 
 
-def write_csv(file: Path, columns: Mapping[str, Sequence[Any]]) -> Path:
+_AT_ONCE = 4096  #: rows of arrays that are Python's numbers at a time
+
+
+def write_csv(file: Path, columns: Mapping[str, Any]) -> Path:
     """Write columns of equal length by heading as CSV, with empty cells for NaN and None."""
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(columns)
-        for row in zip(*columns.values(), strict=True):
-            writer.writerow(["" if as_json(cell) is None else cell for cell in row])
+        count = max(map(len, columns.values()), default=0)
+        for first in range(0, count, _AT_ONCE):
+            some = (values[first : first + _AT_ONCE] for values in columns.values())
+            lists = (v.tolist() if isinstance(v, np.ndarray) else v for v in some)
+            for row in zip(*lists, strict=True):
+                writer.writerow(["" if as_json(cell) is None else cell for cell in row])
     return file
 
 

@@ -31,7 +31,6 @@ from quad_gym.commands.options import (
 
 if TYPE_CHECKING:
     from quad_gym.estimation import Replay
-    from quad_gym.estimation.logs import Floats
     from quad_gym.params.sensors import SensorSuite
 
 RESULT = "replay.json"
@@ -157,27 +156,22 @@ def _capital(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}"
 
 
-def innovations_of(result: "Replay") -> dict[str, list[Any]]:
+def innovations_of(result: "Replay") -> dict[str, Any]:
     """Columns of all innovations, ordered by sensor."""
-    from quad_gym.analysis.reports import stacked
-
-    tables = []
+    found: dict[str, list[Any]] = {}
     for sensor, measured in result.measured.items():
-        table: dict[str, list[Any]] = {"sensor": [sensor] * len(measured.time)}
+        count = len(measured.time)
+        found.setdefault("sensor", []).append(np.full(count, sensor, object))
         for name in ("time", "received", "innovation", "sigma", "nis", "gate"):
             values = getattr(measured, name)
             if values.ndim == 1:
-                table[name] = values.tolist()
+                found.setdefault(name, []).append(values)
                 continue
-            wide = np.full((len(values), 3), np.nan)
+            wide = np.full((count, 3), np.nan)
             wide[:, : values.shape[1]] = values
-            table |= {f"{name}_{i}": wide[:, i].tolist() for i in range(3)}
-        tables.append(table)
-    return stacked(tables)
-
-
-def _lists(columns: "dict[str, Floats]") -> dict[str, list[float]]:
-    return {name: values.tolist() for name, values in columns.items()}
+            for i in range(3):
+                found.setdefault(f"{name}_{i}", []).append(wide[:, i])
+    return {name: np.concatenate(values) for name, values in found.items()}
 
 
 def main(args: ReplayArgs) -> None:
@@ -205,10 +199,10 @@ def main(args: ReplayArgs) -> None:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(MISFIT) from None
     print(report_of(result))
-    files = [write_csv(folder / "estimates.csv", _lists(result.columns()))]
+    files = [write_csv(folder / "estimates.csv", result.columns())]
     files.append(write_csv(folder / "innovations.csv", innovations_of(result)))
     if smoothed is not None:
-        files.append(write_csv(folder / "smoothed.csv", _lists(smoothed.columns())))
+        files.append(write_csv(folder / "smoothed.csv", smoothed.columns()))
     if args.figure:
         from quad_gym.analysis.plots import house_style, save_figure
         from quad_gym.analysis.replay_plots import replay_figure

@@ -151,9 +151,9 @@ def _within(recording: Recording, sources: Sequence[Source]) -> list[Source]:
         inside = (source.time > first - OTHER_CLOCK) & (source.time < last + OTHER_CLOCK)
         if len(source) and not inside.any():
             raise ValueError(
-                f"{recording.file}: the clocks of a log must have times in common, got "
-                f"{source.name} from {source.time.min():.3f} s to {source.time.max():.3f} s, and "
-                f"the IMU from {first:.3f} s to {last:.3f} s"
+                f"{recording.where}the clocks of a log must have times in common, got "
+                f"{source.sensor} ({source.name}) from {source.time.min():.3f} s to "
+                f"{source.time.max():.3f} s, and the IMU from {first:.3f} s to {last:.3f} s"
             )
         found.append(source.keep(inside, OUTSIDE))
     return found

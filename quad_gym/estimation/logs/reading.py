@@ -144,16 +144,15 @@ def _log_of(
             problems=tuple(recording.problems),
         )
     except ValueError as error:
-        raise ValueError(f"{recording.file}: {error}" if recording.file else str(error)) from None
+        raise ValueError(f"{recording.where}{error}") from None
 
 
 def _without_imu(recording: Recording, sources: Sequence[Source]) -> str:
     """Return an error about a log without samples of gyro and accelerometer."""
     names = {s.sensor for s in sources if s.sensor in ("gyro", "accel") and len(s)}
-    where = f"{recording.file}: " if recording.file else ""
-    why = "; ".join(recording.notes)
+    why = "".join(f"; {note}" for note in recording.notes)
     half = f" with both halves (it has only the {names.pop()})" if len(names) == 1 else ""
-    return f"{where}a log must have at least two IMU samples{half}, got 0{why and ': ' + why}"
+    return f"{recording.where}a log must have at least two IMU samples{half}, got 0{why}"
 
 
 def _joined(recording: Recording, gyro: Source, accel: Source) -> Source:

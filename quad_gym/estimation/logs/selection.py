@@ -65,7 +65,7 @@ def _asked(
     if not chosen:
         have = ", ".join(sorted({str(getattr(s, word)) for s in known})) or "none"
         raise ValueError(
-            f"{recording.file}: {word} of {sensor} must be one in the log ({have}), got {asked}"
+            f"{recording.where}{word} of {sensor} must be one in the log ({have}), got {asked}"
         )
     if word == "instance":
         least = min(s.tier for s in chosen)

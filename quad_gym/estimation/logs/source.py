@@ -80,6 +80,11 @@ class Recording:
     notes: list[str] = field(default_factory=list)  #: sentences on choices and dropped rows
     problems: list[str] = field(default_factory=list)  #: sentences on wrong quantities
 
+    @property
+    def where(self) -> str:
+        """Name of the file at the beginning of an error; empty: there is none."""
+        return f"{self.file}: " if self.file else ""
+
 
 def stack(topic: Mapping[str, Any], names: Sequence[str]) -> Floats:
     """Return (n, len(names)) columns of a topic side by side; NaN for a missing one."""

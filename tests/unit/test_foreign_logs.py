@@ -1,0 +1,385 @@
+"""Logs of others, with the defects that they have, replay to the truth or are refused by name."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation import read_log, replay
+from tests import foreign_logs as foreign
+from tests.foreign_logs import BOOT, EPOCH, Bag
+
+CONSUMER = quad_gym.sensor_suite("consumer")
+CLOSE = [0.8, 0.8, 1.0]  #: errors of the unchanged flight are below 0.4 m in all formats [m]
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return foreign.flight()
+
+
+def arrives(flight, log, clock=BOOT, sensors=CONSUMER, start=None, **options):
+    """Replay a log; its errors are small, and no alarm is raised."""
+    result = replay(log, sensors=sensors, start=start, **options)
+    errors = flight.errors(result, clock)
+    assert (np.abs(errors).max(axis=0) < CLOSE).all(), np.abs(errors).max(axis=0)
+    assert result.problems == ()
+    return result
+
+
+def has(sentences, *words):
+    """Some sentence has all of the words."""
+    found = [s for s in sentences if all(word in s for word in words)]
+    assert found, sentences
+    return found[0]
+
+
+# ---- ArduPilot -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def dataflash(flight, tmp_path):
+    pytest.importorskip("pymavlink")
+
+    def write(edit=lambda rows: rows, **options):
+        path = tmp_path / "flight.bin"
+        rows = edit(foreign.ardupilot_rows(flight, old="layouts" in options))
+        foreign.write_dataflash(path, rows, **options)
+        return path
+
+    return write
+
+
+def test_layout_before_2015_has_the_clock_of_the_vehicle(flight, dataflash):
+    path = dataflash(layouts=foreign.OLD_LAYOUTS)
+    result = arrives(flight, path)
+    assert len(result.measured["gnss_velocity"].time) == len(flight.fix_time) - 1
+    np.testing.assert_allclose(read_log(path).gnss.received, flight.fix_time + BOOT + 0.2)
+
+
+@pytest.mark.parametrize("place", [0, 350, 699])
+@pytest.mark.parametrize("hours", [1.0, -0.002])
+def test_a_wrong_stamp_costs_one_row(flight, dataflash, place, hours):
+    def edit(rows):
+        (row,) = [r for r in rows if r[1] == "IMU"][place : place + 1]
+        row[0] = max(row[0] + 3600.0 * hours, -BOOT)
+        return rows
+
+    log = read_log(dataflash(edit))
+    assert len(log.imu) == len(flight.time) - 1
+    np.testing.assert_allclose(np.delete(flight.time, place) + BOOT, log.imu.time, atol=1e-6)
+    has(log.notes, "imu", "1 row dropped", "wrong time stamp")
+    arrives(flight, log)
+
+
+def second_receiver(flight, lost):
+    """Rows of a receiver 0 without a fix from a time on, and of a receiver 1 with all of them."""
+
+    def edit(rows):
+        for row in [r for r in rows if r[1] == "GPS"]:
+            rows.append([row[0], "GPS", [1, *row[2][1:]]])
+            if row[0] > lost:
+                row[2][1:4] = [1, 0.0, 0.0]
+        return sorted(rows, key=lambda row: row[0])
+
+    return edit
+
+
+@pytest.mark.parametrize("lost", [-1.0, 6.0])
+def test_receiver_with_a_fix_is_taken(flight, dataflash, lost):
+    path = dataflash(second_receiver(flight, lost))
+    result = arrives(flight, path)
+    assert result.sources["gnss"]["taken"] == "GPS 1"
+    has(result.notes, "GPS", "left out" if lost < 0.0 else "is taken, not GPS")
+    if lost > 0.0:
+        chosen = read_log(path, instance={"gnss": 0})
+        assert chosen.gnss.received[-1] < lost + BOOT + 0.01
+        has(chosen.notes, "no data", "--instance gnss=1")
+    with pytest.raises(ValueError, match=r"flight.bin: instance of gnss must be .*\(0, 1\), got 5"):
+        read_log(path, instance={"gnss": 5})
+
+
+def test_pause_divides_a_flight_into_parts(flight, dataflash):
+    path = dataflash(lambda rows: [r for r in rows if not 2.0 < r[0] < 5.0])
+    result = arrives(flight, path)
+    has(result.notes, "flown in 2 parts")
+    assert not ((result.time > BOOT + 2.05) & (result.time < BOOT + 4.9)).any()
+    later = replay(path, sensors=CONSUMER, from_=BOOT + 5.0, until=BOOT + 12.0)
+    assert later.time[0] > BOOT + 4.9
+    assert later.time[-1] <= BOOT + 12.0
+    with pytest.raises(
+        ValueError, match="samples of the IMU from 100 s to inf s, got some from 20"
+    ):
+        read_log(path, from_=100.0)
+
+
+@pytest.mark.parametrize("field", [[0, 0, 0], [110, -50, 300]])
+def test_dead_compass_is_left_out(flight, dataflash, field):
+    def edit(rows):
+        for row in rows:
+            row[2][1:] = field if row[1] == "MAG" else row[2][1:]
+        return rows
+
+    result = arrives(flight, dataflash(edit))
+    has(result.notes, "magnetometer", "left out")
+    assert "magnetometer" not in result.measured
+
+
+def test_imu_of_the_primary_estimator_is_taken(flight, dataflash):
+    """EK3_PRIMARY selects the second IMU; the first one has a wrong scale."""
+
+    def edit(rows):
+        extra = [[t, "IMU", [1, *values[1:]]] for t, name, values in rows if name == "IMU"]
+        for row in rows:
+            row[2][1:] = 3.0 * np.array(row[2][1:]) if row[1] == "IMU" else row[2][1:]
+        return sorted([*rows, *extra], key=lambda row: row[0])
+
+    result = arrives(flight, dataflash(edit, parameters=[("EK3_PRIMARY", 1.0)]))
+    assert result.sources["imu"]["taken"] == "IMU 1"
+    has(result.notes, "imu: IMU 1 is taken (EK3_PRIMARY 1), not IMU")
+
+
+# ---- PX4 -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prefer", [0, 1])
+def test_compass_of_higher_priority_is_taken(flight, tmp_path, prefer):
+    pytest.importorskip("pyulog")
+    bad = flight.fields + 4e-5 * np.sin(flight.baro_time)[:, np.newaxis]
+    fields = (bad, None) if prefer else (None, bad)
+    values = [("CAL_MAG0_PRIO", 75 - 25 * prefer), ("CAL_MAG1_PRIO", 50 + 25 * prefer)]
+    foreign.write_px4(tmp_path / "two.ulg", flight, fields, values)
+    result = arrives(flight, tmp_path / "two.ulg")
+    has(result.notes, "magnetometer", "is taken", f"CAL_MAG{prefer}_PRIO 75")
+    worse = read_log(tmp_path / "two.ulg", instance={"magnetometer": 1 - prefer})
+    assert np.ptp(np.linalg.norm(worse.magnetometer.values["magnetometer"], axis=1)) > 2e-5
+    foreign.write_px4(tmp_path / "two.ulg", flight, fields)  # no preference: the steadier field
+    arrives(flight, tmp_path / "two.ulg")
+
+
+def test_log_of_2016_has_compass_and_barometer_in_sensor_combined(flight, tmp_path):
+    pytest.importorskip("pyulog")
+    foreign.write_px4(tmp_path / "old.ulg", flight, combined=True)
+    result = arrives(flight, tmp_path / "old.ulg")
+    assert set(result.measured) >= {"barometer", "magnetometer", "gnss_position"}
+    has(result.notes, "magnetometer", "copy of the measurement before")
+    assert len(read_log(tmp_path / "old.ulg").magnetometer) < 1.1 * len(flight.baro_time)
+
+
+def test_heights_above_the_ellipsoid_that_are_not_filled_are_replaced(flight, tmp_path):
+    pytest.importorskip("pyulog")
+    foreign.write_px4(tmp_path / "flight.ulg", flight, ellipsoid=False)
+    arrives(flight, tmp_path / "flight.ulg")
+
+
+# ---- ROS -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bag(flight, tmp_path):
+    pytest.importorskip("rosbags")
+
+    def write(imu=True, gps=True, velocity=True, air=True, more=lambda bag: None, **options):
+        made = Bag()
+        if imu:
+            made.imu("/imu/data", flight)
+        if gps:
+            made.fixes("/gps/fix", flight, **options)
+        if velocity:
+            made.velocities("/gps/vel", flight, **({} if options.get("clock", 1) else options))
+        if air:
+            made.pressures("/imu/static_pressure", flight)
+        made.compass("/imu/mag", flight)
+        more(made)
+        return made.write(tmp_path / "flight.bag")
+
+    return write
+
+
+def test_gyro_and_accelerometer_on_two_topics_are_joined(flight, bag):
+    def more(made):
+        made.imu("/camera/gyro/sample", flight, accel=False)
+        made.imu("/camera/accel/sample", flight, gyro=False)
+
+    result = arrives(flight, bag(imu=False, more=more), EPOCH)
+    has(result.notes, "/camera/gyro/sample", "/camera/accel/sample", "joined")
+
+
+def test_topics_that_measured_nothing_are_skipped(flight, bag):
+    def more(made):
+        made.imu("/a/unknown", flight, gyro=False, accel=False)
+        made.imu("/b/zeros", flight, zeros=True)
+
+    result = arrives(flight, bag(more=more), EPOCH)
+    assert result.sources["imu"]["taken"] == "/imu/data"
+
+
+def test_receivers_velocity_comes_before_commands_and_parts_of_words(flight, bag):
+    def more(made):
+        made.velocities("/fixed_wing/cmd_vel", flight, 0.0 * flight.velocities + 2.0)
+        made.velocities("/a_prefix/velocity", flight, 0.0 * flight.velocities - 2.0)
+
+    result = arrives(flight, bag(more=more), EPOCH)
+    assert result.sources["gnss_velocity"]["taken"] == "/gps/vel"
+    wrong = read_log(bag(more=more), topic={"gnss_velocity": "/a_prefix/velocity"})
+    assert wrong.sources["gnss_velocity"]["taken"] == "/a_prefix/velocity"
+
+
+def test_repeated_fixes_count_once(flight, bag):
+    path = bag(times=5)
+    result = arrives(flight, path, EPOCH)
+    assert len(result.measured["gnss_position"].time) == len(flight.fix_time) - 1
+    has(result.notes, "/gps/fix", "repeated stamp", str(4 * len(flight.fix_time)))
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.01, 0.001])
+def test_static_pressure_is_taken_in_its_unit(flight, bag, factor):
+    def more(made):
+        made.pressures("/a/pressure_diff", flight, 3.0 + 0.0 * flight.heights)
+        made.pressures("/b/static_pressure", flight, factor * foreign.pressure(flight.heights))
+
+    result = arrives(flight, bag(air=False, more=more), EPOCH)
+    assert result.sources["barometer"]["taken"] == "/b/static_pressure"
+    has(result.notes, "/a/pressure_diff", "no pressure of the atmosphere")
+
+
+def test_stamps_that_were_never_set_are_replaced_by_times_of_recording(flight, bag):
+    result = replay(bag(clock=0), sensors=CONSUMER)
+    assert np.abs(flight.errors(result, EPOCH)).max() < 1.5  # 0.1 s late
+    has(result.notes, "/gps/fix", "never set", "times of recording")
+
+
+def test_clock_of_another_epoch_is_placed_by_times_of_recording_and_named(flight, bag):
+    result = replay(bag(clock=1234.0), sensors=CONSUMER)
+    assert np.abs(flight.errors(result, EPOCH)).max() < 1.5
+    has(result.problems, "/gps/fix", "another clock")
+
+
+def test_bag_without_imu_is_refused_by_name(flight, bag):
+    with pytest.raises(
+        ValueError, match=r"flight.bag must have messages sensor_msgs/Imu, got none"
+    ):
+        read_log(bag(imu=False))
+    with pytest.raises(ValueError, match=r"flight.bag.*both halves \(it has only the gyro\)"):
+        read_log(bag(imu=False, more=lambda made: made.imu("/gyro", flight, accel=False)))
+
+
+# ---- tables and folders --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["leica0", "vicon3", "mocap0", "optitrack"])
+def test_folder_with_doubled_rows_and_motion_capture_replays(flight, tmp_path, name):
+    def row(time, values):
+        return ",".join([str(round(1e9 * (time + EPOCH))), *(f"{x:.9f}" for x in values)])
+
+    inertial = np.column_stack([flight.gyro, flight.accel])
+    tables = {
+        "imu0": ("#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z", flight.time, inertial),
+        name: ("#timestamp [ns],p_RS_R_x [m],p_y,p_z", flight.fix_time, flight.fixes),
+    }
+    for folder, (heading, times, values) in tables.items():
+        (tmp_path / "mav0" / folder).mkdir(parents=True)
+        lines = [row(t, v) for t, v in zip(times, values, strict=True)]
+        lines.insert(50, lines[49])
+        (tmp_path / "mav0" / folder / "data.csv").write_text("\n".join([heading, *lines]))
+    gnss = CONSUMER.gnss.replace(primary_antenna_B=(0.0, 0.0, 0.0), velocity_sigma=None)
+    suite = CONSUMER.replace(barometer=None, magnetometer=None, gnss=gnss)
+    result = arrives(flight, tmp_path, EPOCH, suite, {"heading": 0.3})
+    has(result.notes, "imu0", "1 row dropped", "repeated stamp")
+
+
+def changed(table, rows=None, **columns):
+    """A copy of a table with other values where there are any; of some rows."""
+    found = {name: values.copy() for name, values in table.items()}
+    for name, change in columns.items():
+        have = np.flatnonzero(np.isfinite(found[name].reshape(len(found["time"]), -1)).all(axis=1))
+        have = have if rows is None else have[rows]
+        found[name][have] = change(found[name][have])
+    return found
+
+
+def test_dead_compass_and_doubled_sample_of_a_table_are_named(flight):
+    table = changed(flight.table(), magnetometer=lambda m: 0.0 * m)
+    twice = np.sort([*range(len(table["time"])), 100])
+    result = arrives(flight, {name: values[twice] for name, values in table.items()}, 0.0)
+    has(result.notes, "magnetometer", "left out")
+    has(result.notes, "1 row dropped", "repeated stamp")
+
+
+def test_first_fixes_at_zero_are_no_fixes(flight):
+    lla = np.full((len(flight.table()["time"]), 3), np.nan)
+    table = flight.table()
+    fixes = np.isfinite(table.pop("gnss_enu")).all(axis=1)
+    lla[fixes] = np.column_stack(flight.lla)
+    lla[np.flatnonzero(fixes)[:5]] = 0.0
+    result = replay(table | {"gnss_lla": lla}, sensors=CONSUMER)
+    assert len(result.measured["gnss_position"].time) == len(flight.fix_time) - 6
+    has(result.notes, "gnss", "5 rows dropped", "0, 0")
+    far = changed(flight.table(), gnss_enu=lambda p: p + np.array([300.0, 0, 0]))
+    far = changed(far, slice(0, 5), gnss_enu=lambda p: 0.0 * p)
+    has(read_log(far).notes, "5 rows dropped", "0, 0, 0")
+
+
+def test_heights_that_are_not_filled_are_not_fused(flight):
+    table = changed(flight.table(), gnss_enu=lambda p: p * [1.0, 1.0, 0.0])
+    result = replay(table, sensors=CONSUMER)
+    has(result.problems, "heights of GNSS are constant", "left out")
+    assert (np.abs(flight.errors(result)).max(axis=0) < [0.8, 0.8, 2.0]).all()
+
+
+def test_barometer_above_another_level_is_named_and_still_used(flight):
+    result = replay(changed(flight.table(), barometer=lambda b: b + 1816.0), sensors=CONSUMER)
+    assert [has(result.problems, "1816 m", "sea level")] == list(result.problems)
+    assert (np.abs(flight.errors(result)).max(axis=0) < CLOSE).all()
+    assert len(result.measured["barometer"].time) > 200
+
+
+@pytest.mark.parametrize(
+    ("change", "unit"), [(lambda b: b / 0.3048, "in ft"), (lambda b: 950.0 - 0.113 * b, "in hPa")]
+)
+def test_barometer_in_another_unit_is_named_and_left_out(flight, change, unit):
+    result = replay(changed(flight.table(), barometer=change), sensors=CONSUMER)
+    has(result.problems, "barometer", unit, "left out")
+    assert "barometer" not in result.measured
+
+
+def in_radians(v):
+    """Velocities of a course in radians that was taken for degrees."""
+    course = np.radians(np.arctan2(v[:, 0], v[:, 1]) % (2.0 * np.pi))
+    speed = np.hypot(v[:, 0], v[:, 1])
+    return np.column_stack([speed * np.sin(course), speed * np.cos(course), v[:, 2]])
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (in_radians, "course in radians"),
+        (lambda v: 100.0 * v, "cm/s"),
+        (lambda v: v[:, [1, 0, 2]] * [1.0, 1.0, -1.0], "north, east, down"),
+        (np.negative, "sign is reversed"),
+    ],
+)
+def test_velocities_against_differenced_positions_are_named_and_left_out(flight, change, cause):
+    long = foreign.flight(24.0)
+    table = changed(long.table(), gnss_velocity_enu=change)
+    result = replay(table, sensors=CONSUMER)
+    has(result.problems, "velocities contradict the positions", cause)
+    assert "gnss_velocity" not in result.measured
+    assert (np.abs(long.errors(result)).max(axis=0) < 2.0).all()
+
+
+def test_clocks_with_nothing_in_common_are_refused_with_both_ranges(flight):
+    table = flight.table()
+    fixes = np.isfinite(table["gnss_enu"]).all(axis=1)
+    table["time"][fixes] += EPOCH
+    pattern = r"gnss.*from 1700000000\.000 s to .* and the IMU from 0\.020 s to 14\.000 s"
+    with pytest.raises(ValueError, match=pattern):
+        replay(table, sensors=CONSUMER)
+
+
+def test_calm_flight_gives_no_false_finding():
+    """A vehicle at rest: heights and velocities hardly change, and nothing is left out."""
+    still = foreign.flight(14.0, rest=100.0)
+    log = still.table()
+    result = replay(log, sensors=CONSUMER)
+    assert result.notes == result.problems == ()
+    assert set(result.measured) == {"gnss_position", "gnss_velocity", "barometer", "magnetometer"}
