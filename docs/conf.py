@@ -25,7 +25,7 @@ extensions = [
     "extensions.equations",
     "extensions.films",
 ]
-exclude_patterns = ["_build", "gallery", "tutorials/*.ipynb", "tutorials/*.py"]
+exclude_patterns = ["_build", "gallery", "paper", "tutorials/*.ipynb", "tutorials/*.py"]
 suppress_warnings = [
     "config.cache",  # settings of the gallery are objects
     # CONTRIBUTING.md and CHANGELOG.md are at the top of the repository and are included here

@@ -73,6 +73,22 @@ OPENINGS = (
 )
 """Openings to avoid: a docstring begins with a noun or an imperative verb."""
 
+SEMICOLONS = 6.0  #: largest number per 1,000 words of a page
+MANY_SEMICOLONS = (
+    *("CHANGELOG.md", "docs/architecture.md", "docs/calibration.md", "docs/compiling.md"),
+    *("docs/configure.md", "docs/deployment.md", "docs/environments.md", "docs/estimators.md"),
+    *("docs/faults-and-worlds.md", "docs/filter-equations.md", "docs/flights.md", "docs/logs.md"),
+    *("docs/recovery.md", "docs/sensors-and-filter.md", "docs/sweeps.md", "docs/training.md"),
+)
+"""Pages that have more, until they are revised."""
+VERBS = (
+    r"(is|are|was|were|be|has|have|had|do|does|can|cannot|may|must|will|adds?|begin|belong|build|"
+    r"builds|compiles?|consider|evaluates?|exports?|follows?|include|install|lets?|lists?|"
+    r"localize|look|looks|makes?|need|needs|provides?|reach|read|report|see|selects?|shows?|"
+    r"simulates?|takes?|use|uses)"
+)
+"""Verbs of sentences in README, one of which each sentence needs."""
+
 TABLE_OF_WORDS = r"<!-- words -->.*?<!-- /words -->"
 QUOTED = re.compile(
     TABLE_OF_WORDS + r"|^(?P<fence>[ ]*```+).*?^(?P=fence)[ ]*$|\$\$.*?\$\$|``[^`]+``|`[^`\n]+`"
@@ -117,6 +133,28 @@ def count(text: str, where: str, first_line: int = 1) -> Count:
         line = first_line + text.count("\n", 0, match.start())
         found.append(f"{where}:{line} [{match[0]}] {excerpt}")
     return Count(len(re.findall(r"[A-Za-z][A-Za-z'-]+", text)), found)
+
+
+def prose(page: Path) -> str:
+    """Sentences of a page, without code, formulas, links, tables and headings."""
+    text = QUOTED.sub(blanked, page.read_text(encoding="utf-8"))
+    return "\n".join(line for line in text.split("\n") if not re.match(r"\s*(\||#|\[!)", line))
+
+
+def syntax() -> list[str]:
+    """Pages with too many semicolons, and sentences of README without a verb."""
+    bad = []
+    for file in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]):
+        name, text = file.relative_to(ROOT).as_posix(), prose(file)
+        words, found = len(re.findall(r"[A-Za-z][A-Za-z'-]+", text)), text.count(";")
+        if found > max(1.0, SEMICOLONS * words / 1000.0) and name not in MANY_SEMICOLONS:
+            bad.append(f"{name} has {found} semicolons in {words} words")
+    for sentence in re.split(r"(?<=[.:?])\s|\n\n|\n- ", prose(ROOT / "README.md")):
+        if len(re.findall(r"[a-z]{2,}", sentence)) > 2 and not re.search(
+            rf"\b{VERBS}\b", sentence, re.IGNORECASE
+        ):
+            bad.append(f"README.md has a sentence without a verb: {' '.join(sentence.split())}")
+    return bad
 
 
 def docstrings(file: Path) -> list[Count]:
@@ -175,7 +213,8 @@ def main() -> int:
     bad = too_many(found)
     for text in bad:
         print(f"{text} has too many words of the table in CONTRIBUTING.md", file=sys.stderr)
-    return int(bool(bad))
+    print(*(wrong := syntax()), sep="\n", file=sys.stderr)
+    return int(bool(bad or wrong))
 
 
 if __name__ == "__main__":

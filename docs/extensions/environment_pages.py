@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import docstring_parser
 
 import quad_gym
+from docs.extensions import policy_cards
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
@@ -334,6 +335,7 @@ def pages() -> dict[Path, str]:
         "drawable": _drawable_page(),
         "suites": _suites_page(),
         "fields": _fields_page(),
+        "policies": policy_cards.page(),
     }
     guide = re.sub(
         r"(<!-- observation -->\n).*?(<!-- /observation -->)",

@@ -53,6 +53,21 @@ def test_no_text_has_many_words_to_avoid():
     assert dialect.too_many(dialect.counts()) == []
 
 
+def test_pages_have_few_semicolons_and_readme_has_a_verb_in_each_sentence():
+    assert dialect.syntax() == []
+
+
+def test_a_sentence_without_a_verb_is_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(dialect, "ROOT", tmp_path)
+    page = tmp_path / "README.md"
+    page.write_text(
+        "# Title\n\nOne line with no end; and another; and more;\n\nIt takes a minute.\n"
+    )
+    semicolons, verb = dialect.syntax()
+    assert semicolons == "README.md has 3 semicolons in 12 words"
+    assert verb.endswith("without a verb: One line with no end; and another; and more;")
+
+
 def test_contributing_has_the_table_of_words():
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     rows = page.split("<!-- words -->")[1].split("<!-- /words -->")[0].strip().split("\n")[2:]
