@@ -58,7 +58,13 @@ TARGETS = {
 
 
 def export_filter(
-    suite: SensorSuite, label: str, target: str, folder: Path, policy: Controller | None = None
+    suite: SensorSuite,
+    label: str,
+    target: str,
+    folder: Path,
+    policy: Controller | None = None,
+    *,
+    imu_rate: float = 0.0,
 ) -> list[Path]:
     """Write a filter's library, header, example, and files that build and explain them.
 
@@ -68,6 +74,8 @@ def export_filter(
         target: One of TARGETS.
         folder: Folder to write to; created if it does not exist.
         policy: Policy that acts on the estimate; None: the filter alone.
+        imu_rate: Highest rate of the IMU, if it exceeds the suite's [Hz]: memory for late
+            measurements.
 
     Raises:
         ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
@@ -83,7 +91,7 @@ def export_filter(
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
     done = subprocess.run(
         [sys.executable, "-c", "from baselines.exporting.filter_process import write; write()"],
-        input=pickle.dumps((suite, label, target, values)),
+        input=pickle.dumps((suite, label, target, values, imu_rate)),
         stdout=subprocess.PIPE,
         env={**os.environ, **env, "PYTHONPATH": path},
         check=False,

@@ -26,10 +26,10 @@ def write() -> None:
 
 
 def _contents(
-    suite: SensorSuite, label: str, target: str, policy: dict[str, Any]
+    suite: SensorSuite, label: str, target: str, policy: dict[str, Any], imu_rate: float
 ) -> dict[str, bytes]:
     """Return the files by name; records must have one lane."""
-    sources = Sources(suite, label, target, policy)
+    sources = Sources(suite, label, target, policy, imu_rate)
     processor = Processor(*TARGETS[target].processor)
     missing = [name for name in sources.functions if not is_cached(name, processor)]
     if missing:

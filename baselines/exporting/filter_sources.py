@@ -11,7 +11,6 @@ import numpy as np
 import quad_gym
 from baselines.exporting.filter_library import HEADER, TARGETS
 from baselines.exporting.source import filled
-from quad_gym.estimation import first_motion
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.first_fix import FARTHEST_FIX, LEAST_COURSE
@@ -58,11 +57,20 @@ _WINDOW = 0.5  #: longest delay of measurements beyond the suite's `log_delays` 
 class Sources:
     """Contents of the files of an exported filter of a suite, for one of TARGETS.
 
-    `policy` are the values of a policy for the templates (`policy_values`), or none.
+    `policy` are the values of a policy for the templates (`policy_values`), or none. The memory for
+    late measurements suffices for the suite's IMU rate, or `imu_rate` [Hz] if that is higher.
     """
 
-    def __init__(self, suite: SensorSuite, label: str, target: str, policy: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        suite: SensorSuite,
+        label: str,
+        target: str,
+        policy: dict[str, Any],
+        imu_rate: float = 0.0,
+    ) -> None:
         self.suite, self.label, self.target, self.policy = suite, label, target, policy
+        self.imu_rate = imu_rate
         self.engine = Engine(suite, suite.estimator.kind)
         needed = needed_stages(self.engine.settings[0])
         self.stages = {stage: needed[stage] for stage in FILTER_STAGES if stage in needed}
@@ -149,6 +157,7 @@ class Sources:
             "OF_MASK": offset_of(WORK_BLOCK, "mask"),
             "OF_POSITION_SIGMA": offset_of(PARAMS_BLOCK, "position_sigma_I"),
             "OF_TILT_SIGMA": offset_of(PARAMS_BLOCK, "initial_tilt_sigma"),
+            "OF_LEVEL": offset_of(STEP_BLOCK, "level"),
             "OF_VELOCITY_VARIANCE": offset_of(PARAMS_BLOCK, "initial_velocity_variance"),
         }
         fields = {"POSITION": "r_hat", "VELOCITY": "v_hat", "STATUS": "filter_status"}
@@ -176,10 +185,9 @@ class Sources:
     def _suite_values(self) -> dict[str, Any]:
         suite, engine = self.suite, self.engine
         sensors = [s for s in (suite.gnss, suite.camera, *suite.aids.values()) if s is not None]
-        delays = vars(suite.log_delays)
-        window = _WINDOW + max(0.0, *delays.values())
+        window = _WINDOW + max(0.0, *vars(suite.log_delays).values())
         rate = sum(sensor.rate for sensor in sensors)
-        events = math.ceil(1.25 * window * (suite.imu.rate + rate)) + 24
+        events = math.ceil(1.25 * window * (max(suite.imu.rate, self.imu_rate) + rate)) + 24
         measurements = math.ceil(1.25 * window * rate) + 16
         copies = events // 8 + 2
         words = sum(
@@ -193,7 +201,6 @@ class Sources:
         )
         rest = state_at_rest(suite, (0.0, 0.0, 0.0), 0.0, 0.0)["covariance"]
         return {
-            **self._motion_values(),
             "TITLE": f"State estimator: {suite.estimator.kind.upper()} of the sensor suite "
             f'"{self.label}", quad_gym {quad_gym.__version__}.',
             "SUITE": self.label,
@@ -210,12 +217,11 @@ class Sources:
             "REST_SIGMA": _numbers(np.sqrt(np.diag(rest))),
             "REFERENCE": _numbers(suite.gnss.reference_antenna_G if suite.gnss else (0, 0, 0)),
             "R_IG": _numbers(engine.params["R_IG"].ravel()),
-            **{f"DELAY_{name.upper()}": repr(float(delay)) for name, delay in delays.items()},
         }
 
     def _sensor_values(self) -> dict[str, Any]:
         suite, gnss = self.suite, self.suite.gnss
-        parts = ("AID_MACROS", "AID_FIELDS", "AID_TAKE", "AID_API", "AID_SOURCE")
+        parts = ("AID_MACROS", "AID_FIELDS", "AID_TAKE", "AID_API", "AID_SOURCE", "AID_ROWS")
         texts = dict.fromkeys(parts, "")
         for aid in suite.aids:
             name, count, note = aid.name.lower(), AID_FREEDOMS[aid], _AID_NOTES[aid]
@@ -229,6 +235,9 @@ class Sources:
             texts["AID_FIELDS"] += f"    const double *{name}; /* {count}: {note} */\n"
             texts["AID_FIELDS"] += f"    double {name}_sigma;\n"
             texts["AID_API"] += f"{call}; /* {note} */\n"
+            texts["AID_ROWS"] += (
+                f'    if (!strcmp(name, "{name}"))\n        m.{name} = x + 1;\n    else\n'
+            )
             texts["AID_TAKE"] += filled("aid_take.c", given)
             texts["AID_SOURCE"] += filled("aid_update.c", given)
         values: dict[str, Any] = {
@@ -244,18 +253,6 @@ class Sources:
             **{"BASELINE_BLOCK": BASELINE_BLOCK, "VELOCITY_BLOCK": VELOCITY_BLOCK},
         }
         return values if gnss is None else {**values, **self._start_values()}
-
-    def _motion_values(self) -> dict[str, str]:
-        """Return the numbers with which the example recognizes a start in motion."""
-        gnss, form = self.suite.gnss, self.suite.estimator
-        tilt = form.initial_tilt_sigma
-        names = ("SPAN", "TURNING", "FAST", "CERTAIN")
-        return {
-            **{f"MOTION_{name}": repr(getattr(first_motion, name)) for name in names},
-            "MOTION_TILT": repr(0.0 if tilt is None else max(tilt, first_motion.TILT)),
-            "MOST_POSITION_SIGMA": repr(float(max(gnss.position_sigma_I))) if gnss else "0.0",
-            "SUITE_SPEED_SIGMA": repr(math.sqrt(form.initial_velocity_variance)),
-        }
 
     def _start_values(self) -> dict[str, Any]:
         suite, compass = self.suite, self.suite.magnetometer

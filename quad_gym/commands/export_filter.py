@@ -6,11 +6,15 @@
 
 Writes a folder with a static library, a C99 header, an example that filters a log, and a CMake
 file. The estimates are bitwise those of `quad-gym replay`. docs/deployment.md explains the use.
+
+    quad-gym export filter --sensors mine.toml --log flight.csv --output filter
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from quad_gym.commands.options import SuiteName, full_id, refuse_overwriting, usage_errors
 
@@ -24,6 +28,9 @@ class ExportFilterArgs:
     """processor: x86-64 (with AVX2) or aarch64 with Linux, cortex-m7, or WebAssembly"""
     policy: str | None = None
     """also export a policy that acts on the estimate: pretrained, or a file of quad-gym train"""
+    log: Path | None = None
+    """log of a flight at the place where the filter will run: the origin of its positions, magnetic
+    field and rate of the IMU; if not given, the suite's"""
     env_id: str | None = None
     """environment of the policy; defaults to that of its training record"""
     output: Path | None = None
@@ -37,6 +44,8 @@ def main(args: ExportFilterArgs) -> None:
     from baselines.exporting import controller_of
     from baselines.exporting.filter_library import LIBRARY, export_filter
     from quad_gym.analysis.reports import require_writable
+    from quad_gym.estimation import read_log
+    from quad_gym.estimation.replaying import origin_of
     from quad_gym.params.suites import sensor_suite, suite_label
 
     with usage_errors((ValueError, OSError, ImportError, RuntimeError)):
@@ -48,7 +57,12 @@ def main(args: ExportFilterArgs) -> None:
             raise ValueError("--env-id must come with --policy")
         env_id = None if args.env_id is None else full_id(args.env_id)
         policy = None if args.policy is None else controller_of(args.policy, env_id)
-        files = export_filter(suite, label, args.target, folder, policy)
+        rate = 0.0
+        if args.log is not None:
+            log = read_log(args.log)
+            suite = origin_of(log.corrected(suite), suite)
+            rate = 1.0 / float(np.median(np.diff(log.imu.time)))
+        files = export_filter(suite, label, args.target, folder, policy, imu_rate=rate)
     print(
         f"Wrote {len(files)} files to {folder}: the {suite.estimator.kind.upper()} of the suite "
         f'"{args.sensors}" for {args.target}. README.md there explains how to build and call it.'

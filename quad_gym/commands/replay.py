@@ -64,6 +64,9 @@ class ReplayArgs(ReadingArgs):
     """use the accuracy reported by the receiver, if the log contains it"""
     smooth: bool = False
     """write the smoothed trajectory as well"""
+    samples: Path | None = None
+    """file (.csv) to write the filter's inputs to, row by row, for the example of an exported
+    filter"""
     figure: bool = True
     """draw a figure"""
     output: Path | None = None
@@ -91,6 +94,9 @@ def folder_of(args: ReplayArgs) -> Path:
         raise ValueError("--smooth must not be given with an --estimator of your own")
     if args.figure:
         require_matplotlib()
+    if args.samples is not None:
+        refuse_overwriting(args.samples, args.overwrite)
+        require_writable("--samples", args.samples.parent)
     folder = args.output or Path("results/replay") / args.log.stem
     refuse_overwriting(folder / RESULT, args.overwrite)
     require_writable("--output", folder)
@@ -192,7 +198,7 @@ def main(args: ReplayArgs) -> None:
         }
         try:
             log = read_log(args.log, **args.reading())
-            result = replay(log, window=args.window, **options)
+            result = replay(log, window=args.window, samples=args.samples, **options)
             if args.smooth:
                 smoothed = smooth(log, **options)
         except MisfitError as error:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.calls import Calls
 from quad_gym.estimation.filters import (
     LONGEST_STEP,
     ExtendedKalmanFilter,
@@ -50,6 +51,7 @@ class Player:
     """Processes the contents of a log with a filter, in the order of arrival.
 
     Without a window, measurements are processed in the order of their time stamps, none late.
+    With `calls`, what the filter receives is added to them.
     """
 
     def __init__(
@@ -60,7 +62,9 @@ class Player:
         start: dict[str, Any],
         reported_noise: bool,
         window: float | None,
+        calls: Calls | None = None,
     ) -> None:
+        self.calls = calls
         self.log, self.suite, self.estimator = log, suite, estimator
         self.in_order, window = window is None, window or 0.0
         self.start, self.reported = start, reported_noise
@@ -198,6 +202,11 @@ class Player:
         gyro, accel = self.gyros[chosen], self.accels[chosen]
         sample = Sample(gyro, accel, step, gyro if self.gyro is None else self.gyro)
         self.gyro = gyro
+        if self.calls is not None:
+            for stamp, name, k in self.waiting:
+                if stamp <= time + SAME_TIME:
+                    self._call_update(name, k)
+            self.calls.predict(sample)
         while self.waiting and self.waiting[0][0] < time - SAME_TIME:  # taken within the sample
             stamp, name, k = self.waiting.pop(0)
             if (elapsed := stamp - self.history.time) > SAME_TIME:
@@ -214,12 +223,20 @@ class Player:
         if not self.running:
             self._try_to_start(name, k)
         elif stamp > self.history.time + SAME_TIME:
-            bisect.insort(self.waiting, (stamp, name, k))
+            if self._measurement(name, self.streams[name], k) is not None:
+                bisect.insort(self.waiting, (stamp, name, k))
         elif stamp < self.history.oldest - SAME_TIME:
             received = float(self.streams[name].received[k])
             self.late.setdefault(name, []).append(received - stamp)
         else:
+            self._call_update(name, k)
             self._update(name, k)
+
+    def _call_update(self, name: str, k: int) -> None:
+        if self.calls is not None:
+            measurement = self._measurement(name, self.streams[name], k)
+            if measurement is not None:
+                self.calls.update(name, float(self.streams[name].time[k]), measurement)
 
     def _update(self, name: str, k: int) -> None:
         stream, history = self.streams[name], self.history
@@ -400,6 +417,9 @@ class Player:
         """Process the samples since the time of the start."""
         self.running, begin = True, self.filter.time
         self.history.begin(begin)
+        if self.calls is not None:
+            given = self.first_state or {"time": begin, **self.start}
+            self.calls.start(given, self.filter.sensors, self.log.barometer_from_start)
         for i in self.held:
             if self.log.imu.time[i] > begin + SAME_TIME:
                 self._predict(i)
@@ -414,6 +434,8 @@ class Player:
         if self.running:
             self.times.append(self.history.time)
             self.writer.keep()
+            if self.calls is not None:
+                self.calls.keep()
 
     def _result(self, pieces: Iterable[Results]) -> Replay:
         """Return the estimates of all pieces of the tape."""

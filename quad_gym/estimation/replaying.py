@@ -3,10 +3,12 @@
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar, Unpack
 
 import numpy as np
 
+from quad_gym.estimation.calls import Calls
 from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
 from quad_gym.estimation.logs import Floats, Log, Reading, read_log
@@ -31,6 +33,7 @@ def replay(
     start: Mapping[str, Any] | None = None,
     reported_noise: bool = True,
     window: float = 0.5,
+    samples: Path | str | None = None,
     **reading: Unpack[Reading],
 ) -> Replay:
     """Filter a log.
@@ -62,6 +65,8 @@ def replay(
         reported_noise: True: use the accuracy that the receiver reports, if the log has it, in
             place of the suite's. An own estimator does not receive it.
         window: Longest delay of measurements beyond the suite's `log_delays` [s].
+        samples: File to write the calls of the filter to, see `quad_gym.estimation.calls`, which
+            an exported filter repeats.
         **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
@@ -71,16 +76,25 @@ def replay(
     own = None
     if not isinstance(estimator, str) or ":" in estimator:
         own, estimator = check.own("estimator", estimator, Estimator), "ukf"
+    if own is not None and samples is not None:
+        raise ValueError("samples must not be given with an estimator of your own")
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, reading)
     reach = window + max(0.0, *vars(suite.log_delays).values())
 
     def fly(part: Log, begin: dict[str, Any]) -> Replay:
-        player = Player(part, suite, estimator, begin, reported_noise, reach)
-        return player.play() if own is None else OwnPlayer(player, own).play()
+        calls = None if samples is None else Calls(suite)
+        player = Player(part, suite, estimator, begin, reported_noise, reach, calls)
+        found = player.play() if own is None else OwnPlayer(player, own).play()
+        if calls is not None:
+            rows.extend(calls.rows)
+        return found
 
+    rows: list[str] = []
     result = in_parts(whole, named_start(start), fly)
+    if samples is not None:
+        Path(samples).write_text("".join(rows), encoding="utf-8")
     return with_verdict(whole, reading.get("body", "flu"), suite, result)
 
 

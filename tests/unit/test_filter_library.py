@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +37,14 @@ needs_arm = pytest.mark.skipif(
     not (shutil.which(f"{ARM}-gcc") and shutil.which("qemu-arm-static")),
     reason="no gcc-arm-linux-gnueabihf, or no qemu-user-static",
 )
-FROM_REST = ("--start-position", "0", "0", "1.5", "--heading", "20")
 REST = {"position": (0.0, 0.0, 1.5), "heading": math.radians(20.0)}
+TURNED = quad_gym.sensor_suite("rtk")
+TURNED = TURNED.replace(
+    log_rotation=(0.05, 0.02, 0.1),
+    log_delays=TURNED.log_delays.replace(gnss=0.12, camera=-0.03),
+    imu=TURNED.imu.replace(lever_arm_B=(0.05, -0.02, 0.03)),
+)
+"""A suite as calibration finds it."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -47,7 +54,7 @@ def _folder():
 
 
 def exported(name, target="x86-64", policy=None):
-    folder = FOLDER / f"{name}_{target}_{policy is None}"
+    folder = FOLDER / f"{Path(name).stem}_{target}_{policy is None}"
     if not folder.exists():
         export_filter(quad_gym.sensor_suite(name), name, target, folder, policy)
     return folder
@@ -80,9 +87,11 @@ def estimates(*command):
     return names.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
 
 
-def require_equal(found, log, suite, start):
-    wanted = replay(log, sensors=suite, start=start)
-    names, rows = found
+def require_equal(run, log, suite, start):
+    """Replay a log, and compare with the output of a program on its samples."""
+    samples = FOLDER / f"samples_{len(list(FOLDER.iterdir()))}.csv"
+    wanted = replay(log, sensors=suite, start=start, samples=samples)
+    names, rows = run(samples)
     assert names == list(wanted.columns())
     np.testing.assert_array_equal(rows, np.array(list(wanted.columns().values())).T)
     assert len(rows) > 100
@@ -91,10 +100,95 @@ def require_equal(found, log, suite, start):
 @needs_compiler
 @pytest.mark.parametrize("name", ["rtk", "consumer", "standard", "indoor"])
 def test_example_prints_estimates_of_replay(name):
-    suite, log = quad_gym.sensor_suite(name), logged(name)
-    rests = suite.gnss is None
-    found = estimates(example(name, "x86-64"), log, *(FROM_REST if rests else ()))
-    require_equal(found, log, suite, REST if rests else {})
+    suite, program = quad_gym.sensor_suite(name), example(name, "x86-64")
+    start = REST if suite.gnss is None else {}
+    require_equal(partial(estimates, program), logged(name), suite, start)
+
+
+def turned_table():
+    """A table of `rtk`, whose columns other tests change."""
+    return Recorded(flown(quad_gym.sensor_suite("rtk"), 3.0), quad_gym.sensor_suite("rtk")).table()
+
+
+@functools.cache
+def calibrated():
+    """The example of the suite with rotation, delays and lever arm."""
+    TURNED.save(FOLDER / "turned.toml")
+    return example(str(FOLDER / "turned.toml"), "x86-64")
+
+
+@needs_compiler
+@pytest.mark.parametrize("change", ["none", "motors", "early fix", "missing numbers", "Unix time"])
+def test_example_of_a_calibrated_suite_prints_estimates_of_replay(change):
+    """Rotation, delays of both signs and a lever arm, on logs that the replay reads."""
+    table = turned_table()
+    if change == "motors":
+        table |= {f"motor_{k}": np.full(len(table["time"]), 3.0) for k in range(4)}
+    elif change == "early fix":
+        row = int(np.flatnonzero(np.isfinite(table["gnss_east"]))[0])
+        table = {name: np.insert(values, 0, values[row]) for name, values in table.items()}
+        for name in [name for name in table if name.startswith(("gyro", "accel", "pixel"))]:
+            table[name][0] = np.nan
+        table["time"][0] = table["received"][0] = -1.5
+    elif change == "missing numbers":
+        table["gnss_velocity_east"][::2] = np.nan
+        table["gnss_baseline_north"][::3] = np.nan
+    elif change == "Unix time":
+        table["time"], table["received"] = table["time"] + 1.7e9, table["received"] + 1.7e9
+    require_equal(partial(estimates, calibrated()), table, TURNED, {})
+
+
+@needs_compiler
+def test_example_refuses_measurements_older_than_its_memory(tmp_path):
+    """With an IMU of 1 kHz, it has room for a tenth of the delay."""
+    n = 3000
+    table = {"time": 1e-3 * np.arange(n), "gyro": np.zeros((n, 3))}
+    table["accel"] = np.tile([0.0, 0.0, 9.8], (n, 1))
+    table["gnss_enu"] = np.full((n, 3), np.nan)
+    table["gnss_enu"][::200] = 0.0
+    table["gnss_baseline_enu"] = table["gnss_enu"] + [1.0, 0.0, 0.0]
+    late = table["time"][::200] + 0.45
+    table["received"] = table["time"].copy()
+    table["received"][200::200] = late[1:]
+    samples = tmp_path / "samples.csv"
+    result = replay(table, sensors="rtk", samples=samples)
+    assert result.too_late == 0
+    done = subprocess.run([example("rtk", "x86-64"), samples], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "older than the memory of the filter" in done.stderr
+    folder = tmp_path / "fast"
+    suite = quad_gym.sensor_suite("rtk")
+    export_filter(suite, "rtk", "x86-64", folder, imu_rate=1000.0)
+    files = [folder / "main.c", folder / LIBRARY]
+    subprocess.run(["cc", "-O2", *files, "-lm", "-o", folder / "example"], check=True)
+    found = estimates(folder / "example", samples)[1]
+    np.testing.assert_array_equal(found, np.array(list(result.columns().values())).T)
+
+
+@needs_compiler
+def test_example_refuses_samples_of_another_origin(tmp_path):
+    table = turned_table()
+    far = 1.05 * np.array(TURNED.gnss.reference_antenna_G)
+    for axis, ecef, center in zip(("east", "north", "up"), "xyz", far, strict=True):
+        table[f"gnss_{ecef}"] = center + table.pop(f"gnss_{axis}")
+    replay(table, sensors="rtk", samples=tmp_path / "samples.csv")
+    command = [example("rtk", "x86-64"), tmp_path / "samples.csv"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, "--log LOG" in done.stderr) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("without", "start", "message"),
+    [
+        ("motor", {"tilt_sigma": 0.1}, "tilt_sigma"),
+        ("gnss_baseline", {}, "baseline or a magnetic field"),
+    ],
+)
+def test_starts_that_exported_filters_lack_are_refused(without, start, message):
+    table = {key: v for key, v in turned_table().items() if not key.startswith(without)}
+    with pytest.raises(ValueError, match=message):
+        replay(table, sensors="rtk", start=start, samples=FOLDER / "none.csv")
+    assert not (FOLDER / "none.csv").exists()
 
 
 @needs_compiler
@@ -106,10 +200,9 @@ def test_example_with_start_in_flight_equals_replay(option, tmp_path):
     kept = [k for k, name in enumerate(lines[0]) if not name.startswith("magnetometer")]
     log = tmp_path / "log.csv"
     log.write_text("\n".join(",".join(line[k] for k in kept) for line in lines))
-    given = {"heading": ("--heading", "50"), "course": ("--course",)}[option]
     start = {"heading": {"heading": math.radians(50.0)}, "course": {"course": True}}[option]
-    found = estimates(example("consumer", "x86-64"), log, *given)
-    require_equal(found, log, quad_gym.sensor_suite("consumer"), start)
+    run = partial(estimates, example("consumer", "x86-64"))
+    require_equal(run, log, quad_gym.sensor_suite("consumer"), start)
 
 
 def on_aarch64(name, log):
@@ -138,7 +231,7 @@ def on_arm(name, log):
 )
 @pytest.mark.parametrize("name", ["rtk", "consumer"])
 def test_example_on_foreign_processor_prints_estimates_of_replay(run, name):
-    require_equal(run(name, logged(name)), logged(name), quad_gym.sensor_suite(name), {})
+    require_equal(partial(run, name), logged(name), quad_gym.sensor_suite(name), {})
 
 
 @pytest.mark.slow  # two minutes to fly, three to filter
@@ -147,15 +240,14 @@ def test_example_on_foreign_processor_prints_estimates_of_replay(run, name):
 @needs_arm
 def test_examples_print_a_replay_of_1e5_samples():
     suite, log = quad_gym.sensor_suite("rtk"), logged("rtk", 510.0, 1)
-    for run in (lambda *_: estimates(example("rtk", "x86-64"), log), on_aarch64, on_arm):
-        found = run("rtk", log)
-        assert len(found[1]) > 100_000
-        require_equal(found, log, suite, {})
+    native = partial(estimates, example("rtk", "x86-64"))
+    for run in (native, partial(on_aarch64, "rtk"), partial(on_arm, "rtk")):
+        require_equal(run, log, suite, {})
 
 
 @needs_wasm
 def test_example_as_webassembly_prints_estimates_of_replay(tmp_path):
-    folder, log = exported("rtk", "wasm32"), logged("rtk")
+    folder, log = exported("rtk", "wasm32"), FOLDER / "samples_wasm.csv"
     program, run = tmp_path / "example.wasm", tmp_path / "run.mjs"
     clock = ["-D_WASI_EMULATED_PROCESS_CLOCKS", "-lwasi-emulated-process-clocks", "-lm"]
     files = [folder / "main.c", folder / LIBRARY]
@@ -168,7 +260,12 @@ def test_example_as_webassembly_prints_estimates_of_replay(tmp_path):
         f"const program = await WebAssembly.instantiate(await readFile('{program}'), "
         "wasi.getImportObject());\nwasi.start(program.instance);\n"
     )
-    require_equal(estimates("node", run), log, quad_gym.sensor_suite("rtk"), {})
+
+    def in_node(samples):
+        shutil.copy(samples, log)
+        return estimates("node", run)
+
+    require_equal(in_node, logged("rtk"), quad_gym.sensor_suite("rtk"), {})
 
 
 @pytest.mark.parametrize("target", ["x86-64", "aarch64", "cortex-m7"])
@@ -192,11 +289,12 @@ def test_cmake_builds_the_example_without_warnings(tmp_path):
     flags = "-DCMAKE_C_FLAGS=-Wall -Wextra -pedantic -Werror"
     subprocess.run(["cmake", "-S", exported("rtk"), "-B", tmp_path, flags], check=True)
     subprocess.run(["cmake", "--build", tmp_path], check=True)
-    assert estimates(tmp_path / "example", logged("rtk"))[1].shape[1] == 33
+    replay(logged("rtk"), sensors="rtk", samples=tmp_path / "samples.csv")
+    assert estimates(tmp_path / "example", tmp_path / "samples.csv")[1].shape[1] == 33
 
 
 @needs_compiler
-@pytest.mark.parametrize("words", [["--fast"], [], ["--start-position", "0", "0", "1"], ["no.csv"]])
+@pytest.mark.parametrize("words", [["--fast"], [], ["no.csv", "--time"], ["no.csv"]])
 def test_example_refuses_wrong_options(words):
     done = subprocess.run([example("rtk", "x86-64"), *words], capture_output=True, text=True)
     assert done.returncode == 2

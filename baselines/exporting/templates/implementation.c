@@ -512,6 +512,13 @@ int qg_init_at_rest(qg_filter *f, const double position[3], double heading, doub
     return QG_OK;
 }
 
+@IF BAROMETER@
+void qg_barometer_from_start(qg_filter *f)
+{
+    *(double *)(void *)((char *)f->steps + @OF_LEVEL@) = NAN;
+}
+
+@END@
 @IF GNSS@
 /* Heading by the magnetometer of a level vehicle. */
 static int qgi_magnetic(qg_start_record *s, const double field[3], double white)

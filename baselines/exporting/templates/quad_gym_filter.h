@@ -95,6 +95,11 @@ int qg_init(qg_filter *filter, const qg_start *start);
  * north [rad]; with the errors of the suite's initial pose. */
 int qg_init_at_rest(qg_filter *filter, const double position[3], double heading, double time);
 
+@IF BAROMETER@
+/* After a start: heights of the barometer are relative to the height at the first one. */
+void qg_barometer_from_start(qg_filter *filter);
+
+@END@
 /* ---- inputs ---- */
 
 /* Propagate the estimate over dt, from 1e-9 s to QG_LONGEST_STEP: angular rate [rad/s] and specific

@@ -1,0 +1,117 @@
+"""The calls of a filter that replays a log, as rows that an exported filter repeats.
+
+A row has a name and numbers; NaN: not measured.
+
+| row | numbers |
+|---|---|
+| `origin` | reference antenna in G |
+| `start` | `time`, then the fields of `qg_start` (exported header), absent vectors as NaN |
+| `rest` | position, heading, time: a level vehicle at rest |
+| `level` | none: heights of the barometer are relative to the first one |
+| `imu` | angular rate, specific force, duration: a prediction |
+| `gnss` | time, position and its sigmas, baseline, velocity and its sigma |
+| `camera`, `barometer`, ... | time, the measurement |
+| `estimate` | none: the estimate is printed |
+
+Samples are rotated to B, and time stamps corrected by the suite's delays. Positions, baselines and
+velocities are in G, positions relative to the reference antenna; their sigmas are in I.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quad_gym.estimation.logs import Floats
+from quad_gym.estimation.samples import Measurement, Sample, gnss_noise
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+
+_STARTS = (
+    *("gnss_position_G", "gnss_sigma", "gnss_baseline_G", "gnss_velocity_G", "velocity_sigma"),
+    *("heading", "magnetometer", "course", "time"),
+)
+"""Keywords of `initialize` that exported filters have, too."""
+
+
+class Calls:
+    """Rows of the calls for a part of a log, in their order."""
+
+    def __init__(self, suite: SensorSuite) -> None:
+        self._suite, self.rows = suite, list[str]()
+        if suite.gnss is not None:
+            self._add("origin", *suite.gnss.reference_antenna_G)
+
+    def start(
+        self, given: Mapping[str, Any], wide: SensorSuite, barometer_from_start: bool
+    ) -> None:
+        """Add the start of the filter; `wide` is the suite of a start in motion."""
+        if "position" in given:
+            check.keywords(given, ("position", "heading", "time"), "start with samples=")
+            self._add("rest", *given["position"], given["heading"], given["time"])
+        else:
+            check.keywords(given, _STARTS, "start with samples=")
+            known = {"gnss_baseline_G", "heading", "magnetometer"} & set(given)
+            if not (known or given.get("course")):
+                raise ValueError(
+                    "a log for an exported filter must have a baseline or a magnetic field at its "
+                    "start, or give a heading or the course"
+                )
+            sigmas, covariance = gnss_noise("gnss_sigma", given.get("gnss_sigma", 1.0))
+            self._require_uncorrelated(covariance)
+            tilt = rest = math.nan
+            if wide is not self._suite:
+                tilt = wide.estimator.initial_tilt_sigma or math.nan
+                rest = math.sqrt(wide.estimator.initial_velocity_variance)
+            self._add(
+                "start",
+                *(given["time"], *given["gnss_position_G"]),
+                *(sigmas if "gnss_sigma" in given else _three(None)),
+                *_three(given.get("gnss_baseline_G")),
+                *_three(given.get("gnss_velocity_G")),
+                *(given.get("velocity_sigma", math.nan), given.get("heading", math.nan)),
+                *_three(given.get("magnetometer")),
+                *(bool(given.get("course")), tilt, rest),
+            )
+        if barometer_from_start and self._suite.barometer is not None:
+            self._add("level")
+
+    def predict(self, sample: Sample) -> None:
+        """Add a prediction."""
+        self._add("imu", *sample.gyro, *sample.accel, sample.dt)
+
+    def update(self, name: str, time: float, given: Measurement) -> None:
+        """Add the measurement of a stream with its time stamp."""
+        if name == "gnss":
+            self._require_uncorrelated(given.position_covariance_I)
+            vectors = (
+                *(given.position_G, given.noise.get("position_sigma_I")),
+                *(given.baseline_G, given.velocity_G),
+            )
+            numbers = [number for vector in vectors for number in _three(vector)]
+            self._add(name, time, *numbers, given.noise.get("velocity_sigma", math.nan))
+        elif given.pixels is not None:
+            self._add(name, time, *given.pixels.ravel())
+        else:
+            (value,) = given.aids.values()
+            self._add(name, time, *value)
+
+    def keep(self) -> None:
+        """Add the output of the estimate."""
+        self._add("estimate")
+
+    def _add(self, name: str, *numbers: float) -> None:
+        self.rows.append(",".join((name, *(repr(float(number)) for number in numbers))) + "\n")
+
+    @staticmethod
+    def _require_uncorrelated(covariance: Floats | None) -> None:
+        if covariance is not None:
+            raise ValueError(
+                "exported filters take no correlated errors of positions: replay without the "
+                "reported noise"
+            )
+
+
+def _three(vector: Any) -> Floats:
+    return np.full(3, math.nan) if vector is None else np.asarray(vector, np.float64)
