@@ -247,6 +247,12 @@ def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
 def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:
     """Check a recipe for a number of inputs; return its parameters with defaults."""
     check.choice("algorithm of the compiled engine", recipe.algorithm, ("ppo",))
+    for name in recipe.parameters:
+        if name in Recipe.__dataclass_fields__:
+            raise ValueError(
+                f"{name} belongs to the recipe, not to the parameters of the algorithm: "
+                f"quad-gym sweep has --recipe {name}=..."
+            )
     check.keywords(recipe.parameters, tuple(PARAMETERS), "the compiled PPO")
     check.keywords(recipe.policy, ("log_std_init",), "the policy of the compiled PPO")
     found: dict[str, Any] = {**PARAMETERS, **recipe.parameters}

@@ -33,7 +33,7 @@ def _contents(
     processor = Processor(*TARGETS[target].processor)
     missing = [name for name in sources.functions if not is_cached(name, processor)]
     if missing:
-        say(f"quad_gym: compiling {len(missing)} parts of the filter for {target} (once)")
+        say(f"quad_gym: compiling {len(missing)} kernels of the filter for {target} (once)")
         context = multiprocessing.get_context("spawn")
         with concurrent.futures.ProcessPoolExecutor(min(4, os.cpu_count() or 1), context) as pool:
             tasks = [pool.submit(object_of, name, processor) for name in missing]

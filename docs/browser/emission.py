@@ -54,7 +54,7 @@ def _prepare(names: Sequence[str]) -> None:
     """Compile the functions that are not in the cache, in processes."""
     missing = [name for name in names if not is_cached(name, _PROCESSOR)]
     if missing:
-        say(f"quad_gym: compiling {len(missing)} parts to WebAssembly (once)")
+        say(f"quad_gym: compiling {len(missing)} kernels to WebAssembly (once)")
         context = multiprocessing.get_context("spawn")
         with concurrent.futures.ProcessPoolExecutor(_WORKERS, context) as pool:
             for task in [pool.submit(object_of, name, _PROCESSOR) for name in missing]:

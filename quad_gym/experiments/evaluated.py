@@ -85,7 +85,7 @@ def remark_on_crashes(results: Evaluated, env: Any) -> str:
         return ""
     return (
         f"A crashed episode counts with a tracking error of {bound_of(env):g} m, the bound of the "
-        "task, from its crash to its time limit."
+        "task, from its crash to its time limit. Estimation errors are means up to the crash."
     )
 
 

@@ -61,7 +61,8 @@ def test_parts_compiled_ahead_are_not_compiled_again(tmp_path, monkeypatch, coun
     *listed, summary = first.stdout.splitlines()
     assert listed == [f"{'compiled' if n in missing else 'in cache'}  {n}" for n in names]
     assert summary.startswith(f"{len(missing)} of {len(names)} functions compiled in ")
-    assert f"quad_gym: compiling {len(missing)} parts" in first.stderr
+    plural = "" if len(missing) == 1 else "s"
+    assert f"quad_gym: compiling {len(missing)} kernel{plural} for" in first.stderr
     environment = run(tmp_path, "-c", FIRST_RESET)
     assert environment.returncode == 0, environment.stderr
     assert environment.stderr == ""  # it would list compiled functions

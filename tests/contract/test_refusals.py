@@ -70,6 +70,7 @@ REFUSED = [
     ("fly --output it.gif --replay nowhere.npz", "nowhere.npz"),
     ("fly --output it.npz --policy me", "policy must be"),
     ("fly --output it.npz --policy pretraind", "did you mean pretrained?"),
+    ("train --engine compiled --set layers=128,128", "sweep has --recipe layers="),
     ("fly --output it.npz --sensors standart", "did you mean standard?"),
     ("fly circel --output it.npz", "did you mean circle?"),
     ("fly --output it.npz --env worl=calm", "did you mean world?"),

@@ -105,7 +105,7 @@ def _build(digest: str, jobs: int, family: str) -> None:
     names = part_names()
     file, began = file_of(WIDTH, family), time.monotonic()
     output = file.with_suffix(f".{os.getpid()}.tmp")
-    say(f"quad_gym: compiling {len(names)} parts of the library with {WIDTH} lanes")
+    say(f"quad_gym: compiling {len(names)} kernels of the library with {WIDTH} lanes")
     with tempfile.TemporaryDirectory() as folder:
         for k, content in enumerate(objects_of(names, PROCESSORS[family][WIDTH], jobs)):
             Path(folder, f"{k}.o").write_bytes(content)

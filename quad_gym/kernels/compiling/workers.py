@@ -119,6 +119,11 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+def kernels(count: int) -> str:
+    """Format a number of kernels."""
+    return "1 kernel" if count == 1 else f"{count} kernels"
+
+
 class _Progress:
     """Progress line on standard error: the functions being compiled, and the elapsed time."""
 
@@ -127,25 +132,25 @@ class _Progress:
         self._start = time.monotonic()
         self._moves = sys.stderr is not None and sys.stderr.isatty()
         where = where_cached(*(dispatcher_of(name)._cache.folder for name in names))
-        say(f"quad_gym: compiling {len(names)} parts for this machine ({where})")
+        say(f"quad_gym: compiling {kernels(len(names))} for this machine ({where})")
 
     def show(self, begun: Collection[str]) -> None:
         """Update the line, if standard error is a terminal; `begun`: done or under way."""
         if self._moves:
             running = _missing([name for name in self._missing if name in begun])
             self._missing = [n for n in self._missing if n not in begun or n in running]
-            text = f"{self._count()} parts, {self._seconds():.0f} s"
+            text = f"{self._count()}, {self._seconds():.0f} s"
             functions = ", ".join(n.partition(":")[2].removesuffix("_stage") for n in running)
             say(f"\rquad_gym: {text:<26} {functions[:40]:<40}", end="")
 
     def finish(self) -> None:
         """Report the result."""
         self._missing = _missing(self._missing)
-        text = f"quad_gym: compiled {self._count()} parts in {self._seconds():.0f} s"
+        text = f"quad_gym: compiled {self._count()} in {self._seconds():.0f} s"
         say(f"{chr(13) if self._moves else ''}{text:<78}".rstrip())
 
     def _count(self) -> str:
-        return f"{len(self._names) - len(self._missing)} of {len(self._names)}"
+        return f"{len(self._names) - len(self._missing)} of {kernels(len(self._names))}"
 
     def _seconds(self) -> float:
         return time.monotonic() - self._start

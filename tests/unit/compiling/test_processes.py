@@ -44,9 +44,9 @@ def test_parts_are_compiled_once_and_by_worker_processes(parts):
     assert len(parts.files("code")) == 3
     assert not parts.files("tmp")
     assert [line.split(" (")[0] for line in said.splitlines()][:1] == [
-        "quad_gym: compiling 3 parts for this machine"
+        "quad_gym: compiling 3 kernels for this machine"
     ]
-    assert "compiled 3 of 3 parts" in said.splitlines()[-1]
+    assert "compiled 3 of 3 kernels" in said.splitlines()[-1]
     assert parts.run() == (RIGHT, "")  # all of it comes from the cache
     assert parts.compiled() == ["a", "b", "c"]
 
