@@ -131,8 +131,8 @@ def test_example_of_a_calibrated_suite_prints_estimates_of_replay(change):
             table[name][0] = np.nan
         table["time"][0] = table["received"][0] = -1.5
     elif change == "missing numbers":
-        table["gnss_velocity_east"][::2] = np.nan
-        table["gnss_baseline_north"][::3] = np.nan
+        table["gnss_velocity_east"][200::2] = np.nan
+        table["gnss_baseline_north"][200::3] = np.nan
     elif change == "Unix time":
         table["time"], table["received"] = table["time"] + 1.7e9, table["received"] + 1.7e9
     require_equal(partial(estimates, calibrated()), table, TURNED, {})
