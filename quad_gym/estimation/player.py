@@ -20,6 +20,7 @@ from quad_gym.estimation.filters import (
     UnscentedKalmanFilter,
 )
 from quad_gym.estimation.first_motion import with_wide_start
+from quad_gym.estimation.held_position import SENTENCE, held, lacks_position
 from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
@@ -33,7 +34,7 @@ from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
+from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, POSITION_BLOCK, Aid
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
@@ -50,8 +51,9 @@ PATIENCE = 2.0  #: time for which a start waits for the first magnetic field [s]
 class Player:
     """Processes the contents of a log with a filter, in the order of arrival.
 
-    Without a window, measurements are processed in the order of their time stamps, none late.
-    With `calls`, what the filter receives is added to them.
+    Without a window, measurements are processed in the order of their time stamps, none late. With
+    `calls`, what the filter receives is added to them. With `hold`, a fictitious position keeps
+    roll and pitch in logs without any.
     """
 
     def __init__(
@@ -63,8 +65,14 @@ class Player:
         reported_noise: bool,
         window: float | None,
         calls: Calls | None = None,
+        hold: bool = False,
     ) -> None:
         self.calls = calls
+        self.assumed, self.holds, unused_gnss = suite, False, False
+        place = start.get("position")
+        if hold and place is not None and np.shape(place) == (3,) and lacks_position(log, suite):
+            self.holds, unused_gnss = True, "gnss" in log.streams
+            log, suite = held(log, suite, place)
         self.log, self.suite, self.estimator = log, suite, estimator
         self.in_order, window = window is None, window or 0.0
         self.start, self.reported = start, reported_noise
@@ -89,7 +97,10 @@ class Player:
         self.writer = TapeWriter(self._made)
         writer = self.writer
         self.history = InputHistory(window, writer.apply, writer.copy, writer.restore)
+        self.unused: tuple[str, ...] = ()
         self._choose_streams()
+        if unused_gnss:
+            self.unused = ("gnss", *self.unused)
 
     def _choose_streams(self) -> None:
         """Select the streams that the suite uses, and list the others."""
@@ -461,11 +472,16 @@ class Player:
                     counted.add(times[have], reported[have, row])
         return Replay(
             estimator=self.estimator,
-            sensors=self.suite,
+            sensors=self.assumed,
             time=np.array(self.times),
             **found,
             status=self.filter.status,
-            measured={name_of(b): c.measured() for b, c in blocks.items() if c.rows},
+            measured={
+                name_of(b): c.measured()
+                for b, c in blocks.items()
+                if c.rows and not (self.holds and b == POSITION_BLOCK)
+            },
+            notes=(SENTENCE,) if self.holds else (),
             late={name: np.array(ages) for name, ages in self.late.items()},
             unused=self.unused,
         )

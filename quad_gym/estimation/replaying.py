@@ -85,7 +85,8 @@ def replay(
 
     def fly(part: Log, begin: dict[str, Any]) -> Replay:
         calls = None if samples is None else Calls(suite)
-        player = Player(part, suite, estimator, begin, reported_noise, reach, calls)
+        hold = own is None and calls is None  # the exported filter receives measurements only
+        player = Player(part, suite, estimator, begin, reported_noise, reach, calls, hold)
         found = player.play() if own is None else OwnPlayer(player, own).play()
         if calls is not None:
             rows.extend(calls.rows)

@@ -1,10 +1,13 @@
 """Logs of others, with the defects that they have, replay to the truth or are refused by name."""
 
+import gzip
+
 import numpy as np
 import pytest
 
 import quad_gym
 from quad_gym.estimation import read_log, replay
+from quad_gym.rotations import quaternion_to_dcm
 from tests import foreign_logs as foreign
 from tests.foreign_logs import BOOT, EPOCH, Bag
 
@@ -383,3 +386,83 @@ def test_calm_flight_gives_no_false_finding():
     result = replay(log, sensors=CONSUMER)
     assert result.notes == result.problems == ()
     assert set(result.measured) == {"gnss_position", "gnss_velocity", "barometer", "magnetometer"}
+
+
+def test_fictitious_position_keeps_the_tilt_without_gnss():
+    """Measured over 60 s: 1.6 degrees with it, 3.7 without."""
+    long, suite = foreign.flight(60.0), quad_gym.sensor_suite("field")
+    table = {name: v for name, v in long.table().items() if not name.startswith("gnss")}
+    result = replay(table, sensors=suite, start={"position": (0, 0, 0), "heading": 0.3})
+    force = np.gradient(np.gradient(long.position, long.time, axis=0), long.time, axis=0)
+    truth = np.column_stack([np.interp(result.time, long.time, axis) for axis in force.T])
+    truth[:, 2] += 9.80665
+    up = quaternion_to_dcm(result.quaternion)[:, 2]
+    cosine = (up * truth).sum(axis=1) / np.linalg.norm(truth, axis=1)
+    tilt = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))[100:]
+    assert np.sqrt((tilt**2).mean()) < 2.5
+    has(result.notes, "fictitious", "no meaning")
+    assert set(result.measured) == {"barometer", "magnetometer"}
+    assert result.sensors == suite
+
+
+def test_map_of_columns_converts_units_axes_clocks_and_makes_measurements(flight, tmp_path):
+    """The table is in g, deg/s, mG and hPa, its body is forward, right, down, and time is in ms."""
+    near = [int(np.argmin(np.abs(flight.baro_time - t))) for t in flight.time]
+    columns = {
+        "ms": 1e3 * flight.time,
+        **{f"w{i}": np.degrees(flight.gyro[:, i]) * foreign.FLU[i] for i in range(3)},
+        **{f"a{i}": flight.accel[:, i] * foreign.FLU[i] / 9.80665 for i in range(3)},
+        **{f"m{i}": 1e7 * flight.fields[near, i] * foreign.FLU[i] for i in range(3)},
+        "air": 0.01 * foreign.pressure(flight.heights[near]),
+        **{name: flight.position[:, i] for i, name in enumerate(("n", "e", "d"))},
+    }
+    columns["n"], columns["e"] = columns["e"], columns["n"]
+    columns["d"] = -columns["d"]
+    table = np.column_stack(list(columns.values()))
+    header = ",".join(columns)
+    with gzip.open(tmp_path / "flight.csv.gz", "wt") as file:
+        np.savetxt(file, table, delimiter=",", header=header, comments="")
+    three = lambda name: [f"{name}{i}" for i in range(3)]  # noqa: E731
+    text = f"""
+body = "frd"
+[time]
+columns = ["ms"]
+unit = "ms"
+[gyro]
+columns = {three("w")}
+unit = "deg/s"
+[accel]
+columns = {three("a")}
+unit = "g"
+[magnetometer]
+columns = {three("m")}
+unit = "mG"
+[barometer]
+columns = ["air"]
+unit = "hPa"
+[gnss_enu]
+columns = ["n", "e", "d"]
+axes = ["y", "x", "-z"]
+rate = 5.0
+sigma = 0.1
+seed = 3
+"""
+    file = tmp_path / "map.toml"
+    file.write_text(text)
+    log = read_log(tmp_path / "flight.csv.gz", columns=file)
+    np.testing.assert_allclose(log.imu.values["gyro"], flight.gyro, atol=1e-9)
+    np.testing.assert_allclose(log.imu.values["accel"], flight.accel, atol=1e-9)
+    np.testing.assert_allclose(np.diff(log.gnss.time), 0.2, atol=1e-9)
+    noise = log.gnss.values["position_I"] - flight.position[::10]
+    assert 0.08 < noise.std() < 0.12
+    suite = CONSUMER.replace(gnss=CONSUMER.gnss.replace(velocity_sigma=None))
+    arrives(flight, tmp_path / "flight.csv.gz", 0.0, suite, {"heading": 0.3}, columns=file)
+    for wrong, message in (
+        (text.replace('"deg/s"', '"m"'), r"unit of \[gyro\] must be one of"),
+        (text.replace('"w1"', '"w9"').replace("'w1'", "'w9'"), "no column w9"),
+        (text.replace("[gyro]", "[gyroscope]"), "gyroscope is not a keyword.*did you mean gyro"),
+        (text + "[", r"map.toml must be a map of columns"),
+    ):
+        file.write_text(wrong)
+        with pytest.raises(ValueError, match=message):
+            read_log(tmp_path / "flight.csv.gz", columns=file)

@@ -69,9 +69,11 @@ def mapped(given: Mapping[Any, Any], file: Path, name: str) -> Recording:
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"{file.name} must be a map of columns (.toml): {error}") from None
     try:
-        return Recording(file=name, sources=list(_sources(given, contents)))
+        sources = list(_sources(given, contents))
     except ValueError as error:
         raise ValueError(f"{name} with the map {file.name}: {error}") from None
+    by_pressure = any("pressure" in source.values for source in sources)
+    return Recording(file=name, sources=sources, barometer_from_start=by_pressure)
 
 
 def _sources(given: Mapping[Any, Any], contents: dict[str, Any]) -> Iterator[Source]:
