@@ -1,6 +1,10 @@
 """Settings of all tests: reproducible examples, no deadline, and the number of threads."""
 
+import importlib.util
 import os
+import re
+
+import pytest
 
 os.environ.setdefault("QUAD_GYM_KERNELS", "numba")  # even where a library is built
 
@@ -33,3 +37,15 @@ def pytest_sessionstart(session):
         prepare(
             [*names_of([source.name for source in SOURCES]), *FILTER_ENTRIES, *SENSORS_AND_VEHICLE]
         )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Skip a test that needs an extra which is not installed; the reason names it."""
+    try:
+        return (yield)
+    except ImportError as error:
+        named = re.search(r'needs ([\w-]+): pip install "quad-gym\[', str(error))
+        if named and not importlib.util.find_spec(named[1].lower().replace("-", "_")):
+            pytest.skip(str(error))
+        raise

@@ -5,6 +5,8 @@ import warnings
 import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
+
+pytest.importorskip("stable_baselines3", reason='this needs "quad-gym[train]"')
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import quad_gym

@@ -3,6 +3,8 @@
 import gymnasium
 import numpy as np
 import pytest
+
+pytest.importorskip("stable_baselines3", reason='this needs "quad-gym[train]"')
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 

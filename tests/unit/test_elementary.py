@@ -2,7 +2,6 @@
 
 import math
 
-import mpmath
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,6 +10,8 @@ from hypothesis import strategies as st
 from quad_gym.kernels.maths.elementary import atan2, exp, log, sin_cos, sin_cos_minus_one
 from quad_gym.records import WIDTH
 from tests.unit.compiled import Compiled
+
+mpmath = pytest.importorskip("mpmath")
 
 
 def functions(f, option):
