@@ -109,8 +109,7 @@ def compare_gains(
     for env_id, env in envs.items():
         flown = {k: roll_out(PDPolicy(env, gains=g), env, seed=seed) for k, g in gains.items()}
         start, tuned = flown.values()
-        both = ~(start.crashed | tuned.crashed)
-        change = paired_difference(tuned.mean_error[both], start.mean_error[both])
+        change = paired_difference(tuned.mean_error, start.mean_error)
         row = [env_id]
         for episodes in (start, tuned):
             row += [f"{1e3 * episodes.mean_error.mean():.1f}", f"{episodes.crashed.mean():.1%}"]
