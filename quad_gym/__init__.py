@@ -7,7 +7,13 @@ compiled or loaded from their cache, when the first environment is made.
 from typing import TYPE_CHECKING, Any
 
 from quad_gym import faults
-from quad_gym.envs import IDS, make_sb3_vec_env, register_all, register_task
+from quad_gym.envs import (
+    IDS,
+    make_sb3_vec_env,
+    make_torch_vec_env,
+    register_all,
+    register_task,
+)
 from quad_gym.envs.keywords import EnvKeywords
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
@@ -132,6 +138,7 @@ __all__ = [
     "__version__",
     "faults",
     "make_sb3_vec_env",
+    "make_torch_vec_env",
     "observation_layout",
     "pd_gains",
     "register_task",

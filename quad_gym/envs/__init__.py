@@ -1,4 +1,4 @@
-"""The environments: one flight, many flights, and many flights for Stable-Baselines3."""
+"""The environments: one flight, many flights, and many flights for Stable-Baselines3 or torch."""
 
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -10,7 +10,10 @@ from quad_gym.params import checks as check
 from quad_gym.params.task import TASKS
 
 if TYPE_CHECKING:
+    import torch
+
     from quad_gym.envs.sb3 import QuadSB3VecEnv
+    from quad_gym.envs.torch_env import QuadTorchVecEnv
     from quad_gym.tasks import Task
 
 IDS = {f"QuadGym/{task.title().replace('_', '')}-v0": task for task in (*TASKS, *BENCHMARKS)}
@@ -115,3 +118,39 @@ def make_sb3_vec_env(
     if seed is not None:
         env.seed(seed)
     return env
+
+
+@shows(VectorKeywords)
+def make_torch_vec_env(
+    env_id: str,
+    num_envs: int = 1,
+    device: "str | torch.device" = "cpu",
+    *,
+    autoreset_mode: str = "NextStep",
+    **keywords: Unpack[VectorKeywords],
+) -> "QuadTorchVecEnv":
+    """Make a vector environment of N flights whose observations and rewards are torch tensors.
+
+    Args:
+        env_id: One of `IDS`, with or without the prefix "quad_gym:", or an id of `register_task`.
+        num_envs: Number of flights.
+        device: Device of the tensors, "cpu".
+        autoreset_mode: "NextStep", "SameStep" or "Disabled", as in Gymnasium.
+        keywords: Keywords of `QuadEnv`, `threads` and `render_flights`.
+
+    Returns:
+        The environment; `reset` takes `seed` and `options`, as that of `gymnasium.make_vec`.
+
+    Raises:
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
+        ValueError: If the id is unknown, or a value is invalid.
+        ImportError: If torch is not installed.
+    """
+    given: dict[str, Any] = keywords_of(env_id) | dict(keywords)
+    try:
+        from quad_gym.envs.torch_env import QuadTorchVecEnv
+    except ImportError as error:
+        raise ImportError(
+            'make_torch_vec_env needs torch: pip install "quad-gym[train]"'
+        ) from error
+    return QuadTorchVecEnv(num_envs, device=device, autoreset_mode=autoreset_mode, **given)

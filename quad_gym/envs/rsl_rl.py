@@ -1,0 +1,76 @@
+"""`RslRlVecEnv`: flights as a vector environment of rsl_rl."""
+
+from typing import Any
+
+import torch
+from gymnasium.vector import AutoresetMode
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from quad_gym.envs.torch_env import QuadTorchVecEnv
+from quad_gym.params import checks as check
+
+
+class RslRlVecEnv(VecEnv):
+    """Flights for the runners of rsl_rl.
+
+    Observations are a `TensorDict` with two groups: "policy" has the observation of the policy,
+    "critic" the same and, with `privileged=True`, the privileged quantities behind it.
+    `extras["time_outs"]` marks episodes that were truncated.
+
+    Args:
+        env: An environment of `quad_gym.make_torch_vec_env` with `autoreset_mode="SameStep"`.
+        seed: Seed of the first reset: flight i has seed + i.
+
+    Raises:
+        ValueError: If the environment has another autoreset mode or no time limit.
+    """
+
+    def __init__(self, env: QuadTorchVecEnv, seed: int | None = None) -> None:
+        check.instance("env", env, QuadTorchVecEnv)
+        if env.autoreset_mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                'env must have autoreset_mode="SameStep", which rsl_rl assumes, got '
+                f'"{env.autoreset_mode.value}"'
+            )
+        batch = env.flights.batch
+        if not batch.max_steps:
+            raise ValueError("env must have a time limit: give a duration or max_episode_steps")
+        self.env, self.device, self.num_envs = env, env.device, env.num_envs
+        self.num_actions = int(env.single_action_space.shape[0])  # type: ignore[index]
+        self.max_episode_length = batch.max_steps
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long)
+        self.cfg = {"env_id": env.spec.id if env.spec else env.flights.name, "seed": seed}
+        self._observations = env.reset(seed=seed)[0]
+
+    def get_observations(self) -> TensorDict:
+        """Return the present observations in the groups "policy" and "critic"."""
+        seen = self._observations
+        if isinstance(seen, dict):
+            policy, critic = seen["policy"], torch.cat([seen["policy"], seen["privileged"]], dim=1)
+        else:
+            policy = critic = seen
+        return TensorDict({"policy": policy, "critic": critic}, batch_size=[self.num_envs])
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Fly one control period.
+
+        Args:
+            actions: (n, 4) in [-1, 1]; larger values are clipped.
+
+        Returns:
+            Observations, rewards (n,), ends of episodes (n,) bool, extras.
+        """
+        self._observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        ended = terminated | truncated
+        self.episode_length_buf += 1
+        self.episode_length_buf[ended] = 0
+        log = {f"/{name}": infos[name] for name in ("position_error", "estimation_error")}
+        extras = {"time_outs": truncated & ~terminated, "log": log}
+        return self.get_observations(), rewards, ended, extras
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()

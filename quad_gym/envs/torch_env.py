@@ -1,0 +1,131 @@
+"""`QuadTorchVecEnv`: many flights as a vector environment of torch tensors."""
+
+from typing import Any, Unpack
+
+import torch
+from gymnasium.vector import AutoresetMode
+
+from quad_gym.envs.keywords import VectorKeywords, shows
+from quad_gym.envs.vector import QuadVectorEnv
+
+
+class QuadTorchVecEnv(QuadVectorEnv):
+    """N flights for training loops in torch, whose results are tensors.
+
+    Flights, seeds, autoreset and keywords are those of `QuadVectorEnv`, and the flights have the
+    same bits. Observations share the memory that the compiled code wrote, without a copy; every
+    step returns new tensors. Rewards are float32, (n,). `info` has tensors (n,) by the same names,
+    without the masks `_name`, which are true for all flights after a step. With
+    `autoreset_mode="SameStep"`, `info["final_obs"]` has the last observations of the episodes that
+    ended, with rows for all flights, valid where the mask `info["_final_obs"]` is true.
+
+    Args:
+        num_envs: Number of flights.
+        device: Device of the tensors, "cpu".
+        keywords: Keywords of `QuadVectorEnv`.
+
+    Raises:
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
+        ValueError: If the device is another one, or the value of a keyword is invalid.
+    """
+
+    @shows(VectorKeywords)
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        device: str | torch.device = "cpu",
+        base: str | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        **keywords: Unpack[VectorKeywords],
+    ) -> None:
+        self.device = _checked_device(device)
+        given: dict[str, Any] = dict(keywords)
+        super().__init__(num_envs, base=base, autoreset_mode=autoreset_mode, **given)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes, as `QuadVectorEnv.reset` does.
+
+        Args:
+            seed: As in `QuadVectorEnv.reset`.
+            options: As in `QuadVectorEnv.reset`; "reset_mask" may be a tensor.
+
+        Returns:
+            Observations of all flights, and `info` of those that were reset, with masks.
+        """
+        if isinstance(options, dict):
+            options = {name: _array(value) for name, value in options.items()}
+        observations, infos = super().reset(seed=seed, options=options)
+        return _tensors(observations), _tensors(infos)
+
+    def step(  # type: ignore[override]
+        self, actions: torch.Tensor
+    ) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Fly one control period.
+
+        Args:
+            actions: (n, 4) in [-1, 1]; larger values are clipped. Gradients do not pass.
+
+        Returns:
+            Observations, rewards, terminated, truncated, `info`: new tensors.
+
+        Raises:
+            ValueError: If the actions have another shape or are not finite; nothing has been flown
+                then.
+            gymnasium.error.ResetNeeded: As in `QuadVectorEnv.step`.
+        """
+        observations, rewards, terminated, truncated, infos = super().step(_array(actions))
+        ended = infos.pop("_final_obs", None)
+        if ended is not None:
+            finals = self.flights.batch.final_observations.copy()
+            infos |= {"final_obs": self.flights.split(finals), "_final_obs": ended}
+            infos.pop("_final_info")
+            infos["final_info"] = _without_masks(infos["final_info"])
+        kept = _without_masks(infos) | ({} if ended is None else {"_final_obs": ended})
+        return (
+            _tensors(observations),
+            torch.from_numpy(rewards).float(),
+            torch.from_numpy(terminated),
+            torch.from_numpy(truncated),
+            _tensors(kept),
+        )
+
+
+def _checked_device(device: str | torch.device) -> torch.device:
+    """Return the device of the tensors; refuse all but the processor."""
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f'device must be "cpu", got {device!r}') from error
+    if found.type != "cpu":
+        raise ValueError(
+            f'device must be "cpu", because flights are computed on the processor, got {device!r}; '
+            "move the returned tensors to another device with .to(device)"
+        )
+    return found
+
+
+def _array(value: Any) -> Any:
+    """Return a tensor as an array that shares its memory, and other values as they are."""
+    if not isinstance(value, torch.Tensor):
+        return value
+    value = value.detach().cpu()
+    return value.float().numpy() if value.is_floating_point() else value.numpy()
+
+
+def _tensors(values: Any) -> Any:
+    """Return arrays, also in dictionaries, as tensors that share their memory."""
+    if isinstance(values, dict):
+        return {name: _tensors(value) for name, value in values.items()}
+    return torch.from_numpy(values)
+
+
+def _without_masks(infos: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of an `info` without their masks `_name`."""
+    return {
+        name: _without_masks(value) if isinstance(value, dict) else value
+        for name, value in infos.items()
+        if not name.startswith("_")
+    }
