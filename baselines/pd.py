@@ -163,7 +163,8 @@ class PDPolicy:
                 "layout contains no velocity"
             )
         vehicle = flights.batch.vehicle
-        self.gains = pd_gains(gains, vehicle) if isinstance(gains, str) else gains
+        named = pd_gains(gains, vehicle) if isinstance(gains, str) else gains
+        self.gains = check.instance("gains", named, PDGains)
         if flights.action in ("motor", "wrench"):
             self._warn_if_too_slow(flights.control_rate, vehicle.inertia)
         self._vehicle, self._scales = vehicle, flights.batch.action_params

@@ -1,7 +1,7 @@
 """From the keywords of an environment to its flights: the same for all three interfaces."""
 
 from collections.abc import Collection, Mapping
-from functools import partial
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,15 +24,14 @@ from quad_gym.envs.spaces import (
     policy_size,
 )
 from quad_gym.faults import Fault
-from quad_gym.faults.presets import faults_of, needs_sensors
-from quad_gym.packing.configuration import MOST_FLIGHTS
+from quad_gym.faults.presets import needs_sensors
+from quad_gym.packing.configuration import MOST_FLIGHTS, FlightConfiguration
 from quad_gym.params import checks as check
-from quad_gym.params.randomization import Randomization
 from quad_gym.params.resolved import resolving
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
-from quad_gym.params.world import WorldParams, world_params
+from quad_gym.params.world import WorldParams
 from quad_gym.records import Autoreset, Layout
 
 if TYPE_CHECKING:
@@ -138,45 +137,44 @@ class Flights:
         check.choice("layout", keywords["layout"], tuple(LAYOUTS))
         for name in ("camera", "include_std", "privileged", "reward_terms"):
             check.flag(name, keywords[name])
-        flown = {name: value for name, value in keywords.items() if name not in _NOT_OF_BATCH}
         self.observation, self.action = keywords["observation"], keywords["action"]
         self.layout, self.reward_terms = keywords["layout"], keywords["reward_terms"]
-        flown["sensors"] = suite = _suite(keywords, "camera" in asked)
-        flown["estimator"] = own_estimator(keywords["estimator"])
-        flown["faults"] = _faults(keywords, suite)
-        drawn = flown["randomization"] = Randomization.of(keywords["randomization"])
-        place = resolving(WorldParams, world_params)("world", flown["world"])
-        own_task = keywords.get("task")
-        if place.ground is None and own_task is None and "start_position_I" not in drawn.names:
-            check_pad(self.task)  # a user-defined task may set where vehicles start
-        privileged, raw = flown["privileged"], self.observation == "measurements"
-        shown = drawn.names if drawn.names or place != WorldParams() else None
-        self.table: tuple[ObservationField, ...] = observation_layout(
-            self.observation,
-            None if raw else self.layout,
-            sensors=suite,
-            include_std=flown["include_std"],
-            privileged=privileged,
-            drawn=shown if privileged else None,
-        )
-        self.control_rate = check.positive("control_rate", flown["control_rate"], least=SLOWEST)
+        self.control_rate = check.positive("control_rate", keywords["control_rate"], least=SLOWEST)
         check_limit(self.task, self.control_rate, "control_rate")
-        make = partial(
-            FlightBatch,
+        raw, own_task = self.observation == "measurements", keywords.get("task")
+        flown = {name: value for name, value in keywords.items() if name not in _NOT_OF_BATCH}
+        flown["sensors"] = _suite(keywords, "camera" in asked)
+        c = FlightConfiguration(
+            count,
+            **flown,
+            estimator=own_estimator(keywords["estimator"]),
             task=self.task,
             source=OBSERVATIONS[self.observation],
             control=ACTIONS[self.action],
             layout=Layout.MEASUREMENTS if raw else LAYOUTS[self.layout],
-            bounds=layout_bounds(self.table),
-            **flown,
+            autoreset=autoreset,
         )
-        if own_task is not None:
-            from quad_gym.envs.own_task import with_task
+        drawn = c.randomization.names
+        if c.world.ground is None and own_task is None and "start_position_I" not in drawn:
+            check_pad(self.task)  # a user-defined task may set where vehicles start
+        _require_sensors(c.possible_faults, keywords)
+        self.table: tuple[ObservationField, ...] = observation_layout(
+            self.observation,
+            None if raw else self.layout,
+            sensors=c.sensors,
+            include_std=c.include_std,
+            privileged=c.privileged,
+            drawn=(drawn if drawn or c.world != WorldParams() else None) if c.privileged else None,
+        )
+        c = replace(c, bounds=layout_bounds(self.table))
+        if own_task is None:
+            self.batch = FlightBatch(c)  # type: ignore[arg-type]
+        else:
+            from quad_gym.envs.own_task import batch_with_task
 
-            make, self.table = with_task(own_task, make, self.table)
+            self.batch, self.table = batch_with_task(own_task, c, self.table)
         self.space = observation_space(self.table)
-        self._split = policy_size(self.table) if privileged else None
-        self.batch = make(count=count, autoreset=autoreset)
+        self._split = policy_size(self.table) if c.privileged else None
 
     def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
         """The start values in the options of a reset, checked before anything changes."""
@@ -222,12 +220,8 @@ def own_estimator(given: Any) -> Any:
     return given if not isinstance(given, str) or ":" in given else None
 
 
-def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...]:
-    """Return the faults that can occur; refuse faults of sensors if none runs."""
-    true = keywords["true_sensors"]
-    if true is not None:
-        check.instance("true_sensors", true, SensorSuite)
-    faults = faults_of(keywords["faults"], suite if true is None else true)
+def _require_sensors(faults: Collection[Fault], keywords: Mapping[str, Any]) -> None:
+    """Refuse faults of sensors if none runs."""
     of_sensors = [fault for fault in faults if needs_sensors(fault)]
     if of_sensors and runs_no_sensor(keywords):
         raise ValueError(
@@ -235,7 +229,6 @@ def _faults(keywords: Mapping[str, Any], suite: SensorSuite) -> tuple[Fault, ...
             f'sensors, and none runs with observation="{keywords["observation"]}" (unless '
             "include_std or innovations ask for the filter)"
         )
-    return faults
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:

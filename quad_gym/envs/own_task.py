@@ -1,14 +1,12 @@
 """From the keyword `task` to flights with a user-defined task."""
 
-from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.spaces import PRIVILEGED_NAMES, ObservationField, policy_size
-from quad_gym.params.world import world_params
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.tasks.batch import TaskBatch
 from quad_gym.tasks.observing import Part
 from quad_gym.tasks.task import ObservationSpec, resolve_task
@@ -16,26 +14,18 @@ from quad_gym.tasks.task import ObservationSpec, resolve_task
 Table = tuple[ObservationField, ...]
 
 
-def with_task(
-    given: Any, make: "partial[FlightBatch]", table: Table
-) -> "tuple[partial[FlightBatch], Table]":
-    """Return the maker of flights with a user-defined task, and the table of their observation.
+def batch_with_task(given: Any, c: FlightConfiguration, table: Table) -> tuple[TaskBatch, Table]:
+    """Make the flights with a user-defined task; return them, and their observation's table.
 
     The parts that `observe` returns are found by calling it once, with a flight made for the
     purpose. Parts with names of built-in parts are refused.
     """
     task = resolve_task(given)
-    world = make.keywords["world"]
-    task._require(
-        make.keywords["sensors"], world_params(world) if isinstance(world, str) else world
-    )
+    task._require(c.sensors, c.world)
     split = policy_size(table)
-    under: Callable[..., TaskBatch] = partial(
-        TaskBatch, **make.keywords, own_task=task, split=split
-    )
     if not task.has("observe"):
-        return under, table  # type: ignore[return-value]
-    first = under(1, threads=1)
+        return TaskBatch(c, own_task=task, split=split), table
+    first = TaskBatch(replace(c, count=1, threads=1), own_task=task, split=split)
     first.reset(keys=np.zeros((1, 2), np.uint64))
     sizes = {name: part.shape[1] for name, part in first.ask_parts().items()}
     unknown = sorted(set(task.observes) - set(sizes))
@@ -61,4 +51,5 @@ def with_task(
     if not new:
         raise ValueError("observe must return something where it replaces the observation")
     columns = [k for field in kept for k in range(field.slice.start, field.slice.stop)]
-    return partial(under, parts=parts, kept=columns), tuple(new)  # type: ignore[return-value]
+    batch = TaskBatch(c, own_task=task, split=split, parts=parts, kept=columns)
+    return batch, tuple(new)

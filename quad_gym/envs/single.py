@@ -1,11 +1,9 @@
 """`QuadEnv`: one flight as a Gymnasium environment."""
 
-import inspect
 from typing import TYPE_CHECKING, Any, Unpack
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import make
 
 from quad_gym.batch.resets import stream_key
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
@@ -170,7 +168,9 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
             zeros, which hover. `last_action` in the observation is the commanded action.
         substeps: Runge-Kutta steps per tick.
         max_episode_steps: Time limit in steps, in place of the task's own, whether longer or
-            shorter; with a `duration` as well, the earlier of the two holds.
+            shorter; with a `duration` as well, the earlier of the two holds. `gymnasium.make` keeps
+            this argument for its `TimeLimit`, which can only shorten episodes: there, `duration`
+            sets a longer limit.
         true_vehicle: True parameters of the vehicle; the controller assumes `vehicle`.
         true_sensors: True parameters of the sensors; the filter assumes `sensors`.
         world: "calm", "breeze", "fresh_breeze", "slalom" (of `OutageDash`), or `WorldParams`.
@@ -209,7 +209,6 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     ) -> None:
         given = checked(keywords, "render_mode")
         look = rendering_options(given)
-        given.setdefault("max_episode_steps", limit_asked_of_make())
         flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **given)
         self._open(flights, render_mode, look)
         self.metadata = self.metadata | {"render_fps": round(self.flights.control_rate)}
@@ -305,30 +304,3 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         if rendering is not None and self.render_mode == "rgb_array_list":
             return [frame for (frame,) in rendering.taken_frames()]
         return rendering.frames()[0] if rendering and self.render_mode == "rgb_array" else None
-
-
-ENTRY_POINT = "quad_gym.envs.single:QuadEnv"  #: entry point of `QuadEnv` in Gymnasium's registry
-
-
-def limit_asked_of_make() -> int | None:
-    """Return the `max_episode_steps` of the `gymnasium.make` call in progress, if any.
-
-    Gymnasium does not pass this argument on. It wraps a `TimeLimit` around the environment, which
-    can only shorten episodes: an environment with its own time limit would end before a longer one
-    without notice. The argument is therefore read from the frame of `make`; the wrapper then ends
-    the episode at the same step as the environment.
-    """
-    frame = inspect.currentframe()
-    while frame is not None:
-        if frame.f_code is make.__code__:
-            asked, spec = (frame.f_locals.get(name) for name in ("max_episode_steps", "env_spec"))
-            if getattr(spec, "entry_point", None) != ENTRY_POINT:
-                return None  # it makes an environment that uses this one
-            asked = spec.max_episode_steps if spec is not None and asked is None else asked
-            return None if isinstance(asked, int) and asked == -1 else asked  # -1: no wrapper
-        frame = frame.f_back if frame.f_code.co_name in _MAKERS else None
-    return None
-
-
-_MAKERS = ("limit_asked_of_make", "__init__")
-"""Names of the functions between `gymnasium.make` and the inspection of its frame."""

@@ -3,7 +3,17 @@
 import inspect
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, get_args, get_origin, overload
+from typing import (
+    Any,
+    Concatenate,
+    Generic,
+    ParamSpec,
+    TypeVar,
+    cast,
+    get_args,
+    get_origin,
+    overload,
+)
 
 from quad_gym.params import checks as check
 
@@ -50,7 +60,10 @@ def resolving(
 def taking(
     kind: Callable[Arguments, Value], name: str
 ) -> Callable[[Callable[[Owner, Value], None]], Callable[Concatenate[Owner, Arguments], None]]:
-    """Return a decorator for a method of a dataclass, which then takes the fields as arguments."""
+    """Return a decorator for a method of a dataclass, which then takes the fields as arguments.
+
+    It takes the dataclass itself, too, in place of all of them.
+    """
     make: Callable[..., Value] = kind
     fields = {
         name: parameter.replace(annotation=get_args(hint)[0])
@@ -63,7 +76,8 @@ def taking(
         @wraps(method)
         def take(self: Owner, *values: Any, **given: Any) -> None:
             check.keywords(given, tuple(fields), name)
-            method(self, make(*values, **given))
+            ready = len(values) == 1 and isinstance(values[0], cast(type, kind))
+            method(self, values[0] if ready and not given else make(*values, **given))
 
         itself, *_ = inspect.signature(method).parameters.values()
         shown = inspect.Signature([itself, *fields.values()])

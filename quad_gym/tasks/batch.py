@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import reduce
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.resets import checked_mask
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import checks as check
 from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
 from quad_gym.records.state import State
@@ -42,21 +44,19 @@ class TaskBatch(ReadableBatch):
 
     def __init__(
         self,
-        count: int,
+        c: FlightConfiguration,
         *,
         own_task: Task,
         parts: Mapping[str, Part] | None = None,
         split: int = 0,
         kept: Sequence[int] | None = None,
-        autoreset: Autoreset = Autoreset.DISABLED,
-        **keywords: Any,
     ) -> None:
-        self._in_kernel = autoreset == Autoreset.NEXT_STEP
+        self._in_kernel = c.autoreset is Autoreset.NEXT_STEP
         mode = Autoreset.NEXT_STEP if self._in_kernel else Autoreset.DISABLED
-        super().__init__(count, split, autoreset=mode, **keywords)
+        super().__init__(replace(c, autoreset=mode), split)
         self.own_task = own_task
         self.methods = frozenset(method for method in METHODS if own_task.has(method))
-        self._same_step = autoreset == Autoreset.SAME_STEP
+        self._same_step = c.autoreset is Autoreset.SAME_STEP
         self._joiner: Joiner | None = None
         if parts is not None and "observe" in self.methods:
             self._joiner = Joiner(self.count, parts, self._low.size, split, kept)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.stages import needed_stages
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.records import SHOWN, SHOWN_SHAPES, SHOWN_SIZE, WIDTH, Command, Result
 
 Floats = NDArray[np.float64]
@@ -20,8 +21,8 @@ _JUDGED = slice(int(Result.REWARD), int(Result.ENDING) + 1)
 class ReadableBatch(FlightBatch):
     """`FlightBatch` with quantities that only views of a task need; methods return new arrays."""
 
-    def __init__(self, count: int, split: int, **keywords: Any) -> None:
-        super().__init__(count, **keywords)
+    def __init__(self, c: FlightConfiguration, split: int) -> None:
+        super().__init__(c)  # type: ignore[arg-type]
         self._split = split
         self._settings["shown"] = True
         self._stages = needed_stages(self._settings[0])

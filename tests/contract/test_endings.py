@@ -73,9 +73,10 @@ def test_crash_at_time_limit_is_terminated_and_truncated(crash, own_task):
             quad_gym.register_task(name, own_task, f"QuadGym/{task}-v0")
     steps, terminated, truncated, ending = ended_after(name, keywords, action)
     assert (terminated, truncated) == (True, False)
-    limited = ended_after(name, {**keywords, "max_episode_steps": steps}, action)
+    rate = gymnasium.make(name, **keywords).unwrapped.flights.control_rate
+    limited = ended_after(name, {**keywords, "duration": steps / rate}, action)
     assert limited == (steps, True, True, ending)
-    cut = ended_after(name, {**keywords, "max_episode_steps": steps - 1}, action)
+    cut = ended_after(name, {**keywords, "duration": (steps - 1) / rate}, action)
     assert cut == (steps - 1, False, True, quad_gym.Ending.TIME_LIMIT)
 
 

@@ -188,3 +188,10 @@ def test_low_control_rate_without_inner_loop_gives_warning(action):
         warnings.simplefilter("always")
         PDPolicy(QuadEnv("hover", action=action, control_rate=50))
     assert ["Hz" in str(w.message) for w in caught] == [True] * (action in ("motor", "wrench"))
+
+
+@pytest.mark.parametrize("gains", [5, {"positon": 3}])
+def test_gains_of_another_type_are_refused_where_they_are_given(gains):
+    env = gymnasium.make("QuadGym/Hover-v0", observation="truth")
+    with pytest.raises(ValueError, match="gains must be a PDGains, got"):
+        PDPolicy(env, gains=gains)

@@ -169,8 +169,8 @@ def test_time_limit_defaults_to_duration_of_trajectory():
         env = QuadEnv("trajectory", trajectory=given, observation="truth")
         assert env.flights.batch.max_steps == round(50 * seconds)
     assert QuadEnv("trajectory", trajectory=OPEN, duration=7.0).flights.batch.max_steps == 350
-    env = gymnasium.make("QuadGym/Trajectory-v0", trajectory=OPEN, max_episode_steps=40)
-    assert env.unwrapped.flights.batch.max_steps == 40
+    env = QuadEnv("trajectory", trajectory=OPEN, max_episode_steps=40)
+    assert env.flights.batch.max_steps == 40
 
 
 def test_trajectory_is_read_from_path_of_table(tmp_path):
