@@ -15,7 +15,7 @@ from quad_gym.estimation.logs.parts import longest_part, naming
 from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.numbers import has
 from quad_gym.estimation.plausibility import implausible
-from quad_gym.estimation.replaying import origin_in, origin_of
+from quad_gym.estimation.replaying import origin_of
 from quad_gym.estimation.search import Calibrated, NumberSearch
 from quad_gym.estimation.validation import Validation, validate
 from quad_gym.params import checks as check
@@ -113,8 +113,8 @@ def _calibrated(
 ) -> Calibration:
     """Search and validate, see `calibrate`."""
     placed = origin_of(whole, suite)
-    whole = compared(whole, origin_in(placed))
-    wrong = [*whole.problems, *implausible(whole, reading.get("body", "flu"), suite)]
+    whole = compared(whole, placed)
+    wrong = [*whole.problems, *implausible(whole, reading.get("body", "flu"))]
     if wrong:
         raise ValueError(f"a calibration must have a log in SI units: {'; '.join(wrong)}")
     prior = _prior_of(placed, whole)

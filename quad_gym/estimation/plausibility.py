@@ -9,7 +9,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from quad_gym.estimation.logs import Floats, Log
-from quad_gym.params.sensors import SensorSuite
 
 LEAST_FORCE, MOST_FORCE = 5.0, 20.0
 """Median specific force of a flight [m/s^2], near gravity; a crash hardly changes it."""
@@ -25,22 +24,17 @@ FORCE_CAUSES = (
 MOST_RATE = 35.0  #: largest angular rate that gyros measure [rad/s]: 2000 deg/s
 MOST_MEAN_RATE = 10.0
 """Mean angular rate of a vehicle over a log [rad/s]: one and a half turns per second."""
-MOST_FIELD = 5.0  #: ratio of the mean magnetic field and the suite's, either way [-]
-MOST_HEIGHT = 20_000.0  #: mean height by a barometer [m]
-FIELD_UNITS = {1e4: "gauss", 1e6: "microtesla", 1e7: "milligauss", 1e9: "nanotesla"}
-"""Units in which a field is written, by how many of them one tesla has."""
 
 
 class MisfitError(ValueError):
     """The suite cannot be used with the log."""
 
 
-def implausible(log: Log, body: str, suite: SensorSuite) -> Iterator[str]:
-    """Yield sentences on units and axes of a log."""
+def implausible(log: Log, body: str) -> Iterator[str]:
+    """Yield sentences on units and axes of the IMU of a log."""
     gyro, accel = (log.imu.values[name] for name in ("gyro", "accel"))
     yield from _force(accel, body)
     yield from _rates(gyro)
-    yield from _aids(log, suite)
 
 
 def nothing_in_common(unused: tuple[str, ...]) -> str:
@@ -79,22 +73,3 @@ def _rates(gyro: Floats) -> Iterator[str]:
             f"mean angular rate is {sizes.mean():.3g} rad/s, at most {MOST_MEAN_RATE:g} expected: "
             "gyro in deg/s?"
         )
-
-
-def _aids(log: Log, suite: SensorSuite) -> Iterator[str]:
-    """Units of magnetometer and barometer, where the suite uses them."""
-    if suite.magnetometer is not None and log.magnetometer is not None:
-        field = log.magnetometer.values["magnetometer"]
-        size = float(np.nanmean(np.linalg.norm(field, axis=1)))
-        ratio = size / suite.magnetometer.strength
-        if not 1.0 / MOST_FIELD <= ratio <= MOST_FIELD:
-            near = {abs(np.log(ratio / n)): f"field in {unit}?" for n, unit in FIELD_UNITS.items()}
-            cause = near[min(near)] if min(near) < np.log(MOST_FIELD) else "unit of the field?"
-            yield (
-                f"mean magnetic field is {size:.3g} T, {suite.magnetometer.strength:.3g} expected: "
-                f"{cause}"
-            )
-    if suite.barometer is not None and log.barometer is not None and not log.barometer_from_start:
-        height = float(np.nanmean(log.barometer.values["barometer"]))
-        if abs(height) > MOST_HEIGHT:
-            yield f"mean barometric height is {height:.6g} m: pressure in Pa in place of a height?"

@@ -11,7 +11,7 @@ import numpy as np
 from quad_gym.estimation.calls import Calls
 from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
-from quad_gym.estimation.logs import Floats, Log, Reading, read_log
+from quad_gym.estimation.logs import Log, Reading, read_log
 from quad_gym.estimation.logs.parts import naming, parts_of
 from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.own import Estimator
@@ -160,12 +160,7 @@ def prepared(log: Any, sensors: SensorSuite | str, reading: Reading) -> tuple[Lo
     whole = read_log(log, **reading).corrected(suite)
     with naming(whole):
         suite = origin_of(whole, suite)
-        return compared(whole, origin_in(suite)), suite
-
-
-def origin_in(suite: SensorSuite) -> Floats | None:
-    """Return the origin of I of a suite for a log, in ECEF; None: the suite has none."""
-    return None if suite.gnss is None else np.array(suite.gnss.reference_antenna_G)
+        return compared(whole, suite), suite
 
 
 def origin_of(log: Log, suite: SensorSuite) -> SensorSuite:

@@ -68,7 +68,7 @@ def with_verdict(log: Log, body: str, suite: SensorSuite, result: Replay) -> Rep
     """Return a replay with its findings, the worst first, and the verdict in a line."""
     found = [
         Finding(quantity="log", severity=Severity.LOST, text=text)
-        for text in (*log.problems, *implausible(log, body, suite))
+        for text in (*log.problems, *implausible(log, body))
     ]
     if result.status:
         found.append(_lost("attitude", f"the filter failed in some cycles ({result.status.name})"))

@@ -345,6 +345,13 @@ def test_barometer_in_another_unit_is_named_and_left_out(flight, change, unit):
     assert "barometer" not in result.measured
 
 
+def test_field_in_another_unit_is_named_and_left_out(flight):
+    result = replay(changed(flight.table(), magnetometer=lambda m: 1e4 * m), sensors=CONSUMER)
+    has(result.problems, "field in gauss", "left out")
+    assert "magnetometer" not in result.measured
+    assert (np.abs(flight.errors(result)).max(axis=0) < CLOSE).all()
+
+
 def in_radians(v):
     """Velocities of a course in radians that was taken for degrees."""
     course = np.radians(np.arctan2(v[:, 0], v[:, 1]) % (2.0 * np.pi))

@@ -5,7 +5,7 @@ never fused.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from quad_gym.estimation.logs.log import Floats, Log
 from quad_gym.estimation.logs.source import Recording, Source, positive
 from quad_gym.frames import ecef_to_enu
+from quad_gym.params.sensors import SensorSuite
 
 ENOUGH, LONG = 20, 2.0  #: number of rows, and their duration [s], from which a constant is dead
 LEAST_FORCE = 5.0  #: specific force that contains gravity, at least [m/s^2]
@@ -36,6 +37,9 @@ FARTHEST = 1e6  #: distance from the origin of I [m]
 FAST = 100.0  #: speed of a jump away from a fix at zero [m/s]
 _LENGTHS = {0.001: "km", 3.28084: "ft", 100.0: "cm", 1000.0: "mm", -12.0: "Pa", -0.12: "hPa"}
 """Units of a height or pressure, by the change of the number per meter of height."""
+MOST_FIELD = 5.0  #: ratio of the median magnetic field and the suite's, either way [-]
+_FIELDS = {1e4: "gauss", 1e6: "microtesla", 1e7: "milligauss", 1e9: "nanotesla"}
+"""Units of a magnetic field, by how many of them one tesla has."""
 _SPEEDS = {100.0: "cm/s", 3.6: "km/h", 1.94384: "knots", 3.28084: "ft/s", 1000.0: "mm/s"}
 """Units of a speed, by how many of them 1 m/s has."""
 
@@ -137,23 +141,36 @@ def _height(recording: Recording, source: Source) -> Source:
 
 # ---- several sensors -----------------------------------------------------------------------------
 
+_Found = Iterator[tuple[dict[str, Any], str]]
 
-def compared(log: Log, origin_G: Floats | None) -> Log:
+
+def compared(log: Log, suite: SensorSuite) -> Log:
     """Return a log without streams that others contradict, with sentences about them.
+
+    Streams that the suite does not use are not compared.
 
     Args:
         log: The log.
-        origin_G: Origin of I in ECEF [m], for positions in ECEF; None: the first fix.
+        suite: The suite, whose reference antenna is the origin of I.
     """
+    gnss = suite.gnss
+    checks: list[Callable[[Log, Floats, Floats], _Found]] = []
+    if gnss is not None:
+        checks.append(_heights_of_gnss)
+        checks += [_velocities] if gnss.velocity_sigma is not None else []
+    if suite.barometer is not None:
+        checks += [_unit_of_barometer, _level_of_barometer]
     problems = list(log.problems)
-    for check in (_heights_of_gnss, _velocities, _unit_of_barometer, _level_of_barometer):
+    origin_G = None if gnss is None else np.array(gnss.reference_antenna_G)
+    for check in checks:
         for changes, sentence in check(log, *_places(log, origin_G)):
             log = replace(log, **changes)
             problems.append(sentence)
+    if suite.magnetometer is not None:
+        for changes, sentence in _unit_of_field(log, suite.magnetometer.strength):
+            log = replace(log, **changes)
+            problems.append(sentence)
     return replace(log, problems=tuple(problems))
-
-
-_Found = Iterator[tuple[dict[str, Any], str]]
 
 
 def _places(log: Log, origin_G: Floats | None) -> tuple[Floats, Floats]:
@@ -315,3 +332,18 @@ def _level_of_barometer(log: Log, time: Floats, places: Floats) -> _Found:
             f"heights of the barometer are {apart:.0f} m above those of GNSS in the median: above "
             "sea level beside heights above home? Only their changes are used",
         )
+
+
+def _unit_of_field(log: Log, strength: float) -> _Found:
+    """Magnetic fields in another unit than tesla."""
+    if log.magnetometer is None or not len(log.magnetometer):
+        return
+    size = float(np.median(np.linalg.norm(log.magnetometer.values["magnetometer"], axis=1)))
+    if 1.0 / MOST_FIELD <= size / strength <= MOST_FIELD:
+        return
+    near = {abs(math.log(size / strength / n)): f"field in {u}?" for n, u in _FIELDS.items()}
+    cause = near[min(near)] if min(near) < math.log(MOST_FIELD) else "unit of the field?"
+    yield (
+        {"magnetometer": None},
+        f"mean magnetic field is {size:.3g} T, {strength:.3g} expected: {cause} It is left out",
+    )

@@ -144,7 +144,8 @@ def _log_of(
             problems=tuple(recording.problems),
         )
     except ValueError as error:
-        raise ValueError(f"{recording.where}{error}") from None
+        why = "".join(f"; {note}" for note in _dropped(chosen))
+        raise ValueError(f"{recording.where}{error}{why}") from None
 
 
 def _without_imu(recording: Recording, sources: Sequence[Source]) -> str:
