@@ -1,6 +1,8 @@
 """Logs of others, with the defects that they have, replay to the truth or are refused by name."""
 
 import gzip
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from tests import foreign_logs as foreign
 from tests.foreign_logs import BOOT, EPOCH, Bag
 
 CONSUMER = quad_gym.sensor_suite("consumer")
+EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 CLOSE = [0.8, 0.8, 1.0]  #: errors of the unchanged flight are below 0.4 m in all formats [m]
 
 
@@ -43,9 +46,9 @@ def has(sentences, *words):
 def dataflash(flight, tmp_path):
     pytest.importorskip("pymavlink")
 
-    def write(edit=lambda rows: rows, **options):
+    def write(edit=lambda rows: rows, old=False, **options):
         path = tmp_path / "flight.bin"
-        rows = edit(foreign.ardupilot_rows(flight, old="layouts" in options))
+        rows = edit(foreign.ardupilot_rows(flight, old=old))
         foreign.write_dataflash(path, rows, **options)
         return path
 
@@ -53,7 +56,7 @@ def dataflash(flight, tmp_path):
 
 
 def test_layout_before_2015_has_the_clock_of_the_vehicle(flight, dataflash):
-    path = dataflash(layouts=foreign.OLD_LAYOUTS)
+    path = dataflash(old=True, layouts=foreign.OLD_LAYOUTS)
     result = arrives(flight, path)
     assert len(result.measured["gnss_velocity"].time) == len(flight.fix_time) - 1
     np.testing.assert_allclose(read_log(path).gnss.received, flight.fix_time + BOOT + 0.2)
@@ -139,6 +142,37 @@ def test_imu_of_the_primary_estimator_is_taken(flight, dataflash):
     result = arrives(flight, dataflash(edit, parameters=[("EK3_PRIMARY", 1.0)]))
     assert result.sources["imu"]["taken"] == "IMU 1"
     has(result.notes, "imu: IMU 1 is taken (EK3_PRIMARY 1), not IMU")
+
+
+def test_flow_distance_commands_and_battery_are_read(flight, dataflash):
+    """ArduPilot's flow is positive for right-hand turns of the sensor: about x at a motion to the
+    left, about y at a motion forward. Motors 1 to 4 are on the outputs 4 to 1."""
+    layouts = foreign.LAYOUTS | {
+        "OF": (140, "QBffff", "TimeUS,Qual,flowX,flowY,bodyX,bodyY"),
+        "RFND": (141, "QBfBB", "TimeUS,Instance,Dist,Stat,Orient"),
+        "RCOU": (142, "QHHHH", "TimeUS,C1,C2,C3,C4"),
+        "BAT": (143, "QBf", "TimeUS,I,Volt"),
+    }
+    forward, left, height, (w_x, w_y) = 2.0, 0.5, 4.0, (0.3, -0.2)
+    frd = (left / height + w_x, forward / height - w_y, w_x, -w_y)
+
+    def edit(rows):
+        for t in np.arange(0.0, 10.0, 0.1):
+            rows.append([t, "OF", [200 if t < 5.0 else 0, *frd]])
+            rows.append([t, "RFND", [0, height, 4, 25 if t < 5.0 else 0]])
+            rows.append([t, "RCOU", [1900, 1500, 1300, 1100]])
+            rows.append([t, "BAT", [0, 15.5]])
+        return sorted(rows, key=lambda row: row[0])
+
+    parameters = [("MOT_PWM_MIN", 1100.0), ("MOT_PWM_MAX", 1900.0)]
+    parameters += [(f"SERVO{k}_FUNCTION", 37.0 - k) for k in range(1, 5)]
+    log = read_log(dataflash(edit, layouts=layouts, parameters=parameters))
+    assert len(log.optical_flow) == len(log.range_finder) == 50
+    expected = (forward / height - w_y, left / height + w_x)
+    np.testing.assert_allclose(log.optical_flow.values["optical_flow"][7], expected, atol=1e-6)
+    np.testing.assert_allclose(log.range_finder.values["range_finder"], height)
+    np.testing.assert_allclose(log.motors.values["commands"][0], [0.0, 0.25, 0.5, 1.0])
+    np.testing.assert_allclose(log.battery.values["battery"], 15.5)
 
 
 # ---- PX4 -----------------------------------------------------------------------------------------
@@ -473,3 +507,19 @@ seed = 3
         file.write_text(wrong)
         with pytest.raises(ValueError, match=message):
             read_log(tmp_path / "flight.csv.gz", columns=file)
+
+
+def test_map_for_nanobench_reads_its_columns(flight):
+    contents = tomllib.loads((EXAMPLES / "nanobench.toml").read_text())
+    names = [name for entry in contents.values() for name in entry["columns"]]
+    table = dict.fromkeys(names, np.ones(len(flight.time)))
+    table["t"] = flight.time
+    for names, values in (("gyro", flight.gyro), ("acc", flight.accel / 9.80665)):
+        table |= {f"imu_{names}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
+    table |= {f"p{axis}": flight.position[:, i] for i, axis in enumerate("xyz")}
+    table |= {f"motor_motor_m{k}": 0.25 * 65535 * table["t"] ** 0 for k in range(1, 5)}
+    log = read_log(table, columns=EXAMPLES / "nanobench.toml")
+    np.testing.assert_allclose(log.imu.values["accel"], flight.accel, atol=1e-9)
+    np.testing.assert_allclose(np.diff(log.gnss.time), 0.1, atol=1e-9)
+    np.testing.assert_allclose(log.motors.values["commands"], 0.25)
+    assert np.abs(log.gnss.values["position_I"] - flight.position[::5]).max() < 0.05
