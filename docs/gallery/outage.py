@@ -71,8 +71,8 @@ print(f"within 3 sigma: {100 * inside:.1f} % of all errors; lost filters: {100 *
 #
 # Now the accelerometer's bias steps by 0.2 m/s² while there is no GNSS, ten times the standard
 # deviation that the filter assumes for it. The error grows far beyond the covariance. When
-# fixes return, they contradict the estimate so much that the gate rejects them. After ten
-# rejections in a row the filter inflates its covariance, and accepts the next fix.
+# fixes return, they contradict the estimate so much that the gate rejects them. After a
+# second the filter resets the states that only GNSS measures, and accepts the next fix.
 # ``info["filter_diverged"]`` is true while the filter's covariance does not explain its
 # measurements.
 
@@ -97,7 +97,7 @@ print(f"farther than 10 cm at the end: {100 * far:.1f} % of the flights")
 
 # %%
 # One recovery is not always enough. While the new bias is still uncertain, the estimate drifts off
-# again, as the 95th percentile shows, until the filter inflates its covariance once more.
+# again, as the 95th percentile shows, until the filter resets its biases once more.
 #
 # ``truncate_when_diverged=True`` truncates an episode when its filter is flagged as diverged. See
 # :doc:`/filter-equations` for tests, thresholds and actions.

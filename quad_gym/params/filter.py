@@ -61,10 +61,14 @@ class FilterParams(Checked):
     normalized innovation squared exceeds the chi-square quantile of this probability (Y.
     Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
     Navigation, section 5.4); 0: no gate"""
-    max_rejections: Annotated[int, check.whole] = 10
-    """number of consecutive rejections of a sensor's measurements after which the estimate is
-    assumed to be wrong instead: the variances of the measured states are raised to the square of
-    the innovation, and the next measurement is accepted"""
+    max_rejections: Annotated[int, check.whole] = 5
+    """least number of consecutive rejections of a sensor's measurements before states are reset"""
+    reset_timeout: check.Positive = 1.0
+    """time for which a sensor is rejected before the states that only it measures are reset to it
+    [s]; as `no_aid_timeout_max` of PX4 EKF2"""
+    glitch_timeout: check.Positive = 10.0
+    """the same if its innovations have begun with a step, which an IMU does not make [s]; as
+    `posRetryTimeUseVel_ms` of ArduPilot NavEKF3"""
     max_direction_sigma: check.Positive = 0.2
     """standard deviation of a feature's predicted direction above which a filter with an innovation
     gate ignores the feature [rad]; half the square of this angle, which a linear model neglects, is

@@ -39,6 +39,7 @@ class GateDecision(IntEnum):
     REJECTED = 2  #: excluded from the update, as the innovation exceeds the gate
     FAILED = 3  #: part of an update that failed as a whole, see `FilterStatus`
     UNSURE = 4  #: excluded feature, with a predicted direction too uncertain for a linear model
+    WEAKENED = 5  #: used with so much more noise that its innovation is at the gate
 
 
 class Source(IntEnum):
@@ -109,6 +110,24 @@ AID_FREEDOMS = (1, 3, 2, 1)
 """Numbers in a measurement of each aiding sensor, in the order of `Aid`."""
 
 
+class Observes(IntFlag):
+    """States that a group of measurements observes, for fault isolation."""
+
+    POSITION = 1  #: horizontal
+    HEIGHT = 2
+    VELOCITY = 4
+    HEADING = 8
+
+
+_FIX = int(Observes.POSITION | Observes.HEIGHT | Observes.VELOCITY)
+GROUP_OBSERVES = (
+    *(_FIX, int(Observes.HEADING), int(Observes.VELOCITY), int(_FIX | Observes.HEADING)),
+    *map(int, (Observes.HEIGHT, Observes.HEADING, Observes.VELOCITY, Observes.HEIGHT)),
+)
+"""The same of each group, in the order of `Block` and `Aid`, as numbers."""
+QUANTITIES = len(Observes)  #: number of the bits of `Observes`
+
+
 class Act(IntEnum):
     """Tasks of a sensor's stage."""
 
@@ -116,7 +135,7 @@ class Act(IntEnum):
     SAMPLE = 1  #: measure when due, queue delayed measurements, and deliver the ones that arrive
     EXPECT = 2  #: predict the measurement: its value at the estimate, its noise and its columns
     GATE = 3  #: store the innovation, and mask it if it exceeds the gate
-    INFLATE = 4  #: inflate the variances of states that may be wrong after an alarm
+    RESET = 4  #: reset states to the sensor after it was refused for too long
     ALIGN = 5  #: initialize the heading, if the sensor is the `heading_sensor` of the settings
 
 

@@ -107,7 +107,9 @@ PARAMS_FIELDS = (
     Field("gate_position", (), "-", "largest accepted NIS of a position"),
     Field("gate_direction", (), "-", "largest accepted NIS of a direction"),
     Field("gate_uncertainty", (), "rad^2", "largest sum of the variances of a feature's predicted direction"),
-    Field("max_rejections", (), "-", "rejections in a row that reopen the gate"),
+    Field("max_rejections", (), "-", "rejections in a row before a reset"),
+    Field("reset_timeout", (), "s", "time of rejections before a reset"),
+    Field("glitch_timeout", (), "s", "the same after a step of the sensor"),
     Field("noisy_sigma", (4,), "mixed", "of a noisy observation: position, velocity, attitude, body rates"),
 )
 # fmt: on

@@ -38,8 +38,9 @@ WORK_FIELDS = (
     Field("judged_nis", (), "-", "sum of their NIS"),
     Field("judged_freedoms", (), "-", "sum of their degrees of freedom"),
     Field("left_out", (), "-", "numbers masked"),
-    Field("alarm", (SENSOR_GROUPS,), "0 or 1", "groups rejected so often that the filter is likely wrong"),
-    Field("drifting", (), "0 or 1", "whether the innovations of any drift"),
+    Field("reset", (SENSOR_GROUPS,), "0 or 1", "groups to which states are reset"),
+    Field("alone", (SENSOR_GROUPS,), "0 or 1", "groups that measure what no other accepted sensor does"),
+    Field("drifted", (), "0 or 1", "whether the estimate has drifted off gradually"),
     Field("hidden", (MAX_FEATURES,), "0 or 1", "features whose directions are too uncertain"),
     # the segment of a trajectory at an instant
     Field("path_time", (), "s", "of the episode; then since the beginning of the segment"),

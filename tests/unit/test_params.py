@@ -95,6 +95,7 @@ BAD_VALUES = {
         "attitude_reset": ["turn", 1, None],
         "false_alarm_probability": [0.5, 1.0, *BELOW_ZERO],
         "max_rejections": [0, -1, 1.5, True, *NO_NUMBERS],
+        "reset_timeout glitch_timeout": NOT_POSITIVE,
     },
     "InitialPoseParams": {"position_sigma heading_sigma": NOT_POSITIVE},
     "NoisyObservationParams": {"position velocity attitude body_rates": BELOW_ZERO},

@@ -17,15 +17,14 @@ import numpy as np
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.filter.error_state import E, V, velocity_error
 from quad_gym.kernels.filter.gate import MONITORED
-from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.filter.measurements import (
     choose_valid,
     count_measured,
     restore_valid,
     store_valid,
 )
+from quad_gym.kernels.filter.monitoring import forget_corrections, forget_drift_corrections
 from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_columns, take_mean
-from quad_gym.kernels.filter.recovery import forget_corrections
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
     carry_slow,

@@ -19,13 +19,26 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.measurements import call_measured
-from quad_gym.kernels.filter.recovery import follow_drift, follow_ratio, forget_corrections
+from quad_gym.kernels.filter.monitoring import follow_mean, follow_ratio, forget_corrections
+from quad_gym.kernels.filter.recovery import (
+    OUTLIER,
+    accept_group,
+    count_rejections,
+    glitches,
+    supported,
+)
 from quad_gym.kernels.filter.rows import columns_of
+from quad_gym.kernels.maths.elementary import clip, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or
-from quad_gym.kernels.maths.matrices import load_block, sum_of_outers_of_rows
+from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_outers_of_rows
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, Act, FilterForm, GateDecision
+
+_GAIN = 0.05  #: change of a factor on the noise by one measurement
+_ADAPTED = 1.3  #: mean NIS over the degrees of freedom above which the noise is adapted
+_SERIES = 3.0  #: rejections in a row beyond which further ones do not adapt the noise
+_MOST_FACTOR = 25.0  #: largest factor on the variance of a noise: five times its sigma
 
 
 @kernel
@@ -72,12 +85,21 @@ def _nis_of_direction(P_zz, nu):
 
 
 @kernel
-def _store_innovation(flight, s, first, nu, sigma, nis, rejected, unsure):
+def _minus(nu, last, numbers):
+    """Difference of an innovation and the last one; zero behind its `numbers`."""
+    if numbers < 3.0:
+        return (nu[0] - last[0], 0.0 * nu[0], 0.0 * nu[0])
+    return (nu[0] - last[0], nu[1] - last[1], nu[2] - last[2])
+
+
+@kernel
+def _store_innovation(flight, s, first, nu, sigma, nis, rejected, unsure, weakened):
     """Store the innovation of block s and the decision on it, in the lanes `first`."""
     keep(flight.innovation[s], first, nu)
     keep(flight.innovation_sigma[s], first, sigma)
     flight.block_nis[s] = select(first, nis, flight.block_nis[s])
     decision = select(rejected, GateDecision.REJECTED, GateDecision.ACCEPTED)
+    decision = select(weakened, GateDecision.WEAKENED, decision)
     decision = select(unsure, GateDecision.UNSURE, decision)
     flight.gate[s] = select(first, decision, flight.gate[s])
     rejections = flight.rejections[s]
@@ -99,24 +121,37 @@ def mask_block(work, settings, k, rejected):
 
 
 @kernel
-def count_rejections(flight, group, first, rejected):
-    """Count the consecutive rejections of a group of measurements."""
-    count = select(rejected, flight.rejected_in_row[group] + 1.0, 0.0)
-    flight.rejected_in_row[group] = select(first, count, flight.rejected_in_row[group])
-    accept_group(flight, group, first & logical_not(rejected))
-
-
-@kernel
-def accept_group(flight, group, accepted):
-    """Store the time of a group's last accepted measurement."""
-    before = flight.accepted_tick[group]
-    flight.accepted_tick[group] = select(accepted, flight.tick, before)
-
-
-@kernel
 def _decide(flight, s, valid, wanted, again, decision):
     """Lanes in which a block gets `decision`: as `wanted`, in a later step as in the first."""
     return valid & ((wanted & logical_not(again)) | (again & (flight.gate[s] == decision)))
+
+
+@kernel
+def _weigh(flight, p, settings, group, s, valid, nis, limit, again):
+    """Lanes in which block s is rejected, and lanes in which its noise is increased.
+
+    An innovation beyond the gate is an error of the sensor, or else of the IMU; then it has a
+    bounded weight.
+    """
+    rejected, weakened = nis < 0.0, nis < 0.0  # all false
+    if (settings.form & FilterForm.GATE.value) != 0:
+        beyond = valid & (nis > limit)
+        if any_of(beyond):
+            hard = supported(flight, p, settings, group)
+            hard = hard | glitches(flight, p, settings, group, nis, limit)
+            rejected = beyond & hard
+            weakened = beyond & logical_not(hard)
+    rejected = _decide(flight, s, valid, rejected, again, GateDecision.REJECTED)
+    weakened = _decide(flight, s, valid, weakened, again, GateDecision.WEAKENED)
+    return rejected, weakened
+
+
+@kernel
+def weaken(work, k, weakened, share, P_zz):
+    """Add a share of P_zz to the noise of the block at row k, in the lanes `weakened`."""
+    if any_of(weakened):
+        more = load_block(work.Rz, k, k) + select(weakened, share, 0.0) * P_zz
+        store_block(work.Rz, k, k, more)
 
 
 @kernel
@@ -127,62 +162,126 @@ def add_nis(work, counted, nis, freedoms):
 
 
 @kernel
-def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers, excused):
+def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers):
     """Store the innovation of block s, at row k, and mask it where its NIS exceeds `limit`.
 
+    Its stored standard deviations and NIS are those with the suite's noise.
+
     A block with fewer `numbers` than three has masked rows behind them, which add nothing to its
-    NIS. Rejections in the lanes `excused` do not count against the filter.
+    NIS. Rejections do not count against a filter that other sensors support.
     """
-    gating, again = (settings.form & FilterForm.GATE.value) != 0, work.again > 0.0
+    again = work.again > 0.0
     valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
-    P_zz, nu = _covariance(p, work, settings, k), load3(work.nu[k : k + 3])
-    nis = _nis_of_triple(P_zz, nu)
-    rejected = _decide(flight, s, valid, (nis > limit) & gating, again, GateDecision.REJECTED)
+    P_suite, nu = _covariance(p, work, settings, k), load3(work.nu[k : k + 3])
+    P_zz = P_suite + scale_noise(flight, work, settings, k, group)
+    nis, last = _nis_of_triple(P_zz, nu), flight.innovation[s]
+    scatter = 0.5 * _nis_of_triple(P_zz, _minus(nu, last, numbers))
+    rejected, weakened = _weigh(flight, p, settings, group, s, valid, nis, limit, again)
+    weaken(work, k, weakened, nis / limit - 1.0, P_zz)
     sigma = (math.sqrt(P_zz[0][0]), math.sqrt(P_zz[1][1]), math.sqrt(P_zz[2][2]))
     scaled = (nu[0] / sigma[0], nu[1] / sigma[1], nu[2] / sigma[2])
+    sigma = (math.sqrt(P_suite[0][0]), math.sqrt(P_suite[1][1]), math.sqrt(P_suite[2][2]))
+    nis_suite = _nis_of_triple(P_suite, nu)
     if numbers < 3.0:
         none = np.nan + 0.0 * nis
         nu, sigma = (nu[0], none, none), (sigma[0], none, none)
         scaled = (scaled[0], 0.0 * nis, 0.0 * nis)
     first = valid & logical_not(again)
-    _store_innovation(flight, s, first, nu, sigma, nis, rejected, nis < nis)
-    follow_drift(flight, group, first, scaled)
-    add_nis(work, first & logical_not(rejected & excused), nis, numbers)
-    mask_rejected(flight, work, settings, k, group, valid, rejected, numbers)
+    _store_innovation(flight, s, first, nu, sigma, nis_suite, rejected, nis < nis, weakened)
+    beyond = rejected | weakened
+    judge(flight, p, work, settings, group, first, beyond, nis, scatter, numbers, limit)
+    follow_mean(flight, group, first & logical_not(beyond), scaled)
+    mask_rejected(flight, work, settings, k, s, valid, numbers)
 
 
 @kernel
-def gate_direction(flight, p, work, settings, k, s, valid, limit):
+def gate_direction(flight, p, work, settings, k, s, group, valid, limit):
     """Store the innovation of a direction, block s, in the lanes `valid`.
 
     Returns:
-        Lanes in which it is rejected; lanes in which it is too uncertain, where the sum of its
-        predicted variances exceeds `limit`; its innovation in standard deviations; its NIS.
+        Lanes in which it is beyond the gate; lanes in which it is too uncertain, where the sum of
+        its predicted variances exceeds `limit`; its NIS; half the NIS of its difference from the
+        last one; its innovation in standard deviations.
     """
     gating, again = (settings.form & FilterForm.GATE.value) != 0, work.again > 0.0
     u, nu = load3(work.z_hat[k : k + 3]), load3(work.nu[k : k + 3])
-    nu, P_zz = _across(u, _covariance(p, work, settings, k), nu)
-    nis = _nis_of_direction(P_zz, nu)
+    whole = _covariance(p, work, settings, k)
+    nu_3 = nu
+    nu, P_suite = _across(u, whole, nu_3)
+    whole = whole + scale_noise(flight, work, settings, k, group)
+    _, P_zz = _across(u, whole, nu_3)
+    nis, last = _nis_of_direction(P_zz, nu), flight.innovation[s]
+    scatter = 0.5 * _nis_of_direction(P_zz, (nu[0] - last[0], nu[1] - last[1]))
     vague = (P_zz[0] + P_zz[2] > limit) & gating
     unsure = _decide(flight, s, valid, vague, again, GateDecision.UNSURE)
-    beyond = (nis > p.gate_direction) & gating & logical_not(unsure)
-    rejected = _decide(flight, s, valid, beyond, again, GateDecision.REJECTED)
+    sure, most = valid & logical_not(unsure), p.gate_direction
+    rejected, weakened = _weigh(flight, p, settings, group, s, sure, nis, most, again)
+    weaken(work, k, weakened, nis / most - 1.0, whole)
     none = np.nan + 0.0 * nis
-    sigma = (math.sqrt(P_zz[0]), math.sqrt(P_zz[2]), none)
+    scaled = (nu[0] / math.sqrt(P_zz[0]), nu[1] / math.sqrt(P_zz[2]))
+    sigma = (math.sqrt(P_suite[0]), math.sqrt(P_suite[2]), none)
+    nis_suite = _nis_of_direction(P_suite, nu)
     first = valid & logical_not(again)
-    _store_innovation(flight, s, first, (nu[0], nu[1], none), sigma, nis, rejected, unsure)
-    return rejected, unsure, (nu[0] / sigma[0], nu[1] / sigma[1]), nis
+    _store_innovation(
+        flight, s, first, (nu[0], nu[1], none), sigma, nis_suite, rejected, unsure, weakened
+    )
+    return rejected | weakened, unsure, nis, scatter, scaled
 
 
 @kernel
-def mask_rejected(flight, work, settings, k, group, valid, rejected, numbers):
-    """Mask the block at row k in the lanes `rejected`, and count consecutive rejections."""
+def mask_rejected(flight, work, settings, k, s, valid, numbers):
+    """Mask block s at row k in the lanes in which it is left out."""
     if (settings.form & FilterForm.GATE.value) != 0:
+        gate = flight.gate[s]
+        rejected = valid & ((gate == GateDecision.REJECTED) | (gate == GateDecision.UNSURE))
         mask_block(work, settings, k, rejected)
-        count_rejections(flight, group, valid & logical_not(work.again > 0.0), rejected)
         work.left_out = work.left_out + select(rejected, numbers, 0.0)
+
+
+@kernel
+def scale_noise(flight, work, settings, k, group):
+    """Multiply the noise of the block at row k by the factor of its group; return the increase."""
+    R = load_block(work.Rz, k, k)
+    more = 0.0 * R
+    if (settings.form & FilterForm.GATE.value) != 0:
+        more = (flight.noise_factor[group] - 1.0) * R
+        store_block(work.Rz, k, k, R + more)
+    return more
+
+
+@kernel
+def judge(flight, p, work, settings, group, first, beyond, nis, scatter, freedoms, limit):
+    """Take account of the NIS of a group in the lanes `first`, `beyond` the gate in some.
+
+    Rejections do not count against a filter that other sensors support.
+    """
+    if (settings.form & FilterForm.GATE.value) != 0:
+        glitch, excused = beyond, beyond
+        if any_of(beyond):
+            excused = beyond & supported(flight, p, settings, group)
+            glitch = beyond & glitches(flight, p, settings, group, nis, limit)
+        add_nis(work, first & logical_not(excused), nis, freedoms)
+        adapt_noise(flight, group, first, scatter, freedoms, limit)
+        count_rejections(flight, group, first, beyond, glitch, nis)
     else:
-        accept_group(flight, group, valid)
+        add_nis(work, first, nis, freedoms)
+        accept_group(flight, group, first)
+
+
+@kernel
+def adapt_noise(flight, group, first, scatter, freedoms, limit):
+    """Match the factor on a group's noise to the scatter of its innovations, where `first`.
+
+    The scatter is half the NIS of the difference of two successive innovations. Its mean is the
+    number of degrees of freedom if the noise is right; errors that the two have in common, of
+    biases or of a fault, cancel. The factor grows while the mean exceeds `_ADAPTED` times that.
+    Outliers, and further ones of a series beyond the gate, do not count.
+    """
+    mild = (scatter < OUTLIER * limit) & (flight.rejected_in_row[group] < _SERIES)
+    factor = flight.noise_factor[group]
+    growth = 1.0 + _GAIN * (minimum(scatter, limit) / freedoms - _ADAPTED)
+    factor = select(first & mild, clip(growth * factor, 1.0, _MOST_FACTOR), factor)
+    flight.noise_factor[group] = factor
 
 
 MONITORED = int(FilterForm.GATE | FilterForm.INNOVATIONS)
@@ -216,4 +315,4 @@ def forget_innovations(flight, feature_count, mask):
         keep(flight.innovation[s], mask, none)
         keep(flight.innovation_sigma[s], mask, none)
     forget_corrections(flight, mask)
-    reset(flight, mask, 0.0, "rejected_in_row reopened")
+    reset(flight, mask, 0.0, "rejected_in_row resets")

@@ -1,188 +1,170 @@
-"""Consistency monitoring: alarms, and the flag of a diverged filter.
+"""Fault isolation and resets: what a filter does when its gate refuses a sensor for long.
 
-Four signs show that the covariance does not explain the measurements; three are detected here.
+An innovation that is too large for its gate has one of two causes: the sensor is wrong, or the
+estimate is. Four known rules decide.
 
-* **Rejections.** A group of measurements was rejected `max_rejections` times in a row. Then the
-  filter is more likely wrong than the sensor - unless GNSS is rejected while the camera's features
-  fit, which supports the estimate: GNSS stays out as long as they do.
-* **Drifts.** Innovations of a consistent filter are white. Their mean over the last 50 or so, in
-  standard deviations, exceeds `DRIFT_ALARM` in a consistent filter about once in a million times.
-* **Corrections that go one way.** Corrections of the IMU biases are white in a consistent filter,
-  too, each with the variance that its update removes, P- minus P+. This is no more than the biases'
-  driving noise adds, so their sum over some seconds shows a bias that has changed long before
-  innovations do, in which attitude and position may compensate each other.
-* **Jumps of the drift** of GNSS positions, see `jumps.py`.
+* **Support.** Where sensors that have been accepted within `RECENT` observe all that the refused
+  sensor observes, the sensor is wrong and stays out. An error state of its own (the bias of a
+  barometer, hard iron) is reset to it instead. An image of several features supports itself.
+* **Agreement.** Where two sensors are refused at the same time, the estimate is wrong.
+* **Glitch.** An IMU is right from one measurement to the next, so errors of an estimate grow
+  gradually. A first refusal far beyond the gate is thus a step of the sensor, as in the GPS glitch
+  protection of ArduPilot; the filter waits `glitch_timeout` for its end.
+* **Time limit.** Otherwise, after `reset_timeout`, the states that the sensor measures are reset
+  to it: their covariances with other states are cut and their variances are the square of the
+  innovation, so that the next measurement determines them. If the error grew gradually, the IMU is
+  to blame: velocity, tilt and biases, too, get no more than the variances of their start. The
+  filter is flagged as diverged.
 
-`inflation.py` then inflates the covariance.
-
-Source: for the drift of innovations R. K. Mehra and J. Peschon, Automatica 7, 1971. That
-corrections are white with these variances follows from the whiteness of innovations.
+Source: the time limits and resets of PX4 EKF2 and ArduPilot NavEKF3; J. R. Carpenter and C. N.
+D'Souza (editors), Navigation Filter Best Practices, NASA/TP-2018-219822.
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BA, BG, E
-from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import dot, outer
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covariance
+from quad_gym.kernels.filter.measurements import call_sensors, flag_failure
+from quad_gym.kernels.filter.monitoring import (
+    RECENT,
+    biased,
+    drifts_suddenly,
+    forget_corrections,
+    forget_drift_corrections,
+    one_way,
+)
+from quad_gym.kernels.filter.slow import fill_slow, keep_factor
+from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.maths.factors import cholesky
+from quad_gym.kernels.maths.linalg import diagonal, dot, load33, outer
 from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import any_of, select
-from quad_gym.records import SENSOR_GROUPS
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import (
+    AID_GROUPS,
+    FEATURE_BLOCKS,
+    FIRST_GROUP,
+    GROUP_COUNT,
+    GROUP_OBSERVES,
+    POSITION_BLOCK,
+    QUANTITIES,
+    SENSOR_GROUPS,
+    SENSORS,
+    VELOCITY_BLOCK,
+    Act,
+    Aid,
+    Observes,
+)
 
-DRIFT_ALARM = 0.55  #: mean of the last innovations, in standard deviations, above which they drift
-_MEMORY = 0.02
-"""Weight of the latest innovation in the mean, of standard deviation sqrt(0.02 / 1.98) = 0.1."""
-_CORRECTION_TIME = 3.0  #: time over which corrections of the biases are summed [s]
-_LONG_TIME = 12.0
-"""Time of the long sums, for errors that are small compared with the noise [s]: corrections of a
-bias compensate its error within P/Q, ten seconds or more, and show all of it only by then."""
-_ONE_WAY = 5.0  #: standard deviations of their sum above which they go one way
-_ONE_WAY_LONG = 24.0
-"""Normalized square of three long sums, chi-square, above which they go one way: exceeded with a
-probability of 2e-5, and, as these sums change slowly, once in many hours."""
-_HARMLESS = 1.0 / _ONE_WAY**2
-"""Share of the bias's variance in the test: the sum must also exceed its standard deviation."""
-LARGEST = 3.0  #: limit on each innovation in the mean, in standard deviations, because of outliers
-DIVERGED_RATIO, CONVERGED_RATIO = 2.1, 1.5
-"""Mean NIS over degrees of freedom at which a filter is flagged as diverged, and no longer is."""
-_RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
-ALARM_TIME = 1.0  #: shortest time for which a filter is flagged as diverged after an alarm [s]
-_LONGEST_MEMORY = 60.0
-"""Longest such time where no variance is inflated [s]: by then the effect of a bias that is barely
-observable shows again."""
-FITTING_FEATURES = 3  #: fitting features of an image that support the estimate against GNSS
-_FIT_TIME = 1.0  #: time for which they support it [s]
-MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
-"""Largest standard deviations after an inflation [m/s^2], [rad/s], [rad]."""
-MOST_POSITION, MOST_VELOCITY = 100.0, 20.0
-"""Largest standard deviations after an inflation [m], [m/s]. A rejected position counts in full."""
-_REMAINING = 9.0
-"""Square of the ratio of a possible error to its visible part: corrections or the drift of GNSS may
-have followed in part."""
+_BAROMETER = AID_GROUPS + int(Aid.BAROMETER)
+_WITH_OWN_ERROR = (_BAROMETER, AID_GROUPS + int(Aid.MAGNETOMETER))
+"""Groups of sensors with an error state of their own."""
+_NO_GLITCH = (*_WITH_OWN_ERROR, FEATURE_BLOCKS)
+"""Groups whose steps do not lengthen the time limit: an image of several features is redundant."""
+VELOCITY_BIT = int(Observes.VELOCITY).bit_length() - 1
+OUTLIER = 4.0
+"""Ratio of NIS and gate beyond which a first refusal is a step of the sensor: an innovation of
+twice the largest one that the gate explains."""
+_MORE = 16.0  #: factor on the variances of position and velocity where the biases are reset
 MOST_ANGLE = math.pi / math.sqrt(3.0)
 """Largest standard deviation of an angle [rad], when it is unknown."""
 
 
 @kernel
-def follow_drift(flight, group, valid, nu):
-    """Average the innovation of a group, in standard deviations, in the lanes `valid`."""
-    for i in range(3):
-        value = clip(nu[i], -LARGEST, LARGEST)
-        mean = flight.innovation_drift[group, i]
-        mean = mean + _MEMORY * (value - mean)
-        flight.innovation_drift[group, i] = select(valid, mean, flight.innovation_drift[group, i])
-
-
-@kernel
-def follow_corrections(flight, p, L, L9, dx, columns, ok):
-    """Add up an update's corrections dx of the biases, and their variances, where `ok`.
-
-    L is the factor before the update, L9 has the `columns` that the update has changed.
-    """
-    passed = (flight.tick - flight.corrected_tick) * p.dt
-    kept = maximum(1.0 - passed / _CORRECTION_TIME, 0.0)
-    kept_long = maximum(1.0 - passed / _LONG_TIME, 0.0)
-    for i in range(6):
-        removed = 0.0 * kept
-        for j in range(columns):
-            if j < 15:
-                removed = removed + L[BA + i, j] * L[BA + i, j]
-            removed = removed - L9[BA + i, j] * L9[BA + i, j]
-        removed, shift = maximum(removed, 0.0), dx[BA + i]
-        add_correction(flight.corrected, flight.corrected_variance, i, ok, kept, shift, removed)
-        sums, variances = flight.corrected_long, flight.corrected_long_variance
-        add_correction(sums, variances, i, ok, kept_long, shift, removed)
-    flight.corrected_tick = select(ok, flight.tick, flight.corrected_tick)
-
-
-@kernel
-def add_correction(sums, variances, i, ok, kept, shift, variance):
-    """Add a correction and its variance to sums of which a share is `kept`, where `ok`."""
-    sums[i] = select(ok, kept * sums[i] + shift, sums[i])
-    variances[i] = select(ok, kept * kept * variances[i] + variance, variances[i])
-
-
-@kernel
-def variance_of(flight, row):
-    """Variance of a state, from its row of the factor."""
-    variance = 0.0 * flight.tick
-    for j in range(15):
-        if j <= row:
-            variance = variance + flight.L[row, j] * flight.L[row, j]
-    return variance
-
-
-@kernel
-def one_way(flight, first):
-    """Lanes in which corrections of three biases from `first` on go one way; how far, squared.
-
-    Their sum must exceed the standard deviation of the bias: a smaller one is harmless, and may be
-    a rounding error of corrections by measurements that do not observe biases yet.
-    """
-    largest, square = -1.0 + 0.0 * flight.tick, 0.0 * flight.tick
-    together = square
-    for i in range(first, first + 3):
-        own = _HARMLESS * variance_of(flight, BA + i)
-        total = flight.corrected[i] * flight.corrected[i]
-        variance = own + flight.corrected_variance[i]
-        largest = maximum(largest, total - _ONE_WAY * _ONE_WAY * variance)
-        slow = flight.corrected_long[i] * flight.corrected_long[i]
-        together = together + slow / (own + flight.corrected_long_variance[i])
-        square = maximum(square, maximum(total, slow))
-    return (largest > 0.0) | (together > _ONE_WAY_LONG), square
-
-
-@kernel
-def follow_ratio(flight, p, nis, freedoms, mask):
-    """Average NIS over its degrees of freedom, and flag divergence, in the lanes `mask`."""
-    ratio = minimum(nis / maximum(freedoms, 1.0), _LARGEST_RATIO)
-    measured = mask & (freedoms > 0.0)
-    mean = flight.nis_ratio + _RATIO_MEMORY * (ratio - flight.nis_ratio)
-    flight.nis_ratio = select(measured, mean, flight.nis_ratio)
-    limit = select(flight.diverged > 0.0, CONVERGED_RATIO, DIVERGED_RATIO)
-    alarmed = (flight.tick - flight.alarm_tick) * p.dt < ALARM_TIME
-    diverged = (flight.nis_ratio > limit) | alarmed
-    flight.diverged = select(mask, select(diverged, 1.0, 0.0), flight.diverged)
-
-
-@kernel
-def camera_fits(flight, p):
-    """Lanes whose features have fitted lately, which supports the estimate against GNSS."""
-    return (flight.tick - flight.fit_tick) * p.dt <= _FIT_TIME
-
-
-@kernel
-def forget_corrections(flight, mask):
-    """Reset the sums of corrections, in the lanes `mask`."""
-    names = "corrected corrected_variance corrected_long corrected_long_variance"
-    reset(flight, mask, 0.0, names)
-    flight.corrected_tick = select(mask, flight.tick, flight.corrected_tick)
-
-
-@kernel
 def begin_recovery(flight, mask):
     """Reset the monitoring at the start of an episode, in the lanes `mask`."""
-    reset(flight, mask, 0.0, "accepted_tick innovation_drift diverged")
-    reset(flight, mask, -1e9, "alarm_tick fit_tick")
-    flight.nis_ratio = select(mask, 1.0, flight.nis_ratio)
+    reset(
+        flight, mask, 0.0, "accepted_tick refused_tick refused_nis stepped innovation_mean diverged"
+    )
+    reset(flight, mask, 1.0, "noise_factor nis_ratio")
+    flight.alarm_tick = select(mask, -1e9, flight.alarm_tick)
 
 
 @kernel
-def drifts(flight, group):
-    """Lanes in which the innovations of a group of measurements drift."""
-    largest = abs(flight.innovation_drift[group, 0])
-    largest = maximum(largest, abs(flight.innovation_drift[group, 1]))
-    largest = maximum(largest, abs(flight.innovation_drift[group, 2]))
-    return largest > DRIFT_ALARM
+def count_rejections(flight, group, first, beyond, glitch, nis):
+    """Count the consecutive innovations of a group beyond its gate, and find steps of its sensor.
+
+    A step back, toward the estimate, begins another time limit.
+    """
+    row, last = flight.rejected_in_row[group], flight.refused_nis[group]
+    new, closer = first & beyond & (row < 1.0), first & beyond & (OUTLIER * nis < last)
+    again = closer & logical_not(new)
+    step = select(glitch & logical_not(again), 1.0, 0.0)
+    flight.stepped[group] = select(first & beyond, step, flight.stepped[group])
+    flight.refused_tick[group] = select(new | again, flight.tick, flight.refused_tick[group])
+    flight.refused_nis[group] = select(first & beyond, nis, last)
+    flight.rejected_in_row[group] = select(first, select(beyond, row + 1.0, 0.0), row)
+    accept_group(flight, group, first & logical_not(beyond))
 
 
 @kernel
-def raise_alarm(flight, p, work, group, free):
-    """Set work.alarm of a group of measurements, and work.drifting, in the lanes `free`."""
-    alarm = free & (flight.rejected_in_row[group] >= p.max_rejections)
-    work.alarm[group] = select(alarm, 1.0, 0.0)
-    work.drifting = select(free & drifts(flight, group), 1.0, work.drifting)
+def accept_group(flight, group, accepted):
+    """Store the time of a group's last accepted measurement."""
+    before = flight.accepted_tick[group]
+    flight.accepted_tick[group] = select(accepted, flight.tick, before)
+
+
+@kernel
+def _confirmed(flight, p, settings, refused, bit):
+    """Lanes in which another group than `refused` has lately measured a quantity of `Observes`."""
+    found = flight.tick < 0.0  # all false
+    for sensor in range(SENSORS):
+        if settings.sensor_blocks[sensor] > 0:
+            first = FIRST_GROUP[sensor]
+            for group in range(first, first + GROUP_COUNT[sensor]):
+                shifted = (
+                    group == POSITION_BLOCK and settings.estimates_drift and bit != VELOCITY_BIT
+                )
+                if group != refused and not shifted and (GROUP_OBSERVES[group] >> bit) & 1:
+                    since = (flight.tick - flight.accepted_tick[group]) * p.dt
+                    found = found | (since < RECENT)
+    return found
+
+
+@kernel
+def supported(flight, p, settings, refused):
+    """Lanes in which other sensors confirm all that the group `refused` measures.
+
+    An image of several features supports itself, so nothing overrules it.
+    """
+    if refused == FEATURE_BLOCKS:
+        return flight.tick < 0.0
+    found = flight.tick >= 0.0  # all true
+    for bit in range(QUANTITIES):
+        if (GROUP_OBSERVES[refused] >> bit) & 1:
+            found = found & _confirmed(flight, p, settings, refused, bit)
+    return found
+
+
+@kernel
+def glitches(flight, p, settings, group, nis, limit):
+    """Lanes in which an innovation beyond the gate is an error of the sensor, not of the IMU.
+
+    The series of such innovations has begun with a step since the last accepted one, beyond what
+    the last ones explain.
+    """
+    row = flight.rejected_in_row[group]
+    since = (flight.tick - flight.accepted_tick[group]) * p.dt
+    step = (nis > OUTLIER * maximum(flight.nis_ratio, 1.0) * limit) & (since < RECENT)
+    found = ((row < 1.0) & step) | ((row > 0.0) & (flight.stepped[group] > 0.0))
+    if group in (POSITION_BLOCK, VELOCITY_BLOCK):  # of one receiver
+        other = POSITION_BLOCK + VELOCITY_BLOCK - group
+        found = found | ((flight.stepped[other] > 0.0) & (flight.rejected_in_row[other] > 0.0))
+    if group in _WITH_OWN_ERROR:
+        found = flight.tick >= 0.0  # their error state would take up the error
+    if group == POSITION_BLOCK:
+        found = found | _dead_reckons(flight, p, settings)
+    return found
+
+
+@kernel
+def _dead_reckons(flight, p, settings):
+    """Lanes in which accepted velocities predict positions better than fixes measure them.
+
+    That is, over the time `RECENT`; the position cannot have drifted off then.
+    """
+    precise = p.velocity_sigma * RECENT < p.position_sigma_I[0]
+    return precise & _confirmed(flight, p, settings, POSITION_BLOCK, VELOCITY_BIT)
 
 
 @kernel
@@ -192,83 +174,177 @@ def time_of(flight, p, group):
 
 
 @kernel
-def enlarge(square, most):
-    """Variance of an error whose visible part has the `square`, at most `most` squared."""
-    return minimum(_REMAINING * square, most * most)
+def reset_rows(P, first, last, states, lanes):
+    """Set the covariances in rows and columns from `first` until `last` to zero, where `lanes`."""
+    for i in range(first, states):
+        for j in range(i // 3 * 3 + 3):
+            if i != j and ((first <= i and i < last) or (first <= j and j < last)):
+                P[i, j] = select(lanes, 0.0, P[i, j])
 
 
 @kernel
-def raise_variance(P, i, alarm, least):
-    """Raise a variance of P to at least `least` in the lanes `alarm`."""
-    P[i, i] = maximum(P[i, i], select(alarm, least, 0.0))
+def reset_variances(P, first, states, lanes, variances):
+    """Cut the covariances of three states from the row `first` on, and set their variances.
 
-
-@kernel
-def raise_variances(P, first, alarm, least):
-    """Raise three variances of P from the row `first` on to at least `least`, where `alarm`."""
-    for i in range(first, first + 3):
-        raise_variance(P, i, alarm, least)
-
-
-@kernel
-def inflate_accel_bias(p, P, acceleration, alarm):
-    """Raise the standard deviations of accelerometer biases, and of the tilt in proportion."""
-    bounded = minimum(acceleration, MOST_ACCEL_BIAS)
-    raise_variances(P, BA, alarm, bounded * bounded)
-    tilt = minimum(acceleration / p.gravity, MOST_TILT)
-    raise_variances(P, E, alarm, tilt * tilt)
-
-
-@kernel
-def inflate_gyro_bias(P, rate, alarm):
-    """Raise the standard deviations of gyro biases."""
-    bounded = minimum(rate, MOST_GYRO_BIAS)
-    raise_variances(P, BG, alarm, bounded * bounded)
-
-
-@kernel
-def inflate_heading(P, R_BI, square, alarm):
-    """Raise the variance of the heading, the angle about the vertical."""
-    P_ee, vertical = load_block(P, E, E), R_BI.T[2]
-    heading = dot(vertical, P_ee @ vertical)
-    wanted = select(alarm, minimum(square, MOST_ANGLE * MOST_ANGLE), 0.0)
-    more = maximum(wanted - heading, 0.0)
-    store_block(P, E, E, P_ee + outer(more * vertical, vertical))
-
-
-@kernel
-def _memory(flight, p, i, drive):
-    """Time in which corrections reduce the error of a bias to a third [s].
-
-    Updates reduce its variance P at the recent rate, so an error decays at this rate over P. In the
-    long run the rate is the Q that drives the bias; while P is still larger after a start, it is
-    higher. All innovations together show an error of n standard deviations as n over the root of
-    two: when they no longer show it, up to about seven may remain.
+    No variance becomes smaller.
     """
-    variance = variance_of(flight, BA + i)
-    taken = flight.corrected_long_variance[i] / (0.5 * _LONG_TIME)
-    driven = drive * drive / p.dt
-    return minimum(variance / maximum(taken, driven), _LONGEST_MEMORY)
+    reset_rows(P, first, first + 3, states, lanes)
+    for i in range(3):
+        k = first + i
+        P[k, k] = maximum(P[k, k], select(lanes, variances[i], 0.0))
 
 
 @kernel
-def flag_drifts(flight, p, mask):
-    """Flag a filter without a gate as diverged while innovations drift, in the lanes `mask`.
+def reset_variance(P, row, states, lanes, variance):
+    """Do the same for one state."""
+    reset_rows(P, row, row + 1, states, lanes)
+    P[row, row] = maximum(P[row, row], select(lanes, variance, 0.0))
 
-    The mean of a sensor that no longer measures is outdated and does not count. As nothing is
-    inflated, the flag stays until the biases have been corrected.
+
+@kernel
+def reset_heading(P, R_BI, states, lanes, variance):
+    """Cut the covariances of the heading, the angle about the vertical, and set its variance."""
+    k = R_BI.T[2]
+    cut, P_ee = select(lanes, 1.0, 0.0), load_block(P, E, E)
+    one = 0.0 * cut + 1.0
+    M = diagonal((one, one, one)) + outer(-cut * k, k)
+    for j in range(0, E, 3):
+        store_block(P, E, j, M @ load_block(P, E, j))
+    heading = cut * maximum(minimum(variance, MOST_ANGLE * MOST_ANGLE), dot(k, P_ee @ k))
+    store_block(P, E, E, M @ P_ee @ M + outer(heading * k, k))
+    for i in range(E + 3, states, 3):
+        store_block(P, i, E, load_block(P, i, E) @ M)
+
+
+@kernel
+def _reset_motion(flight, p, P, states, lanes, accel, gyro):
+    """Reset attitude and biases to their variances at the start, and cut their covariances.
+
+    Position and velocity follow from them: their variances are multiplied by `_MORE`, and the
+    velocity's are at least those that such a tilt causes in the time `RECENT`.
+    Those of the biases are at least nine times the squares of corrections, `accel` and `gyro`, that
+    have gone one way.
     """
-    drifting = flight.nis_ratio > DIVERGED_RATIO
+    R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
+    k, start = R_BI.T[2], p.heading_sigma * p.heading_sigma
+    heading = select(lanes, maximum(dot(k, P_ee @ k), start), 0.0)
+    level = p.initial_tilt_sigma > 0.0
+    tilt = select(level, p.initial_tilt_sigma, p.first_baseline_sigma)
+    tilt = tilt * tilt
+    speed = p.gravity * p.gravity * tilt * RECENT * RECENT
+    for row, least in ((R, 0.0 * speed), (V, speed)):
+        own = load_block(P, row, row)
+        x, y = maximum(_MORE * own[0][0], least), maximum(_MORE * own[1][1], least)
+        reset_variances(P, row, states, lanes, (x, y, _MORE * own[2][2]))
+    reset_variances(P, E, states, lanes, (tilt, tilt, tilt))
+    P_ee = load_block(P, E, E)
+    more = maximum(heading - dot(k, P_ee @ k), 0.0)
+    store_block(P, E, E, P_ee + outer(more * k, k))
+    accel = maximum(p.accel_bias_sigma * p.accel_bias_sigma, 9.0 * accel)
+    reset_variances(P, BA, states, lanes, (accel, accel, accel))
+    gyro = maximum(p.gyro_bias_sigma * p.gyro_bias_sigma, 9.0 * gyro)
+    reset_variances(P, BG, states, lanes, (gyro, gyro, gyro))
+
+
+@kernel
+def _reset_drift(flight, p, P, states, lanes):
+    """Reset position and drift after a jump, by the square of the drift's corrections."""
+    mean = 0.0 * flight.tick
+    for i in range(3):
+        mean = mean + flight.drift_corrected[i] * flight.drift_corrected[i] / 3.0
+    for i in range(3):
+        total = flight.drift_corrected[i]
+        square = 9.0 * maximum(total * total, mean)
+        reset_variance(P, R + i, states, lanes, square)
+        reset_variance(P, D + i, states, lanes, square)
+
+
+@kernel
+def _choose(flight, p, work, settings, mask, drifted):
+    """Fill work.reset with the groups to which states are reset, and work.drifted.
+
+    Returns:
+        Lanes in which any state is reset.
+    """
+    none = flight.tick < 0.0
+    sensors, late = 0.0 * flight.tick, none
+    for sensor in range(SENSORS):
+        first, refused = FIRST_GROUP[sensor], none
+        for group in range(first, first + GROUP_COUNT[sensor]):
+            refused = refused | (flight.rejected_in_row[group] >= 2.0)
+            drifted = drifted | (mask & biased(flight, p, group))
+        sensors = sensors + select(refused, 1.0, 0.0)
+    work.drifted = select(drifted, 1.0, 0.0)
+    if not any_of((mask & (sensors > 0.0)) | drifted):
+        for group in range(SENSOR_GROUPS):
+            work.reset[group] = 0.0 * flight.tick
+            work.alone[group] = 0.0 * flight.tick
+        return none
     for group in range(SENSOR_GROUPS):
-        recent = (flight.tick - flight.accepted_tick[group]) * p.dt <= ALARM_TIME
-        drifting = drifting | (recent & drifts(flight, group))
-    accel, _ = one_way(flight, 0)
-    gyro, _ = one_way(flight, 3)
-    drifting = mask & (drifting | accel | gyro)
-    if any_of(drifting):
-        memory = ALARM_TIME + 0.0 * p.dt
-        for i in range(3):
-            memory = maximum(memory, _memory(flight, p, i, p.accel_bias_drive))
-            memory = maximum(memory, _memory(flight, p, 3 + i, p.gyro_bias_drive))
-        held = maximum(flight.alarm_tick, flight.tick + (memory - ALARM_TIME) / p.dt)
-        flight.alarm_tick = select(drifting, held, flight.alarm_tick)
+        row, stepped = flight.rejected_in_row[group], flight.stepped[group] > 0.0
+        alone = logical_not(supported(flight, p, settings, group))
+        waited = (flight.tick - flight.refused_tick[group]) * p.dt
+        long = mask & (row >= 2.0) & (waited >= p.reset_timeout)
+        flight.alarm_tick = select(long & alone, flight.tick, flight.alarm_tick)
+        due = long & (row >= p.max_rejections)
+        if group not in _NO_GLITCH:
+            glitch = stepped & (sensors < 2.0) & (waited < p.glitch_timeout)
+            due = due & logical_not(glitch)
+        late = late | (due & alone)
+        drifted = drifted | (due & alone & logical_not(stepped))
+        work.alone[group] = select(alone, 1.0, 0.0)
+        work.reset[group] = select(due, 1.0, 0.0)
+    work.drifted = select(drifted, 1.0, 0.0)
+    alarmed = drifted
+    for group in range(SENSOR_GROUPS):
+        alone, refused = work.alone[group] > 0.0, mask & (flight.rejected_in_row[group] >= 2.0)
+        chosen = refused & late & alone
+        if group in _WITH_OWN_ERROR:
+            chosen = chosen | (work.reset[group] > 0.0)
+        work.reset[group] = select(chosen, 1.0, 0.0)
+        alarmed = alarmed | chosen
+    return alarmed
+
+
+@kernel
+def reset_states(flight, p, work, settings, mask, slow, stages):
+    """Reset states to sensors that were refused for too long, in the lanes `mask`."""
+    accel, corrected_a = one_way(flight, 0)
+    gyro, corrected_g = one_way(flight, 3)
+    accel, gyro = mask & accel, mask & gyro
+    alarmed = _choose(flight, p, work, settings, mask, accel | gyro)
+    moved = flight.tick < 0.0  # all false
+    if slow is not None:
+        if slow.estimates_drift:
+            altered = (work.reset[_BAROMETER] > 0.0) & (work.alone[_BAROMETER] > 0.0)
+            moved = mask & (drifts_suddenly(flight) | altered)
+            moved = moved & logical_not(supported(flight, p, settings, POSITION_BLOCK))
+            alarmed = alarmed | moved
+    if not any_of(alarmed):
+        return
+    P, states = work.P, 15
+    put_covariance(P, flight.L, 1.0 + 0.0 * flight.tick)
+    if slow is not None:
+        states = 15 + slow.slow_states
+        fill_slow(flight, slow, P)
+    drifted, corrected_a = work.drifted > 0.0, select(accel, corrected_a, 0.0)
+    _reset_motion(flight, p, P, states, drifted, corrected_a, select(gyro, corrected_g, 0.0))
+    if slow is not None:
+        if slow.estimates_drift:
+            _reset_drift(flight, p, P, states, moved)
+    call_sensors(flight, p, p, settings, work, stages, Act.RESET, 0)
+    ok = alarmed & (cholesky(P, states, work.inverse_diagonal) > 0.0)
+    keep_factor(flight, slow, work, ok)
+    failed = alarmed & logical_not(ok)
+    flag_failure(flight, failed)
+    flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
+    flight.alarm_tick = select(alarmed, flight.tick, flight.alarm_tick)
+    for group in range(SENSOR_GROUPS):
+        flight.resets[group] = flight.resets[group] + work.reset[group]
+        row = flight.rejected_in_row[group]
+        flight.rejected_in_row[group] = select(work.reset[group] > 0.0, 0.0, row)
+    reset(flight, drifted, 0.0, "innovation_mean")
+    forget_corrections(flight, drifted)
+    if slow is not None:
+        if slow.estimates_drift:
+            forget_drift_corrections(flight, alarmed)

@@ -25,7 +25,7 @@ fifteen states, as without d, and their prediction does not depend on d. Kernels
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
-from quad_gym.kernels.filter.jumps import forget_drift_corrections
+from quad_gym.kernels.filter.monitoring import forget_drift_corrections
 from quad_gym.kernels.maths.linalg import add_diagonal, cross, load3, load33
 from quad_gym.kernels.maths.matrices import (
     load_block,

@@ -17,15 +17,18 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.filter.gate import MONITORED, gate_innovations
-from quad_gym.kernels.filter.inflation import inflate
-from quad_gym.kernels.filter.jumps import follow_drift_corrections
 from quad_gym.kernels.filter.measurements import (
     call_measured,
     count_measured,
     flag_failure,
     mark_failed,
 )
-from quad_gym.kernels.filter.recovery import flag_drifts, follow_corrections
+from quad_gym.kernels.filter.monitoring import (
+    flag_biased,
+    follow_corrections,
+    follow_drift_corrections,
+)
+from quad_gym.kernels.filter.recovery import reset_states
 from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.filter.slow import load_slow, shift_slow, turn_iron
 from quad_gym.kernels.maths.elementary import is_finite
@@ -321,9 +324,9 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
         mark_failed(flight, failed)
     updated = mask & (work.measured > 0.0)
     if (form & FilterForm.GATE.value) != 0:
-        inflate(flight, p, work, settings, updated & logical_not(failed), slow, stages)
+        reset_states(flight, p, work, settings, updated & logical_not(failed), slow, stages)
     elif (form & MONITORED) != 0:
-        flag_drifts(flight, p, updated)
+        flag_biased(flight, p, updated)
 
 
 @stage

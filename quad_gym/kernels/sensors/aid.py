@@ -7,6 +7,7 @@ of one, and constant errors of scale and alignment.
 from typing import Any
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.error_state import D
 from quad_gym.kernels.filter.gate import gate_numbers
 from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
@@ -111,7 +112,7 @@ def _deliver(flight, work, settings, s, mask, due, values):
         deliver_arrived(work, block, measurement, 3, mask)
 
 
-def aid_stage(aid: Aid, measure: Any, expect: Any, inflate: Any, *others: Any) -> Any:
+def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> Any:
     """Make the stage of an aiding sensor.
 
     Args:
@@ -119,8 +120,8 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, inflate: Any, *others: Any) -
         measure: `(flight, p) -> numbers, within`: three numbers that it measures now, zero beyond
             its own, and the lanes in which it can measure.
         expect: `(flight, p, work, settings, k, valid)`: fill its rows from k on, in these lanes.
-        inflate: `(flight, p, work, settings, alarm, nu)`: inflate variances in the lanes `alarm`,
-            by the innovation nu.
+        reset: `(flight, p, work, settings, states, lanes, alone, nu)`: reset states to the sensor
+            in `lanes`, those of the vehicle where it is `alone`, by the innovation nu.
         others: `(flight, p, mask)`, draw further constant errors of an episode, and `align` of
             `sensor_stage`; optional.
     """
@@ -149,15 +150,15 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, inflate: Any, *others: Any) -
 
     @kernel
     def gate(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
-        limit, never = p.aid_gate[s], flight.tick < 0.0
-        gate_numbers(flight, p, work, settings, k, block, group, limit, numbers, never)
+        gate_numbers(flight, p, work, settings, k, block, group, p.aid_gate[s], numbers)
 
     @kernel
-    def inflate_alarmed(flight, p, work, settings):  # type: ignore[no-untyped-def]
-        nu = load3(flight.innovation[block])
-        inflate(flight, p, work, settings, work.alarm[group] > 0.0, nu)
+    def reset_states(flight, p, work, settings):  # type: ignore[no-untyped-def]
+        nu, lanes, alone = load3(flight.innovation[block]), work.reset[group], work.alone[group]
+        states = D + settings.slow_states
+        reset(flight, p, work, settings, states, lanes > 0.0, alone > 0.0, nu)
 
-    kernels = (begin, sample, expect_valid, gate, inflate_alarmed, *align)
+    kernels = (begin, sample, expect_valid, gate, reset_states, *align)
     return sensor_stage(Sensor[aid.name], *kernels)
 
 

@@ -7,11 +7,13 @@ filter (`filter/slow.py`). The model is linear, so sigma points and derivatives 
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.recovery import raise_variance
+from quad_gym.kernels.filter.recovery import reset_variance
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
+from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import diagonal, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.sensors.aid import aid_stage
+from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_AID, Aid
 
 _S = Aid.BAROMETER
@@ -42,10 +44,12 @@ def _expect(flight, p, work, settings, k, valid):
 
 
 @kernel
-def _inflate(flight, p, work, settings, alarm, nu):
-    """Inflate slow error and height to the square of a rejected innovation."""
-    raise_variance(work.P, D + settings.aid_scalar[_S], alarm, nu[0] * nu[0])
-    raise_variance(work.P, R + 2, alarm, nu[0] * nu[0])
+def _reset(flight, p, work, settings, states, lanes, alone, nu):
+    """Reset the slow error; where no other sensor measures it, the height, too."""
+    first, own = D + settings.aid_scalar[_S], p.slow_sigma[settings.aid_scalar[_S]]
+    square = maximum(select(alone, 0.0, nu[0] * nu[0]), own * own)
+    reset_variance(work.P, first, states, lanes, square)
+    reset_variance(work.P, R + 2, states, lanes & alone, nu[0] * nu[0] + own * own)
 
 
-barometer_stage = aid_stage(_S, _measure, _expect, _inflate)
+barometer_stage = aid_stage(_S, _measure, _expect, _reset)

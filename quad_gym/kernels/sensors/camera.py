@@ -16,23 +16,10 @@ import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
-from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.gate import (
-    accept_group,
-    add_nis,
-    count_rejections,
-    gate_direction,
-    mask_block,
-)
-from quad_gym.kernels.filter.recovery import (
-    FITTING_FEATURES,
-    LARGEST,
-    MOST_ANGLE,
-    follow_drift,
-    inflate_gyro_bias,
-    raise_variances,
-    time_of,
-)
+from quad_gym.kernels.filter.error_state import D, E, R, V
+from quad_gym.kernels.filter.gate import gate_direction, judge, mask_rejected
+from quad_gym.kernels.filter.monitoring import LARGEST, follow_mean
+from quad_gym.kernels.filter.recovery import MOST_ANGLE, reset_variances, time_of
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
@@ -49,7 +36,14 @@ from quad_gym.kernels.sensors.latency import (
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import DRAW_FEATURE, DRAW_PHASE, FEATURE_BLOCKS, FilterForm, Sensor
+from quad_gym.records import (
+    DRAW_FEATURE,
+    DRAW_PHASE,
+    FEATURE_BLOCKS,
+    VELOCITY_BLOCK,
+    FilterForm,
+    Sensor,
+)
 
 _CAMERA = int(Sensor.CAMERA)
 _PIXEL = 2e-6  #: [m]; it cancels, so it is no parameter: the report writes rays in meters
@@ -188,61 +182,57 @@ def _gate(flight, p, work, settings, k):
 
     A feature whose predicted direction is too uncertain for a linear model is masked, too: the
     error of a direction is bounded, so it would pass any gate, and its update would be wrong and
-    overconfident.
+    overconfident. An image counts as rejected if most of its features are.
     """
-    gating, again = (settings.form & FilterForm.GATE.value) != 0, work.again > 0.0
-    zero = 0.0 * p.sigma_beta
-    seen, refused, fresh, side, up = zero, zero, zero, zero, zero
+    again, zero = work.again > 0.0, 0.0 * p.sigma_beta
+    seen, refused, total, scatter, side, up = zero, zero, zero, zero, zero, zero
     for i in range(settings.feature_count):
         block = FEATURE_BLOCKS + i
         if any_of(flight.block_valid[block] > 0.0):
             valid = (work.taking > 0.0) & (flight.block_valid[block] > 0.0)
-            rejected, unsure, scaled, nis = gate_direction(
-                flight, p, work, settings, k, block, valid, p.gate_uncertainty
+            beyond, unsure, nis, change, scaled = gate_direction(
+                flight, p, work, settings, k, block, FEATURE_BLOCKS, valid, p.gate_uncertainty
             )
             counted = valid & logical_not(unsure | again)
-            add_nis(work, counted, nis, 2.0)
-            counts = select(counted, 1.0, 0.0)
-            fresh = fresh + counts
-            side = side + counts * clip(scaled[0], -LARGEST, LARGEST)
-            up = up + counts * clip(scaled[1], -LARGEST, LARGEST)
-            if gating:
-                out = rejected | unsure
-                mask_block(work, settings, k, out)
-                work.left_out = work.left_out + select(out, 3.0, 0.0)
-                seen = seen + select(valid & logical_not(unsure), 1.0, 0.0)
-                refused = refused + select(rejected, 1.0, 0.0)
+            seen = seen + select(counted, 1.0, 0.0)
+            refused = refused + select(counted & beyond, 1.0, 0.0)
+            total = total + select(counted, nis, 0.0)
+            scatter = scatter + select(counted, change, 0.0)
+            side = side + select(counted, clip(scaled[0], -LARGEST, LARGEST), 0.0)
+            up = up + select(counted, clip(scaled[1], -LARGEST, LARGEST), 0.0)
+            mask_rejected(flight, work, settings, k, block, valid, 3.0)
             k += 3
-    root = math.sqrt(maximum(fresh, 1.0))
-    follow_drift(flight, FEATURE_BLOCKS, fresh > 0.0, (side / root, up / root, zero))
-    if gating:
-        first = (seen > 0.0) & logical_not(again)
-        count_rejections(flight, FEATURE_BLOCKS, first, refused >= seen)
-        fits = (seen - refused >= FITTING_FEATURES) & (2.0 * refused < seen) & logical_not(again)
-        flight.fit_tick = select(fits, flight.tick, flight.fit_tick)
-    else:
-        accept_group(flight, FEATURE_BLOCKS, fresh > 0.0)
+    first, most = seen > 0.0, refused > 0.5 * seen
+    count, s = maximum(seen, 1.0), FEATURE_BLOCKS
+    mean, scatter, limit = total / count, scatter / count, p.gate_direction
+    judge(flight, p, work, settings, s, first, first & most, mean, scatter, 2.0, limit)
+    root = math.sqrt(count)
+    follow_mean(flight, s, first & logical_not(most), (side / root, up / root, zero))
 
 
 @kernel
-def _inflate(flight, p, work, settings):
-    """Inflate attitude, position and gyro biases after rejections of whole images.
+def _reset(flight, p, work, settings):
+    """Reset attitude and position.
 
-    The attitude is inflated by the largest innovation, the position by the corresponding offset at
-    the feature's distance.
+    The variance of the attitude is the square of the largest innovation, the variance of the
+    position that of the corresponding offset at the feature's distance.
     """
     angle, offset, P = 0.0 * flight.tick, 0.0 * flight.tick, work.P
-    alarm = work.alarm[FEATURE_BLOCKS] > 0.0
+    lanes, states = work.reset[FEATURE_BLOCKS] > 0.0, D + settings.slow_states
     for i in range(settings.feature_count):
         nu = flight.innovation[FEATURE_BLOCKS + i]
-        seen = alarm & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
+        seen = lanes & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
         square = select(seen, nu[0] * nu[0] + nu[1] * nu[1], 0.0)
         distance = norm(load3(p.features[i]) - load3(flight.r_hat))
         angle = maximum(angle, square)
         offset = maximum(offset, square * distance * distance)
-    raise_variances(P, E, alarm, minimum(angle, MOST_ANGLE * MOST_ANGLE))
-    raise_variances(P, R, alarm, offset)
-    inflate_gyro_bias(P, math.sqrt(angle) / time_of(flight, p, FEATURE_BLOCKS), alarm)
+    T = time_of(flight, p, FEATURE_BLOCKS)
+    speed = 4.0 * offset / (T * T)
+    drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
+    reset_variances(P, V, states, drifted, (speed, speed, speed))
+    reset_variances(P, R, states, lanes, (offset, offset, offset))
+    angle = minimum(angle, MOST_ANGLE * MOST_ANGLE)
+    reset_variances(P, E, states, lanes, (angle, angle, angle))
 
 
-camera_stage = sensor_stage(Sensor.CAMERA, _begin, _sample, _expect, _gate, _inflate)
+camera_stage = sensor_stage(Sensor.CAMERA, _begin, _sample, _expect, _gate, _reset)

@@ -1,8 +1,8 @@
 """The GNSS receiver: one clock and latency for position, baseline and velocity."""
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.error_state import D
 from quad_gym.kernels.filter.gate import gate_numbers
-from quad_gym.kernels.filter.recovery import camera_fits
 from quad_gym.kernels.maths.elementary import minimum
 from quad_gym.kernels.maths.linalg import keep, load3, load4
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
@@ -142,31 +142,27 @@ def _expect(flight, p, work, settings, k):
 
 @kernel
 def _gate(flight, p, work, settings, k):
-    """Store the innovations in the rows from k on, and mask those beyond the gate.
-
-    A position that is rejected while the camera fits shows an error of GNSS, not of the filter.
-    """
-    limit = p.gate_position
+    """Store the innovations in the rows from k on, and mask those beyond the gate."""
     for block in _BLOCKS:
         if any_of(flight.block_valid[block] > 0.0):
             if block == BASELINE_BLOCK:
                 gnss_baseline.gate(flight, p, work, settings, k)
             else:
-                excused = (block == POSITION_BLOCK) & camera_fits(flight, p)
-                gate_numbers(flight, p, work, settings, k, block, block, limit, 3.0, excused)
+                gate_numbers(flight, p, work, settings, k, block, block, p.gate_position, 3.0)
             k += 3
 
 
 @kernel
-def _inflate(flight, p, work, settings):
+def _reset(flight, p, work, settings):
+    states = D + settings.slow_states
     for block in _BLOCKS:
-        nu, alarm = load3(flight.innovation[block]), work.alarm[block] > 0.0
+        nu, lanes = load3(flight.innovation[block]), work.reset[block] > 0.0
         if block == POSITION_BLOCK:
-            gnss_position.inflate(flight, p, work, settings, alarm, nu)
+            gnss_position.reset(flight, p, work, settings, states, lanes, nu)
         elif block == BASELINE_BLOCK:
-            gnss_baseline.inflate(flight, p, work, settings, alarm, nu)
+            gnss_baseline.reset(flight, work, states, lanes, nu)
         else:
-            gnss_velocity.inflate(flight, p, work, settings, alarm, nu)
+            gnss_velocity.reset(work, states, lanes, nu)
 
 
-gnss_stage = sensor_stage(Sensor.GNSS, _begin, _sample, _expect, _gate, _inflate)
+gnss_stage = sensor_stage(Sensor.GNSS, _begin, _sample, _expect, _gate, _reset)

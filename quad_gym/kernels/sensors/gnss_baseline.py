@@ -16,19 +16,11 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.directions import direction_noise
-from quad_gym.kernels.filter.error_state import E
-from quad_gym.kernels.filter.gate import add_nis, gate_direction, mask_rejected
-from quad_gym.kernels.filter.recovery import (
-    camera_fits,
-    follow_drift,
-    inflate_gyro_bias,
-    inflate_heading,
-    time_of,
-)
+from quad_gym.kernels.filter.gate import gate_direction, judge, mask_rejected
+from quad_gym.kernels.filter.monitoring import follow_mean
+from quad_gym.kernels.filter.recovery import reset_heading
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
-from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import (
-    add_to_diagonal,
     dot,
     keep,
     load3,
@@ -37,7 +29,6 @@ from quad_gym.kernels.maths.linalg import (
     outer,
     rounded,
 )
-from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.simd.lanes import logical_not, select
 from quad_gym.records import BASELINE_BLOCK
 
@@ -85,37 +76,19 @@ def expect(flight, p, work, settings, k, valid):
 
 @kernel
 def gate(flight, p, work, settings, k):
-    """Store the innovation in the rows from k on, and mask it beyond the gate.
-
-    As for positions, a rejection while the camera fits does not count against the filter.
-    """
+    """Store the innovation in the rows from k on, and mask it beyond the gate."""
     s = BASELINE_BLOCK
     valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
-    rejected, _, nu, nis = gate_direction(flight, p, work, settings, k, s, valid, np.inf)
+    beyond, _, nis, scatter, scaled = gate_direction(
+        flight, p, work, settings, k, s, s, valid, np.inf
+    )
     first = valid & logical_not(work.again > 0.0)
-    follow_drift(flight, s, first, (nu[0], nu[1], 0.0 * p.sigma_beta))
-    add_nis(work, first & logical_not(rejected & camera_fits(flight, p)), nis, 2.0)
-    mask_rejected(flight, work, settings, k, s, valid, rejected, 3.0)
+    judge(flight, p, work, settings, s, first, beyond, nis, scatter, 2.0, p.gate_direction)
+    follow_mean(flight, s, first & logical_not(beyond), (scaled[0], scaled[1], 0.0 * nis))
+    mask_rejected(flight, work, settings, k, s, valid, 3.0)
 
 
 @kernel
-def inflate(flight, p, work, settings, alarm, nu):
-    """Inflate the attitude and the gyro biases.
-
-    The heading is inflated by the sideward innovation, roll and pitch by the upward one.
-    """
-    P, R_BI, side, up = (
-        work.P,
-        load33(flight.R_hat),
-        select(alarm, nu[0], 0.0),
-        select(alarm, nu[1], 0.0),
-    )
-    vertical = R_BI.T[2]
-    P_ee = load_block(P, E, E)
-    heading = dot(vertical, P_ee @ vertical)
-    tilt = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)
-    more = maximum(up * up - tilt, 0.0)
-    store_block(P, E, E, add_to_diagonal(P_ee, more) + outer(-more * vertical, vertical))
-    inflate_heading(P, R_BI, side * side, alarm)
-    rate = maximum(abs(side), abs(up)) / time_of(flight, p, BASELINE_BLOCK)
-    inflate_gyro_bias(P, rate, alarm)
+def reset(flight, work, states, lanes, nu):
+    """Reset the heading to the sideward innovation."""
+    reset_heading(work.P, load33(flight.R_hat), states, lanes, nu[0] * nu[0] + nu[1] * nu[1])

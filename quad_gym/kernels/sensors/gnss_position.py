@@ -12,23 +12,15 @@ and the derivative along an offset is dr + R_hat^T (de x l_p) + dd.
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.recovery import (
-    MOST_POSITION,
-    camera_fits,
-    drifts,
-    enlarge,
-    inflate_accel_bias,
-    raise_variance,
-    time_of,
-)
+from quad_gym.kernels.filter.error_state import D, R, V
+from quad_gym.kernels.filter.recovery import reset_variances, time_of
 from quad_gym.kernels.filter.rows import columns_of, lever_column, put_block, put_column
-from quad_gym.kernels.maths.elementary import exp, log, maximum
-from quad_gym.kernels.maths.linalg import diagonal, keep, load3, load33, norm, rounded, vector
+from quad_gym.kernels.maths.elementary import exp, log
+from quad_gym.kernels.maths.linalg import diagonal, dot, keep, load3, load33, rounded, vector
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
-from quad_gym.kernels.simd.lanes import logical_not, select
-from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, SENSOR_GROUPS
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, VELOCITY_BLOCK
 
 
 @kernel
@@ -77,36 +69,26 @@ def expect(flight, p, work, settings, k, valid):
 
 
 @kernel
-def inflate(flight, p, work, settings, alarm, nu):
-    """Inflate the position or its slow error, accelerometer biases and tilt.
+def reset(flight, p, work, settings, states, lanes, nu):
+    """Reset the position, and its slow error to the stationary one.
 
-    Where positions drift, a jump may be three times the innovation, as the drift has followed it in
-    part; but an innovation beyond `MOST_POSITION` counts in full, so that any jump is followed.
+    Where the estimate has drifted off and no other sensor measures the velocity, it has changed by
+    as much as the position in the time since the last accepted fix.
     """
-    P, T, jumped = work.P, time_of(flight, p, POSITION_BLOCK), alarm
+    square, T = dot(nu, nu), time_of(flight, p, POSITION_BLOCK)
+    zero, speed = 0.0 * square, 4.0 * square / (T * T)
+    drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
+    reset_variances(work.P, V, states, drifted, (speed, speed, speed))
+    drift = (zero, zero, zero)
     if settings.estimates_drift:
-        jumped = _has_jumped(flight, p, work)
-    for i in range(3):
-        square = nu[i] * nu[i]
-        if settings.estimates_drift:
-            square = maximum(enlarge(square, MOST_POSITION), square)
-            raise_variance(P, D + i, jumped, square)
-        raise_variance(P, R + i, jumped, square)
-    inflate_accel_bias(p, P, 2.0 * norm(nu) / (T * T), alarm)
+        drift = (_stationary(p, 0), _stationary(p, 1), _stationary(p, 2))
+        reset_variances(work.P, D, states, lanes, drift)
+    squares = (square + drift[0], square + drift[1], square + drift[2])
+    reset_variances(work.P, R, states, lanes, squares)
 
 
 @kernel
-def _has_jumped(flight, p, work):
-    """Lanes in which the vehicle, or GNSS, has likely jumped.
-
-    Positions raise an alarm; or another sensor does while at least two consecutive fixes are
-    rejected, as a single one may be an outlier; or innovations of fixes drift. A jump shows in
-    these innovations as often as in the sum of the drift's corrections (`filter/jumps.py`). A
-    camera that fits is evidence against a jump.
-    """
-    alarm = work.drifting
-    for group in range(SENSOR_GROUPS):
-        alarm = maximum(alarm, work.alarm[group])
-    jumped = (alarm > 0.0) & (flight.rejected_in_row[POSITION_BLOCK] > 1.0)
-    jumped = (jumped | drifts(flight, POSITION_BLOCK)) & logical_not(camera_fits(flight, p))
-    return (work.taking > 0.0) & (jumped | (work.alarm[POSITION_BLOCK] > 0.0))
+def _stationary(p, i):
+    """Variance of the slow error of positions in the long run."""
+    a, s = p.slow_decay[i], p.slow_drive[i]
+    return s * s / ((1.0 - a) * (1.0 + a))

@@ -9,13 +9,13 @@ linear: dz = dv.
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import V
-from quad_gym.kernels.filter.recovery import inflate_accel_bias, raise_variance, time_of
+from quad_gym.kernels.filter.recovery import reset_variances
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
-from quad_gym.kernels.maths.linalg import cross, diagonal, keep, load3, load4, load33, norm
+from quad_gym.kernels.maths.linalg import cross, diagonal, keep, load3, load4, load33
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK
+from quad_gym.records import DRAW_VELOCITY
 
 
 @kernel
@@ -44,8 +44,7 @@ def expect(flight, p, work, settings, k, valid):
 
 
 @kernel
-def inflate(flight, p, work, settings, alarm, nu):
-    """Inflate the velocity, accelerometer biases and tilt."""
-    for i in range(3):
-        raise_variance(work.P, V + i, alarm, nu[i] * nu[i])
-    inflate_accel_bias(p, work.P, norm(nu) / time_of(flight, p, VELOCITY_BLOCK), alarm)
+def reset(work, states, lanes, nu):
+    """Reset the velocity."""
+    squares = (nu[0] * nu[0], nu[1] * nu[1], nu[2] * nu[2])
+    reset_variances(work.P, V, states, lanes, squares)

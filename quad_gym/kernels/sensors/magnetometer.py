@@ -26,16 +26,9 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.align import lever_of_attitude
 from quad_gym.kernels.filter.error_state import BA, D, E, R, V, put_covariance
-from quad_gym.kernels.filter.recovery import (
-    MOST_ANGLE,
-    drifts,
-    inflate_gyro_bias,
-    inflate_heading,
-    raise_variance,
-    raise_variances,
-)
+from quad_gym.kernels.filter.recovery import reset_heading, reset_variances
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
-from quad_gym.kernels.maths.elementary import minimum, sin_cos
+from quad_gym.kernels.maths.elementary import maximum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     cross,
@@ -55,12 +48,9 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm
+from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.MAGNETOMETER
-_DRIFT_TIME = 0.5
-"""Time within which the magnetometer pulls the heading back [s]: shorter than it really is, so that
-the bias may be larger than a drift implies."""
 
 
 @kernel
@@ -186,29 +176,14 @@ def _expect(flight, p, work, settings, k, valid):
 
 
 @kernel
-def _inflate(flight, p, work, settings, alarm, nu):
-    """Inflate hard iron, attitude and gyro biases.
-
-    The variances of hard iron and of the heading are raised to the square of a rejected innovation.
-    Where innovations drift, a gyro bias rotates the attitude while the magnetometer pulls it back:
-    the variances of the attitude are raised to the square of the mean innovation, as an angle, and
-    the variances of the gyro biases to the square of the rate that rotates as far in `_DRIFT_TIME`.
-    """
-    k, group = D + settings.aid_vector[_S], AID_GROUPS + _S
-    m, R_BI, P = load3(p.aid_numbers[_S]), load33(flight.R_hat), work.P
-    level = m[0] * m[0] + m[1] * m[1]
-    inflate_heading(P, R_BI, dot(nu, nu) / level, alarm)
-    mean, sigma = (
-        load3(flight.innovation_drift[group]),
-        load3(flight.innovation_sigma[AID_BLOCKS + _S]),
-    )
-    off = (mean[0] * sigma[0], mean[1] * sigma[1], mean[2] * sigma[2])
-    turned = dot(off, off) / level
-    drifting = (work.taking > 0.0) & drifts(flight, group)
-    raise_variances(P, E, drifting, minimum(turned, MOST_ANGLE * MOST_ANGLE))
-    inflate_gyro_bias(P, math.sqrt(turned) / _DRIFT_TIME, drifting)
-    for i in range(3):
-        raise_variance(P, k + i, alarm, nu[i] * nu[i])
+def _reset(flight, p, work, settings, states, lanes, alone, nu):
+    """Reset hard iron; where no other sensor measures the heading, the heading, too."""
+    first, m, square = settings.aid_vector[_S], load3(p.aid_numbers[_S]), dot(nu, nu)
+    own = p.slow_sigma[first] * p.slow_sigma[first]
+    iron = select(alone, own, maximum(own, square))
+    reset_variances(work.P, D + first, states, lanes, (iron, iron, iron))
+    variance = (square + own) / (m[0] * m[0] + m[1] * m[1])
+    reset_heading(work.P, load33(flight.R_hat), states, lanes & alone, variance)
 
 
-magnetometer_stage = aid_stage(_S, _measure, _expect, _inflate, _draw, _align)
+magnetometer_stage = aid_stage(_S, _measure, _expect, _reset, _draw, _align)

@@ -18,11 +18,9 @@ W = R_hat v, dV = R_hat dv, G = u / h and D = h^2 - dh^2, that is
 and the derivative along an offset is (dV + W x de) G + W (du / h - u dh / h^2).
 """
 
-import math
-
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import E, R, V
-from quad_gym.kernels.filter.recovery import inflate_accel_bias, raise_variances, time_of
+from quad_gym.kernels.filter.recovery import reset_variances
 from quad_gym.kernels.filter.rows import put_block, put_column
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33, vector
@@ -32,7 +30,7 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.sensors.range_finder import LEAST_COSINE, ground_range
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_GROUPS, DRAW_AID, Aid, FilterForm
+from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.OPTICAL_FLOW
 
@@ -97,13 +95,11 @@ def _expect(flight, p, work, settings, k, valid):
 
 
 @kernel
-def _inflate(flight, p, work, settings, alarm, nu):
-    """Inflate velocity, accelerometer biases and tilt by a rejected innovation."""
+def _reset(flight, p, work, settings, states, lanes, alone, nu):
+    """Reset the velocity."""
     h, _ = ground_range(p, flight.r_hat, load33(flight.R_hat))
     square = h * h * (nu[0] * nu[0] + nu[1] * nu[1])
-    raise_variances(work.P, V, alarm, square)
-    T = time_of(flight, p, AID_GROUPS + _S)
-    inflate_accel_bias(p, work.P, math.sqrt(square) / T, alarm)
+    reset_variances(work.P, V, states, lanes & alone, (square, square, square))
 
 
-optical_flow_stage = aid_stage(_S, _measure, _expect, _inflate)
+optical_flow_stage = aid_stage(_S, _measure, _expect, _reset)

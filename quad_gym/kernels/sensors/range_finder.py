@@ -11,7 +11,7 @@ U = u + even_u and D = U^2 - odd_u^2; the derivative along an offset is dh / u -
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.recovery import raise_variance
+from quad_gym.kernels.filter.recovery import reset_variance
 from quad_gym.kernels.filter.rows import put_block, put_column
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33
@@ -70,9 +70,9 @@ def _expect(flight, p, work, settings, k, valid):
 
 
 @kernel
-def _inflate(flight, p, work, settings, alarm, nu):
-    """Inflate the height to the square of a rejected innovation."""
-    raise_variance(work.P, R + 2, alarm, nu[0] * nu[0])
+def _reset(flight, p, work, settings, states, lanes, alone, nu):
+    """Reset the height where no other sensor measures it."""
+    reset_variance(work.P, R + 2, states, lanes & alone, nu[0] * nu[0])
 
 
-range_finder_stage = aid_stage(_S, _measure, _expect, _inflate)
+range_finder_stage = aid_stage(_S, _measure, _expect, _reset)

@@ -19,7 +19,7 @@ def sensor_stage(
     sample: Any,
     expect: Any,
     gate: Any,
-    inflate: Any,
+    reset: Any,
     align: Any = _cannot_align,
 ) -> Any:
     """Make the stage of a sensor; its flag is an `Act`, and an argument times `ACTS`.
@@ -32,7 +32,7 @@ def sensor_stage(
         expect: `(flight, p, work, settings, k)`: fill the sensor's rows, from k on.
         gate: `(flight, p, work, settings, k)`: store its innovations, and mask those beyond the
             gate.
-        inflate: `(flight, p, work, settings)`: inflate variances where `work.alarm`.
+        reset: `(flight, p, work, settings)`: reset states where `work.reset`.
         align: `(flight, p, work, settings, mask)`: initialize the heading.
     """
 
@@ -47,8 +47,8 @@ def sensor_stage(
             expect(flight, model, work, settings, argument)
         elif act == Act.GATE:
             gate(flight, model, work, settings, argument)
-        elif act == Act.INFLATE:
-            inflate(flight, model, work, settings)
+        elif act == Act.RESET:
+            reset(flight, model, work, settings)
         else:
             align(flight, model, work, settings, mask)
 

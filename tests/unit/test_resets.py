@@ -1,0 +1,211 @@
+"""Protection of the filter: resets, adaptation of noise, and that neither does harm."""
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+import quad_gym.frames
+from quad_gym.estimation import replay
+from quad_gym.records import POSITION_BLOCK, VELOCITY_BLOCK, GateDecision
+from tests.field_flights import fly, state_errors, steps
+from tests.filter_states import set_at_rest
+
+R_BI = Rotation.from_rotvec([-0.2, 0.4, -0.1]).as_matrix()
+SUITE = quad_gym.sensor_suite("rtk").simplified().replace(camera=None)
+R_IG = quad_gym.frames.ecef_to_enu(SUITE.gnss.reference_antenna_G)
+CIRCLE = Path(__file__).parents[1] / "data" / "flights" / "crazyflie_circle.csv.gz"
+
+
+def started(deviations, seed=0):
+    """A filter whose states are correlated, with given standard deviations."""
+    ukf = quad_gym.UnscentedKalmanFilter(SUITE)
+    rng = np.random.default_rng(seed)
+    mixed = np.eye(15) + 0.3 * rng.standard_normal((15, 15))
+    P = mixed @ mixed.T
+    scaled = np.array(deviations) / np.sqrt(np.diag(P))
+    set_at_rest(ukf, P * np.outer(scaled, scaled), R_BI=R_BI)
+    return ukf
+
+
+def refuse(ukf, off, *, stepped):
+    """Update with a velocity that is `off` [m/s], after 20 s in which velocities were refused."""
+    blocks = ukf._engine.blocks
+    blocks["tick"] += 20.0 * SUITE.imu.rate
+    blocks["accepted_tick"][:] = 0.0
+    blocks["rejected_in_row"][:, VELOCITY_BLOCK] = 20.0
+    blocks["stepped"][:, VELOCITY_BLOCK] = stepped
+    lever = np.cross(ukf._engine.read("w_meas")[0] - ukf.gyro_bias, SUITE.gnss.primary_antenna_B)
+    expected = ukf.velocity + ukf.R_BI.T @ lever
+    ukf.update(gnss_velocity_G=R_IG.T @ (expected + off))
+
+
+def cut(P, rows):
+    """P without the covariances of some states."""
+    kept = P.copy()
+    kept[rows], kept[:, rows] = 0.0, 0.0
+    kept[rows, rows] = P[rows, rows]
+    return kept
+
+
+def assert_close(covariance, expected):
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-6
+    )
+
+
+DEVIATIONS = np.repeat([0.1, 0.05, 0.01, 0.002, 1e-4], 3)
+
+
+def test_reset_after_a_step_sets_variances_of_the_measured_states_alone():
+    ukf, off = started(DEVIATIONS), np.array([5.0, -3.0, 2.0])
+    before = ukf.covariance
+    refuse(ukf, off, stepped=True)
+    rows = np.arange(3, 6)
+    expected = cut(before, rows)
+    expected[rows, rows] = off**2
+    assert_close(ukf.covariance, expected)
+    assert ukf._engine.read("resets")[0, VELOCITY_BLOCK] == 1.0
+    np.testing.assert_array_equal(ukf._engine.read("alarm_tick"), ukf._engine.read("tick"))
+
+
+def test_measurement_after_a_reset_determines_the_state():
+    ukf, off = started(DEVIATIONS), np.array([5.0, -3.0, 2.0])
+    refuse(ukf, off, stepped=True)
+    ukf.update(gnss_velocity_G=R_IG.T @ off)
+    np.testing.assert_allclose(ukf.velocity, off, atol=0.01)
+    sigma = np.sqrt(np.diag(ukf.covariance)[3:6])
+    np.testing.assert_allclose(sigma, SUITE.gnss.velocity_sigma, rtol=0.01)
+
+
+def test_reset_of_a_drifted_estimate_restores_the_variances_of_the_start():
+    ukf, off = started(DEVIATIONS), np.array([5.0, -3.0, 2.0])
+    refuse(ukf, off, stepped=False)
+    P, k = ukf.covariance, ukf.R_BI[:, 2]  # the velocity has had a bounded weight before
+    sigma = np.sqrt(np.diag(P))
+    np.testing.assert_allclose(sigma[9:12], SUITE.imu.accel_bias_sigma)
+    np.testing.assert_allclose(sigma[12:], SUITE.imu.gyro_bias_sigma)
+    start, mark = SUITE.estimator.initial_tilt_sigma, SUITE.initial_pose.heading_sigma
+    expected = start**2 * np.eye(3) + (mark**2 - start**2) * np.outer(k, k)
+    np.testing.assert_allclose(P[6:9, 6:9], expected, atol=1e-9)
+    others = cut(P, np.arange(6, 15))
+    np.testing.assert_array_equal(P[6:9, :6], others[6:9, :6])
+    assert (np.linalg.eigvalsh(P / np.outer(sigma, sigma)) > 0.0).all()
+
+
+def at_rest(offsets, sigma=1.0, seed=0):
+    """Update a filter at rest with fixes at 10 Hz, `offsets` (n, 3) [m] off, with scaled noise."""
+    ukf, rng, found = quad_gym.UnscentedKalmanFilter(SUITE), np.random.default_rng(seed), []
+    antenna, noise = (
+        np.array(SUITE.gnss.primary_antenna_B),
+        sigma * np.array(SUITE.gnss.position_sigma_I),
+    )
+    ukf.initialize(R_IG.T @ antenna, R_IG.T @ np.array(SUITE.gnss.baseline_B))
+    for offset in offsets:
+        for _ in range(round(0.1 * SUITE.imu.rate)):
+            ukf.predict(np.zeros(3), np.array([0.0, 0.0, 9.8]))
+        ukf.update(gnss_position_G=R_IG.T @ (antenna + offset + noise * rng.normal(size=3)))
+        factor = ukf._engine.read("noise_factor")[0, POSITION_BLOCK]
+        found.append((*ukf.position, factor, ukf.gate_decisions[POSITION_BLOCK], ukf.diverged))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("sigma", "least", "most"), [(1.0, 1.0, 1.4), (3.0, 5.0, 14.0)])
+def test_noise_factor_is_the_square_of_the_true_ratio(sigma, least, most):
+    found = at_rest(np.zeros((300, 3)), sigma)
+    assert least <= found[100:, 3].mean() <= most
+    assert (found[:, 4] == GateDecision.REJECTED).mean() < 0.05
+    assert np.abs(found[100:, :3]).max() < 0.05
+
+
+def test_huge_outliers_are_rejected_and_do_not_change_the_noise():
+    offsets = np.zeros((100, 3))
+    offsets[20::20] = 50.0
+    found, calm = at_rest(offsets), at_rest(0.0 * offsets)
+    assert (found[20::20, 4] == GateDecision.REJECTED).all()
+    assert found[:, 3].max() <= calm[:, 3].max() * 1.2
+    assert np.abs(found[:, :3]).max() < 0.1
+
+
+def test_fixes_that_step_away_are_waited_for_and_flagged():
+    """They return after 8 s; the estimate, which has dead reckoned, is at them at once."""
+    offsets = np.zeros((200, 3))
+    offsets[50:130, 0] = 500.0
+    found = at_rest(offsets)
+    assert found[62:130, 5].all()
+    sigma_of_dead_reckoning = 0.5 * 0.05 * 8.0**2  # of a tilt of 5 mrad
+    assert np.abs(found[:, :3]).max() < 3.0 * sigma_of_dead_reckoning
+    assert np.abs(found[140:, :3]).max() < 0.1
+    assert not found[-1, 5]
+
+
+def test_fixes_that_step_away_for_good_are_followed_after_the_time_limit():
+    offsets = np.zeros((200, 3))
+    offsets[50:, 0] = 500.0
+    found = at_rest(offsets)
+    since = 50 + round(10.0 * SUITE.estimator.glitch_timeout)
+    assert found[since - 5, 0] < 100.0
+    assert found[since + 20, 0] == pytest.approx(500.0, abs=0.1)
+
+
+def test_protection_does_no_harm_where_noise_is_three_times_as_large():
+    """32 flights of 10 s; the same without a gate."""
+    suite = quad_gym.sensor_suite("consumer")
+    sigma = tuple(3.0 * s for s in suite.gnss.position_sigma_I)
+    true = suite.replace(gnss=suite.gnss.replace(position_sigma_I=sigma))
+    open_gate = suite.replace(estimator=suite.estimator.replace(false_alarm_probability=0.0))
+    rms = []
+    for assumed in (suite, open_gate):
+        batch = fly(assumed, 32, task="circle", start="hover", true_sensors=true)
+        squares = []
+        for _ in range(40):
+            steps(batch, 0.25)
+            squares.append(np.square(state_errors(batch)[:, :3]).sum(axis=1))
+        rms.append(np.sqrt(np.mean(squares[8:])))
+    assert rms[0] < 2.0 * rms[1], rms
+
+
+def circle():
+    """Log of the real flight, with positions every 0.1 s and 1 cm of noise; its truth."""
+    with gzip.open(CIRCLE, "rt") as file:
+        names = file.readline().strip().split(",")
+        d = dict(zip(names, np.loadtxt(file, delimiter=",").T, strict=True))
+    t, p = d["t"], np.stack([d["px"], d["py"], d["pz"]], axis=1)
+    fix, i = np.full(p.shape, np.nan), np.arange(5, len(t), 10)
+    fix[i] = p[i] + 0.01 * np.random.default_rng(0).normal(size=(len(i), 3))
+    log = {
+        "time": t,
+        "gyro": np.stack([d[f"imu_gyro_{axis}"] for axis in "xyz"], axis=1),
+        "accel": 9.81 * np.stack([d[f"imu_acc_{axis}"] for axis in "xyz"], axis=1),
+        "gnss_enu": fix,
+    }
+    return t, p, log, {"heading": 0.0217, "heading_sigma": 0.1}
+
+
+def test_protection_does_no_harm_to_a_real_flight():
+    """Gyro samples are wrong for a tenth of a second at 22 s: the estimate is off by 0.5 m/s."""
+    t, p, log, start = circle()
+    rtk = quad_gym.sensor_suite("rtk")
+    imu = {"accel_noise_density": 0.029, "gyro_noise_density": 0.0097, "accel_vibration": 0.0}
+    imu |= {"accel_bias_sigma": 0.3, "gyro_bias_sigma": 0.015, "gyro_vibration": 0.0}
+    gnss = {"primary_antenna_B": (-0.019, 0.016, 0.017), "position_sigma_I": (0.01, 0.01, 0.01)}
+    gnss |= {"drift_sigma_I": (0.02, 0.02, 0.025), "drift_tau": 13.0, "secondary_antenna_B": None}
+    suite = rtk.replace(
+        imu=rtk.imu.replace(**imu),
+        gnss=rtk.gnss.replace(**gnss),
+        camera=None,
+        log_delays=rtk.log_delays.replace(gnss=0.0985),
+    )
+    open_gate = suite.replace(estimator=suite.estimator.replace(false_alarm_probability=0.0))
+    rms = []
+    for assumed in (suite, open_gate):
+        found = replay(log, sensors=assumed, start=start)
+        true = np.stack([np.interp(found.time, t, p[:, i]) for i in range(3)], axis=1)
+        errors = np.linalg.norm(found.position - true, axis=1)[found.time > 5.0]
+        rms.append(np.sqrt(np.mean(errors**2)))
+    assert rms[0] < 0.3
+    assert rms[0] < 2.0 * rms[1], rms
