@@ -54,7 +54,7 @@ class TuneArgs:
     fresh_episodes: int = 500
     """number of episodes at the end, with seeds that the search does not use"""
     seed: int = 0
-    """seed of the search, which determines its episodes, and of the first fresh episode"""
+    """seed of the search, which determines its episodes, and of the first held-out episode"""
     threads: options.Threads = None
     output: Path = Path("results/tune")
     """folder for gains and numbers"""

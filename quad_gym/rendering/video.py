@@ -93,7 +93,7 @@ def fly_steps(
 def times_of(
     end: float, fps: float, speed: float, progress: Progress | None = None
 ) -> Iterable[float]:
-    """Return the times of the pictures of a video [s], the end included."""
+    """Return the times of the frames of a video [s], the end included."""
     check.positive("fps", fps)
     check.positive("speed", speed)
     times = np.append(np.arange(0.0, end - 1e-9, speed / fps), end)
@@ -117,9 +117,9 @@ def save_video(
         path: Path of the file; missing folders are created.
         view: "fixed" or "chase".
         size: Width and height [pixels].
-        fps: Pictures per second.
+        fps: Frames per second.
         speed: Seconds of flight per second of video; below 1 for slow motion.
-        progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
+        progress: Wrapper of the times of the frames, such as `tqdm.tqdm`.
 
     Returns:
         Path of the file.
@@ -178,7 +178,7 @@ def checked_video_path(path: Path | str) -> Path:
 def write_frames(
     frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float, lossless: bool = False
 ) -> None:
-    """Write pictures (height, width, 3) as a video in the format of the file name's extension.
+    """Write frames (height, width, 3) as a video in the format of the file name's extension.
 
     The file is renamed when it is complete: an interrupted run leaves an earlier file unchanged.
     Lossless compression (WebP only) makes files smaller if most of the picture does not change.
