@@ -147,6 +147,10 @@ def report_of(result: "Replay") -> str:
     heads = ["of", "count", "rejected", "NIS per degree of freedom"]
     table = text_table({"measurements": heads}, rows)
     lines = [f"{len(result)} IMU samples from {result.time[0]:.2f} s to {result.time[-1]:.2f} s."]
+    taken = {each["taken"] for each in result.sources.values()} - {"table"}
+    if taken:
+        sources = (f"{name} {each['taken']}" for name, each in result.sources.items())
+        lines.append(f"Read: {', '.join(sources)}.")
     if result.notes:
         lines.append(told(result.notes))
     if result.too_late:
