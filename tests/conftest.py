@@ -31,6 +31,17 @@ settings.register_profile(
 settings.load_profile("quad_gym")
 
 
+QUICK = {"wahba", "rotation", "linalg", "integration", "gnss", "imu", "ekf", "camera", "dryden"}
+"""Files of tests that an author of kernels runs first, see the marker `quick`."""
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests of the files in `QUICK`."""
+    for item in items:
+        if item.path.stem.removeprefix("test_") in QUICK and not item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.quick)
+
+
 def pytest_sessionstart(session):
     """Compile shared kernels before tests run in several processes, which then load them."""
     if getattr(session.config.option, "numprocesses", None):

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.memory import FlightMemory
-from quad_gym.estimation.own import Floats, Reading, Truths
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
@@ -22,6 +21,10 @@ from quad_gym.records import (
     Sensor,
     field_of_flights,
 )
+from quad_gym.records.reading import SensorReading
+
+Floats = NDArray[np.float64]
+Truths = NDArray[np.bool_]
 
 
 def _record(name: str, meaning: str) -> "cached_property[Floats]":
@@ -34,10 +37,10 @@ def _record(name: str, meaning: str) -> "cached_property[Floats]":
     return cached_property(read)
 
 
-def _aid(aid: Aid, meaning: str) -> "cached_property[Reading | None]":
+def _aid(aid: Aid, meaning: str) -> "cached_property[SensorReading | None]":
     """Make a property of the measurement of an aiding sensor."""
 
-    def read(self: "Measurements") -> Reading | None:
+    def read(self: "Measurements") -> SensorReading | None:
         if getattr(self.sensors, aid.name.lower()) is None:
             return None
         numbers = AID_FREEDOMS[aid]
@@ -103,25 +106,25 @@ class Measurements:
     # ---- readings -----------------------------------------------------------------------------
 
     @cached_property
-    def gnss_position(self) -> Reading | None:
+    def gnss_position(self) -> SensorReading | None:
         """Primary antenna, (n, 3) in I [m]."""
         return self._gnss("gnss_position", POSITION_BLOCK, self.sensors.gnss is not None)
 
     @cached_property
-    def gnss_baseline(self) -> Reading | None:
+    def gnss_baseline(self) -> SensorReading | None:
         """Vector from the primary to the secondary antenna, (n, 3) in I [m]."""
         gnss = self.sensors.gnss
         return self._gnss("gnss_baseline", BASELINE_BLOCK, gnss is not None and gnss.has_baseline)
 
     @cached_property
-    def gnss_velocity(self) -> Reading | None:
+    def gnss_velocity(self) -> SensorReading | None:
         """Velocity of the primary antenna, (n, 3) in I [m/s]."""
         gnss = self.sensors.gnss
         has = gnss is not None and gnss.velocity_sigma is not None
         return self._gnss("gnss_velocity", VELOCITY_BLOCK, has)
 
     @cached_property
-    def pixels(self) -> Reading | None:
+    def pixels(self) -> SensorReading | None:
         """Projections of the features, from the center of the image, (n, features, 2) [pixels]."""
         if self.sensors.camera is None:
             return None
@@ -134,7 +137,7 @@ class Measurements:
     optical_flow = _aid(Aid.OPTICAL_FLOW, "Angular rate of the ground below, (n, 2) in B [rad/s].")
     range_finder = _aid(Aid.RANGE_FINDER, "Distance to the ground along body -z, (n,) [m].")
 
-    def _gnss(self, name: str, block: int, has: bool) -> Reading | None:
+    def _gnss(self, name: str, block: int, has: bool) -> SensorReading | None:
         if not has:
             return None
         found = self._reading(name, self._new(block, 1)[:, 0], Sensor.GNSS)
@@ -148,11 +151,13 @@ class Measurements:
         rows = valid.transpose(0, 2, 1).reshape(len(valid) * WIDTH, count)
         return np.asarray(rows[: self.count] > 0.0)
 
-    def _reading(self, field: str, new: Truths, sensor: Sensor, *part: int | slice) -> Reading:
+    def _reading(
+        self, field: str, new: Truths, sensor: Sensor, *part: int | slice
+    ) -> SensorReading:
         age = float(self._batch._settings["sensor_delay"][0, sensor] * self.dt)
         values = self._batch.record(field)[part or slice(None)]
         values[~new] = np.nan
-        return Reading(values, new, age)
+        return SensorReading(values, new, age)
 
 
 class StartView(Measurements):

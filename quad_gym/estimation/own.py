@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,15 +33,6 @@ _NORM_ERROR = 1e-2  #: largest error of the squared norm of a quaternion, or of 
 _ASYMMETRY = 1e-4
 """Largest difference of covariances P_ij and P_ji over the standard deviations of both; sums in
 float32 reach 1e-5."""
-
-
-class Reading(NamedTuple):
-    """Measurement of one sensor, of all flights."""
-
-    value: Floats  #: one row per flight; NaN where no measurement arrives at this instant
-    new: Truths  #: True where one arrives: (n,), for pixels (n, features)
-    age: float
-    """Time since the measurement was taken, its time stamp: the latency of the sensor [s]"""
 
 
 class Estimator:

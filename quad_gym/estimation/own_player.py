@@ -8,7 +8,7 @@ import numpy as np
 
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.own import Estimator, Reading, checked_estimate, factors, own_copy
+from quad_gym.estimation.own import Estimator, checked_estimate, factors, own_copy
 from quad_gym.estimation.player import Player, name_of
 from quad_gym.estimation.results import Measured, Replay
 from quad_gym.estimation.samples import Measurement
@@ -20,6 +20,7 @@ from quad_gym.records import (
     Aid,
     FilterStatus,
 )
+from quad_gym.records.reading import SensorReading
 from quad_gym.records.state import State
 from quad_gym.rotations import dcm_to_quaternion
 
@@ -113,9 +114,9 @@ class OwnPlayer:
                 found += [(stream.received[k], stream.time[k], name, k) for k in later]
         return deque(sorted(found))
 
-    def _readings(self, waiting: deque[Any], now: float) -> dict[str, Reading]:
+    def _readings(self, waiting: deque[Any], now: float) -> dict[str, SensorReading]:
         """Return the measurements that have arrived; a second one of a sensor waits for a tick."""
-        found: dict[str, Reading] = {}
+        found: dict[str, SensorReading] = {}
         later, known = [], set()
         while waiting and waiting[0][0] <= now + SAME_TIME:
             received, stamp, name, k = arrival = waiting.popleft()
@@ -132,7 +133,7 @@ class OwnPlayer:
         waiting.extendleft(reversed(later))
         return found
 
-    def _by_name(self, given: Measurement, age: float) -> dict[str, Reading]:
+    def _by_name(self, given: Measurement, age: float) -> dict[str, SensorReading]:
         """Return a measurement as readings, by their names."""
         found, R_IG = {}, self._player.R_GI.T
         for name, key in _OF_GNSS.items():
@@ -142,13 +143,13 @@ class OwnPlayer:
                     assert self._suite.gnss is not None
                     length = np.linalg.norm(self._suite.gnss.baseline_B)
                     value = value * (length / np.linalg.norm(value))
-                found[name] = Reading((R_IG @ value)[np.newaxis], EVERYONE, age)
+                found[name] = SensorReading((R_IG @ value)[np.newaxis], EVERYONE, age)
         if given.pixels is not None:
             seen = np.asarray(~np.isnan(given.pixels).any(axis=1))
-            found["pixels"] = Reading(given.pixels[np.newaxis], seen[np.newaxis], age)
+            found["pixels"] = SensorReading(given.pixels[np.newaxis], seen[np.newaxis], age)
         for aid, value in given.aids.items():
             one = value if AID_FREEDOMS[aid] == 1 else value[np.newaxis]
-            found[aid.name.lower()] = Reading(np.array(one), EVERYONE, age)
+            found[aid.name.lower()] = SensorReading(np.array(one), EVERYONE, age)
         return found
 
     def _at(
@@ -157,7 +158,7 @@ class OwnPlayer:
         gyro: Floats,
         accel: Floats,
         now: Floats,
-        readings: dict[str, Reading],
+        readings: dict[str, SensorReading],
         **start: Any,
     ) -> Any:
         """Return the `Measurements`, or the `StartView`, of an instant."""
@@ -169,7 +170,9 @@ class OwnPlayer:
         for name, shape in shapes.items():
             if name not in readings:
                 new = np.zeros((1, count) if name == "pixels" else 1, bool)
-                start[name] = Reading(np.full(shape, np.nan), new, 0.0) if self._has[name] else None
+                start[name] = (
+                    SensorReading(np.full(shape, np.nan), new, 0.0) if self._has[name] else None
+                )
         return SimpleNamespace(
             count=1,
             dt=self._suite.imu.dt,
