@@ -28,12 +28,12 @@ def logs_of(name, count, seconds, seed=0, task="random_trajectory", start="groun
     """Return logs of flights from the ground under PD control on their estimates, and their motion.
 
     A log is a table as for `read_log`, with each measurement in its own row, and `received`. The
-    truth has arrays of time, position, velocity and quaternion.
+    truth has arrays of time, position, velocity, quaternion and biases of the IMU.
     """
     suite = sensor_suite(name)
     batch = fly(suite, count, task=task, seed=seed, start=start, **keywords)
     names = [n for n in _QUANTITIES if _sensor(n) is None or getattr(suite, _sensor(n))]
-    truth = ("position", "velocity", "quaternion")
+    truth = ("position", "velocity", "quaternion", "accel_bias", "gyro_bias")
     kept = {n: [] for n in (*names, *truth)}
     for k in range(round(seconds * suite.imu.rate) + 1):
         if k:

@@ -1,5 +1,6 @@
 """Figures of a calibration: numbers before and after, and innovations of the validation part."""
 
+import math
 from typing import Any
 
 from quad_gym.analysis.plots import BLUE, GREY, ORANGE, house_style, panels
@@ -35,7 +36,8 @@ def innovations_figure(calibration: Calibration) -> Any:
         for axes, name in zip(column, names, strict=True):
             if name in kinds:
                 draw_nis(axes, kinds[name], f"{name.replace('_', ' ')}, {label}")
-            axes.axvline(calibration.split, color=GREY, linewidth=1.0, linestyle=":")
+            if math.isfinite(calibration.split):
+                axes.axvline(calibration.split, color=GREY, linewidth=1.0, linestyle=":")
         column[0].set_xlim(validation.replay.time[0], validation.replay.time[-1])
         column[-1].set_xlabel("time [s]; dotted: start of the validation part")
     return figure

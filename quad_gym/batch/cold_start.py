@@ -51,7 +51,8 @@ def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
     for field, value, bound, unit in _vague(sensors):
         warnings.warn(
             f"{field} is {value:.3g} {unit}, more than {bound:.3g} {unit}: after a cold start the "
-            "filter is overconfident, as its linearized model does not hold for errors so large",
+            "filter is overconfident, as its linearized model does not hold for errors so large; "
+            "filter_start='warm' begins with a converged filter",
             UserWarning,
             stacklevel=4,
         )

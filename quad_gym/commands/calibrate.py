@@ -1,13 +1,15 @@
-"""Find the noise, delays and field of a vehicle's sensors from the log of a flight.
+"""Find the noise, delays and field of a vehicle's sensors from logs of its flights.
 
     quad-gym calibrate flight.csv --sensors consumer
+    quad-gym calibrate one.csv two.csv three.csv --sensors consumer --output results/mine
     quad-gym calibrate flight.ulg --sensors consumer --output results/mine
     quad-gym train --sensors results/mine/suite.toml
     quad-gym calibrate flight.csv --vehicle mine-vehicle.toml
 
-The first part of the log is for the search, the rest for validation. The result is a suite
-with the rates, delays and noise of this vehicle, for `replay`, `train` and all other commands. If
-the result does not describe the validation part, the last lines report it and the exit code is 1.
+The first part of the log, or the first ones of several logs, are for the search, the rest for
+validation. The result is a suite with the rates, delays and noise of this vehicle, for `replay`,
+`train` and all other commands. The verdict is in the last lines; if the suite is not usable, the
+exit code is 1.
 """
 
 import math
@@ -18,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from quad_gym.commands.options import (
     MISFIT,
-    LogFile,
+    LogFiles,
     ReadingArgs,
     SuiteName,
     refuse_overwriting,
@@ -37,15 +39,17 @@ SUITE, RESULT = "suite.toml", "calibration.json"
 class CalibrateArgs(ReadingArgs):
     """Options of the calibration."""
 
-    log: LogFile
+    logs: LogFiles
     sensors: SuiteName = "consumer"
     share: float = 0.5
-    """share of the log that the search uses, from its beginning"""
+    """share of the log that the search uses, from its beginning; or of the logs"""
     delays: bool = True
     """find the delays of time stamps, too"""
-    heading: float | None = None
-    """heading of the body x axis at the start, from east toward north [deg]; by default from a
-    baseline or a magnetometer"""
+    rotation: bool = False
+    """find the rotation from the IMU to the body; otherwise the magnetometer is rotated"""
+    heading: tuple[float, ...] | None = None
+    """heading of the body x axis at the start, from east toward north [deg], one for each log;
+    by default from a baseline or a magnetometer"""
     course: bool = False
     """use the direction of the first GNSS velocity as heading"""
     vehicle: Path | None = None
@@ -61,12 +65,16 @@ class CalibrateArgs(ReadingArgs):
 
 
 def number_rows(calibration: "Calibration") -> list[tuple[str, ...]]:
-    """Return a row of texts for each number."""
+    """Return a row of texts for each number, and for each mean bias of the IMU."""
     rows: list[tuple[str, ...]] = []
     for found in calibration.numbers:
         interval = f"[{found.low:.3g}, {found.high:.3g}]" if found.determined else "not determined"
         row = (found.number.name, f"{found.prior:.3g}", f"{found.value:.3g}", interval)
         rows.append((*row, found.number.unit))
+    for name, unit in (("log_accel_bias", "m/s^2"), ("log_gyro_bias", "rad/s")):
+        if any(bias := getattr(calibration.suite, name)):
+            values = ", ".join(f"{value:.2g}" for value in bias)
+            rows.append((name, "0", values, "mean of the flights", unit))
     return rows
 
 
@@ -105,8 +113,8 @@ def _held_out(validation: "Validation") -> tuple[str, str, str]:
 NUMBER_HEADINGS = ("number", "before", "found", "95 % interval", "unit")
 VALIDATION_HEADINGS = {
     "validation": ["of"],
-    "before": ["mean NIS", "rejected", "correlation"],
-    "after": ["mean NIS", "rejected", "correlation"],
+    "before": ["NIS per degree of freedom", "rejected", "correlation"],
+    "after": ["NIS per degree of freedom", "rejected", "correlation"],
 }
 
 
@@ -136,7 +144,9 @@ def summary_of(calibration: "Calibration") -> dict[str, Any]:
     return {
         "delays": dict(calibration.delays),
         "numbers": numbers,
-        "split": calibration.split,
+        "verdict": calibration.verdict,
+        "split": calibration.split if math.isfinite(calibration.split) else None,
+        "logs_used": calibration.used,
         "before": summary(calibration.before),
         "after": summary(calibration.after),
         "notes": calibration.notes,
@@ -152,8 +162,9 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     report = Report(folder, title)
     report.add(
         "p",
-        "Mean NIS over degrees of freedom is 1, and the correlation of successive "
-        "innovations 0, for a consistent filter.",
+        f"{calibration.verdict[0].upper()}{calibration.verdict[1:]}. NIS per degree of freedom, of "
+        "all measurements, is 1, and the correlation of successive innovations 0, for a consistent "
+        "filter.",
     )
     headings = [f"{part} {name}" for part, names in VALIDATION_HEADINGS.items() for name in names]
     headings[0] = "validation"
@@ -174,7 +185,7 @@ def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -
     from quad_gym.estimation import fit_vehicle, read_log
 
     assert args.vehicle is not None
-    log = read_log(args.log, **args.reading())
+    log = read_log(args.logs[0], **args.reading())
     if log.motors is None:
         return (
             f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
@@ -192,10 +203,28 @@ def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -
 
 def next_command(args: CalibrateArgs, folder: Path) -> list[str]:
     """Return the words of a replay of the same log."""
-    words = ["quad-gym", "replay", str(args.log), "--sensors", str(folder / SUITE)]
+    log = args.logs[-1]  # of several, one for validation
+    words = ["quad-gym", "replay", str(log), "--sensors", str(folder / SUITE)]
+    words += ["--no-reported-noise"]  # the suite's noise is as found
     if args.heading is not None:
-        words += ["--heading", f"{args.heading:g}"]
+        words += ["--heading", f"{args.heading[-1]:g}"]
     return words + ["--course"] * args.course + args.words()
+
+
+def starts_of(args: CalibrateArgs) -> list[dict[str, Any]]:
+    """Return the starts of the logs.
+
+    Raises:
+        ValueError: If there are neither one heading nor one for each log.
+    """
+    starts: list[dict[str, Any]] = [{"course": True} if args.course else {} for _ in args.logs]
+    if args.heading is not None:
+        headings = args.heading * (len(starts) if len(args.heading) == 1 else 1)
+        if len(headings) != len(starts):
+            raise ValueError(f"--heading must be given for each of {len(starts)} logs")
+        for start, heading in zip(starts, headings, strict=True):
+            start["heading"] = math.radians(heading)
+    return starts
 
 
 def main(args: CalibrateArgs) -> None:
@@ -205,7 +234,7 @@ def main(args: CalibrateArgs) -> None:
     from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
     from quad_gym.estimation import calibrate
 
-    folder = args.output or Path("results/calibrate") / args.log.stem
+    folder = args.output or Path("results/calibrate") / args.logs[0].stem
     with usage_errors():
         if args.course and args.heading is not None:
             raise ValueError("--heading must not be given with --course")
@@ -221,13 +250,13 @@ def main(args: CalibrateArgs) -> None:
             refuse_overwriting(args.vehicle, args.overwrite)
             require_writable("--vehicle", args.vehicle.parent)
         require_writable("--output", folder)
-        start: dict[str, Any] = {"course": True} if args.course else {}
-        if args.heading is not None:
-            start["heading"] = math.radians(args.heading)
+        starts = starts_of(args)
+        several = len(args.logs) > 1
         found = calibrate(
-            args.log,
+            list(args.logs) if several else args.logs[0],
             sensors=args.sensors,
-            start=start,
+            start=starts if several else starts[0],
+            rotation=args.rotation,
             share=args.share,
             delays=args.delays,
             **args.reading(),
@@ -238,7 +267,7 @@ def main(args: CalibrateArgs) -> None:
     for sentence in (*found.after.problems, *found.notes):
         print(f"{sentence[0].upper()}{sentence[1:]}.")
     found.suite.save(folder / SUITE)
-    files = [folder / SUITE, *write_page(folder, found, f"Calibration with {args.log.name}")]
+    files = [folder / SUITE, *write_page(folder, found, f"Calibration with {args.logs[0].name}")]
     contents = {
         **summary_of(found),
         "configuration": args,
@@ -247,7 +276,8 @@ def main(args: CalibrateArgs) -> None:
     files.append(write_json(folder / RESULT, contents))
     print(f"\nWrote {len(files)} files to {folder}; open {folder / 'report.html'}.")
     if args.vehicle is not None:
-        print(fit_body(args, found.suite, start))
+        print(fit_body(args, found.suite, starts[0]))
+    print(f"{found.verdict[0].upper()}{found.verdict[1:]}.")
     if found.after.problems:
         raise SystemExit(MISFIT)
     print(f"Next: {shlex.join(next_command(args, folder))}")

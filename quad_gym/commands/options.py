@@ -311,6 +311,11 @@ LogFile = Positional[
         ),
     ]
 ]
+LogFiles = Positional[
+    Annotated[
+        tuple[Path, ...], arg(metavar="LOG [LOG ...]", help="logs, as `quad-gym replay` takes")
+    ]
+]
 
 
 @dataclass(frozen=True, kw_only=True)

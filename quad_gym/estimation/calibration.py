@@ -1,23 +1,27 @@
-"""Calibration: the numbers of a sensor suite from the log of a flight.
+"""Calibration: the numbers of a sensor suite from logs of flights.
 
-The first part of the log is for the search (`search.py`), the rest validates its result.
+The first part of a log, or the first ones of several logs, are for the search (`search.py`); the
+rest validates its result. Biases of the IMU are found first, for each flight by itself.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
 
+from quad_gym.estimation.likelihood import in_flight
 from quad_gym.estimation.logs import Log, Reading, read_log
 from quad_gym.estimation.logs.parts import longest_part, naming
 from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.numbers import has
 from quad_gym.estimation.plausibility import implausible
-from quad_gym.estimation.replaying import origin_of
+from quad_gym.estimation.replaying import origin_of, replay
 from quad_gym.estimation.search import Calibrated, NumberSearch
-from quad_gym.estimation.validation import Validation, validate
+from quad_gym.estimation.validation import Validation, pooled, validate
+from quad_gym.estimation.verdict import BEYOND, MOST_BIAS
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -28,6 +32,8 @@ in flight."""
 _DRIFT, _DRIFT_TAU = 3.0, 5.0
 """Prior drift of GNSS in a suite without, in standard deviations of its noise, and its correlation
 time [s]: receivers filter their positions."""
+_INACCURATE = 5.0  #: reported standard deviation of a fix over the median that leaves it out [-]
+_AT_REST = 2.0  #: time at rest that shows the bias of the gyro [s]
 _AIDS = ("gnss", "camera", "barometer", "magnetometer", "optical_flow", "range_finder")
 
 
@@ -40,7 +46,13 @@ class Calibration:
     numbers: tuple[Calibrated, ...]
     before: Validation  #: the suite before, on the validation part of the log
     after: Validation  #: the suite with the numbers that were found, on this part
-    split: float  #: time at which this part begins [s]
+    split: float  #: time at which this part begins [s]; of several logs, all of the later ones
+    used: int = 1  #: number of logs that the search used
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in a line, such as "usable: NIS per degree of freedom 0.6 to 1.3"."""
+        return self.after.verdict
 
     @property
     def delays(self) -> dict[str, float]:
@@ -70,80 +82,175 @@ def calibrate(
     log: Any,
     *,
     sensors: SensorSuite | str,
-    start: Mapping[str, Any] | None = None,
+    start: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
     share: float = 0.5,
     delays: bool = True,
+    rotation: bool = False,
     progress: Callable[[str], None] | None = None,
     **reading: Unpack[Reading],
 ) -> Calibration:
-    """Find the numbers of a sensor suite from the log of a flight.
+    """Find the numbers of a sensor suite from the log of a flight, or of several.
 
     Args:
-        log: A table or a file, see `read_log`.
+        log: A table or a file, see `read_log`; or a list of them, of one vehicle.
         sensors: The suite to begin with, or its name: its sensors, mounting and filter stay, and
             its numbers are the centers of the priors.
-        start: Keywords of `initialize`, such as `{"heading": 0.5}`.
-        share: Share of the log, from its beginning, that the search uses; the rest is for
-            validation.
+        start: Keywords of `initialize`, such as `{"heading": 0.5}`; a list of them for several
+            logs, or one for all.
+        share: Share of the log, from its beginning, that the search uses, or of the logs; the rest
+            is for validation.
         delays: True: find delays of time stamps, too; False: keep the suite's.
+        rotation: True: find the rotation from the IMU to the axes of the body; False: the axes of
+            the IMU are the body's, and the magnetometer is rotated.
         progress: Called with a sentence before each step.
         **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
-        ValueError: If the log or an argument is invalid, units or axes of the log are implausible,
+        ValueError: If a log or an argument is invalid, units or axes of the log are implausible,
             or the heading at the start is unknown.
     """
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
     check.number("share", share, least=0.05, most=0.95)
     check.flag("delays", delays)
-    whole = longest_part(read_log(log, **reading))
-    with naming(whole):
-        return _calibrated(whole, suite, dict(start or {}), share, delays, reading, progress)
-
-
-def _calibrated(
-    whole: Log,
-    suite: SensorSuite,
-    start: dict[str, Any],
-    share: float,
-    delays: bool,
-    reading: Reading,
-    progress: Callable[[str], None] | None,
-) -> Calibration:
-    """Search and validate, see `calibrate`."""
-    placed = origin_of(whole, suite)
-    whole = compared(whole, placed)
-    wrong = [*whole.problems, *implausible(whole, reading.get("body", "flu"))]
-    if wrong:
-        raise ValueError(f"a calibration must have a log in SI units: {'; '.join(wrong)}")
-    prior = _prior_of(placed, whole)
-    time = whole.imu.time
-    split = float(time[0] + share * (time[-1] - time[0]))
+    check.flag("rotation", rotation)
+    several = list(log) if isinstance(log, list | tuple) else [log]
+    starts: list[Any] = list(start) if isinstance(start, list | tuple) else [start] * len(several)
+    if len(starts) != len(several) or not several:
+        raise ValueError(f"start must be one for each of {len(several)} logs, got {len(starts)}")
+    logs = [longest_part(read_log(each, **reading)) for each in several]
+    placed, body = origin_of(logs[0], suite), reading.get("body", "flu")
+    for k, each in enumerate(logs):
+        with naming(each):
+            logs[k] = _checked(each, placed, body)
+    prior = _prior_of(placed, logs[0], rotation)
+    begins = [dict(each or {}) for each in starts]
     report = progress or (lambda _: None)
-    search = NumberSearch(whole.until(split), prior, start, delays)
+    if len(logs) == 1:
+        (whole,), used = logs, 1
+        time = whole.imu.time
+        split = float(time[0] + share * (time[-1] - time[0]))
+        parts, judged = [whole.until(split)], {"": 0}
+    else:
+        used, split = max(1, min(len(logs) - 1, round(share * len(logs)))), -math.inf
+        parts = logs[:used]
+        judged = {_name_of(logs[k], k): k for k in range(used, len(logs))}
+    with naming(logs[0]):
+        report("Biases of the IMU")
+        biases = [turn_on_biases(*each, prior) for each in zip(parts, begins, strict=False)]
+        parts = [_without(part, found) for part, found in zip(parts, biases, strict=True)]
+        found = _searched(NumberSearch(parts, prior, begins[:used], delays, rotation), report)
+        new = prior
+        for number in found:
+            new = number.number.put(new, number.value)
+        new = _with_biases(_like_the_log(new, logs[0]), biases)
+        report("Validation")
+        before, after = (
+            pooled({n: validate(logs[k], s, begins[k], split) for n, k in judged.items()})
+            for s in (prior, new)
+        )
+    return Calibration(new, prior, found, before, after, split, used)
+
+
+def _searched(search: NumberSearch, report: Callable[[str], None]) -> tuple[Calibrated, ...]:
+    """Return the numbers that a search finds."""
     report(f"Search for {len(search.numbers)} numbers in a part of the flight")
     search.begin()
-    report("Search in all of the first part")
+    report("Search in all that is not for validation")
     search.fit()
     report("Search with the tails and correlations of the innovations")
     search.adapt()
     search.fit()
     report("Intervals")
     found = search.intervals()
-    if search.keep_priors(found):
-        found = search.intervals()
-    report("Validation")
-    new = prior
-    for each in found:
-        new = each.number.put(new, each.value)
-    new = _like_the_log(new, whole)
-    before, after = (validate(whole, s, start, split) for s in (prior, new))
-    return Calibration(new, prior, found, before, after, split)
+    return search.intervals() if search.keep_priors(found) else found
 
 
-def _prior_of(suite: SensorSuite, log: Log) -> SensorSuite:
-    """Return the suite with errors that change slowly, and with the magnetic field of the log."""
+def _checked(log: Log, placed: SensorSuite, body: str) -> Log:
+    """Return a log of the place of a suite, with fixes as accurate as they mostly are.
+
+    Raises:
+        ValueError: If the log has wrong units, or comes from another place.
+    """
+    log = compared(log, placed)
+    if wrong := [*log.problems, *implausible(log, body)]:
+        raise ValueError(f"a calibration must have a log in SI units: {'; '.join(wrong)}")
+    origin = None if placed.gnss is None else np.array(placed.gnss.reference_antenna_G)
+    if origin is not None and (other := log.origin(origin)) is not None and other is not origin:
+        raise ValueError("logs of a calibration must come from places within 100 km")
+    sigmas = _reported(log)
+    if sigmas is None or log.gnss is None:
+        return log
+    accurate = ~(sigmas.max(axis=1) > _INACCURATE * np.nanmedian(sigmas.max(axis=1)))
+    return replace(log, gnss=log.gnss.rows(accurate))
+
+
+def _reported(log: Log) -> Any:
+    """Return the standard deviations (n, 3) of positions that a receiver reports, or None."""
+    sigmas = None if log.gnss is None else log.gnss.values.get("position_sigma_I")
+    if sigmas is None:
+        return None
+    known = np.where(np.isfinite(sigmas) & (sigmas > 0.0), sigmas, np.nan)
+    return known if np.isfinite(known).any(axis=0).all() else None
+
+
+def _name_of(log: Log, k: int) -> str:
+    return f"log {k + 1} {Path(str(log.about.get('file', ''))).name}".strip()
+
+
+def turn_on_biases(log: Log, start: dict[str, Any], suite: SensorSuite) -> dict[str, Any]:
+    """Return biases of the IMU (3,) in a flight that its suite does not admit; 0 for others.
+
+    Of the gyro from its mean at rest, if there are two seconds; otherwise from a replay with wide
+    priors, and noise of the IMU as large as its samples admit.
+    """
+    imu, time = suite.imu, log.imu.time
+    dt = float(np.median(np.diff(time)))
+    changes = {}
+    for name, least in (("accel", 0.5), ("gyro", 0.1)):
+        rough = float(np.diff(log.imu.values[name], axis=0).std()) * math.sqrt(0.5 * dt)
+        changes[f"{name}_bias_sigma"] = max(getattr(imu, f"{name}_bias_sigma"), least)
+        changes[f"{name}_noise_density"] = max(getattr(imu, f"{name}_noise_density"), rough)
+    wide = suite.replace(imu=imu.replace(**changes))
+    result = replay(log, sensors=wide, start=start, reported_noise=False)
+    late = result.time > 0.5 * (result.time[0] + result.time[-1])
+    still = ~in_flight(log, time)
+    found = {}
+    for name, first in (("accel", 9), ("gyro", 12)):
+        bias = getattr(result, f"{name}_bias")[late].mean(axis=0)
+        sigma = result.sigma[late, first : first + 3].mean(axis=0)
+        if name == "gyro" and still.sum() * dt > _AT_REST:
+            bias, sigma = log.imu.values[name][still].mean(axis=0), 0.0 * sigma
+        large = np.abs(bias).max() > BEYOND * getattr(imu, f"{name}_bias_sigma")
+        possible = large and np.abs(bias).max() < MOST_BIAS[name]
+        found[name] = np.where((np.abs(bias) > 3.0 * sigma) & possible, bias, 0.0)
+    return found
+
+
+def _without(log: Log, biases: Mapping[str, Any]) -> Log:
+    """Return a log without biases of its IMU."""
+    values = {name: value - biases[name] for name, value in log.imu.values.items()}
+    return replace(log, imu=replace(log.imu, values=values))
+
+
+def _with_biases(suite: SensorSuite, biases: Sequence[Mapping[str, Any]]) -> SensorSuite:
+    """Return a suite with the mean biases of flights, and with their spread between flights."""
+    changes: dict[str, Any] = {}
+    imu: dict[str, Any] = {}
+    for name in ("accel", "gyro"):
+        each = np.array([found[name] for found in biases])
+        spread = float(each.std(axis=0, ddof=min(1, len(each) - 1)).max())
+        changes[f"log_{name}_bias"] = tuple(each.mean(axis=0).tolist())
+        field = f"{name}_bias_sigma"
+        imu[field] = math.hypot(getattr(suite.imu, field), spread)
+    return suite.replace(imu=suite.imu.replace(**imu), **changes)
+
+
+def _prior_of(suite: SensorSuite, log: Log, rotation: bool) -> SensorSuite:
+    """Return the suite with errors that change slowly, and with the magnetic field of the log.
+
+    Noise of positions begins with what the receiver reports, if this is less than the suite's.
+    """
     imu, gnss, compass, stream = suite.imu, suite.gnss, suite.magnetometer, log.magnetometer
     root = math.sqrt(imu.dt)  # vibration and density are one white noise in a log
     imu = imu.replace(
@@ -152,11 +259,15 @@ def _prior_of(suite: SensorSuite, log: Log) -> SensorSuite:
         accel_vibration=0.0,
         gyro_vibration=0.0,
     )
+    if gnss is not None and (sigmas := _reported(log)) is not None:
+        least = np.minimum(np.nanmedian(sigmas, axis=0), gnss.position_sigma_I)
+        gnss = gnss.replace(position_sigma_I=tuple(least.tolist()))
     if gnss is not None and not gnss.drifts:
         drift = tuple(_DRIFT * sigma for sigma in gnss.position_sigma_I)
         gnss = gnss.replace(drift_sigma_I=drift, drift_tau=_DRIFT_TAU)
     if gnss is not None and has(log, "baseline"):
-        gnss = gnss.replace(heading_error_sigma=0.0)  # the mounting of the IMU shows it
+        if rotation:  # which shows it
+            gnss = gnss.replace(heading_error_sigma=0.0)
     elif gnss is not None:
         gnss = gnss.replace(secondary_antenna_B=None)
     suite = suite.replace(imu=imu, gnss=gnss)

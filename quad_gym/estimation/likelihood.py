@@ -48,18 +48,45 @@ PART = 0.1  #: length of the parts of a log whose losses are told apart [s]
 _FEWEST = 50
 _TOGETHER = 64  #: suites, as their innovations take memory
 _WINDOW = 0.5  #: [s]
-_AT_REST = 0.6
+_VIBRATES = 3.0  #: ratio of the vibration in flight and in the quietest second [-]
+_TURNS, _TILTS = 0.05, 0.5
+"""Change of mean rates [rad/s] and of mean specific force [m/s^2] that no vehicle at rest shows."""
+_CALM = 5.0  #: longest time without vibration and motion in flight [s]
+_RUNNING = 0.4  #: command of running motors, over their largest [-]
 
 
 def in_flight(log: Log, times: Floats) -> Any:
-    """Return True for the times at which the vehicle flies: its accelerometer vibrates."""
-    from scipy.ndimage import uniform_filter1d
+    """Return True for the times at which the vehicle flies.
 
-    time, size = log.imu.time, np.linalg.norm(log.imu.values["accel"], axis=1)
-    count = max(3, round(_WINDOW / float(np.median(np.diff(time)))))
+    Its accelerometer vibrates more than in the quietest second, or it turns or tilts against its
+    attitude then; and the motors run, if the log has their commands. Calm times in between count.
+    """
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+
+    time, dt = log.imu.time, float(np.median(np.diff(log.imu.time)))
+    gyro, accel = log.imu.values["gyro"], log.imu.values["accel"]
+    size, count, second = (
+        np.linalg.norm(accel, axis=1),
+        max(3, round(_WINDOW / dt)),
+        round(1.0 / dt),
+    )
     squares = uniform_filter1d((size - uniform_filter1d(size, count)) ** 2, count)
     spread = np.sqrt(np.maximum(squares, 0.0))
-    return np.interp(times, time, spread) > _AT_REST * np.median(spread)
+    quiet = uniform_filter1d(spread, max(second, 1), mode="nearest")
+    k = int(np.argmin(quiet))
+    flies = spread > _VIBRATES * quiet[k]
+    for values, most in ((gyro, _TURNS), (accel, _TILTS)):
+        means = uniform_filter1d(values, max(second, 1), axis=0, mode="nearest")
+        flies |= np.linalg.norm(means - means[k], axis=1) > most
+    calm = max(1, round(_CALM / dt))
+    flies = minimum_filter1d(maximum_filter1d(flies, calm), calm)
+    found = np.interp(times, time, flies.astype(float)) > 0.5
+    motors = None if log.motors is None else next(iter(log.motors.values.values())).mean(axis=1)
+    if motors is not None and (most := float(np.nanpercentile(motors, 95.0))) > 0.0:
+        assert log.motors is not None
+        held = np.clip(np.searchsorted(log.motors.time, times, side="right") - 1, 0, None)
+        found &= motors[held] > _RUNNING * most
+    return found
 
 
 def thinned(log: Log) -> Log:

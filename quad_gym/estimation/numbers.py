@@ -31,7 +31,7 @@ class Number:
     @property
     def of_log(self) -> bool:
         """True if the number changes the log before the filter: a delay, or the mounting."""
-        return self.field == _MOUNTING or self.sensor == _DELAYS
+        return self.field in (_MOUNTING, _COMPASS) or self.sensor == _DELAYS
 
     def ends(self, prior: float) -> tuple[float, float]:
         """Return bounds of the coordinate: a sensor in flight is hardly better than at rest."""
@@ -91,7 +91,7 @@ class Number:
 _LEVEL, _UP = (0, 1), (2,)
 _LEVER, _PRECISE = "primary_antenna_B", 0.1  #: [m]
 _WIDE, _NARROW = 1.5, 0.7  #: logarithms: factors of 4.5 and 2
-_DELAYS, _MOUNTING = "log_delays", "log_rotation"
+_DELAYS, _MOUNTING, _COMPASS = "log_delays", "log_rotation", "log_compass_rotation"
 MOST, _LEAST = 3.0, -0.3
 """Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's."""
 
@@ -106,6 +106,10 @@ NUMBERS = (
     *(
         Number(sensor="", field=_MOUNTING, axes=(k,), spread=0.1, positive=False, unit="rad")
         for k in range(3)
+    ),
+    *(  # the declination is its yaw
+        Number(sensor="", field=_COMPASS, axes=(k,), spread=0.1, positive=False, unit="rad")
+        for k in range(2)
     ),
     Number(sensor="imu", field="accel_noise_density", spread=2.5, unit="m/s^2/sqrt(Hz)"),
     Number(sensor="imu", field="gyro_noise_density", spread=2.0, unit="rad/s/sqrt(Hz)"),
@@ -138,12 +142,17 @@ NUMBERS = (
 sensor at rest, and vibration, airflow and motor currents multiply its noise."""
 
 
-def numbers_in(suite: SensorSuite, log: Log, delays: bool) -> list[Number]:
-    """Return the numbers of the sensors that a suite and a log have, with or without delays."""
+def numbers_in(suite: SensorSuite, log: Log, delays: bool, rotation: bool) -> list[Number]:
+    """Return the numbers of the sensors that a suite and a log have.
+
+    With or without delays, and with the rotation of the IMU or of the magnetometer only.
+    """
     measured = {name for name in log.streams if getattr(suite, name, None) is not None}
     paired = "gnss" in measured and has(log, "baseline")
     others = {
-        _MOUNTING: paired or bool(measured & {"camera", "magnetometer"}),  # with axes in B
+        # with axes in B
+        _MOUNTING: rotation and (paired or bool(measured & {"camera", "magnetometer"})),
+        _COMPASS: not rotation and "magnetometer" in measured,
         "baseline_sigma": paired,
         "velocity_sigma": has(log, "velocity"),
         # with a baseline, its direction would change, and noise hides it
@@ -153,7 +162,7 @@ def numbers_in(suite: SensorSuite, log: Log, delays: bool) -> list[Number]:
     }
     found = []
     for number in NUMBERS:
-        known = number.sensor in measured or number.field == _MOUNTING
+        known = number.sensor in measured or number.field in (_MOUNTING, _COMPASS)
         if number.sensor == _DELAYS:
             known = delays and number.field in measured
         if known and others.get(number.field, True):

@@ -81,21 +81,30 @@ class Calibrated(NamedTuple):
 class NumberSearch:
     """The search for the numbers of a suite, at coordinates x."""
 
-    def __init__(self, log: Log, prior: SensorSuite, start: dict[str, Any], delays: bool) -> None:
-        self.log, self.prior, self.start = log, prior, start
+    def __init__(
+        self,
+        logs: Sequence[Log],
+        prior: SensorSuite,
+        starts: Sequence[dict[str, Any]],
+        delays: bool,
+        rotation: bool,
+    ) -> None:
+        self.logs, self.prior, self.starts = list(logs), prior, starts
         self.nu: dict[str, float] = {}  #: tails of innovations by sensor, see `Likelihood`
         self.white: set[str] = set()  #: sensors whose innovations are white
-        self.numbers = numbers_in(prior, log, delays)
+        every = (n for log in logs for n in numbers_in(prior, log, delays, rotation))
+        self.numbers = list(dict.fromkeys(every))
         self.kept = np.zeros(len(self.numbers), bool)  #: numbers that keep their priors
         self.values = np.array([number.of(prior) for number in self.numbers])
         ends = [number.ends(number.of(prior)) for number in self.numbers]
         self.low, self.high = np.array(ends).reshape(-1, 2).T.copy()
         self.of_log = np.array([number.of_log for number in self.numbers])
-        period = float(np.median(np.diff(log.imu.time)))
+        period = max(float(np.median(np.diff(log.imu.time))) for log in logs)
         self.steps = np.diag([number.step_for(period) for number in self.numbers])
         self.x = np.clip(self._first(), self.low, self.high)
         self._margin = _MARGIN
-        self._known: dict[bytes, Likelihood] = {}
+        self._known: dict[bytes, list[Likelihood]] = {}
+        self._sizes: list[int] = []  # numbers of parts of the logs
 
     def _first(self) -> Floats:
         """Return where the search begins: with noise as wide as the log may need."""
@@ -111,9 +120,12 @@ class NumberSearch:
 
     def _roughness(self, number: Number) -> float:
         """Return the noise density of the IMU if its samples changed by noise only."""
-        values = self.log.imu.values[number.field.split("_")[0]]
-        dt = float(np.median(np.diff(self.log.imu.time)))
-        return float(np.diff(values, axis=0).std()) * math.sqrt(0.5 * dt)
+        found = []
+        for log in self.logs:
+            values = log.imu.values[number.field.split("_")[0]]
+            dt = float(np.median(np.diff(log.imu.time)))
+            found.append(float(np.diff(values, axis=0).std()) * math.sqrt(0.5 * dt))
+        return float(np.median(found))
 
     def suite(self, x: Floats, gate: bool = False) -> SensorSuite:
         """Return the suite at coordinates."""
@@ -125,21 +137,21 @@ class NumberSearch:
         return found
 
     def losses(self, points: Sequence[Floats]) -> Floats:
-        """Return the losses of parts of the log, (parts, points), without priors."""
+        """Return the losses of parts of all logs, (parts, points), without priors."""
         found = np.empty((0, 0))
         groups: dict[bytes, list[int]] = {}  # of points with the same delays and mounting
         for k, point in enumerate(points):
             groups.setdefault(point[self.of_log].tobytes(), []).append(k)
         for key, rows in groups.items():
             suites = [self.suite(points[k]) for k in rows]
-            likelihood = self._known.get(key)
-            if likelihood is None:
-                likelihood = Likelihood(
-                    self.log, suites[0], self.start, self.nu, self.white, self._margin
-                )
+            likelihoods = self._known.get(key) or [
+                Likelihood(log, suites[0], start, self.nu, self.white, self._margin)
+                for log, start in zip(self.logs, self.starts, strict=True)
+            ]
             if key == self.x[self.of_log].tobytes():
-                self._known = {key: likelihood}
-            some = likelihood.losses(suites)
+                self._known = {key: likelihoods}
+            each = [likelihood.losses(suites) for likelihood in likelihoods]
+            self._sizes, some = [len(losses) for losses in each], np.concatenate(each)
             found = found if found.size else np.empty((len(some), len(points)))
             found[:, rows] = some
         return found
@@ -154,10 +166,8 @@ class NumberSearch:
         The likelihood has several maxima, as noise of the IMU and drift of GNSS both explain large
         innovations: the search begins with much and with little of the first.
         """
-        whole, time = self.log, self.log.imu.time
-        flying = np.cumsum(np.diff(time, prepend=time[0]) * in_flight(whole, time))
-        last = int(np.searchsorted(flying, _SHORT + SETTLING))
-        self.log = whole.until(float(time[min(last, len(time) - 1)]))
+        whole = self.logs
+        self.logs = [_begin_of(log, _SHORT / len(whole) + SETTLING) for log in whole]
         for k, number in enumerate(self.numbers):
             if number.sensor == "log_delays":
                 self._margin = max(0.0, -float((self.values[k] + _COARSE).min())) + _MARGIN
@@ -169,7 +179,7 @@ class NumberSearch:
         little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
         tried = [self._descend(x, ~self.of_log, _FEW_STEPS) for x in (self.x, little)]
         self.x = min(tried, key=lambda found: found[1])[0]
-        self.log, self._known = whole, {}
+        self.logs, self._known = whole, {}
 
     def fit(self) -> None:
         """Find delays and mounting, and the numbers of the suite, in turn."""
@@ -227,18 +237,23 @@ class NumberSearch:
     def _describe(self) -> dict[str, Floats]:
         """Find tails and whiteness of the innovations; return the innovations over their sigmas."""
         suite = self.suite(self.x, gate=True)
-        measured = replay(self.log, sensors=suite, start=self.start, reported_noise=False).measured
-        scaled = {}
-        for name, m in measured.items():
-            counts = in_flight(self.log, m.time) & np.isfinite(m.nis)
-            counts &= m.time > m.time[0] + SETTLING
-            scaled[name] = (m.innovation / m.sigma)[counts]
+        values: dict[str, list[Floats]] = {}
+        nis: dict[str, list[Floats]] = {}
+        for log, start in zip(self.logs, self.starts, strict=True):
+            measured = replay(log, sensors=suite, start=start, reported_noise=False).measured
+            for name, m in measured.items():
+                counts = in_flight(log, m.time) & np.isfinite(m.nis)
+                counts &= m.time > m.time[0] + SETTLING
+                values.setdefault(name, []).append((m.innovation / m.sigma)[counts])
+                nis.setdefault(name, []).append(m.nis[counts])
+        scaled = {name: np.concatenate(some) for name, some in values.items()}
+        for name, some in nis.items():
             if len(scaled[name]) > _FEWEST:
-                self.nu[name] = tails(m.nis[counts], scaled[name].shape[1])
+                self.nu[name] = tails(np.concatenate(some), scaled[name].shape[1])
         self.white = {
             name
-            for name, values in scaled.items()
-            if len(values) > _FEWEST and max(map(correlation_time, values.T)) == 1.0
+            for name, each in scaled.items()
+            if len(each) > _FEWEST and max(map(correlation_time, each.T)) == 1.0
         }
         self._known = {}
         return scaled
@@ -247,7 +262,8 @@ class NumberSearch:
         """Return the numbers with 95 % intervals.
 
         The covariance is H^-1 J H^-1 (Godambe), with the curvature H from differences and J the sum
-        of squares of the scores of independent parts of the log.
+        of squares of the scores of independent parts of the log. Of several logs, the spread of
+        the numbers between flights enters too.
         """
         from scipy.stats import t
 
@@ -271,13 +287,16 @@ class NumberSearch:
         sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
         sums -= sums.mean(axis=0)  # not zero at a bound
         root = np.linalg.solve(information, np.linalg.cholesky(sums.T @ sums + np.eye(n)))
-        sigmas = np.where(self.kept, 1.0, np.minimum(np.sqrt((root**2).sum(axis=1)), 1.0))
+        between = _spread_between(losses, h, self._sizes, length)
+        sigmas = np.minimum(np.sqrt((root**2).sum(axis=1) + between), 1.0)
+        sigmas = np.where(self.kept, 1.0, sigmas)
         curved = np.maximum(bends, 0.0)
         alone = np.sqrt(np.maximum((sums**2).sum(axis=0), curved) + 1.0) / (curved + 1.0)
         reach = float(t.ppf(0.975, len(sums) - 1))
         found, priors = [], self.values.tolist()
         for k, (number, prior) in enumerate(zip(self.numbers, priors, strict=True)):
-            wide = 2.0 * number.spread * float(alone[k]) ** 2 if number.noise else 0.0
+            square = float(alone[k]) ** 2 + float(between[k])
+            wide = 2.0 * number.spread * square if number.noise else 0.0
             moves = (min(wide, _WIDEST / number.spread), -reach * sigmas[k], reach * sigmas[k])
             value, low, high = (number.value(prior, float(self.x[k] + move)) for move in moves)
             determined = bool(sigmas[k] < _SILENT)
@@ -321,6 +340,33 @@ def _derivatives(losses: Floats, steps: Floats) -> tuple[Floats, Floats]:
     ahead, back = losses[:, 1:count:2], losses[:, 2:count:2]
     bends = (ahead + back).sum(axis=0) - 2.0 * losses[:, 0].sum()
     return (ahead - back) / (2.0 * steps), bends / steps**2
+
+
+def _begin_of(log: Log, seconds: float) -> Log:
+    """Return a log up to some time of flight [s]."""
+    time = log.imu.time
+    flying = np.cumsum(np.diff(time, prepend=time[0]) * in_flight(log, time))
+    last = int(np.searchsorted(flying, seconds))
+    return log.until(float(time[min(last, len(time) - 1)]))
+
+
+def _spread_between(losses: Floats, h: Floats, sizes: Sequence[int], length: int) -> Floats:
+    """Return the variances (n,) of numbers between logs, from losses as in `_derivatives`.
+
+    Each log has its best number one Newton step from the common one; the variance of these beyond
+    the uncertainty within each log is the method of moments of DerSimonian and Laird, Controlled
+    Clinical Trials 7(3), 1986, with equal weights.
+    """
+    steps, errors = [], []
+    for rows in np.split(losses, np.cumsum(sizes)[:-1]):
+        scores, bends = _derivatives(rows, h)
+        H = np.maximum(bends, 0.0) + 1.0
+        sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
+        steps.append(-scores.sum(axis=0) / H)
+        errors.append((sums**2).sum(axis=0) / H**2)
+    if len(steps) < 2:
+        return np.zeros(len(h))
+    return np.maximum(np.var(steps, axis=0, ddof=1) - np.mean(errors, axis=0), 0.0)
 
 
 def _curvature(scores: Floats, bends: Floats) -> Floats:

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.fits import Fit, fit_of
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Replay, by_sensor
+from quad_gym.estimation.verdict import in_one_line
 from quad_gym.params.sensors import SensorSuite
 
 _PERIOD, _GAP = 5, 1
@@ -29,8 +31,18 @@ class Validation:
     held_out_ratios: tuple[float, float, float] | None
     """mean squared difference over its variance: east, north, up; 1 for a consistent filter"""
     diverged: float  #: share of the samples at which the filter counts as diverged
-    problems: tuple[str, ...]  #: sentences of the replay, see `Replay.problems`
-    replay: Replay
+    findings: tuple[Finding, ...]  #: of the replay
+    replay: Replay  #: of several logs, of the first one
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Sentences with which the suite does not describe the log."""
+        return tuple(str(f) for f in self.findings if f.severity == Severity.LOST)
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in a line."""
+        return in_one_line(self.findings, self.sensors)
 
 
 def validate(
@@ -44,7 +56,42 @@ def validate(
             sensors[name] = fit
     diverged = float(np.mean(result.diverged[result.time > split]))
     held_out = _held_out(log, suite, start, split)
-    return Validation(sensors, *held_out, diverged, result.problems, result)
+    return Validation(sensors, *held_out, diverged, result.findings, result)
+
+
+def pooled(validations: Mapping[str, Validation]) -> Validation:
+    """Return one validation of several logs, by name: means over measurements and over logs."""
+    if len(validations) == 1:
+        return next(iter(validations.values()))
+    each = list(validations.values())
+    sensors = {}
+    for name in dict.fromkeys(name for v in each for name in v.sensors):
+        fits = [v.sensors[name] for v in each if name in v.sensors]
+        counts = [fit.measurements for fit in fits]
+        mean, median, rejected = (
+            float(np.average([getattr(fit, field) for fit in fits], weights=counts))
+            for field in ("mean_nis", "median_nis", "rejected")
+        )
+        worst = max((fit.correlation for fit in fits), key=abs)
+        sensors[name] = Fit(sum(counts), fits[0].freedoms, mean, median, rejected, worst)
+    held = [v for v in each if v.held_out_error is not None]
+    errors = np.array([v.held_out_error for v in held])
+    level, up = np.sqrt((errors**2).mean(axis=0)).tolist() if held else (0.0, 0.0)
+    each_ratios = np.array([v.held_out_ratios for v in held], float)
+    ratios = each_ratios.mean(axis=0).tolist() if held else None
+    findings = [
+        replace(f, text=f"{f.text} ({name})") for name, v in validations.items() for f in v.findings
+    ]
+    findings.sort(key=lambda finding: -finding.severity)
+    return Validation(
+        sensors,
+        (level, up) if held else None,
+        float(np.mean([v.held_out_nis for v in held])) if held else None,
+        None if ratios is None else tuple(ratios),
+        float(np.mean([v.diverged for v in each])),
+        tuple(findings),
+        each[0].replay,
+    )
 
 
 def _held_out(

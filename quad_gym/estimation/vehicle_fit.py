@@ -93,7 +93,8 @@ def fit_vehicle(
     whole = longest_part(read_log(log, **reading))
     times, voltages = given or _commands(_in_log(whole))
     whole, suite = prepared(whole, sensors, {})
-    suite = suite.replace(log_delays=LogDelays(), log_rotation=(0.0, 0.0, 0.0))  # now corrected
+    names = ("log_rotation", "log_compass_rotation", "log_accel_bias", "log_gyro_bias")
+    suite = suite.replace(log_delays=LogDelays(), **dict.fromkeys(names, (0.0,) * 3))  # corrected
     smoothed = smooth(whole, sensors=suite, start=start)
     first, last = max(smoothed.time[0], times[0]) + _SETTLING, min(smoothed.time[-1], times[-1])
     ends = whole.imu.time

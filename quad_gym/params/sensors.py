@@ -131,6 +131,13 @@ class SensorSuite(Checked, Saved):
     log_rotation: check.Vector3 = (0.0, 0.0, 0.0)
     """roll, pitch and yaw from the axes of the IMU in this vehicle's logs to B [rad], by which a
     replay rotates the samples; 3-1-2 Euler angles"""
+    log_compass_rotation: check.Vector3 = (0.0, 0.0, 0.0)
+    """the same of the magnetometer [rad]"""
+    log_accel_bias: check.Vector3 = (0.0, 0.0, 0.0)
+    """mean bias of the accelerometer in this vehicle's logs, in the axes of the IMU, which a replay
+    subtracts [m/s^2]; the filter starts with what is left"""
+    log_gyro_bias: check.Vector3 = (0.0, 0.0, 0.0)
+    """mean bias of the gyro in this vehicle's logs [rad/s]"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -127,7 +127,7 @@ def run(index):
     began = time.process_time()
     table, true, base, start = simulated(index)
     flown_in = time.process_time() - began
-    found = calibrate(table, sensors=base, start=start)
+    found = calibrate(table, sensors=base, start=start, rotation=True)
     numbers = {
         n.number.name: (true[n.number.name], n.prior, n.value, n.low, n.high, n.determined)
         for n in found.numbers

@@ -11,17 +11,20 @@ import pytest
 import quad_gym
 from quad_gym import estimation
 from quad_gym.estimation import calibrate, read_log, replay
+from quad_gym.estimation.calibration import turn_on_biases
+from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.fits import correlation_time
 from quad_gym.estimation.likelihood import NU, SETTLING, SPACING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import MOST, NUMBERS
-from quad_gym.estimation.search import NumberSearch, widening
+from quad_gym.estimation.search import NumberSearch, _spread_between, widening
 from quad_gym.estimation.validation import validate
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import euler_to_dcm
 from tests.console_commands import run
 from tests.logged_flights import Recorded, flown
+from tests.many_logs import logs_of
 
 DELAY, MOUNTING = 0.15, (0.05, -0.04, 0.0)
 TRUE = CONSUMER.replace(
@@ -49,7 +52,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def found(table):
-    return calibrate(table, sensors="consumer")
+    return calibrate(table, sensors="consumer", rotation=True)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +118,8 @@ def test_suite_has_the_values_of_the_numbers_found(found):
 @pytest.mark.parametrize("name", ["log_delays.gnss", "log_rotation[2]"])
 def test_undetermined_number_keeps_its_prior_if_the_prior_is_as_likely(table, found, name):
     """Both count as undetermined here; the true delay differs from its prior, the rotation not."""
-    search = NumberSearch(read_log(table).until(found.split), found.prior, {}, delays=True)
+    logs = [read_log(table).until(found.split)]
+    search = NumberSearch(logs, found.prior, [{}], delays=True, rotation=True)
     search.x = np.array([n.number.coordinate(n.prior, n.value) for n in found.numbers])
     k = [n.number.name for n in found.numbers].index(name)
     before = float(search.x[k])
@@ -163,10 +167,14 @@ def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
     ended = run("calibrate", "flight.csv", *options, where=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert "Wrote no body.toml: the log has no motor voltages" in ended.stdout
-    assert "Next: quad-gym replay flight.csv --sensors mine/suite.toml --body frd" in ended.stdout
+    assert (
+        "Next: quad-gym replay flight.csv --sensors mine/suite.toml --no-reported-noise --body frd"
+        in ended.stdout
+    )
     assert asked == [(Path("flight.csv"), "consumer", False)]
     summary = json.loads((tmp_path / "mine/calibration.json").read_text())
     without = ("camera", "log_delays.camera", "gnss.baseline", "gnss.primary_antenna")
+    without += ("log_compass_rotation",)
     assert set(summary["numbers"]) == {n.name for n in NUMBERS if not n.name.startswith(without)}
     assert summary["after"]["measurements"]["gnss_velocity"]["mean_nis"] > 0.0
     assert (tmp_path / "mine/report.html").stat().st_size > 10_000
@@ -235,20 +243,22 @@ def test_loss_counts_every_measurement_of_sensors_with_white_innovations():
 
 def test_log_in_other_units_is_refused_before_the_search(table):
     in_g = {n: c / 9.8 if n.startswith("accel") else c for n, c in table.items()}
-    with pytest.raises(ValueError, match=r"SI units: mean specific force .* in g\?"):
+    with pytest.raises(ValueError, match=r"SI units: median specific force .* in g\?"):
         calibrate(in_g, sensors="consumer")
 
 
 def test_suite_that_does_not_describe_the_validation_part_exits_with_one(
     found, tmp_path, monkeypatch
 ):
-    after = replace(found.after, problems=("GNSS velocity: mean NIS 53, 3 expected",))
+    text = "GNSS velocity: NIS per degree of freedom 53, 1 expected"
+    finding = Finding(quantity="position", severity=Severity.LOST, text=text)
+    after = replace(found.after, findings=(finding,))
     wrong = replace(found, after=after, suite=found.suite.replace(range_finder=RangeFinderParams()))
     monkeypatch.setattr(estimation, "calibrate", lambda log, **options: wrong)
     (tmp_path / "flight 1.csv").write_text("time")
     ended = run("calibrate", "flight 1.csv", "--output", "mine", where=tmp_path)
     assert ended.returncode == 1
-    assert "GNSS velocity: mean NIS 53, 3 expected." in ended.stdout
+    assert f"Not usable, because position: {text}." in ended.stdout
     assert "The log has no range finder: the suite keeps its own." in ended.stdout
     assert "Next" not in ended.stdout
     assert (tmp_path / "mine/suite.toml").is_file()
@@ -273,7 +283,7 @@ def test_sensor_that_stops_early_does_not_stop_a_calibration(table, found):
     for name in stopped:
         if name.startswith("magnet"):
             stopped[name][table["time"] > 4.5] = np.nan
-    search = NumberSearch(read_log(stopped), found.prior, {}, delays=True)
+    search = NumberSearch([read_log(stopped)], found.prior, [{}], delays=True, rotation=True)
     before = search.low.copy()
     search.adapt()
     noise = [n.name for n in search.numbers].index("magnetometer.noise_sigma")
@@ -289,6 +299,93 @@ def test_search_near_the_largest_delay_and_inclination_stays_below_it():
             assert number.value(prior, high) == pytest.approx(number.limit)
             assert number.value(prior, low) == pytest.approx(prior + number.spread * low)
             assert low == -MOST
+
+
+def at_rest_for(rest, total=75.0):
+    """A log that rests, and then vibrates."""
+    rng, time = np.random.default_rng(0), np.arange(0.0, total, 0.01)
+    accel = rng.normal([0.0, 0.0, 9.8], 0.05, (len(time), 3))
+    accel += (time > rest)[:, np.newaxis] * rng.normal(0.0, 1.0, (len(time), 3))
+    gyro = rng.normal(0.0, 0.002, (len(time), 3))
+    return Log(imu=Stream(time, time, {"accel": accel, "gyro": gyro}))
+
+
+@pytest.mark.parametrize("rest", [30.0, 45.0, 75.0])
+def test_vehicle_at_rest_is_not_in_flight_for_any_share_of_the_log(rest):
+    log = at_rest_for(rest)
+    flying, time = in_flight(log, log.imu.time), log.imu.time
+    assert not flying[time < rest - 1.0].any()
+    assert flying[time > rest + 1.0].all()
+
+
+def test_calm_flight_without_vibration_is_in_flight():
+    """Noise as at rest, and slow turns of 3 degrees, from the beginning to the end."""
+    rng, time = np.random.default_rng(3), np.arange(0.0, 40.0, 0.01)
+    turns = 0.15 * np.sin(1.5 * time)[:, np.newaxis] * [1.0, 0.5, 0.0]
+    values = {
+        "gyro": turns + rng.normal(0.0, 0.002, (len(time), 3)),
+        "accel": rng.normal([0.0, 0.0, 9.8], 0.02, (len(time), 3)),
+    }
+    log = Log(imu=Stream(time, time, values))
+    assert in_flight(log, time).mean() > 0.95
+
+
+def test_vehicle_with_stopped_motors_is_not_in_flight():
+    log = at_rest_for(30.0)
+    commands = np.where(log.imu.time > 50.0, 0.6, 0.05)[:, np.newaxis] * np.ones(4)
+    motors = Stream(log.imu.time, log.imu.time, {"commands": commands})
+    flying = in_flight(replace(log, motors=motors), log.imu.time)
+    assert not flying[log.imu.time < 49.0].any()
+    assert flying[log.imu.time > 51.0].all()
+
+
+def test_turn_on_biases_of_a_flight_are_found_and_subtracted():
+    """Of 0.06 rad/s and 1.2 m/s^2, beyond four standard deviations of the suite."""
+    suite, biases = CONSUMER, {"gyro": [0.0, 0.06, 0.0], "accel": [1.2, 0.0, 0.0]}
+    log, truth = next(logs_of("consumer", 1, 30.0, seed=3))
+    biased = log | {name: log[name] + bias for name, bias in biases.items()}
+    found = turn_on_biases(read_log(biased), {}, suite)
+    for name, error in (("gyro", 0.005), ("accel", 0.15)):
+        true = truth[f"{name}_bias"].mean(axis=0) + biases[name]
+        np.testing.assert_allclose(found[name], true, atol=error)
+    means = {f"log_{name}_bias": tuple(biases[name]) for name in biases}
+    clean, corrected = replay(log, sensors=suite), replay(biased, sensors=suite.replace(**means))
+    np.testing.assert_allclose(corrected.position, clean.position, atol=1e-6)
+    assert not any(np.any(b) for b in turn_on_biases(read_log(log), {}, suite).values())
+
+
+def test_replay_rotates_the_compass_into_body_axes():
+    log, _ = next(logs_of("consumer", 1, 10.0, seed=4))
+    turned = log | {"magnetometer": log["magnetometer"] @ euler_to_dcm((0.1, -0.1, 0.3))}
+    suite = CONSUMER.replace(log_compass_rotation=(0.1, -0.1, 0.3))
+    body, askew = replay(log, sensors=CONSUMER), replay(turned, sensors=suite)
+    np.testing.assert_allclose(askew.quaternion, body.quaternion, atol=1e-9)
+
+
+def test_spread_between_flights_is_the_variance_of_their_numbers():
+    """Quadratic losses of ten logs with other minima, plus noise in their parts."""
+    rng, parts, spread = np.random.default_rng(5), 200, 0.6
+    h, losses = np.array([0.1]), []
+    for best in spread * rng.normal(size=10):
+        centers = best + rng.normal(0.0, 1.0, parts)
+        losses.append(np.stack([0.5 * (x - centers) ** 2 for x in (0.0, 0.1, -0.1)], axis=1))
+    found = _spread_between(np.concatenate(losses), h, [parts] * 10, 10)
+    assert found[0] == pytest.approx(spread**2, rel=0.6)
+    same = [np.stack([0.5 * (x - rng.normal(0.0, 1.0, parts)) ** 2 for x in (0.0, 0.1, -0.1)], 1)]
+    assert _spread_between(np.concatenate(same), h, [parts], 10)[0] == 0.0
+
+
+@pytest.mark.slow
+def test_calibration_on_two_flights_describes_a_third():
+    """Flights with velocity noise that differs by a factor of two, judged on another one."""
+    logs = [log for log, _ in logs_of("consumer", 3, 25.0, seed=6)]
+    rng = np.random.default_rng(7)
+    for log, sigma in zip(logs, (0.15, 0.3, 0.2), strict=True):
+        log["gnss_velocity_enu"] += rng.normal(0.0, sigma, log["gnss_velocity_enu"].shape)
+    result = calibrate(logs, sensors="consumer", share=0.7)
+    assert result.used == 2
+    assert result.verdict.startswith("usable"), result.verdict
+    assert 0.3 < result.after.sensors["gnss_velocity"].mean_nis < 1.5
 
 
 def test_vehicle_at_rest_is_not_in_flight():

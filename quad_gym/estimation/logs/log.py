@@ -154,18 +154,24 @@ class Log:
         return {name: s for name, s in found.items() if s is not None and len(s)}
 
     def corrected(self, suite: SensorSuite) -> "Log":
-        """Return the log without the delays of a suite, and with its IMU in the axes of B."""
+        """Return the log without delays and mean biases of a suite, in the axes of B."""
         delays = vars(suite.log_delays)
         changes: dict[str, Any] = {
             name: replace(stream, time=stream.time - delays[name])
             for name, stream in self.streams.items()
             if delays.get(name)
         }
-        if any(suite.log_rotation):
+        means = {"accel": suite.log_accel_bias, "gyro": suite.log_gyro_bias}
+        if any((*suite.log_rotation, *means["accel"], *means["gyro"])):
             R = euler_to_dcm(suite.log_rotation)
+            given = self.imu.values.items()
             changes["imu"] = replace(
-                self.imu, values={name: v @ R.T for name, v in self.imu.values.items()}
+                self.imu, values={name: (v - means[name]) @ R.T for name, v in given}
             )
+        compass = changes.get("magnetometer", self.magnetometer)
+        if any(suite.log_compass_rotation) and compass is not None:
+            field_B = compass.values["magnetometer"] @ euler_to_dcm(suite.log_compass_rotation).T
+            changes["magnetometer"] = replace(compass, values={"magnetometer": field_B})
         return replace(self, **changes) if changes else self
 
     def between(self, first: float | None, last: float | None) -> "Log":
