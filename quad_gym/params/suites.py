@@ -10,11 +10,12 @@
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
 | `crazyflie` | none: starts from a mark; optical flow, range finder | none | as `indoor` |
+| `mocap` | positions and heading by motion capture, 50 Hz | none | as a Crazyflie's in flight |
 | `field` | as `consumer`, with noise and delay of a real flight | none | noise of that flight |
 
 `one_wall` and `stale` were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in
-one direction only, and a filter that ignores time stamps. They, `crazyflie` and `field` are not
-among SUITES, on which results for all tasks are based.
+one direction only, and a filter that ignores time stamps. They, `crazyflie`, `mocap` and `field`
+are not among SUITES, on which results for all tasks are based.
 
 The IMU runs at 200 Hz, so cameras of 30 Hz run at 25 Hz, which divides that rate. Except in `lab`,
 the phases of GNSS and camera are drawn in each episode, the fix that starts the filter is used
@@ -267,6 +268,37 @@ CRAZYFLIE = SensorSuite(
 """A small vehicle indoors that navigates by optical flow and a range finder: nothing observes its
 heading and horizontal position, whose errors grow."""
 
+MOCAP = SensorSuite(
+    imu=INDOOR.imu.replace(
+        # noise and biases that explain a flight of a Crazyflie 2.1 (S. I. Ullah and J. Baca,
+        # NanoBench, arXiv:2603.09908, B3_figure8_fast_rep2), vibration among them
+        accel_noise_density=0.03,
+        gyro_noise_density=0.01,
+        accel_bias_sigma=0.3,
+        gyro_bias_sigma=0.015,
+        accel_vibration=0.0,
+        gyro_vibration=0.0,
+    ),
+    gnss=GnssParams(
+        rate=50.0,  # systems capture at 100 Hz and more, and radios pass on some of it
+        # capture, transfer and radio; our judgment. The flight above is explained by 0.1 s, which
+        # is the offset of its clock as well
+        latency=0.02,
+        # two sets of markers, before and behind the center of mass of a small vehicle
+        primary_antenna_B=(0.05, 0.0, 0.0),
+        secondary_antenna_B=(-0.05, 0.0, 0.0),
+        # markers are found to a millimeter, and time stamps jitter by some milliseconds at 1 m/s;
+        # our judgment
+        position_sigma_I=(0.005, 0.005, 0.005),
+        baseline_sigma=0.02,  # attitudes of small bodies are right to a degree; our judgment
+        phase=None,
+    ),
+    camera=None,
+    estimator=FIELD_FILTER,
+    noisy=_noise(0.0026, 0.0183, 0.0088, 0.142),
+)
+"""A laboratory with motion capture, which passes position and heading of a small vehicle."""
+
 FIELD = _changed(
     CONSUMER,
     # noise that explains real flights of a small quadrotor: "quad122a" of P. Riseborough's
@@ -296,6 +328,7 @@ FIELD = _changed(
 _ALL = {
     **{"standard": STANDARD, "lab": SensorSuite(), "rtk": RTK, "consumer": CONSUMER},
     **{"indoor": INDOOR, "one_wall": ONE_WALL, "stale": STALE, "crazyflie": CRAZYFLIE},
+    "mocap": MOCAP,
     "field": FIELD,
 }
 ALL_SUITES = tuple(_ALL)  #: names of all sensor suites
