@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, ecef_of
-from quad_gym.estimation.logs.source import TO_FLU, Recording, Source, positive, reading, stack
+from quad_gym.estimation.logs.source import TO_FLU, LogSource, Recording, positive, reading, stack
 
 GNSS_DELAY = 0.2  #: delay of receivers if the log does not contain it [s]
 
@@ -152,7 +152,7 @@ def _primary(tables: _Tables, parameters: Mapping[str, float]) -> tuple[int, str
     return None
 
 
-def _inertial(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Source]:
+def _inertial(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[LogSource]:
     primary = _primary(tables, parameters)
     mask = int(parameters.get("EK3_IMU_MASK", parameters.get("EK2_IMU_MASK", 7.0)))
     cores = [k for k in range(8) if mask >> k & 1]
@@ -162,7 +162,7 @@ def _inertial(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Sour
             "accel": stack(table, _AXES["Acc"]) * TO_FLU,
         }
         flew = primary is not None and cores[primary[0] : primary[0] + 1] == [number]
-        yield Source(
+        yield LogSource(
             sensor="imu",
             topic="IMU",
             instance=number,
@@ -173,7 +173,7 @@ def _inertial(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Sour
         )
 
 
-def _gnss(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Source]:
+def _gnss(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[LogSource]:
     """Yield positions and velocities with a fix, with the accuracy reported at that time."""
     for number, table in tables.get("GPS", {}).items():
         delay = parameters.get(f"GPS{number + 1}_DELAY_MS") or 0.0
@@ -199,7 +199,7 @@ def _gnss(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Source]:
             "velocity_sigma": positive(s),
         }
         used = float(np.nanmean(table["U"])) if np.isfinite(table["U"]).any() else 0.0
-        yield Source(
+        yield LogSource(
             sensor="gnss",
             topic="GPS",
             instance=number,
@@ -211,7 +211,7 @@ def _gnss(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Source]:
         ).keep(fixed, "no fix")
 
 
-def _compasses(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Source]:
+def _compasses(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[LogSource]:
     """Yield compasses; the first of COMPASS_PRIO1_ID and later is the one with number 0.
 
     A priority that names the device of another number is ambiguous, and has no effect.
@@ -229,7 +229,7 @@ def _compasses(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Sou
         chosen, because = 0, "COMPASS_PRIO1_ID"
     for number, table in tables.get("MAG", {}).items():
         off = parameters.get(f"COMPASS_USE{number + 1 if number else ''}", 1.0) == 0.0
-        yield Source(
+        yield LogSource(
             sensor="magnetometer",
             topic="MAG",
             instance=number,
@@ -240,7 +240,7 @@ def _compasses(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Sou
         )
 
 
-def _aids(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[Source]:
+def _aids(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[LogSource]:
     """Yield barometers, flow, distances, motors and batteries."""
     first = int(parameters.get("BARO_PRIMARY", 0.0))
     for number, table in tables.get("BARO", {}).items():
@@ -276,7 +276,7 @@ def _aid(
     table: _Table,
     values: dict[str, Floats],
     rank: float = 0.0,
-) -> Source:
-    return Source(
+) -> LogSource:
+    return LogSource(
         sensor=sensor, topic=topic, instance=number, time=table["time"], values=values, rank=rank
     )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats
-from quad_gym.estimation.logs.source import Recording, Source
+from quad_gym.estimation.logs.source import LogSource, Recording
 
 LATE = (
     1.0  #: largest delay of a measurement behind a later one, beyond which its stamp is wrong [s]
@@ -49,7 +49,7 @@ def longest_increase(time: Floats) -> Any:
     return found
 
 
-def cleaned(recording: Recording, source: Source) -> Source:
+def cleaned(recording: Recording, source: LogSource) -> LogSource:
     """Return a source with correct stamps, in which each row counts once."""
     if source.received is not None:
         source = _stamped(recording, source)
@@ -65,7 +65,7 @@ def cleaned(recording: Recording, source: Source) -> Source:
     return _once(source)
 
 
-def _stamped(recording: Recording, source: Source) -> Source:
+def _stamped(recording: Recording, source: LogSource) -> LogSource:
     """Return a source that has its times of arrival as stamps, if none was ever set."""
     assert source.received is not None
     known = source.time[np.isfinite(source.time)]
@@ -77,7 +77,7 @@ def _stamped(recording: Recording, source: Source) -> Source:
     return source
 
 
-def _without_lone_stamps(source: Source) -> Source:
+def _without_lone_stamps(source: LogSource) -> LogSource:
     """Return an IMU without samples apart from all others: they fit, but only at an end."""
     if source.sensor not in _OF_IMU or len(source) <= _FEW:
         return source
@@ -86,7 +86,7 @@ def _without_lone_stamps(source: Source) -> Source:
     return source.keep(sizes[part] > min(_FEW, sizes.max() - 1), WRONG)
 
 
-def _once(source: Source) -> Source:
+def _once(source: LogSource) -> LogSource:
     """Return a source without doubled rows, and without copies of the measurement before."""
     if len(source) < 2:
         return source
@@ -110,7 +110,7 @@ def _once(source: Source) -> Source:
     return source.keep(kept, COPIES)
 
 
-def on_one_clock(recording: Recording, sources: Sequence[Source]) -> list[Source]:
+def on_one_clock(recording: Recording, sources: Sequence[LogSource]) -> list[LogSource]:
     """Return sources on one clock.
 
     Stamps of another clock than the recorder's are moved by the median difference, unless all
@@ -140,7 +140,7 @@ def on_one_clock(recording: Recording, sources: Sequence[Source]) -> list[Source
     return _arrived(_within(recording, found))
 
 
-def _within(recording: Recording, sources: Sequence[Source]) -> list[Source]:
+def _within(recording: Recording, sources: Sequence[LogSource]) -> list[LogSource]:
     """Return sources without measurements outside of the time of the IMU."""
     samples = [s.time for s in sources if s.sensor in _OF_IMU and len(s)]
     if not samples:
@@ -159,7 +159,7 @@ def _within(recording: Recording, sources: Sequence[Source]) -> list[Source]:
     return found
 
 
-def _arrived(sources: Sequence[Source]) -> list[Source]:
+def _arrived(sources: Sequence[LogSource]) -> list[LogSource]:
     """Return sources of a table with their times of arrival: no row before the row above it."""
     rows = [s.row for s in sources if s.row is not None and s.received is None and len(s)]
     if not rows:

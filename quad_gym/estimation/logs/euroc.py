@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats
-from quad_gym.estimation.logs.source import Recording, Source
+from quad_gym.estimation.logs.source import LogSource, Recording
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 _FROM_X_UP = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -48,11 +48,11 @@ def read_euroc(path: Path | str) -> Recording:
     mean = np.nanmean(accel, axis=0) if len(accel) else np.zeros(3)
     turn = _FROM_X_UP if mean[0] == np.abs(mean).max() and mean.any() else np.eye(3)
     values = {"gyro": gyro @ turn.T, "accel": accel @ turn.T}
-    imu = Source(sensor="imu", topic="imu0", time=time, values=values)
+    imu = LogSource(sensor="imu", topic="imu0", time=time, values=values)
     return Recording(file=Path(path).name, sources=[imu, *_places(root, turn)])
 
 
-def _places(root: Path, turn: Floats) -> Iterator[Source]:
+def _places(root: Path, turn: Floats) -> Iterator[LogSource]:
     """Yield positions and attitudes of motion capture."""
     for file in sorted(root.glob("*/data.csv")):
         name = file.parent.name
@@ -63,13 +63,13 @@ def _places(root: Path, turn: Floats) -> Iterator[Source]:
             continue
         time, numbers = _table(file, 8 if _QUATERNION.search(heading) else 4)
         values = {"position_I": numbers[:, :3]}
-        yield Source(sensor="gnss", topic=name, time=time, values=values)
+        yield LogSource(sensor="gnss", topic=name, time=time, values=values)
         if numbers.shape[1] >= 7:
             known_rows = np.linalg.norm(numbers[:, 3:7], axis=1) > 0.5
             R_SI = quaternion_to_dcm(numbers[known_rows, 3:7])
             q = dcm_to_quaternion(turn @ _rotation(file.parent) @ R_SI)
             stamps = time[known_rows]
-            yield Source(sensor="attitude", topic=name, time=stamps, values={"quaternion": q})
+            yield LogSource(sensor="attitude", topic=name, time=stamps, values={"quaternion": q})
 
 
 def _root(path: Path) -> Path:

@@ -28,7 +28,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import tables
 from quad_gym.estimation.logs.log import LOG_COLUMNS, Floats
-from quad_gym.estimation.logs.source import Recording, Source
+from quad_gym.estimation.logs.source import LogSource, Recording
 from quad_gym.params import checks as check
 
 _KEYS = (
@@ -76,7 +76,7 @@ def mapped(given: Mapping[Any, Any], file: Path, name: str) -> Recording:
     return Recording(file=name, sources=sources, barometer_from_start=by_pressure)
 
 
-def _sources(given: Mapping[Any, Any], contents: dict[str, Any]) -> Iterator[Source]:
+def _sources(given: Mapping[Any, Any], contents: dict[str, Any]) -> Iterator[LogSource]:
     """Yield the sources of all quantities with the same clock together."""
     body = check.choice("body", contents.pop("body", "flu"), ("flu", "frd"))
     check.keywords(contents, tuple(LOG_COLUMNS), "a map of columns")
@@ -156,12 +156,12 @@ def _numbers(given: Mapping[Any, Any], key: str, entry: Mapping[str, Any]) -> Fl
     return values[:, ["xyz".index(word[-1]) for word in words]] * signs
 
 
-def _pressure(given: Mapping[Any, Any], entry: Mapping[str, Any], time: Floats) -> Source:
+def _pressure(given: Mapping[Any, Any], entry: Mapping[str, Any], time: Floats) -> LogSource:
     """Return a barometer that is given as a pressure."""
     factor = _PRESSURES[entry["unit"]]
     values = _numbers(given, "barometer", {**entry, "unit": "m", "scale": factor})[:, 0]
     rows = np.isfinite(values)
-    return Source(
+    return LogSource(
         sensor="barometer",
         topic="table",
         time=time[rows],

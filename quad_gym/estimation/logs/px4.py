@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, ecef_of
-from quad_gym.estimation.logs.source import TO_FLU, Recording, Source, positive, reading, stack
+from quad_gym.estimation.logs.source import TO_FLU, LogSource, Recording, positive, reading, stack
 
 GNSS_DELAY = 0.11  #: delay of receivers if the log does not contain it [s]: PX4's default
 
@@ -91,14 +91,16 @@ def _each(topics: _Topics, *names: str) -> Iterator[tuple[int, str, int, _Topic]
             yield tier, name, instance, topic
 
 
-def _source(sensor: str, name: str, topic: _Topic, delay: float = 0.0, **contents: Any) -> Source:
+def _source(
+    sensor: str, name: str, topic: _Topic, delay: float = 0.0, **contents: Any
+) -> LogSource:
     """Return a source with its times; `delay` if only the time of arrival is known [s]."""
     received = 1e-6 * np.asarray(topic["timestamp"], np.float64)
     taken = received - delay
     if "timestamp_sample" in topic:
         stamps = 1e-6 * np.asarray(topic["timestamp_sample"], np.float64)
         taken = np.where(stamps > _EARLIEST, np.minimum(stamps, received), taken)
-    return Source(sensor=sensor, topic=name, time=taken, received=received, **contents)
+    return LogSource(sensor=sensor, topic=name, time=taken, received=received, **contents)
 
 
 def _three(topic: _Topic, name: str) -> Floats:
@@ -107,7 +109,7 @@ def _three(topic: _Topic, name: str) -> Floats:
     return stack(topic, names if names[0] in topic else list("xyz"))
 
 
-def _inertial(topics: _Topics) -> Iterator[Source]:
+def _inertial(topics: _Topics) -> Iterator[LogSource]:
     for tier, name, instance, topic in _each(topics, "sensor_combined"):
         values = {
             "gyro": _three(topic, "gyro_rad") * TO_FLU,
@@ -116,7 +118,7 @@ def _inertial(topics: _Topics) -> Iterator[Source]:
         yield _source("imu", name, topic, instance=instance, tier=tier, values=values)
 
 
-def _gnss(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[Source]:
+def _gnss(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[LogSource]:
     """Yield positions and velocities with a fix."""
     delay = 1e-3 * float(parameters.get("EKF2_GPS_DELAY", 1e3 * GNSS_DELAY))
     for tier, name, instance, topic in _each(topics, "vehicle_gps_position", "sensor_gps"):
@@ -155,7 +157,7 @@ def _used(topics: _Topics) -> set[int]:
     return found - {0}
 
 
-def _compasses(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[Source]:
+def _compasses(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[LogSource]:
     used = _used(topics)
     names = ("vehicle_magnetometer", "sensor_mag", "sensor_combined")
     for tier, name, instance, topic in _each(topics, *names):
@@ -182,7 +184,7 @@ def _compasses(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[Sourc
         )
 
 
-def _barometers(topics: _Topics) -> Iterator[Source]:
+def _barometers(topics: _Topics) -> Iterator[LogSource]:
     used = _used(topics)
     names = ("vehicle_air_data", "sensor_baro", "sensor_combined")
     for tier, name, instance, topic in _each(topics, *names):
@@ -201,7 +203,7 @@ def _barometers(topics: _Topics) -> Iterator[Source]:
         )
 
 
-def _aids(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[Source]:
+def _aids(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[LogSource]:
     """Yield compasses, barometers, flow, distances, headings, motors and batteries."""
     yield from _compasses(topics, parameters)
     yield from _barometers(topics)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, Log
-from quad_gym.estimation.logs.source import Recording, Source, positive
+from quad_gym.estimation.logs.source import LogSource, Recording, positive
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params.sensors import SensorSuite
 
@@ -47,7 +47,7 @@ _SPEEDS = {100.0: "cm/s", 3.6: "km/h", 1.94384: "knots", 3.28084: "ft/s", 1000.0
 # ---- one source ----------------------------------------------------------------------------------
 
 
-def measured(recording: Recording, source: Source) -> Source:
+def measured(recording: Recording, source: LogSource) -> LogSource:
     """Return a source without rows in which nothing was measured; empty: without any that was."""
     if source.sensor == "gnss":
         source = _with_valid_numbers(source)
@@ -72,7 +72,7 @@ def measured(recording: Recording, source: Source) -> Source:
     return source
 
 
-def _with_valid_numbers(source: Source) -> Source:
+def _with_valid_numbers(source: LogSource) -> LogSource:
     """Return GNSS measurements with NaN for zero baselines and accuracies: both mean unknown."""
     values = dict(source.values)
     for name, value in values.items():
@@ -83,7 +83,7 @@ def _with_valid_numbers(source: Source) -> Source:
     return replace(source, values=values)
 
 
-def _finite(source: Source) -> Any:
+def _finite(source: LogSource) -> Any:
     """Return True for the rows in which all of a vector, or one of several, was measured."""
     if not len(source):
         return np.ones(0, bool)
@@ -98,7 +98,7 @@ def _finite(source: Source) -> Any:
     return np.any(whole, axis=0) if source.sensor == "gnss" else np.all(whole, axis=0)
 
 
-def _with_fix(source: Source) -> Source:
+def _with_fix(source: LogSource) -> LogSource:
     """Return GNSS measurements without positions that no receiver has."""
     if (places := source.values.get("position_G")) is not None:
         away = np.linalg.norm(places, axis=1)
@@ -123,7 +123,7 @@ def _with_fix(source: Source) -> Source:
     return source.keep(slow, "fix at 0, 0, 0")
 
 
-def _height(recording: Recording, source: Source) -> Source:
+def _height(recording: Recording, source: LogSource) -> LogSource:
     """Return heights from static pressures, in the unit that makes them such."""
     pressure = source.values["pressure"]
     middle = float(np.median(pressure)) if len(pressure) else 0.0

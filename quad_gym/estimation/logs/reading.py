@@ -10,7 +10,7 @@ import numpy as np
 from quad_gym.estimation.logs import clocks, euroc, maps, quantities, tables
 from quad_gym.estimation.logs.log import Log, Stream
 from quad_gym.estimation.logs.selection import select
-from quad_gym.estimation.logs.source import Recording, Source
+from quad_gym.estimation.logs.source import LogSource, Recording
 from quad_gym.params import checks as check
 
 
@@ -148,7 +148,7 @@ def _log_of(
         raise ValueError(f"{recording.where}{error}{why}") from None
 
 
-def _without_imu(recording: Recording, sources: Sequence[Source]) -> str:
+def _without_imu(recording: Recording, sources: Sequence[LogSource]) -> str:
     """Return an error about a log without samples of gyro and accelerometer."""
     names = {s.sensor for s in sources if s.sensor in ("gyro", "accel") and len(s)}
     why = "".join(f"; {note}" for note in recording.notes)
@@ -156,7 +156,7 @@ def _without_imu(recording: Recording, sources: Sequence[Source]) -> str:
     return f"{recording.where}a log must have at least two IMU samples{half}, got 0{why}"
 
 
-def _joined(recording: Recording, gyro: Source, accel: Source) -> Source:
+def _joined(recording: Recording, gyro: LogSource, accel: LogSource) -> LogSource:
     """Return an IMU of a gyro and an accelerometer, at the times of the faster one."""
     gyro, accel = clocks.on_one_clock(recording, [gyro, accel])
     fast, slow = sorted((gyro, accel), key=len, reverse=True)
@@ -191,7 +191,7 @@ def _shape(name: str) -> tuple[int, ...]:
     return () if name == "velocity_sigma" else (3,)
 
 
-def _report(chosen: Mapping[str, Source], sources: Sequence[Source]) -> dict[str, Any]:
+def _report(chosen: Mapping[str, LogSource], sources: Sequence[LogSource]) -> dict[str, Any]:
     """Return the sources that were taken, by sensor."""
     found: dict[str, Any] = {}
     for sensor, source in chosen.items():
@@ -206,7 +206,7 @@ def _report(chosen: Mapping[str, Source], sources: Sequence[Source]) -> dict[str
     return found
 
 
-def _dropped(chosen: Mapping[str, Source]) -> list[str]:
+def _dropped(chosen: Mapping[str, LogSource]) -> list[str]:
     """Return sentences on rows that were dropped."""
     sentences = []
     for source in chosen.values():

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, ecef_of
-from quad_gym.estimation.logs.source import Recording, Source, positive, reading
+from quad_gym.estimation.logs.source import LogSource, Recording, positive, reading
 
 
 class _Kind(NamedTuple):
@@ -179,7 +179,7 @@ def _rank(topic: str, kind: _Kind) -> float | None:
     return rank + (4.0 * bool(words & kind.needs) if kind.needs else 0.0)
 
 
-def _sources(topic: str, kind: str, rows: Floats) -> Iterator[Source]:
+def _sources(topic: str, kind: str, rows: Floats) -> Iterator[LogSource]:
     """Yield the sources of a topic."""
     rank = _rank(topic, _KINDS[kind])
     if rank is None:
@@ -197,24 +197,24 @@ def _sources(topic: str, kind: str, rows: Floats) -> Iterator[Source]:
             sigma = np.sqrt(np.maximum(numbers[:, 5:], 0.0))
             sigma[(told == 0.0) | ~(sigma > 0.0).all(axis=1)] = np.nan
             values = {"position_G": place, "position_sigma_I": positive(sigma)}
-            yield Source(sensor=sensor, values=values, **some).keep(fixed, "no fix")
+            yield LogSource(sensor=sensor, values=values, **some).keep(fixed, "no fix")
         case "FluidPressure":
-            yield Source(sensor=sensor, values={"pressure": numbers[:, 0]}, **some)
+            yield LogSource(sensor=sensor, values={"pressure": numbers[:, 0]}, **some)
         case "Range" if any(word in topic.lower() for word in _DOWN):
             distance, low, high = numbers.T
             good = (distance >= low) & (distance <= high)
-            source = Source(sensor=sensor, values={"range_finder": distance}, **some)
+            source = LogSource(sensor=sensor, values={"range_finder": distance}, **some)
             yield source.keep(good, "no distance")
         case "MagneticField":
-            yield Source(sensor=sensor, values={"magnetometer": numbers}, **some)
+            yield LogSource(sensor=sensor, values={"magnetometer": numbers}, **some)
         case _ if sensor == "gnss_velocity":
-            yield Source(sensor=sensor, values={"velocity_I": numbers}, **some)
+            yield LogSource(sensor=sensor, values={"velocity_I": numbers}, **some)
         case _ if sensor == "pose":
-            yield Source(sensor="gnss", values={"position_I": numbers[:, :3]}, tier=2, **some)
-            yield Source(sensor="attitude", values={"quaternion": numbers[:, 3:]}, **some)
+            yield LogSource(sensor="gnss", values={"position_I": numbers[:, :3]}, tier=2, **some)
+            yield LogSource(sensor="attitude", values={"quaternion": numbers[:, 3:]}, **some)
 
 
-def _halves(numbers: Floats, some: dict[str, Any]) -> Iterator[Source]:
+def _halves(numbers: Floats, some: dict[str, Any]) -> Iterator[LogSource]:
     """Yield an IMU, or the half of it that was measured: neither marked so, nor always zero."""
     halves = {"gyro": (numbers[:, :3], numbers[:, 6]), "accel": (numbers[:, 3:6], numbers[:, 7])}
     values = {
@@ -223,6 +223,6 @@ def _halves(numbers: Floats, some: dict[str, Any]) -> Iterator[Source]:
     }
     whole = {name: v for name, v in values.items() if np.nan_to_num(v).any()}
     if len(whole) == 2:
-        yield Source(sensor="imu", values=whole, **some)
+        yield LogSource(sensor="imu", values=whole, **some)
     for name, v in whole.items() if len(whole) < 2 else ():
-        yield Source(sensor=name, values={name: v}, **some)
+        yield LogSource(sensor=name, values={name: v}, **some)

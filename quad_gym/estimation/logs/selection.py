@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats
-from quad_gym.estimation.logs.source import SENSORS, Recording, Source
+from quad_gym.estimation.logs.source import SENSORS, LogSource, Recording
 from quad_gym.params.checks import keywords
 
 _NEARLY = 0.9  #: share of the best source's time that makes another one eligible
@@ -20,10 +20,10 @@ _LOST = 3.0  #: time without data in which another source has some, to be report
 
 def select(
     recording: Recording,
-    sources: Sequence[Source],
+    sources: Sequence[LogSource],
     instance: Mapping[str, int] | None = None,
     topic: Mapping[str, str] | None = None,
-) -> dict[str, Source]:
+) -> dict[str, LogSource]:
     """Return a source for each sensor of a file.
 
     Args:
@@ -37,7 +37,7 @@ def select(
     """
     keywords(instance or {}, SENSORS, "instance")
     keywords(topic or {}, SENSORS, "topic")
-    found: dict[str, Source] = {}
+    found: dict[str, LogSource] = {}
     for sensor in SENSORS:
         known = [s for s in sources if s.sensor == sensor]
         chosen = _asked(recording, sensor, known, (instance or {}).get(sensor), "instance")
@@ -56,8 +56,8 @@ def select(
 
 
 def _asked(
-    recording: Recording, sensor: str, known: list[Source], asked: Any, word: str
-) -> list[Source]:
+    recording: Recording, sensor: str, known: list[LogSource], asked: Any, word: str
+) -> list[LogSource]:
     """Return the sources that the caller's choice leaves."""
     if asked is None:
         return known
@@ -73,18 +73,18 @@ def _asked(
     return chosen
 
 
-def _empty(source: Source) -> str:
+def _empty(source: LogSource) -> str:
     """Return a sentence on a source of which nothing is left."""
     reasons = ", ".join(f"{n} rows: {reason}" for reason, n in source.dropped.items())
     return f"{source.sensor} ({source.name}) is left out: {reasons}"
 
 
-def _seconds(source: Source) -> Any:
+def _seconds(source: LogSource) -> Any:
     """Return the numbers of the seconds with data."""
     return np.unique(np.floor(source.time))
 
 
-def _best(sources: list[Source]) -> Source:
+def _best(sources: list[LogSource]) -> LogSource:
     """Return the source to take of some with data."""
     covered = [len(_seconds(s)) for s in sources]
     eligible = [
@@ -93,7 +93,7 @@ def _best(sources: list[Source]) -> Source:
     return min(eligible, key=lambda s: (s.tier, -s.rank, _unsteady(s), -len(s), s.instance))
 
 
-def _unsteady(source: Source) -> float:
+def _unsteady(source: LogSource) -> float:
     """Return the relative spread of the magnetic field [-]; 0 for other sensors."""
     if source.sensor != "magnetometer":
         return 0.0
@@ -101,7 +101,7 @@ def _unsteady(source: Source) -> float:
     return round(float(size.std() / size.mean()), 2) if size.any() else np.inf
 
 
-def _taken(sensor: str, best: Source, others: list[Source]) -> str:
+def _taken(sensor: str, best: LogSource, others: list[LogSource]) -> str:
     """Return a sentence on the source that was taken."""
     why = f" ({best.because})" if best.because else ""
     rest = ", ".join(sorted({s.name for s in others}))
@@ -117,7 +117,7 @@ def _taken(sensor: str, best: Source, others: list[Source]) -> str:
     return text
 
 
-def _could_take_over(sensor: str, best: Source, others: list[Source]) -> list[str]:
+def _could_take_over(sensor: str, best: LogSource, others: list[LogSource]) -> list[str]:
     """Return a sentence on other sources with data where the one that was taken has none."""
     have: Floats = _seconds(best)
     for other in others:

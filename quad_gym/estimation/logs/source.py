@@ -27,7 +27,7 @@ TO_FLU = np.array([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Source:
+class LogSource:
     """Samples of one sensor, in the order of the file, with all its defects."""
 
     sensor: str  #: one of SENSORS
@@ -50,7 +50,7 @@ class Source:
         """Name of the source in sentences."""
         return f"{self.topic} {self.instance}" if self.instance else self.topic
 
-    def keep(self, chosen: Any, reason: str) -> "Source":
+    def keep(self, chosen: Any, reason: str) -> "LogSource":
         """Return the source with some of its rows, and count the others."""
         count = len(self) - int(np.count_nonzero(chosen))
         if not count:
@@ -74,7 +74,7 @@ class Recording:
     """Contents of a file: the sources of all sensors, and sentences about them."""
 
     file: str
-    sources: Sequence[Source]
+    sources: Sequence[LogSource]
     barometer_from_start: bool = False
     """True: heights from pressure refer to another level than positions"""
     notes: list[str] = field(default_factory=list)  #: sentences on choices and dropped rows

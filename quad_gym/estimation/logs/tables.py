@@ -10,7 +10,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from quad_gym.estimation.logs.log import LOG_COLUMNS, Floats, ecef_of
-from quad_gym.estimation.logs.source import Recording, Source
+from quad_gym.estimation.logs.source import LogSource, Recording
 from quad_gym.params import checks as check
 
 _FORMS = {
@@ -134,11 +134,11 @@ def _together(columns: Columns, key: str) -> Floats | None:
     return block if len(names) > 1 else block[:, 0]
 
 
-def sources_of(columns: Columns, body: str) -> Iterator[Source]:
+def sources_of(columns: Columns, body: str) -> Iterator[LogSource]:
     """Yield a source for each sensor with columns."""
     axes = np.array([1.0, 1.0, 1.0] if body == "flu" else [1.0, -1.0, -1.0])
 
-    def source(sensor: str, **values: Floats | None) -> Iterator[Source]:
+    def source(sensor: str, **values: Floats | None) -> Iterator[LogSource]:
         """The rows in which something was measured."""
         given = {name: v for name, v in values.items() if v is not None}
         rows = np.zeros(len(columns["time"]), bool)
@@ -148,7 +148,7 @@ def sources_of(columns: Columns, body: str) -> Iterator[Source]:
                 rows |= known.all(axis=1) if sensor == "imu" else known.any(axis=1)
         if rows.any():
             received = columns.get("received")
-            yield Source(
+            yield LogSource(
                 sensor=sensor,
                 topic="table",
                 time=columns["time"][rows],
