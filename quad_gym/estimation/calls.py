@@ -35,7 +35,7 @@ _STARTS = (
 """Keywords of `initialize` that exported filters have, too."""
 
 
-class Calls:
+class FilterCalls:
     """Rows of the calls for a part of a log, in their order."""
 
     def __init__(self, suite: SensorSuite) -> None:

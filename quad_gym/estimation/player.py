@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.calls import Calls
+from quad_gym.estimation.calls import FilterCalls
 from quad_gym.estimation.filters import (
     LONGEST_STEP,
     ExtendedKalmanFilter,
@@ -64,7 +64,7 @@ class Player:
         start: dict[str, Any],
         reported_noise: bool,
         window: float | None,
-        calls: Calls | None = None,
+        calls: FilterCalls | None = None,
         hold: bool = False,
     ) -> None:
         self.calls = calls

@@ -8,7 +8,7 @@ from typing import Any, TypeVar, Unpack
 
 import numpy as np
 
-from quad_gym.estimation.calls import Calls
+from quad_gym.estimation.calls import FilterCalls
 from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
 from quad_gym.estimation.logs import Log, Reading, read_log
@@ -84,7 +84,7 @@ def replay(
     reach = window + max(0.0, *vars(suite.log_delays).values())
 
     def fly(part: Log, begin: dict[str, Any]) -> Replay:
-        calls = None if samples is None else Calls(suite)
+        calls = None if samples is None else FilterCalls(suite)
         hold = own is None and calls is None  # the exported filter receives measurements only
         player = Player(part, suite, estimator, begin, reported_noise, reach, calls, hold)
         found = player.play() if own is None else OwnPlayer(player, own).play()

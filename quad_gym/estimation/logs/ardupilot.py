@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, ecef_of
-from quad_gym.estimation.logs.source import TO_FLU, LogSource, Recording, positive, reading, stack
+from quad_gym.estimation.logs.source import TO_FLU, LogSource, RawLog, positive, reading, stack
 
 GNSS_DELAY = 0.2  #: delay of receivers if the log does not contain it [s]
 
@@ -64,7 +64,7 @@ _Table = Mapping[str, Floats]
 _Tables = Mapping[str, Mapping[int, _Table]]
 
 
-def read_bin(path: Path | str) -> Recording:
+def read_bin(path: Path | str) -> RawLog:
     """Read a log of ArduPilot.
 
     Args:
@@ -79,7 +79,7 @@ def read_bin(path: Path | str) -> Recording:
         tables, parameters = _tables(file)
     if "IMU" not in tables:
         raise ValueError(f"{file.name} must be a log of ArduPilot with messages IMU, got none")
-    return Recording(
+    return RawLog(
         file=file.name,
         sources=[
             *_inertial(tables, parameters),

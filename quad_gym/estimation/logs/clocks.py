@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats
-from quad_gym.estimation.logs.source import LogSource, Recording
+from quad_gym.estimation.logs.source import LogSource, RawLog
 
 LATE = (
     1.0  #: largest delay of a measurement behind a later one, beyond which its stamp is wrong [s]
@@ -49,7 +49,7 @@ def longest_increase(time: Floats) -> Any:
     return found
 
 
-def cleaned(recording: Recording, source: LogSource) -> LogSource:
+def cleaned(recording: RawLog, source: LogSource) -> LogSource:
     """Return a source with correct stamps, in which each row counts once."""
     if source.received is not None:
         source = _stamped(recording, source)
@@ -65,7 +65,7 @@ def cleaned(recording: Recording, source: LogSource) -> LogSource:
     return _once(source)
 
 
-def _stamped(recording: Recording, source: LogSource) -> LogSource:
+def _stamped(recording: RawLog, source: LogSource) -> LogSource:
     """Return a source that has its times of arrival as stamps, if none was ever set."""
     assert source.received is not None
     known = source.time[np.isfinite(source.time)]
@@ -110,7 +110,7 @@ def _once(source: LogSource) -> LogSource:
     return source.keep(kept, COPIES)
 
 
-def on_one_clock(recording: Recording, sources: Sequence[LogSource]) -> list[LogSource]:
+def on_one_clock(recording: RawLog, sources: Sequence[LogSource]) -> list[LogSource]:
     """Return sources on one clock.
 
     Stamps of another clock than the recorder's are moved by the median difference, unless all
@@ -140,7 +140,7 @@ def on_one_clock(recording: Recording, sources: Sequence[LogSource]) -> list[Log
     return _arrived(_within(recording, found))
 
 
-def _within(recording: Recording, sources: Sequence[LogSource]) -> list[LogSource]:
+def _within(recording: RawLog, sources: Sequence[LogSource]) -> list[LogSource]:
     """Return sources without measurements outside of the time of the IMU."""
     samples = [s.time for s in sources if s.sensor in _OF_IMU and len(s)]
     if not samples:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats
-from quad_gym.estimation.logs.source import LogSource, Recording
+from quad_gym.estimation.logs.source import LogSource, RawLog
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 _FROM_X_UP = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -34,7 +34,7 @@ def is_euroc(path: Path) -> bool:
     return _root(path).joinpath("imu0", "data.csv").is_file()
 
 
-def read_euroc(path: Path | str) -> Recording:
+def read_euroc(path: Path | str) -> RawLog:
     """Read a folder, `mav0` or the one that contains it.
 
     Raises:
@@ -49,7 +49,7 @@ def read_euroc(path: Path | str) -> Recording:
     turn = _FROM_X_UP if mean[0] == np.abs(mean).max() and mean.any() else np.eye(3)
     values = {"gyro": gyro @ turn.T, "accel": accel @ turn.T}
     imu = LogSource(sensor="imu", topic="imu0", time=time, values=values)
-    return Recording(file=Path(path).name, sources=[imu, *_places(root, turn)])
+    return RawLog(file=Path(path).name, sources=[imu, *_places(root, turn)])
 
 
 def _places(root: Path, turn: Floats) -> Iterator[LogSource]:

@@ -28,7 +28,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import tables
 from quad_gym.estimation.logs.log import LOG_COLUMNS, Floats
-from quad_gym.estimation.logs.source import LogSource, Recording
+from quad_gym.estimation.logs.source import LogSource, RawLog
 from quad_gym.params import checks as check
 
 _KEYS = (
@@ -52,7 +52,7 @@ _UNITS: dict[str, dict[str, float]] = {
 _PRESSURES = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1e3, "bar": 1e5}
 
 
-def read_table(path: Path, file: Path) -> Recording:
+def read_table(path: Path, file: Path) -> RawLog:
     """Return the contents of a comma-separated table by a map.
 
     Raises:
@@ -62,7 +62,7 @@ def read_table(path: Path, file: Path) -> Recording:
     return mapped(tables.csv_columns(path), file, path.name)
 
 
-def mapped(given: Mapping[Any, Any], file: Path, name: str) -> Recording:
+def mapped(given: Mapping[Any, Any], file: Path, name: str) -> RawLog:
     """Return the contents of columns by a map, see `read_table`."""
     try:
         contents = tomllib.loads(file.read_text(encoding="utf-8"))
@@ -73,7 +73,7 @@ def mapped(given: Mapping[Any, Any], file: Path, name: str) -> Recording:
     except ValueError as error:
         raise ValueError(f"{name} with the map {file.name}: {error}") from None
     by_pressure = any("pressure" in source.values for source in sources)
-    return Recording(file=name, sources=sources, barometer_from_start=by_pressure)
+    return RawLog(file=name, sources=sources, barometer_from_start=by_pressure)
 
 
 def _sources(given: Mapping[Any, Any], contents: dict[str, Any]) -> Iterator[LogSource]:

@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, ecef_of
-from quad_gym.estimation.logs.source import TO_FLU, LogSource, Recording, positive, reading, stack
+from quad_gym.estimation.logs.source import TO_FLU, LogSource, RawLog, positive, reading, stack
 
 GNSS_DELAY = 0.11  #: delay of receivers if the log does not contain it [s]: PX4's default
 
@@ -52,7 +52,7 @@ _PWM = (1000.0, 1000.0)  #: least pulse and range of `actuator_outputs` [us]
 _Topic = Mapping[str, Any]
 
 
-def read_ulog(path: Path | str) -> Recording:
+def read_ulog(path: Path | str) -> RawLog:
     """Read a log of PX4.
 
     Args:
@@ -74,7 +74,7 @@ def read_ulog(path: Path | str) -> Recording:
         parameters = dict(ulog.initial_parameters)
     if "sensor_combined" not in topics:
         raise ValueError(f"{file.name} must have the topic sensor_combined, got {sorted(topics)}")
-    return Recording(
+    return RawLog(
         file=file.name,
         sources=[*_inertial(topics), *_gnss(topics, parameters), *_aids(topics, parameters)],
         barometer_from_start=True,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, Log
-from quad_gym.estimation.logs.source import LogSource, Recording, positive
+from quad_gym.estimation.logs.source import LogSource, RawLog, positive
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params.sensors import SensorSuite
 
@@ -47,7 +47,7 @@ _SPEEDS = {100.0: "cm/s", 3.6: "km/h", 1.94384: "knots", 3.28084: "ft/s", 1000.0
 # ---- one source ----------------------------------------------------------------------------------
 
 
-def measured(recording: Recording, source: LogSource) -> LogSource:
+def measured(recording: RawLog, source: LogSource) -> LogSource:
     """Return a source without rows in which nothing was measured; empty: without any that was."""
     if source.sensor == "gnss":
         source = _with_valid_numbers(source)
@@ -123,7 +123,7 @@ def _with_fix(source: LogSource) -> LogSource:
     return source.keep(slow, "fix at 0, 0, 0")
 
 
-def _height(recording: Recording, source: LogSource) -> LogSource:
+def _height(recording: RawLog, source: LogSource) -> LogSource:
     """Return heights from static pressures, in the unit that makes them such."""
     pressure = source.values["pressure"]
     middle = float(np.median(pressure)) if len(pressure) else 0.0

@@ -10,7 +10,7 @@ import numpy as np
 from quad_gym.estimation.logs import clocks, euroc, maps, quantities, tables
 from quad_gym.estimation.logs.log import Log, Stream
 from quad_gym.estimation.logs.selection import select
-from quad_gym.estimation.logs.source import LogSource, Recording
+from quad_gym.estimation.logs.source import LogSource, RawLog
 from quad_gym.params import checks as check
 
 
@@ -76,7 +76,7 @@ def read_log(
     return found if from_ is None is until else found.between(from_, until)
 
 
-def _recording(log: Any, body: str, columns: Path | str | None) -> Recording:
+def _recording(log: Any, body: str, columns: Path | str | None) -> RawLog:
     """Translate a log."""
     if isinstance(log, (str, Path)):
         path = Path(log)
@@ -113,7 +113,7 @@ def _recording(log: Any, body: str, columns: Path | str | None) -> Recording:
 
 
 def _log_of(
-    recording: Recording,
+    recording: RawLog,
     instance: Mapping[str, int] | None,
     topic: Mapping[str, str] | None,
 ) -> Log:
@@ -148,7 +148,7 @@ def _log_of(
         raise ValueError(f"{recording.where}{error}{why}") from None
 
 
-def _without_imu(recording: Recording, sources: Sequence[LogSource]) -> str:
+def _without_imu(recording: RawLog, sources: Sequence[LogSource]) -> str:
     """Return an error about a log without samples of gyro and accelerometer."""
     names = {s.sensor for s in sources if s.sensor in ("gyro", "accel") and len(s)}
     why = "".join(f"; {note}" for note in recording.notes)
@@ -156,7 +156,7 @@ def _without_imu(recording: Recording, sources: Sequence[LogSource]) -> str:
     return f"{recording.where}a log must have at least two IMU samples{half}, got 0{why}"
 
 
-def _joined(recording: Recording, gyro: LogSource, accel: LogSource) -> LogSource:
+def _joined(recording: RawLog, gyro: LogSource, accel: LogSource) -> LogSource:
     """Return an IMU of a gyro and an accelerometer, at the times of the faster one."""
     gyro, accel = clocks.on_one_clock(recording, [gyro, accel])
     fast, slow = sorted((gyro, accel), key=len, reverse=True)

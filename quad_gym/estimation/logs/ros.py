@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, ecef_of
-from quad_gym.estimation.logs.source import LogSource, Recording, positive, reading
+from quad_gym.estimation.logs.source import LogSource, RawLog, positive, reading
 
 
 class _Kind(NamedTuple):
@@ -76,7 +76,7 @@ _DOWN = (
 )
 
 
-def read_bag(path: Path | str) -> Recording:
+def read_bag(path: Path | str) -> RawLog:
     """Read a bag.
 
     Args:
@@ -111,7 +111,7 @@ def read_bag(path: Path | str) -> Recording:
             topic, kind, np.frombuffer(rows, np.float64).reshape(-1, _SIZES[kind])
         )
     ]
-    return Recording(file=file.name, sources=sources, barometer_from_start=True)
+    return RawLog(file=file.name, sources=sources, barometer_from_start=True)
 
 
 def _name(connection: Any) -> str:

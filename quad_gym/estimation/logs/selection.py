@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats
-from quad_gym.estimation.logs.source import SENSORS, LogSource, Recording
+from quad_gym.estimation.logs.source import SENSORS, LogSource, RawLog
 from quad_gym.params.checks import keywords
 
 _NEARLY = 0.9  #: share of the best source's time that makes another one eligible
@@ -19,7 +19,7 @@ _LOST = 3.0  #: time without data in which another source has some, to be report
 
 
 def select(
-    recording: Recording,
+    recording: RawLog,
     sources: Sequence[LogSource],
     instance: Mapping[str, int] | None = None,
     topic: Mapping[str, str] | None = None,
@@ -56,7 +56,7 @@ def select(
 
 
 def _asked(
-    recording: Recording, sensor: str, known: list[LogSource], asked: Any, word: str
+    recording: RawLog, sensor: str, known: list[LogSource], asked: Any, word: str
 ) -> list[LogSource]:
     """Return the sources that the caller's choice leaves."""
     if asked is None:

@@ -70,7 +70,7 @@ class LogSource:
 
 
 @dataclass(eq=False)
-class Recording:
+class RawLog:
     """Contents of a file: the sources of all sensors, and sentences about them."""
 
     file: str

@@ -10,7 +10,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from quad_gym.estimation.logs.log import LOG_COLUMNS, Floats, ecef_of
-from quad_gym.estimation.logs.source import LogSource, Recording
+from quad_gym.estimation.logs.source import LogSource, RawLog
 from quad_gym.params import checks as check
 
 _FORMS = {
@@ -116,9 +116,9 @@ def _pixel_of(name: str) -> tuple[int, int] | None:
     return None
 
 
-def recording_of(columns: Columns, body: str, file: str) -> Recording:
+def recording_of(columns: Columns, body: str, file: str) -> RawLog:
     """Return the contents of checked columns."""
-    return Recording(file=file, sources=list(sources_of(columns, body)))
+    return RawLog(file=file, sources=list(sources_of(columns, body)))
 
 
 def _together(columns: Columns, key: str) -> Floats | None:
