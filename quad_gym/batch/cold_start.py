@@ -52,7 +52,8 @@ def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
         warnings.warn(
             f"{field} is {value:.3g} {unit}, more than {bound:.3g} {unit}: after a cold start the "
             "filter is overconfident, as its linearized model does not hold for errors so large; "
-            "filter_start='warm' begins with a converged filter",
+            "filter_start='warm' (of quad-gym train: --env filter_start=warm) begins with a "
+            "converged filter, if these sensors let it converge in 10 s of hovering",
             UserWarning,
             stacklevel=4,
         )

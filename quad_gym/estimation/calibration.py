@@ -16,7 +16,7 @@ from quad_gym.estimation.likelihood import in_flight
 from quad_gym.estimation.logs import Log, Reading, read_log
 from quad_gym.estimation.logs.parts import longest_part, naming
 from quad_gym.estimation.logs.quantities import compared
-from quad_gym.estimation.numbers import has
+from quad_gym.estimation.numbers import has_heading
 from quad_gym.estimation.plausibility import implausible
 from quad_gym.estimation.replaying import origin_of, replay
 from quad_gym.estimation.search import Calibrated, NumberSearch
@@ -135,20 +135,19 @@ def calibrate(
         used, split = max(1, min(len(logs) - 1, round(share * len(logs)))), -math.inf
         parts = logs[:used]
         judged = {_name_of(logs[k], k): k for k in range(used, len(logs))}
-    with naming(logs[0]):
-        report("Biases of the IMU")
-        biases = [turn_on_biases(*each, prior) for each in zip(parts, begins, strict=False)]
-        parts = [_without(part, found) for part, found in zip(parts, biases, strict=True)]
-        found = _searched(NumberSearch(parts, prior, begins[:used], delays, rotation), report)
-        new = prior
-        for number in found:
-            new = number.number.put(new, number.value)
-        new = _with_biases(_like_the_log(new, logs[0]), biases)
-        report("Validation")
-        before, after = (
-            pooled({n: validate(logs[k], s, begins[k], split) for n, k in judged.items()})
-            for s in (prior, new)
-        )
+    report("Biases of the IMU")
+    biases = [turn_on_biases(*each, prior) for each in zip(parts, begins, strict=False)]
+    parts = [_without(part, found) for part, found in zip(parts, biases, strict=True)]
+    found = _searched(NumberSearch(parts, prior, begins[:used], delays, rotation), report)
+    new = prior
+    for number in found:
+        new = number.number.put(new, number.value)
+    new = _with_biases(_like_the_log(new, logs[0]), biases)
+    report("Validation")
+    before, after = (
+        pooled({n: validate(logs[k], s, begins[k], split) for n, k in judged.items()})
+        for s in (prior, new)
+    )
     return Calibration(new, prior, found, before, after, split, used)
 
 
@@ -265,7 +264,7 @@ def _prior_of(suite: SensorSuite, log: Log, rotation: bool) -> SensorSuite:
     if gnss is not None and not gnss.drifts:
         drift = tuple(_DRIFT * sigma for sigma in gnss.position_sigma_I)
         gnss = gnss.replace(drift_sigma_I=drift, drift_tau=_DRIFT_TAU)
-    if gnss is not None and has(log, "baseline"):
+    if gnss is not None and has_heading(log):
         if rotation:  # which shows it
             gnss = gnss.replace(heading_error_sigma=0.0)
     elif gnss is not None:

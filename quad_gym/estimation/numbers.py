@@ -80,7 +80,11 @@ class Number:
             for axis in self.axes:
                 values[axis] = value
             new = tuple(values)
-        part = part.replace(**{self.field: new})
+        changes = {self.field: new}
+        if self.field == _LEVER and part.secondary_antenna_B is not None:  # with the same baseline
+            moves = np.subtract(new, part.primary_antenna_B)
+            changes["secondary_antenna_B"] = tuple((part.secondary_antenna_B + moves).tolist())
+        part = part.replace(**changes)
         return suite.replace(**{self.sensor: part}) if self.sensor else part
 
     def part(self, suite: SensorSuite) -> Any:
@@ -148,15 +152,15 @@ def numbers_in(suite: SensorSuite, log: Log, delays: bool, rotation: bool) -> li
     With or without delays, and with the rotation of the IMU or of the magnetometer only.
     """
     measured = {name for name in log.streams if getattr(suite, name, None) is not None}
-    paired = "gnss" in measured and has(log, "baseline")
+    paired = "gnss" in measured and has_heading(log)
     others = {
         # with axes in B
         _MOUNTING: rotation and (paired or bool(measured & {"camera", "magnetometer"})),
         _COMPASS: not rotation and "magnetometer" in measured,
         "baseline_sigma": paired,
         "velocity_sigma": has(log, "velocity"),
-        # with a baseline, its direction would change, and noise hides it
-        _LEVER: not paired
+        # of baselines, noise hides it
+        _LEVER: not has(log, "baseline")
         and suite.gnss is not None
         and suite.gnss.position_sigma_I[0] <= _PRECISE,
     }
@@ -170,6 +174,11 @@ def numbers_in(suite: SensorSuite, log: Log, delays: bool, rotation: bool) -> li
             if value is not None and (not number.positive or np.all(np.asarray(value) != 0.0)):
                 found.append(number)
     return found
+
+
+def has_heading(log: Log) -> bool:
+    """Return True if a log has baselines, or attitudes, which act as such."""
+    return has(log, "baseline") or log.attitude is not None
 
 
 def has(log: Log, quantity: str) -> bool:

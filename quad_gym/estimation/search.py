@@ -6,11 +6,10 @@ the flight. Newton steps follow, whose derivatives are differences between filte
 numbers of the suite, on a log each for delays and the mounting of the IMU. Their second derivatives
 are exact on the diagonal, and otherwise as correlated as the scores of parts of the log.
 
-The likelihood alone makes noise too small where errors are correlated in time, such as errors of a
-magnetometer near motors: innovations are then as small as predicted, but not white, and the filter
-counts the same error many times. Noise of such sensors becomes larger by sqrt(tau) (`widening`),
-where tau is the integrated autocorrelation time of the innovations in samples, before the other
-numbers are fitted again.
+The likelihood alone makes noise too small where errors are correlated in time, as near motors:
+innovations are as small as predicted, but not white. Noise of such sensors becomes larger by
+sqrt(tau) (`widening`), where tau is the integrated autocorrelation time of the innovations in
+samples, before the other numbers are fitted again.
 """
 
 import math
@@ -23,14 +22,14 @@ from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.fits import correlation_time
 from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log
+from quad_gym.estimation.logs.parts import naming
 from quad_gym.estimation.numbers import Number, numbers_in
 from quad_gym.estimation.replaying import replay
 from quad_gym.params.sensors import SensorSuite
 
 _SILENT = 0.8
 """Ratio of standard deviations after and before above which a log does not determine a number."""
-_COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")
-"""Noise that the search begins with twice: as large as the samples admit, and at its prior."""
+_COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")  #: begun with twice
 _FEW_STEPS, _STEPS = 4, 12  #: Newton steps from each beginning, and after
 _SHARES = np.array([1.0, 0.75, 0.5, 0.35, 0.2, 0.1, 0.05, 0.02])
 """Shares of a Newton step that are tried side by side."""
@@ -144,10 +143,7 @@ class NumberSearch:
             groups.setdefault(point[self.of_log].tobytes(), []).append(k)
         for key, rows in groups.items():
             suites = [self.suite(points[k]) for k in rows]
-            likelihoods = self._known.get(key) or [
-                Likelihood(log, suites[0], start, self.nu, self.white, self._margin)
-                for log, start in zip(self.logs, self.starts, strict=True)
-            ]
+            likelihoods = self._known.get(key) or self._likelihoods(suites[0])
             if key == self.x[self.of_log].tobytes():
                 self._known = {key: likelihoods}
             each = [likelihood.losses(suites) for likelihood in likelihoods]
@@ -155,6 +151,14 @@ class NumberSearch:
             found = found if found.size else np.empty((len(some), len(points)))
             found[:, rows] = some
         return found
+
+    def _likelihoods(self, suite: SensorSuite) -> list[Likelihood]:
+        """Return the likelihood of each log with the delays and the mounting of a suite."""
+        made = []
+        for log, start in zip(self.logs, self.starts, strict=True):
+            with naming(log):
+                made.append(Likelihood(log, suite, start, self.nu, self.white, self._margin))
+        return made
 
     def total(self, points: Sequence[Floats]) -> Floats:
         """Return the losses of the whole log, with priors."""

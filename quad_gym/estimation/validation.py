@@ -9,6 +9,7 @@ import numpy as np
 
 from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.fits import Fit, fit_of
+from quad_gym.estimation.likelihood import SETTLING
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Replay, by_sensor
@@ -103,8 +104,9 @@ def _held_out(
         return None, None, None
     errors, sigmas, nis = [], [], []
     period = float(np.median(np.diff(gnss.time)))
+    begin = max(split, float(gnss.time[0]) + SETTLING)  # the start needs all fixes
     for first in range(0, _PERIOD, _GAP):
-        since = gnss.time - split - first
+        since = gnss.time - begin - first
         kept = np.flatnonzero((since < 0.0) | (since % _PERIOD >= _GAP))
         skipped = np.diff(kept, prepend=kept[:1]) > 1
         gaps = np.diff(gnss.time[kept], prepend=gnss.time[kept[:1]])

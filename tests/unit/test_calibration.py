@@ -278,6 +278,22 @@ def test_outage_of_a_log_is_no_second_left_out(table):
     assert short[0] < 1.3 * whole[0]
 
 
+def test_validation_on_a_whole_log_predicts_fixes_after_the_start(table):
+    suite = TRUE.replace(log_delays=TRUE.log_delays.replace(gnss=DELAY), log_rotation=MOUNTING)
+    late, whole = (validate(read_log(table), suite, {}, split) for split in (12.0, -math.inf))
+    assert whole.sensors["gnss_position"].measurements > late.sensors["gnss_position"].measurements
+    assert whole.held_out_error[0] == pytest.approx(late.held_out_error[0], rel=0.5)
+    assert 0.3 < whole.held_out_nis < 3.0
+
+
+def test_lever_arm_moves_both_antennas_by_the_same_distance():
+    lever = next(n for n in NUMBERS if n.name == "gnss.primary_antenna_B[2]")
+    suite = quad_gym.sensor_suite("mocap")
+    moved = lever.put(suite, 0.2).gnss
+    assert moved.primary_antenna_B[2] == 0.2
+    assert moved.baseline_B == pytest.approx(suite.gnss.baseline_B, abs=1e-15)
+
+
 def test_sensor_that_stops_early_does_not_stop_a_calibration(table, found):
     stopped = {name: c.copy() for name, c in table.items()}
     for name in stopped:

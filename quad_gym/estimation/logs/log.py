@@ -155,7 +155,7 @@ class Log:
 
     def corrected(self, suite: SensorSuite) -> "Log":
         """Return the log without delays and mean biases of a suite, in the axes of B."""
-        delays = vars(suite.log_delays)
+        delays = {**vars(suite.log_delays), "attitude": suite.log_delays.gnss}  # of one system
         changes: dict[str, Any] = {
             name: replace(stream, time=stream.time - delays[name])
             for name, stream in self.streams.items()
