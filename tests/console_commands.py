@@ -4,14 +4,11 @@ import contextlib
 import io
 import re
 import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 from quad_gym.commands.main import main
-
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
 
 class Ended(NamedTuple):
@@ -22,9 +19,9 @@ class Ended(NamedTuple):
     stderr: str
 
 
-def line(script, *options):
-    """The command line that runs a script in a separate process."""
-    return [sys.executable, str(SCRIPTS / script), *map(str, options)]
+def line(command, *options):
+    """The command line that runs `quad-gym COMMAND` in a separate process."""
+    return [sys.executable, "-m", "quad_gym", command, *map(str, options)]
 
 
 def run(command, *options, where=None):

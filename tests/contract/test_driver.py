@@ -64,7 +64,7 @@ class ScriptedJob:
 
 
 def test_died_trainings_restart_and_failed_ones_do_not(tmp_path):
-    *trainings, finished = expand({"seeds": 7, "env": TRUTH}, {}, tmp_path)
+    *trainings, finished = expand({"seeds": 7, "env": TRUTH}, tmp_path)
     pretend(finished, 0.1)
     fine, died = Ended("finished"), Ended("died", "signal 9")
     ends = [
@@ -94,7 +94,7 @@ def test_died_trainings_restart_and_failed_ones_do_not(tmp_path):
 
 
 def test_signals_stop_all_trainings_and_start_no_others(tmp_path):
-    trainings = expand({"seeds": 3, "env": TRUTH}, {}, tmp_path)
+    trainings = expand({"seeds": 3, "env": TRUTH}, tmp_path)
     stops = []
 
     class Patient(Scripted):
@@ -136,7 +136,7 @@ def test_locked_folder_is_busy(tmp_path):
 
 def small(tmp_path):
     (tmp_path / "small.toml").write_text(SMALL)
-    return expand(read(tmp_path / "small.toml"), {}, tmp_path / "out")
+    return expand(read(tmp_path / "small.toml"), tmp_path / "out")
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def tables(where):
 
 def start(where, *options):
     (where / "small.toml").write_text(SMALL)
-    line = console_commands.line("sweep.py", "small.toml", "--output", "out", *options)
+    line = console_commands.line("sweep", "small.toml", "--output", "out", *options)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(line, cwd=where, text=True, **pipes)
 

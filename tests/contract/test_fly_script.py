@@ -19,7 +19,7 @@ def fly(*options, cwd, **environment):
     if not environment:
         return console_commands.run("fly", *options, where=cwd)
     return subprocess.run(
-        console_commands.line("fly.py", *options),
+        console_commands.line("fly", *options),
         cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
         capture_output=True,
@@ -36,7 +36,7 @@ def test_fly_writes_video_and_flight_that_replays_to_same_video(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "time limit after 1.00 s" in done.stdout
     assert "Wrote new/hover.gif" in done.stdout
-    assert done.stderr.index("drawing: 100%") < done.stderr.index("encoding new/hover.gif ...")
+    assert done.stderr.index("rendering: 100%") < done.stderr.index("encoding new/hover.gif ...")
     flight = Flight.load(tmp_path / "new" / "hover.npz")
     assert (len(flight), flight.about["seed"], flight.about["task"]) == (51, 4, "hover")
     assert flight.about["policy"] == "pd"

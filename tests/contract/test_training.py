@@ -120,7 +120,7 @@ def options(folder, *more):
 
 
 def script(folder, *more):
-    return console_commands.line("train.py", *options(folder, *more))
+    return console_commands.line("train", *options(folder, *more))
 
 
 def rows(folder):

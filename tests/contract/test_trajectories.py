@@ -186,7 +186,7 @@ def test_infeasible_or_invalid_trajectory_is_refused():
     fast = Trajectory.through(FIVE, max_speed=8.0, max_acceleration=30.0)
     with pytest.raises(ValueError, match=r"trajectory must be .* fly: .* at .* s .segment . of 4"):
         gymnasium.make("QuadGym/Trajectory-v0", trajectory=fast)
-    with pytest.raises(ValueError, match=r"trajectory\[1\] must be one that the vehicle can fly"):
+    with pytest.raises(ValueError, match=r"trajectory\[1\] is infeasible for this vehicle"):
         gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=2, trajectory=[OPEN, fast])
     far = Trajectory.through([(0, 0, 1), (2000, 0, 1)])
     for keywords, message in (

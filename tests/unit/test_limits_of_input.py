@@ -124,7 +124,7 @@ def test_averaged_samples_need_midpoint_integration():
     ],
 )
 def test_periods_too_short_for_the_thrust_limit_are_refused(task, least, options):
-    message = "period must be one that the vehicle can fly"
+    message = "period is infeasible for this vehicle"
     refused(message, QuadEnv, task, period=0.99 * least, **options)
     QuadEnv(task, period=1.01 * least, **options)
 
