@@ -30,7 +30,7 @@ class ExportFilterArgs:
     """also export a policy that acts on the estimate: pretrained, or a file of quad-gym train"""
     log: Path | None = None
     """log of a flight at the place where the filter will run: the origin of its positions, magnetic
-    field and rate of the IMU; if not given, the suite's"""
+    field and rate of the IMU; defaults to the suite's"""
     env_id: str | None = None
     """environment of the policy; defaults to that of its training record"""
     output: Path | None = None

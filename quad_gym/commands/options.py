@@ -313,7 +313,12 @@ LogFile = Positional[
 ]
 LogFiles = Positional[
     Annotated[
-        tuple[Path, ...], arg(metavar="LOG [LOG ...]", help="logs, as `quad-gym replay` takes")
+        tuple[Path, ...],
+        arg(
+            metavar="LOG [LOG ...]",
+            help="logs, as `quad-gym replay` takes",
+            help_behavior_hint="(required)",
+        ),
     ]
 ]
 

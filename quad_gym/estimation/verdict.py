@@ -148,7 +148,8 @@ def _misfit(name: str, m: Measured, fit: Fit, fits: Mapping[str, Fit]) -> Iterat
     says = f"{NAMES[name]}: NIS per degree of freedom {fit.mean_nis:.3g}, 1 expected"
     ratio = RATIO**2 if not shared else RATIO**4
     many = exceeds(m.rejected[known], MOST_REJECTED)
-    if larger(nis, d, ratio) or (many and not shared):
+    heavy = larger(nis, d, RATIO) and fit.mean_nis > 2.0 * ratio  # in the median, and in the mean
+    if larger(nis, d, ratio) or heavy or (many and not shared):
         text = f"{says}, {_percent(fit.rejected)} rejected: this suite does not describe this log"
         yield _lost(quantity, text)
     elif many or larger(nis, d, RATIO):
