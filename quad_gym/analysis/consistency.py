@@ -57,7 +57,11 @@ def flight_errors(batch: FlightBatch) -> Floats:
     truth = {name: batch.record(field) for name, field in _FIELDS.items()}
     estimate = {name: batch.record(f"{field}_hat") for name, field in _FIELDS.items()}
     R_BI, R_hat = quaternion_to_dcm(batch.record("q")), batch.record("R_hat")
-    return state_error(truth | {"R_BI": R_BI}, estimate | {"R_BI": R_hat})
+    return state_error(
+        truth | {"R_BI": R_BI},
+        estimate | {"R_BI": R_hat},
+        rotation_vector=batch.sensors.flow_alone,
+    )
 
 
 def start_matched(batch: FlightBatch, seed: int) -> None:

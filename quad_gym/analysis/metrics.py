@@ -2,8 +2,8 @@
 
 Errors of flights are arrays whose last axis is time; numbers over seeds are arrays with one entry
 per flight. The filter's error has 15 coordinates in the order of its covariance: position,
-velocity, attitude (the rotation vector e with R_BI = exp(-[e x]) R_hat, which agrees with the error
-Euler angles of the filter to first order), accelerometer bias, gyro bias; each is truth minus
+velocity, attitude (the 3-1-2 Euler angles e with R_BI = R(e) R_hat; with optical flow alone, the
+rotation vector e with R_BI = exp(-[e x]) R_hat), accelerometer bias, gyro bias; each is truth minus
 estimate.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.records import Ending
-from quad_gym.rotations import dcm_to_vector
+from quad_gym.rotations import dcm_to_euler, dcm_to_vector
 
 STATE_DIMENSION = 15  #: number of coordinates of the filter's error
 
@@ -106,20 +106,23 @@ def spread(values: ArrayLike) -> Spread:
     return Spread(x.size, mean, sd, median, low, high, float(x.max()))
 
 
-def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats:
+def state_error(
+    truth: Mapping[str, Any], estimate: Mapping[str, Any], *, rotation_vector: bool = False
+) -> Floats:
     """Error of the filter in the coordinates of its covariance.
 
     Truth and estimate have "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI"
     (..., 3, 3); position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
 
     Returns:
-        Truth minus estimate, (..., 15); attitude as the rotation vector e [rad] with
-        R_BI = exp(-[e x]) R_hat.
+        Truth minus estimate, (..., 15); attitude as Euler angles e [rad] with R_BI = R(e) R_hat, or
+        as the rotation vector e with R_BI = exp(-[e x]) R_hat (see `SensorSuite.flow_alone`).
     """
     names = ("position", "velocity", "accel_bias", "gyro_bias")
     r, v, b_a, b_g = (np.subtract(truth[name], estimate[name]) for name in names)
     R_hat = np.asarray(estimate["R_BI"], np.float64)
-    e = dcm_to_vector(np.asarray(truth["R_BI"], np.float64) @ np.swapaxes(R_hat, -1, -2))
+    R = np.asarray(truth["R_BI"], np.float64) @ np.swapaxes(R_hat, -1, -2)
+    e = dcm_to_vector(R) if rotation_vector else dcm_to_euler(R)
     return np.concatenate([r, v, e, b_a, b_g], axis=-1, dtype=np.float64)
 
 

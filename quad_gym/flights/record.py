@@ -223,7 +223,8 @@ def _fill(row: Any, batch: FlightBatch, which: NDArray[np.intp], scene: FlightSc
     estimate = {word: row[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
     try:
         truth["R_BI"] = quaternion_to_dcm(row["quaternion"])
-        row["nees"] = nees(state_error(truth, estimate), row["covariance"])
+        error = state_error(truth, estimate, rotation_vector=batch.sensors.flow_alone)
+        row["nees"] = nees(error, row["covariance"])
     except ValueError:  # a state that is not finite, or a singular covariance
         row["nees"] = np.nan
     for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):

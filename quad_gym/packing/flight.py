@@ -165,14 +165,12 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
 def form_of(sensors: SensorSuite, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
     """Return the options of a filter as flags; it may store innovations, and model a lever arm."""
     estimator = sensors.estimator
-    in_I = sensors.gnss is not None or sensors.camera is not None  # what is measured
-    flow_alone = sensors.optical_flow is not None and not in_I
     options = {
         FilterForm.INNOVATIONS: innovations,
         FilterForm.EKF: estimator.kind == "ekf",
         FilterForm.MIDPOINT: estimator.integration == "midpoint",
         FilterForm.TURN: estimator.attitude_reset,
-        FilterForm.FIRST_ESTIMATES: estimator.attitude_reset and flow_alone,
+        FilterForm.FIRST_ESTIMATES: sensors.flow_alone,
         FilterForm.GATE: estimator.false_alarm_probability > 0.0,
         FilterForm.GRADUAL: estimator.recursive_update_threshold is not None,
     }

@@ -165,6 +165,13 @@ class SensorSuite(Checked, Saved):
         return Aid.MAGNETOMETER if alone and self.magnetometer is not None else None
 
     @property
+    def flow_alone(self) -> bool:
+        """True if the filter keeps the heading unobservable: flow, but neither GNSS nor camera."""
+        measures_in_I = self.gnss is not None or self.camera is not None
+        corrected = self.estimator.attitude_reset  # not the report's form
+        return corrected and self.optical_flow is not None and not measures_in_I
+
+    @property
     def drifts(self) -> bool:
         """True if GNSS positions have a time-correlated error, which the filter estimates."""
         return self.gnss is not None and self.gnss.drifts

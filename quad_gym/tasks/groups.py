@@ -116,6 +116,7 @@ class TruthView(Group):
         error = state_error(
             {name: getattr(self, name) for name in names},
             {name: getattr(self._estimate, name) for name in names},
+            rotation_vector=self._flights.sensors.flow_alone,
         )
         return nees(error, self._estimate.covariance)
 

@@ -82,21 +82,23 @@ def test_invalid_numbers_are_refused(function, arguments, message):
         function(*arguments)
 
 
+@pytest.mark.parametrize("vector", [False, True])
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
-def test_estimate_plus_error_is_the_truth(shape):
+def test_estimate_plus_error_is_the_truth(shape, vector):
     names, rng = ("position", "velocity", "accel_bias", "gyro_bias"), np.random.default_rng(3)
     truth, estimate = (
         {name: rng.normal(size=(*shape, 3)) for name in names}
         | {"R_BI": euler_to_dcm(rng.uniform(-1, 1, size=(*shape, 3)))}
         for _ in range(2)
     )
-    x = metrics.state_error(truth, estimate)
+    x = metrics.state_error(truth, estimate, rotation_vector=vector)
     assert x.shape == (*shape, 15)
     for name, first in zip(names, (0, 3, 9, 12), strict=True):
         error = x[..., first : first + 3]
         np.testing.assert_allclose(estimate[name] + error, truth[name], atol=1e-15)
     e = x[..., 6:9].reshape(-1, 3)  # SciPy rotates from B to I
-    R_BI = Rotation.from_rotvec(-e).as_matrix().reshape(*shape, 3, 3) @ estimate["R_BI"]
+    R = Rotation.from_rotvec(-e).as_matrix().reshape(*shape, 3, 3)
+    R_BI = (R if vector else euler_to_dcm(x[..., 6:9])) @ estimate["R_BI"]
     np.testing.assert_allclose(R_BI, truth["R_BI"], atol=1e-14)
 
 

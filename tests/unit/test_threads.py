@@ -162,5 +162,5 @@ def test_run_during_another_run_raises_runtime_error():
         crew.run(0)
 
     crew = Crew(fly, 1, 1)
-    with pytest.raises(RuntimeError, match="one thread at a time"):
+    with pytest.raises(RuntimeError, match="already being stepped by another thread"):
         crew.run(0)
