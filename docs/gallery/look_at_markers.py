@@ -25,7 +25,8 @@ class LookAtMarkers(quad_gym.Task):
 
     def reset(self, view, rng):
         x, y, _ = view.reference_heading.T
-        return {"yaw": np.arctan2(y, x) + self.turned + rng.normal(0.0, 0.1)}
+        yaw = np.arctan2(y, x) + self.turned + rng.normal(0.0, 0.1)
+        return {"yaw": np.remainder(yaw, 2.0 * np.pi)}
 
     def reward(self, view):
         return self.pieces(view)

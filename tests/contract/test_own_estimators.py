@@ -342,7 +342,7 @@ WRONG = [
     ({"R_BI": None}, r'must return either "R_BI" or "quaternion"'),
     ({"positon": lambda n: np.zeros((n, 3))}, r"got 'positon'; did you mean position\?"),
     ({"velocity": lambda n: np.zeros((n, 2))}, r'shape \(3, 3\) for "velocity", got \(3, 2\)'),
-    ({"velocity": lambda n: "fast"}, r"must return numbers for \"velocity\", got 'fast'"),
+    ({"velocity": lambda n: "fast"}, r"must return real numbers for \"velocity\", got 'fast'"),
     ({"accel_bias": lambda n: np.full((n, 3), np.nan)}, r'finite numbers for "accel_bias"'),
     ({"R_BI": lambda n: np.zeros((n, 3, 3))}, r'rotations for "R_BI".* for flight 0 and 2 more'),
     ({"covariance": lambda n: np.zeros((n, 15, 15))}, r'positive definite "covariance"'),

@@ -122,8 +122,9 @@ def test_tables_contain_records_of_folders(tmp_path):
     np.testing.assert_allclose(group["mean_error_high"] - 0.3, half, rtol=1e-4)
     np.testing.assert_allclose(0.3 - group["mean_error_low"], half, rtol=1e-4)
     limits = binomtest(25, 100).proportion_ci(method="exact")  # the rate is the same in all seeds
-    np.testing.assert_allclose(group["crash_rate_low"], limits.low)
-    np.testing.assert_allclose(group["crash_rate_high"], limits.high)
+    # three trainings hardly exclude that others fail: the interval is wider than over episodes
+    assert 0.0 < group["crash_rate_low"] < limits.low
+    assert limits.high < group["crash_rate_high"] < 1.0
     write_tables(rows, tmp_path)
     with (tmp_path / "trainings.csv").open(newline="") as stream:
         written = list(csv.DictReader(stream))

@@ -184,7 +184,9 @@ def test_trajectory_is_read_from_path_of_table(tmp_path):
 
 def test_infeasible_or_invalid_trajectory_is_refused():
     fast = Trajectory.through(FIVE, max_speed=8.0, max_acceleration=30.0)
-    with pytest.raises(ValueError, match=r"trajectory must be .* fly: .* at .* s .segment . of 4"):
+    with pytest.raises(
+        ValueError, match=r"trajectory is infeasible .*: it needs .* at .* s .segment . of 4"
+    ):
         gymnasium.make("QuadGym/Trajectory-v0", trajectory=fast)
     with pytest.raises(ValueError, match=r"trajectory\[1\] is infeasible for this vehicle"):
         gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=2, trajectory=[OPEN, fast])

@@ -147,7 +147,7 @@ def test_flights_that_failed_must_be_reset():
         ({"position": np.zeros(2)}, r"shape \(3, 3\) for 'position', got \(2,\)"),
         ({"height": 1.0}, "None or a dictionary with any of position, velocity, yaw"),
         ({"velocity": np.full(3, 1e6)}, "invalid start: velocity must be at most"),
-        ({"yaw": 100.0}, "invalid start: yaw must be in rad, at most 2 pi either way, got 100"),
+        ({"yaw": 100.0}, "invalid start: yaw must be in rad, within ±2 pi, got 100"),
         (7, "None or a dictionary with any of"),
     ):
         task.wrong = wrong

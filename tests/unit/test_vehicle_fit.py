@@ -72,7 +72,7 @@ def test_command_writes_the_vehicle_of_a_log_in_a_file(table, found, tmp_path):
     (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
     mine = LAB.replace(mass=0.9, thrust_coefficient=LAB.thrust_coefficient * 0.9 / LAB.mass)
     args = CalibrateArgs(
-        log=tmp_path / "flight.csv",
+        logs=(tmp_path / "flight.csv",),
         vehicle=tmp_path / "body.toml",
         vehicle_from=str(mine.save(tmp_path / "mine.toml")),
     )
