@@ -57,12 +57,6 @@ CATALOG = {
             figures={"0/overview.png": ".github/images/circle.png"},
         ),
         Result(
-            name="circle_predicted",
-            commands=["circle --bearing-noise-at predicted --output OUT"],
-            flights=("Circle, lab",),
-            texts=texts.console("circle_predicted"),
-        ),
-        Result(
             name="evaluate",
             commands=["evaluate QuadGym/Circle-v0 --policy pd pretrained --output OUT"],
             flights=("Circle, standard", "observation truth, standard"),

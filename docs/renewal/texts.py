@@ -90,20 +90,20 @@ def _nees(value: float) -> str:
 
 
 def ablation(which: str) -> Texts:
-    """NEES by part, and root mean square errors, of each case."""
+    """NEES, root mean square errors and tracking errors of each case."""
 
     def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
         rows = []
         for case, row in _read(folder / f"0/{which}.json")["rows"].items():
-            cells = [_nees(row[f"nees_{part}"]) for part in PARTS]
-            cells += [
+            cells = [
+                _nees(row["nees_state"]),
                 f"{1e3 * row['rms_position']:.1f} mm",
                 f"{1e3 * row['rms_attitude']:.1f} mrad",
+                f"{1e3 * row['tracking_mean']:.0f} mm",
             ]
-            rows.append([case, *cells, f"{1e3 * row['tracking_mean']:.0f} mm"])
-        parts = (part.replace("_", " ") for part in PARTS)
-        errors = ("position error", "attitude error", "tracking error")
-        return {f"ablation_{which}": table(("case; NEES of", *parts, *errors), rows)}
+            rows.append([case, *cells])
+        heads = ("case", "NEES", "position error", "attitude error", "tracking error")
+        return {f"ablation_{which}": table(heads, rows)}
 
     return texts
 
@@ -118,17 +118,14 @@ def filters(folder: Path, _: Sequence[str]) -> dict[str, str]:
         for row in found:
             first = [f"`{row['suite']}`", row["name"]]
             if row["failed"]:
-                accuracy.append([*first, row["failed"], *[""] * 6])
+                accuracy.append([*first, row["failed"], *[""] * 5])
                 continue
             errors = [_bracketed(row[f"{part}_rmse"], *form) for part, form in parts.items()]
-            ratios = [row[f"{part}_ratio"] for part in parts]
-            ratio = " / ".join("-" if r is None else f"{r:.2f}" for r in ratios)
             nees, nis, us = row["nees"], row["nis"], row["seconds"]
             accuracy.append(
                 [
                     *first,
                     *errors,
-                    "" if ratios[0] is None else ratio,
                     "" if nees is None else f"{nees[0]:,.2f}",
                     "" if nis is None else f"{nis:.2f}",
                     "" if us is None else f"{1e6 * us:,.1f}",
@@ -141,7 +138,7 @@ def filters(folder: Path, _: Sequence[str]) -> dict[str, str]:
                 ]
                 control.append([*first, _bracketed(row["tracking"], 1e3, ".0f"), *lost])
     heads = ("suite", "filter", "position [mm]", "velocity [mm/s]", "attitude [mrad]")
-    more = ("over the bound", "NEES", "NIS", "us a tick")
+    more = ("NEES", "NIS", "us a tick")
     lost_heads = ("lost", "GNSS outage", "GNSS outliers", "wrong features")
     return {
         "filters": table((*heads, *more), accuracy),
