@@ -33,6 +33,7 @@ class MetadataHook(MetadataHookInterface):
         metadata["urls"] = {"Source": url, **named} if url else {}
         text = Path(self.root, "README.md").read_text(encoding="utf-8")
         if url:
+            text = text.replace("](../../", f"]({url}/")  # README lies in url/blob/BRANCH
             text = absolute_links(text, f"{url}/blob/{tag}/", f"{url}/raw/{tag}/")
         metadata["readme"] = {"content-type": "text/markdown", "text": text}
 

@@ -46,8 +46,17 @@ def test_links_are_absolute_where_a_release_names_the_repository(metadata):
     found = metadata(QUAD_GYM_URL="https://example.org/us/it/")
     assert found.urls["Source"] == "https://example.org/us/it"
     links = re.findall(r"\]\(([^)\s]+)\)", found.readme)
+    assert all(link.startswith("https://") for link in links)
+    ours = [link for link in links if link.startswith("https://example.org/us/it/")]
+    of_files = [link for link in ours if "/blob/" in link or "/raw/" in link]
     assert len(links) > 20
-    for link in links:
+    assert of_files
+    assert set(ours) - set(of_files) == {
+        "https://example.org/us/it/actions/workflows/tests.yml",
+        "https://example.org/us/it/actions/workflows/tests.yml/badge.svg",
+        "https://example.org/us/it/issues",
+    }
+    for link in of_files:
         place = link.removeprefix("https://example.org/us/it/").partition("/v")
         kind, path = place[0], place[2].partition("/")[2]
         assert kind == ("raw" if path.endswith(".webp") else "blob"), link
