@@ -5,6 +5,7 @@ import re
 import runpy
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -70,29 +71,44 @@ def test_foreign_policy_adapts_to_unknown_mass():
     assert max(names["errors"][:5]) < 40.0  # mm, half to twice the assumed mass
 
 
-TASKS = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", TASKS.read_text(encoding="utf-8"), re.DOTALL)[:3]
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
-def test_examples_of_page_give_stated_results():
-    names, envs = {}, []
-    for block in BLOCKS:
-        exec(block, names)
-        envs.append(names["env"])
-    reward, path, wall = envs
-    reward.reset(seed=0)
-    first = reward.step(np.full(4, 0.5, np.float32))[1]
-    again = reward.step(np.full(4, 0.5, np.float32))[1]
-    assert again > first + 0.05, "a change of the action costs 0.1 times its square"
-    flown = names["path"]
-    times = np.linspace(0.0, flown.duration, 20_001)
+def run_block(name, start=""):
+    """Run the page's block that defines a name, after another block; return its names."""
+    names = {"quad_gym": quad_gym, "gymnasium": gymnasium}
+    for text in (start, name):
+        exec(next(block for block in BLOCKS if text in block) if text else "", names)
+    return names
+
+
+def test_reward_of_page_charges_the_change_of_the_action():
+    charged = run_block("rewards.ActionRate")["envs"]
+    task = quad_gym.Task.of(reward=quad_gym.rewards.Tracking())
+    free = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=charged.num_envs, task=task)
+    action = np.full((charged.num_envs, 4), 0.5, np.float32)
+    costs = []
+    for envs in (free, charged):
+        envs.reset(seed=0)
+        costs.append([envs.step(action)[1] for _ in range(2)])
+    first, again = np.subtract(*costs)
+    np.testing.assert_allclose(first, 0.05 * 4 * 0.5**2, atol=1e-9)  # from an action of zero
+    np.testing.assert_allclose(again, 0.0, atol=1e-9)
+
+
+def test_observation_of_page_is_the_distance_of_the_nearest_marker():
+    env = run_block("class NearestMarker")["env"]
+    observation, _ = env.reset(seed=0)
+    batch = env.unwrapped.flights.batch
+    gaps = batch.feature_places() - batch.record("r_seen")[0]
+    expected = np.linalg.norm(gaps, axis=-1).min()
+    seen = part(env, observation, "marker_distance")
+    np.testing.assert_allclose(seen, expected, rtol=1e-5)
+
+
+def test_trajectory_of_page_passes_through_its_points():
+    names = run_block("Trajectory.through(points")
+    path = names["path"]
+    flown = path(np.linspace(0.0, path.duration, 20_001))
     for point in names["points"]:
-        assert np.linalg.norm(flown(times) - point, axis=1).min() < 1e-3
-    path.reset(seed=0)
-    observation, _ = wall.reset(seed=0)
-    batch = wall.unwrapped.flights.batch
-    seen = batch.record("r_seen")[0]
-    level = np.maximum(np.abs(seen[:2] - [6.0, 0.0]) - [2.0, 0.1], 0.0)
-    above = max(abs(seen[2] - 1.5) - 1.5, 0.0)
-    expected = np.linalg.norm([*level, above])
-    np.testing.assert_allclose(part(wall, observation, "wall"), expected, rtol=1e-5)
+        assert np.linalg.norm(flown - point, axis=1).min() < 1e-3
