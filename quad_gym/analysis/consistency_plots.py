@@ -73,22 +73,10 @@ def mean_square_figure(
 
 
 @plots.house_style()
-def errors_figure(
-    time: Floats,
-    errors: Floats,
-    sigmas: Floats,
-    title: str,
-    bound: tuple[Floats, Floats] | None = None,
-) -> Any:
-    """Figure of root mean square errors and standard deviations of the filter, (t, 15) each.
-
-    `bound` has times (b,) and the posterior Cramer-Rao bounds on the mean squares, (b, 15).
-    """
-    text = (
-        f"{title}\nError (blue), standard deviation of the filter (dashed)"
-        + ("" if bound is None else ", Cramer-Rao bound (red, dotted)")
-        + "; root mean square over flights"
-    )
+def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
+    """Figure of root mean square errors and standard deviations of the filter, (t, 15) each."""
+    what = "Error (blue), standard deviation of the filter (dashed)"
+    text = f"{title}\n{what}; root mean square over flights"
     blocks = {name: part for name, part in PARTS.items() if name in _UNITS}
     figure, axes = _grid(len(blocks), text)
     for axis, (name, part) in zip(axes, blocks.items(), strict=True):
@@ -96,9 +84,6 @@ def errors_figure(
         for values, color, dashes in ((errors, plots.BLUE, "-"), (sigmas, plots.INK, (0, (4, 3)))):
             size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
             axis.plot(time, size, color=color, linestyle=dashes, linewidth=1.3)
-        if bound is not None:
-            size = factor * np.sqrt(bound[1][:, part].sum(axis=1))
-            axis.plot(bound[0], size, color=plots.VERMILLION, linestyle=(0, (1, 2)), linewidth=1.6)
         axis.set_title(f"{_title(name)} [{unit}]")
         plots.logarithmic(axis, subs=(2.0, 5.0))
         axis.yaxis.set_minor_formatter("{x:g}")

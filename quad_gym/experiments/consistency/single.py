@@ -1,7 +1,6 @@
 """Consistency of a filter in one configuration: report, figures and numbers."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +11,13 @@ from quad_gym.analysis.consistency import (
     BAND_FLIGHTS,
     CONSISTENT_SHARE,
     PARTS,
-    Floats,
     MeanSquare,
 )
 from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.consistency_plots import errors_figure, mean_square_figure, whiteness_figure
-from quad_gym.analysis.linear_sensors import SuiteModel
 from quad_gym.analysis.plots import save_figure
-from quad_gym.analysis.posterior_bound import bound_over_time
 from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.experiments.consistency.cases import Case, CaseFlights, fly
-from quad_gym.records import Source
-
-BOUND_FLIGHTS, BOUND_EVERY = 64, 0.05
-"""Largest number of flights over which the bound is averaged, and its times in the figure [s]."""
 
 
 def run_single(
@@ -50,8 +42,7 @@ def run_single(
         whole = fly(batch, flights, progress=lambda flown: bar.update(flown - bar.n), **options)
     findings = whole.since(settle)
     print(report_of(findings))
-    bound = None if matched else bound_of(case, flights)
-    files = _draw(case.name, whole, findings, settle, output, bound)
+    files = _draw(case.name, whole, findings, settle, output)
     squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
     found = {
         "consistent": findings.consistent if findings.nees else None,
@@ -74,30 +65,10 @@ def run_single(
         "whiteness": findings.whiteness,
         "rms_errors": whole.errors,
         "rms_claimed": whole.claimed,
-        "bound": None if bound is None else {"time": bound[0], "rms": np.sqrt(bound[1])},
     }
     files.append(write_json(output / "consistency.json", found))
     seconds = time.monotonic() - began
     print(f"\nWrote {len(files)} files to {output} after {seconds:.1f} s.")
-
-
-def bound_of(case: Case, flights: CaseFlights) -> tuple[Floats, Floats] | None:
-    """Return times and the posterior Cramer-Rao bounds (t, 15) on mean squares; None if unknown.
-
-    The bound is known for suites whose sensors it models, and for a true vehicle, sensors and air
-    as the filter assumes them.
-    """
-    keywords = {name: given for name, given in case.keywords.items() if name != "estimator"}
-    if keywords.get("faults") or keywords.get("true_sensors", case.sensors) != case.sensors:
-        return None
-    try:
-        SuiteModel(case.sensors)
-    except ValueError:
-        return None
-    on_truth = replace(case, keywords={**keywords, "source": Source.TRUTH, "run_filter": True})
-    batch = on_truth.batch(min(BOUND_FLIGHTS, flights.count), flights.threads)
-    seeds = flights.seeds[: batch.count]
-    return bound_over_time(batch, seeds=seeds, duration=flights.duration, every=BOUND_EVERY)
 
 
 def _draw(
@@ -106,11 +77,10 @@ def _draw(
     findings: Findings,
     settle: float,
     output: Path,
-    bound: tuple[Floats, Floats] | None,
 ) -> list[Path]:
     """Draw and save the figures; return their files."""
     figures = {
-        "errors": errors_figure(whole.time, whole.errors, whole.claimed, title, bound),
+        "errors": errors_figure(whole.time, whole.errors, whole.claimed, title),
     }
     if whole.nees:
         figures["nees"] = mean_square_figure("NEES", whole.nees, title, settle)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.analysis.consistency import PARTS
-from quad_gym.analysis.linear_sensors import MOVING, SuiteModel, Truth, transposed
+from scripts.benchmarks.linear_sensors import MOVING, SuiteModel, Truth, transposed
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Sensor
 
