@@ -3,11 +3,8 @@
 | quantity | interval |
 |---|---|
 | a mean of independent values, or of paired differences | Student's t |
-| a mean over trainings that fly the same episodes | Student's t of each, added in squares |
 | a rate over episodes | Clopper and Pearson's |
 | a rate over trainings that fly the same episodes | the Bayesian bootstrap's, with a floor |
-| a difference of two estimates | MOVER, from the limits of both |
-| the probability of improvement | Newcombe's |
 
 Student's t interval covers the mean of normal values with a probability of 95 %, of any number of
 them. Of strongly skewed values (lognormal, sigma 1) it covers 89 % with 2, 82 % with 5, 84 % with
@@ -15,14 +12,11 @@ them. Of strongly skewed values (lognormal, sigma 1) it covers 89 % with 2, 82 %
 averaged with equal weights: an interquartile mean of five discards two of them, and its interval
 (Yuen's) is half as wide again for normal values.
 
-Where numbers have the shape (s, e), rows are trainings, one for each seed, and columns are
-episodes; column i is the same episode in every row and in every arm. Intervals of means over both
-cover 95 % of scores that vary smoothly, and up to 99 % of equal ones; those of rates also hold
-where a share of the trainings fails, 93 % or more (`tests.statistical.interval_coverage`).
+Intervals of rates over trainings also hold where a share of the trainings fails, 93 % or more
+(`tests.statistical.interval_coverage`).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -33,7 +27,6 @@ from quad_gym.analysis.metrics import Interval, Spread, spread
 from quad_gym.params import checks as check
 
 Floats = NDArray[np.float64]
-Score = Callable[[Floats], Floats]  #: from numbers (..., e) of episodes to one number (...)
 
 TAIL = 0.025  #: probability beyond either end of an interval
 FLOOR = 0.5  #: weight of a training with rate 0, and of one with rate 1, in `rate_over_trainings`
@@ -62,26 +55,12 @@ def in_brackets(
     return f"{text} [{low:{form}}, {high:{form}}]"
 
 
-def mean(values: Floats) -> Floats:
-    """Mean over the last axis."""
-    return np.asarray(np.mean(values, axis=-1))
-
-
-def worst_tenth(values: Floats) -> Floats:
-    """Mean of the lowest tenth along the last axis, of at least one number (CVaR at 10 %).
-
-    Of n normal values it is too high by 0.22 sigma (n = 10), 0.12 (20) or 0.02 (100).
-    """
-    count = max(1, round(0.1 * values.shape[-1]))
-    return np.asarray(np.partition(values, count - 1, axis=-1)[..., :count].mean(axis=-1))
-
-
 def mean_interval(values: ArrayLike) -> Interval:
     """Student's t interval of the mean of (n,) independent finite numbers, at least two."""
     x = np.asarray(values, np.float64).reshape(-1)
     if x.size < 2 or not np.isfinite(x).all():
         raise ValueError(f"values must be at least two finite numbers, got {x.size}")
-    center, half = _center(x), _half_width(_variance(x) / x.size, x.size - 1)
+    center, half = center_of(x), half_width(variance_of(x) / x.size, x.size - 1)
     return Interval(center - half, center + half)
 
 
@@ -99,30 +78,6 @@ def rate_interval(count: float, trials: float) -> Interval:
     low = float(betaincinv(k, n - k + 1.0, TAIL)) if k > 0.0 else 0.0
     high = float(betaincinv(k + 1.0, n - k, 1.0 - TAIL)) if k < n else 1.0
     return Interval(low, high)
-
-
-def mean_over_trainings(values: ArrayLike, score: Score = mean) -> Estimated:
-    """Mean over trainings of a score over episodes, with an interval that covers both.
-
-    Its half width is the root of the sum of squares of two: Student's t of the trainings' scores,
-    and Student's t of the episodes, by the jackknife over them. With one training, as of a fixed
-    rule, the interval covers the episodes alone. Of `worst_tenth`, the degrees of freedom are the
-    episodes in the tenth: the interval then covers 91 % (10 normal episodes), 88 % (20), 92 % (50),
-    93 % (100) and 94 % (200).
-
-    Args:
-        values: (s, e) one finite number for each training and episode, at least two.
-        score: Of the episodes.
-    """
-    x = np.atleast_2d(np.asarray(values, np.float64))
-    if x.ndim != 2 or x.size < 2 or not np.isfinite(x).all():
-        raise ValueError(f"values must be finite numbers (trainings, episodes), got {x.shape}")
-    scores, (s, e) = score(x), x.shape
-    between = _half_width(_variance(scores) / s, s - 1) if s > 1 else 0.0
-    freedom = max(1, round(0.1 * e)) if score is worst_tenth else e - 1
-    within = _half_width(_variance_over_episodes(x, score), freedom) if e > 1 else 0.0
-    value, half = _center(scores), math.hypot(between, within)
-    return Estimated(value, value - half, value + half)
 
 
 def rate_over_trainings(rates: ArrayLike, episodes: int) -> Estimated:
@@ -145,7 +100,7 @@ def rate_over_trainings(rates: ArrayLike, episodes: int) -> Estimated:
     check.whole("episodes", episodes)
     from scipy.special import betaincinv
 
-    value = _center(x)
+    value = center_of(x)
     if x.size == 1:
         return Estimated(value, *rate_interval(value * episodes, episodes))
     weight = x.size + 2.0 * FLOOR
@@ -157,19 +112,6 @@ def rate_over_trainings(rates: ArrayLike, episodes: int) -> Estimated:
         float(betaincinv(center * total, (1.0 - center) * total, p)) for p in (TAIL, 1.0 - TAIL)
     )
     return Estimated(value, min(low, value) if value else 0.0, max(high, value) if value < 1 else 1)
-
-
-def difference(first: Estimated, second: Estimated) -> Estimated:
-    """First less second, of two independent estimates, by the limits of both.
-
-    The interval is the MOVER of G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008; of two
-    rates, it is Newcombe's. Two arms that are equal differ by it with a probability of at most 5 %:
-    1 % with three trainings each, 2 % with five (simulated with normal scores).
-    """
-    value = first.value - second.value
-    below = math.hypot(first.value - first.low, second.high - second.value)
-    above = math.hypot(first.high - first.value, second.value - second.low)
-    return Estimated(value, value - below, value + above)
 
 
 @dataclass(frozen=True)
@@ -200,58 +142,18 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> PairedDifference:
     return PairedDifference(spread=spread(differences), interval=interval)
 
 
-def probability_of_improvement(first: ArrayLike, second: ArrayLike) -> Estimated:
-    """Probability that a training of the first arm scores above one of the second.
-
-    P = mean over pairs of 1 (above), 1/2 (equal) or 0: the Mann-Whitney statistic over the number
-    of pairs. The interval is by R. G. Newcombe, Statistics in Medicine 25, 2006 (method 5). There
-    is one score per training, (s,) and (t,).
-    """
-    from scipy.optimize import brentq
-
-    a, b = (np.asarray(scores, np.float64).reshape(-1) for scores in (first, second))
-    if not (a.size and b.size and np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ValueError(f"scores must be finite numbers, got {a.size} and {b.size} of them")
-    P = float(((a[:, np.newaxis] > b) + 0.5 * (a[:, np.newaxis] == b)).mean())
-    z, half = _t(math.inf), 0.5 * (a.size + b.size) - 1.0
-
-    def excess(p: float) -> float:
-        """Squared distance of p from P minus z^2 variances."""
-        terms = 1.0 + half * ((1.0 - p) / (2.0 - p) + p / (1.0 + p))
-        return (p - P) ** 2 - z**2 * p * (1.0 - p) * terms / (a.size * b.size)
-
-    end = 1e-9  # where P is 0 or 1, that is a root, too, and not the one
-    low = brentq(excess, 0.0, min(P, 1.0 - end)) if P > 0.0 else 0.0
-    high = brentq(excess, max(P, end), 1.0) if P < 1.0 else 1.0
-    return Estimated(P, float(low), float(high))
-
-
-def _center(x: Floats) -> float:
+def center_of(x: Floats) -> float:
     """Mean, exact for equal numbers."""
     return float(x[0] + (x - x[0]).mean())
 
 
-def _variance(x: Floats) -> float:
+def variance_of(x: Floats) -> float:
     """Variance with n - 1, exactly zero for equal numbers."""
     return float((x - x[0]).var(ddof=1))
 
 
-def _variance_over_episodes(x: Floats, score: Score) -> float:
-    """Variance of the mean score due to the choice of episodes, by the jackknife."""
-    e = x.shape[1]
-    if score is mean:  # in closed form
-        return _variance(x.mean(axis=0)) / e
-    left = np.array([float(score(np.delete(x, j, axis=1)).mean()) for j in range(e)])
-    return (e - 1) ** 2 / e * _variance(left)
-
-
-def _half_width(variance: float, freedom: float) -> float:
+def half_width(variance: float, freedom: float) -> float:
     """Half width of Student's t interval of a number with this variance."""
-    return _t(freedom) * math.sqrt(variance)
+    from scipy.special import stdtrit
 
-
-def _t(freedom: float) -> float:
-    """Upper quantile of Student's t; of the normal distribution with infinite freedom."""
-    from scipy.special import ndtri, stdtrit
-
-    return float(ndtri(1.0 - TAIL) if math.isinf(freedom) else stdtrit(freedom, 1.0 - TAIL))
+    return float(stdtrit(freedom, 1.0 - TAIL)) * math.sqrt(variance)

@@ -9,7 +9,6 @@ from typing import Any
 from tqdm import tqdm
 
 from baselines.keeping import holder, is_locked, signals_to
-from baselines.training import train
 from quad_gym.experiments.executors import Ended, Executor, Job
 from quad_gym.experiments.experiment import Training
 
@@ -20,15 +19,6 @@ REFRESH = 1.0  #: time between updates of the progress bar [s]
 RETRIES = 2  #: default number of restarts of a training that died
 
 INTERRUPTED = 130  #: exit code of an experiment that was stopped
-
-
-def train_here(trainings: Sequence[Training]) -> None:
-    """Complete trainings one after the other in this process."""
-    for number, training in enumerate(trainings, 1):
-        done = train(training.plan, training.folder, resume=True, tensorboard=False, quiet=True)
-        if not done.finished:
-            raise SystemExit(stopped())
-        print(_progress(number, trainings, training), flush=True)
 
 
 def train_all(
@@ -141,7 +131,7 @@ class Driver:
     def _finish(self, training: Training) -> None:
         self._steps[training] = training.plan.recipe.steps
         done = len(self._trainings) - len(self._waiting) - len(self._running) - len(self.failed)
-        self._bar.write(_progress(done, self._trainings, training))
+        self._bar.write(progress(done, self._trainings, training))
 
     def _fail(self, training: Training, reason: str) -> None:
         self.failed[training] = reason
@@ -180,6 +170,7 @@ class Driver:
         self._bar.set_postfix_str("; ".join(words))
 
 
-def _progress(done: int, trainings: Sequence[Training], latest: Training) -> str:
+def progress(done: int, trainings: Sequence[Training], latest: Training) -> str:
+    """Describe the latest training that is finished."""
     seconds = latest.record().get("training_seconds", 0.0)
     return f"[{done}/{len(trainings)}] {latest.name}: {seconds:.0f} s"

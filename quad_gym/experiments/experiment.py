@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +99,6 @@ class Experiment(ABC):
     """Keywords of the environment in training and test"""
     folder: Path
     threads: int | None = None
-    trial_kind: ClassVar[type[Trial]] = Trial
 
     @abstractmethod
     def cases(self) -> dict[str, Plan]:
@@ -109,12 +108,14 @@ class Experiment(ABC):
     def trials(self) -> dict[str, Trial]:
         """Test flights by name."""
 
-    def trial(self, keywords: Mapping[str, Any], policy: str, *traced: str) -> Trial:
-        """Test flights with keywords of the environment; see `Trial` for the other arguments."""
+    def trial(
+        self, keywords: Mapping[str, Any], policy: str, kind: type[Trial] = Trial, **more: Any
+    ) -> Trial:
+        """Test flights with keywords of the environment; see `kind` for the other arguments."""
         names = ("env_id", "episodes", "first_episode", "threads")
         shared: dict[str, Any] = {name: getattr(self, name) for name in names}
         keywords = {**self.environment, **keywords}
-        return self.trial_kind(keywords=keywords, policy=policy, traced=traced, **shared)
+        return kind(keywords=keywords, policy=policy, **shared, **more)
 
     @cached_property
     def trainings(self) -> list[Training]:

@@ -2,11 +2,11 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
@@ -24,10 +24,6 @@ from quad_gym.params.suites import contents_of_suite_files
 
 Floats = NDArray[np.float64]
 
-MARKERS = 2  #: number of features that determine position and heading if the vertical is known
-
-TRACED = 12  #: number of episodes whose traces are stored
-
 
 @dataclass(frozen=True, eq=False)
 class Flown:
@@ -35,7 +31,7 @@ class Flown:
 
     episodes: Episodes
     recorded: Mapping[str, Floats]
-    """Arrays of `PathRecorder` or `ViewRecorder` by name, with "time" (t,) [s]"""
+    """Arrays of the recorder by name, with "time" (t,) [s]"""
 
     def save(self, file: Path) -> None:
         """Write a file atomically."""
@@ -67,8 +63,6 @@ class Trial:
     episodes: int
     first_episode: int
     """Seed of the first episode; episode i has this seed + i"""
-    traced: tuple[str, ...] = ()
-    """Names from `TRACES`; empty: errors and the path of the first episode are recorded"""
     threads: int | None = None
 
     def make(self, count: int) -> Any:
@@ -87,30 +81,41 @@ class Trial:
         file = Path(policy)
         trained = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else policy
         suites = contents_of_suite_files(self.keywords.get("sensors"))
-        about = [self.env_id, self.keywords, self.episodes, self.first_episode, self.traced]
-        given = as_json([*about, trained, flights_digest(), *suites.values()])
+        about = as_json(self) | {"policy": trained, "threads": None}
+        given = [about, flights_digest(), *as_json(suites).values()]
         return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:12]
 
     def flown(self, policy: str, folder: Path) -> Flown:
         """Flights of a policy, by name or file; read from their file in a folder if it exists."""
         file = folder / f"{self.digest(policy)}.npz"
         if not file.exists():
-            fly(self.load(policy), self.env, self.first_episode, self.traced).save(file)
+            fly(self.load(policy), self.env, self.first_episode, self.recorder()).save(file)
         return Flown.load(file)
+
+    def recorder(self) -> "Recorder":
+        """Make the recorder of the episodes."""
+        return PathRecorder()
 
     def load(self, policy: str) -> Policy:
         """Load a policy by name or file."""
         return load_policy(policy, self.env)
 
 
-def fly(policy: Policy, env: Any, seed: int, traced: Sequence[str] = ()) -> Flown:
-    """Fly one episode in every flight of a vector environment; episode i has seed + i.
-
-    Traces named in `traced`, of `TRACES`, need a task with a `View`; without, see `PathRecorder`.
-    """
-    recorder = ViewRecorder(traced) if traced else PathRecorder()
+def fly(policy: Policy, env: Any, seed: int, recorder: "Recorder | None" = None) -> Flown:
+    """Fly one episode in every flight of a vector environment; episode i has seed + i."""
+    recorder = recorder or PathRecorder()
     episodes = roll_out(policy, env, seed=seed, watch=recorder.add)
     return Flown(episodes, recorder.arrays())
+
+
+class Recorder(Protocol):
+    """Recorder of test episodes."""
+
+    def add(self, step: int, batch: Any, flying: NDArray[np.bool_]) -> None:
+        """Record an instant; see `quad_gym.evaluation.Watch`."""
+
+    def arrays(self) -> dict[str, Floats]:
+        """Recorded arrays by name."""
 
 
 class PathRecorder(Tracer):
@@ -147,76 +152,3 @@ def flight_of_episode(
 def path_of(flown: Flown) -> Trace:
     """First episode, recorded by `PathRecorder`."""
     return Trace(**{name: flown.recorded[f"path.{name}"] for name in Trace.__dataclass_fields__})
-
-
-class ViewRecorder:
-    """Recorder of "in_view" and "mean_speed", (e,), and of `TRACES` (t, k) of k episodes by name.
-
-    `in_view` is the share of time in which the camera faces at least `MARKERS` features,
-    `mean_speed` the mean true speed [m/s]. Traces are NaN after the end of an episode.
-    """
-
-    def __init__(self, traced: Sequence[str]) -> None:
-        self._traced = traced
-        self._seen = self._steps = self._distance = np.zeros(0)
-        self._rows: list[list[Any]] = []
-
-    def add(self, step: int, batch: Any, flying: NDArray[np.bool_]) -> None:
-        """Record an instant; see `quad_gym.evaluation.Watch`."""
-        view = batch.view
-        if step == 0:
-            self._seen, self._steps, self._distance = np.zeros((3, view.count))
-        if view.features.shape[1]:
-            self._seen += (view.truth.features_in_view.sum(axis=1) >= MARKERS) & flying
-        self._distance += np.where(flying, np.linalg.norm(view.velocity, axis=1), 0.0)
-        self._steps += flying
-        k = min(TRACED, view.count)
-        row = [TRACES[name](view, slice(k)).astype(np.float64) for name in self._traced]
-        for values in row:
-            values[~flying[:k]] = np.nan
-        self._rows.append([view.period * step, *row])
-
-    def arrays(self) -> dict[str, Floats]:
-        """Recorded arrays."""
-        time, *columns = (np.array(column) for column in zip(*self._rows, strict=True))
-        return {
-            "time": time,
-            "in_view": self._seen / self._steps,
-            "mean_speed": self._distance / self._steps,
-            **dict(zip(self._traced, columns, strict=True)),
-        }
-
-
-def _sigma(view: Any, k: slice) -> Floats:
-    try:
-        return np.asarray(view.estimate.position_sigma[k].max(axis=1))
-    except ValueError:  # no filter runs on the truth
-        return np.zeros(len(view.position[k]))
-
-
-def _outage(view: Any, k: slice) -> Floats:
-    failing = view.truth.faults.get("gnss_outage")  # no GNSS runs on the truth
-    return np.zeros(len(view.position[k])) if failing is None else failing[k].astype(np.float64)
-
-
-TRACES: Mapping[str, Callable[[Any, slice], Floats]] = {
-    "off_wall": lambda view, k: _angle(
-        view.features[k].mean(axis=1) - view.position[k], view.truth.forward[k]
-    ),
-    "off_reward": lambda view, k: _angle(view.reference_heading[k], view.truth.forward[k]),
-    "sigma": _sigma,
-    "estimation_error": lambda view, k: view.estimation_error[k].copy(),
-    "position_error": lambda view, k: view.position_error[k].copy(),
-    "speed": lambda view, k: np.linalg.norm(view.velocity[k], axis=1),
-    "outage": _outage,
-}
-"""Traces by name: horizontal angle of body x from the direction of the features, and from the
-desired heading, positive to the left [rad]; largest standard deviation of the position according to
-the filter, estimation error and tracking error of the position [m]; true speed [m/s]; 1 while GNSS
-fails."""
-
-
-def _angle(start: Floats, end: Floats) -> Floats:
-    """Horizontal angle from one direction to another, in (-pi, pi] [rad]."""
-    cross = start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0]
-    return np.asarray(np.arctan2(cross, start[:, 0] * end[:, 0] + start[:, 1] * end[:, 1]))

@@ -14,7 +14,6 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from scripts.benchmarks.linear_sensors import SuiteModel
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.benchmark import BenchmarkArgs, run_sections
 from quad_gym.commands.options import SuiteNames, parse, require_at_least, usage_errors
@@ -33,6 +32,7 @@ from scripts.benchmarks import (
     own_task,
     stages,
 )
+from scripts.benchmarks.linear_sensors import SuiteModel
 from scripts.benchmarks.scope import Scope
 
 SECTIONS = {

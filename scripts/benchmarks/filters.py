@@ -20,7 +20,6 @@ from quad_gym.analysis.consistency import PARTS, InnovationRecorder, flight_erro
 from quad_gym.analysis.consistency_flights import ASTRAY, endless
 from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_over_trainings
 from quad_gym.analysis.metrics import nees
-from scripts.benchmarks.posterior_bound import posterior_bound
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.evaluation import roll_out
@@ -28,6 +27,7 @@ from quad_gym.experiments.benchmark import timing
 from quad_gym.faults.presets import possible
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import Source
+from scripts.benchmarks.posterior_bound import posterior_bound
 from scripts.benchmarks.scope import Scope
 from scripts.consistency.recovered import MOTION
 

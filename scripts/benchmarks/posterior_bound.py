@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.analysis.consistency import PARTS
-from scripts.benchmarks.linear_sensors import MOVING, SuiteModel, Truth, transposed
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Sensor
+from scripts.benchmarks.linear_sensors import MOVING, SuiteModel, Truth, transposed
 
 Floats = NDArray[np.float64]
 MEMORY = 64  #: number of ticks after which a measurement is too late

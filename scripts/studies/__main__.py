@@ -23,11 +23,12 @@ from tyro.conf import arg
 from baselines.keeping import RunError
 from baselines.recipes import Recipe, recipe
 from baselines.seeds import first_seed
+from baselines.training import train
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
-from quad_gym.experiments.driver import train_here
+from quad_gym.experiments.driver import progress, stopped
 from scripts.studies.arms import Arm, chosen_arms, read_arms
 from scripts.studies.films import require_film, write_film
 from scripts.studies.report import conclusions, table_text, write_report
@@ -117,6 +118,15 @@ def _recipe(args: StudyArgs, algorithm: str) -> Recipe:
     return chosen.replace(steps=steps, parameters={**chosen.parameters, **args.set})
 
 
+def complete(study: Study) -> None:
+    """Complete the trainings one after the other."""
+    for number, training in enumerate(study.trainings, 1):
+        done = train(training.plan, training.folder, resume=True, tensorboard=False, quiet=True)
+        if not done.finished:
+            raise SystemExit(stopped())
+        print(progress(number, study.trainings, training), flush=True)
+
+
 def main(args: StudyArgs) -> None:
     """Study."""
     began = time.perf_counter()
@@ -128,7 +138,7 @@ def main(args: StudyArgs) -> None:
         f"{study.episodes:,} episodes with each policy; into {study.folder}."
     )
     with options.usage_errors((RunError,)):
-        train_here(study.trainings)
+        complete(study)
     results = study.results()
     print(f"\n{table_text(results)}\n")
     print("\n".join(conclusions(results)))

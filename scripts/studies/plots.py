@@ -1,6 +1,6 @@
 """Figures of a study: the same episode, flown by several policies.
 
-An episode is a mapping of its "time" [s] and of traces from `quad_gym.experiments.flown.TRACES`,
+An episode is a mapping of its "time" [s] and of traces from `scripts.studies.traces.TRACES`,
 (t,) each, which are NaN after its end. Figures take episodes by the label of the policy.
 """
 

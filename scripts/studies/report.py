@@ -9,12 +9,13 @@ import numpy as np
 
 from quad_gym import IDS, sensor_suite
 from quad_gym.analysis.comparison_plots import learning_figure
-from quad_gym.analysis.intervals import Estimated, difference, in_brackets
+from quad_gym.analysis.intervals import Estimated, in_brackets
 from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.experiments.pages import Report
 from scripts.studies.films import CHOICES, label_of, pair_of
 from scripts.studies.plots import glance_figure, pace_figure
+from scripts.studies.scores import difference
 from scripts.studies.study import StudyResults
 
 FEW = 5  #: number of seeds below which intervals over trainings are wide

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from baselines.plans import Plan
 from baselines.recipes import Recipe
-from quad_gym.analysis.intervals import (
-    Estimated,
-    Score,
-    mean_over_trainings,
-    probability_of_improvement,
-    rate_over_trainings,
-)
+from quad_gym.analysis.intervals import Estimated, rate_over_trainings
 from quad_gym.analysis.reports import as_json
 from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Policy
@@ -25,11 +19,21 @@ from quad_gym.experiments.experiment import Experiment, Floats
 from quad_gym.experiments.flown import Flown, Trial
 from scripts.studies.arms import Arm
 from scripts.studies.planning import PlanningPolicy
+from scripts.studies.scores import Score, mean_over_trainings, probability_of_improvement
 from scripts.studies.tasks import StudiedTask
+from scripts.studies.traces import ViewRecorder
 
 
+@dataclass(frozen=True, kw_only=True)
 class StudyTrial(Trial):
-    """Test episodes that also the policy "planning" flies."""
+    """Test episodes that also the policy "planning" flies, with traces of the first ones."""
+
+    traced: tuple[str, ...]
+    """Names from `TRACES`"""
+
+    def recorder(self) -> ViewRecorder:
+        """Make the recorder of the episodes."""
+        return ViewRecorder(self.traced)
 
     def load(self, policy: str) -> Policy:
         """Load a policy by name or file."""
@@ -40,7 +44,6 @@ class StudyTrial(Trial):
 class Study(Experiment):
     """Trainings and flights of the arms of a task."""
 
-    trial_kind = StudyTrial
     arms: tuple[Arm, ...]
     recipes: Mapping[str, Recipe]
     """Recipe of each algorithm that trains an arm"""
@@ -69,7 +72,8 @@ class Study(Experiment):
             arm.name: self.trial(
                 {"observation": "estimate", **arm.environment},
                 arm.policy or arm.flies or arm.name,
-                *self.about.traced,
+                kind=StudyTrial,
+                traced=self.about.traced,
             )
             for arm in self.arms
         }

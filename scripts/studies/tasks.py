@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.intervals import Score, mean, worst_tenth
 from quad_gym.experiments.flown import Flown
 from scripts.studies.arms import ARMS, OUTAGE_DASH, STALE_RACE, Arm
+from scripts.studies.scores import Score, mean, worst_tenth
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class StudiedTask:
     telling: str
     """Column that the conclusions quote, in addition to successes and crashes"""
     traced: tuple[str, ...]
-    """Traces of the first episodes that the figure shows, see `flown.TRACES`"""
+    """Traces of the first episodes that the figure shows, see `traces.TRACES`"""
     evaluations: int = 9
     """Number of evaluations during a training, of which the best policy is kept"""
     figure: str

@@ -5,10 +5,10 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from quad_gym.analysis.consistency_flights import endless
-from scripts.benchmarks.posterior_bound import Recursion, posterior_bound
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.records import Source
+from scripts.benchmarks.posterior_bound import Recursion, posterior_bound
 
 F = np.array([[1.0, 0.1], [0.0, 1.0]])
 Q = 0.04 * np.outer([0.005, 0.1], [0.005, 0.1])  # of rank one

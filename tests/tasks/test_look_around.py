@@ -15,6 +15,7 @@ from baselines.policies import keywords_of_policy, load_policy
 from quad_gym.commands.main import main
 from quad_gym.experiments.flown import fly
 from quad_gym.tasks.look_around import LookAround
+from scripts.studies.traces import ViewRecorder
 from tests.builders import part
 
 ID = "QuadGym/LookAround-v0"
@@ -92,12 +93,12 @@ def test_features_in_view_are_within_the_camera_angles():
 def facing():
     """Flights of the rule that always looks at the features."""
     env = gymnasium.make_vec(ID, num_envs=60)
-    return fly(PDPolicy(env, faces="features"), env, 0, traced=("sigma",))
+    return fly(PDPolicy(env, faces="features"), env, 0, ViewRecorder(["sigma"]))
 
 
 def test_rule_that_never_looks_crashes_more_than_one_that_does(facing):
     env = gymnasium.make_vec(ID, num_envs=60)
-    blind = fly(PDPolicy(env), env, 0, traced=("sigma",))
+    blind = fly(PDPolicy(env), env, 0, ViewRecorder(["sigma"]))
     # 64 % of 500 flights crash; at most 24 crashes in 60 flights have p < 1e-4
     assert blind.episodes.crashed.mean() > 0.4
     assert not facing.episodes.crashed.any()
@@ -108,7 +109,7 @@ def test_rule_that_never_looks_crashes_more_than_one_that_does(facing):
 
 def test_rule_that_looks_when_uncertain_earns_more(facing):
     env = gymnasium.make_vec(ID, num_envs=60, include_std=True)
-    rule = fly(PDPolicy(env, faces="features_when_uncertain"), env, 0, traced=("sigma",))
+    rule = fly(PDPolicy(env, faces="features_when_uncertain"), env, 0, ViewRecorder(["sigma"]))
     assert rule.episodes.returns.mean() > facing.episodes.returns.mean()
     assert UNSURE < np.nanmax(rule.recorded["sigma"]) < 3.0
     assert rule.episodes.crashed.mean() < 0.1

@@ -7,13 +7,15 @@ from scipy.stats import beta, binomtest, mannwhitneyu, norm, ttest_1samp
 
 from quad_gym.analysis.intervals import (
     Estimated,
-    difference,
     mean_interval,
-    mean_over_trainings,
     paired_difference,
-    probability_of_improvement,
     rate_interval,
     rate_over_trainings,
+)
+from scripts.studies.scores import (
+    difference,
+    mean_over_trainings,
+    probability_of_improvement,
     worst_tenth,
 )
 from tests.statistical.interval_coverage import DESIGNS, SEEDS, coverage
