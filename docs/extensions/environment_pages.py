@@ -24,6 +24,7 @@ import docstring_parser
 
 import quad_gym
 from docs.extensions import policy_cards
+from docs.renewal.pages import TABLES
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
@@ -357,7 +358,7 @@ def write_pages(app: "Sphinx | None" = None) -> list[Path]:
     for file in changed:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(texts[file], encoding="utf-8")
-    for file in set(FOLDER.rglob("*.md")) - set(texts):
+    for file in set(FOLDER.rglob("*.md")) - {*texts, TABLES}:
         file.unlink()
     return changed
 

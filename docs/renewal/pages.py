@@ -8,12 +8,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+TABLES = ROOT / "docs" / "reference" / "measurements.md"
+"""Page of the large tables."""
 MARKED = re.compile(r"(<!-- =([\w.]+) -->)(.*?)(<!-- / -->)", re.DOTALL)
 
 
 def pages() -> list[Path]:
-    """README and the pages that are not generated."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    """README, the pages that are not generated, and the page of large tables."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), TABLES]
 
 
 def marked(page: Path) -> dict[str, list[str]]:

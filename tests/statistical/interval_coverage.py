@@ -1,6 +1,6 @@
 """Coverage of the intervals of rates over trainings, by simulation.
 
-python -m tests.statistical.interval_coverage    # prints the table of docs/where-it-matters.md
+python -m tests.statistical.interval_coverage    # prints the table behind docs/where-it-matters.md
 """
 
 import numpy as np
