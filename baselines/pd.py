@@ -14,7 +14,7 @@ from quad_gym.params.control import PDGains, pd_gains
 
 Array = NDArray[np.float64]
 
-LEAST_LIFT, MOST_TILT = 0.3, 1.2
+MIN_LIFT, MAX_TILT = 0.3, 1.2
 """Limits of the desired force: minimum upward part as a share of the weight, and maximum ratio of
 horizontal to vertical part (50 degrees), so that steps of the reference do not flip the vehicle."""
 
@@ -103,7 +103,7 @@ class PDPolicy:
 
     On courses with gaps, such as OutageDash, "velocity" also works with the relative layout.
 
-    F is prevented from pointing down or far sideways (`LEAST_LIFT`, `MOST_TILT`), as it otherwise
+    F is prevented from pointing down or far sideways (`MIN_LIFT`, `MAX_TILT`), as it otherwise
     would between gates; on the report's circle these limits are never reached.
 
     Args:
@@ -270,11 +270,9 @@ class PDPolicy:
         )
         lift = (force * seen.up).sum(axis=1, keepdims=True)
         sideways = force - lift * seen.up
-        lift = np.maximum(lift, LEAST_LIFT * vehicle.mass * vehicle.gravity)
+        lift = np.maximum(lift, MIN_LIFT * vehicle.mass * vehicle.gravity)
         push = np.linalg.norm(sideways, axis=1, keepdims=True)
-        return lift * seen.up + sideways * np.minimum(
-            1.0, MOST_TILT * lift / np.maximum(push, 1e-9)
-        )
+        return lift * seen.up + sideways * np.minimum(1.0, MAX_TILT * lift / np.maximum(push, 1e-9))
 
     @staticmethod
     def _attitude_error(z_wanted: Array, heading: Array) -> Array:

@@ -55,10 +55,10 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
 class Recorded:
     """Recording of a flight: (time, received, values) of each sensor."""
 
-    def __init__(self, flight, suite=RTK, seed=0, *, lost=LOST, jitter=JITTER, most_ticks=3):
+    def __init__(self, flight, suite=RTK, seed=0, *, lost=LOST, jitter=JITTER, max_ticks=3):
         rng, time = np.random.default_rng(seed), flight["time"]
         self.suite, self.flight = suite, flight
-        ends = np.cumsum(rng.integers(1, most_ticks + 1, len(time)))
+        ends = np.cumsum(rng.integers(1, max_ticks + 1, len(time)))
         ends = ends[ends < len(time)]
         starts = np.concatenate([[0], ends[:-1]])
         self.imu = []

@@ -13,7 +13,7 @@ from baselines.exporting.filter_library import HEADER, TARGETS
 from baselines.exporting.source import filled
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
-from quad_gym.estimation.first_fix import FARTHEST_FIX, LEAST_COURSE
+from quad_gym.estimation.first_fix import FARTHEST_FIX, MIN_COURSE
 from quad_gym.estimation.starts import LEVEL_SIGMA, state_at_rest
 from quad_gym.kernels.entries import FILTER_STAGES
 from quad_gym.kernels.library import core_symbol
@@ -259,7 +259,7 @@ class Sources:
         assert suite.gnss is not None
         values: dict[str, Any] = {
             "VELOCITY_SIGMA": repr(float(suite.gnss.velocity_sigma or 0.0)),
-            "LEAST_COURSE": repr(LEAST_COURSE),
+            "MIN_COURSE": repr(MIN_COURSE),
             "FARTHEST": repr(FARTHEST_FIX),
             "HAS_BASELINE": int(suite.gnss.has_baseline),
             "ROOT_SCALE": repr(math.sqrt(suite.estimator.initial_covariance_scale)),

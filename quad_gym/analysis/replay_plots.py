@@ -9,7 +9,7 @@ from quad_gym.analysis.plots import BLUE, GREEN, ORANGE, PALE, VERMILLION, house
 from quad_gym.estimation.results import Measured, Replay, by_sensor
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
-_MOST = 4000  #: points of a curve
+_MAX_POINTS = 4000  #: points of a curve
 _AXES = (BLUE, ORANGE, GREEN)
 _SENSORS = {
     "gnss_position": "NIS of positions",
@@ -25,7 +25,7 @@ _SENSORS = {
 
 def draw_states(axes: Any, result: Replay, name: str) -> None:
     """Draw "position", "velocity" or "attitude", with bands of two standard deviations."""
-    some = slice(None, None, 1 + len(result) // _MOST)
+    some = slice(None, None, 1 + len(result) // _MAX_POINTS)
     time, sigmas = result.time[some], result.sigma[some]
     first, unit = {"position": (0, "m"), "velocity": (3, "m/s"), "attitude": (6, "deg")}[name]
     labels, scale = ("east", "north", "up"), 1.0

@@ -17,7 +17,7 @@ from quad_gym.records import COLUMNS, Control
 
 Floats = NDArray[np.float64]
 
-MOST_THRUST = 2.0
+MAX_THRUST = 2.0
 """Largest thrust-to-weight ratio that an action commands; motor voltages have no such limit."""
 
 SHARPNESS = {"circle": 1.0, "lemniscate": 17.0 / 8.0}
@@ -34,7 +34,7 @@ def check_reference(
     limits: dict[str, Any] = {"max_tilt": task.max_tilt}
     if control in (Control.WRENCH, Control.CTBR, Control.ATTITUDE):
         limits["max_thrust"] = min(
-            MOST_THRUST * vehicle.mass * vehicle.gravity, 4.0 * vehicle.max_rotor_force
+            MAX_THRUST * vehicle.mass * vehicle.gravity, 4.0 * vehicle.max_rotor_force
         )
     if control is Control.CTBR:
         limits["max_body_rates"] = actions.rate_scale

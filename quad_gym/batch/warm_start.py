@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from quad_gym.packing.aids import slow_states
 from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import portable
-from quad_gym.params.gnss import LEAST_DRIFT, GnssParams
+from quad_gym.params.gnss import MIN_DRIFT, GnssParams
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
@@ -161,7 +161,7 @@ def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
     slow = np.array([error.sigma for error in slow_states(sensors).errors])
     if sensors.gnss is not None and sensors.drifts:
-        slow[:3] = np.maximum(drift_sigma(sensors.gnss), LEAST_DRIFT)
+        slow[:3] = np.maximum(drift_sigma(sensors.gnss), MIN_DRIFT)
     sigma = np.concatenate([sigma, slow])
     W = np.zeros((len(P), WARM_DRAWS + 2 * len(slow)))
     with_truth = P[:, 9:] / sigma

@@ -25,7 +25,7 @@ from quad_gym.envs.spaces import (
 )
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import needs_sensors
-from quad_gym.packing.configuration import MOST_FLIGHTS, FlightConfiguration
+from quad_gym.packing.configuration import MAX_FLIGHTS, FlightConfiguration
 from quad_gym.params import checks as check
 from quad_gym.params.resolved import resolving
 from quad_gym.params.sensors import SensorSuite
@@ -96,7 +96,7 @@ class Flights:
         base: str | None = None,
         **keywords: Any,
     ) -> None:
-        check.whole("num_envs", count, most=MOST_FLIGHTS)
+        check.whole("num_envs", count, most=MAX_FLIGHTS)
         name, own_task = kind_and_task(task, base)
         self.name = name
         defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})

@@ -21,7 +21,7 @@ from quad_gym.estimation.plausibility import implausible
 from quad_gym.estimation.replaying import origin_of, replay
 from quad_gym.estimation.search import Calibrated, NumberSearch
 from quad_gym.estimation.validation import Validation, pooled, validate
-from quad_gym.estimation.verdict import BEYOND, MOST_BIAS
+from quad_gym.estimation.verdict import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -221,7 +221,7 @@ def turn_on_biases(log: Log, start: dict[str, Any], suite: SensorSuite) -> dict[
         if name == "gyro" and still.sum() * dt > _AT_REST:
             bias, sigma = log.imu.values[name][still].mean(axis=0), 0.0 * sigma
         large = np.abs(bias).max() > BEYOND * getattr(imu, f"{name}_bias_sigma")
-        possible = large and np.abs(bias).max() < MOST_BIAS[name]
+        possible = large and np.abs(bias).max() < MAX_BIAS[name]
         found[name] = np.where((np.abs(bias) > 3.0 * sigma) & possible, bias, 0.0)
     return found
 

@@ -31,7 +31,7 @@ from quad_gym.records import Aid
 FARTHEST_FIX = 1e6
 """Largest distance of a fix from the reference antenna [m]; the center of the Earth is farther."""
 
-LEAST_COURSE = 5.0
+MIN_COURSE = 5.0
 """Speed divided by its standard deviation from which a course determines the heading."""
 
 
@@ -267,9 +267,9 @@ def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) ->
     if velocity is None:
         raise ValueError("course must come with gnss_velocity_G")
     speed = math.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
-    if speed < LEAST_COURSE * sigma:
+    if speed < MIN_COURSE * sigma:
         raise ValueError(
-            f"course must belong to a moving vehicle, at least {LEAST_COURSE * sigma:g} m/s over "
+            f"course must belong to a moving vehicle, at least {MIN_COURSE * sigma:g} m/s over "
             f"the ground, got {speed:g} m/s"
         )
     angle = math.atan2(velocity[1], velocity[0])

@@ -37,9 +37,9 @@ class Number:
         """Return bounds of the coordinate: a sensor in flight is hardly better than at rest."""
         if self.positive:
             bounded = self.noise and self.field != "drift_sigma_I"
-            return _LEAST / self.spread if bounded else -MOST, MOST
+            return _MIN_SPREAD / self.spread if bounded else -MAX_SPREAD, MAX_SPREAD
         low, high = (self.coordinate(prior, end) for end in (-self.limit, self.limit))
-        return max(-MOST, low), min(MOST, high)
+        return max(-MAX_SPREAD, low), min(MAX_SPREAD, high)
 
     @property
     def noise(self) -> bool:
@@ -96,7 +96,7 @@ _LEVEL, _UP = (0, 1), (2,)
 _LEVER, _PRECISE = "primary_antenna_B", 0.1  #: [m]
 _WIDE, _NARROW = 1.5, 0.7  #: logarithms: factors of 4.5 and 2
 _DELAYS, _MOUNTING, _COMPASS = "log_delays", "log_rotation", "log_compass_rotation"
-MOST, _LEAST = 3.0, -0.3
+MAX_SPREAD, _MIN_SPREAD = 3.0, -0.3
 """Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's."""
 
 # fmt: off

@@ -10,7 +10,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import Floats, Log
 
-LEAST_FORCE, MOST_FORCE = 5.0, 20.0
+MIN_FORCE, MAX_FORCE = 5.0, 20.0
 """Median specific force of a flight [m/s^2], near gravity; a crash hardly changes it."""
 FORCE_CAUSES = (
     (0.5, "gravity subtracted from the accelerometer?"),
@@ -21,8 +21,8 @@ FORCE_CAUSES = (
     (math.inf, "accelerometer in milli-g or cm/s^2?"),
 )
 """Likely causes of other values, each up to a median specific force [m/s^2]."""
-MOST_RATE = 35.0  #: largest angular rate that gyros measure [rad/s]: 2000 deg/s
-MOST_MEAN_RATE = 10.0
+MAX_RATE = 35.0  #: largest angular rate that gyros measure [rad/s]: 2000 deg/s
+MAX_MEAN_RATE = 10.0
 """Mean angular rate of a vehicle over a log [rad/s]: one and a half turns per second."""
 
 
@@ -45,7 +45,7 @@ def nothing_in_common(unused: tuple[str, ...]) -> str:
 def _force(accel: Floats, body: str) -> Iterator[str]:
     """Units and axes of the accelerometer, by gravity."""
     size, upward = float(np.median(np.linalg.norm(accel, axis=1))), np.median(accel, axis=0)
-    if not LEAST_FORCE <= size <= MOST_FORCE:
+    if not MIN_FORCE <= size <= MAX_FORCE:
         cause = next(cause for most, cause in FORCE_CAUSES if size <= most)
         yield f"median specific force is {size:.1f} m/s^2, 9.8 expected: {cause}"
     axis = int(np.argmax(np.abs(upward)))
@@ -63,13 +63,13 @@ def _force(accel: Floats, body: str) -> Iterator[str]:
 def _rates(gyro: Floats) -> Iterator[str]:
     """Units of the gyro."""
     sizes = np.linalg.norm(gyro, axis=1)
-    if np.abs(gyro).max() > MOST_RATE:
+    if np.abs(gyro).max() > MAX_RATE:
         yield (
             f"angular rates reach {np.abs(gyro).max():.3g} rad/s, gyros measure up to "
-            f"{MOST_RATE:g} rad/s: gyro in deg/s?"
+            f"{MAX_RATE:g} rad/s: gyro in deg/s?"
         )
-    elif sizes.mean() > MOST_MEAN_RATE:
+    elif sizes.mean() > MAX_MEAN_RATE:
         yield (
-            f"mean angular rate is {sizes.mean():.3g} rad/s, at most {MOST_MEAN_RATE:g} expected: "
+            f"mean angular rate is {sizes.mean():.3g} rad/s, at most {MAX_MEAN_RATE:g} expected: "
             "gyro in deg/s?"
         )

@@ -33,7 +33,7 @@ _COARSE_NOISE = ("imu.accel_noise_density", "imu.gyro_noise_density")  #: begun 
 _FEW_STEPS, _STEPS = 4, 12  #: Newton steps from each beginning, and after
 _SHARES = np.array([1.0, 0.75, 0.5, 0.35, 0.2, 0.1, 0.05, 0.02])
 """Shares of a Newton step that are tried side by side."""
-_LEAST_GAIN = 0.02  #: drop of the log likelihood in a step with which the search ends
+_MIN_GAIN = 0.02  #: drop of the log likelihood in a step with which the search ends
 _FINE, _LONG = 0.3, 3.0
 """Steps for intervals over those of the search: of numbers in which the loss is smooth, and of
 delays in which it is not."""
@@ -219,7 +219,7 @@ class NumberSearch:
             gain = loss - float(totals[best])
             if gain > 0.0:
                 x, loss = points[best], float(totals[best])
-            if gain < _LEAST_GAIN:
+            if gain < _MIN_GAIN:
                 break
         return x, loss
 

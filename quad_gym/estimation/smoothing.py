@@ -40,9 +40,9 @@ from quad_gym.records import OPERATION, Operation
 from quad_gym.rotations import dcm_to_euler, dcm_to_quaternion, euler_to_dcm
 
 _AT_ONCE = 256  #: operations between two readings of the filter's memory
-_LEAST_JUMP = 1e-9  #: share of a variance, at least, that an inflation adds
-_LEAST_CHANGE = 1e-6  #: share of a variance that smoothing must remove for the consistency test
-_LEAST_VARIANCE = 1e-14  #: added to all variances, in units of these, against rounding
+_MIN_JUMP = 1e-9  #: share of a variance, at least, that an inflation adds
+_MIN_CHANGE = 1e-6  #: share of a variance that smoothing must remove for the consistency test
+_MIN_VARIANCE = 1e-14  #: added to all variances, in units of these, against rounding
 _E = slice(6, 9)
 
 
@@ -87,7 +87,7 @@ def _smoothed(player: Player) -> Smoothed:
     x, R_BI, P = _smooth_back(forward)
     rows = forward.rows
     gained = forward.variances[rows, :15] - np.diagonal(P, axis1=1, axis2=2)
-    gained[gained < _LEAST_CHANGE * forward.variances[rows, :15]] = np.nan
+    gained[gained < _MIN_CHANGE * forward.variances[rows, :15]] = np.nan
     difference = forward.x[rows, :15] - x[:, :15]
     difference[:, _E] = dcm_to_euler(forward.R_BI[rows] @ R_BI.swapaxes(1, 2))
     return Smoothed(
@@ -244,12 +244,12 @@ def _smooth_back(f: _Forward) -> tuple[Floats, Floats, Floats]:
         Phi = _transition(f, k - 1) if predicts else np.eye(len(before))
         moved = Phi @ before
         expected = moved @ Phi.T
-        noise = _added(f, k, expected, 0.0 if predicts else _LEAST_JUMP)
+        noise = _added(f, k, expected, 0.0 if predicts else _MIN_JUMP)
         if not (predicts or noise.any()):
             continue
         after = expected + noise
         units = _units(np.diag(after))
-        scaled = after / units[:, np.newaxis] / units + _LEAST_VARIANCE * np.eye(len(units))
+        scaled = after / units[:, np.newaxis] / units + _MIN_VARIANCE * np.eye(len(units))
         gain = cho_solve((np.linalg.cholesky(scaled), True), moved / units[:, np.newaxis]).T / units
         origin = k if predicts else k - 1
         error, angles = x - f.x[origin], dcm_to_euler(R_BI @ f.R_BI[origin].T)

@@ -40,7 +40,7 @@ LEVEL_SIGMA = 0.03
 """Standard deviation of roll and pitch of a vehicle put down or hovering, if the suite has none
 [rad]; as in `quad_gym.params.suites`."""
 
-MOST_MOTION = 0.1
+MAX_MOTION = 0.1
 """Fraction of gravity by which the specific force of a vehicle at rest may differ from it: twice
 the effect of the bias of a cheap accelerometer."""
 
@@ -105,9 +105,9 @@ def resting_tilt(accel: Floats, sigma: float, gravity: float) -> Tilt:
         ValueError: If the measurement is not from a vehicle at rest, or its x axis is vertical.
     """
     size = float(np.linalg.norm(accel))
-    if abs(size - gravity) > MOST_MOTION * gravity:
+    if abs(size - gravity) > MAX_MOTION * gravity:
         raise ValueError(
-            f"accel must be from a vehicle at rest, within {100 * MOST_MOTION:g} % of gravity, "
+            f"accel must be from a vehicle at rest, within {100 * MAX_MOTION:g} % of gravity, "
             f"{gravity:g} m/s^2, got {size:g} m/s^2"
         )
     k = accel / size

@@ -2,7 +2,7 @@
 
 A finding is LOST if the estimate of its quantity cannot be used, or the suite does not describe
 the sensors that measure it; UNCERTAIN if errors are larger than the suite has them; or a NOTE.
-Limits are sizes that matter (`RATIO`, `MOST_REJECTED`, `PATIENCE`); a
+Limits are sizes that matter (`RATIO`, `MAX_REJECTED`, `PATIENCE`); a
 test counts as many independent innovations as their autocorrelation leaves.
 """
 
@@ -24,9 +24,9 @@ from quad_gym.params.sensors import SensorSuite
 
 FALSE_ALARM = 1e-3  #: probability of a chance event that counts as a finding
 RATIO = 2.0  #: ratio of true and assumed standard deviations with which a filter still works [-]
-MOST_REJECTED = 0.1  #: share of the measurements of a sensor that the gate rejects [-]
+MAX_REJECTED = 0.1  #: share of the measurements of a sensor that the gate rejects [-]
 PATIENCE = 10.0  #: time without a measurement after which the estimate is dead reckoning [s]
-MOST_CORRELATED = 0.8  #: correlation of successive innovations of GNSS that noise does not have
+MAX_CORRELATED = 0.8  #: correlation of successive innovations of GNSS that noise does not have
 PESSIMISTIC = 0.3
 """NIS per degree of freedom below which noise is assumed much too large: innovations of such a
 filter are correlated, as it follows the measurements slowly."""
@@ -36,7 +36,7 @@ correct a filter more often, so that noise of the IMU matters less."""
 SMALL = {"attitude": math.radians(1.0), "heading": math.radians(2.0)}
 """Changes of the attitude that do not matter [rad]: mounting is no more accurate."""
 LATE = 0.5  #: share of late measurements above which the clocks do not agree [-]
-MOST_BIAS = {"accel": 2.0, "gyro": 0.2}
+MAX_BIAS = {"accel": 2.0, "gyro": 0.2}
 """Biases that no sensor has [m/s^2], [rad/s]: data sheets of cheap parts admit 0.5 m/s^2 and 0.09
 rad/s (TDK ICM-20948)."""
 BEYOND = 4.0  #: ratio of a bias and its standard deviation in the suite that is worth a note [-]
@@ -102,7 +102,7 @@ def _late(log: Log, result: Replay) -> Iterator[Finding]:
             )
         quantity = OF_SENSOR.get(sensor, "position")
         severity = Severity.LOST if share > LATE else Severity.UNCERTAIN
-        if share > LATE or exceeds(np.arange(count) < len(ages), MOST_REJECTED):
+        if share > LATE or exceeds(np.arange(count) < len(ages), MAX_REJECTED):
             yield Finding(quantity=quantity, severity=severity, text=text)
 
 
@@ -147,7 +147,7 @@ def _misfit(name: str, m: Measured, fit: Fit, fits: Mapping[str, Fit]) -> Iterat
     shared = quantity == "height" and others
     says = f"{NAMES[name]}: NIS per degree of freedom {fit.mean_nis:.3g}, 1 expected"
     ratio = RATIO**2 if not shared else RATIO**4
-    many = exceeds(m.rejected[known], MOST_REJECTED)
+    many = exceeds(m.rejected[known], MAX_REJECTED)
     heavy = larger(nis, d, RATIO) and fit.mean_nis > 2.0 * ratio  # in the median, and in the mean
     if larger(nis, d, ratio) or heavy or (many and not shared):
         text = f"{says}, {_percent(fit.rejected)} rejected: this suite does not describe this log"
@@ -190,7 +190,7 @@ def _correlated(name: str, m: Measured, quantity: str) -> Iterator[Finding]:
         worst = max(axes, key=lambda k: rho[k])
         # the lower end of the interval, by Fisher's transformation
         sure = math.tanh(math.atanh(min(rho[worst], 0.999)) - 3.0 / math.sqrt(len(scaled) - 3))
-        if sure > MOST_CORRELATED and size[worst] > PESSIMISTIC:
+        if sure > MAX_CORRELATED and size[worst] > PESSIMISTIC:
             text = (
                 f"{NAMES[name]}: successive innovations have a correlation of {rho[worst]:.2f}, 0 "
                 "expected: time stamps or noise of this suite do not describe this log"
@@ -256,7 +256,7 @@ def _biases(result: Replay, suite: SensorSuite) -> Iterator[Finding]:
         text = (
             f"{'accelerometer' if name == 'accel' else 'gyro'}: estimated bias {found:.2g} {unit}"
         )
-        if not found <= max(MOST_BIAS[name], BEYOND * sigma):
+        if not found <= max(MAX_BIAS[name], BEYOND * sigma):
             yield _lost(
                 "attitude",
                 f"{text}, which no sensor has: magnetic field, time stamps, mounting or noise of "

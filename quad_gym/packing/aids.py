@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params.aids import SlowError
-from quad_gym.params.gnss import LEAST_DRIFT
+from quad_gym.params.gnss import MIN_DRIFT
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
     AID_BLOCKS,
@@ -47,7 +47,7 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
     vectors, scalars = [-1] * AIDS, [-1] * AIDS
     if sensors.gnss is not None and sensors.drifts:
         tau = sensors.gnss.drift_tau
-        errors = [SlowError(max(s, LEAST_DRIFT), tau) for s in sensors.gnss.drift_sigma_I]
+        errors = [SlowError(max(s, MIN_DRIFT), tau) for s in sensors.gnss.drift_sigma_I]
     for aid, params in sensors.aids.items():
         if params.assumed_vector is not None:
             vectors[aid] = len(errors)

@@ -25,7 +25,7 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
 
-MOST_FLIGHTS = 10**7  #: largest number of flights in a batch
+MAX_FLIGHTS = 10**7  #: largest number of flights in a batch
 FILTER_STARTS = ("cold", "warm")  #: values of the keyword `filter_start`
 
 _WITHOUT = {
@@ -107,7 +107,7 @@ class FlightConfiguration:
     faults: FaultsGiven = None
 
     def __post_init__(self) -> None:
-        check.whole("count", self.count, most=MOST_FLIGHTS)
+        check.whole("count", self.count, most=MAX_FLIGHTS)
         for name, kind in (
             ("source", Source),
             ("control", Control),

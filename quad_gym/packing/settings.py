@@ -70,7 +70,7 @@ def _pack_task(s: Any, task: TaskParams) -> None:
     s["near_decay"], s["fine_decay"] = weights.near_decay, weights.fine_decay
     s["harmonics"] = _HARMONICS.get(kind, MAX_HARMONICS)
     s["path_count"] = len(task.trajectories)
-    s["least_up"] = math.cos(task.max_tilt)
+    s["min_up"] = math.cos(task.max_tilt)
     for name in (
         *("randomize_reference", "radius", "period", "height", "preview"),
         *("max_speed", "max_acceleration", "gate_count", "gate_radius"),

@@ -17,7 +17,7 @@ _NO_NUMBERS = (str, bytes, bytearray, bool, np.bool_)
 Vector = tuple[float, ...]
 Matrix = tuple[tuple[float, ...], ...]
 
-MOST_TICKS = 10**5  #: largest number of ticks between two events of a clock; 500 s at 200 Hz
+MAX_TICKS = 10**5  #: largest number of ticks between two events of a clock; 500 s at 200 Hz
 LARGEST = 1e15  #: largest magnitude of any quantity in SI units; its square is far from overflow
 
 SMALLEST = 1e-15
@@ -296,9 +296,9 @@ def matrix(name: str, value: Any, rows: int | None, columns: int) -> tuple[tuple
 def ticks(name: str, rate: float, tick_rate: float) -> int:
     """Return the number of ticks between two events at `rate` [Hz], which must be whole."""
     ratio = tick_rate / positive(name, rate)
-    if ratio > MOST_TICKS:
+    if ratio > MAX_TICKS:
         raise ValueError(
-            f"{name} must be at least {tick_rate / MOST_TICKS:g} Hz at an IMU rate of "
+            f"{name} must be at least {tick_rate / MAX_TICKS:g} Hz at an IMU rate of "
             f"{tick_rate:g} Hz, got {rate:g} Hz"
         )
     if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-9 * ratio:

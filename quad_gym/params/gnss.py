@@ -8,7 +8,7 @@ import numpy as np
 from quad_gym.params import checks as check
 from quad_gym.params.aids import SensorBase
 
-LEAST_DRIFT = 1e-6
+MIN_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so
 that its covariance stays regular."""
 
@@ -16,13 +16,13 @@ HEADING_MEMORY = 60.0
 """Time over which a filter does not average out the constant heading error of a baseline [s]."""
 
 
-LEAST_BASELINE = 1e-3  #: antennas are farther apart than this [m]
+MIN_BASELINE = 1e-3  #: antennas are farther apart than this [m]
 
 
 def check_baseline(name: str, baseline: np.ndarray) -> None:
-    """Refuse antennas at one place, with a baseline (3,) below LEAST_BASELINE [m]."""
-    if np.linalg.norm(baseline) < LEAST_BASELINE:
-        raise ValueError(f"{name} must be apart, by at least {LEAST_BASELINE:g} m")
+    """Refuse antennas at one place, with a baseline (3,) below MIN_BASELINE [m]."""
+    if np.linalg.norm(baseline) < MIN_BASELINE:
+        raise ValueError(f"{name} must be apart, by at least {MIN_BASELINE:g} m")
 
 
 class GnssParams(SensorBase):

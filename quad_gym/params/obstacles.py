@@ -15,9 +15,9 @@ from quad_gym.records import Shape
 
 FARTHEST_OBSTACLE = 1e4
 """Largest size of an obstacle, distance of its center from the origin, and shift [m]."""
-LEAST_SIZE = 1e-3  #: smallest length, thickness, height or radius [m]
+MIN_SIZE = 1e-3  #: smallest length, thickness, height or radius [m]
 
-Size = Annotated[float, partial(check.positive, least=LEAST_SIZE, most=FARTHEST_OBSTACLE)]
+Size = Annotated[float, partial(check.positive, least=MIN_SIZE, most=FARTHEST_OBSTACLE)]
 
 
 class Obstacle(Checked):
@@ -64,7 +64,7 @@ class Wall(Obstacle):
     def __post_init__(self) -> None:
         super().__post_init__()
         for length in self.size:
-            check.positive("Wall.size", length, least=LEAST_SIZE, most=FARTHEST_OBSTACLE)
+            check.positive("Wall.size", length, least=MIN_SIZE, most=FARTHEST_OBSTACLE)
 
     @property
     def half_size(self) -> Vector:

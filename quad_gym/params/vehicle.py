@@ -20,14 +20,14 @@ from quad_gym.params.clocks import Clocks
 from quad_gym.params.gravity import GRAVITY
 from quad_gym.params.suite_files import Saved, is_params_file, read_params
 
-LEAST_MOMENT = 1e-9
+MIN_MOMENT = 1e-9
 """Moment of inertia below which numbers are mistakes; a quadrotor of 10 g has 1e-6 [kg m^2]."""
 
-LEAST_GYRATION = 1.0 / 30.0
+MIN_GYRATION = 1.0 / 30.0
 """Radius of gyration over the distance of the rotors, below which numbers are mistaken: the rotors
 would turn the vehicle faster than a tick resolves. Quadrotors have 0.2 to 0.8."""
 
-MOST_GYRATION = 10.0
+MAX_GYRATION = 10.0
 """The same ratio, above which numbers are mistakes, such as moments in kg mm^2."""
 
 SLOWEST_ROTORS = 1.0
@@ -154,8 +154,8 @@ def check_moments(name: str, moments: ArrayLike) -> None:
 def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike) -> None:
     """Refuse moments of inertia (3,) too small or too large for mass and rotor hubs (4, 3) [SI]."""
     reach = float(np.linalg.norm(rotors, axis=1).max())
-    smallest = max(LEAST_MOMENT, mass * (LEAST_GYRATION * reach) ** 2)
-    largest = mass * (MOST_GYRATION * reach) ** 2
+    smallest = max(MIN_MOMENT, mass * (MIN_GYRATION * reach) ** 2)
+    largest = mass * (MAX_GYRATION * reach) ** 2
     for limit, bound, found in (
         ("least", smallest, float(np.min(moments))),
         ("most", largest, float(np.max(moments))),

@@ -53,7 +53,7 @@ SETTINGS_FIELDS = (
     Field("out_of_bounds", (), "m", "largest distance from the reference"),
     Field("min_height", (), "m", "height below which the vehicle has crashed"),
     Field("truncate_when_diverged", (), "0 or 1", "whether a lost filter ends the episode"),
-    Field("least_up", (), "-", "least cosine of the tilt"),
+    Field("min_up", (), "-", "least cosine of the tilt"),
     Field("radius", (), "m", "size of the reference"),
     Field("period", (), "s", "period of the reference"),
     Field("height", (), "m", "height of the reference"),

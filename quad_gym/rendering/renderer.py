@@ -20,7 +20,7 @@ from quad_gym.rendering.scene import Scene, ellipsoid_scale
 
 VIEWS = ("fixed", "chase")  #: names of the views of a flight
 MOVING_VIEWS = {"chase": chase_view, "course": course_view}
-LEAST_WIDTH, LEAST_HEIGHT = 320, 240
+MIN_WIDTH, MIN_HEIGHT = 320, 240
 STALE_FIX = 0.5  #: time without a fix after which a warning is shown [s]
 _SEEN = {
     "truth": "the truth",
@@ -195,8 +195,8 @@ def checked_size(size: tuple[int, int]) -> tuple[int, int]:
     """
     if not isinstance(size, (tuple, list)) or len(size) != 2:
         raise ValueError(f"render_size must be a width and a height, got {size!r}")
-    width = check.whole("render_size[0]", size[0], least=LEAST_WIDTH)
-    height = check.whole("render_size[1]", size[1], least=LEAST_HEIGHT)
+    width = check.whole("render_size[0]", size[0], least=MIN_WIDTH)
+    height = check.whole("render_size[1]", size[1], least=MIN_HEIGHT)
     if width % 2 or height % 2:
         raise ValueError(f"render_size must be even numbers, got {width} x {height}")
     return width, height

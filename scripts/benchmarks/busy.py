@@ -10,7 +10,7 @@ from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.suites import SUITES, TRUTH, flying, ticks_of
 from scripts.benchmarks.scope import Scope
 
-MOST_BUSY = 4
+MAX_BUSY = 4
 
 
 @contextmanager
@@ -35,7 +35,7 @@ def time_busy(scope: Scope) -> list[timing.Row]:
         batches = [flying(scope.envs, threads, suite) for threads in (1, scope.threads)]
         steps = max(1, round(scope.effort.seconds / timing.lasting(batches[0].step, 3)))
         jobs = [partial(timing.lasting, batch.step, steps) for batch in batches]
-        for busy in range(MOST_BUSY + 1):
+        for busy in range(MAX_BUSY + 1):
             with _busy(busy):
                 one, all_of_them = timing.by_turns(jobs, 2 * scope.effort.repeats)
             medians = [t.best * (1.0 + t.spread) / ticks_of(batches[0]) for t in (one, all_of_them)]

@@ -19,7 +19,7 @@ from tests.estimators import Simple
 from tests.field_flights import nees
 
 FLIGHTS, FEW, STEPS = 48, 3, 40
-MOST_NEES = 5.5 * np.sqrt(2.0 * 15.0 / FLIGHTS)
+MAX_NEES = 5.5 * np.sqrt(2.0 * 15.0 / FLIGHTS)
 """Alarm level of the mean NEES beyond 15: 5.5 standard deviations of a consistent filter. One of a
 thousand pairs would exceed it once in 10,000 runs, or less."""
 CRAZYFLIE = quad_gym.sensor_suite("crazyflie")
@@ -151,14 +151,14 @@ def check(pair):
 @pytest.mark.parametrize("pair", SAMPLE, ids=name_of)
 def test_pair_of_options_is_consistent_and_independent_of_batch_size_or_refused(pair):
     found = check(pair)
-    assert found is None or abs(found - 15.0) < MOST_NEES
+    assert found is None or abs(found - 15.0) < MAX_NEES
 
 
 @pytest.mark.slow  # some 400 pairs
 @pytest.mark.parametrize("pair", PAIRS, ids=name_of)
 def test_every_pair_of_options_is_consistent_and_independent_of_batch_size_or_refused(pair):
     found = check(pair)
-    assert found is None or abs(found - 15.0) < MOST_NEES
+    assert found is None or abs(found - 15.0) < MAX_NEES
 
 
 def test_expected_pairs_are_refused_by_name():

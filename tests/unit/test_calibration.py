@@ -16,7 +16,7 @@ from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.fits import correlation_time
 from quad_gym.estimation.likelihood import NU, SETTLING, SPACING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
-from quad_gym.estimation.numbers import MOST, NUMBERS
+from quad_gym.estimation.numbers import MAX_SPREAD, NUMBERS
 from quad_gym.estimation.search import NumberSearch, _spread_between, widening
 from quad_gym.estimation.validation import validate
 from quad_gym.params.range_finder import RangeFinderParams
@@ -38,7 +38,7 @@ TRUE = CONSUMER.replace(
 @pytest.fixture(scope="module")
 def table():
     """A log whose GNSS stamps are late, and whose IMU is mounted askew."""
-    columns = Recorded(flown(TRUE, 24.0), TRUE, lost=0.0, jitter=0.0, most_ticks=9).table()
+    columns = Recorded(flown(TRUE, 24.0), TRUE, lost=0.0, jitter=0.0, max_ticks=9).table()
     fixes = np.isfinite(columns["gnss_east"])
     columns["time"] = columns["time"] + DELAY * fixes
     columns["received"] = np.maximum(columns["received"], columns["time"])
@@ -314,7 +314,7 @@ def test_search_near_the_largest_delay_and_inclination_stays_below_it():
             low, high = number.ends(prior)
             assert number.value(prior, high) == pytest.approx(number.limit)
             assert number.value(prior, low) == pytest.approx(prior + number.spread * low)
-            assert low == -MOST
+            assert low == -MAX_SPREAD
 
 
 def at_rest_for(rest, total=75.0):

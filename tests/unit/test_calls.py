@@ -43,7 +43,7 @@ def repeated(rows, suite):
 @pytest.mark.parametrize("suite", [RTK, TURNED], ids=["plain", "calibrated"])
 def test_calls_of_a_replay_give_its_estimates(suite, tmp_path):
     flight = flown(RTK, 2.0)
-    table = Recorded(flight, RTK, most_ticks=1).table()
+    table = Recorded(flight, RTK, max_ticks=1).table()
     table = {name: values for name, values in table.items() if not name.startswith("pixel")}
     result = replay(table, sensors=suite, samples=tmp_path / "samples.csv")
     rows = (tmp_path / "samples.csv").read_text().splitlines()

@@ -61,10 +61,10 @@ def exported(name, target="x86-64", policy=None):
 
 
 @functools.cache
-def logged(name, seconds=3.0, most_ticks=3):
+def logged(name, seconds=3.0, max_ticks=3):
     """Write a log with latency, jitter and losses, without columns of absent sensors."""
     suite = quad_gym.sensor_suite(name)
-    recorded = Recorded(flown(suite, seconds), suite, most_ticks=most_ticks)
+    recorded = Recorded(flown(suite, seconds), suite, max_ticks=max_ticks)
     table = recorded.table()
     absent = [k for k, v in table.items() if "gnss" in k and np.isnan(v).all()]
     absent += [k for k in table if k.startswith("pixel") and suite.camera is None]

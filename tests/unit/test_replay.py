@@ -136,7 +136,7 @@ def test_late_aiding_sensors_find_an_unknown_heading(tmp_path):
 
 def test_a_regular_log_replays_as_it_was_flown(flight):
     """Without losses and jitter, replay and retrodiction in flight agree to first order."""
-    recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, most_ticks=1)
+    recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, max_ticks=1)
     result = replay(recorded.table(), sensors=RTK)
     k = np.rint(result.time * RTK.imu.rate).astype(int)
     late = k > 400

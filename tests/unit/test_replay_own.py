@@ -22,7 +22,7 @@ def flight():
 
 @pytest.fixture(scope="module")
 def table(flight):
-    return Recorded(flight, lost=0.0, jitter=0.0, most_ticks=1).table()
+    return Recorded(flight, lost=0.0, jitter=0.0, max_ticks=1).table()
 
 
 def test_regular_log_gives_the_estimates_of_the_flight(flight, table):
@@ -107,7 +107,7 @@ def test_invalid_starts_and_estimates_are_refused(table):
 
 def test_command_writes_the_estimates_of_an_own_estimator(flight, table, tmp_path):
     pytest.importorskip("matplotlib")
-    Recorded(flight, lost=0.0, jitter=0.0, most_ticks=1).write_csv(tmp_path / "flight.csv")
+    Recorded(flight, lost=0.0, jitter=0.0, max_ticks=1).write_csv(tmp_path / "flight.csv")
     options = ("flight.csv", "--sensors", "rtk", "--output", "out")
     own = ("--estimator", "tests.estimators:Certain")
     ended = run("replay", *options, *own, where=tmp_path)

@@ -24,7 +24,7 @@ def cross_matrix(a):
     return np.cross(a, -np.eye(3))
 
 
-def least_heading_sigmas(r, v, R_BI, dt):
+def min_heading_sigmas(r, v, R_BI, dt):
     """Standard deviations of the heading by a Kalman filter that is linearized at the truth.
 
     Its errors (r, v, theta, b_a, b_g) have the attitude in I; it measures in every second tick.
@@ -85,7 +85,7 @@ def test_heading_sigma_in_flight_is_at_least_that_of_a_filter_at_the_truth(task,
     dt = 1.0 / suite.imu.rate
     for k in range(8):
         r, v, R_BI = (np.array([row[i][k] for row in rows]) for i in range(3))
-        least = least_heading_sigmas(r, v, R_BI, dt)
+        least = min_heading_sigmas(r, v, R_BI, dt)
         assert least[-1] > 0.9 * SIGMA  # a known velocity of the start shows some heading
         np.testing.assert_array_less(0.99 * least, np.array(ours)[:, k])
         np.testing.assert_array_less(np.array(ours)[:, k], 1.1 * least)

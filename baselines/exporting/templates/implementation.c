@@ -562,7 +562,7 @@ static int qgi_magnetic(qg_start_record *s, const double field[3], double white)
 static int qgi_course(qg_start_record *s, const double velocity[3], double sigma)
 {
     double speed = sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1]), across;
-    if (speed < @LEAST_COURSE@ * sigma)
+    if (speed < @MIN_COURSE@ * sigma)
         return QG_OUT_OF_RANGE;
     across = sigma / speed;
     s->heading = atan2(velocity[1], velocity[0]);

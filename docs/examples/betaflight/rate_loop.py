@@ -119,7 +119,7 @@ def stick_range(rate: float) -> int:
     return 10 * math.ceil(math.degrees(rate) / 10.0)
 
 
-MOST_FLIGHTS = 200  # processes of the firmware
+MAX_FLIGHTS = 200  # processes of the firmware
 
 
 def flights_behind(commanded: Any, keywords: Mapping[str, Any], threads: int | None = None) -> Any:
@@ -135,9 +135,9 @@ def flights_behind(commanded: Any, keywords: Mapping[str, Any], threads: int | N
             keyword that Betaflight does not support.
     """
     flights, count = commanded.unwrapped.flights, commanded.num_envs
-    if count > MOST_FLIGHTS:
+    if count > MAX_FLIGHTS:
         raise ValueError(
-            f"episodes must be at most {MOST_FLIGHTS} behind Betaflight, each has a process, "
+            f"episodes must be at most {MAX_FLIGHTS} behind Betaflight, each has a process, "
             f"got {count}"
         )
     for name, found, expected in (

@@ -36,7 +36,7 @@ from quad_gym.estimation.logs.source import TO_FLU, LogSource, RawLog, positive,
 
 GNSS_DELAY = 0.2  #: delay of receivers if the log does not contain it [s]
 
-_LEAST_FIX = 3
+_MIN_FIX = 3
 _MILLIGAUSS = 1e-7  #: [T]
 _DOWN = 25  #: orientation of a range finder that looks down
 _PULSES = (1000.0, 2000.0)  #: pulses of motors, if the log does not contain them [us]
@@ -187,7 +187,7 @@ def _gnss(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[LogSourc
             )
             same = reported["time"][place] == received
             h, v, s = (np.where(same, reported[n][place], np.nan) for n in ("HAcc", "VAcc", "SAcc"))
-        fixed = (table["Status"] >= _LEAST_FIX) & (np.abs(table["Lat"]) <= 90.0)
+        fixed = (table["Status"] >= _MIN_FIX) & (np.abs(table["Lat"]) <= 90.0)
         fixed &= (table["Lat"] != 0.0) | (table["Lng"] != 0.0)
         place_lla = np.where(fixed, np.stack([table["Lat"], table["Lng"], table["Alt"]]), np.nan)
         values = {

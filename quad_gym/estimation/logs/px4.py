@@ -39,7 +39,7 @@ from quad_gym.estimation.logs.source import TO_FLU, LogSource, RawLog, positive,
 
 GNSS_DELAY = 0.11  #: delay of receivers if the log does not contain it [s]: PX4's default
 
-LEAST_FIX = 3  #: smallest `fix_type` of a three-dimensional position
+MIN_FIX = 3  #: smallest `fix_type` of a three-dimensional position
 
 _GAUSS = 1e-4  #: [T]
 _NED = 1  #: `pose_frame` of a known heading
@@ -131,7 +131,7 @@ def _gnss(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[LogSource]
             lat, lon, height, sea = 1e-7 * lat, 1e-7 * lon, 1e-3 * height, 1e-3 * sea
         if not np.ptp(np.nan_to_num(height)) and np.isfinite(sea).any():
             height = sea
-        fixed = np.asarray(topic["fix_type"]) >= LEAST_FIX
+        fixed = np.asarray(topic["fix_type"]) >= MIN_FIX
         fixed &= (np.abs(lat) <= 90.0) & ((lat != 0.0) | (lon != 0.0))
         place = np.where(fixed, np.stack([lat, lon, height]), np.nan)
         velocity = stack(topic, ["vel_e_m_s", "vel_n_m_s", "vel_d_m_s"]) * [1.0, 1.0, -1.0]

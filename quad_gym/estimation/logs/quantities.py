@@ -17,7 +17,7 @@ from quad_gym.frames import ecef_to_enu
 from quad_gym.params.sensors import SensorSuite
 
 ENOUGH, LONG = 20, 2.0  #: number of rows, and their duration [s], from which a constant is dead
-LEAST_FORCE = 5.0  #: specific force that contains gravity, at least [m/s^2]
+MIN_FORCE = 5.0  #: specific force that contains gravity, at least [m/s^2]
 EARTH = (6.3e6, 7.0e6)  #: distances of receivers from the center of the Earth [m]
 NULL_ISLAND = 2e4  #: distance from 0 degrees north and east without land [m]
 SEA_LEVEL, SCALE, EXPONENT = 101325.0, 44330.77, 0.190263
@@ -37,7 +37,7 @@ FARTHEST = 1e6  #: distance from the origin of I [m]
 FAST = 100.0  #: speed of a jump away from a fix at zero [m/s]
 _LENGTHS = {0.001: "km", 3.28084: "ft", 100.0: "cm", 1000.0: "mm", -12.0: "Pa", -0.12: "hPa"}
 """Units of a height or pressure, by the change of the number per meter of height."""
-MOST_FIELD = 5.0  #: ratio of the median magnetic field and the suite's, either way [-]
+MAX_FIELD = 5.0  #: ratio of the median magnetic field and the suite's, either way [-]
 _FIELDS = {1e4: "gauss", 1e6: "microtesla", 1e7: "milligauss", 1e9: "nanotesla"}
 """Units of a magnetic field, by how many of them one tesla has."""
 _SPEEDS = {100.0: "cm/s", 3.6: "km/h", 1.94384: "knots", 3.28084: "ft/s", 1000.0: "mm/s"}
@@ -67,7 +67,7 @@ def measured(recording: RawLog, source: LogSource) -> LogSource:
             return source.keep(np.zeros(len(source), bool), f"{word} {name}")
     if (force := source.values.get("accel")) is not None:
         size = float(np.median(np.linalg.norm(force, axis=1)))
-        if size < LEAST_FORCE and np.linalg.norm(force.mean(axis=0)) < 0.5 * size:
+        if size < MIN_FORCE and np.linalg.norm(force.mean(axis=0)) < 0.5 * size:
             return source.keep(np.zeros(len(source), bool), "specific force without gravity")
     return source
 
@@ -339,10 +339,10 @@ def _unit_of_field(log: Log, strength: float) -> _Found:
     if log.magnetometer is None or not len(log.magnetometer):
         return
     size = float(np.median(np.linalg.norm(log.magnetometer.values["magnetometer"], axis=1)))
-    if 1.0 / MOST_FIELD <= size / strength <= MOST_FIELD:
+    if 1.0 / MAX_FIELD <= size / strength <= MAX_FIELD:
         return
     near = {abs(math.log(size / strength / n)): f"field in {u}?" for n, u in _FIELDS.items()}
-    cause = near[min(near)] if min(near) < math.log(MOST_FIELD) else "unit of the field?"
+    cause = near[min(near)] if min(near) < math.log(MAX_FIELD) else "unit of the field?"
     yield (
         {"magnetometer": None},
         f"mean magnetic field is {size:.3g} T, {strength:.3g} expected: {cause} It is left out",

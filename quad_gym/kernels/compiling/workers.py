@@ -25,7 +25,7 @@ from quad_gym.kernels.compiling.cache import CodeCache, locked, where_cached
 from quad_gym.kernels.cores import available_cores
 from quad_gym.kernels.library import say
 
-MOST_WORKERS = 8
+MAX_WORKERS = 8
 _START = (
     "import sys; sys.path[:] = {path!r}; from {module} import work; work({names!r}, {claims!r})"
 )
@@ -63,7 +63,7 @@ def _missing(names: Collection[str]) -> list[str]:
 def _compile(names: Sequence[str], processes: int) -> None:
     """Compile `names`: into the cache by processes, or else in this one."""
     progress = _Progress(names)
-    workers = min(processes, MOST_WORKERS, len(names))
+    workers = min(processes, MAX_WORKERS, len(names))
     cached = all(dispatcher_of(name)._cache.folder is not None for name in names)
     program = sys.executable and not getattr(sys, "frozen", False)
     announcing, CodeCache.announcing = CodeCache.announcing, False

@@ -38,7 +38,7 @@ from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, Act, FilterForm, 
 _GAIN = 0.05  #: change of a factor on the noise by one measurement
 _ADAPTED = 1.3  #: mean NIS over the degrees of freedom above which the noise is adapted
 _SERIES = 3.0  #: rejections in a row beyond which further ones do not adapt the noise
-_MOST_FACTOR = 25.0  #: largest factor on the variance of a noise: five times its sigma
+_MAX_FACTOR = 25.0  #: largest factor on the variance of a noise: five times its sigma
 
 
 @kernel
@@ -280,7 +280,7 @@ def adapt_noise(flight, group, first, scatter, freedoms, limit):
     mild = (scatter < OUTLIER * limit) & (flight.rejected_in_row[group] < _SERIES)
     factor = flight.noise_factor[group]
     growth = 1.0 + _GAIN * (minimum(scatter, limit) / freedoms - _ADAPTED)
-    factor = select(first & mild, clip(growth * factor, 1.0, _MOST_FACTOR), factor)
+    factor = select(first & mild, clip(growth * factor, 1.0, _MAX_FACTOR), factor)
     flight.noise_factor[group] = factor
 
 

@@ -66,7 +66,7 @@ OUTLIER = 4.0
 """Ratio of NIS and gate beyond which a first refusal is a step of the sensor: an innovation of
 twice the largest one that the gate explains."""
 _MORE = 16.0  #: factor on the variances of position and velocity where the biases are reset
-MOST_ANGLE = math.pi / math.sqrt(3.0)
+MAX_ANGLE = math.pi / math.sqrt(3.0)
 """Largest standard deviation of an angle [rad], when it is unknown."""
 
 
@@ -210,7 +210,7 @@ def reset_heading(P, R_BI, states, lanes, variance):
     M = diagonal((one, one, one)) + outer(-cut * k, k)
     for j in range(0, E, 3):
         store_block(P, E, j, M @ load_block(P, E, j))
-    heading = cut * maximum(minimum(variance, MOST_ANGLE * MOST_ANGLE), dot(k, P_ee @ k))
+    heading = cut * maximum(minimum(variance, MAX_ANGLE * MAX_ANGLE), dot(k, P_ee @ k))
     store_block(P, E, E, M @ P_ee @ M + outer(heading * k, k))
     for i in range(E + 3, states, 3):
         store_block(P, i, E, load_block(P, i, E) @ M)

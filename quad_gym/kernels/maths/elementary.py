@@ -20,7 +20,7 @@ from quad_gym.kernels.simd.lanes import any_of, select
 
 # pi/2 in three parts (Cody and Waite): x - k * first is exact, k * second is for |k| < 2^20
 _PIO2_1, _PIO2_2, _PIO2_3 = 1.5707963267948966, 6.12323399538461e-17, 3.5215598651832e-27
-_MOST_TURNED = 1e9
+_MAX_TURNED = 1e9
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _SMALL_ANGLE = 0.05
 
@@ -101,7 +101,7 @@ def sin_cos(x):
     |x| <= 1e9. Any larger angle counts as 0, which is as good as any: a unit in its last place may
     be many degrees. Infinity and NaN give NaN.
     """
-    x = select(abs(x) <= _MOST_TURNED, x, x - x)
+    x = select(abs(x) <= _MAX_TURNED, x, x - x)
     turns = round_to_even(x * 0.63661977236758138243)
     near = fused_multiply_add(-turns, _PIO2_1, x)
     reduced = fused_multiply_add(-turns, _PIO2_2, near)

@@ -19,7 +19,7 @@ from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.error_state import D, E, R, V
 from quad_gym.kernels.filter.gate import gate_direction, judge, mask_rejected
 from quad_gym.kernels.filter.monitoring import LARGEST, follow_mean
-from quad_gym.kernels.filter.recovery import MOST_ANGLE, reset_variances, time_of
+from quad_gym.kernels.filter.recovery import MAX_ANGLE, reset_variances, time_of
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
@@ -231,7 +231,7 @@ def _reset(flight, p, work, settings):
     drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
     reset_variances(P, V, states, drifted, (speed, speed, speed))
     reset_variances(P, R, states, lanes, (offset, offset, offset))
-    angle = minimum(angle, MOST_ANGLE * MOST_ANGLE)
+    angle = minimum(angle, MAX_ANGLE * MAX_ANGLE)
     reset_variances(P, E, states, lanes, (angle, angle, angle))
 
 

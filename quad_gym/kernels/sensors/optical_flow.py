@@ -28,7 +28,7 @@ from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
-from quad_gym.kernels.sensors.range_finder import LEAST_COSINE, ground_range
+from quad_gym.kernels.sensors.range_finder import MIN_COSINE, ground_range
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_AID, Aid, FilterForm
 
@@ -41,7 +41,7 @@ def _measure(flight, p):
     n_x, n_y = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
     R_BI, w = quaternion_to_dcm(load4(flight.q)), load3(flight.w)
     h, u = ground_range(p, flight.r, R_BI)
-    within = (h >= p.aid_numbers[_S, 0]) & (u >= LEAST_COSINE)
+    within = (h >= p.aid_numbers[_S, 0]) & (u >= MIN_COSINE)
     g, v_B = u / select(within, h, 1.0), R_BI @ load3(flight.v)
     x, y = g * v_B[0] - w[1], g * v_B[1] + w[0]
     most, sigma = p.aid_numbers[_S, 1], p.aid_sigma[_S]

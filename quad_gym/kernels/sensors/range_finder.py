@@ -23,7 +23,7 @@ from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.RANGE_FINDER
-LEAST_COSINE = 0.5  #: cosine of the tilt below which it does not measure: 60 degrees
+MIN_COSINE = 0.5  #: cosine of the tilt below which it does not measure: 60 degrees
 
 
 @kernel
@@ -37,11 +37,11 @@ def _measure(flight, p):
     """The distance, within range."""
     n, _ = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
     h, u = ground_range(p, flight.r, quaternion_to_dcm(load4(flight.q)))
-    steep = u < LEAST_COSINE
+    steep = u < MIN_COSINE
     distance = h / select(steep, 1.0, u)
     within = (distance >= p.aid_numbers[_S, 0]) & (distance <= p.aid_numbers[_S, 1])
     zero = 0.0 * distance
-    return (distance + p.aid_sigma[_S] * n, zero, zero), within & (u >= LEAST_COSINE)
+    return (distance + p.aid_sigma[_S] * n, zero, zero), within & (u >= MIN_COSINE)
 
 
 @kernel
@@ -50,7 +50,7 @@ def _expect(flight, p, work, settings, k, valid):
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
     zero, sigma = 0.0 * u, p.aid_sigma[_S]
-    u = maximum(u, LEAST_COSINE)
+    u = maximum(u, MIN_COSINE)
     z, noise = load3(flight.aid_measurement[_S]), (sigma * sigma, zero + 1.0, zero + 1.0)
     put_block(work, settings, k, valid, z, (h / u, zero, zero), diagonal(noise))
     z_B = R_BI.T[2]

@@ -79,7 +79,7 @@ def judge_stage(flight, world, model, settings, work, stages, flag):
     flight.step = select(active, flight.step + 1.0, flight.step)
     reward, error, finished, sound = _reward(flight, model, settings, work, active, R_BI, w_B)
     lost = (error > settings.out_of_bounds) | logical_not(sound)
-    tipped = R_BI[2][2] < settings.least_up
+    tipped = R_BI[2][2] < settings.min_up
     grounded = flight.r[2] < settings.min_height
     terminated = active & (finished | lost | tipped | grounded)
     failed = logical_not(flight.filter_status == 0)

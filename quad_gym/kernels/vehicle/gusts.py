@@ -15,7 +15,7 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_GUST
 
-LEAST_AIRSPEED = 1.0
+MIN_AIRSPEED = 1.0
 """Least airspeed with which gusts change [m/s]: turbulence that is frozen in the air (Taylor's
 hypothesis) would be constant for a vehicle that drifts with the wind."""
 _FOOT = 0.3048
@@ -95,7 +95,7 @@ def carry_gust(flight, p):
     """Carry the gust over a tick, at the vehicle's present height and airspeed."""
     _, _, L_u, L_w = gust_scales(flight.r[2] - p.ground_height, p.gust_wind_speed)
     airspeed = norm(load3(flight.v) - load3(p.wind_I))
-    way = p.dt * maximum(airspeed, LEAST_AIRSPEED)
+    way = p.dt * maximum(airspeed, MIN_AIRSPEED)
     stream = stream_of(flight)
     n_u, n_v = normal_pair(stream, DRAW_GUST)
     m_v, n_w = normal_pair(stream, DRAW_GUST + 1)

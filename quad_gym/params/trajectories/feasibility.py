@@ -12,10 +12,10 @@ from quad_gym.params.trajectories.flatness import motion_of
 from quad_gym.params.trajectories.pieces import Floats, Reference, derivative
 from quad_gym.params.vehicle import VehicleParams
 
-INTERVAL, SAMPLES, MOST_SAMPLES = 0.01, 16, 400
+INTERVAL, SAMPLES, MAX_SAMPLES = 0.01, 16, 400
 """Interval of the checks [s], and their least and largest number per segment."""
 
-LEAST_THRUST = 0.01
+MIN_THRUST = 0.01
 """Thrust as a fraction of the weight below which, in free fall, the direction of body z is
 undefined."""
 
@@ -101,11 +101,11 @@ def _checked(
     speeds, accelerations = (np.linalg.norm(trajectory(times, k), axis=1) for k in (1, 2))
     force, rates = motion.rotor_forces, np.abs(motion.body_rates)
     largest = vehicle.max_rotor_force
-    least_thrust = LEAST_THRUST * vehicle.mass * vehicle.gravity
+    min_thrust = MIN_THRUST * vehicle.mass * vehicle.gravity
     # name, values over time, unit, lower and upper limit
     demands: list[tuple[str, Floats, str, float, float]] = [
         ("a speed", speeds, "m/s", 0.0, max_speed or math.inf),
-        ("a thrust", motion.thrust, "N", least_thrust, max_thrust or 4.0 * largest),
+        ("a thrust", motion.thrust, "N", min_thrust, max_thrust or 4.0 * largest),
         ("a tilt", np.degrees(motion.tilt), "degrees", 0.0, math.degrees(max_tilt)),
     ]
     if max_rates is not None:
@@ -178,7 +178,7 @@ def _refuse_turnabouts(trajectory: Reference, times: Floats, name: str) -> None:
 def sampling_times(trajectory: Reference) -> Floats:
     """Return the times at which demands are checked [s]."""
     lengths = np.diff(trajectory.times)
-    count = int(np.clip(np.ceil(lengths.max() / INTERVAL), SAMPLES, MOST_SAMPLES))
+    count = int(np.clip(np.ceil(lengths.max() / INTERVAL), SAMPLES, MAX_SAMPLES))
     return trajectory.instants(count)
 
 

@@ -12,7 +12,7 @@ from quad_gym.params.trajectories.splines import heading_choice, polynomials
 
 Function = Callable[[float], Any]
 
-FEWEST, MOST = 16, 8192  #: segments that are tried, each time twice as many
+MIN_SEGMENTS, MAX_SEGMENTS = 16, 8192  #: segments that are tried, each time twice as many
 STEP = 1e-3  #: step of the differences that check derivatives, as a fraction of the duration
 SLACK = 1e-3  #: largest difference between derivatives and differences, as a fraction of their size
 LOOSER = 1e3  #: factor on the tolerance for derivatives [1/s, 1/s^2]
@@ -104,7 +104,7 @@ def _fitted(
     given: dict[str, Function | None],
 ) -> tuple[Floats, Floats]:
     """Return times (m + 1,) and coefficients (8, m, size) of the coarsest spline within a limit."""
-    count, known = FEWEST, dict[float, Floats]()
+    count, known = MIN_SEGMENTS, dict[float, Floats]()
     while True:
         times = np.linspace(0.0, span, count + 1)
         spline = _spline(times, _values(joint, times, size, known), closed)
@@ -112,9 +112,9 @@ def _fitted(
         if miss <= limit:
             return times, polynomials(spline, times, 7)
         count *= 2
-        if count > MOST:
+        if count > MAX_SEGMENTS:
             raise ValueError(
-                f"function must be smooth: splines of {MOST} segments still miss it by "
+                f"function must be smooth: splines of {MAX_SEGMENTS} segments still miss it by "
                 f"{miss:.3g} m, tolerance={limit:g} m"
             )
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Arguments = ParamSpec("Arguments")
 
 TERMS = 8  #: coefficients of a polynomial of degree 7, as minimum snap requires
-LEAST_SPEED = 1e-3  #: horizontal speed below which a heading along the path is held [m/s]
+MIN_SPEED = 1e-3  #: horizontal speed below which a heading along the path is held [m/s]
 EARLY = 1e-3  #: fraction of a trajectory after which a start from rest has a direction
 
 
@@ -143,7 +143,7 @@ class Trajectory(Checked, eq=False):
             held &= not self.closed
             d = np.where(held[0][..., np.newaxis], begin, d)
             d = np.where(held[1][..., np.newaxis], end, d)
-            still = held.any(axis=0) | (np.hypot(d[..., 0], d[..., 1]) < LEAST_SPEED)
+            still = held.any(axis=0) | (np.hypot(d[..., 0], d[..., 1]) < MIN_SPEED)
         else:
             d = np.array(self.point) - self(times)[..., :2]
             d1, d2 = (-self(times, k)[..., :2] for k in (1, 2))
