@@ -31,6 +31,7 @@ from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
 from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.envs.keywords import TASK_KEYWORDS
 from quad_gym.envs.spaces import ObservationField
+from quad_gym.estimation.logs.log import LOG_COLUMNS, LogColumn
 from quad_gym.flights.columns import COLUMNS, FEATURES
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES
@@ -43,6 +44,7 @@ DOCS = Path(__file__).parents[1]
 FOLDER = DOCS / "reference"
 GUIDE = DOCS / "environments.md"
 """A page with the table of the default observation, between two marks."""
+_PIXELS = ("pixel_0_u", "pixel_0_v", "pixel_1_u", "...")
 FILM = "<!-- film -->"
 """Line of an environment's page; the site shows a film there (`films`)."""
 
@@ -301,6 +303,22 @@ def _fields_page() -> str:
     )
 
 
+def _log_page() -> str:
+    """Columns of a log in a table."""
+    columns = {**LOG_COLUMNS, "pixels": LogColumn(_PIXELS, "pixels", "C", "of each feature")}
+    rows = [
+        (f"`{key}`", ", ".join(f"`{name}`" for name in c.names), c.unit, c.frame, c.meaning)
+        for key, c in columns.items()
+    ]
+    return (
+        "# Columns of a log\n\n[`quad-gym replay`](../logs.md#tables) reads these columns of a "
+        "table. A dictionary may have the columns of a quantity together, by the name at the left. "
+        "Reported standard deviations replace the suite's, and a value of motors holds until "
+        "the next row with one. Frames: I east, north, up; B body (forward, left, up); C image, "
+        "from its center.\n\n" + _table(("together", "columns", "unit", "frame", "meaning"), rows)
+    )
+
+
 def _drawable_page() -> str:
     """Parameters that can be drawn for each episode."""
     rows = [
@@ -336,6 +354,7 @@ def pages() -> dict[Path, str]:
         "drawable": _drawable_page(),
         "suites": _suites_page(),
         "fields": _fields_page(),
+        "log-columns": _log_page(),
         "policies": policy_cards.page(),
     }
     guide = re.sub(

@@ -1,5 +1,4 @@
-"""Consistency after vague starts: the table in docs/sensors-and-filter.md, section Starts.
-`pytest tests/statistical/test_vague_starts.py -m slow -s` prints it."""
+"""Consistency after vague starts; docs/sensors-and-filter.md, Initialization, has the bounds."""
 
 import pytest
 
