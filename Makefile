@@ -72,7 +72,7 @@ results: $(VENV)/.trainer  ## renew the numbers, tables and figures of README an
 	$(BIN)/python -m docs.renewal
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not slow" --durations=30
 
 test-oldest: $(OLDEST)/.tester  ## golden flights and interfaces with the oldest versions admitted
 	$(OLDEST)/bin/python -m pytest -q tests/contract/test_golden.py tests/contract/test_checkers.py \

@@ -108,24 +108,3 @@ def flat(observation):
     if isinstance(observation, dict):
         return np.concatenate(list(observation.values()), axis=-1)
     return observation
-
-
-def _columns(rows):
-    observations, *others = zip(*rows, strict=True)
-    return tuple(np.array(column) for column in (list(map(flat, observations)), *others))
-
-
-def together(base, flights, *, mode="NextStep", threads=1, **keywords):
-    """Fly a batch; return observations, rewards, terminated, truncated, (steps, n, ...) each."""
-    count = len(flights)
-    made = {**SHORT, "base": base, "autoreset_mode": mode, **keywords}
-    env = QuadVectorEnv(count, threads=threads, **made)
-    observation, _ = env.reset(seed=[1000 + flight for flight in flights])
-    rows = [(observation, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool))]
-    rows += [env.step(action)[:4] for action in actions_for(flights)]
-    return _columns(rows)
-
-
-def chosen(columns, flights):
-    """Columns of some flights."""
-    return tuple(column[:, flights].copy() for column in columns)

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from tests.builders import actions_of
-
 IDS = (
     "QuadGym/Hover-v0",
     "QuadGym/Circle-v0",
@@ -44,15 +42,3 @@ def assert_same(left, right, where="root"):
 def state_of(env):
     """Return the state of all flights as bytes, for each of the three interfaces."""
     return getattr(env, "unwrapped", env).flights.batch.snapshot().tobytes()
-
-
-def future_of(env, count, vector):
-    """Return the results of the next 80 steps and of two resets."""
-    seen = []
-    for k in range(80):
-        action = actions_of(k, 1)[0]
-        result = env.step(np.tile(action, (count, 1)) if vector else action)
-        seen.append(result)
-        if not vector and (result[2] or result[3]):
-            seen.append(env.reset())
-    return [*seen, env.reset(), env.reset(seed=4)]

@@ -16,10 +16,9 @@ from tests.contract.comparing import ACTIONS, IDS, LAYOUTS, OBSERVATIONS
 from tests.contract.configurations import CONFIGURATIONS
 
 COVERING = [
-    (env_id, OBSERVATIONS[(i + j) % 4], ACTIONS[j], LAYOUTS[(i + j + j // 2) % 2])
-    for i, env_id in enumerate(IDS)
-    for j in range(5)
+    (IDS[k % 8], OBSERVATIONS[k % 4], ACTIONS[k % 5], LAYOUTS[k // 4 % 2]) for k in range(20)
 ]
+"""Every observation with every action, and every task."""
 
 
 @pytest.fixture(autouse=True)

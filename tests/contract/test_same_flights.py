@@ -12,21 +12,60 @@ import numpy as np
 import pytest
 
 import quad_gym
-from tests.builders import SHORT, actions_for, actions_of, chosen, together, vec_env
-from tests.contract.comparing import assert_same, future_of, state_of
+from tests.builders import SHORT, actions_for, flat, vec_env
+from tests.contract.comparing import assert_same, state_of
 from tests.contract.configurations import CONFIGURATIONS
 
 STANDARD = quad_gym.sensor_suite("standard")
 QUIETER = STANDARD.replace(camera=STANDARD.camera.replace(pixel_sigma=19.0))
+MANY, HALF = range(40), 30
+SOME = np.random.default_rng(1).permutation(40)[:11].tolist()
+
+
+def twin_of(env, pickled):
+    return pickle.loads(pickle.dumps(env)) if pickled else copy.deepcopy(env)
+
+
+def made(name, count, **more):
+    """A vector environment of a configuration, whose episodes end at different steps."""
+    base, keywords = CONFIGURATIONS[name]
+    return vec_env(base, count, **{**SHORT, "autoreset_mode": "SameStep", **keywords, **more})
+
+
+def begun(env, flights, last=HALF):
+    """Results of a reset with a seed for each flight, and of the first steps."""
+    start = env.reset(seed=[1000 + flight for flight in flights])
+    return [start[:1], *(env.step(action) for action in actions_for(flights)[:last])]
+
+
+def future(env):
+    """Results of the following steps of MANY flights, and of two resets."""
+    later = [env.step(action) for action in actions_for(MANY)[HALF:]]
+    return [*later, env.reset(), env.reset(seed=4)]
+
+
+def columns(rows, flights=slice(None)):
+    """Observations, rewards and endings of some flights."""
+    return [[flat(part)[flights] for part in row[:4]] for row in rows]
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_size_order_and_threads_do_not_change_flights(name):
-    base, keywords = CONFIGURATIONS[name]
-    many = together(base, range(40), mode="SameStep", threads=2, **keywords)
-    order = np.random.default_rng(1).permutation(40)[:11]
-    few = together(base, order.tolist(), mode="SameStep", **keywords)
-    assert_same(few, chosen(many, order))
+def test_flights_depend_on_their_seeds_and_actions_only(name):
+    """Not on size, order and threads of the batch, on copies, snapshots or earlier episodes."""
+    env = made(name, len(MANY), threads=2)
+    first = begun(env, MANY)
+    instant, past = env.flights.batch.snapshot(), state_of(env)
+    twin = twin_of(env, pickled=len(name) % 2)
+    onward = future(env)
+    assert state_of(twin) == past
+    assert_same(future(twin), onward)
+    for other in (env, made(name, len(MANY), seed=99)):
+        other.flights.batch.restore(instant)
+        assert_same(future(other), onward)
+    few = begun(made(name, len(SOME), threads=1), SOME, last=None)
+    assert_same(columns(few), columns([*first, *onward[:-2]], SOME))
+    assert_same(begun(env, MANY), first)
+    assert (flat(env.reset(seed=7)[0]) != flat(first[0][0])).any(axis=1).all()
 
 
 def test_actions_of_one_flight_do_not_change_others():
@@ -39,8 +78,8 @@ def test_actions_of_one_flight_do_not_change_others():
 
 
 def digest():
-    flown = together("random_trajectory", range(9), mode="SameStep")
-    return hashlib.sha256(b"".join(column.tobytes() for column in flown)).hexdigest()
+    flown = columns(begun(made("random_trajectory", 9), range(9)))
+    return hashlib.sha256(b"".join(part.tobytes() for row in flown for part in row)).hexdigest()
 
 
 def test_another_process_flies_the_same_flights():
@@ -55,76 +94,31 @@ def test_another_process_flies_the_same_flights():
     assert other.stdout.strip() == digest()
 
 
-def pickled(env):
-    return pickle.loads(pickle.dumps(env))
+@pytest.mark.parametrize("pickled", [True, False])
+@pytest.mark.parametrize("kind", ["single", "wrapped", "sb3"])
+def test_copied_environment_has_the_same_future(kind, pickled):
+    if kind == "sb3":
+        env = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", n_envs=9, seed=3, **SHORT)
+        env.reset()
+    else:
+        env = gymnasium.make("QuadGym/Hover-v0", max_tilt=0.6)
+        env = env.unwrapped if kind == "single" else env
+        env.reset(seed=6)
+    actions = actions_for(range(9))
 
+    def onward(env, chosen):
+        seen = []
+        for action in actions[chosen]:
+            seen.append(env.step(action if kind == "sb3" else action[0])[: 3 + (kind != "sb3")])
+            if kind != "sb3" and (seen[-1][2] or seen[-1][3]):
+                seen.append(env.reset())
+        return seen
 
-@pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
-@pytest.mark.parametrize("wrapped", [False, True])
-def test_copied_environment_has_the_same_future(twin_of, wrapped):
-    env = gymnasium.make("QuadGym/Hover-v0", max_tilt=0.6)
-    env = env if wrapped else env.unwrapped
-    env.reset(seed=6)
-    for action in actions_of(1, 4):
-        env.step(action)
-    twin = twin_of(env)
-    past = state_of(twin)
-    future = future_of(env, 1, vector=False)
+    onward(env, slice(4))
+    twin = twin_of(env, pickled)
+    past, mine = state_of(twin), [*onward(env, slice(4, 60)), env.reset()]
     assert state_of(twin) == past
-    assert_same(future, future_of(twin, 1, vector=False))
-
-
-def in_mid_episode(name, count=5, seed=6, steps=25, **more):
-    """A vector environment of a configuration after some steps."""
-    base, keywords = CONFIGURATIONS[name]
-    env = vec_env(
-        count=count, seed=seed, **{**SHORT, "base": base, "threads": 2, **keywords, **more}
-    )
-    for action in actions_for(range(count), steps):
-        env.step(action)
-    return env
-
-
-@pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
-@pytest.mark.parametrize(
-    ("name", "count"), [*((name, 5) for name in CONFIGURATIONS), ("circle", 1), ("circle", 256)]
-)
-def test_copied_vector_environment_has_the_same_future(name, count, twin_of):
-    env = in_mid_episode(name, count)
-    twin = twin_of(env)
-    past = state_of(twin)
-    future = future_of(env, count, vector=True)
-    assert state_of(twin) == past
-    assert_same(future, future_of(twin, count, vector=True))
-
-
-@pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
-def test_copied_sb3_environment_has_the_same_future(twin_of):
-    env = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", n_envs=9, seed=3, **SHORT)
-    env.reset()
-    for k in range(7):
-        env.step(np.tile(actions_of(k, 1), (9, 1)))
-    twin = twin_of(env)
-    for k in range(40):
-        actions = np.tile(actions_of(k, 1), (9, 1))
-        mine, other = env.step(actions), twin.step(actions)
-        for info in (*mine[3], *other[3]):
-            info.get("episode", {}).pop("t", None)
-        assert_same(mine, other)
-    assert_same(env.reset(), twin.reset())
-
-
-@pytest.mark.parametrize(
-    ("name", "count"), [*((name, 5) for name in CONFIGURATIONS), ("circle", 1), ("circle", 70)]
-)
-def test_restored_snapshot_has_the_same_future(name, count):
-    made = {"autoreset_mode": "SameStep", "count": count}
-    env, fresh = in_mid_episode(name, **made), in_mid_episode(name, seed=99, steps=1, **made)
-    instant = env.flights.batch.snapshot()
-    future = future_of(env, count, vector=True)
-    for other in (env, fresh):
-        other.flights.batch.restore(instant)
-        assert_same(future, future_of(other, count, vector=True))
+    assert_same([*onward(twin, slice(4, 60)), twin.reset()], mine)
 
 
 def test_snapshot_of_another_batch_is_refused():

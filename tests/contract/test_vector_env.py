@@ -64,11 +64,20 @@ def fly_both(ours, theirs, steps, seed):
     return ended
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", CONFIGURATIONS)
+IN_ALL_MODES = ("circle", "noisy", "faults", "own task")
+ROTATED = [
+    (name, mode)
+    for k, name in enumerate(CONFIGURATIONS)
+    for i, mode in enumerate(MODES)
+    if name in IN_ALL_MODES or i == k % 3
+]
+"""Each configuration in one mode, and some in all."""
+
+
+@pytest.mark.parametrize(("name", "mode"), ROTATED)
 def test_vector_env_equals_sync_vector_env_of_gymnasium(name, mode):
-    terminated, truncated = fly_both(*both(name, 11, mode), steps=STEPS, seed=5)
-    assert terminated + truncated > 11
+    terminated, truncated = fly_both(*both(name, 9, mode), steps=STEPS, seed=5)
+    assert terminated + truncated > 9
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)

@@ -22,9 +22,16 @@ from quad_gym.faults import (
     RotorLoss,
     WrongAssociations,
 )
-from quad_gym.faults.presets import ALL, faults_of
+from quad_gym.faults.presets import ALL, PRESETS, faults_of
 from quad_gym.frames import ecef_to_enu
-from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK, FaultKind, Source
+from quad_gym.records import (
+    BASELINE_BLOCK,
+    FEATURE_SLICE,
+    POSITION_BLOCK,
+    Aid,
+    FaultKind,
+    Source,
+)
 from quad_gym.rotations import quaternion_to_dcm
 from tests.field_flights import fly
 from tests.unit.alarms import ALARM, alarm_score
@@ -319,3 +326,18 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
     dw = torque / np.diag(vehicle.inertia)[:2] * DT
     measured = (faulty.record("w") - calm.record("w"))[:, :2]
     np.testing.assert_allclose(measured, dw, rtol=0.05, atol=5e-3)
+
+
+def test_fault_presets_are_found_by_name():
+    assert faults_of(None, LAB) == faults_of("none", LAB) == faults_of((), LAB) == ()
+    kinds = {fault.kind for preset in PRESETS.values() for fault in preset}
+    assert kinds <= set(FaultKind)  # some faults have no name
+    named = faults_of("rotor_loss+gnss_outage", LAB)
+    assert [type(fault) for fault in named] == [GnssOutage, RotorLoss]
+    assert named == faults_of(["rotor_loss", PRESETS["gnss_outage"][0]], LAB)
+    flow = quad_gym.sensor_suite("crazyflie")
+    every = AIDED.replace(optical_flow=flow.optical_flow, range_finder=flow.range_finder)
+    assert len(faults_of(ALL, every)) == len(kinds)
+    assert len(faults_of(ALL, RTK)) == len(kinds) - len(Aid)
+    for suite in ("consumer", "indoor"):
+        assert 0 < len(faults_of(ALL, quad_gym.sensor_suite(suite))) < len(FaultKind)

@@ -37,6 +37,7 @@ needs_arm = pytest.mark.skipif(
     not (shutil.which(f"{ARM}-gcc") and shutil.which("qemu-arm-static")),
     reason="no gcc-arm-linux-gnueabihf, or no qemu-user-static",
 )
+slow = partial(pytest.param, marks=pytest.mark.slow)  # half a minute for each target
 REST = {"position": (0.0, 0.0, 1.5), "heading": math.radians(20.0)}
 TURNED = quad_gym.sensor_suite("rtk")
 TURNED = TURNED.replace(
@@ -105,9 +106,14 @@ def test_example_prints_estimates_of_replay(name):
     require_equal(partial(estimates, program), logged(name), suite, start)
 
 
-def turned_table():
-    """A table of `rtk`, whose columns other tests change."""
+@functools.cache
+def rtk_table():
     return Recorded(flown(quad_gym.sensor_suite("rtk"), 3.0), quad_gym.sensor_suite("rtk")).table()
+
+
+def turned_table():
+    """A table of `rtk`, whose columns tests change."""
+    return {name: column.copy() for name, column in rtk_table().items()}
 
 
 @functools.cache
@@ -226,11 +232,11 @@ def on_arm(name, log):
 @pytest.mark.parametrize(
     "run",
     [
-        pytest.param(on_aarch64, id="aarch64", marks=needs_aarch64),
+        pytest.param(on_aarch64, id="aarch64", marks=[needs_aarch64, pytest.mark.slow]),
         pytest.param(on_arm, id="cortex-m7", marks=needs_arm),
     ],
 )
-@pytest.mark.parametrize("name", ["rtk", "consumer"])
+@pytest.mark.parametrize("name", ["rtk", slow("consumer")])
 def test_example_on_foreign_processor_prints_estimates_of_replay(run, name):
     require_equal(partial(run, name), logged(name), quad_gym.sensor_suite(name), {})
 
@@ -246,6 +252,7 @@ def test_examples_print_a_replay_of_1e5_samples():
         require_equal(run, log, suite, {})
 
 
+@pytest.mark.slow
 @needs_wasm
 def test_example_as_webassembly_prints_estimates_of_replay(tmp_path):
     folder, log = exported("rtk", "wasm32"), FOLDER / "samples_wasm.csv"
@@ -269,7 +276,7 @@ def test_example_as_webassembly_prints_estimates_of_replay(tmp_path):
     require_equal(in_node, logged("rtk"), quad_gym.sensor_suite("rtk"), {})
 
 
-@pytest.mark.parametrize("target", ["x86-64", "aarch64", "cortex-m7"])
+@pytest.mark.parametrize("target", ["x86-64", "cortex-m7", slow("aarch64")])
 @pytest.mark.skipif(not shutil.which("nm"), reason="no nm (binutils)")
 def test_compiled_filter_calls_no_function_of_the_math_library(target):
     command = ["nm", "--undefined-only", exported("rtk", target) / LIBRARY]
@@ -498,7 +505,7 @@ def test_archive_is_readable_by_ar(tmp_path):
     assert told.stdout == b"\n<0.o>\n\nodd\n<1.o>\n\neven"
 
 
-@pytest.mark.parametrize("target", ["cortex-m7", "wasm32"])
+@pytest.mark.parametrize("target", ["cortex-m7", slow("wasm32")])
 def test_library_for_a_foreign_processor_has_its_format(target):
     library = (exported("crazyflie", target) / LIBRARY).read_bytes()
     member = library[8 + 60 + int(library[8 + 48 : 8 + 58]) :].lstrip(b"\n")[60:]

@@ -51,9 +51,8 @@ def test_parts_are_compiled_once_and_by_worker_processes(parts):
     assert parts.compiled() == ["a", "b", "c"]
 
 
-@pytest.mark.parametrize(
-    "what", ["prepare(parts.NAMES, processes=2)", pytest.param("pass", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["prepare(parts.NAMES, processes=2)", "pass"])
 def test_six_processes_that_begin_at_once_compile_each_part_once(parts, what):
     """Parts are compiled by `prepare`, or by calls without it."""
     output, said = parts.run(MANY.replace("{what}", what))
@@ -64,6 +63,7 @@ def test_six_processes_that_begin_at_once_compile_each_part_once(parts, what):
     assert len([line for line in lines if "quad_gym: compiling" in line]) in (1, 3)
 
 
+@pytest.mark.slow  # a worker that fails is tested below
 def test_parts_of_killed_workers_are_compiled_by_the_parent(parts):
     output, _ = parts.run(MOOD="die")
     assert output == RIGHT
