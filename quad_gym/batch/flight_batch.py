@@ -25,7 +25,7 @@ from quad_gym.packing.flight import params_block, params_record
 from quad_gym.packing.paths import pack_paths
 from quad_gym.packing.settings import settings_record
 from quad_gym.params import checks as check
-from quad_gym.params.resolved import taking
+from quad_gym.params.shown import takes
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.world import WorldParams
 from quad_gym.records import (
@@ -56,14 +56,16 @@ class FlightBatch(FlightMemory):
     flight depends only on its seed and its actions, not on the size of the batch, its order or the
     number of threads.
 
-    `quad_gym.packing.configuration.FlightConfiguration` explains the arguments.
+    It takes a `quad_gym.packing.configuration.FlightConfiguration`, or its fields as arguments.
 
     Raises:
         ValueError: If an argument is invalid; nothing is allocated then.
     """
 
-    @taking(FlightConfiguration, "FlightBatch")
-    def __init__(self, c: FlightConfiguration) -> None:
+    @takes(FlightConfiguration)
+    def __init__(self, *values: Any, **keywords: Any) -> None:
+        ready = isinstance(values[0], FlightConfiguration) if len(values) == 1 else False
+        c: FlightConfiguration = values[0] if ready else FlightConfiguration(*values, **keywords)
         self.configuration, self.count = c, int(c.count)
         self.vehicle, self.sensors, self.task, self.world = c.vehicle, c.sensors, c.task, c.world
         self.gains, self.action_params, self.action_delay = c.pd_gains, c.actions, c.action_delay

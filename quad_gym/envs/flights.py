@@ -27,9 +27,8 @@ from quad_gym.faults import Fault
 from quad_gym.faults.presets import needs_sensors
 from quad_gym.packing.configuration import MAX_FLIGHTS, FlightConfiguration
 from quad_gym.params import checks as check
-from quad_gym.params.resolved import resolving
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import sensor_suite
+from quad_gym.params.suites import given_suite
 from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.params.world import WorldParams
 from quad_gym.records import Autoreset, Layout
@@ -204,7 +203,7 @@ _NOT_OF_BATCH = ("observation", "action", "layout", "task", "camera", "estimator
 def _suite(keywords: Mapping[str, Any], camera_is_wanted: bool) -> SensorSuite:
     """Return the sensor suite that the keywords `sensors`, `camera` and `estimator` select."""
     sensors, estimator = keywords["sensors"], keywords["estimator"]
-    suite = resolving(SensorSuite, sensor_suite)("sensors", sensors)
+    suite = given_suite("sensors", sensors)
     if not keywords["camera"]:
         suite = suite.replace(camera=None)
     elif camera_is_wanted and suite.camera is None:

@@ -18,6 +18,7 @@ from quad_gym.params.control import ActionParams
 from quad_gym.params.randomization import Given, Randomization
 from quad_gym.params.reward import RewardParams
 from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.shown import show
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
@@ -145,15 +146,11 @@ def shows(keywords: type) -> Callable[[F], F]:
     """Return a decorator that shows the keywords of a TypedDict in a signature."""
 
     def decorate(function: F) -> F:
-        signature = inspect.signature(function)
-        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        more = [
-            inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=DEFAULTS.get(name), annotation=kind
-            )
-            for name, kind in types_of(keywords).items()
-        ]
-        function.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
-        return function
+        kind = inspect.Parameter.KEYWORD_ONLY
+        types = types_of(keywords).items()
+        return show(
+            function,
+            [inspect.Parameter(n, kind, default=DEFAULTS.get(n), annotation=t) for n, t in types],
+        )
 
     return decorate

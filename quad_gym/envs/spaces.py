@@ -12,9 +12,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.resolved import resolving
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import sensor_suite
+from quad_gym.params.suites import given_suite
 from quad_gym.records import AID_FREEDOMS, COLUMNS, MAX_OBSERVATION, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
@@ -156,7 +155,7 @@ def observation_layout(
     """
     check.choice("observation", observation, tuple(OBSERVATIONS))
     check.choice("layout", "relative" if layout is None else layout, tuple(LAYOUTS))
-    suite = resolving(SensorSuite, sensor_suite)("sensors", sensors)
+    suite = given_suite("sensors", sensors)
     raw = observation == "measurements"
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
     if raw:

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from quad_gym.estimation.headings import RESOLVED, collapse, moments, update_and
 from quad_gym.estimation.history import SAME_TIME, InputHistory
 from quad_gym.estimation.samples import Measurement, Sample, checked_measurement
 from quad_gym.params import checks as check
-from quad_gym.params.resolved import taking
 from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.shown import takes
 from quad_gym.records import FilterForm, FilterStatus
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
@@ -48,8 +49,8 @@ class KalmanFilter(FilterEstimate):
 
     # ---- the cycle ----------------------------------------------------------------------------
 
-    @taking(FirstFix, "initialize")
-    def initialize(self, fix: FirstFix) -> None:
+    @takes(FirstFix)
+    def initialize(self, *values: Any, **keywords: Any) -> None:
         """Start from a first fix; `FirstFix` explains the arguments.
 
         With a baseline, the attitude solves Wahba's problem, with the body z axis assumed vertical.
@@ -74,7 +75,9 @@ class KalmanFilter(FilterEstimate):
                 than FARTHEST_FIX from the reference antenna, the baseline is zero, arguments
                 contradict each other, or the suite lacks a sensor.
         """
-        start, engine = filter_start(self.sensors, fix), self._engine
+        check.keywords(keywords, [field.name for field in fields(FirstFix)], "initialize")
+        fix, engine = FirstFix(*values, **keywords), self._engine
+        start = filter_start(self.sensors, fix)
         self._begin(check.number("time", fix.time), len(start.estimates))
         start.write(engine)
         if len(start.estimates) > 1:

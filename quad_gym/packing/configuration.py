@@ -1,9 +1,10 @@
 """`FlightConfiguration`: the keywords of `FlightBatch`, checked; packing reads them."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass, fields
-from functools import cached_property
+from dataclasses import KW_ONLY, fields
+from enum import IntEnum
+from functools import cached_property, partial
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,23 +12,20 @@ from numpy.typing import NDArray
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import FaultsGiven, faults_of
 from quad_gym.params import checks as check
+from quad_gym.params.checked import Checked
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.draw_limits import check_draws
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.randomization import DrawingTable, Randomization
-from quad_gym.params.randomization import Given as Drawn
-from quad_gym.params.resolved import Resolved, resolving
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import ALL_SUITES, sensor_suite
+from quad_gym.params.suites import ALL_SUITES, given_suite, sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
 
 MAX_FLIGHTS = 10**7  #: largest number of flights in a batch
-FILTER_STARTS = ("cold", "warm")  #: values of the keyword `filter_start`
-
 _WITHOUT = {
     "gains": tuple(control for control in Control if control is not Control.PD),
     "action_params": (Control.PD, Control.MOTOR, Control.WRENCH),
@@ -35,62 +33,70 @@ _WITHOUT = {
 """Arguments of controllers, and the meanings of an action with which they have no effect."""
 
 
-class _World(Resolved[WorldParams | str, WorldParams]):
-    """Field for a world; a preset is that of the flown vehicle."""
-
-    def __set__(self, instance: "FlightConfiguration", given: WorldParams | str) -> None:
-        if isinstance(given, str):
-            vehicle = check.instance("true_vehicle", instance.flown_vehicle, VehicleParams)
-            given = world_params(given, vehicle)
-        super().__set__(instance, given)
+def _vehicle(name: str, given: Any) -> VehicleParams:
+    return check.instance(
+        name, vehicle_params(given) if isinstance(given, str) else given, VehicleParams
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class FlightConfiguration:
+def _unresolved(_: str, given: Any) -> Any:
+    return given
+
+
+def _member(kind: type[IntEnum]) -> check.Rule:
+    return lambda _, given: kind(given)
+
+
+def _task(name: str, given: Any) -> TaskParams:
+    return check.instance(name, TaskParams() if given is None else given, TaskParams)
+
+
+def _randomization(_: str, given: Any) -> Randomization:
+    return Randomization.of(given)
+
+
+class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
     """Arguments of `FlightBatch`: number of flights, and everything that they have in common.
 
-    `quad_gym.QuadEnv` explains the fields that are keywords of environments, too. See
-    `quad_gym.batch.cold_start` and `warm_start` for the bounds and the details of `filter_start`.
+    `quad_gym.QuadEnv` explains the fields that are keywords of environments, too. Vehicle, sensors
+    and world may be given by their names. See `quad_gym.batch.cold_start` and `warm_start` for the
+    bounds and the details of `filter_start`.
 
     Raises:
         ValueError: If a value is invalid, or has no effect with the others.
     """
 
-    count: int
+    count: Annotated[int, partial(check.whole, most=MAX_FLIGHTS)]
     """number of flights"""
     _: KW_ONLY
-    vehicle: Resolved[VehicleParams | str, VehicleParams] = Resolved(
-        resolving(VehicleParams, vehicle_params), "lab"
-    )
-    sensors: Resolved[SensorSuite | str, SensorSuite] = Resolved(
-        resolving(SensorSuite, sensor_suite), "standard"
-    )
+    vehicle: Annotated[VehicleParams, _vehicle] = cast(Any, "lab")
+    sensors: Annotated[SensorSuite, given_suite] = cast(Any, "standard")
     gains: PDGains | str | None = None
     """gains of `Control.PD`, or the name of a preset; None: "lab\""""
     action_params: ActionParams | None = None
-    task: Resolved[TaskParams | None, TaskParams] = Resolved(resolving(TaskParams), None)
+    task: Annotated[TaskParams, _task] = cast(Any, None)
     """reference, start and termination"""
-    source: Source = Source.ESTIMATE
+    source: Annotated[Source, _member(Source)] = Source.ESTIMATE
     """source of the state that the controller observes"""
-    control: Control = Control.PD
+    control: Annotated[Control, _member(Control)] = Control.PD
     """meaning of an action; `Control.PD` flies without actions"""
     control_rate: float | None = None
     """actions per second, which must divide the IMU rate; None: the IMU rate [Hz]"""
     substeps: int = 1
-    action_delay: float = 0.0
-    layout: Layout = Layout.RELATIVE
+    action_delay: Annotated[float, check.between(0.0, float(MAX_ACTION_DELAY))] = 0.0
+    layout: Annotated[Layout, _member(Layout)] = Layout.RELATIVE
     """layout of the observations"""
     include_std: bool = False
     privileged: bool = False
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     """(low, high) of the observations, each (n,); None: no observations"""
-    autoreset: Autoreset = Autoreset.DISABLED
+    autoreset: Annotated[Autoreset, _member(Autoreset)] = Autoreset.DISABLED
     """start of the next episode after one has ended"""
     run_filter: bool | None = None
     """True: sensors and filter run; None: they run if another argument needs them"""
     estimator: object = None
     """an own `quad_gym.Estimator`, its class, or "module:Class"; None: the filter of the sensors"""
-    filter_start: str = "cold"
+    filter_start: Literal["cold", "warm"] = "cold"
     innovations: bool = False
     """True: keep innovations and NIS block by block, for `record`: "innovation",
     "innovation_sigma", "block_nis". Filters with an innovation gate, with `faults`, or with
@@ -98,36 +104,23 @@ class FlightConfiguration:
     threads: int | None = None
     true_vehicle: VehicleParams | None = None
     true_sensors: SensorSuite | None = None
-    world: Resolved[WorldParams | str, WorldParams] = _World(
-        resolving(WorldParams, world_params), "calm"
-    )
-    randomization: Resolved[Randomization | Mapping[str, Drawn] | None, Randomization] = Resolved(
-        lambda _, given: Randomization.of(given), None
-    )
+    world: Annotated[WorldParams, _unresolved] = cast(Any, "calm")
+    """a preset is that of the flown vehicle"""
+    randomization: Annotated[Randomization, _randomization] = cast(Any, None)
     faults: FaultsGiven = None
 
     def __post_init__(self) -> None:
-        check.whole("count", self.count, most=MAX_FLIGHTS)
-        for name, kind in (
-            ("source", Source),
-            ("control", Control),
-            ("layout", Layout),
-            ("autoreset", Autoreset),
-        ):
-            object.__setattr__(self, name, kind(getattr(self, name)))
+        super().__post_init__()
+        world: Any = self.world
+        if isinstance(world, str):
+            world = world_params(world, self.flown_vehicle)
+        self._set("world", check.instance("world", world, WorldParams))
         check.instance("gains", self.pd_gains, PDGains)
-        check.instance("action_params", self.actions, ActionParams)
-        check.instance("true_vehicle", self.flown_vehicle, VehicleParams)
-        check.instance("true_sensors", self.flown_sensors, SensorSuite)
-        for name in ("innovations", "include_std", "privileged"):
-            check.flag(name, getattr(self, name))
-        check.choice("filter_start", self.filter_start, FILTER_STARTS)
         check_limit(self.task, self.clocks.imu_rate, "IMU rate")
         self.sensors.require_like(self.flown_sensors)
         self._require_effect()
         if self.filters:
             self.sensors.require_filter()
-        check.number("action_delay", self.action_delay, least=0.0, most=float(MAX_ACTION_DELAY))
         if self.longest_delay > 0 and self.control is Control.PD:
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(self.draws, self.flown_vehicle, self.world, self.clocks)
@@ -210,7 +203,7 @@ class FlightConfiguration:
     def filters(self) -> bool:
         """True if sensors and filter run."""
         if self.run_filter is not None:
-            return check.flag("run_filter", self.run_filter)
+            return self.run_filter
         needed = self.include_std or self.innovations
         return needed or self.source in (Source.ESTIMATE, Source.MEASUREMENTS)
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import inspect
-from functools import partial
+from functools import partial, wraps
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -40,16 +40,6 @@ def _unless_none(rule: Rule, name: str, value: Any) -> Any:
     return None if value is None else rule(name, value)
 
 
-class _Signature:
-    """The signature of a dataclass that has a `__new__`, which Python would show in its place."""
-
-    def __get__(self, instance: Any, owner: type) -> inspect.Signature:
-        """Return the parameters of its `__init__` without `self`."""
-        init = owner.__init__  # type: ignore[misc]
-        _, *parameters = inspect.signature(init).parameters.values()
-        return inspect.Signature(parameters)
-
-
 @dataclass_transform(
     frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
 )
@@ -57,36 +47,41 @@ class Checked:
     """Base of frozen dataclasses whose fields are replaced by their checked form on creation.
 
     Subclasses are dataclasses without a decorator, with keyword-only fields by default. The rule of
-    a field is part of its type, as in `Annotated[float, rule]`, or follows from it.
+    a field is part of its type, as in `Annotated[float, rule]`, or follows from it. Errors name a
+    field with its class; `bare`: without it.
+
+    Raises:
+        UnknownKeywordError: If a keyword is no field.
     """
 
-    __signature__ = _Signature()
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
     _rules: ClassVar[dict[str, Rule]] = {}
+    _prefix: ClassVar[str]
 
-    def __init_subclass__(cls, *, kw_only: bool = True, eq: bool = True) -> None:
+    def __init_subclass__(
+        cls, *, kw_only: bool = True, eq: bool = True, bare: bool = False
+    ) -> None:
         """Move the rules out of the types of fields, which then are plain, and make a dataclass."""
         super().__init_subclass__()
+        cls._prefix = "" if bare else f"{cls.__name__}."
         split = {name: _rule_of(hint) for name, hint in inspect.get_annotations(cls).items()}
         cls.__annotations__ = {name: plain for name, (plain, _) in split.items()}
         cls._rules = cls._rules | {name: rule for name, (_, rule) in split.items() if rule}
         dataclasses.dataclass(frozen=True, kw_only=kw_only, eq=eq)(cls)
+        create = cls.__init__
+        known = [field.name for field in dataclasses.fields(cls) if field.init]
+
+        @wraps(create)
+        def init(self: Self, *values: Any, **given: Any) -> None:
+            keywords(given, known, cls.__name__)
+            create(self, *values, **given)
+
+        cls.__init__ = init  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         """Apply the rules of all fields."""
         for name, rule in self._rules.items():
-            self._set(name, rule(f"{type(self).__name__}.{name}", getattr(self, name)))
-
-    def __new__(cls, *_: Any, **given: Any) -> Self:
-        """Refuse keywords that are no fields, and name the field that may be meant.
-
-        Raises:
-            UnknownKeywordError: If there is one.
-        """
-        if given:
-            fields = dataclasses.fields(cls)
-            keywords(given, [field.name for field in fields if field.init], cls.__name__)
-        return super().__new__(cls)
+            self._set(name, rule(self._prefix + name, getattr(self, name)))
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -94,7 +89,7 @@ class Checked:
     def _refuse(self, name: str, must: str, got: Any = ...) -> NoReturn:
         """Raise a ValueError for a field that must be otherwise."""
         value = getattr(self, name) if got is ... else got
-        raise ValueError(f"{type(self).__name__}.{name} must {must}, got {value}")
+        raise ValueError(f"{self._prefix}{name} must {must}, got {value}")
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; all values are checked again."""

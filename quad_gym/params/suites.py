@@ -358,6 +358,12 @@ def sensor_suite(name: str | Path) -> SensorSuite:
     return _ALL[name]
 
 
+def given_suite(name: str, given: Any) -> SensorSuite:
+    """Return a suite that is given as one or by its name, under the name of the argument."""
+    suite = sensor_suite(given) if isinstance(given, str) else given
+    return check.instance(name, suite, SensorSuite)
+
+
 def suite_label(name: str) -> str:
     """The name of a suite in titles and names of files: for a file, without folder and ending."""
     return Path(name).stem if is_params_file(name) else name

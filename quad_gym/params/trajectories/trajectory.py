@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.params import checks, portable
 from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
+from quad_gym.params.shown import show
 from quad_gym.params.trajectories.feasibility import check_trajectory
 from quad_gym.params.trajectories.fitting import fit
 from quad_gym.params.trajectories.pieces import Floats, HeadingRule, Pieces
@@ -40,12 +41,8 @@ def _making(
     ) -> "Trajectory":
         return cls(**function(*values, **named)._asdict())
 
-    own = inspect.Parameter("cls", inspect.Parameter.POSITIONAL_ONLY)
-    others = inspect.signature(function).parameters.values()
-    shown = inspect.Signature([own, *others], return_annotation="Trajectory")
-    make.__signature__ = shown  # type: ignore[attr-defined]
     make.__annotations__ = {**function.__annotations__, "return": "Trajectory"}
-    return classmethod(make)
+    return classmethod(show(make, inspect.signature(function).parameters.values()))
 
 
 class Trajectory(Checked, eq=False):
