@@ -1,10 +1,9 @@
-"""Show a flight live in a window, as a video, or in the Rerun viewer, and save its data.
+"""Show a flight live in a window or as a video, and save its data.
 
     quad-gym fly lemniscate
     quad-gym fly circle --no-camera --faults gnss_outage --fault-time 4 7
     quad-gym fly circle --faults rotor_loss --output results/outage.mp4
     quad-gym fly --replay results/outage.npz --view chase
-    quad-gym fly --replay results/outage.npz --output results/outage.rrd
 
 The blue vehicle is the truth. The orange ghost is the filter's estimate, with its 3-sigma
 ellipsoid; the controller flies on the estimate unless --observation selects another source.
@@ -32,14 +31,13 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import options
 from quad_gym.evaluation import Policy
 from quad_gym.faults.presets import PRESETS, faults_of
-from quad_gym.flights.rerun import load_rerun
 from quad_gym.params import checks as check
 from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path, fly_steps
 
 FAULTS = tuple(name for name in PRESETS if name != "none")
-ENDINGS = (*VIDEO_ENDINGS, ".npz", ".csv", ".rrd")
+ENDINGS = (*VIDEO_ENDINGS, ".npz", ".csv")
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ class FlyArgs:
     """frames per second of a video"""
     output: Path | None = None
     """file to write instead of opening a window: a video (.mp4, .gif or .webp), saved with the
-    flight as .npz; only the flight (.npz or .csv); or a recording for the Rerun viewer (.rrd)"""
+    flight as .npz; or only the flight (.npz or .csv)"""
     replay: Path | None = None
     """saved flight (.npz) to show instead of a new one"""
 
@@ -135,8 +133,6 @@ def check_options(args: FlyArgs) -> None:
             raise ValueError(f"--output must end in one of {', '.join(ENDINGS)}, got {args.output}")
         if ending in VIDEO_ENDINGS:
             checked_video_path(args.output)
-        if ending == ".rrd":
-            load_rerun()
         require_writable("--output", args.output.parent)
     if ending is None or ending in VIDEO_ENDINGS:
         Renderer(args.view, args.size)
@@ -215,12 +211,6 @@ def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
     ending = path.suffix.lower()
     if ending in (".npz", ".csv"):
         return [flight.save(path) if ending == ".npz" else flight.to_csv(path)]
-    if ending == ".rrd":
-        path.parent.mkdir(parents=True, exist_ok=True)
-        recording = flight.to_rerun()
-        recording.save(path)
-        recording.disconnect()  # which completes the file
-        return [path]
 
     def progress(times: Iterable[float]) -> Iterator[float]:
         yield from tqdm(times, desc="rendering", unit=" frames")

@@ -1,1 +1,1 @@
-"""The record of one flight: its columns, its files, its replay in Rerun."""
+"""The record of one flight: its columns and its files."""

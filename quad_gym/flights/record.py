@@ -17,7 +17,6 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.flights import files
 from quad_gym.flights.columns import READ, WITH_FILTER, row_dtype
 from quad_gym.flights.flight_scene import FlightScene
-from quad_gym.flights.rerun import rerun_recording
 from quad_gym.packing.flight import params_record
 from quad_gym.params import checks as check
 from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, Source
@@ -25,7 +24,6 @@ from quad_gym.rotations import quaternion_to_dcm
 
 if TYPE_CHECKING:
     import pandas
-    import rerun
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,17 +82,6 @@ class Flight:
         """
         pandas = check.package("pandas", "to_pandas", "pandas")
         return pandas.DataFrame(files.table(self.rows)).set_index("time")
-
-    def to_rerun(self) -> "rerun.RecordingStream":
-        """Return a recording for the Rerun viewer: 3D, camera image and plots on one timeline.
-
-        `flight.to_rerun().spawn()` opens the viewer; `flight.to_rerun().save("flight.rrd")` writes
-        a file for it. `quad_gym.flights.rerun` lists the contents.
-
-        Raises:
-            ImportError: If rerun-sdk is not installed.
-        """
-        return rerun_recording(self)
 
 
 class FlightRecorder:

@@ -70,15 +70,6 @@ def test_any_suite_is_made_with_and_without_a_camera(suite, camera):
     assert (env.unwrapped.flights.batch.sensors.camera is not None) == wanted
 
 
-def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
-    pytest.importorskip("rerun")
-    options = ("hover", "--duration", 0.1, "--output", "new/hover.rrd")
-    done = fly(*options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "Wrote new/hover.rrd" in done.stdout
-    assert (tmp_path / "new" / "hover.rrd").read_bytes()[:4] == b"RRF2"
-
-
 def test_faults_begin_and_end_at_given_times(tmp_path):
     options = ("hover", "--duration", 3, "--faults", "gnss_outage", "--fault-time", 1, 2)
     done = fly(*options, "--no-camera", "--output", "flight.npz", cwd=tmp_path)

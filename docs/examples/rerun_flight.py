@@ -1,4 +1,11 @@
-"""A `Flight` as a Rerun recording: 3D, the camera's image and plots on one timeline.
+"""Show a saved flight in the Rerun viewer: 3D, the camera's image and plots on one timeline.
+
+    pip install rerun-sdk
+    quad-gym fly circle --output flight.npz
+    python docs/examples/rerun_flight.py flight.npz             # opens the viewer
+    python docs/examples/rerun_flight.py flight.npz flight.rrd  # writes a recording for it
+
+`rerun_recording` makes the recording of a `quad_gym.Flight` in memory, too.
 
 | entity | contents |
 |---|---|
@@ -15,14 +22,18 @@ Times are seconds since the start of the episode, lengths meters, in east, north
 3D objects in single precision and plots in double precision.
 """
 
+import argparse
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from quad_gym import Flight
 from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
-from quad_gym.params import checks as check
 from quad_gym.records import GateDecision, Shape
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
@@ -39,11 +50,10 @@ TRUTH, ESTIMATE, REFERENCE = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 FIX, RAY, NEUTRAL = (204, 121, 167), (86, 180, 233), (130, 130, 130)
 
 
-def rerun_recording(flight: Any) -> Any:
-    """Return the `rerun.RecordingStream` of a `Flight`."""
-    rr = load_rerun()
+def rerun_recording(flight: Flight) -> rr.RecordingStream:
+    """Return the recording of a flight."""
     recording = rr.RecordingStream("quad_gym")
-    log = _Log(flight, rr, recording)
+    log = _Log(flight, recording)
     log.scene()
     log.vehicles()
     log.reference()
@@ -57,30 +67,25 @@ def rerun_recording(flight: Any) -> Any:
     return recording
 
 
-def load_rerun() -> Any:
-    """Return the module `rerun`, or raise an ImportError."""
-    return check.package("rerun", "to_rerun", "rerun")
-
-
 class _Log:
     """Sender of the columns of a flight to a recording, entity by entity."""
 
-    def __init__(self, flight: Any, rr: Any, recording: Any) -> None:
-        self._flight, self._scene, self._rr, self._recording = flight, flight.scene, rr, recording
+    def __init__(self, flight: Flight, recording: rr.RecordingStream) -> None:
+        self._flight, self._scene, self._recording = flight, flight.scene, recording
 
     def _static(self, entity: str, what: Any) -> None:
         self._recording.log(entity, what, static=True, strict=True)
 
     def _send(self, entity: str, columns: Any, chosen: NDArray[np.bool_] | None = None) -> None:
         times = self._flight["time"]
-        index = self._rr.TimeColumn(TIMELINE, duration=times if chosen is None else times[chosen])
+        index = rr.TimeColumn(TIMELINE, duration=times if chosen is None else times[chosen])
         self._recording.send_columns(entity, indexes=[index], columns=columns, strict=True)
 
     # ---- the world ----------------------------------------------------------------------------
 
     def scene(self) -> None:
         """Log the constant part of the scene."""
-        rr, scene = self._rr, self._scene
+        scene = self._scene
         self._static("about", rr.TextDocument(self._about(), media_type=rr.MediaType.MARKDOWN))
         self._static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         if scene.reference_period and not len(scene.gates_I):
@@ -98,7 +103,7 @@ class _Log:
 
     def _obstacles(self) -> None:
         """Log walls as boxes, cylinders as cylinders, and the geofence as edges."""
-        rr, scene = self._rr, self._scene
+        scene = self._scene
         solid = {"colors": [NEUTRAL], "fill_mode": "solid"}
         is_wall = scene.obstacles[:, 0] == Shape.WALL
         walls, cylinders = scene.obstacles[is_wall], scene.obstacles[~is_wall]
@@ -125,7 +130,7 @@ class _Log:
 
     def reference(self) -> None:
         """Log the present reference, and the reference over the next second."""
-        rr, flight, scene = self._rr, self._flight, self._scene
+        flight, scene = self._flight, self._scene
         at = rr.Points3D.columns(positions=flight["reference_position"])
         self._static("world/reference/now", rr.Points3D.from_fields(radii=0.05, colors=[REFERENCE]))
         self._send("world/reference/now", at)
@@ -142,13 +147,13 @@ class _Log:
         """Log the vehicle at its true pose, with body axes."""
         self._body("world/truth", "position", "quaternion", TRUTH)
         axes = 0.42 * np.eye(3)
-        arrows = self._rr.Arrows3D(vectors=axes, colors=[NEUTRAL], labels=list("xyz"))
+        arrows = rr.Arrows3D(vectors=axes, colors=[NEUTRAL], labels=list("xyz"))
         self._static("world/truth/axes", arrows)
         self._trail("truth", "position", TRUTH)
 
     def estimate(self) -> None:
         """Log the vehicle at its estimated pose, with the covariance of its position."""
-        rr, flight = self._rr, self._flight
+        flight = self._flight
         self._body("world/estimate", "estimated_position", "estimated_quaternion", ESTIMATE)
         self._trail("estimate", "estimated_position", ESTIMATE)
         good = np.isfinite(flight["covariance"]).all(axis=(1, 2))
@@ -165,7 +170,7 @@ class _Log:
         self._send("world/ellipsoid", columns, good)
 
     def _body(self, entity: str, position: str, attitude: str, color: tuple[int, ...]) -> None:
-        rr, flight, hubs = self._rr, self._flight, self._scene.rotor_positions_B
+        flight, hubs = self._flight, self._scene.rotor_positions_B
         good = np.isfinite(flight[position]).all(axis=1) & np.isfinite(flight[attitude]).all(axis=1)
         columns = rr.Transform3D.columns(
             translation=flight[position][good], quaternion=_xyzw(flight[attitude][good])
@@ -179,7 +184,7 @@ class _Log:
 
     def _trail(self, name: str, position: str, color: tuple[int, ...]) -> None:
         """Log one segment per row; the view shows the segments of the last seconds."""
-        rr, places = self._rr, self._flight[position]
+        places = self._flight[position]
         good = np.isfinite(places).all(axis=1)
         pieces = np.stack([np.concatenate([places[:1], places[:-1]]), places], axis=1)
         good &= np.isfinite(pieces).all(axis=(1, 2))
@@ -191,7 +196,7 @@ class _Log:
 
     def fixes(self) -> None:
         """Log GNSS fixes when they arrive; in gray if the filter's gate rejected them."""
-        rr, fixes = self._rr, self._flight["gnss_position"]
+        fixes = self._flight["gnss_position"]
         measured = np.isfinite(fixes).all(axis=1)
         if measured.any():
             refused = self._flight["gnss_decision"][measured, 0] == GateDecision.REJECTED
@@ -202,7 +207,7 @@ class _Log:
 
     def camera(self) -> None:
         """Log the image plane with measured and predicted features, and rays to the features."""
-        rr, flight, scene = self._rr, self._flight, self._scene
+        flight, scene = self._flight, self._scene
         turn = _xyzw(dcm_to_quaternion(scene.R_CB))
         camera = "world/truth/camera"
         self._static(camera, rr.Transform3D(translation=scene.camera_B, quaternion=turn))
@@ -268,16 +273,15 @@ class _Log:
             self._plot(f"actions/{k + 1}", flight["action"][:, k], color, f"action {k + 1}")
 
     def _plot(self, name: str, values: Floats, color: tuple[int, ...], words: str) -> None:
-        entity, rr = f"plots/{name}", self._rr
+        entity = f"plots/{name}"
         self._static(entity, rr.SeriesLines(colors=[color], names=[words]))
         good = np.isfinite(values)
         if good.any():
             self._send(entity, rr.Scalars.columns(scalars=values[good]), good)
 
 
-def _blueprint(flight: Any) -> Any:
+def _blueprint(flight: Flight) -> rrb.Blueprint:
     """Return the layout of the viewer: 3D on the left, camera and plots on the right."""
-    import rerun.blueprint as rrb
 
     def last(seconds: float) -> Any:
         start = rrb.TimeRangeBoundary.cursor_relative(seconds=-seconds)
@@ -322,3 +326,21 @@ def _numbers(count: int) -> list[str]:
 def _xyzw(q: Floats) -> Floats:
     """Quaternions (..., 4) in Rerun's order, from (w, x, y, z)."""
     return np.roll(q, -1, axis=-1)
+
+
+def main() -> None:
+    """Open the viewer, or write the file that is given."""
+    parser = argparse.ArgumentParser(description="Show a saved flight in the Rerun viewer.")
+    parser.add_argument("flight", type=Path, help="the flight, a file .npz")
+    parser.add_argument("output", type=Path, nargs="?", help="the recording to write, a file .rrd")
+    args = parser.parse_args()
+    recording = rerun_recording(Flight.load(args.flight))
+    if args.output is None:
+        recording.spawn()
+    else:
+        recording.save(args.output)
+        recording.disconnect()  # which completes the file
+
+
+if __name__ == "__main__":
+    main()

@@ -8,6 +8,7 @@ import pytest
 import quad_gym
 from quad_gym.rotations import quaternion_to_dcm
 from tests.builders import recorded_flight
+from tests.examples import example
 
 
 def flown(task="hover", steps=30, **keywords):
@@ -18,11 +19,12 @@ def flown(task="hover", steps=30, **keywords):
 def read_back(tmp_path):
     """Return a function from a flight to the columns of its recording by entity."""
     pytest.importorskip("rerun")
+    recording = example("rerun_flight").rerun_recording
     chunk = pytest.importorskip("rerun.chunk", reason="this rerun-sdk cannot read files")
 
     def entities(flight):
         file = tmp_path / "flight.rrd"
-        flight.to_rerun().save(file)
+        recording(flight).save(file)
         found = {}
         for piece in chunk.RrdReader(file).stream().to_chunks():
             batch = piece.to_record_batch()
@@ -133,7 +135,10 @@ def test_entities_without_data_are_left_out(read_back, keywords, there, missing)
     assert missing not in entities
 
 
-def test_a_missing_rerun_gives_the_install_hint(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ImportError, match=r"quad-gym\[rerun\]"):
-        flown(steps=1).to_rerun()
+def test_a_saved_flight_becomes_a_recording_on_disk(tmp_path, monkeypatch):
+    pytest.importorskip("rerun")
+    flown(steps=2).save(tmp_path / "flight.npz")
+    files = [str(tmp_path / name) for name in ("flight.npz", "flight.rrd")]
+    monkeypatch.setattr(sys, "argv", ["rerun_flight.py", *files])
+    example("rerun_flight").main()
+    assert (tmp_path / "flight.rrd").read_bytes()[:4] == b"RRF2"
