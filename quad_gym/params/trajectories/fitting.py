@@ -13,17 +13,12 @@ from quad_gym.params.trajectories.splines import heading_choice, polynomials
 Function = Callable[[float], Any]
 
 MIN_SEGMENTS, MAX_SEGMENTS = 16, 8192  #: segments that are tried, each time twice as many
-STEP = 1e-3  #: step of the differences that check derivatives, as a fraction of the duration
-SLACK = 1e-3  #: largest difference between derivatives and differences, as a fraction of their size
-LOOSER = 1e3  #: factor on the tolerance for derivatives [1/s, 1/s^2]
 
 
 def fit(
     function: Callable[[float], ArrayLike],
     duration: float,
     *,
-    velocity: Callable[[float], ArrayLike] | None = None,
-    acceleration: Callable[[float], ArrayLike] | None = None,
     closed: bool = False,
     tolerance: float = 1e-6,
     yaw: Callable[[float], float] | float | str | None = None,
@@ -37,10 +32,6 @@ def fit(
     Args:
         function: Position (3,) in I [m] as a function of time [s], from 0 to the duration.
         duration: Duration of the trajectory [s].
-        velocity: First derivative of the position [m/s], if known: checked against differences,
-            and met to 1000 times the tolerance.
-        acceleration: Second derivative of the position [m/s^2], if known: checked and met in
-            the same way.
         closed: True: the trajectory repeats.
         tolerance: Largest distance from the function [m].
         yaw: Heading of body x: None (east), an angle [rad], "along" the horizontal velocity, or
@@ -51,21 +42,17 @@ def fit(
         The trajectory.
 
     Raises:
-        ValueError: If a function does not return finite numbers, a derivative contradicts the
-            function, a closed trajectory does not return to its start, or the function is not
-            smooth enough.
+        ValueError: If a function does not return finite numbers, a closed trajectory does not
+            return to its start, or the function is not smooth enough.
     """
     span = check.positive("duration", duration, least=1e-3)
     check.flag("closed", closed)
     limit = check.positive("tolerance", tolerance, least=1e-9)
-    given = {"function": function, "velocity": velocity, "acceleration": acceleration}
-    for name, part in given.items():
-        if not (callable(part) or (part is None and name != "function")):
-            raise ValueError(f"{name} must be a function of time, got {part!r}")
+    if not callable(function):
+        raise ValueError(f"function must be a function of time, got {function!r}")
     rule, point, angles = heading_choice(yaw, look_at)
     if np.ndim(angles) > 0:
         raise ValueError("yaw must be a number, 'along' or a function of time, got an array")
-    _check_derivatives(given, span)
     if closed:
         begin, end = _called("function", function, [0.0, span], 3)
         if np.abs(end - begin).max() > limit:
@@ -84,7 +71,7 @@ def fit(
         return np.append(np.asarray(function(t), np.float64), angles(t) - turns * t)
 
     size = 4 if callable(angles) else 3
-    times, found = _fitted(joint, span, size, limit, closed, given)
+    times, found = _fitted(joint, span, size, limit, closed)
     terms = np.zeros((8, len(times) - 1, 4))
     terms[..., :size] = found
     if callable(angles):
@@ -96,19 +83,15 @@ def fit(
 
 
 def _fitted(
-    joint: Function,
-    span: float,
-    size: int,
-    limit: float,
-    closed: bool,
-    given: dict[str, Function | None],
+    joint: Function, span: float, size: int, limit: float, closed: bool
 ) -> tuple[Floats, Floats]:
     """Return times (m + 1,) and coefficients (8, m, size) of the coarsest spline within a limit."""
     count, known = MIN_SEGMENTS, dict[float, Floats]()
     while True:
         times = np.linspace(0.0, span, count + 1)
         spline = _spline(times, _values(joint, times, size, known), closed)
-        miss = _misses(spline, joint, times, size, known, given)
+        between = 0.5 * (times[:-1] + times[1:])
+        miss = float(np.abs(spline(between) - _values(joint, between, size, known)).max())
         if miss <= limit:
             return times, polynomials(spline, times, 7)
         count *= 2
@@ -142,48 +125,3 @@ def _spline(times: Floats, values: Floats, closed: bool) -> Any:
     if closed:
         values = np.concatenate([values[:-1], values[:1]])
     return make_interp_spline(times, values, k=7, bc_type="periodic" if closed else None)
-
-
-def _misses(
-    spline: Any,
-    joint: Function,
-    times: Floats,
-    size: int,
-    known: dict[float, Floats],
-    given: dict[str, Function | None],
-) -> float:
-    """Return the distance from the function between knots; for derivatives, over LOOSER."""
-    between = 0.5 * (times[:-1] + times[1:])
-    miss = float(np.abs(spline(between) - _values(joint, between, size, known)).max())
-    for order, name in ((1, "velocity"), (2, "acceleration")):
-        part = given[name]
-        if part is not None:
-            gap = spline(between, order)[:, :3] - _called(name, part, between, 3)
-            miss = max(miss, float(np.abs(gap).max()) / LOOSER)
-    return miss
-
-
-def _check_derivatives(given: dict[str, Any], span: float) -> None:
-    """Refuse derivatives that contradict differences of the functions that they belong to."""
-    step = STEP * span
-    times = np.linspace(2.0 * step, span - 2.0 * step, 31)
-    weights = np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
-    below = "function"
-    for name in ("velocity", "acceleration"):
-        if given[name] is None:
-            if name == "velocity" and given["acceleration"] is not None:
-                raise ValueError("velocity must be given where acceleration is")
-            continue
-        around = (times[:, np.newaxis] + step * np.array([-2.0, -1.0, 1.0, 2.0])).ravel()
-        values = _called(below, given[below], around, 3).reshape(-1, 4, 3)
-        slope = np.einsum("k,tki->ti", weights, values)
-        said = _called(name, given[name], times, 3)
-        miss = np.abs(said - slope).max(axis=1)
-        k = int(miss.argmax())
-        allowed = SLACK * (float(np.abs(slope).max()) + 1e-6)
-        if miss[k] > allowed:
-            raise ValueError(
-                f"{name} must be the derivative of {below}: at {times[k]:g} s differences give "
-                f"{slope[k]}, got {said[k]}"
-            )
-        below = name
