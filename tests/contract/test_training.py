@@ -90,7 +90,10 @@ def test_td3_explores_with_action_noise():
 
 @pytest.mark.parametrize(
     ("algorithm", "steps"),
-    [("ppo", 70), ("ppo", 20), ("sac", 75), pytest.param("td3", 75, marks=pytest.mark.slow)],
+    [
+        *(("ppo", 70), ("sac", 75)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("ppo", 20), ("td3", 75))),
+    ],
 )
 def test_resumed_run_equals_uninterrupted_run(tmp_path, monkeypatch, algorithm, steps):
     plan = small_plan(algorithm)
@@ -240,7 +243,7 @@ def test_every_task_and_algorithm_has_a_valid_recipe():
         recipe(CIRCLE, "dqn")
 
 
-@pytest.mark.parametrize("algorithm", ["td3", "tqc"])
+@pytest.mark.parametrize("algorithm", [pytest.param("td3", marks=pytest.mark.slow), "tqc"])
 def test_td3_and_tqc_write_best_policy(tmp_path, algorithm):
     assert train(small_plan(algorithm), tmp_path, **QUIET).best_policy.exists()
 

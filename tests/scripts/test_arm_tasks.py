@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
 from baselines.recipes import recipe
-from scripts.studies.arm_tasks import CONSTANT_CRASH_COST, RACE_STD
 from scripts.studies.arms import OUTAGE_DASH
 from tests.builders import part
 
@@ -76,34 +75,6 @@ def test_reported_std_is_scaled(name, told):
     np.testing.assert_allclose(change, np.log10(told), atol=1e-5)
 
 
-def test_masked_std_of_a_race_is_constant():
-    task, steps = "QuadGym/StaleRace-v0", 30
-    plain = gymnasium.make_vec(task, num_envs=6, autoreset_mode="Disabled", include_std=True)
-    told, some = make("ALL_SHOWN", env_id=task), make("ATTITUDE_MASKED", env_id=task)
-    shown, _ = plain.reset(seed=3)
-    told, observed, some, partly = *told, *some
-    for _ in range(steps):
-        np.testing.assert_array_equal(observed, shown)
-        withheld = part(some, partly, "attitude_sigma")
-        np.testing.assert_array_equal(withheld, np.float32(RACE_STD["attitude_sigma"][2]))
-        others = np.ones(shown.shape[1], bool)
-        others[-9:-6] = False  # the third of the five blocks
-        np.testing.assert_array_equal(partly[:, others], shown[:, others])
-        actions = np.full((6, 4), 0.01, np.float32)
-        (shown, *_), (observed, *_), (partly, *_) = (e.step(actions) for e in (plain, told, some))
-
-
-def test_observed_race_equals_the_builtin_observation():
-    (plain, a), (own, b) = (
-        make(name, env_id="QuadGym/StaleRace-v0") for name in ("RaceWithHistory", "ObservedRace")
-    )
-    for _ in range(20):
-        for name in (*STATE, "heading", "preview_1", "preview_2", "last_action"):
-            np.testing.assert_allclose(part(own, b, name), part(plain, a, name), atol=1e-5)
-        action = np.full((6, 4), 0.05, np.float32)
-        a, b = plain.step(action)[0], own.step(action)[0]
-
-
 def test_residual_race_observes_true_state_plus_residual():
     env, b = make("ResidualRace", env_id="QuadGym/StaleRace-v0", observation="truth")
     batch = env.unwrapped.flights.batch
@@ -131,24 +102,6 @@ def test_uncertainty_is_two_sigma_over_the_room_in_the_gap():
         observations, *_ = env.step(np.zeros((6, 4), np.float32))
     env, observations = make("WithUncertainty", env_id="QuadGym/OutageDash-v0", observation="truth")
     np.testing.assert_array_equal(part(env, observations, "uncertainty"), -4.0)
-
-
-def test_constant_crash_cost_is_the_same_everywhere():
-    env, _ = make(
-        "ConstantCrashCostWithUncertainty", env_id="QuadGym/OutageDash-v0", observation="truth"
-    )
-    batch, last, action = env.unwrapped.flights.batch, np.zeros((6, 4)), np.zeros((6, 4))
-    action[:, :3] = 0.3, 0.0, -0.5  # forward, and down to the ground
-    for _ in range(60):
-        _, reward, over, *_ = env.step(action)
-        effort = ((action - last) ** 2).sum(axis=1)
-        paid = 0.5 * np.minimum(-batch.record("v")[:, 0], 5.0)
-        costs = 0.02 * effort + 0.002 * (batch.record("w") ** 2).sum(axis=1)
-        np.testing.assert_allclose(reward, paid - costs - CONSTANT_CRASH_COST * over, atol=1e-9)
-        if over.any():
-            return
-        last = action
-    raise AssertionError("no flight crashed")
 
 
 def test_starts_are_before_the_first_wall_or_between_two():
@@ -197,19 +150,6 @@ def test_rules_fly_the_plain_task_and_arms_the_scaled_one():
             load_policy(arm.policy, env)
 
 
-def true_state(env, target):
-    """Return true errors relative to fixed targets, up and body rates, rotated by SciPy."""
-    batch = env.unwrapped.flights.batch
-    body = Rotation.from_quat(batch.record("q"), scalar_first=True)
-    into = body.inv().apply
-    return {
-        "position_error": into(target - batch.record("r")),
-        "up": into(np.tile([0.0, 0.0, 1.0], (len(target), 1))),
-        "body_rates": batch.record("w"),
-        "velocity_error": into(-batch.record("v")),
-    }
-
-
 def test_critic_of_look_around_observes_the_truth():
     plain, _ = make("WithStdCertaintyReward")
     shipped = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", privileged=True)
@@ -225,40 +165,6 @@ def test_critic_of_look_around_observes_the_truth():
         np.testing.assert_array_equal(reward, same)
     seen = part(env, observations, "position_error")
     assert abs(part(env, observations, "actual_position_error") - seen).max() > 0.01
-
-
-def test_critic_of_outage_dash_observes_gap_and_outage():
-    name = "ConstantCrashCostWithUncertainty"
-    env, _ = make(f"{name}ForCritic", 20, DASH_ID, "arm_critics")
-    plain, _ = make(name, 20, DASH_ID)
-    batch = env.unwrapped.flights.batch
-    kinds = set()
-    for _ in range(80):
-        actions = np.tile(np.array([0.15, 0.0, 0.0, 0.0], np.float32), (20, 1))
-        observations, _, over, late, _ = env.step(actions)
-        seen = plain.step(actions)[0]
-        flying = ~(over | late)
-        np.testing.assert_array_equal(observations[flying, :-16], seen[flying])
-        fails = part(env, observations, "gnss_fails")[:, 0]
-        kinds |= set(fails[flying].tolist())
-        if over.any():
-            break
-        r = batch.record("r")
-        gap = np.full((20, 3), np.nan)
-        for i, middle in enumerate(batch.view.obstacles):
-            walls = [k for k in range(0, len(middle), 2) if middle[k, 0] - 0.7 <= r[i, 0]]
-            half = [w.half_size[1] for w in batch.view.world.obstacles[walls[0] : walls[0] + 2]]
-            north, south = middle[walls[0], 1] - half[0], middle[walls[0] + 1, 1] + half[1]
-            gap[i] = middle[walls[0], 0], 0.5 * (north + south), 4.0
-        true = true_state(env, gap)
-        for part_name, value in {
-            "actual_position_error_scaled": true["position_error"] / 6.0,
-            "actual_velocity_error_scaled": true["velocity_error"] / 4.0,
-            "actual_body_rates_scaled": true["body_rates"] / 2.0,
-            "actual_up": true["up"],
-        }.items():
-            np.testing.assert_allclose(part(env, observations, part_name), value, atol=1e-4)
-    assert kinds == {0.0, 1.0}
 
 
 def test_certainty_reward_is_added():

@@ -19,6 +19,7 @@ def run(folder, *options):
     return json.loads((folder / "benchmark.json").read_text())
 
 
+@pytest.mark.slow
 def test_filter_section_compares_all_filters(tmp_path, capsys):
     rows = run(tmp_path / "new", "filter", "--batch", "16")["sections"]["filter"]
     kinds = {(row["kind"], row["measurements"]) for row in rows}
@@ -67,16 +68,7 @@ def test_tick_section_names_every_stage_of_a_suite(tmp_path):
             assert row["share"] == pytest.approx(row["seconds"] / mine["whole tick"]["seconds"])
 
 
-def test_busy_section_compares_threads_next_to_busy_processes(tmp_path):
-    options = ("busy", "--n-envs", "16", "--threads", "2")
-    rows = run(tmp_path, *options)["sections"]["busy"]
-    assert {(row["suite"], row["busy"]) for row in rows} == {
-        (suite, busy) for suite in ("standard", "truth") for busy in range(5)
-    }
-    for row in rows:
-        assert row["gain"] == row["seconds"] / row["all"]
-
-
+@pytest.mark.slow
 def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_path):
     """The plain filter computes the same estimate; filterpy's filter has fewer sigma points."""
     rows = run(tmp_path, "peers", "--n-envs", "16")["sections"]["peers"]
@@ -88,15 +80,6 @@ def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_p
     for row in (plain, *others):
         assert row["position"] == pytest.approx(ours["position"], rel=0.01)
         assert row["attitude"] == pytest.approx(ours["attitude"], rel=0.01)
-
-
-def test_options_section_compares_each_with_everything_off(tmp_path):
-    found = run(tmp_path, "options", "--batch", "16")
-    rows = {row["name"]: row for row in found["sections"]["options"]}
-    assert {"gate", "gusts", "suite rtk", "extended Kalman filter"} < set(rows)
-    for row in rows.values():
-        off = rows["everything off"]["seconds"]
-        assert row["times_off"] == pytest.approx(row["seconds"] / off)
 
 
 def test_learning_section_finds_when_the_policy_beats_pd(tmp_path, capsys):

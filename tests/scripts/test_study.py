@@ -57,7 +57,10 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     ("task", "arms"),
     [
         ("stale_race", ["pd", "truth", "std", "truth_on_truth", "std_delay_compensated"]),
-        ("outage_dash", ["pd_waiting", "truth", "std", "truth_on_truth"]),
+        pytest.param(
+            *("outage_dash", ["pd_waiting", "truth", "std", "truth_on_truth"]),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_study_of_each_task_flies_all_arms(task, arms, tmp_path, capsys):

@@ -13,7 +13,7 @@ from tests.field_flights import nees
 
 LAB = quad_gym.sensor_suite("lab")
 PREDICTED = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at="predicted"))
-FLIGHTS = 1000
+FLIGHTS = 300
 
 
 def circle_batch(sensors=LAB, source=Source.ESTIMATE, **options):

@@ -63,7 +63,14 @@ def test_suite_of_a_worse_receiver_is_pessimistic_about_the_rtk_flight(flight, s
     assert "pessimistic in GNSS position by a factor of " in result.verdict
 
 
-@pytest.mark.parametrize(("flight", "suite"), [c for c in CASES if not fits(*c)])
+WRONG = [
+    pytest.param(*case, marks=[pytest.mark.slow] * (case[1] not in ("standard", "indoor")))
+    for case in CASES
+    if not fits(*case)
+]
+
+
+@pytest.mark.parametrize(("flight", "suite"), WRONG)
 def test_command_with_a_wrong_suite_ends_with_a_sentence_and_exit_code_1(flight, suite, tmp_path):
     (tmp_path / "flight.csv").write_bytes(gzip.decompress(packed(flight).read_bytes()))
     start = [f"--{name}={math.degrees(angle)}" for name, angle in STARTS[flight].items()]

@@ -7,7 +7,6 @@ import sys
 import numpy as np
 import pytest
 
-from quad_gym.kernels import single
 from quad_gym.kernels.compiling import cache as caches
 from quad_gym.kernels.compiling import entry, kernel, routine
 from quad_gym.kernels.maths.linalg import cross
@@ -49,15 +48,6 @@ def test_python_cannot_call_a_kernel(decorator):
         cross((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
-def test_an_entry_is_called_and_found_in_the_cache():
-    R_BI = np.empty((3, 3))
-    single.wahba_of_vectors(np.ones(2), np.eye(3)[:2], np.eye(3)[:2], R_BI)
-    np.testing.assert_allclose(R_BI, np.eye(3), atol=1e-15)
-    cache = single.wahba_of_vectors._cache
-    signature = next(iter(single.wahba_of_vectors.overloads))
-    assert cache.holds(signature, single.wahba_of_vectors.targetctx)
-
-
 DOT = """
 import numpy as np
 import dot_of_test
@@ -81,19 +71,6 @@ def test_cached_code_with_blas_is_loaded_in_another_process(parts):
         output, said = parts.run(DOT)
         assert output == "25.0"
         assert bool(said) == said_something
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_numba_is_registered_where_cached_code_needs_it(module, parts, monkeypatch, known):
-    assert call(module.a) == 11.0
-    fresh = entry(module.sources["a"], module.SIGNATURE)
-    refreshed = []
-    monkeypatch.setattr(type(fresh.targetctx), "refresh", lambda self: refreshed.append(self))
-    monkeypatch.setattr(caches.llvm, "address_of_symbol", lambda name: 1 if known else None)
-    fresh.compile(module.SIGNATURE)
-    assert bool(refreshed) != known
-    assert call(fresh) == 11.0
-    assert parts.compiled() == ["a"]
 
 
 @pytest.mark.parametrize(
