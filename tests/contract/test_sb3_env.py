@@ -29,7 +29,14 @@ def make(n_envs=5, env_id="QuadGym/Hover-v0", seed=50, **keywords):
     return quad_gym.make_sb3_vec_env(env_id, n_envs=n_envs, seed=seed, **keywords)
 
 
-@pytest.mark.parametrize("name", CONFIGURATIONS)
+CHOSEN = ("circle", "waypoints", "noisy", "late", "faults", "own estimator", "own task")
+"""Configurations of the normal run; all fly in the vector environment that this one wraps."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n not in CHOSEN)) for n in CONFIGURATIONS],
+)
 def test_sb3_env_equals_a_dummy_vec_env_of_monitors(name):
     base, keywords = CONFIGURATIONS[name]
     keywords = {**SHORT, "base": base, **keywords}

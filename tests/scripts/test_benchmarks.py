@@ -82,6 +82,7 @@ def test_peers_section_compares_errors_of_filters_on_the_same_measurements(tmp_p
         assert row["attitude"] == pytest.approx(ours["attitude"], rel=0.01)
 
 
+@pytest.mark.slow
 def test_learning_section_finds_when_the_policy_beats_pd(tmp_path, capsys):
     rows = run(tmp_path, "learning", "--seeds", "2")["sections"]["learning"]
     assert [(row["seed"], row["steps_to_pd"]) for row in rows] == [(0, None)]  # a quick run

@@ -10,6 +10,7 @@ from tests.scripts.running import run
 
 pytest.importorskip("pygame")
 Image = pytest.importorskip("PIL.Image")
+pytestmark = pytest.mark.slow  # a study of four trainings; frames are in test_side_by_side.py
 
 DURATION = 0.6
 QUICK = ["--quick", "--steps", "4096", "--env", f"duration={DURATION}", "--arms", "truth", "std"]

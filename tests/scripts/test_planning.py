@@ -28,6 +28,7 @@ def test_plan_that_looks_at_the_markers_crashes_less_than_tracking_of_the_headin
     assert crash_rate(LOOK, "planning", 24) < 0.15
 
 
+@pytest.mark.slow
 def test_plan_that_waits_crashes_less_than_flying_on():
     assert crash_rate(DASH, "planning", 60) < crash_rate(DASH, "pd", 60) - 0.1
 

@@ -53,14 +53,12 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     assert again["rows"] == summary["rows"]  # the repeated training is bitwise equal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "arms"),
     [
         ("stale_race", ["pd", "truth", "std", "truth_on_truth", "std_delay_compensated"]),
-        pytest.param(
-            *("outage_dash", ["pd_waiting", "truth", "std", "truth_on_truth"]),
-            marks=pytest.mark.slow,
-        ),
+        ("outage_dash", ["pd_waiting", "truth", "std", "truth_on_truth"]),
     ],
 )
 def test_study_of_each_task_flies_all_arms(task, arms, tmp_path, capsys):

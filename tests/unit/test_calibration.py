@@ -404,16 +404,6 @@ def test_calibration_on_two_flights_describes_a_third():
     assert 0.3 < result.after.sensors["gnss_velocity"].mean_nis < 1.5
 
 
-def test_vehicle_at_rest_is_not_in_flight():
-    rng, time = np.random.default_rng(1), 0.01 * np.arange(3000)
-    vibration = np.where(time > 8.0, 0.5, 0.01)[:, np.newaxis]
-    accel = [0.0, 0.0, 9.8] + vibration * rng.normal(size=(3000, 3))
-    log = Log(imu=Stream(time, time, {"accel": accel, "gyro": 0.0 * accel}))
-    flying = in_flight(log, time)
-    assert not flying[time < 7.0].any()
-    assert flying[time > 9.0].mean() > 0.98
-
-
 def test_tails_of_normal_and_of_heavy_tailed_innovations_differ():
     """One sample is Gaussian with another variance, the other is Student's t with nu = 4."""
     rng = np.random.default_rng(2)

@@ -15,6 +15,9 @@ from tests.builders import flown_batch
 from tests.golden.flights import cases
 
 EVERYTHING = frozenset(name for name, _ in PARTS)
+CASES = [
+    pytest.param(name, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, name in enumerate(cases())
+]
 TRUTH = {"source": Source.TRUTH, "run_filter": False}
 
 
@@ -29,7 +32,7 @@ def flown(case, steps=4):
     return env.unwrapped.flights.batch
 
 
-@pytest.mark.parametrize("name", cases())
+@pytest.mark.parametrize("name", CASES)
 def test_memory_around_the_flights_is_neither_written_nor_read(monkeypatch, name):
     """Flights lie between guards of zeros or NaN, which stay as they are and change no flight."""
     found, size = [], FLIGHT_BLOCK.itemsize // 64 * 64 + 64
@@ -51,7 +54,7 @@ def test_memory_around_the_flights_is_neither_written_nor_read(monkeypatch, name
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("name", cases())
+@pytest.mark.parametrize("name", CASES)
 def test_parts_that_a_record_lacks_are_neither_written_nor_read(monkeypatch, name):
     """Flights in full records are equal, and the extra parts, filled before, stay unchanged."""
     small = flown(cases()[name], steps=12)
