@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.samples import Measurement, Sample, gnss_noise
+from quad_gym.estimation.samples import Measurement, Sample
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 
@@ -58,8 +58,6 @@ class FilterCalls:
                     "a log for an exported filter must have a baseline or a magnetic field at its "
                     "start, or give a heading or the course"
                 )
-            sigmas, covariance = gnss_noise("gnss_sigma", given.get("gnss_sigma", 1.0))
-            self._require_uncorrelated(covariance)
             tilt = rest = math.nan
             if wide is not self._suite:
                 tilt = wide.estimator.initial_tilt_sigma or math.nan
@@ -67,7 +65,7 @@ class FilterCalls:
             self._add(
                 "start",
                 *(given["time"], *given["gnss_position_G"]),
-                *(sigmas if "gnss_sigma" in given else _three(None)),
+                *_three(given.get("gnss_sigma")),
                 *_three(given.get("gnss_baseline_G")),
                 *_three(given.get("gnss_velocity_G")),
                 *(given.get("velocity_sigma", math.nan), given.get("heading", math.nan)),
@@ -84,7 +82,6 @@ class FilterCalls:
     def update(self, name: str, time: float, given: Measurement) -> None:
         """Add the measurement of a stream with its time stamp."""
         if name == "gnss":
-            self._require_uncorrelated(given.position_covariance_I)
             vectors = (
                 *(given.position_G, given.noise.get("position_sigma_I")),
                 *(given.baseline_G, given.velocity_G),
@@ -104,14 +101,7 @@ class FilterCalls:
     def _add(self, name: str, *numbers: float) -> None:
         self.rows.append(",".join((name, *(repr(float(number)) for number in numbers))) + "\n")
 
-    @staticmethod
-    def _require_uncorrelated(covariance: Floats | None) -> None:
-        if covariance is not None:
-            raise ValueError(
-                "exported filters take no correlated errors of positions: replay without the "
-                "reported noise"
-            )
 
-
-def _three(vector: Any) -> Floats:
-    return np.full(3, math.nan) if vector is None else np.asarray(vector, np.float64)
+def _three(given: Any) -> Floats:
+    """Return three numbers, of one or three; NaN for None."""
+    return np.broadcast_to(np.asarray(math.nan if given is None else given, np.float64), 3)

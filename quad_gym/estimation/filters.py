@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.estimation.correlated import update_with_correlated
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.estimate import FilterEstimate
 from quad_gym.estimation.first_fix import FirstFix, filter_start
@@ -189,9 +188,8 @@ class KalmanFilter(FilterEstimate):
                 None: the filter's `time`.
             others: Measurements of aiding sensors in the suite: `barometer`, the height in I from
                 static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T]. Also
-                standard deviations that replace the suite's, per axis: `gnss_sigma`, a number,
-                three numbers (east, north, up) or a (3, 3) covariance in I, with which the position
-                is processed separately [m, m^2]; `velocity_sigma` [m/s], `baseline_sigma` [rad],
+                standard deviations that replace the suite's, per axis: `gnss_sigma`, a number or
+                three numbers (east, north, up) [m]; `velocity_sigma` [m/s], `baseline_sigma` [rad],
                 `pixel_sigma` [pixels], `barometer_sigma` [m], `magnetometer_sigma` [T].
 
         Raises:
@@ -248,19 +246,14 @@ class KalmanFilter(FilterEstimate):
 
     def _apply(self, given: Sample | Measurement) -> None:
         """Process a sample or a measurement."""
-        self._moments, whole = None, given
+        self._moments = None
         if isinstance(given, Sample):
             self._engine.predict(given)
             return
-        covariance = given.position_covariance_I
-        if covariance is not None:
-            correlated = given.only_position()
-            update_with_correlated(self._engine, self._condition, correlated, covariance)
-            given = given.without_position()
         if not given.empty:
             self._condition(given)
-        if whole is self._awaited:
-            self._report = self._innovations(whole.blocks)
+        if given is self._awaited:
+            self._report = self._innovations(given.blocks)
 
     def _condition(self, measurement: Measurement) -> None:
         """Update the estimate, or the bank of filters until a single one is left."""

@@ -6,7 +6,6 @@ from dataclasses import KW_ONLY, dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_gym.estimation.correlated import in_principal_axes
 from quad_gym.estimation.engine import Engine, Floats
 from quad_gym.estimation.headings import COUNT, SPACING, write_starts
 from quad_gym.estimation.samples import checked_baseline, gnss_noise, require_gnss
@@ -124,9 +123,9 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     assert sensors.gnss is not None
     position = check.array("gnss_position_G", fix.gnss_position_G, (3,))
     _require_relative(position)
-    sigmas, covariance = np.array(sensors.gnss.position_sigma_I), None
+    sigmas = np.array(sensors.gnss.position_sigma_I)
     if fix.gnss_sigma is not None:
-        sigmas, covariance = gnss_noise("gnss_sigma", fix.gnss_sigma)
+        sigmas = gnss_noise("gnss_sigma", fix.gnss_sigma)
     velocity, speeds = _first_velocity(sensors, fix)
     baseline = fix.gnss_baseline_G
     if baseline is not None:
@@ -134,8 +133,6 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     if baseline is not None and fix.accel is None:
         others = ("heading_sigma", "magnetometer", "magnetometer_sigma", "tilt_sigma")
         fix.refuse("not be given with gnss_baseline_G", *others, "accel_sigma", "course")
-        if covariance is not None:
-            raise ValueError("a covariance as gnss_sigma must not be given with gnss_baseline_G")
         x_I = np.zeros(3)
         if fix.heading is not None:
             angle = check.number("heading", fix.heading)
@@ -144,7 +141,7 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     tilt = _first_tilt(sensors, fix)
     headings = _first_headings(sensors, fix, tilt, velocity, float(speeds[0]), baseline)
     antenna_I = turned(ecef_to_enu(sensors.gnss.reference_antenna_G), position)
-    root = math.sqrt(sensors.estimator.initial_covariance_scale) * _root(sigmas, covariance)
+    root = math.sqrt(sensors.estimator.initial_covariance_scale) * np.diag(sigmas)
     still = np.zeros(3) if velocity is None else velocity
     found = [still_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
     return FilterStart(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), found)
@@ -158,14 +155,6 @@ def _require_relative(position_G: Floats) -> None:
             f"(GnssParams.reference_antenna_G), within {FARTHEST_FIX:g} m of it, got "
             f"{position_G}; subtract the antenna's position from an absolute position in ECEF"
         )
-
-
-def _root(sigmas: Floats, covariance: Floats | None) -> Floats:
-    """Return a root of the covariance of the position."""
-    if covariance is None:
-        return np.diag(sigmas)
-    T, s = in_principal_axes(covariance)
-    return T.T * s
 
 
 def _first_velocity(sensors: SensorSuite, fix: FirstFix) -> tuple[Floats | None, Floats]:

@@ -61,8 +61,6 @@ class Measurement:
     aids: dict[Aid, Floats] = field(default_factory=dict)
     noise: dict[str, Any] = field(default_factory=dict)
     """fields of the parameter record that replace the suite's for this measurement"""
-    position_covariance_I: Floats | None = None
-    """(3, 3) covariance of a position with correlated errors [m^2]"""
 
     @property
     def empty(self) -> bool:
@@ -79,20 +77,6 @@ class Measurement:
             seen = ~np.isnan(self.pixels).any(axis=1)
             found += [FEATURE_BLOCKS + int(i) for i in np.flatnonzero(seen)]
         return found + [AID_BLOCKS + int(aid) for aid in self.aids]
-
-    def only_position(self) -> "Measurement":
-        """Return a measurement with its position alone."""
-        return Measurement(position_G=self.position_G, noise=self.noise)
-
-    def without_position(self) -> "Measurement":
-        """Return a measurement without its position."""
-        return Measurement(
-            baseline_G=self.baseline_G,
-            velocity_G=self.velocity_G,
-            pixels=self.pixels,
-            aids=self.aids,
-            noise=self.noise,
-        )
 
 
 def checked_measurement(
@@ -141,8 +125,7 @@ def checked_measurement(
         "pixel_sigma": image is not None,
         **{f"{aid.name.lower()}_sigma": aid in aids for aid in Aid},
     }
-    noise, covariance = _checked_noise(others, measured)
-    return Measurement(position, baseline, velocity, image, aids, noise, covariance)
+    return Measurement(position, baseline, velocity, image, aids, _checked_noise(others, measured))
 
 
 def require_gnss(sensors: SensorSuite, what: str) -> None:
@@ -184,31 +167,19 @@ def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Flo
     return found
 
 
-def gnss_noise(name: str, value: Any) -> tuple[Floats, Floats | None]:
-    """Return sigmas (3,) in I [m], and the covariance or None, of a number, three or (3, 3)."""
+def gnss_noise(name: str, value: Any) -> Floats:
+    """Return standard deviations (3,) in I [m] of a number or three."""
     if np.ndim(value) == 0:
-        return np.full(3, check.positive(name, value, least=1e-9)), None
-    if np.ndim(value) == 2:
-        covariance = check.array(name, value, (3, 3))
-        if not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0):
-            raise ValueError(f"{name} must be a symmetric covariance, got {value!r}")
-        if np.linalg.eigvalsh(covariance)[0] < 1e-18:
-            raise ValueError(f"{name} must be a positive definite covariance, got {value!r}")
-        sigmas = np.sqrt(np.diag(covariance))
-        correlated = np.count_nonzero(covariance - np.diag(np.diag(covariance)))
-        return sigmas, covariance if correlated else None
+        return np.full(3, check.positive(name, value, least=1e-9))
     sigmas = check.array(name, value, (3,))
     if not (sigmas >= 1e-9).all():
         raise ValueError(f"{name} must be at least 1e-9, got {value!r}")
-    return sigmas, None
+    return sigmas
 
 
-def _checked_noise(
-    others: dict[str, Any], measured: dict[str, bool]
-) -> tuple[dict[str, Any], Floats | None]:
-    """Return noise by fields of the parameter record, and the covariance of a position."""
+def _checked_noise(others: dict[str, Any], measured: dict[str, bool]) -> dict[str, Any]:
+    """Return noise by fields of the parameter record."""
     noise: dict[str, Any] = {}
-    covariance = None
     for name in SIGMA_KEYWORDS:
         value = others.get(name)
         if value is None:
@@ -216,7 +187,7 @@ def _checked_noise(
         if not measured[name]:
             raise ValueError(f"{name} must come with its measurement")
         if name == "gnss_sigma":
-            noise["position_sigma_I"], covariance = gnss_noise(name, value)
+            noise["position_sigma_I"] = gnss_noise(name, value)
             continue
         sigma = check.positive(name, value, least=1e-12)
         if name == "baseline_sigma":
@@ -225,4 +196,4 @@ def _checked_noise(
             noise.setdefault("aid_sigma", {})[Aid[name.removesuffix("_sigma").upper()]] = sigma
         else:
             noise[name] = sigma
-    return noise, covariance
+    return noise
