@@ -6,7 +6,6 @@
   quad-gym consistency --sensors lab --form corrected   the same sensors, all corrections
   quad-gym consistency --estimator ekf             an extended Kalman filter
   quad-gym consistency --estimator module:Class    a quad_gym.Estimator of your own
-  quad-gym consistency --mass-factor 1.2           a vehicle heavier than the controller assumes
   quad-gym consistency --noise-factor 1.5          sensors noisier than the filter assumes
 
 The flights follow random trajectories (or another task) by PD control. The normalized estimation
@@ -21,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
+from quad_gym import FilterParams, SensorSuite, sensor_suite
 from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
@@ -51,8 +50,6 @@ class ConsistencyArgs:
     filter_start: Literal["cold", "warm", "matched"] = "cold"
     """start of the filter: cold (from its first fix), warm (after some seconds of hovering), or
     matched (with errors drawn from its own covariance, to test the filter without its start)"""
-    every: float = 0.05
-    """evaluation interval [s]"""
     settle: float = 0.0
     """initial transient excluded from averages [s]"""
     output: Path = Path("results/consistency")
@@ -62,29 +59,9 @@ class ConsistencyArgs:
     sensors: options.SuiteName = "standard"
     form: Literal["suite", "report", "corrected"] = "suite"
     """form of filter and IMU: the suite's, the report's, or the one with all corrections"""
-    samples: Literal["instant", "average"] | None = None
-    """quantity in an IMU sample; defaults to the form's"""
-    integration: Literal["euler", "midpoint"] | None = None
-    """integration of IMU samples by the filter; defaults to the form's"""
-    attitude_reset: bool | None = None
-    """transform the covariance when the attitude is corrected; defaults to what the form does"""
-    bearing_noise_at: Literal["measured", "predicted", "pinhole"] | None = None
-    """direction to which the filter assumes camera noise is perpendicular; defaults to the
-    form's"""
     estimator: options.EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
-    imu_rate: float | None = None
-    """IMU samples and filter cycles per second [Hz]; defaults to the suite's"""
-    gnss_rate: float | None = None
-    """GNSS fixes per second [Hz]; defaults to the suite's"""
-    camera_rate: float | None = None
-    """images per second [Hz]; defaults to the suite's"""
-
-    mass_factor: float = 1.0
-    """true mass, relative to the mass that the controller assumes"""
-    motor_lag_factor: float = 1.0
-    """true lag of the motors, relative to the assumed one"""
     world: str = "calm"
     """air, ground and battery: calm, breeze or fresh_breeze"""
     faults: str | None = None
@@ -97,13 +74,13 @@ class ConsistencyArgs:
         options.require_at_least(self, episodes=2, seed=0, threads=1)
         full_id = options.known_id("ENV_ID", self.env_id, options.TRACKING)
         object.__setattr__(self, "env_id", full_id)
-        for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
+        for name in ("duration", "noise_factor"):
             check.positive(options.option_name(name), getattr(self, name))
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
         if self.own_estimator is not None:
-            for name in ("form", "filter_start", *_CHOICES):
-                if (value := getattr(self, name)) not in ("suite", "cold", "warm", None):
+            for name in ("form", "filter_start"):
+                if (value := getattr(self, name)) not in ("suite", "cold", "warm"):
                     raise ValueError(
                         f"{options.option_name(name)} {value} has no effect with an own "
                         "--estimator, and must not be given"
@@ -113,10 +90,6 @@ class ConsistencyArgs:
     def own_estimator(self) -> str | None:
         """A user's estimator; None for built-in filters."""
         return own_estimator(self.estimator)
-
-
-_CHOICES = ("integration", "attitude_reset", "bearing_noise_at")
-"""Options of filters that a suite has under these names."""
 
 
 def suite_of(args: ConsistencyArgs) -> SensorSuite:
@@ -129,26 +102,16 @@ def suite_of(args: ConsistencyArgs) -> SensorSuite:
         "report": ("instant", FilterParams()),
         "corrected": ("average", FIELD_FILTER),
     }[args.form]
-    chosen = {name: getattr(args, name) for name in _CHOICES}
-    chosen["kind"] = args.estimator if args.own_estimator is None else None
-    suite = suite.replace(
-        imu=suite.imu.replace(samples=args.samples or samples),
-        estimator=form.replace(**{k: v for k, v in chosen.items() if v is not None}),
-    )
-    camera_rate = args.camera_rate if args.camera else None
-    return suite.with_rates(imu=args.imu_rate, gnss=args.gnss_rate, camera=camera_rate)
+    if args.estimator is not None and args.own_estimator is None:
+        form = form.replace(kind=args.estimator)
+    return suite.replace(imu=suite.imu.replace(samples=samples), estimator=form)
 
 
 def case_of(args: ConsistencyArgs) -> Case:
     """Configuration of the options."""
-    suite, vehicle = suite_of(args), vehicle_params("lab")
+    suite = suite_of(args)
     keywords: dict[str, Any] = {
-        "vehicle": vehicle,
         "source": Source[args.observation.upper()],
-        "true_vehicle": vehicle.replace(
-            mass=args.mass_factor * vehicle.mass,
-            motor_time_constant=args.motor_lag_factor * vehicle.motor_time_constant,
-        ),
         "true_sensors": suite.scaled_noise(args.noise_factor),
         "world": args.world,
         "faults": args.faults,
@@ -186,7 +149,6 @@ def main(args: ConsistencyArgs) -> None:
         case,
         CaseFlights(args.episodes, args.seed, args.duration, args.threads),
         args.output,
-        every=args.every,
         settle=args.settle,
         matched=args.filter_start == "matched",
         configuration=args,

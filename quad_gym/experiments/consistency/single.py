@@ -25,7 +25,6 @@ def run_single(
     flights: CaseFlights,
     output: Path,
     *,
-    every: float,
     settle: float,
     matched: bool,
     configuration: Any,
@@ -36,7 +35,7 @@ def run_single(
     """
     began, batch = time.monotonic(), case.batch(flights.count, flights.threads)
     print(f"{case.name}; {flights.count:,} flights of {flights.duration:g} s, {case.task}.\n")
-    options: dict[str, Any] = {"every": every, "settle": settle, "matched": matched}
+    options: dict[str, Any] = {"settle": settle, "matched": matched}
     look = {"bar_format": "{desc}: {percentage:3.0f}% of the flights, {remaining} left"}
     with tqdm(total=flights.duration, desc="simulating", mininterval=2.0, **look) as bar:
         whole = fly(batch, flights, progress=lambda flown: bar.update(flown - bar.n), **options)
