@@ -13,7 +13,6 @@ from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Measured, Replay, Smoothed
 from quad_gym.estimation.search import Calibrated
 from quad_gym.estimation.smoothing import smooth
-from quad_gym.estimation.vehicle_fit import FittedNumber, FittedVehicle, fit_vehicle
 from quad_gym.estimation.wahba import solve_wahba
 
 __all__ = [
@@ -24,8 +23,6 @@ __all__ = [
     "Calibration",
     "ExtendedKalmanFilter",
     "FirstFix",
-    "FittedNumber",
-    "FittedVehicle",
     "Innovations",
     "Log",
     "LogColumn",
@@ -36,7 +33,6 @@ __all__ = [
     "Stream",
     "UnscentedKalmanFilter",
     "calibrate",
-    "fit_vehicle",
     "read_log",
     "replay",
     "smooth",
