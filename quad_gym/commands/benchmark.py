@@ -34,25 +34,19 @@ class BenchmarkArgs:
     threads: int | None = None
     """largest number of threads; defaults to one per core"""
     quick: bool = False
-    """two short repeats instead of --repeats and --seconds, to check that it runs"""
-    repeats: int = 7
-    """number of repeats of each measurement, of which the best counts"""
-    seconds: float = 0.3
-    """length of a repeat [s]"""
+    """two short repeats of each measurement, to check that it runs"""
     output: Path = Path("results/benchmark")
     """folder for benchmark.json"""
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        require_at_least(self, n_envs=1, repeats=1, threads=1)
-        if not self.seconds > 0.0:
-            raise ValueError(f"--seconds must be above 0, got {self.seconds}")
+        require_at_least(self, n_envs=1, threads=1)
 
     @property
     def extent(self) -> dict[str, Any]:
         """Fields of the `Scope`."""
         threads = available_cores() if self.threads is None else self.threads
-        effort = Effort(2, 0.01) if self.quick else Effort(self.repeats, self.seconds)
+        effort = Effort(2, 0.01) if self.quick else Effort(7, 0.3)
         return {"envs": self.n_envs, "threads": threads, "effort": effort}
 
 

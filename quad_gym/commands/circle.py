@@ -50,23 +50,11 @@ class CircleArgs:
 
     gains: Literal["lab", "tuned"] = "lab"
     """gains of the report, or gains tuned for the smallest error"""
-    position_gain: float | None = None
-    """position gain k, overrides --gains [N/m]"""
-    velocity_gain: float | None = None
-    """velocity gain kd, overrides --gains [N s/m]"""
-    attitude_gain: tuple[float, float, float] | None = None
-    """diagonal of the attitude gain K, overrides --gains [N m]"""
-    body_rates_gain: tuple[float, float, float] | None = None
-    """diagonal of the body rate gain Kd, overrides --gains [N m s]"""
 
     camera: bool = True
     """include the case with the camera"""
-    imu_rate: float = 200.0
-    """rate of the IMU, the filter and the controller [Hz]"""
     gnss_rate: float | None = None
     """rate of GNSS fixes [Hz]; defaults to the IMU rate"""
-    camera_rate: float | None = None
-    """rate of camera images [Hz]; defaults to the IMU rate"""
     estimator: Literal["ukf", "ekf"] = "ukf"
     """filter: ukf, the report's, or ekf"""
     bearing_noise_at: Literal["measured", "predicted"] = "measured"
@@ -77,8 +65,6 @@ class CircleArgs:
 def configure(args: CircleArgs) -> circle.Setup:
     """Check all options before the flights."""
     require_at_least(args, episodes=1, seed=0, threads=1)
-    if args.camera_rate is not None and not args.camera:
-        raise ValueError("--camera-rate has no effect with --no-camera")
     task = TaskParams(
         kind="circle",
         start="ground",
@@ -89,12 +75,7 @@ def configure(args: CircleArgs) -> circle.Setup:
         duration=0.0,
         out_of_bounds=3.0 + args.height,  # do not count the climb from the ground as a crash
     )
-    names = ("position", "velocity", "attitude", "body_rates")
-    given = {name: getattr(args, f"{name}_gain") for name in names}
-    gains = pd_gains(args.gains).replace(**{k: v for k, v in given.items() if v is not None})
-    suite = sensor_suite("lab").with_rates(
-        imu=args.imu_rate, gnss=args.gnss_rate, camera=args.camera_rate
-    )
+    suite = sensor_suite("lab").with_rates(gnss=args.gnss_rate)
     estimator = suite.estimator.replace(kind=args.estimator, bearing_noise_at=args.bearing_noise_at)
     suite = suite.replace(estimator=estimator)
     cases = {circle.TRUTH: (Source.TRUTH, suite)}
@@ -110,7 +91,7 @@ def configure(args: CircleArgs) -> circle.Setup:
     require_writable("--output", args.output)
     return circle.Setup(
         cases=cases,
-        gains=gains,
+        gains=pd_gains(args.gains),
         task=task,
         seeds=range(args.seed, args.seed + args.episodes),
         ticks=round(args.duration * suite.imu.rate),

@@ -50,23 +50,17 @@ class FlyArgs:
     the task), or a file of quad-gym train (.zip or .npz)"""
     observation: Literal["estimate", "truth", "noisy", "measurements"] = "estimate"
     """observation of the controller"""
-    action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] | None = None
-    """commands of the controller; defaults to the task's default"""
     seed: int = 0
     """seed of the episode; in the window, the next episodes have consecutive seeds"""
     duration: float | None = None
     """time limit [s]; defaults to the task's default"""
     env: options.Keywords = field(default_factory=dict)
-    """further keywords of the environment, such as control_rate=100 world=breeze"""
+    """further keywords of the environment, such as action=motor control_rate=200 world=breeze"""
 
     sensors: options.OwnSuite = None
     estimator: options.EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
-    gnss_rate: float | None = None
-    """GNSS fixes per second [Hz]; defaults to the suite's"""
-    camera_rate: float | None = None
-    """images per second [Hz]; defaults to the suite's"""
     faults: Annotated[
         tuple[str, ...],
         arg(
@@ -141,12 +135,11 @@ def check_options(args: FlyArgs) -> None:
 def make_env(args: FlyArgs) -> Any:
     """Make an environment with one flight."""
     args = options.with_full_id(args)
-    options.leave(args.env, "observation", "action", "sensors", "camera", "duration", "faults")
+    options.leave(args.env, "observation", "sensors", "camera", "duration", "faults")
     given = options.with_estimator(args.env, args.estimator)
     suite = sensor_suite(options.sensors_of(args.env_id, args.sensors))
     keywords: dict[str, Any] = {**keywords_of_policy(args.policy, args.env_id), **given}
     keywords |= {} if args.camera else {"camera": False}
-    keywords |= {} if args.action is None else {"action": args.action}
     if args.faults:
         faults = faults_of(args.faults, suite if args.camera else suite.replace(camera=None))
         if args.fault_time is not None:
@@ -159,7 +152,7 @@ def make_env(args: FlyArgs) -> Any:
         num_envs=1,
         autoreset_mode="Disabled",
         observation=args.observation,
-        sensors=suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate),
+        sensors=suite,
         duration=args.duration,
         **keywords,
     )

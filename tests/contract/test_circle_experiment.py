@@ -85,19 +85,17 @@ def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
 
 
 def test_crashes_are_counted(tmp_path, capsys):
-    weak = "--episodes 3 --duration 4 --position-gain 0 --velocity-gain 0 --attitude-gain 0 0 0"
-    summary = run(tmp_path, f"--no-camera {weak}")
+    summary = run(tmp_path, "--no-camera --episodes 3 --duration 4 --radius 40 --period 1")
     for case in summary["cases"].values():
         assert (case["finished"], case["crashed"]) == (0, 3)
     assert "too few flights were completed" in capsys.readouterr().out
 
 
 def test_options_reach_the_flights(tmp_path, no_figures):
-    line = "--episodes 2 --duration 1 --radius 2 --gains tuned --velocity-gain 4 --gnss-rate 10"
+    line = "--episodes 2 --duration 1 --radius 2 --gains tuned --gnss-rate 10"
     configuration = run(tmp_path, f"{line} --bearing-noise-at predicted")["configuration"]
     assert configuration["task"]["radius"] == 2.0
     assert configuration["gains"]["position"] == pd_gains("tuned").position
-    assert configuration["gains"]["velocity"] == 4.0
     suite = configuration["sensors"]["estimate"]
     assert (suite["gnss"]["rate"], suite["camera"]["rate"]) == (10.0, 200.0)
     assert suite["estimator"]["bearing_noise_at"] == "predicted"
