@@ -18,8 +18,8 @@ from typing import Any, Literal
 
 from quad_gym.analysis.reports import require_writable, versions, write_json
 from quad_gym.commands.options import require_at_least, usage_errors
-from quad_gym.experiments.benchmark import interfaces, machine, suites
-from quad_gym.experiments.benchmark.timing import Effort, Row, Scope, Section
+from quad_gym.experiments.benchmark import interfaces, suites
+from quad_gym.experiments.benchmark.timing import Effort, Row, Scope, Section, processor
 from quad_gym.kernels.cores import available_cores
 
 
@@ -63,7 +63,7 @@ def main(args: BenchmarkArgs) -> None:
 
 def run_sections(sections: Mapping[str, Section], scope: Scope, args: BenchmarkArgs) -> None:
     """Run sections, print their tables, and write benchmark.json."""
-    cpu = machine.processor()
+    cpu = processor()
     print(f"{cpu['model']}, {cpu['cores']} cores for this process.\n")
     rows: dict[str, list[Row]] = {}
     for name, section in sections.items():

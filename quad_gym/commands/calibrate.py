@@ -147,7 +147,7 @@ def summary_of(calibration: "Calibration") -> dict[str, Any]:
 
 def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Path]:
     """Write figures and page."""
-    from quad_gym.analysis.calibration_plots import innovations_figure, numbers_figure
+    from quad_gym.analysis.log_plots import innovations_figure, numbers_figure
     from quad_gym.analysis.plots import house_style
     from quad_gym.experiments.pages import Report
 

@@ -26,8 +26,7 @@ from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.envs import IDS
 from quad_gym.envs.flights import own_estimator
-from quad_gym.experiments.consistency.cases import Case, CaseFlights
-from quad_gym.experiments.consistency.single import run_single
+from quad_gym.experiments.consistency import Case, CaseFlights, run_single
 from quad_gym.params import checks as check
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source

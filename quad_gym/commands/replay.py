@@ -135,7 +135,7 @@ def suite_of(args: ReplayArgs) -> "SensorSuite":
 
 def report_of(result: "Replay") -> str:
     """Format a table of measurements, rejections and NIS, and the verdict."""
-    from quad_gym.analysis.replay_plots import sensors_of
+    from quad_gym.analysis.log_plots import sensors_of
     from quad_gym.analysis.reports import text_table
     from quad_gym.estimation.findings import by_quantity
 
@@ -214,8 +214,8 @@ def main(args: ReplayArgs) -> None:
     if smoothed is not None:
         files.append(write_csv(folder / "smoothed.csv", smoothed.columns()))
     if args.figure:
+        from quad_gym.analysis.log_plots import replay_figure
         from quad_gym.analysis.plots import house_style, save_figure
-        from quad_gym.analysis.replay_plots import replay_figure
 
         with house_style():
             name = result.estimator.upper() if ":" not in args.estimator else result.estimator

@@ -13,7 +13,7 @@ from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Measured, Replay, Smoothed
 from quad_gym.estimation.search import Calibrated
 from quad_gym.estimation.smoothing import smooth
-from quad_gym.estimation.wahba import solve_wahba
+from quad_gym.estimation.starts import solve_wahba
 
 __all__ = [
     "FARTHEST_FIX",

@@ -1,4 +1,4 @@
-"""Starts from one fix without Wahba's problem: level, or tilted as measured at rest.
+"""Starts from one fix: level, or tilted as measured at rest; and Wahba's problem, for others.
 
 All that is uncertain at the start is a linear function of independent errors s,
 
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.kernels.entries import start_level
+from quad_gym.kernels import entries
 from quad_gym.packing.aids import slow_states
 from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
@@ -216,7 +216,7 @@ def still_start(
     record["slow_sigma"][0, : len(slow)] = slow
     for place, gain in heading.of_slow.items():
         record["heading_of_slow"][0, place] = gain
-    start_level(record)
+    entries.start_level(record)
     found, n = record[0], _D + len(slow)
     factor = found["factor"][:n, :n].copy()
     return FirstEstimate(found["position"].copy(), velocity, found["R_BI"].copy(), factor)
@@ -256,3 +256,36 @@ def lower_factor(root: Floats) -> Floats:
     upper = np.linalg.qr(root.T, mode="r")
     signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
     return np.ascontiguousarray((signs[:, np.newaxis] * upper).T)
+
+
+def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> Floats:
+    """Return the rotation that best maps vectors in I to the same vectors measured in B.
+
+    It minimizes `sum_i a_i |v_B,i - R_BI v_I,i|^2`.
+
+    Args:
+        weights: (n,) weights a_i, none negative and not all zero.
+        v_I: (n, 3) vectors in I.
+        v_B: (n, 3) the same vectors in B.
+
+    Returns:
+        (3, 3) R_BI, a proper rotation.
+
+    Raises:
+        ValueError: If the shapes do not fit, a value is not finite, or the vectors do not determine
+            the rotation (all parallel, for example).
+
+    Source: report section 4.1; F. L. Markley, J. Astronautical Sciences 36(3), 1988.
+    """
+    a = check.array("weights", weights, (None,))
+    vectors_I = check.array("v_I", v_I, (len(a), 3))
+    vectors_B = check.array("v_B", v_B, (len(a), 3))
+    if (a < 0.0).any() or not (a > 0.0).any():
+        raise ValueError(f"weights must be at least 0 and not all zero, got {a}")
+    R_BI = np.empty((3, 3))
+    uniqueness = entries.wahba_of_vectors(a, vectors_I, vectors_B, R_BI)
+    if not uniqueness > 1e-10:
+        raise ValueError(
+            "v_I and v_B must determine a rotation: at least two directions must differ"
+        )
+    return R_BI

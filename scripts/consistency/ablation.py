@@ -12,7 +12,7 @@ from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.analysis.reports import text_table
 from quad_gym.experiments.benchmark.timing import by_turns, lasting
-from quad_gym.experiments.consistency.cases import Case, CaseFlights, fly
+from quad_gym.experiments.consistency import Case, CaseFlights, fly
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.vehicle import vehicle_params

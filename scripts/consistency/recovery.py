@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from quad_gym.experiments.consistency.cases import Case, CaseFlights
+from quad_gym.experiments.consistency import Case, CaseFlights
 from quad_gym.faults import AccelBiasStep, Fault, GnssOutage, GyroBiasStep, PositionJump
 from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.suites import SUITES, sensor_suite

@@ -8,7 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from quad_gym.analysis.reports import as_json, versions, write_json
-from quad_gym.experiments.consistency.cases import Case, CaseFlights
+from quad_gym.experiments.consistency import Case, CaseFlights
 from quad_gym.kernels.digest import flights_digest
 
 CaseResults = dict[str, dict[str, Any]]  #: results of cases, by name

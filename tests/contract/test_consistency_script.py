@@ -10,7 +10,7 @@ import pytest
 import quad_gym
 from quad_gym.analysis.consistency import MeanSquare
 from quad_gym.analysis.consistency_flights import Findings
-from quad_gym.experiments.consistency import single
+from quad_gym.experiments import consistency
 from tests import console_commands
 
 
@@ -36,7 +36,7 @@ def test_command_writes_figures_numbers_and_configuration(tmp_path):
 
 
 def test_wrong_noise_is_called_overconfident_or_too_cautious(tmp_path, monkeypatch):
-    monkeypatch.setattr(single, "save_figure", lambda figure, stem: [])
+    monkeypatch.setattr(consistency, "save_figure", lambda figure, stem: [])
     assert run(tmp_path, "--noise-factor", "1.5").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
     assert not found["consistent"]

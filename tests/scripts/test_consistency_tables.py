@@ -9,7 +9,7 @@ from scipy import stats
 
 import quad_gym
 from quad_gym.commands.options import parse
-from quad_gym.experiments.consistency.cases import CaseFlights
+from quad_gym.experiments.consistency import CaseFlights
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.suites import SUITES
 from scripts.consistency import __main__ as script

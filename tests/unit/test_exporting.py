@@ -14,7 +14,7 @@ import pytest
 
 import quad_gym
 from baselines.exporting import c_source, controller_of, save_onnx
-from baselines.exporting.actions import action_fields
+from baselines.exporting.controller import action_fields
 from baselines.mlp import MlpPolicy
 from quad_gym.packing.flight import params_record
 

@@ -1,13 +1,16 @@
 """Sections of the benchmark: timing by the best of several repeats, and tables of the results."""
 
+import platform
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from quad_gym.analysis.reports import text_table
+from quad_gym.kernels.cores import available_cores
 
 
 class Effort(NamedTuple):
@@ -137,3 +140,19 @@ class Section:
         headings = {heading: list(group) for heading, group in self.groups.items()}
         cells = [[cell(row) for cell in columns] for row in rows]
         return text_table(headings, cells) + self.summary(rows)
+
+
+def processor() -> dict[str, Any]:
+    """Name and vector instructions of the processor, as far as the system reports them."""
+    found: dict[str, Any] = {"machine": platform.machine(), "cores": available_cores()}
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return found | {"model": platform.processor()}
+    fields: dict[str, str] = {}
+    for line in lines:
+        name, _, value = line.partition(":")
+        fields.setdefault(name.strip(), value.strip())
+    flags = fields.get("flags", fields.get("Features", "")).split()
+    vector = [flag for flag in flags if flag.startswith(("avx", "fma", "sse4", "asimd", "sve"))]
+    return found | {"model": fields.get("model name", ""), "vector_instructions": vector}

@@ -1,11 +1,22 @@
-"""Figure of a replayed log: estimates with their standard deviations, and innovations."""
+"""Figures of replayed logs and of calibrations: estimates, innovations, numbers."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from quad_gym.analysis.metrics import chi_square_quantile
-from quad_gym.analysis.plots import BLUE, GREEN, ORANGE, PALE, VERMILLION, house_style
+from quad_gym.analysis.plots import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PALE,
+    VERMILLION,
+    house_style,
+    panels,
+)
+from quad_gym.estimation.calibration import Calibration
 from quad_gym.estimation.results import Measured, Replay, by_sensor
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
@@ -89,3 +100,38 @@ def sensors_of(result: Replay) -> dict[str, Measured]:
     """Innovations by sensor; the innovations of all features are combined."""
     kinds = by_sensor(result.measured)
     return {name: kinds[name] for name in _SENSORS if name in kinds}
+
+
+@house_style()
+def numbers_figure(calibration: Calibration) -> Any:
+    """Make a figure of the numbers with their intervals, in units of their prior values."""
+    scaled = [found for found in calibration.numbers if found.number.positive]
+    title = "parameters relative to the initial suite, with 95 % intervals"
+    figure, ((axes,),) = panels(1, 1, (8.0, 0.8 + 0.28 * len(scaled)), title)
+    for row, found in enumerate(reversed(scaled)):
+        low, value, high = (n / found.prior for n in (found.low, found.value, found.high))
+        color = BLUE if found.determined else GREY
+        axes.plot([low, high], [row, row], color=color, linewidth=2.0)
+        axes.plot([value], [row], "o", color=color, markersize=5.0)
+    axes.axvline(1.0, color=ORANGE, linewidth=1.0)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(scaled)), [found.number.name for found in reversed(scaled)])
+    return figure
+
+
+@house_style()
+def innovations_figure(calibration: Calibration) -> Any:
+    """Make a figure of the NIS of each sensor before and after."""
+    validations = {"before": calibration.before, "after": calibration.after}
+    names = list(sensors_of(calibration.after.replay))
+    figure, grid = panels(len(names), 2, (9.0, 0.6 + 1.9 * len(names)), sharex="col")
+    for column, (label, validation) in zip(grid.T, validations.items(), strict=True):
+        kinds = sensors_of(validation.replay)
+        for axes, name in zip(column, names, strict=True):
+            if name in kinds:
+                draw_nis(axes, kinds[name], f"{name.replace('_', ' ')}, {label}")
+            if math.isfinite(calibration.split):
+                axes.axvline(calibration.split, color=GREY, linewidth=1.0, linestyle=":")
+        column[0].set_xlim(validation.replay.time[0], validation.replay.time[-1])
+        column[-1].set_xlabel("time [s]; dotted: start of the validation part")
+    return figure

@@ -1,1 +1,0 @@
-"""Consistency of filters: one configuration, and tables of many."""
