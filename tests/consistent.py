@@ -1,6 +1,11 @@
-"""Check of the NEES, NIS and innovations of a filter over many flights."""
+"""Check of the NEES, NIS and innovations of a filter over many flights; a start for it."""
 
 import numpy as np
+
+from quad_gym import records
+from quad_gym.analysis.consistency import FIELDS, PARTS
+from quad_gym.analysis.metrics import STATE_DIMENSION
+from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 
 STATE = ("state", "attitude", "accel_bias", "gyro_bias")
 """Parts of the state with errors that hardly change in 10 s."""
@@ -30,3 +35,26 @@ def assert_consistent(nees, nis, whiteness, apart=()):
         assert part.consistent or by_mean or lasting, message
     for name, white in whiteness.items():
         assert white.white or name in apart, f"{name}: autocorrelation {white.largest:.3f}"
+
+
+def start_matched(batch, seed):
+    """Give all filters of flights that have just been reset errors drawn from their covariances.
+
+    After a first fix, errors and covariance do not match: a level attitude is assumed with an
+    assumed uncertainty, which matters for as long as tilt and accelerometer bias cannot be
+    distinguished. Here the estimates become the truth minus errors drawn from each filter's
+    covariance.
+    """
+    flights, factor = batch.count, batch.record("L")
+    draws = np.random.default_rng(seed).normal(size=(flights, STATE_DIMENSION, 1))
+    errors = (factor @ draws)[..., 0]
+    estimates = {
+        f"{field}_hat": batch.record(field) - errors[:, PARTS[name]]
+        for name, field in FIELDS.items()
+    }
+    turned = np.swapaxes(euler_to_dcm(errors[:, PARTS["attitude"]]), 1, 2)
+    estimates["R_hat"] = turned @ quaternion_to_dcm(batch.record("q"))
+    blocks, flight = batch.snapshot(), np.arange(flights)
+    for name, values in estimates.items():
+        blocks[name][flight // records.WIDTH, ..., flight % records.WIDTH] = values
+    batch.restore(blocks)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym import records
 from quad_gym.analysis.metrics import STATE_DIMENSION, mean_band, nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
+from quad_gym.rotations import quaternion_to_dcm
 
 PARTS = {
     "state": slice(0, STATE_DIMENSION),
@@ -34,7 +34,7 @@ PARTS = {
 }
 """Parts of the error state, in the order of the covariance: all of it, and blocks of three."""
 
-_FIELDS = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
+FIELDS = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
 """Fields of the true values; the fields of estimates end in `_hat`."""
 
 CONSISTENT_SHARE = 0.9
@@ -54,37 +54,14 @@ Floats = NDArray[np.float64]
 
 def flight_errors(batch: FlightBatch) -> Floats:
     """Errors of a batch's filters in the coordinates of their covariances, (count, 15)."""
-    truth = {name: batch.record(field) for name, field in _FIELDS.items()}
-    estimate = {name: batch.record(f"{field}_hat") for name, field in _FIELDS.items()}
+    truth = {name: batch.record(field) for name, field in FIELDS.items()}
+    estimate = {name: batch.record(f"{field}_hat") for name, field in FIELDS.items()}
     R_BI, R_hat = quaternion_to_dcm(batch.record("q")), batch.record("R_hat")
     return state_error(
         truth | {"R_BI": R_BI},
         estimate | {"R_BI": R_hat},
         rotation_vector=batch.sensors.flow_alone,
     )
-
-
-def start_matched(batch: FlightBatch, seed: int) -> None:
-    """Give all filters of flights that have just been reset errors drawn from their covariances.
-
-    After a first fix, errors and covariance do not match: a level attitude is assumed with an
-    assumed uncertainty, which matters for as long as tilt and accelerometer bias cannot be
-    distinguished. Here the estimates become the truth minus errors drawn from each filter's
-    covariance.
-    """
-    flights, factor = batch.count, batch.record("L")
-    draws = np.random.default_rng(seed).normal(size=(flights, STATE_DIMENSION, 1))
-    errors = (factor @ draws)[..., 0]
-    estimates = {
-        f"{field}_hat": batch.record(field) - errors[:, PARTS[name]]
-        for name, field in _FIELDS.items()
-    }
-    turned = np.swapaxes(euler_to_dcm(errors[:, PARTS["attitude"]]), 1, 2)
-    estimates["R_hat"] = turned @ quaternion_to_dcm(batch.record("q"))
-    blocks, flight = batch.snapshot(), np.arange(flights)
-    for name, values in estimates.items():
-        blocks[name][flight // records.WIDTH, ..., flight % records.WIDTH] = values
-    batch.restore(blocks)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from quad_gym.analysis.consistency import (
     MeanSquare,
     NeesRecorder,
     Whiteness,
-    start_matched,
     verdict,
 )
 from quad_gym.analysis.metrics import RunningSummary, TrackingSummary
@@ -97,7 +96,6 @@ def measure_consistency(
     duration: float,
     every: float = 0.05,
     settle: float = 0.0,
-    matched: bool = False,
     progress: Callable[[float], Any] = lambda time: None,
 ) -> Findings:
     """Fly, and compare errors and innovations with the covariances of the filters.
@@ -109,7 +107,6 @@ def measure_consistency(
         duration: Length of the flights [s].
         every: Evaluation interval of the errors [s].
         settle: Time before which innovations are left out of the autocorrelation [s].
-        matched: True to start the filters with errors drawn from their own covariance.
         progress: Function called repeatedly with the time flown so far [s].
 
     Raises:
@@ -128,8 +125,6 @@ def measure_consistency(
     tracking = RunningSummary(batch.count, steps)
     astray = np.zeros(batch.count, bool)
     batch.reset(seeds=seeds)
-    if matched:
-        start_matched(batch, int(seeds[0]))
     squares.add(batch, 0.0)
     for step in range(1, steps + 1):
         batch.step()

@@ -46,9 +46,8 @@ class ConsistencyArgs:
     """length of a flight [s]"""
     observation: Literal["estimate", "truth"] = "estimate"
     """observation of the controller"""
-    filter_start: Literal["cold", "warm", "matched"] = "cold"
-    """start of the filter: cold (from its first fix), warm (after some seconds of hovering), or
-    matched (with errors drawn from its own covariance, to test the filter without its start)"""
+    filter_start: Literal["cold", "warm"] = "cold"
+    """start of the filter: cold (from its first fix), or warm (after some seconds of hovering)"""
     settle: float = 0.0
     """initial transient excluded from averages [s]"""
     output: Path = Path("results/consistency")
@@ -77,13 +76,10 @@ class ConsistencyArgs:
             check.positive(options.option_name(name), getattr(self, name))
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
-        if self.own_estimator is not None:
-            for name in ("form", "filter_start"):
-                if (value := getattr(self, name)) not in ("suite", "cold", "warm"):
-                    raise ValueError(
-                        f"{options.option_name(name)} {value} has no effect with an own "
-                        "--estimator, and must not be given"
-                    )
+        if self.own_estimator is not None and self.form != "suite":
+            raise ValueError(
+                f"--form {self.form} has no effect with an own --estimator, and must not be given"
+            )
 
     @property
     def own_estimator(self) -> str | None:
@@ -117,8 +113,7 @@ def case_of(args: ConsistencyArgs) -> Case:
     }
     if args.own_estimator is not None:
         keywords["estimator"] = args.own_estimator
-    start: Literal["cold", "warm"] = "warm" if args.filter_start == "warm" else "cold"
-    return Case(title_of(suite, args), suite, IDS[args.env_id], start, keywords)
+    return Case(title_of(suite, args), suite, IDS[args.env_id], args.filter_start, keywords)
 
 
 def title_of(suite: SensorSuite, args: ConsistencyArgs) -> str:
@@ -149,6 +144,5 @@ def main(args: ConsistencyArgs) -> None:
         CaseFlights(args.episodes, args.seed, args.duration, args.threads),
         args.output,
         settle=args.settle,
-        matched=args.filter_start == "matched",
         configuration=args,
     )

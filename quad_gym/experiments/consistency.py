@@ -79,7 +79,6 @@ def run_single(
     output: Path,
     *,
     settle: float,
-    matched: bool,
     configuration: Any,
 ) -> None:
     """Fly a case, print the report, and write figures and numbers; see `measure_consistency`.
@@ -88,10 +87,9 @@ def run_single(
     """
     began, batch = time.monotonic(), case.batch(flights.count, flights.threads)
     print(f"{case.name}; {flights.count:,} flights of {flights.duration:g} s, {case.task}.\n")
-    options: dict[str, Any] = {"settle": settle, "matched": matched}
     look = {"bar_format": "{desc}: {percentage:3.0f}% of the flights, {remaining} left"}
     with tqdm(total=flights.duration, desc="simulating", mininterval=2.0, **look) as bar:
-        whole = fly(batch, flights, progress=lambda flown: bar.update(flown - bar.n), **options)
+        whole = fly(batch, flights, settle=settle, progress=lambda flown: bar.update(flown - bar.n))
     findings = whole.since(settle)
     print(report_of(findings))
     files = _draw(case.name, whole, findings, settle, output)

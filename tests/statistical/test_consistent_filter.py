@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.analysis.consistency import flight_errors, start_matched
+from quad_gym.analysis.consistency import flight_errors
 from quad_gym.analysis.consistency_flights import endless, measure_consistency
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.records import Source
 from tests.builders import batch as flights_of
-from tests.consistent import assert_consistent
+from tests.consistent import assert_consistent, start_matched
 
 
-def flown(sensors, *, flights=1500, seconds=10.0, matched=False, **keywords):
+def flown(sensors, *, flights=1500, seconds=10.0, **keywords):
     """Return the consistency of flights on the estimate; check that no filter failed."""
     task = endless(TASK_DEFAULTS["random_trajectory"])
     batch = FlightBatch(
         flights, sensors=sensors, task=task, gains="tuned", innovations=True, **keywords
     )
-    findings = measure_consistency(batch, seeds=range(flights), duration=seconds, matched=matched)
+    findings = measure_consistency(batch, seeds=range(flights), duration=seconds)
     assert findings.failed == 0
     return findings
 

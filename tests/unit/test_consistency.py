@@ -10,12 +10,12 @@ from quad_gym.analysis.consistency import (
     MeanSquare,
     NeesRecorder,
     flight_errors,
-    start_matched,
     verdict,
 )
 from quad_gym.analysis.metrics import mean_band
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK, GateDecision
+from tests.consistent import start_matched
 from tests.unit.alarms import assert_normal
 
 
