@@ -85,7 +85,7 @@ def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
 
 
 def test_crashes_are_counted(tmp_path, capsys):
-    summary = run(tmp_path, "--no-camera --episodes 3 --duration 4 --radius 40 --period 1")
+    summary = run(tmp_path, "--no-camera --episodes 3 --duration 4 --radius 30 --period 3")
     for case in summary["cases"].values():
         assert (case["finished"], case["crashed"]) == (0, 3)
     assert "too few flights were completed" in capsys.readouterr().out
