@@ -31,7 +31,6 @@ from quad_gym.commands.options import (
 
 if TYPE_CHECKING:
     from quad_gym.estimation import Replay
-    from quad_gym.params.sensors import SensorSuite
 
 RESULT = "replay.json"
 
@@ -44,12 +43,6 @@ class ReplayArgs(ReadingArgs):
     sensors: SuiteName = "standard"
     estimator: str = "ukf"
     """filter: ukf, ekf, or module:Class of a quad_gym.Estimator"""
-    barometer: bool = False
-    """add a barometer with default parameters to the suite"""
-    magnetometer: tuple[float, float, float] | None = None
-    """add a magnetometer with default parameters to the suite; the values are strength
-    [microtesla], declination and inclination [deg] of the magnetic field, from a model of the
-    Earth's field"""
     heading: float | None = None
     """heading of the body x axis at the start, from east toward north [deg]; by default from a
     baseline or a magnetometer, or else unknown"""
@@ -111,26 +104,6 @@ def start_of(args: ReplayArgs) -> dict[str, Any]:
     if args.start_position is not None:
         start["position"] = args.start_position
     return start
-
-
-def suite_of(args: ReplayArgs) -> "SensorSuite":
-    """Sensor suite, with sensors added by options."""
-    from quad_gym.params.barometer import BarometerParams
-    from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
-    from quad_gym.params.suites import sensor_suite
-
-    suite = sensor_suite(args.sensors)
-    if args.barometer:
-        suite = suite.replace(barometer=BarometerParams())
-    if args.magnetometer is not None:
-        strength, declination, inclination = args.magnetometer
-        compass = MagnetometerParams(
-            strength=MICROTESLA * strength,
-            declination=math.radians(declination),
-            inclination=math.radians(inclination),
-        )
-        suite = suite.replace(magnetometer=compass)
-    return suite
 
 
 def report_of(result: "Replay") -> str:
@@ -195,7 +168,7 @@ def main(args: ReplayArgs) -> None:
     with usage_errors():
         folder = folder_of(args)
         options: dict[str, Any] = {
-            "sensors": suite_of(args),
+            "sensors": args.sensors,
             "estimator": args.estimator,
             "start": start_of(args),
             "reported_noise": args.reported_noise,
