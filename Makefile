@@ -35,10 +35,6 @@ $(VENV)/.developer: pyproject.toml constraints.txt | $(BIN)/python
 	$(BYTECODE)
 	touch $(VENV)/.user $(VENV)/.viewer $(VENV)/.trainer $@  # which it holds
 
-$(VENV)/.sweeper: $(VENV)/.developer
-	$(INSTALL) ".[sweep]"  # Ray is large: no part of the setup
-	touch $@
-
 $(VENV)/.writer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,render,docs]"
 	$(BYTECODE)
@@ -90,7 +86,7 @@ test-clients:  ## each client of docs/libraries.md in an environment of its own;
 test-arm: setup  ## golden flights on AArch64, emulated: needs gcc-aarch64-linux-gnu and qemu-user-static
 	$(BIN)/python -m tests.golden.aarch64
 
-test-slow: $(VENV)/.sweeper  ## the slow tests: statistics, soak, many processes
+test-slow: setup  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
 soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults

@@ -28,7 +28,6 @@ from quad_gym.batch.threads import resolve_threads
 from quad_gym.commands import options
 from quad_gym.experiments import compare
 from quad_gym.experiments.driver import train_all
-from quad_gym.experiments.executors import make_executor
 from quad_gym.params import checks as check
 from quad_gym.params.suites import suite_label
 
@@ -112,8 +111,8 @@ def main(args: CompareArgs) -> int:
         f"{comparison.recipe.steps:,} steps, {comparison.episodes:,} episodes with each policy; "
         f"into {comparison.folder}."
     )
-    executor = make_executor("local", comparison.folder)
-    driver = train_all(comparison.trainings, executor, args.jobs or resolve_threads(None))
+    jobs = args.jobs or resolve_threads(None)
+    driver = train_all(comparison.trainings, comparison.folder, jobs)
     if code := driver.exit_code():
         return code
     matrix = compare.ComparisonResults(comparison, comparison.fly())

@@ -15,7 +15,7 @@ COMMANDS = {
     "train": "train a controller on the estimate, the truth, or another observation",
     "evaluate": "evaluate policies over many episodes: errors, crashes, videos",
     "compare": "train on the truth, on noise and on the estimate, and compare",
-    "sweep": "run sets of trainings on this machine, on a Slurm cluster, or with Ray",
+    "sweep": "run sets of trainings, on one machine or on several that share a folder",
     "tune": "tune the gains of the PD controller",
     "fly": "show a flight in a window, or render a video",
     "replay": "run the filter on the log of a real flight (CSV or PX4)",

@@ -1,16 +1,15 @@
 """Train all combinations of environments, keywords, parameters and seeds.
 
     quad-gym sweep sweep.toml
-    quad-gym sweep sweep.toml --executor slurm --options slurm_partition=long mem_gb=4
     quad-gym sweep --engine compiled --env sensors=standard,rtk --set gamma=0.97,0.99 --seeds 5
     quad-gym sweep sweep.toml --steps 300000 --n-envs 64 256 --output results/sweep/short
     quad-gym sweep sweep.toml --dry-run
 
 Several values are separated by commas in key=value, and are lists in the file. Each training has a
-folder with the files of quad-gym train. Trainings run as processes of this machine, as jobs of
-Slurm (through submitit) or as tasks of Ray. A training that dies restarts from its checkpoint; a
-sweep that was stopped or killed continues when it is started again; two sweeps in one folder share
-the work. The tables, trainings.csv, groups.csv and table.txt, are made from the folders only.
+folder with the files of quad-gym train. Trainings run as processes of this machine. A training that
+dies restarts from its checkpoint; a sweep that was stopped or killed continues when it is started
+again; sweeps in one folder, also on several machines, share the work. The tables, trainings.csv,
+groups.csv and table.txt, are made from the folders only.
 """
 
 from dataclasses import dataclass, field
@@ -31,7 +30,6 @@ from quad_gym.commands.options import (
     value_of,
 )
 from quad_gym.experiments.driver import RETRIES, train_all
-from quad_gym.experiments.executors import make_executor
 from quad_gym.experiments.experiment import Training, check_trainings
 from quad_gym.experiments.sweep_plan import DEFAULTS, TABLES, expand, read
 from quad_gym.experiments.sweep_table import FILES, row_of, table_text, write_tables
@@ -69,12 +67,8 @@ class SweepArgs:
 
     output: Path | None = None
     """folder; defaults to results/sweep/NAME, with the name of the file or of the first task"""
-    executor: Literal["local", "slurm", "ray"] = "local"
-    """processes of this machine, Slurm jobs through submitit, or Ray tasks"""
-    options: Keywords = field(default_factory=dict)
-    """options of the executor: parameters of submitit's AutoExecutor, or of ray.init"""
     jobs: int | None = None
-    """number of simultaneous trainings; defaults to one per core, or all with Slurm and Ray"""
+    """number of simultaneous trainings; defaults to one per core"""
     threads: int = 1
     """number of threads of each training; it does not affect results"""
     retries: int = RETRIES
@@ -134,13 +128,10 @@ def main(args: SweepArgs) -> int:
         return 0
     with usage_errors():
         require_writable("--output", folder)
-        executor = make_executor(args.executor, folder, args.threads, args.options)
-    jobs = args.jobs
-    if jobs is None and args.executor == "local":
-        jobs = max(1, resolve_threads(None) // args.threads)
+    jobs = args.jobs or max(1, resolve_threads(None) // args.threads)
     print(f"{len(trainings)} trainings, {steps:,} steps; into {folder}.", flush=True)
     hidden = None if args.progress else True
-    driver = train_all(trainings, executor, jobs, retries=args.retries, hidden=hidden)
+    driver = train_all(trainings, folder, jobs, retries=args.retries, hidden=hidden)
     rows = [row_of(training) for training in trainings]
     print(f"\n{table_text(rows)}", flush=True)
     with usage_errors((OSError,)):

@@ -3,14 +3,16 @@
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from baselines.keeping import holder, is_locked, signals_to
-from quad_gym.experiments.executors import Ended, Executor, Job
 from quad_gym.experiments.experiment import Training
+from quad_gym.experiments.processes import Ended, Job
 
 PAUSE = 0.1  #: time between looks at the jobs [s]
 
@@ -23,13 +25,13 @@ INTERRUPTED = 130  #: exit code of an experiment that was stopped
 
 def train_all(
     trainings: Sequence[Training],
-    executor: Executor,
-    jobs: int | None,
+    folder: Path,
+    jobs: int,
     *,
     retries: int = RETRIES,
     hidden: bool | None = None,
 ) -> "Driver":
-    """Complete trainings with an executor, and show their progress.
+    """Complete trainings in processes, with their output in `folder`, and show the progress.
 
     `jobs` limits the number of simultaneous trainings; a training that died is restarted `retries`
     times; the bar is hidden by default (None) if stderr is no terminal. Returns the driver, with
@@ -37,7 +39,7 @@ def train_all(
     """
     total = sum(training.plan.recipe.steps for training in trainings)
     with tqdm(total=total, desc="training", unit=" steps", unit_scale=True, disable=hidden) as bar:
-        driver = Driver(trainings, executor, jobs, retries, bar)
+        driver = Driver(trainings, partial(Job, folder / "logs"), jobs, retries, bar)
         driver.run()
     return driver
 
@@ -54,16 +56,15 @@ class Driver:
     def __init__(
         self,
         trainings: Sequence[Training],
-        executor: Executor,
-        jobs: int | None,
+        start: Callable[[Training], Job],
+        jobs: int,
         retries: int,
         bar: Any,
     ) -> None:
         self.failed: dict[Training, str] = {}
         self.stopped = False
-        self._trainings, self._executor, self._bar = trainings, executor, bar
-        self._jobs = len(trainings) if jobs is None else jobs
-        self._retries = retries
+        self._trainings, self._begin, self._bar = trainings, start, bar
+        self._jobs, self._retries = jobs, retries
         self._waiting = deque(training for training in trainings if not training.finished)
         self._running: dict[Training, Job] = {}
         self._elsewhere: dict[Training, str] = {}
@@ -150,7 +151,7 @@ class Driver:
                 elif training.finished:  # by another process
                     self._finish(training)
                 else:
-                    self._running[training] = self._executor(training)
+                    self._running[training] = self._begin(training)
             except (OSError, ValueError) as error:  # no process, a full disk, another training
                 self._fail(training, str(error))
 

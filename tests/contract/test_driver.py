@@ -11,7 +11,7 @@ import pytest
 
 from baselines.keeping import BusyError, holder, is_locked, locked
 from quad_gym.experiments.driver import Driver
-from quad_gym.experiments.executors import Ended, work
+from quad_gym.experiments.processes import Ended, work
 from quad_gym.experiments.sweep_plan import expand, read
 from quad_gym.experiments.sweep_table import FILES
 from tests import console_commands
@@ -181,42 +181,25 @@ def worker_at(process, folder, rows=3):
     raise AssertionError("no evaluations")
 
 
-EXECUTORS = {
-    "local": [],
-    "submitit": ["--executor", "slurm", "--options", "cluster=local"],
-    "ray": ["--executor", "ray", "--options", "num_cpus=2"],  # Ray on this machine
-}
-
-
-@pytest.fixture(params=EXECUTORS)
-def executor(request, monkeypatch):
-    """Options of an executor whose package is installed."""
-    if request.param != "local":
-        pytest.importorskip(request.param)
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    return EXECUTORS[request.param]
-
-
 @pytest.mark.slow  # processes
-def test_tables_are_the_same_after_kills(tmp_path, undisturbed, executor):
+def test_tables_are_the_same_after_kills(tmp_path, undisturbed):
     """A worker is killed, and then the sweep itself."""
     runs = tmp_path / "out/runs"
-    process = start(tmp_path, *executor, "--jobs", "1")
+    process = start(tmp_path, "--jobs", "1")
     os.kill(worker_at(process, runs / GROUP.format(0.97) / "seed_0"), signal.SIGKILL)
     second = runs / GROUP.format(0.9) / "seed_0"
     worker = worker_at(process, second)
     process.kill()
     said, _ = process.communicate()
     assert "restarts from its checkpoint (1 of 2)" in said
-    end(start(tmp_path, *executor))
-    if executor == EXECUTORS["local"]:  # its processes survive the sweep
-        assert int(holder(second).split()[1]) == worker
+    end(start(tmp_path))
+    assert int(holder(second).split()[1]) == worker  # which survives the sweep
     assert tables(tmp_path) == undisturbed
 
 
 @pytest.mark.slow  # processes
-def test_terminated_sweep_leaves_checkpoints_and_continues(tmp_path, undisturbed, executor):
-    process = start(tmp_path, *executor, "--jobs", "1")
+def test_terminated_sweep_leaves_checkpoints_and_continues(tmp_path, undisturbed):
+    process = start(tmp_path, "--jobs", "1")
     first = tmp_path / "out/runs" / GROUP.format(0.97) / "seed_0"
     worker_at(process, first)
     process.send_signal(signal.SIGTERM)
@@ -224,7 +207,7 @@ def test_terminated_sweep_leaves_checkpoints_and_continues(tmp_path, undisturbed
     assert "Start the same command again to continue" in err
     assert not is_locked(first)
     assert not json.loads((first / "training.json").read_text())["finished"]
-    end(start(tmp_path, *executor))
+    end(start(tmp_path))
     assert tables(tmp_path) == undisturbed
 
 

@@ -49,7 +49,6 @@ REFUSED = [
     ("tune --env action=velocity", 'layout="absolute"'),
     ("sweep folder", "folder: Is a directory"),
     ("sweep nowhere.toml", "nowhere.toml does not exist"),
-    ("sweep --engine compiled --options mem_gb=4", "--options are of slurm and ray"),
     # ---- flights
     ("circle --seed -1", "--seed must be at least 0, got -1"),
     ("circle --gnss-rate 33", "gnss_rate must divide the IMU rate of 200 Hz"),

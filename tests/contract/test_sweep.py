@@ -85,16 +85,6 @@ def test_invalid_file_is_rejected_with_one_line(tmp_path, text, message):
     assert not (tmp_path / "results/sweep/bad/runs").exists()
 
 
-@pytest.mark.parametrize("executor", ["slurm", "ray"])
-def test_missing_package_of_executor_is_named(tmp_path, monkeypatch, executor):
-    package = {"slurm": "submitit", "ray": "ray"}[executor]
-    monkeypatch.setitem(__import__("sys").modules, package, None)
-    options = ["--engine", "compiled", "--executor", executor]
-    done = console_commands.run("sweep", *options, where=tmp_path)
-    assert done.returncode == 2
-    assert f'needs {package}: pip install "quad-gym[sweep]"' in done.stderr
-
-
 def pretend(training, error):
     """Write the files of a training, finished if an error is given."""
     training.folder.mkdir(parents=True)
