@@ -219,37 +219,21 @@ def _first_headings(
     if fix.heading is not None:
         return [known_heading(check.number("heading", fix.heading), sigma, tilt)]
     if fix.magnetometer is not None:
-        return [_by_magnetometer(sensors, fix, tilt)]
+        if Aid.MAGNETOMETER not in sensors.aids:
+            raise ValueError("the sensor suite has no magnetometer to initialize with")
+        white = fix.magnetometer_sigma
+        if white is not None:
+            white = check.positive("magnetometer_sigma", white)
+        field_B = check.array("magnetometer", fix.magnetometer, (3,))
+        return [magnetic_heading(sensors, field_B, white, tilt)]
     if fix.course:
         return [_by_course(velocity, speed_sigma, sigma, tilt)]
     if baseline_G is not None:
-        return [_by_baseline(sensors, baseline_G, tilt)]
+        assert sensors.gnss is not None
+        R_IG = ecef_to_enu(sensors.gnss.reference_antenna_G)
+        return [baseline_heading(sensors, turned(R_IG, baseline_G), tilt)]
     # with half the spacing as standard deviation they overlap to a uniform distribution
     return [known_heading(k * SPACING, 0.5 * SPACING, tilt) for k in range(COUNT)]
-
-
-def _by_magnetometer(sensors: SensorSuite, fix: FirstFix, tilt: Tilt) -> FirstHeading:
-    if Aid.MAGNETOMETER not in sensors.aids:
-        raise ValueError("the sensor suite has no magnetometer to initialize with")
-    assert fix.magnetometer is not None
-    field_B, sigma = check.array("magnetometer", fix.magnetometer, (3,)), fix.magnetometer_sigma
-    if sigma is not None:
-        sigma = check.positive("magnetometer_sigma", sigma)
-    return magnetic_heading(sensors, field_B, sigma, tilt)
-
-
-def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> FirstHeading:
-    gnss = sensors.gnss
-    assert gnss is not None
-    sigma = math.sqrt(sensors.estimator.initial_covariance_scale) * gnss.first_baseline_sigma
-    baseline_I = turned(ecef_to_enu(gnss.reference_antenna_G), baseline_G)
-    found = baseline_heading(np.array(gnss.baseline_B), baseline_I, sigma, tilt)
-    if found is None:
-        raise ValueError(
-            "gnss_baseline_G must not be within 12 degrees of the vertical where accel gives the "
-            "tilt: use a heading in its place"
-        )
-    return found
 
 
 def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) -> FirstHeading:

@@ -166,18 +166,26 @@ def magnetic_heading(
     return FirstHeading(angle, white / f_h, of_tilt, of_slow)
 
 
-def baseline_heading(
-    baseline_B: Floats, baseline_I: Floats, sigma: float, tilt: Tilt
-) -> FirstHeading | None:
-    """Return the heading by two antennas, for a vehicle of known tilt; None if they are too steep.
+def baseline_heading(sensors: SensorSuite, baseline_I: Floats, tilt: Tilt) -> FirstHeading:
+    """Return the heading by two antennas, for a vehicle of known tilt.
 
     The baseline, (3,) from the primary antenna, acts as a magnetic field whose direction is
-    measured in I, to `sigma` [rad].
+    measured in I.
+
+    Raises:
+        ValueError: If the baseline is too steep.
     """
+    assert sensors.gnss is not None
+    baseline_B = np.array(sensors.gnss.baseline_B)
+    scale = math.sqrt(sensors.estimator.initial_covariance_scale)
+    sigma = scale * sensors.gnss.first_baseline_sigma
     f = tilt.T.T @ (baseline_B / np.linalg.norm(baseline_B))
     f_h = math.hypot(f[0], f[1])
     if f_h < STEEP or math.hypot(baseline_I[0], baseline_I[1]) == 0.0:
-        return None
+        raise ValueError(
+            "gnss_baseline_G must not be within 12 degrees of the vertical where accel gives the "
+            "tilt: use a heading in its place"
+        )
     angle = math.atan2(baseline_I[1], baseline_I[0]) - math.atan2(f[1], f[0])
     slope = f[2] / f_h
     return FirstHeading(angle, sigma / f_h, (float(slope * f[0] / f_h), float(slope * f[1] / f_h)))
