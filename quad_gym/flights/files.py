@@ -12,7 +12,6 @@ A table has one number per column: vectors as `_x`, `_y`, `_z` (quaternions as `
 `_z`; without axes, `_1` ...), and the standard deviations `sigma_...` instead of the covariance.
 """  # noqa: E501 - a table
 
-import csv
 import dataclasses
 import json
 import os
@@ -148,15 +147,3 @@ def _parts(column: Column, count: int) -> Sequence[str]:
     if column.name in ("action", "rotor_speeds", "feature_decision"):
         return [str(k + 1) for k in range(count)]
     return "wxyz" if column.name.endswith("quaternion") else "xyz"
-
-
-def write_flight_csv(rows: NDArray[Any], path: Path) -> Path:
-    """Write the table as CSV, with all digits; missing values are empty cells."""
-    columns = table(rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
-        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-            writer.writerow(["" if cell != cell else repr(cell) for cell in row])
-    return path

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
+from quad_gym.analysis.reports import write_csv
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.flights import files
 from quad_gym.flights.columns import READ, WITH_FILTER, row_dtype
@@ -72,7 +73,9 @@ class Flight:
 
     def to_csv(self, path: Path | str) -> Path:
         """Write a table for spreadsheets, with the covariance's standard deviations."""
-        return files.write_flight_csv(self.rows, Path(path))
+        file = Path(path)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        return write_csv(file, files.table(self.rows))
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Return the table of `to_csv` as a pandas DataFrame, indexed by time.
