@@ -16,7 +16,7 @@ from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import columns_of, text_table, versions, write_csv, write_json
 from quad_gym.envs.effects import with_effect
 from quad_gym.experiments.experiment import Experiment, Floats
-from quad_gym.experiments.flown import Flown, Trial, path_of
+from quad_gym.experiments.flown import Flown, Trial
 from quad_gym.experiments.pages import Report
 from quad_gym.params.suites import contents_of_suite_files, suite_label
 
@@ -307,7 +307,7 @@ def _add_figures(report: Report, matrix: ComparisonResults, suite: str) -> None:
     caption = "Error over time: median and middle nine tenths of the episodes. "
     caption += f"A crashed episode counts with {matrix.bound:g} m from its crash on."
     report.add_figure(f"errors_{label}", figure, caption)
-    paths = {name: path_of(flown) for name, flown in first.items()}
+    paths = {name: flown.recorded["path"] for name, flown in first.items()}
     title = f"Seen from above, evaluated on the estimate, sensors {suite}"
     figure = comparison_plots.paths_figure(paths, title)
     report.add_figure(f"paths_{label}", figure, "The first episode of the first training seed.")

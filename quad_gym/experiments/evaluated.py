@@ -11,7 +11,7 @@ from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_fig
 from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_interval
 from quad_gym.analysis.plots import save_figure
 from quad_gym.evaluation import Episodes, Policy
-from quad_gym.experiments.flown import Flown, flight_of_episode, path_of
+from quad_gym.experiments.flown import Flown, flight_of_episode
 from quad_gym.rendering.side_by_side import Side
 
 Evaluated = Mapping[tuple[str, str], Flown]  #: episodes by policy and observation
@@ -146,7 +146,7 @@ def write_figures(results: Evaluated, env: Any, folder: Path) -> list[Path]:
     """
     labeled = {f"{label_of(policy)}, on {seen}": f for (policy, seen), f in results.items()}
     curves = {label: flown.recorded for label, flown in labeled.items()}
-    paths = paths_figure({label: path_of(flown) for label, flown in labeled.items()})
+    paths = paths_figure({label: flown.recorded["path"] for label, flown in labeled.items()})
     return [
         *save_figure(paths, folder / "paths"),
         *save_figure(error_over_time_figure(curves, bound_of(env)), folder / "errors"),

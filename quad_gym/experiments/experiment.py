@@ -140,6 +140,5 @@ class Experiment(ABC):
         """Fly all policies; returns the flights of each policy, by name of the trial."""
         flown = {}
         for name, trial in tqdm(self.trials().items(), desc="evaluating", unit=" runs"):
-            place = self.folder / "flights" / name
-            flown[name] = [trial.flown(policy, place) for policy in self.policies(trial)]
+            flown[name] = [trial.flown(policy) for policy in self.policies(trial)]
         return flown

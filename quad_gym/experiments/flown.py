@@ -1,11 +1,8 @@
-"""Flights of policies in test episodes, stored in files so that each policy is flown only once."""
+"""Flights of policies in test episodes."""
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Protocol
 
 import gymnasium
@@ -14,13 +11,9 @@ from numpy.typing import NDArray
 
 from baselines.policies import load_policy
 from quad_gym import Flight, FlightRecorder
-from quad_gym.analysis.plots import Trace
 from quad_gym.analysis.recording import Tracer
-from quad_gym.analysis.reports import as_json
 from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Episodes, Policy, roll_out
-from quad_gym.kernels.digest import flights_digest
-from quad_gym.params.suites import contents_of_suite_files
 
 Floats = NDArray[np.float64]
 
@@ -30,25 +23,8 @@ class Flown:
     """Test episodes of one policy."""
 
     episodes: Episodes
-    recorded: Mapping[str, Floats]
-    """Arrays of the recorder by name, with "time" (t,) [s]"""
-
-    def save(self, file: Path) -> None:
-        """Write a file atomically."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_suffix(".part.npz")
-        arrays: dict[str, Any] = {f"episodes.{k}": v for k, v in self.episodes._asdict().items()}
-        arrays["episodes.ending"] = self.episodes.ending.astype(str)
-        np.savez_compressed(part, **{**arrays, **self.recorded})
-        part.replace(file)
-
-    @classmethod
-    def load(cls, file: Path) -> "Flown":
-        """Read a file written by `save`."""
-        with np.load(file) as stored:
-            episodes = Episodes(*(stored[f"episodes.{name}"] for name in Episodes._fields))
-            names = [name for name in stored if not name.startswith("episodes.")]
-            return cls(episodes, {name: stored[name] for name in names})
+    recorded: Mapping[str, Any]
+    """What the recorder has, by name, with "time" (t,) [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,21 +52,9 @@ class Trial:
         """Environment of all episodes."""
         return self.make(self.episodes)
 
-    def digest(self, policy: str) -> str:
-        """Digest of everything that affects the flights of a policy."""
-        file = Path(policy)
-        trained = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else policy
-        suites = contents_of_suite_files(self.keywords.get("sensors"))
-        about = as_json(self) | {"policy": trained, "threads": None}
-        given = [about, flights_digest(), *as_json(suites).values()]
-        return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:12]
-
-    def flown(self, policy: str, folder: Path) -> Flown:
-        """Flights of a policy, by name or file; read from their file in a folder if it exists."""
-        file = folder / f"{self.digest(policy)}.npz"
-        if not file.exists():
-            fly(self.load(policy), self.env, self.first_episode, self.recorder()).save(file)
-        return Flown.load(file)
+    def flown(self, policy: str) -> Flown:
+        """Fly a policy, by name or file."""
+        return fly(self.load(policy), self.env, self.first_episode, self.recorder())
 
     def recorder(self) -> "Recorder":
         """Make the recorder of the episodes."""
@@ -105,7 +69,7 @@ def fly(policy: Policy, env: Any, seed: int, recorder: "Recorder | None" = None)
     """Fly one episode in every flight of a vector environment; episode i has seed + i."""
     recorder = recorder or PathRecorder()
     episodes = roll_out(policy, env, seed=seed, watch=recorder.add)
-    return Flown(episodes, recorder.arrays())
+    return Flown(episodes, recorder.recorded())
 
 
 class Recorder(Protocol):
@@ -114,18 +78,17 @@ class Recorder(Protocol):
     def add(self, step: int, batch: Any, flying: NDArray[np.bool_]) -> None:
         """Record an instant; see `quad_gym.evaluation.Watch`."""
 
-    def arrays(self) -> dict[str, Floats]:
-        """Recorded arrays by name."""
+    def recorded(self) -> dict[str, Any]:
+        """Return what it has recorded, by name."""
 
 
 class PathRecorder(Tracer):
     """Recorder of the first path, and of errors: "percentiles" (3, t) [m], "not_crashed" (t,)."""
 
-    def arrays(self) -> dict[str, Floats]:
-        """Recorded arrays; the path is in those named "path.FIELD", see `path_of`."""
-        path = {f"path.{name}": values for name, values in vars(self.trace()).items()}
+    def recorded(self) -> dict[str, Any]:
+        """Return path and errors by name."""
         errors = {"percentiles": self.percentiles, "not_crashed": self.not_crashed}
-        return {"time": self.time, **errors, **path}
+        return {"time": self.time, "path": self.trace(), **errors}
 
 
 def flight_of_episode(
@@ -147,8 +110,3 @@ def flight_of_episode(
 
     episodes = roll_out(policy, env, seed=seed, watch=keep)
     return recorder.flight, episodes
-
-
-def path_of(flown: Flown) -> Trace:
-    """First episode, recorded by `PathRecorder`."""
-    return Trace(**{name: flown.recorded[f"path.{name}"] for name in Trace.__dataclass_fields__})

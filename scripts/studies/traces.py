@@ -39,8 +39,8 @@ class ViewRecorder:
             values[~flying[:k]] = np.nan
         self._rows.append([view.period * step, *row])
 
-    def arrays(self) -> dict[str, Floats]:
-        """Recorded arrays."""
+    def recorded(self) -> dict[str, Any]:
+        """Return shares of time, speeds and traces by name."""
         time, *columns = (np.array(column) for column in zip(*self._rows, strict=True))
         return {
             "time": time,

@@ -1,7 +1,6 @@
 """Studies: arms, trainings, resumption, tables, conclusions."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +8,9 @@ import pytest
 from baselines.recipes import recipe
 from quad_gym import IDS
 from quad_gym.evaluation import Episodes
-from quad_gym.experiments import flown as flights
 from quad_gym.experiments.flown import Flown
 from scripts.studies import __main__ as command
-from scripts.studies.arms import Arm, chosen_arms
+from scripts.studies.arms import Arm
 from scripts.studies.study import Study
 from scripts.studies.tasks import STUDIED, stays
 from tests.console_commands import plain
@@ -101,22 +99,6 @@ def test_reward_of_an_arm_applies_in_training_only():
     assert type(learned.own_task).__name__ == "WithStdCertaintyReward"
     assert type(judged.own_task).__name__ == "WithStd"
     assert judged.task.out_of_bounds == 8.0
-
-
-def test_digest_of_flights_depends_on_policy_and_sources(tmp_path, monkeypatch):
-    arms = chosen_arms(STUDIED["stale_race"].arms, ("truth", "truth_on_truth"))
-    study = study_of("stale_race", arms, tmp_path, seeds=(0,))
-    trial = study.trials()["truth_on_truth"]
-    (policy,) = study.policies(trial)
-    assert policy == str(tmp_path / "runs/truth/seed_0/best.npz")
-    Path(policy).parent.mkdir(parents=True)
-    found = []
-    for content in (b"one training", b"another", b"another"):
-        Path(policy).write_bytes(content)
-        found.append(trial.digest(policy))
-    monkeypatch.setattr(flights, "flights_digest", lambda: "of other sources")
-    first, second, same, last = *found, trial.digest(policy)
-    assert first != second == same != last
 
 
 def study_of(task, arms, folder, seeds=(0, 1, 2, 3, 4)):

@@ -117,7 +117,7 @@ def test_crashes_on_purpose_raise_errors_and_percentiles(share):
         policy = PDPolicy(env) if name == "pd" else Quitting(env, share)
         recorder = PathRecorder()
         episodes = roll_out(policy, env, seed=0, watch=recorder.add)
-        found[name] = (episodes, recorder.arrays(), env.flights.task.out_of_bounds)
+        found[name] = (episodes, recorder.recorded(), env.flights.task.out_of_bounds)
     (pd, flown, _), (quitting, dropped, bound) = found.values()
     few = int(20 * share)
     assert quitting.crashed.sum() == few
