@@ -156,7 +156,7 @@ def _table(quantity: str, parts: dict[str, MeanSquare]) -> str:
 
 
 def _errors_alone(findings: Findings) -> str:
-    """Describe what can be tested of an estimator without a covariance."""
+    """Describe the errors of an estimator without a covariance."""
     last = dict(zip(PARTS, (findings.errors[-1, part] for part in PARTS.values()), strict=True))
     r, v, e = (float(np.linalg.norm(last[name])) for name in ("position", "velocity", "attitude"))
     return (

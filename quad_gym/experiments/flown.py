@@ -24,7 +24,7 @@ class Flown:
 
     episodes: Episodes
     recorded: Mapping[str, Any]
-    """What the recorder has, by name, with "time" (t,) [s]"""
+    """Results of the recorder by name, with "time" (t,) [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ class Recorder(Protocol):
         """Record an instant; see `quad_gym.evaluation.Watch`."""
 
     def recorded(self) -> dict[str, Any]:
-        """Return what it has recorded, by name."""
+        """Return its results by name."""
 
 
 class PathRecorder(Tracer):
