@@ -25,7 +25,7 @@ class Scope:
     """Extent of the measurements."""
 
     envs: int
-    """Number of environments in the batches of interfaces, and of flights in the batches of suites"""
+    """Number of environments in batches of interfaces, and of flights in batches of suites"""
     threads: int
     """Largest number of threads"""
     effort: Effort
