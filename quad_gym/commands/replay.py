@@ -130,8 +130,6 @@ def report_of(result: "Replay") -> str:
         lines.append(f"Too late for the window: {result.too_late} measurements.")
     if result.unused:
         lines.append(f"Ignored (sensors not in the suite): {', '.join(result.unused)}.")
-    if not result.heading_known[-1]:
-        lines.append("The heading is still unknown at the end: use --heading or --course.")
     return "\n".join([table, *lines, "", *map(_capital, by_quantity(result.findings))])
 
 

@@ -28,11 +28,12 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.collecting import name_of
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.first_motion import SPAN
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Log
-from quad_gym.estimation.player import Player, name_of
+from quad_gym.estimation.player import Player
 from quad_gym.estimation.sets import run_sets
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite

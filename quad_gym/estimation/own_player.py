@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.collecting import name_of
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.own import Estimator, checked_estimate, factors, own_copy
-from quad_gym.estimation.player import Player, name_of
+from quad_gym.estimation.player import Player
 from quad_gym.estimation.results import Measured, Replay
 from quad_gym.estimation.samples import Measurement
 from quad_gym.packing.aids import blocks_of
@@ -56,7 +57,7 @@ class OwnPlayer:
         self._has |= {aid.name.lower(): True for aid in suite.aids}
         self._has |= {"pixels": suite.camera is not None, "gnss_position": gnss is not None}
         self._has["gnss_baseline"] = gnss is not None and gnss.has_baseline
-        self._has["gnss_velocity"] = player.takes_velocity
+        self._has["gnss_velocity"] = player.measured.takes_velocity
         self._vehicle = VehicleParams(gravity=suite.estimator.gravity)
         features = () if suite.camera is None else suite.camera.features_I
         self._features = np.array(features, np.float64).reshape(1, -1, 3)
@@ -69,7 +70,7 @@ class OwnPlayer:
                 invalid.
         """
         player, dt = self._player, self._suite.imu.dt
-        player.tilted = False  # an estimator of a user's knows no unknown heading
+        player.start.tilted = False  # an estimator of a user's knows no unknown heading
         player.write_tape()
         kf = player.filter
         if not kf.heading_known:
@@ -125,7 +126,7 @@ class OwnPlayer:
                 continue
             known.add(name)
             player, age = self._player, max(now - stamp, 0.0)
-            measurement = player._measurement(name, player.streams[name], k)
+            measurement = player.measured.at(name, k)
             if measurement is not None and age <= player.window + self._suite.imu.dt:
                 found |= self._by_name(measurement, age)
                 for block in measurement.blocks:
@@ -135,7 +136,7 @@ class OwnPlayer:
 
     def _by_name(self, given: Measurement, age: float) -> dict[str, SensorReading]:
         """Return a measurement as readings, by their names."""
-        found, R_IG = {}, self._player.R_GI.T
+        found, R_IG = {}, self._player.measured.R_GI.T
         for name, key in _OF_GNSS.items():
             value = getattr(given, key)
             if value is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from quad_gym.estimation.calls import FilterCalls
 from quad_gym.estimation.earth_field import at_place
 from quad_gym.estimation.filters import UnscentedKalmanFilter
-from quad_gym.estimation.logs import Log, Reading, read_log
+from quad_gym.estimation.logs import Floats, Log, Reading, read_log
 from quad_gym.estimation.logs.parts import naming, parts_of
 from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.own import Estimator
@@ -134,7 +134,16 @@ def in_parts(
         spans = ", ".join(f"{each.time[0]:.2f} to {each.time[-1]:.2f} s" for each in found)
         notes.insert(0, f"the log has pauses, and is flown in {len(found)} parts: {spans}")
     notes += found[0].notes
-    return replace(joined(found), notes=tuple(notes), sources=log.sources)
+    whole = joined(found)
+    quaternion = _continuous(whole.quaternion)
+    return replace(whole, quaternion=quaternion, notes=tuple(notes), sources=log.sources)
+
+
+def _continuous(quaternion: Floats) -> Floats:
+    """Return quaternions (n, 4), each with the sign that is nearer to the one before."""
+    steps = (quaternion[1:] * quaternion[:-1]).sum(axis=1)
+    signs = np.cumprod(np.append(1.0, np.where(steps < 0.0, -1.0, 1.0)))
+    return np.asarray(signs[:, np.newaxis] * quaternion)
 
 
 def _start_of(start: dict[str, Any], before: Estimates | None) -> dict[str, Any]:

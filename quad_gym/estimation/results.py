@@ -55,7 +55,8 @@ class Estimates:
     time: Floats  #: (n,) times of the samples [s]
     position: Floats  #: (n, 3) position in I [m]
     velocity: Floats  #: (n, 3) velocity in I [m/s]
-    quaternion: Floats  #: (n, 4) attitude: unit quaternions (w, x, y, z), body to inertial
+    quaternion: Floats
+    """(n, 4) attitude: unit quaternions (w, x, y, z), body to inertial, without changes of sign"""
     accel_bias: Floats  #: (n, 3) accelerometer bias in B [m/s^2]
     gyro_bias: Floats  #: (n, 3) gyro bias in B [rad/s]
     sigma: Floats

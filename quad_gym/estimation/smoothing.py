@@ -131,9 +131,7 @@ def _filter_forward(player: Player) -> _Forward:
         ValueError: As `Player.write_tape`, or if the heading is never known.
     """
     player.write_tape()
-    kf, engine = player.filter, player.filter._engine
-    if player.log.barometer_from_start:
-        engine.steps["level"] = np.nan
+    kf = player.filter
     tape, status = player.writer.tape(), kf.status
     tape = tape.after(run_while_unknown(kf, player.writer, tape, {})[0])
     codes = tape.operations["code"]

@@ -79,7 +79,7 @@ def with_verdict(log: Log, body: str, suite: SensorSuite, result: Replay) -> Rep
     fits = {name: fit for name, m in sensors.items() if (fit := fit_of(m))}
     for name, fit in fits.items():
         found += _misfit(name, sensors[name], fit, fits)
-    found += [*_changes(log, result), *_biases(result, suite)]
+    found += [*_changes(log, result), *_biases(result, suite), *_unknown_heading(result)]
     found.sort(key=lambda finding: -finding.severity)
     return replace(result, findings=tuple(found), verdict=in_one_line(found, fits))
 
@@ -245,6 +245,17 @@ def _changes(log: Log, result: Replay) -> Iterator[Finding]:
             f"the estimate changes by {size} at about {each.time:.1f} s, {each.ratio:.0f} standard "
             "deviations, which the IMU does not explain: the filter was wrong before, or follows "
             "wrong measurements",
+        )
+
+
+def _unknown_heading(result: Replay) -> Iterator[Finding]:
+    """A heading that no sensor and no motion shows until the end."""
+    if not result.heading_known[-1]:
+        yield Finding(
+            quantity="heading",
+            severity=Severity.UNCERTAIN,
+            text="unknown until the end: no sensor measures it, and the motion does not show it; "
+            "give a heading or the course (--heading, --course)",
         )
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import read_log, replay
+from quad_gym.estimation.logs.quantities import compared
 from quad_gym.rotations import quaternion_to_dcm
 from tests import foreign_logs as foreign
 from tests.foreign_logs import BOOT, EPOCH, Bag
@@ -102,6 +103,19 @@ def test_receiver_with_a_fix_is_taken(flight, dataflash, lost):
         has(chosen.notes, "no data", "--instance gnss=1")
     with pytest.raises(ValueError, match=r"flight.bin: instance of gnss must be .*\(0, 1\), got 5"):
         read_log(path, instance={"gnss": 5})
+
+
+def test_receiver_that_could_take_over_in_flight_is_named(flight, dataflash):
+    """Receiver 0 loses its fix after 10 s; receiver 1 has its first fix after 7 s."""
+
+    def edit(rows):
+        late = [[t, name, [1, *values[1:]]] for t, name, values in rows if name == "GPS" and t > 7]
+        first = [row for row in rows if row[1] != "GPS" or row[0] < 10.0]
+        return sorted([*first, *late], key=lambda row: row[0])
+
+    log = read_log(dataflash(edit))
+    assert log.sources["gnss"]["taken"] == "GPS"
+    has(log.notes, "GPS has no data in 4 s in which GPS 1 has", "--instance gnss=1")
 
 
 def test_pause_divides_a_flight_into_parts(flight, dataflash):
@@ -409,6 +423,22 @@ def test_velocities_against_differenced_positions_are_named_and_left_out(flight,
     has(result.problems, "velocities contradict the positions", cause)
     assert "gnss_velocity" not in result.measured
     assert (np.abs(long.errors(result)).max(axis=0) < 2.0).all()
+
+
+def test_velocities_of_a_slow_flight_agree_with_noisy_positions_that_jump(flight):
+    """Noise of 0.4 m makes differences of positions faster than the motion of up to 1 m/s; 3 % of
+    the fixes are off by 40 m."""
+    rng, slow = np.random.default_rng(0), foreign.flight(24.0)
+
+    def noisy(p):
+        wrong = 40.0 * (rng.random(len(p)) < 0.03)[:, np.newaxis]
+        return 0.3 * p + rng.normal(0.0, 0.4, p.shape) + wrong * [1.0, 0.0, 0.0]
+
+    table = changed(slow.table(), gnss_enu=noisy, gnss_velocity_enu=lambda v: 0.3 * v)
+    log = read_log(table)
+    assert compared(log, CONSUMER).problems == ()
+    silent = read_log(changed(slow.table(), gnss_velocity_enu=lambda v: 1e-3 * v))
+    has(compared(silent, CONSUMER).problems, "velocities contradict the positions")
 
 
 def test_clocks_with_nothing_in_common_are_refused_with_both_ranges(flight):

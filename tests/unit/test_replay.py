@@ -366,3 +366,17 @@ def test_offset_of_a_barometer_with_unknown_zero_changes_no_estimate():
         shifted = dataclasses.replace(log, barometer=barometer, barometer_from_start=True)
         found.append(replay(shifted, sensors=CONSUMER, start={"heading": 0.3}))
     np.testing.assert_allclose(found[1].position, found[0].position, atol=1e-9)
+
+
+def test_quaternions_of_a_turn_do_not_change_their_sign():
+    time = 0.02 * np.arange(1, 400)
+    still = {
+        "gyro": np.tile([0.0, 0.0, -1.0], (399, 1)),
+        "accel": np.tile([0, 0, 9.80665], (399, 1)),
+    }
+    start = {"position": (0.0, 0.0, 0.0), "heading": 0.0}
+    result = replay({"time": time, **still}, sensors="indoor", start=start)
+    w, x, y, z = result.quaternion.T
+    half = -0.5 * (result.time - time[0])
+    np.testing.assert_allclose(np.stack([w, z]), [np.cos(half), np.sin(half)], atol=1e-2)
+    np.testing.assert_allclose(np.stack([x, y]), 0.0, atol=1e-2)

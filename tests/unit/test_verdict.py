@@ -16,6 +16,7 @@ from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.results import Measured
 from quad_gym.estimation.verdict import in_one_line
 from quad_gym.records import GateDecision
+from tests import foreign_logs
 from tests.statistical import verdicts
 
 NAME = "consumer"
@@ -40,6 +41,14 @@ def test_a_flight_without_a_fault_is_usable_in_every_quantity():
         f"{quantity}: usable" for quantity in ("position", "height", "attitude", "heading")
     ]
     assert result.verdict.startswith("usable: NIS per degree of freedom ")
+
+
+def test_a_heading_that_nothing_shows_is_uncertain():
+    still = foreign_logs.flight(6.0, rest=100.0).table()
+    del still["magnetometer"]
+    (heading,) = of(replay(still, sensors=NAME), "heading")
+    assert heading.severity == Severity.UNCERTAIN
+    assert "unknown until the end" in heading.text
 
 
 @pytest.mark.parametrize("change", [verdicts.ramp, verdicts.jump])

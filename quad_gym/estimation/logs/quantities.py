@@ -31,7 +31,8 @@ ALIKE = 0.9  #: correlation of heights that belong together [-]
 CERTAIN = 4.0  #: standard deviations of a motion beyond which it is no noise
 OFF = 0.5
 """Difference from 1 of the median ratio of velocities and motion, as complex numbers: of their turn
-and scale [-]. Noise and outliers leave it at 1."""
+and scale [-]. Noise and outliers of positions leave it at 1."""
+SILENT = 0.25  #: ratio of velocities and motion below which a log has no velocities [-]
 SPAN = 1.0  #: time over which velocities are compared with positions [s]
 FARTHEST = 1e6  #: distance from the origin of I [m]
 FAST = 100.0  #: speed of a jump away from a fix at zero [m/s]
@@ -224,18 +225,32 @@ def _velocities(log: Log, time: Floats, places: Floats) -> _Found:
     moved, mean = _motions(time, places, gnss.time[rows], told[rows])
     bends = np.abs(np.diff(places[:, :2], 2, axis=0))
     noise = math.sqrt(2.0 / 6.0) * float(np.median(bends)) / 0.6745  # of a difference
-    fast = np.linalg.norm(moved[:, :2], axis=1) > max(1.0, CERTAIN * noise / SPAN)
-    if fast.sum() < ENOUGH:
+    rows = _contradiction(moved, mean, max(1.0, CERTAIN * noise / SPAN))
+    if rows is None:
         return
-    moved, mean = moved[fast], mean[fast]
-    gains = (mean[:, 0] + 1j * mean[:, 1]) / (moved[:, 0] + 1j * moved[:, 1])
-    if math.hypot(np.median(gains.real) - 1.0, np.median(gains.imag)) < OFF:
-        return
+    moved, mean = moved[rows], mean[rows]
     values = {k: v for k, v in gnss.values.items() if k not in (name, "velocity_sigma")}
     yield (
         {"gnss": replace(gnss, values=values)},
         f"GNSS velocities contradict the positions: {_cause(moved, mean)}; they are left out",
     )
+
+
+def _contradiction(moved: Floats, mean: Floats, limit: float) -> Any:
+    """Return the rows (n,) above a speed if they contradict each other; None: they do not.
+
+    The velocities of the log choose the rows: positions would choose those with the largest
+    noise, which are faster than the motion. Positions choose if the log has hardly any velocity.
+    """
+    by_places, told = (v[:, 0] + 1j * v[:, 1] for v in (moved, mean))
+    for chosen, other in ((told, by_places), (by_places, told)):
+        rows = np.abs(chosen) > limit
+        if rows.sum() >= ENOUGH:
+            ratios = other[rows] / chosen[rows]
+            ratio = complex(np.median(ratios.real), np.median(ratios.imag))
+            off = abs(1.0 - ratio) > OFF * abs(ratio) if chosen is told else abs(ratio) < SILENT
+            return rows if off else None
+    return None
 
 
 def _motions(time: Floats, places: Floats, stamps: Floats, told: Floats) -> tuple[Floats, Floats]:

@@ -1,0 +1,79 @@
+"""Results of a replay from the pieces of its tape: estimates, and innovations by measurement."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from quad_gym.estimation.logs import Floats
+from quad_gym.estimation.results import Measured
+from quad_gym.estimation.running import Results
+from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
+from quad_gym.rotations import dcm_to_quaternion
+
+
+def collected(
+    pieces: Iterable[Results], blocks: Iterable[int], count: int, stamps: Floats
+) -> tuple[dict[str, Any], dict[int, Measured]]:
+    """Return columns of `Replay` by name, and innovations by block.
+
+    Args:
+        pieces: Results of all pieces of a tape.
+        blocks: Blocks of innovations, in the order of the results.
+        count: Number of estimates.
+        stamps: Times of measurement and arrival (m, 2) of the updates.
+    """
+    columns: dict[str, Any] = {}
+    rows: dict[int, list[Floats]] = {block: [] for block in blocks}
+    first = updates = 0
+    for kept, reported, valid in pieces:
+        for name, values in _columns_of(kept).items():
+            if name not in columns:
+                columns[name] = np.empty((count, *values.shape[1:]), values.dtype)
+            columns[name][first : first + len(kept)] = values
+        first += len(kept)
+        times = stamps[updates : updates + len(valid)]
+        updates += len(valid)
+        for row, (block, found) in enumerate(rows.items()):
+            have = valid[:, block]
+            if have.any():
+                found.append(np.column_stack([times[have], reported[have, row]]))
+    measured = {
+        block: _measured(np.concatenate(found), FREEDOMS[block])
+        for block, found in rows.items()
+        if found
+    }
+    return columns, measured
+
+
+def _columns_of(kept: Floats) -> dict[str, Any]:
+    """Return fields of `Replay` from stored estimates."""
+    r, v, R, b_a, b_g, variances, state = np.split(kept, np.cumsum((3, 3, 9, 3, 3, 15)), 1)
+    return {
+        "position": r,
+        "velocity": v,
+        "quaternion": dcm_to_quaternion(R.reshape(-1, 3, 3)),
+        "accel_bias": b_a,
+        "gyro_bias": b_g,
+        "sigma": np.sqrt(variances),
+        "heading_known": state[:, 1] > 0.0,
+        "diverged": state[:, 0] > 0.0,
+    }
+
+
+def _measured(table: Floats, d: int) -> Measured:
+    """Return innovations from rows of two times and REPORTED numbers."""
+    values = table[:, 2:]
+    return Measured(
+        *(table[:, 0], table[:, 1], values[:, :d], values[:, 3 : 3 + d]),
+        *(values[:, 6], values[:, 7]),
+    )
+
+
+def name_of(block: int) -> str:
+    """Return the name of a block of innovations."""
+    if block < FEATURE_BLOCKS:
+        return ("gnss_position", "gnss_baseline", "gnss_velocity")[block]
+    if block >= AID_BLOCKS:
+        return Aid(block - AID_BLOCKS).name.lower()
+    return f"feature_{block - FEATURE_BLOCKS}"

@@ -1,0 +1,101 @@
+"""Start of a filter on a log: from its first fix, or from a state that the caller gives."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from quad_gym.estimation.filters import LONGEST_STEP, KalmanFilter
+from quad_gym.estimation.measurements import LogMeasurements
+from quad_gym.estimation.starts import state_at_rest
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+
+PATIENCE = 2.0  #: time for which a start waits for the first magnetic field [s]
+
+
+class LogStart:
+    """Start of filters on a log, the same for each.
+
+    Args:
+        measured: Measurements of the log.
+        given: Keywords of `initialize` or, with a position, of `set_state`.
+        in_order: True if measurements are processed in the order of their time stamps.
+        tilted: True if roll and pitch are too uncertain for a heading by a magnetic field.
+    """
+
+    def __init__(
+        self, measured: LogMeasurements, given: dict[str, Any], in_order: bool, tilted: bool
+    ) -> None:
+        self.given, self.tilted = given, tilted
+        self.at_rest = "position" in given  #: True: the caller gives the state
+        self.from_fix: dict[str, Any] = {}  #: keywords of `initialize`, once they are known
+        self._measured, self._in_order = measured, in_order
+        self._field: int | None = None  # the last magnetic field before the start
+        self._first_fix = math.inf
+
+    def begin(self, kf: KalmanFilter, suite: SensorSuite) -> None:
+        """Start a filter; `suite` is its suite, without a wide start."""
+        if self.at_rest:
+            try:
+                kf.set_state(**self._state(suite))
+            except TypeError as error:
+                raise ValueError(f"start must be the keywords of set_state: {error}") from None
+        else:
+            kf.initialize(**self.from_fix)
+        if self._measured.log.barometer_from_start:  # relative to the height of the vehicle
+            kf._engine.steps["level"] = np.nan
+
+    def found_in(self, name: str, k: int) -> bool:
+        """Return True if the start is known with measurement k of a stream."""
+        if name == "magnetometer":
+            self._field = k
+        if name != "gnss":
+            return False
+        stream, log = self._measured.streams["gnss"], self._measured.log
+        fix, time = self._measured.fix(k), float(stream.time[k])
+        averages = self._measured.suite.imu.samples == "average"
+        first = float(log.imu.time[0 if averages else 1])  # an instant needs the sample before
+        if "gnss_position_G" not in fix or time < first - LONGEST_STEP:
+            return False
+        if not {"heading", "course"} & set(self.given) and "gnss_baseline_G" not in fix:
+            heading = self._measured.heading(time)
+            fix |= {} if heading is None else {"heading": heading}
+        if not self._knows_heading(fix) and "magnetometer" in self._measured.streams:
+            if self._in_order:  # the nearest one, even if it is later
+                fields = self._measured.streams["magnetometer"].time
+                self._field = int(np.argmin(np.abs(fields - time)))
+            self._first_fix = min(self._first_fix, float(stream.received[k]))
+            if self._field is None and stream.received[k] < self._first_fix + PATIENCE:
+                return False
+            if self._field is not None:
+                fields = self._measured.streams["magnetometer"].values["magnetometer"]
+                fix["magnetometer"] = fields[self._field]
+        if self.given.get("course") and "gnss_velocity_G" not in {**fix, **self.given}:
+            why = "the first fix of the log has none"
+            if not self._measured.takes_velocity:
+                why = "the sensors take none: GnssParams.velocity_sigma is None"
+            raise ValueError(f"a start by its course must have a GNSS velocity, but {why}")
+        self.from_fix = {**fix, **self.given, "time": time}
+        return True
+
+    def _knows_heading(self, fix: dict[str, Any]) -> bool:
+        """Return True if no magnetic field is necessary, or admitted, for the heading."""
+        by_fix = {"gnss_baseline_G", "heading"} & set(fix)
+        return bool(
+            self.tilted or by_fix or {"heading", "course", "magnetometer"} & set(self.given)
+        )
+
+    def _state(self, suite: SensorSuite) -> dict[str, Any]:
+        """Return keywords of `set_state`, completed for a vehicle at rest."""
+        state = {"time": float(self._measured.log.imu.time[0]), **self.given}
+        if {"R_BI", "covariance"} & set(state):
+            return state
+        check.keywords(state, ("position", "heading", "time"), "a start at a position")
+        heading = state.setdefault("heading", self._measured.heading(state["time"]))
+        if heading is None:
+            raise ValueError(
+                "start must have a heading in addition to the position, or all keywords of "
+                "set_state"
+            )
+        return state_at_rest(suite, **state)
