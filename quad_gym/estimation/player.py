@@ -190,7 +190,8 @@ class Player:
             return
         if step > max(LONGEST_STEP, self.suite.imu.dt):
             usual = float(np.median(np.diff(self.log.imu.time)))
-            cause = "cut the log there" if usual < LONGEST_STEP else "time in ms?"
+            unit = "ms" if usual < 1e3 else "us" if usual < 1e6 else "ns"
+            cause = "cut the log there" if usual < LONGEST_STEP else f"time in {unit}?"
             raise ValueError(
                 f"samples of the IMU must be at most {LONGEST_STEP:g} s apart, got none from "
                 f"{now:.3f} s to {time:.3f} s: {cause}"

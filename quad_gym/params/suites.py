@@ -234,7 +234,10 @@ ONE_WALL = _changed(
     noisy=_noise(0.0079, 0.0139, 0.00089, 0.0107)
 )
 """The suite of `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west
-wall."""
+wall. Without a marker the position is dead reckoning. Once its standard deviation exceeds a fifth
+of the markers' distance, after some 3 s, the next image may leave an overconfident estimate: over
+random trajectories under PD control, the NEES is 32 on average after 4 s, and 14.9 in the median
+(15 expected)."""
 
 STALE = _changed(
     RTK,

@@ -25,7 +25,7 @@ MOVING = 10.0  #: time from which fixes are left out, as the filter starts in mo
 
 
 def attitude_errors(result, folder):
-    """Return RMS differences of roll, pitch and yaw from the autopilot, about their medians."""
+    """Return medians of differences of roll, pitch and yaw from the autopilot, and RMS about."""
     autopilot = np.loadtxt(folder / "ATT.txt")
     time = 1e-3 * autopilot[:, 0]
     rows = np.clip(np.searchsorted(result.time, time), 0, len(result.time) - 1)
@@ -34,13 +34,14 @@ def attitude_errors(result, folder):
     pitch = np.arcsin(R[:, 0, 2])  # nose up
     yaw = np.arctan2(R[:, 0, 0], R[:, 0, 1])  # from north toward east
     found = np.degrees(np.column_stack([roll, pitch, yaw]))
-    errors = []
+    errors, medians = [], []
     for angle, other in zip(found.T, autopilot[:, 2:5].T, strict=True):
         error = (angle - other + 180.0) % 360.0 - 180.0
         error = error[(time > time[0] + SETTLED) & (time <= result.time[-1])]
-        error = (error - np.median(error) + 180.0) % 360.0 - 180.0
+        medians.append(np.median(error))
+        error = (error - medians[-1] + 180.0) % 360.0 - 180.0
         errors.append(np.sqrt((error**2).mean()))
-    return np.array(errors)
+    return np.array(medians), np.array(errors)
 
 
 def fit_texts(validation):
@@ -64,8 +65,9 @@ def hobby_vehicle(folder):
     first = float(log.imu.time[0]) + SETTLED
     field = validate(log, quad_gym.sensor_suite("field"), None, first)
     for name, seen in (("consumer", found.before), ("calibrated", found.after), ("field", field)):
-        angles = attitude_errors(seen.replay, folder)
-        print(name, *fit_texts(seen), f"roll, pitch, yaw {angles.round(2)} deg", sep="; ")
+        medians, errors = attitude_errors(seen.replay, folder)
+        angles = f"roll, pitch, yaw {errors.round(2)} deg about {medians.round(2)} deg"
+        print(name, *fit_texts(seen), angles, sep="; ")
 
 
 def survey_vehicle(folders):

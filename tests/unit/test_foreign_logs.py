@@ -356,6 +356,18 @@ def test_dead_compass_and_doubled_sample_of_a_table_are_named(flight):
     has(result.notes, "1 row dropped", "repeated stamp")
 
 
+@pytest.mark.parametrize("turn", ["reversed", "shuffled"])
+def test_rows_in_another_order_than_time_are_sorted(flight, turn):
+    table = flight.table()
+    rows = np.arange(len(table["time"]))[::-1]
+    if turn == "shuffled":
+        rows = np.random.default_rng(1).permutation(rows)
+    result = arrives(flight, {name: values[rows] for name, values in table.items()}, 0.0)
+    has(result.notes, "not in the order of time: they are sorted")
+    late = table | {"received": table["time"]}  # whose order is given
+    assert not any("sorted" in note for note in read_log(late).notes)
+
+
 def test_first_fixes_at_zero_are_no_fixes(flight):
     lla = np.full((len(flight.table()["time"]), 3), np.nan)
     table = flight.table()

@@ -20,6 +20,8 @@ _FORMS = {
 }
 """Forms in which quantities may be given."""
 
+DISORDER = 0.1  #: share of steps back in time, of the IMU, that no recorder writes
+
 Columns = Mapping[str, Floats]
 
 
@@ -117,8 +119,20 @@ def _pixel_of(name: str) -> tuple[int, int] | None:
 
 
 def recording_of(columns: Columns, body: str, file: str) -> RawLog:
-    """Return the contents of checked columns."""
-    return RawLog(file=file, sources=list(sources_of(columns, body)))
+    """Return the contents of checked columns, in the order of arrival."""
+    columns, notes = _in_order(columns)
+    return RawLog(file=file, sources=list(sources_of(columns, body)), notes=notes)
+
+
+def _in_order(columns: Columns) -> tuple[Columns, list[str]]:
+    """Return the rows in the order of time if theirs cannot be the order of arrival."""
+    time = columns["time"]
+    back = np.diff(time[np.isfinite(columns["gyro_x"])]) < 0.0
+    if "received" in columns or not len(back) or back.mean() < DISORDER:
+        return columns, []
+    order = np.argsort(time, kind="stable")
+    sentence = "the rows of the table are not in the order of time: they are sorted"
+    return {name: column[order] for name, column in columns.items()}, [sentence]
 
 
 def _together(columns: Columns, key: str) -> Floats | None:
