@@ -2,14 +2,14 @@
 
 `gymnasium.make(..., render_mode="rgb_array")` is the usual interface. `Renderer` draws a
 `quad_gym.Flight`, `tile` arranges frames in a grid, `record_flight` runs a policy and returns the
-flight, `save_video` writes a flight as a video, and `record_video` does both; `save_side_by_side`
-writes several flights of one episode into one video.
+flight, `save_video` writes a flight as a video, and `save_side_by_side` several flights of one
+episode.
 """
 
 from quad_gym.rendering.live import RENDER_MODES, Rendering
 from quad_gym.rendering.renderer import VIEWS, Renderer, tile
 from quad_gym.rendering.side_by_side import Side, SideBySide, save_side_by_side
-from quad_gym.rendering.video import flight_of, record_flight, record_video, save_video
+from quad_gym.rendering.video import record_flight, save_video
 
 __all__ = [
     "RENDER_MODES",
@@ -18,9 +18,7 @@ __all__ = [
     "Rendering",
     "Side",
     "SideBySide",
-    "flight_of",
     "record_flight",
-    "record_video",
     "save_side_by_side",
     "save_video",
     "tile",

@@ -38,27 +38,10 @@ def record_flight(
         ValueError: If the environment has no time limit, or a keyword is invalid.
     """
     env = gymnasium.make_vec(env_id, num_envs=1, autoreset_mode="Disabled", **keywords)
-    return flight_of(policy, env, seed=seed, about={"env_id": env_id, **(about or {})})
-
-
-def flight_of(
-    policy: Any,
-    env: gymnasium.vector.VectorEnv[Any, Any, Any],
-    *,
-    seed: int = 0,
-    about: dict[str, Any] | None = None,
-) -> Flight:
-    """Run a policy for one episode of a vector environment with one flight, and return the flight.
-
-    Raises:
-        ValueError: If `env` has no time limit, or is not a vector environment with one flight.
-    """
-    flights = getattr(env.unwrapped, "flights", None)
-    if flights is None or env.num_envs != 1:
-        raise ValueError("env must be a QuadGym vector environment of one flight")
-    if flights.batch.max_steps == 0:
+    if env.unwrapped.flights.batch.max_steps == 0:  # type: ignore[attr-defined]
         raise ValueError("env must have a time limit: a duration or max_episode_steps above 0")
-    *_, (flight, _) = fly_steps(policy, env, seed, {"seed": seed, **(about or {})})
+    known = {"seed": seed, "env_id": env_id, **(about or {})}
+    *_, (flight, _) = fly_steps(policy, env, seed, known)
     return flight
 
 
@@ -71,7 +54,12 @@ def fly_steps(
 ) -> Iterator[tuple[Flight, str]]:
     """Run an episode; yield the flight so far, at the start and after each step, and its ending.
 
-    Arguments are as in `flight_of`; `before_step` is called with the batch before each step.
+    Args:
+        policy: As in `record_flight`.
+        env: A vector environment of one flight.
+        seed: Seed of the episode.
+        about: Information to be stored with the flight.
+        before_step: Function that is called with the batch before each step.
     """
     batch = env.unwrapped.flights.batch
     recorder = FlightRecorder(batch, about=about)
@@ -134,36 +122,6 @@ def save_video(
     frames = (renderer.draw(flight.until(t)) for t in times)
     write_frames(frames, target, fps=fps)
     return target
-
-
-def record_video(
-    policy: Any,
-    env_id: str,
-    path: Path | str,
-    *,
-    seed: int = 0,
-    view: str = "fixed",
-    size: tuple[int, int] = (640, 480),
-    fps: float = 25.0,
-    speed: float = 1.0,
-    progress: Progress | None = None,
-    **keywords: Any,
-) -> Flight:
-    """Run a policy for one episode and write a video of it: `record_flight`, then `save_video`.
-
-    These explain the arguments.
-
-    Returns:
-        The flight, to be saved or inspected.
-
-    Raises:
-        ValueError: If an argument is invalid.
-        ImportError: If a library that writes the file is not installed.
-    """
-    checked_video_path(path)  # before the flight
-    flight = record_flight(policy, env_id, seed=seed, **keywords)
-    save_video(flight, path, view=view, size=size, fps=fps, speed=speed, progress=progress)
-    return flight
 
 
 def checked_video_path(path: Path | str) -> Path:

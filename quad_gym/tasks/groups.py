@@ -192,18 +192,6 @@ class MeasuredView(Group):
     gnss_position, gnss_baseline = quantity("gnss_position"), quantity("gnss_baseline")
     gnss_velocity, pixels = quantity("gnss_velocity"), quantity("pixels")
 
-    @field("(n,) bool", "-", "-", "True where a position was measured in this step")
-    def gnss_valid(self) -> Truths:
-        return np.isfinite(self.gnss_position[:, 0])
-
-    @field("(n,) bool", "-", "-", "True where a baseline was measured in this step")
-    def baseline_valid(self) -> Truths:
-        return np.isfinite(self.gnss_baseline[:, 0])
-
-    @field("(n, m) bool", "-", "-", "True for features in an image of this step")
-    def features_seen(self) -> Truths:
-        return np.isfinite(self.pixels[:, :, 0])
-
 
 class BuiltinView(Group):
     """Reward and endings of the built-in task; zero where an episode has begun since."""
