@@ -1,0 +1,205 @@
+"""Predict logged flights of a Crazyflie in closed loop, and compare with the logs.
+
+    python -m scripts.studies.real_flights LOGS... --sensors mine.toml --fitted 5
+    python -m scripts.studies.real_flights LOGS... --fitted 5 --policy results/policy/best.npz
+
+Logs are tables of NanoBench (arXiv:2603.09908). Thrust and drag are fitted to the first ones. A
+simulated vehicle with the Crazyflie's PID then flies the logged setpoints of all of them, with the
+logged voltage of the battery, sensors and filter of the suite, and thrusts as they vary between the
+fitted flights. Prints a table, and writes it with a figure. With a policy, both controllers also
+fly the same random trajectories in this environment.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from scipy.stats import spearmanr
+from tyro.conf import Positional
+
+from baselines.crazyflie_pid import CrazyfliePID
+from baselines.policies import load_policy
+from quad_gym import SensorSuite, sensor_suite, vehicle_params
+from quad_gym.analysis import plots
+from quad_gym.analysis.reports import (
+    columns_of,
+    require_writable,
+    text_table,
+    write_csv,
+    write_json,
+)
+from quad_gym.commands import options
+from quad_gym.evaluation import roll_out
+from scripts.studies.closed_loop import (
+    IMU,
+    RATE,
+    Body,
+    Flown,
+    LoggedFlight,
+    fit_body,
+    fly,
+    read_flight,
+    rms,
+)
+
+FACTOR = 1.3  #: ratio of predicted and logged errors that counts as right
+TASK = "QuadGym/RandomTrajectory-v0"
+
+
+@dataclass(frozen=True)
+class RealFlightsArgs:
+    """Options of the study."""
+
+    logs: Positional[tuple[Path, ...]]
+    """tables of flights"""
+    fitted: int = 5
+    """number of logs, from the first, to which thrust and drag are fitted"""
+    sensors: str = "mocap"
+    """suite, by name or file (.toml)"""
+    draws: int = 16
+    """simulated flights of each log"""
+    seed: int = 0
+    """seed of the first simulated flight"""
+    policy: str | None = None
+    """file of a policy (.npz) to compare with the PID in simulation"""
+    episodes: int = 100
+    """random trajectories of this comparison"""
+    output: Path = Path("results/real_flights")
+    """folder"""
+
+
+def row_of(log: LoggedFlight, flown: Flown, fitted: bool) -> dict[str, Any]:
+    """Return the row of a flight in the table; errors are root mean squares [m]."""
+    rows = log.judged
+    errors = rms((log.setpoint - flown.position)[:, rows])
+    low, middle, high = np.nanpercentile(errors, [5.0, 50.0, 95.0])
+    return {
+        "flight": log.name,
+        "fitted": fitted,
+        "crashed": log.crashed,
+        "clock": log.clock,
+        "logged": float(rms((log.setpoint - log.position)[rows])),
+        "predicted": float(middle),
+        "low": float(low),
+        "high": float(high),
+        "crashes": int(np.isnan(flown.position[:, :-200]).any(axis=(1, 2)).sum()),
+        "command": float(log.commands[rows].mean()),
+        "predicted_command": float(np.nanmean(flown.commands[:, rows])),
+        "estimation": float(rms((log.estimate - log.position)[rows])),
+        "predicted_estimation": float(
+            np.nanmedian(rms((flown.estimate - flown.position)[:, rows]))
+        ),
+    }
+
+
+def summary_of(table: list[dict[str, Any]]) -> dict[str, float]:
+    """Return how well errors are predicted."""
+    logged, predicted = (np.array([row[key] for row in table]) for key in ("logged", "predicted"))
+    within = np.abs(np.log(predicted / logged)) < np.log(FACTOR)
+    return {
+        "flights": len(table),
+        "within_factor": float(within.mean()),
+        "rank_correlation": float(spearmanr(logged, predicted)[0]),
+        "in_interval": float(np.mean([row["low"] < row["logged"] < row["high"] for row in table])),
+    }
+
+
+@plots.house_style()
+def prediction_figure(table: list[dict[str, Any]]) -> Any:
+    """Figure of predicted over logged tracking errors, with intervals and the factor."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 4.6))
+    axes = figure.subplots()
+    ends = np.array([0.2, 1.0])
+    axes.plot(ends, ends, color=plots.INK, linewidth=0.8)
+    axes.fill_between(ends, ends / FACTOR, ends * FACTOR, color=plots.PALE, zorder=0, linewidth=0)
+    for kind, color in ((True, plots.GREY), (False, plots.BLUE)):
+        some = [row for row in table if row["fitted"] == kind]
+        x, y, low, high = (
+            np.array([row[key] for row in some]) for key in ("logged", "predicted", "low", "high")
+        )
+        label = "thrust fitted to it" if kind else "not used before"
+        style: dict[str, Any] = {
+            "fmt": "o",
+            "markersize": 4.5,
+            "color": color,
+            "label": label,
+            "elinewidth": 1.0,
+        }
+        axes.errorbar(x, y, yerr=[y - low, high - y], **style)
+    for row in table:
+        if row["crashed"]:
+            place = row["logged"], row["predicted"]
+            axes.annotate("crashes", place, (5, -10), textcoords="offset points")
+    axes.set(xscale="log", yscale="log", xlim=ends, ylim=(0.1, 1.4))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("{x:.1g}")
+    axes.set(xlabel="logged tracking error [m]", ylabel="predicted tracking error [m]")
+    axes.legend(loc="upper left")
+    return figure
+
+
+def compare_policies(args: RealFlightsArgs, suite: SensorSuite, body: Body) -> dict[str, Any]:
+    """Fly random trajectories with the PID and with a policy; return their results."""
+    fast = suite.replace(imu=suite.imu.replace(rate=RATE))
+    common: dict[str, Any] = {
+        **{"vehicle": body.vehicle, "world": body.world, "randomization": body.randomization},
+        **{"start": "hover", "filter_start": "warm", "max_speed": 1.0, "max_acceleration": 2.0},
+        **{"sensors": fast, "true_sensors": fast.replace(imu=IMU.replace(rate=RATE))},
+    }
+    envs: dict[str, dict[str, Any]] = {
+        "pid": {"action": "motor", "layout": "absolute", "control_rate": RATE},
+        str(args.policy): {},
+    }
+    found = {}
+    for name, own in envs.items():
+        env = gymnasium.make_vec(TASK, args.episodes, **common, **own)
+        policy = CrazyfliePID(env) if name == "pid" else load_policy(name, env)
+        flown = roll_out(policy, env, seed=args.seed)
+        found[name] = {
+            "error": float(flown.mean_error.mean()),
+            "late_error": float(np.nanmean(flown.late_error)),
+            "crashed": float(flown.crashed.mean()),
+        }
+    return found
+
+
+def main(args: RealFlightsArgs) -> None:
+    """Fit, fly, compare."""
+    with options.usage_errors():
+        plots.require_matplotlib()
+        options.require_at_least(args, fitted=1, draws=1, seed=0, episodes=1)
+        require_writable("--output", args.output)
+        logs, suite = [read_flight(file) for file in args.logs], sensor_suite(args.sensors)
+        body = fit_body(logs[: args.fitted], vehicle_params("crazyflie"))
+    print(f"Thrust carries the weight at {body.vehicle.hover_voltage:.3f} V.")
+    body.vehicle.save(args.output / "body.toml")
+    results: dict[str, Any] = {}
+    if args.policy is not None:
+        results["policies"] = compare_policies(args, suite, body)
+        for name, values in results["policies"].items():
+            print(name, *(f"{key} {value:.3f}" for key, value in values.items()), sep="; ")
+    flown = fly(logs, suite, *body, draws=args.draws, seed=args.seed)
+    pairs = enumerate(zip(logs, flown, strict=True))
+    table = [row_of(log, one, k < args.fitted) for k, (log, one) in pairs]
+    for name, some in (("all", table), ("others", table[args.fitted :])):
+        if len(some) > 2:
+            results[name] = summary_of(some)
+            print(name, *(f"{key} {value:.3g}" for key, value in results[name].items()), sep="; ")
+    cells = [
+        [f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()]
+        for row in table
+    ]
+    print(text_table({"": list(table[0])}, cells))
+    write_csv(args.output / "flights.csv", columns_of(table))
+    write_json(args.output / "results.json", {**results, "configuration": args, "body": body})
+    plots.save_figure(prediction_figure(table), args.output / "prediction")
+
+
+if __name__ == "__main__":
+    program = "python -m scripts.studies.real_flights"
+    main(options.parse(RealFlightsArgs, prog=program, description=__doc__))
