@@ -325,15 +325,6 @@ class ExtendedKalmanFilter(KalmanFilter):
     Its covariance follows from analytic derivatives of the models at the estimate, which cost less
     than sigma points and neglect the second order; see `quad_gym.kernels.filter.ekf`.
 
-    Args:
-        sensors: The sensor suite whose geometry and noise the filter assumes.
-        window: Longest delay of measurements with a time stamp [s]; 0: no delays, and no data are
-            kept for them.
-
-    Raises:
-        ValueError: If `sensors` is not a sensor suite, or its filter misinterprets the IMU samples,
-            see `SensorSuite.require_filter`.
-
     Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for error angles about an
     estimated attitude.
     """

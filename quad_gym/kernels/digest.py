@@ -44,25 +44,6 @@ def digest_of(module: str) -> str:
     return _combined(seen)
 
 
-@functools.cache
-def flights_digest() -> str:
-    """Digest of all sources on which flights and their results depend.
-
-    Results on disk are stored with it: after a change of code they are measured again. The layout
-    of commands and pictures does not count.
-    """
-    apart = {"commands", "experiments", "rendering", "compiling"}
-    root = Path(__file__).parents[1]
-    files = {str(file.relative_to(root)): file for file in root.rglob("*.py")}
-    return _combined(
-        {
-            name: _parsed(file.read_bytes(), PACKAGE)[0]
-            for name, file in files.items()
-            if not apart & {*Path(name).parts}
-        }
-    )
-
-
 def _combined(digests: dict[str, str]) -> str:
     """Digest of modules' names and digests: with names, as two may swap their contents."""
     lines = [sys.version, *(f"{name} {digest}" for name, digest in sorted(digests.items()))]
