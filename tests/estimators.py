@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import quad_gym
 from tests.examples import example
@@ -29,12 +30,8 @@ class Simple(quad_gym.Estimator):
         s, fix = self.state, measurements.gnss_position
         s.ticks += 1
         s.r += measurements.dt * s.v
-        x, y, z = (measurements.dt * measurements.gyro.T)[..., np.newaxis]
-        rows = s.R[:, 0].copy(), s.R[:, 1].copy(), s.R[:, 2].copy()
-        s.R[:, 0] += z * rows[1] - y * rows[2]
-        s.R[:, 1] += x * rows[2] - z * rows[0]
-        s.R[:, 2] += y * rows[0] - x * rows[1]
-        s.R /= np.linalg.norm(s.R, axis=2, keepdims=True)
+        turns = Rotation.from_rotvec(-measurements.dt * measurements.gyro)
+        s.R = turns.as_matrix() @ s.R
         if fix is not None:
             s.r += np.where(fix.new[:, np.newaxis], 0.2 * (fix.value - s.r), 0.0)
         return self.estimate()

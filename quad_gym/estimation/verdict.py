@@ -162,11 +162,11 @@ def _misfit(name: str, m: Measured, fit: Fit, fits: Mapping[str, Fit]) -> Iterat
         )
     elif (run := _longest_run(m, known & (m.time > m.time[0] + SETTLED))) is not None:
         since, length = run
-        yield Finding(
-            quantity=quantity,
-            severity=Severity.UNCERTAIN,
-            text=f"{NAMES[name]} refused for {length:.1f} s in a row from {since:.1f} s on",
-        )
+        text = f"{NAMES[name]} refused for {length:.1f} s in a row from {since:.1f} s on"
+        severity = Severity.UNCERTAIN
+        if quantity == "position" and length >= PATIENCE:
+            severity, text = Severity.LOST, f"{text}: it drifts or jumps, or others do"
+        yield Finding(quantity=quantity, severity=severity, text=text)
     if name.startswith("gnss") and len(nis) >= FEWEST:
         yield from _correlated(name, m, quantity)
     if fit.mean_nis < PESSIMISTIC:

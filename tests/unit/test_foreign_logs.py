@@ -397,7 +397,12 @@ def test_barometer_above_another_level_is_named_and_still_used(flight):
 
 
 @pytest.mark.parametrize(
-    ("change", "unit"), [(lambda b: b / 0.3048, "in ft"), (lambda b: 950.0 - 0.113 * b, "in hPa")]
+    ("change", "unit"),
+    [
+        (lambda b: b / 0.3048, "in ft"),
+        (lambda b: 950.0 - 0.113 * b, "in hPa"),
+        (np.negative, "in m downward"),
+    ],
 )
 def test_barometer_in_another_unit_is_named_and_left_out(flight, change, unit):
     result = replay(changed(flight.table(), barometer=change), sensors=CONSUMER)

@@ -59,6 +59,13 @@ def test_gnss_that_drifts_or_jumps_makes_the_position_unusable(change):
     assert result.verdict.startswith("not usable, because position: ")
 
 
+def test_gnss_that_drifts_while_a_camera_holds_the_position_is_a_problem():
+    log, truth = next(iter(verdicts.flown("rtk", 1, seed=7)))
+    result, error = verdicts.judged("rtk", verdicts.ramp, log, truth, seed=0)
+    assert error < 0.1
+    assert any("GNSS position refused for" in problem for problem in result.problems)
+
+
 def test_measurements_of_another_clock_are_named_with_the_difference():
     log, _ = flight()
     table = log | {"time": np.where(np.isfinite(log["gyro"][:, 0]), log["time"], log["time"] - 1.5)}

@@ -36,7 +36,15 @@ SILENT = 0.25  #: ratio of velocities and motion below which a log has no veloci
 SPAN = 1.0  #: time over which velocities are compared with positions [s]
 FARTHEST = 1e6  #: distance from the origin of I [m]
 FAST = 100.0  #: speed of a jump away from a fix at zero [m/s]
-_LENGTHS = {0.001: "km", 3.28084: "ft", 100.0: "cm", 1000.0: "mm", -12.0: "Pa", -0.12: "hPa"}
+_LENGTHS = {
+    -1.0: "m downward",
+    0.001: "km",
+    3.28084: "ft",
+    100.0: "cm",
+    1000.0: "mm",
+    -12.0: "Pa",
+    -0.12: "hPa",
+}
 """Units of a height or pressure, by the change of the number per meter of height."""
 MAX_FIELD = 5.0  #: ratio of the median magnetic field and the suite's, either way [-]
 _FIELDS = {1e4: "gauss", 1e6: "microtesla", 1e7: "milligauss", 1e9: "nanotesla"}

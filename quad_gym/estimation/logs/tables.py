@@ -42,7 +42,9 @@ def csv_columns(path: Path) -> Columns:
     numbers, count = array("d"), 0
     try:
         with opened(path) as file:
-            rows = csv.reader(file)
+            separator = max(",;\t", key=file.readline().count)
+            file.seek(0)
+            rows = csv.reader(file, delimiter=separator)
             names = [name.strip() for name in next(rows, [])]
             for row in filter(None, rows):
                 count += 1
