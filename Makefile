@@ -76,7 +76,7 @@ test-oldest: $(OLDEST)/.tester  ## golden flights and interfaces with the oldest
 
 $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 	$(PYTHON) -m venv $(OLDEST)
-	$(OLDEST)/bin/python -m pip install --quiet --constraint constraints-oldest.txt \
+	$(OLDEST)/bin/python -m pip install --quiet --no-compile --constraint constraints-oldest.txt \
 		--editable ".[train,plot,render]" pytest hypothesis
 	touch $@
 

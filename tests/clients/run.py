@@ -9,6 +9,7 @@ the programs of the page. An environment is reused until the line, the constrain
 change.
 """
 
+import os
 import re
 import shlex
 import subprocess
@@ -18,6 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "libraries.md"
 CONSTRAINTS = ROOT / "constraints-clients.txt"
+SCRIPTS = "Scripts" if os.name == "nt" else "bin"  #: folder of a virtual environment's commands
 SECTION = re.compile(r"^## (.+?)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 INSTALL = re.compile(r"^pip install (.+)$", re.MULTILINE)
 PROGRAMS = "tests/contract/test_documentation.py::test_programs_run[libraries.md]"
@@ -33,7 +35,7 @@ def clients():
 def installed(name, packages):
     """Return the Python of a client's environment; make it if it is missing or out of date."""
     folder = ROOT / ".venv-clients" / name
-    python, stamp = folder / "bin" / "python", folder / "installed.txt"
+    python, stamp = folder / SCRIPTS / "python", folder / "installed.txt"
     files = (CONSTRAINTS, ROOT / "pyproject.toml")
     wanted = "\n".join([*packages, *(file.read_text(encoding="utf-8") for file in files)])
     if not stamp.exists() or stamp.read_text(encoding="utf-8") != wanted:

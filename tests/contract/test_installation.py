@@ -1,5 +1,6 @@
 """Installers read the dependencies before they build a wheel, and an index shows working links."""
 
+import os
 import re
 import runpy
 import shutil
@@ -70,6 +71,20 @@ def test_links_elsewhere_and_within_the_page_are_kept():
     assert absolute(text, "https://p/", "https://q/") == (
         "[a](https://a.org/b) [c](#d) [e](https://p/f.md#g) [![h](https://q/i.png)](https://p/j.md)"
     )
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="the workflow runs in bash")
+@pytest.mark.parametrize("tag", ["v0.1.0", "v0.1", "v0.1.0rc1", "v0.2.0"])
+def test_a_release_takes_only_the_tag_of_its_version(tag, tmp_path):
+    workflow = (ROOT / ".github" / "workflows" / "release.yml").read_text(encoding="utf-8")
+    step = re.search(r"The tag is the version of every file\n +run: \|\n((?: {10}.+\n)+)", workflow)
+    (tmp_path / "dist").mkdir()
+    for end in (".tar.gz", "-py3-none-any.whl", "-py3-none-manylinux_2_17_x86_64.whl"):
+        (tmp_path / "dist" / f"quad_gym-0.1.0{end}").touch()
+    variables = os.environ | {"GITHUB_REF_NAME": tag}
+    command = ["bash", "-e", "-c", step[1]]
+    done = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, check=False)
+    assert (done.returncode == 0) == (tag == "v0.1.0"), done.stderr
 
 
 @pytest.mark.slow  # builds in an environment with packages from the index
