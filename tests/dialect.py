@@ -3,8 +3,8 @@
     python -m tests.dialect              # the counts per 1,000 words, as `make lint` prints them
     python -m tests.dialect --list NAME  # every find in pages and folders whose name contains NAME
 
-A text is a page or the docstrings of a folder. It may have one find, or up to `LIMIT` per 1,000
-words. The table in CONTRIBUTING.md has the standard words to write instead.
+A text is a page, or the docstrings and tables of a folder. It may have one find, or up to `LIMIT`
+per 1,000 words. The table in CONTRIBUTING.md has the standard words to write instead.
 """
 
 import argparse
@@ -72,6 +72,9 @@ OPENINGS = (
     r"(What|Whether|Which|Who|Whose|How|Where|Of|Likewise|Its|Their|The same|Same|In place of)\b"
 )
 """Openings to avoid: a docstring begins with a noun or an imperative verb."""
+
+ROWS = ("Field", "Quantity", "Drawable", "Column", "field", "record", "shown")
+"""Calls that make the rows of tables, each with a description."""
 
 SEMICOLONS = 6.0  #: largest number per 1,000 words of a page
 MANY_SEMICOLONS = ("docs/recovery.md",)
@@ -152,8 +155,19 @@ def syntax() -> list[str]:
     return bad
 
 
+def descriptions(tree: ast.AST) -> list[tuple[int, str]]:
+    """Lines and descriptions of the rows of tables, such as `Field(...)`: the last text of each."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ROWS:
+            values = [getattr(argument, "value", None) for argument in node.args]
+            texts = [value for value in values if isinstance(value, str) and " " in value]
+            found += [(node.lineno, text) for text in texts[-1:]]
+    return found
+
+
 def docstrings(file: Path) -> list[Count]:
-    """Counts of docstrings, of descriptions behind constants, and of names of tests."""
+    """Counts of docstrings, descriptions behind constants and in tables, and names of tests."""
     where, text = file.relative_to(ROOT).as_posix(), file.read_text(encoding="utf-8")
     behind = enumerate((line.partition("  #: ")[2] for line in text.split("\n")), start=1)
     counts = [count(words, where, line) for line, words in behind if words]
@@ -164,9 +178,17 @@ def docstrings(file: Path) -> list[Count]:
         if isinstance(value, str):
             text = inspect.cleandoc(value)
             counts.append(count(text, where, node.lineno))
-            if opening := re.match(OPENINGS, text):
-                counts.append(Count(0, [f"{where}:{node.lineno} [{opening[0]} ...] {text[:60]}"]))
+            counts += badly_opened(text, where, node.lineno)
+    for line, words in descriptions(ast.parse(file.read_text(encoding="utf-8"))):
+        counts.append(count(words, where, line))
+        counts += badly_opened(words[:1].upper() + words[1:], where, line)
     return counts
+
+
+def badly_opened(text: str, where: str, line: int) -> list[Count]:
+    """Return one find if a text begins with one of OPENINGS."""
+    opening = re.match(OPENINGS, text)
+    return [Count(0, [f"{where}:{line} [{opening[0]} ...] {text[:60]}"])] if opening else []
 
 
 def counts() -> dict[str, Count]:

@@ -219,7 +219,7 @@ QUANTITIES = {
     "accel": Quantity("accel", (3,), "m/s^2", "B", "specific force", filtered=True),
     "gnss_position": Quantity(_gnss("gnss_position", POSITION_BLOCK), (3,), "m", "I", "primary antenna", filtered=True),
     "gnss_baseline": Quantity(_gnss("gnss_baseline", BASELINE_BLOCK), (3,), "m", "I", "primary to secondary antenna", filtered=True),
-    "gnss_velocity": Quantity(_gnss("gnss_velocity", VELOCITY_BLOCK), (3,), "m/s", "I", "of the primary antenna, where the receiver gives it", filtered=True),
+    "gnss_velocity": Quantity(_gnss("gnss_velocity", VELOCITY_BLOCK), (3,), "m/s", "I", "velocity of the primary antenna, where the receiver measures it", filtered=True),
     "pixels": Quantity(_pixels, ("features", 2), "pixels", "C", "features, from the image's center", filtered=True),
     "barometer": Quantity(_aid(Aid.BAROMETER), (), "m", "-", "altitude", filtered=True),
     "magnetometer": Quantity(_aid(Aid.MAGNETOMETER), (3,), "T", "B", "magnetic field", filtered=True),
@@ -244,7 +244,7 @@ QUANTITIES = {
     "features": Quantity(_features, ("features", 3), "m", "I", "features of the camera, in the filter's map of this episode"),
     "obstacles": Quantity(_first("obstacle_center", lambda b: len(b.world.obstacles)), ("obstacles", 3), "m", "I", "centers of the world's obstacles in this episode, in the order given"),
     "obstacle_distance": Quantity(_obstacle_distance, (), "m", "-", "from the nearest obstacle's surface, negative inside, infinite without obstacles"),
-    "on_ground": Quantity("footing", (), "-", "-", "the ground pushes a foot, in a world whose ground carries vehicles", bool),
+    "on_ground": Quantity("footing", (), "-", "-", "a foot touches the ground, in a world whose ground supports vehicles", bool),
 }
 """Every quantity that `FlightBatch.read` returns, by its name."""
 # fmt: on

@@ -8,46 +8,46 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
     ("ground", (
         # contact with the ground
         Field("ground_push", (3,), "m/s^2", "specific force of the ground at the accelerometer, in B, over the last tick"),
-        Field("footing", (), "-", "how many feet the ground pushes"),
-        Field("crashed", (), "0 or 1", "whether the vehicle has crashed into the ground in this episode"),
+        Field("footing", (), "-", "number of feet in contact with the ground"),
+        Field("crashed", (), "0 or 1", "1 if the vehicle has crashed into the ground in this episode"),
     )),
     ("contacts", (
         # obstacles and the geofence
         Field("obstacle_center", (MAX_OBSTACLES, 3), "m", "centers of the obstacles in I"),
         Field("obstacle_distance", (), "m", "from the center of mass to the nearest surface of an obstacle, negative inside; infinite: there is none"),
         Field("obstacle_vector", (3,), "m", "from the center of mass to that surface's nearest point, in I"),
-        Field("collided", (), "0 or 1", "whether the vehicle has touched an obstacle in this episode"),
-        Field("left_fence", (), "0 or 1", "whether it has left the geofence in this episode"),
+        Field("collided", (), "0 or 1", "1 if the vehicle has touched an obstacle in this episode"),
+        Field("left_fence", (), "0 or 1", "1 if the vehicle has left the geofence in this episode"),
     )),
     ("path", (
         # the trajectory of this episode, and its values at the present instant
-        Field("path", (), "-", "which one, in the order in which they were given"),
-        Field("path_share", (), "-", "share of the round at which the episode begins, if it is closed"),
-        Field("path_turn", (2,), "-", "cosine and sine of the angle by which it is turned about the vertical"),
+        Field("path", (), "-", "index of the trajectory, in the order in which they were given"),
+        Field("path_share", (), "-", "fraction of a closed trajectory at which the episode begins"),
+        Field("path_turn", (2,), "-", "cosine and sine of the trajectory's rotation about the vertical"),
         Field("path_r", (3,), "m", "reference position in I"),
         Field("path_v", (3,), "m/s", "reference velocity in I"),
         Field("path_a", (3,), "m/s^2", "reference acceleration in I"),
         Field("path_x", (3,), "-", "reference heading in I"),
-        Field("path_ahead", (2, 3), "m", "reference position in I a little later: the preview"),
+        Field("path_ahead", (2, 3), "m", "reference positions in I at the times of the preview"),
     )),
     ("faults", (
         # faults
-        Field("fault_active", (FAULT_KINDS,), "0 or 1", "the same, kind by kind"),
-        Field("fault_count", (FAULT_KINDS,), "-", "times that a fault has come in this episode"),
-        Field("fault_from", (FAULT_KINDS,), "ticks", "since the start of the episode, when it comes (next)"),
-        Field("fault_until", (FAULT_KINDS,), "ticks", "likewise, when it goes"),
-        Field("fault_news", (FAULT_KINDS,), "-1, 0 or 1", "whether it goes or comes at the present instant"),
-        Field("fault_size", (FAULT_KINDS,), "mixed", "drawn when it comes"),
-        Field("fault_vector", (FAULT_KINDS, 3), "mixed", "likewise: its size along its direction"),
-        Field("fault_pick", (FAULT_KINDS,), "-", "likewise: which rotor, as a share of four"),
-        Field("outlier", (), "0 or 1", "whether the last GNSS position is an outlier"),
-        Field("feature_hidden", (MAX_FEATURES,), "0 or 1", "whether an occlusion hides a feature"),
-        Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "whether a feature of the last image is another one"),
-        Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a working one; only where rotors can fail"),
+        Field("fault_active", (FAULT_KINDS,), "0 or 1", "1 if a fault of the kind is active"),
+        Field("fault_count", (FAULT_KINDS,), "-", "number of onsets in this episode"),
+        Field("fault_from", (FAULT_KINDS,), "ticks", "time of the next onset, from the start of the episode"),
+        Field("fault_until", (FAULT_KINDS,), "ticks", "time of the end, from the start of the episode"),
+        Field("fault_news", (FAULT_KINDS,), "-1, 0 or 1", "end (-1) or onset (1) at the present instant"),
+        Field("fault_size", (FAULT_KINDS,), "mixed", "size, drawn at the onset"),
+        Field("fault_vector", (FAULT_KINDS, 3), "mixed", "size times direction, drawn at the onset"),
+        Field("fault_pick", (FAULT_KINDS,), "-", "rotor as a fraction of four, drawn at the onset"),
+        Field("outlier", (), "0 or 1", "1 if the last GNSS position is an outlier"),
+        Field("feature_hidden", (MAX_FEATURES,), "0 or 1", "1 if an occlusion hides a feature"),
+        Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "1 if a feature of the last image was confused with another one"),
+        Field("rotor_gain", (4,), "-", "thrust of each rotor divided by the thrust of a working one; only where rotors can fail"),
     )),
     ("places", (
         # where the features are in this episode
-        Field("feature_place", (MAX_FEATURES, 3), "m", "places of the features in I, as the filter believes"),
+        Field("feature_place", (MAX_FEATURES, 3), "m", "positions of the features in I, as assumed by the filter"),
     )),
     ("draws", (
         # parameters
@@ -55,17 +55,17 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
     )),
     ("actions", (
         # actions under way
-        Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "the present action and those before it, the latest first"),
-        Field("delayed_action", (4,), "-", "the action that the vehicle carries out"),
+        Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "present action and earlier ones, the latest first"),
+        Field("delayed_action", (4,), "-", "action that the vehicle executes"),
     )),
     ("raw", (
         # raw measurements as observations
-        Field("gyro_sum", (3,), "rad/s", "gyro, summed over the samples since the last step"),
-        Field("accel_sum", (3,), "m/s^2", "accel, likewise"),
+        Field("gyro_sum", (3,), "rad/s", "sum of the gyro samples since the last step"),
+        Field("accel_sum", (3,), "m/s^2", "sum of the accelerometer samples since the last step"),
     )),
     ("own", (
         # a user's estimator
-        Field("w_hat", (3,), "rad/s", "its body rates in B"),
+        Field("w_hat", (3,), "rad/s", "estimated body rates in B"),
     )),
     ("core", (
         # read and written at every tick: the truth, clocks, the random stream
@@ -75,9 +75,9 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("w", (3,), "rad/s", "body rates w_B"),
         Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
         Field("voltages", (4,), "V", "motor voltages over the present tick"),
-        Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
+        Field("on_pad", (), "0 or 1", "1 if the launch pad carries the vehicle"),
         Field("disturbance", (3,), "N", "external force d_I on the body"),
-        Field("tick", (), "ticks", "since the start of the episode"),
+        Field("tick", (), "ticks", "time since the start of the episode"),
         Field("instant", (), "-", "instants drawn so far", "u8"),
         Field("key", (2,), "-", "key of the stream", "u8"),
         Field("action", (4,), "-", "the present action, in [-1, 1]"),
@@ -92,7 +92,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("idle", (), "0 or 1", "a lane that only pads the last block"),
         Field("step", (), "steps", "control steps since the start of the episode"),
         Field("gate_next", (), "-", "gates passed so far"),
-        Field("reward", (), "-", "of the last step"),
+        Field("reward", (), "-", "reward of the last step"),
         Field("terminated", (), "0 or 1", "the last step ended the episode by a crash or at the goal"),
         Field("truncated", (), "0 or 1", "the last step ended the episode by its time limit or a failed filter"),
         Field("ending", (), "-", "why the episode ended, see Ending"),
@@ -101,7 +101,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("episode_return", (), "-", "sum of rewards in this episode"),
         Field("episode_error", (), "m", "sum over steps of the position error in this episode"),
         Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
-        Field("diverged", (), "0 or 1", "whether the covariance does not explain the last innovations"),
+        Field("diverged", (), "0 or 1", "1 if the covariance does not explain the last innovations"),
         Field("faults", (), "bits", "active at the present instant: the sum of 2^FaultKind"),
         # the reference: r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)
         Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
@@ -117,16 +117,16 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
         # the air
         Field("wind", (3,), "m/s", "velocity of the air in I"),
-        Field("air_force", (3,), "N", "force of the air in I, less thrust and disc drag"),
-        Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
+        Field("air_force", (3,), "N", "force of the air in I, without thrust and disc drag"),
+        Field("air_torque", (3,), "N m", "torque of the air in B, minus the torque of the rotors' thrust far from the ground"),
         Field("gust", (5,), "-", "states of the Dryden gusts u, v, w, see `kernels.vehicle.gusts`"),
         Field("charge", (), "-", "charge of the battery, 1: full"),
         # slow errors and clocks of the sensors
         Field("b_a", (3,), "m/s^2", "accelerometer bias"),
         Field("b_g", (3,), "rad/s", "gyro bias"),
         Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
-        Field("wait", (SENSORS,), "ticks", "until each sensor measures next"),
-        Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement has arrived since the last step"),
+        Field("wait", (SENSORS,), "ticks", "time until the next measurement of each sensor"),
+        Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "1 if a block of the measurement has arrived since the last step"),
         # the batches that a snapshot fits
         Field("configuration", (), "-", "digest of settings and parameters, see `quad_gym.batch.memory`", "u8"),
     )),
@@ -134,12 +134,12 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         # the last measurements
         Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
         Field("w_before", (3,), "rad/s", "w_meas one sample before"),
-        Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
-        Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
-        Field("block_valid", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement reaches the filter at the present instant"),
+        Field("gyro", (3,), "rad/s", "sample for the filter: w_meas, or the mean over the last tick"),
+        Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or the mean over the last tick"),
+        Field("block_valid", (MAX_BLOCKS,), "0 or 1", "1 if a block of the measurement reaches the filter at the present instant"),
         Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
         Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
-        Field("gnss_velocity", (3,), "m/s", "of the primary antenna, in G"),
+        Field("gnss_velocity", (3,), "m/s", "velocity of the primary antenna, in G"),
         Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
         # the filter
         Field("r_hat", (3,), "m", "estimated position in I"),
@@ -154,34 +154,34 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("nis_dimension", (), "-", "measurements in the last update"),
         Field("rejected_in_row", (SENSOR_GROUPS,), "-", "positions, baselines, velocities, images wholly rejected, other sensors, since the last accepted one"),
         Field("resets", (SENSOR_GROUPS,), "-", "times that states were reset to each of these in this episode"),
-        Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
-        Field("refused_tick", (SENSOR_GROUPS,), "ticks", "when each of these was first rejected since then, or has come closer in a step"),
-        Field("refused_nis", (SENSOR_GROUPS,), "-", "NIS of the last rejected one of each"),
-        Field("innovation_mean", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
+        Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "time of the last accepted measurement of each group"),
+        Field("refused_tick", (SENSOR_GROUPS,), "ticks", "time of the first rejection since then, or of a step that reduced the innovation"),
+        Field("refused_nis", (SENSOR_GROUPS,), "-", "NIS of the last rejected measurement of each group"),
+        Field("innovation_mean", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each group, in standard deviations"),
         Field("corrected", (6,), "m/s^2, rad/s", "sum of the last corrections of the biases"),
-        Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
-        Field("corrected_tick", (), "ticks", "when the last of them was"),
-        Field("stepped", (SENSOR_GROUPS,), "0 or 1", "whether the first rejected one was a step of the sensor"),
-        Field("noise_factor", (SENSOR_GROUPS,), "-", "factor on the variance of each's noise that explains its innovations"),
-        Field("alarm_tick", (), "ticks", "of the last inconsistency alarm; without a gate, later by the time that biases take to be corrected"),
+        Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "variance of this sum in a consistent filter"),
+        Field("corrected_tick", (), "ticks", "time of the last correction"),
+        Field("stepped", (SENSOR_GROUPS,), "0 or 1", "1 if the first rejected measurement was a step of the sensor"),
+        Field("noise_factor", (SENSOR_GROUPS,), "-", "factor on the noise variance of each group that explains its innovations"),
+        Field("alarm_tick", (), "ticks", "time of the last inconsistency alarm; without a gate, later by the time in which biases are corrected"),
         Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
         Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
     )),
     ("errors", (
         # errors of sensors that are constant over an episode
         Field("accel_error", (3, 3), "-", "errors of scale and alignment of the accelerometer"),
-        Field("gyro_error", (3, 3), "-", "likewise of the gyro"),
+        Field("gyro_error", (3, 3), "-", "errors of scale and alignment of the gyro"),
         Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
     )),
     ("watch", (
         # the innovations of the last measurements, one by one: position, baseline, velocity, features, other sensors
-        Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
-        Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
+        Field("innovation", (MAX_BLOCKS, 3), "mixed", "innovation: of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
+        Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations of these, as predicted by the filter"),
         Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
-        Field("gate", (MAX_BLOCKS,), "-", "what became of it, see GateDecision"),
-        Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
+        Field("gate", (MAX_BLOCKS,), "-", "decision of the gate, see GateDecision"),
+        Field("rejections", (MAX_BLOCKS,), "-", "number of rejections since the start of the episode"),
         Field("corrected_long", (6,), "m/s^2, rad/s", "as corrected, over a longer time"),
-        Field("corrected_long_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
+        Field("corrected_long_variance", (6,), "m^2/s^4, rad^2/s^2", "variance of this sum in a consistent filter"),
     )),
     ("late", (
         # sums of the IMU's samples since the start of the episode, biases and gravity included
@@ -193,20 +193,20 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("stamps", (SENSORS, DELAY_SLOTS, STAMP), "mixed", "the tick (NaN: none), C, V, X, B, w_meas"),
         # the measurements in transit
         Field("waiting", (MAX_BLOCKS, DELAY_SLOTS, 3), "mixed", "measurements, block by block"),
-        Field("waiting_valid", (MAX_BLOCKS, DELAY_SLOTS), "0 or 1", "whether these were measured"),
+        Field("waiting_valid", (MAX_BLOCKS, DELAY_SLOTS), "0 or 1", "1 if the block was measured"),
     )),
     ("slow", (
         # slow errors of sensors, where the filter estimates them
         Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
         Field("drift_corrected", (3,), "m", "sum of the last corrections of the drift of GNSS positions, where that is estimated"),
-        Field("drift_corrected_variance", (3,), "m^2", "its variance in a filter that is right"),
+        Field("drift_corrected_variance", (3,), "m^2", "variance of this sum in a consistent filter"),
         Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
     )),
     ("aids", (
         # sensors other than GNSS and camera, in the order of Aid
         Field("aid_measurement", (AIDS, 3), "m; T; rad/s", "altitude, then zeros; magnetic field in B; flow, then zero; distance, then zeros"),
-        Field("aid_vector", (AIDS, 3), "T", "true slow error in B, if it has one of three numbers: hard iron"),
-        Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination less the believed one"),
+        Field("aid_vector", (AIDS, 3), "T", "true slow error of three numbers in B: hard iron"),
+        Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination minus the assumed one"),
         Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),
     )),
 )

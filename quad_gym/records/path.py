@@ -8,17 +8,17 @@ from quad_gym.records.sizes import TERMS, Field
 
 # fmt: off
 PATH_FIELDS = (
-    Field("first", (), "-", "its first piece", "i8"),
-    Field("pieces", (), "-", "how many it has", "i8"),
-    Field("closed", (), "0 or 1", "whether it repeats", "i8"),
-    Field("duration", (), "s", "of the whole, or of a round"),
+    Field("first", (), "-", "index of the first piece", "i8"),
+    Field("pieces", (), "-", "number of pieces", "i8"),
+    Field("closed", (), "0 or 1", "1 if the path repeats", "i8"),
+    Field("duration", (), "s", "duration of the path, or of one round"),
     Field("heading", (), "-", "0: toward the point; 2: along the velocity; 3: the yaw"),
-    Field("point", (2,), "m", "to look toward, in I"),
+    Field("point", (2,), "m", "point that body x faces, in I"),
     Field("begin_heading", (2,), "-", "horizontal direction of the velocity at the start, even from rest"),
-    Field("end_heading", (2,), "-", "likewise at the end"),
+    Field("end_heading", (2,), "-", "horizontal direction of the velocity at the end"),
 )
 PIECE_FIELDS = (
-    Field("begin", (), "s", "where the segment begins"),
+    Field("begin", (), "s", "time at which the segment begins"),
     Field("terms", (TERMS, 4), "mixed", "coefficients of x, y, z [m] and yaw [rad], the highest power first"),
 )
 # fmt: on
