@@ -165,15 +165,14 @@ FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in
 """Stages that a filter runs, as far as it needs them."""
 FILTER_ENTRIES = (start_filter.name, run_tape.name)
 """Names of the entries that a filter calls, the slowest to compile first."""
-SENSORS_AND_VEHICLE = tuple(
-    entry.name
-    for entry in (
-        *(sense_features, sense_gnss, body_accelerations_in_air, integrate_flight),
-        *(sense_imu_average, sense_imu, body_accelerations, start_level),
-        *(wahba_of_vectors, step_biases, step_gnss_drift, draw_sensor_errors),
-        *(disturb_imu, turn_gnss_baseline, limit_features, nearest_obstacles, hide_points),
-    )
+_SENSORS_AND_VEHICLE = (
+    *(sense_features, sense_gnss, body_accelerations_in_air, integrate_flight),
+    *(sense_imu_average, sense_imu, body_accelerations, start_level),
+    *(wahba_of_vectors, step_biases, step_gnss_drift, draw_sensor_errors),
+    *(disturb_imu, turn_gnss_baseline, limit_features, nearest_obstacles, hide_points),
 )
+SENSORS_AND_VEHICLE = tuple(entry.name for entry in _SENSORS_AND_VEHICLE)
 """Names of the entries for sensors and vehicles, the slowest to compile first."""
-ENTRIES = {entry.name: entry for entry in tuple(globals().values()) if isinstance(entry, Entry)}
+_ENTRIES = (fly, run_tape, start_filter, run_stage, *_SENSORS_AND_VEHICLE)
+ENTRIES = {entry.name: entry for entry in _ENTRIES}
 """All entries by their names."""

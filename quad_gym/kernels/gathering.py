@@ -36,6 +36,9 @@ from quad_gym.records import (
 _MANY = 6 * WIDTH // 8
 """Smallest number of lanes with a measurement for which a block is updated in place."""
 
+QUEUE_ORDER = (*range(2, KINDS, 2), *range(1, KINDS, 2))
+"""Sets of sensors in the order in which their waiting lanes are updated: those with GNSS last."""
+
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
 _plain_work_at = record_at(WORK_BLOCK)
 _words_at = array_at("u8")
@@ -148,8 +151,7 @@ def update_soon(call, index, model, settings, work, stages):
 def update_waiting(call, model, settings, work, stages):
     """Update the lanes that wait, those of different queues together."""
     plain = _plain_work_at(call[Call.WORK])
-    for place in range(1, KINDS):
-        kind = 2 * place % KINDS + 2 * place // KINDS  # even ones first, and then those with GNSS
+    for kind in QUEUE_ORDER:
         for k in range(plain.queued[kind, 0]):
             source, block = plain.source[kind, k], plain.source_block[kind, k]
             _put(call, 0, source, block, model, settings, work, stages)

@@ -84,9 +84,13 @@ class Stage(IntEnum):
     HIDE_FEATURES = auto()
     CORRUPT_FEATURES = auto()
     FORGET_INNOVATIONS = auto()
-    _ignore_ = "sensor"
-    for sensor in Sensor:  # last, in their order
-        vars()[sensor.name] = auto()
+    # sensors, last and in their order
+    GNSS = auto()
+    CAMERA = auto()
+    BAROMETER = auto()
+    MAGNETOMETER = auto()
+    OPTICAL_FLOW = auto()
+    RANGE_FINDER = auto()
 
 
 class Kernel(NamedTuple):
