@@ -1,4 +1,9 @@
-"""Builders of environments, batches and flights for tests."""
+"""Builders of environments, batches, flights and processes for tests."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -72,6 +77,18 @@ def recorded_flight(task="circle", steps=12, seed=2, **keywords):
         observations.append(env.step(action)[0])
         recorder.keep()
     return env, recorder.flight, np.array(observations)
+
+
+def run_python(*words, **environment):
+    """Run Python in a process with some variables of the environment; return it when it ended."""
+    return subprocess.run(
+        [sys.executable, *words],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])} | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
 
 
 def put(flights, **fields):

@@ -14,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv
 from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.kernels import cores
-from tests.builders import actions_of, vec_env
+from tests.builders import actions_of, run_python, vec_env
 from tests.contract.comparing import assert_same
 from tests.contract.hovering import SHORT, make_hover, next_steps
 
@@ -122,8 +122,7 @@ def test_an_environment_takes_the_available_cores(monkeypatch):
 
 def test_import_of_package_loads_no_heavy_modules():
     code = "import sys, quad_gym; print(*sorted(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    modules = set(done.stdout.split())
+    modules = set(run_python("-c", code).stdout.split())
     heavy = ("numba", "llvmlite", "scipy", "torch", "stable_baselines3", "matplotlib", "pygame")
     assert not modules & {*heavy, "quad_gym.kernels", "quad_gym.kernels.batch"}
     assert "gymnasium" in modules

@@ -1,9 +1,6 @@
 """The command that compiles ahead of the first use."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +12,7 @@ from quad_gym.kernels.compiling import workers
 from quad_gym.kernels.compiling.decorators import EntryDispatcher
 from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.kernels.stages import SOURCES, Stage
+from tests.builders import run_python
 
 ROOT = Path(__file__).parents[2]
 FIRST_RESET = """
@@ -25,14 +23,7 @@ gymnasium.make_vec("QuadGym/Circle-v0", 3, observation="truth").reset(seed=0)
 
 def run(folder, *words):
     """Run Python in a process with a separate cache."""
-    return subprocess.run(
-        [sys.executable, *words],
-        env=os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+    return run_python(*words, NUMBA_CACHE_DIR=str(folder))
 
 
 def fill(folder, names, monkeypatch):

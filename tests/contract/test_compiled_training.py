@@ -2,8 +2,6 @@
 
 import json
 import signal
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from baselines.policies import PRETRAINED, load_policy
 from baselines.recipes import recipe
 from baselines.training import export, train
 from tests import console_commands
+from tests.builders import run_python
 
 ROOT = Path(__file__).resolve().parents[2]
 CIRCLE = "QuadGym/Circle-v0"
@@ -255,7 +254,7 @@ def test_compiled_engine_is_imported_without_torch():
         "import sys; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
         "import baselines.training, baselines.compiled_ppo.run"
     )
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+    assert run_python("-c", code).returncode == 0
 
 
 @pytest.mark.parametrize("file", sorted(PRETRAINED.glob("*.npz")), ids=lambda f: f.stem)

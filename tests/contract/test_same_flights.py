@@ -2,17 +2,14 @@
 
 import copy
 import hashlib
-import os
 import pickle
-import subprocess
-import sys
 
 import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
-from tests.builders import SHORT, actions_for, flat, vec_env
+from tests.builders import SHORT, actions_for, flat, run_python, vec_env
 from tests.contract.comparing import assert_same, state_of
 from tests.contract.configurations import CONFIGURATIONS
 
@@ -84,13 +81,7 @@ def digest():
 
 def test_another_process_flies_the_same_flights():
     code = "from tests.contract.test_same_flights import digest; print(digest())"
-    other = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PYTHONHASHSEED": "7"},
-    )
+    other = run_python("-c", code, PYTHONHASHSEED="7")
     assert other.stdout.strip() == digest()
 
 

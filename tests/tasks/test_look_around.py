@@ -1,8 +1,5 @@
 """`LookAround`: recomputed reward, observation and features in view, and results of policies."""
 
-import subprocess
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from quad_gym.commands.main import main
 from quad_gym.experiments.flown import fly
 from quad_gym.tasks.look_around import LookAround
 from scripts.studies.traces import ViewRecorder
-from tests.builders import part
+from tests.builders import part, run_python
 
 ID = "QuadGym/LookAround-v0"
 WALL = np.array([(-8.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (0.8, 2.8)])
@@ -147,8 +144,7 @@ def test_tasks_are_not_imported_before_use():
         "import sys, gymnasium, quad_gym; gymnasium.make('QuadGym/Circle-v0'); "
         "print([m for m in sys.modules if m.startswith('quad_gym.tasks') or 'baselines' in m])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert run_python("-c", code).stdout.strip() == "[]"
 
 
 def test_pretrained_policy_earns_more_than_the_facing_rule(facing):

@@ -1,8 +1,6 @@
 """The catalog of compiled functions is complete and needs no Numba."""
 
 import inspect
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -11,13 +9,14 @@ from quad_gym.kernels import batch, entries, single, tape
 from quad_gym.kernels.compiling.decorators import EntryDispatcher
 from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.records import FLIGHT, PARAMS
+from tests.builders import run_python
 
 CATALOG = "from quad_gym.kernels import entries, linked, stages; import sys"
 
 
 def test_catalog_and_stages_are_imported_without_numba():
     code = f"{CATALOG}; sys.exit('numba' in sys.modules or 'llvmlite' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert run_python("-c", code).returncode == 0
 
 
 def test_catalog_has_the_entries_of_kernels_with_their_arguments():

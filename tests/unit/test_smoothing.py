@@ -12,13 +12,10 @@ from quad_gym.rotations import quaternion_to_dcm
 from tests.console_commands import run
 from tests.filter_states import at_rest
 from tests.logged_flights import PX4, RTK, Recorded, errors_in_replay, flown
+from tests.reference_aids import cross_matrix
 
 G = 9.8
 E3 = np.array([0.0, 0.0, G])
-
-
-def cross(v):
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 LINEAR = RTK.replace(
@@ -55,7 +52,11 @@ def least_squares(table):
     imu = LINEAR.imu
     F = np.eye(15)
     F[6:9, 12:15] = -DT * np.eye(3)
-    of_states = {6: -cross(E3), 9: -np.eye(3), 12: 0.5 * DT * cross(E3)}  # d(accel)/d(state)
+    of_states = {
+        6: -cross_matrix(E3),
+        9: -np.eye(3),
+        12: 0.5 * DT * cross_matrix(E3),
+    }  # d(accel)/d(state)
     for column, block in of_states.items():
         F[0:3, column : column + 3] = 0.5 * DT**2 * block
         F[3:6, column : column + 3] = DT * block
@@ -64,7 +65,7 @@ def least_squares(table):
     acceleration = imu.accel_noise_density / np.sqrt(DT) * np.eye(3)
     rate = imu.gyro_noise_density / np.sqrt(DT) * np.eye(3)
     noise[0:3, 0:3], noise[3:6, 0:3] = 0.5 * DT**2 * acceleration, DT * acceleration
-    noise[3:6, 3:6], noise[6:9, 3:6] = 0.5 * DT**2 * cross(E3) @ rate, -DT * rate
+    noise[3:6, 3:6], noise[6:9, 3:6] = 0.5 * DT**2 * cross_matrix(E3) @ rate, -DT * rate
     noise[0:3, 3:6] = 0.5 * DT * noise[3:6, 3:6]
     for k, (tau, sigma) in enumerate(
         ((imu.accel_bias_tau, imu.accel_bias_sigma), (imu.gyro_bias_tau, imu.gyro_bias_sigma))

@@ -12,16 +12,13 @@ from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.params.vehicle import vehicle_params
 from quad_gym.rotations import euler_to_dcm
 from tests.field_flights import attitudes, fly, nees
+from tests.reference_aids import cross_matrix
 
 pytestmark = pytest.mark.filterwarnings("ignore:InitialPoseParams.heading_sigma")
 
 SUITE = quad_gym.sensor_suite("crazyflie").simplified()
 SIGMA, GRAVITY = 0.2, 9.80665
 GROUND = quad_gym.WorldParams().ground_height
-
-
-def cross_matrix(a):
-    return np.cross(a, -np.eye(3))
 
 
 def min_heading_sigmas(r, v, R_BI, dt):

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from quad_gym.vehicle import state_derivative
 from tests.body_states import random_state
+from tests.reference_aids import cross_matrix
 
 LAB = quad_gym.vehicle_params("lab")
 SKEWED = quad_gym.VehicleParams(
@@ -25,10 +26,6 @@ NO_FORCE = np.zeros(3)
 def at_rest(**changes):
     still = dict.fromkeys(("position", "velocity", "body_rates"), np.zeros(3))
     return {**still, "R_BI": np.eye(3), "rotor_speeds": np.zeros(4), **changes}
-
-
-def cross_matrix(w):
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
 def newton_and_euler(state, voltages, d_I, p):

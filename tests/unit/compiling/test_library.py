@@ -1,8 +1,5 @@
 """The library of compiled kernels: conditions of its use, and flights equal to Numba's."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +9,7 @@ from quad_gym.kernels.compiling import building
 from quad_gym.kernels.library import Library, file_of, library, machine
 from quad_gym.kernels.sources import MARK, digest_in, sources_digest
 from quad_gym.records import WIDTH
+from tests.builders import run_python
 
 PACKAGE = Path(libraries.__file__).parents[1]
 HUNDRED_STEPS = """
@@ -114,13 +112,7 @@ def test_missing_compiler_is_named(monkeypatch):
 
 @pytest.mark.parametrize("lanes", ["3", "16", "eight"])
 def test_unsupported_number_of_lanes_in_the_environment_is_refused(lanes):
-    done = subprocess.run(
-        [sys.executable, "-c", "import quad_gym.records"],
-        env=os.environ | {"PYTHONPATH": str(PACKAGE.parent), "QUAD_GYM_LANES": lanes},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python("-c", "import quad_gym.records", QUAD_GYM_LANES=lanes)
     assert f"QUAD_GYM_LANES must be 2, 4 or 8, got '{lanes}'" in done.stderr
 
 
@@ -129,9 +121,7 @@ def test_unsupported_number_of_lanes_in_the_environment_is_refused(lanes):
 
 def run(lanes, *words):
     """Run a process with the library of a number of lanes."""
-    environment = os.environ | {"QUAD_GYM_KERNELS": "library", "QUAD_GYM_LANES": str(lanes)}
-    command = [sys.executable, *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return run_python(*words, QUAD_GYM_KERNELS="library", QUAD_GYM_LANES=str(lanes))
 
 
 @pytest.fixture(params=sorted(building.PROCESSORS.get(machine(), {})))
