@@ -4,6 +4,7 @@
     quad-gym calibrate one.csv two.csv three.csv --sensors consumer --output results/mine
     quad-gym calibrate flight.ulg --sensors consumer --output results/mine
     quad-gym train --sensors results/mine/suite.toml
+    quad-gym calibrate flight.csv --vehicle mine-vehicle.toml
 
 The first part of the log, or the first ones of several logs, are for the search, the rest for
 validation. The result is a suite with the rates, delays and noise of this vehicle, for `replay`,
@@ -29,6 +30,7 @@ from quad_gym.commands.options import (
 if TYPE_CHECKING:
     from quad_gym.estimation.calibration import Calibration
     from quad_gym.estimation.validation import Validation
+    from quad_gym.params.sensors import SensorSuite
 
 SUITE, RESULT = "suite.toml", "calibration.json"
 
@@ -50,6 +52,12 @@ class CalibrateArgs(ReadingArgs):
     by default from a baseline or a magnetometer"""
     course: bool = False
     """use the direction of the first GNSS velocity as heading"""
+    vehicle: Path | None = None
+    """write a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the log to
+    this file"""
+    vehicle_from: str | None = None
+    """vehicle whose mass, inertia and arms that file has: lab, crazyflie or a .toml file;
+    defaults to lab"""
     output: Path | None = None
     """folder for the results, created if it is missing; defaults to results/calibrate/LOG"""
     overwrite: bool = False
@@ -172,6 +180,27 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     return report.write()
 
 
+def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -> str:
+    """Write the file of the vehicle; return a sentence about it."""
+    from quad_gym.estimation import fit_vehicle, read_log
+
+    assert args.vehicle is not None
+    log = read_log(args.logs[0], **args.reading())
+    if log.motors is None:
+        return (
+            f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
+        )
+    with usage_errors():
+        begin = args.vehicle_from or "lab"
+        fitted = fit_vehicle(log, sensors=suite, start=start, vehicle=begin)
+        file = fitted.vehicle.save(args.vehicle)
+    lag, hover = fitted.motor_time_constant, fitted.hover_voltage
+    return (
+        f"Wrote {file}: rotor lag {lag.value:.3f} s [{lag.low:.3f}, {lag.high:.3f}], hover voltage "
+        f"{hover.value:.2f} V [{hover.low:.2f}, {hover.high:.2f}]."
+    )
+
+
 def next_command(args: CalibrateArgs, folder: Path) -> list[str]:
     """Return the words of a replay of the same log."""
     log = args.logs[-1]  # of several, one for validation
@@ -200,6 +229,7 @@ def starts_of(args: CalibrateArgs) -> list[dict[str, Any]]:
 
 def main(args: CalibrateArgs) -> None:
     """Search, validate and write."""
+    from quad_gym import vehicle_params
     from quad_gym.analysis.plots import require_matplotlib
     from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
     from quad_gym.estimation import calibrate
@@ -210,6 +240,15 @@ def main(args: CalibrateArgs) -> None:
             raise ValueError("--heading must not be given with --course")
         require_matplotlib()
         refuse_overwriting(folder / RESULT, args.overwrite)
+        if args.vehicle_from is not None:
+            if args.vehicle is None:
+                raise ValueError("--vehicle-from needs --vehicle")
+            vehicle_params(args.vehicle_from)
+        if args.vehicle is not None:
+            if args.vehicle.suffix != ".toml":
+                raise ValueError(f"--vehicle must end with .toml, got {args.vehicle}")
+            refuse_overwriting(args.vehicle, args.overwrite)
+            require_writable("--vehicle", args.vehicle.parent)
         require_writable("--output", folder)
         starts = starts_of(args)
         several = len(args.logs) > 1
@@ -236,6 +275,8 @@ def main(args: CalibrateArgs) -> None:
     }
     files.append(write_json(folder / RESULT, contents))
     print(f"\nWrote {len(files)} files to {folder}; open {folder / 'report.html'}.")
+    if args.vehicle is not None:
+        print(fit_body(args, found.suite, starts[0]))
     print(f"{found.verdict[0].upper()}{found.verdict[1:]}.")
     if found.after.problems:
         raise SystemExit(MISFIT)

@@ -14,6 +14,7 @@ from quad_gym.estimation.results import Measured, Replay, Smoothed
 from quad_gym.estimation.search import Calibrated
 from quad_gym.estimation.smoothing import smooth
 from quad_gym.estimation.starts import solve_wahba
+from quad_gym.estimation.vehicle_fit import FittedNumber, FittedVehicle, fit_vehicle
 
 __all__ = [
     "FARTHEST_FIX",
@@ -23,6 +24,8 @@ __all__ = [
     "Calibration",
     "ExtendedKalmanFilter",
     "FirstFix",
+    "FittedNumber",
+    "FittedVehicle",
     "Innovations",
     "Log",
     "LogColumn",
@@ -33,6 +36,7 @@ __all__ = [
     "Stream",
     "UnscentedKalmanFilter",
     "calibrate",
+    "fit_vehicle",
     "read_log",
     "replay",
     "smooth",

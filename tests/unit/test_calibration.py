@@ -163,9 +163,10 @@ def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
     names = ["time", *(f"{name}_{axis}" for name in ("gyro", "accel") for axis in "xyz")]
     rows = [f"0.{k},0,0,0,0,0,9.8" for k in range(3)]
     (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *rows]))
-    options = ["--no-delays", "--output", "mine", "--body", "frd"]
+    options = ["--no-delays", "--output", "mine", "--vehicle", "body.toml", "--body", "frd"]
     ended = run("calibrate", "flight.csv", *options, where=tmp_path)
     assert ended.returncode == 0, ended.stderr
+    assert "Wrote no body.toml: the log has no motor voltages" in ended.stdout
     assert (
         "Next: quad-gym replay flight.csv --sensors mine/suite.toml --no-reported-noise --body frd"
         in ended.stdout

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 import quad_gym
-from docs.examples.fit_vehicle import _mean_squares, fit_vehicle, main
 from quad_gym import VehicleParams, vehicle_params
+from quad_gym.commands.calibrate import CalibrateArgs, fit_body
+from quad_gym.estimation import fit_vehicle
+from quad_gym.estimation.vehicle_fit import _mean_squares
 from tests.logged_flights import RTK, Recorded, flown
 
 LAB = VehicleParams()
@@ -63,16 +65,18 @@ def test_fitted_vehicle_flies_after_saving_and_reading(found, tmp_path):
     assert np.isfinite(env.step(env.action_space.sample())[0]).all()
 
 
-def test_example_writes_the_vehicle_of_a_log_in_a_file(table, found, tmp_path, capsys):
+def test_command_writes_the_vehicle_of_a_log_in_a_file(table, found, tmp_path):
     names = list(table)
     rows = np.column_stack([table[name] for name in names])
     lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows]
     (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
     mine = LAB.replace(mass=0.9, thrust_coefficient=LAB.thrust_coefficient * 0.9 / LAB.mass)
-    files = {"--vehicle": mine.save(tmp_path / "mine.toml"), "--output": tmp_path / "body.toml"}
-    files["--sensors"] = RTK.save(tmp_path / "rtk.toml")
-    main([str(tmp_path / "flight.csv"), *(str(x) for pair in files.items() for x in pair)])
-    assert "rotor lag 0.08" in capsys.readouterr().out
+    args = CalibrateArgs(
+        logs=(tmp_path / "flight.csv",),
+        vehicle=tmp_path / "body.toml",
+        vehicle_from=str(mine.save(tmp_path / "mine.toml")),
+    )
+    assert "rotor lag 0.08" in fit_body(args, RTK, {})
     written = vehicle_params(tmp_path / "body.toml")
     assert (written.mass, written.inertia) == (0.9, LAB.inertia)
     found_ratio = found.vehicle.thrust_coefficient / found.vehicle.mass

@@ -1,6 +1,4 @@
-"""Find thrust, rotor lag, drag and battery sag of a vehicle from a log with motor voltages.
-
-    python fit_vehicle.py flight.csv --sensors mine.toml --vehicle lab --output body.toml
+"""Parameters of the vehicle from a log with motor voltages.
 
 The smoothed trajectory of the log gives attitude, velocity and accelerometer bias. The specific
 force of the model is, in B,
@@ -13,10 +11,8 @@ a, tau_m, c and s. Residuals that are correlated in time widen the intervals by 
 their autocorrelation time.
 """
 
-import argparse
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple, Unpack
 
 import numpy as np
@@ -227,25 +223,3 @@ def _mean_squares(
         for k in [np.searchsorted(times, span, side="right") - 1]
     )
     return np.asarray((ends - begins) / (spans[1] - spans[0]))
-
-
-def main(words: list[str] | None = None) -> None:
-    """Write the file of the vehicle, and print what was found."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("log", type=Path)
-    options.add_argument("--sensors", default="consumer", help="suite, or its file (.toml)")
-    options.add_argument("--vehicle", default="lab", help="vehicle whose mass and arms are known")
-    options.add_argument("--heading", type=float, help="heading at the start [deg]")
-    options.add_argument("--output", type=Path, default=Path("body.toml"))
-    args = options.parse_args(words)
-    start = {} if args.heading is None else {"heading": math.radians(args.heading)}
-    fitted = fit_vehicle(args.log, sensors=args.sensors, vehicle=args.vehicle, start=start)
-    lag, hover = fitted.motor_time_constant, fitted.hover_voltage
-    print(
-        f"Wrote {fitted.vehicle.save(args.output)}: rotor lag {lag.value:.3f} s [{lag.low:.3f}, "
-        f"{lag.high:.3f}], hover voltage {hover.value:.2f} V [{hover.low:.2f}, {hover.high:.2f}]."
-    )
-
-
-if __name__ == "__main__":
-    main()
