@@ -42,7 +42,7 @@ _REQUIRED = {
 }
 """Fields of the observation that modes require."""
 
-UNSURE = 0.1
+UNCERTAIN = 0.1
 """Standard deviation of the position above which "features_when_uncertain" faces features [m]."""
 
 
@@ -116,7 +116,7 @@ class PDPolicy:
         faces: Direction of body x. "reference": desired heading; "features": toward the features,
             if the environment observes their direction, as LookAround does;
             "features_when_uncertain": toward the features while the filter's largest standard
-            deviation of the position is above `UNSURE` (requires `include_std=True`), else the
+            deviation of the position is above `UNCERTAIN` (requires `include_std=True`), else the
             desired heading.
         pace: "steady", or "waiting": wait `WAITS_BEFORE` a gap that is too narrow for the filter's
             uncertainty (requires `include_std=True`).
@@ -234,7 +234,7 @@ class PDPolicy:
         toward = _unit(toward - (toward * seen.up).sum(axis=1, keepdims=True) * seen.up)
         if self._faces == "features":
             return seen._replace(heading=toward)
-        unsure = part["position_sigma"].max(axis=1, keepdims=True) > UNSURE
+        unsure = part["position_sigma"].max(axis=1, keepdims=True) > UNCERTAIN
         return seen._replace(heading=np.where(unsure, toward, seen.heading))
 
     def _read_state(self, part: Mapping[str, Array]) -> _Seen:

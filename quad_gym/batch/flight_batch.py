@@ -116,7 +116,7 @@ class FlightBatch(FlightMemory):
             whole = blocks * size <= 2 * _GROUP_MEMORY
             self._group = blocks if whole else max(1, _GROUP_MEMORY // size)
         self._own = [self._world.copy() for _ in range(self.threads)]
-        self._believed = [self._model.copy() for _ in range(self.threads)]
+        self._assumed = [self._model.copy() for _ in range(self.threads)]
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         self._gathered = [aligned_zeros(1, FLIGHT_BLOCK) for _ in range(self.threads)]
         for block in self._gathered:
@@ -276,7 +276,7 @@ class FlightBatch(FlightMemory):
             Call.RESULTS: self._results,
             Call.EXCHANGE: self._exchange,
             Call.OWN: self._own,
-            Call.BELIEVED: self._believed,
+            Call.BELIEVED: self._assumed,
             Call.WORK: self._work,
             Call.GATHERED: self._gathered,
         }

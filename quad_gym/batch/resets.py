@@ -31,9 +31,9 @@ def checked_keys(
     """Return keys (count, 2): of the seeds if given, else `keys`; None without either."""
     if seeds is not None:
         if isinstance(seeds, str) or not hasattr(seeds, "__len__"):  # type: ignore[unreachable]
-            raise ValueError(f"seeds must hold {count} seeds, got {seeds!r}")
+            raise ValueError(f"seeds must contain {count} seeds, got {seeds!r}")
         if len(seeds) != count:
-            raise ValueError(f"seeds must hold {count} seeds, got {len(seeds)}")
+            raise ValueError(f"seeds must contain {count} seeds, got {len(seeds)}")
         return stream_keys(seeds)
     if keys is None:
         return None

@@ -173,7 +173,7 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     if calibration.notes or calibration.after.problems:
         report.add_bullets([*calibration.after.problems, *calibration.notes])
     with house_style():
-        caption = "Positive numbers and their intervals"
+        caption = "Positive parameters and their intervals"
         report.add_figure("numbers", numbers_figure(calibration), caption)
         caption = "Innovations before and after; crosses are rejected"
         report.add_figure("innovations", innovations_figure(calibration), caption)

@@ -48,8 +48,7 @@ class CompareArgs:
     seeds: int = 5
     """number of training seeds"""
     quick: bool = False
-    """one seed and 200 episodes instead of --seeds and --episodes: a check that it works, not a
-    result"""
+    """one seed and 200 episodes instead of --seeds and --episodes: only to check that it works"""
 
     algorithm: Literal["ppo", "sac", "td3", "tqc"] = "ppo"
     """reinforcement learning algorithm"""
@@ -59,10 +58,10 @@ class CompareArgs:
     env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as control_rate=100"""
     jobs: int | None = None
-    """number of simultaneous trainings, each with one thread; defaults to one per core"""
+    """number of parallel trainings, each with one thread; defaults to one per core"""
 
     episodes: int = 1000
-    """number of episodes that each policy flies on each observation"""
+    """number of episodes of each policy on each observation"""
     seed: int = 0
     """seed of the first episode, and of the first training; no training flies these episodes"""
     output: Path | None = None

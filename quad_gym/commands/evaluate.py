@@ -53,7 +53,7 @@ class EvaluateArgs:
     LookAround: the included one that was trained on the true state), or files of quad-gym train
     (.zip or .npz); defaults to pd, and pretrained if it fits"""
     observation: tuple[str, ...] = ("truth", "estimate")
-    """observations on which the policies fly: truth, estimate, noisy, or measurements (for policies
+    """observations of the policies: truth, estimate, noisy, or measurements (for policies
     trained on raw measurements)"""
     sensors: options.OwnSuite = None
     estimator: options.EstimatorName = None

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Union, get_type_hints
 
 from tyro.conf import subcommand
 
-from quad_gym.commands.options import parse, without_empty_hints
+from quad_gym.commands.options import parse, with_plain_help
 
 COMMANDS = {
     "circle": "reproduce the report's experiment over many seeds: tables and figures",
@@ -18,7 +18,7 @@ COMMANDS = {
     "sweep": "run sets of trainings, on one machine or on several that share a folder",
     "tune": "tune the gains of the PD controller",
     "fly": "show a flight in a window, or render a video",
-    "replay": "run the filter on the log of a real flight (CSV or PX4)",
+    "replay": "run the filter on the log of a real flight (CSV, PX4, ArduPilot, ROS, EuRoC)",
     "calibrate": "find the noise and delays of a vehicle's sensors from the log of a flight",
     "consistency": "test the filter's consistency: NEES and NIS over many flights",
     "benchmark": "measure the speed of flights on this machine",
@@ -100,7 +100,7 @@ def module_of(command: str) -> Any:
 
 def options_of(module: Any) -> Any:
     """Dataclass of a command's options, the argument of its `main`."""
-    return without_empty_hints(get_type_hints(module.main)["args"])
+    return with_plain_help(get_type_hints(module.main)["args"])
 
 
 def _interrupted(error: BaseException | None) -> bool:

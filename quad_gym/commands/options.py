@@ -6,16 +6,20 @@ help text. Types that several commands share are at the end of this file.
 
 import ast
 import dataclasses
+import io
 import itertools
 import shlex
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_args
 
+import docstring_parser
 import tyro
 from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -46,8 +50,8 @@ def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
         **options: Further options of `tyro.cli`.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    kind = without_empty_hints(kind)
-    with usage_errors((ValueError,)):
+    kind = with_plain_help(kind)
+    with usage_errors((ValueError,)), _wrapped_help(words):
         args = tyro.cli(kind, args=words, registry=_REGISTRY, **options)
         for field in dataclasses.fields(args):
             name = option_name(field.name)
@@ -56,14 +60,45 @@ def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
     return args
 
 
-def without_empty_hints(kind: Any) -> Any:
-    """Leave "(default: None)" out of the help of a dataclass of options, which is returned."""
-    for each in dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ():
+def with_plain_help(kind: Any) -> Any:
+    """Set the help of a dataclass of options, which is returned.
+
+    A description is one paragraph, without the line breaks of the source. "(default: None)" is left
+    out.
+    """
+    if not dataclasses.is_dataclass(kind):
+        return kind
+    described = {
+        param.arg_name: " ".join((param.description or "").split())
+        for base in reversed(cast(type, kind).__mro__[:-1])
+        for param in docstring_parser.parse_from_object(base).params
+    }
+    for each in dataclasses.fields(kind):
         made = each.default_factory
         default = each.default if made is dataclasses.MISSING else made()
-        if default is None or default in ((), {}):
-            kind.__annotations__[each.name] = Annotated[each.type, arg(help_behavior_hint="")]
+        empty = default is None or default in ((), {})
+        about = arg(help=described.get(each.name), help_behavior_hint="" if empty else None)
+        kind.__annotations__[each.name] = Annotated[each.type, about]
     return kind
+
+
+@contextmanager
+def _wrapped_help(words: Sequence[str]) -> Iterator[None]:
+    """Wrap the description of a command, of which tyro makes one line per paragraph."""
+    if not {"-h", "--help"} & set(words):
+        yield
+        return
+    shown, stdout = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding), sys.stdout
+    shown.isatty = stdout.isatty  # type: ignore[method-assign]  # for colors
+    try:
+        with redirect_stdout(shown):
+            yield
+    finally:
+        shown.seek(0)
+        width = shutil.get_terminal_size().columns
+        for line in shown.read().splitlines():
+            indented = line[:1] in "\x1b ╭│╰"  # examples and boxes
+            print(line if indented else textwrap.fill(line, width, break_on_hyphens=False))
 
 
 @_REGISTRY.primitive_rule
@@ -316,7 +351,7 @@ LogFiles = Positional[
         tuple[Path, ...],
         arg(
             metavar="LOG [LOG ...]",
-            help="logs, as `quad-gym replay` takes",
+            help="logs in the formats of quad-gym replay",
             help_behavior_hint="(required)",
         ),
     ]
@@ -330,10 +365,10 @@ class ReadingArgs:
     body: Literal["flu", "frd"] = "flu"
     """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
     instance: Keywords = field(default_factory=dict)
-    """sensors to take where the log has several, such as magnetometer=1; defaults to those that
+    """sensors to use where the log has several, such as magnetometer=1; defaults to those that
     the autopilot used or prefers, else those with the most valid data"""
     topic: Keywords = field(default_factory=dict)
-    """topics of a ROS bag to take, such as imu=/mavros/imu/data_raw"""
+    """topics of a ROS bag to use, such as imu=/mavros/imu/data_raw"""
     columns: Path | None = None
     """file (.toml) that maps the columns of a table to those of docs/logs.md"""
     from_: Annotated[float | None, arg(name="from")] = None

@@ -40,7 +40,9 @@ class SweepArgs:
     """Options of the sweep; they override the file."""
 
     file: tyro.conf.Positional[
-        Annotated[Path | None, tyro.conf.arg(help="the trainings, in TOML: see docs/sweeps.md")]
+        Annotated[
+            Path | None, tyro.conf.arg(help="file (.toml) of the trainings, as in docs/sweeps.md")
+        ]
     ] = None
     env_ids: tuple[str, ...] = ()
     """ids of environments, or their short names; defaults to circle"""
@@ -68,7 +70,7 @@ class SweepArgs:
     output: Path | None = None
     """folder; defaults to results/sweep/NAME, with the name of the file or of the first task"""
     jobs: int | None = None
-    """number of simultaneous trainings; defaults to one per core"""
+    """number of parallel trainings; defaults to one per core"""
     threads: int = 1
     """number of threads of each training; it does not affect results"""
     retries: int = RETRIES

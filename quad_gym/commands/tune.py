@@ -95,7 +95,7 @@ def main(args: TuneArgs) -> None:
     with options.usage_errors():
         search = configure(args)
     tuned = search.run(args.candidates, args.seed)
-    gains = {f"gains at the start ({args.gains})": search.start, "tuned gains": tuned}
+    gains = {f"initial gains ({args.gains})": search.start, "tuned gains": tuned}
     seed = first_seed("test", args.seed, args.fresh_episodes)
     text, numbers = compare_gains(make_envs(args, args.fresh_episodes), gains, seed)
     print(

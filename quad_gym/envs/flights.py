@@ -270,5 +270,5 @@ def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
     known = ("position", "velocity", "yaw")
     unknown = sorted(set(chosen) - set(known))
     if unknown:
-        raise ValueError(f"options may hold {', '.join(known)}, got {unknown[0]!r}")
+        raise ValueError(f"options may contain {', '.join(known)}, got {unknown[0]!r}")
     return chosen

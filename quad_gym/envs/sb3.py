@@ -221,6 +221,6 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         if not names:
             return {}
         if any(set(options) != names for options in chosen):
-            raise ValueError("options must hold the same names for every environment")
+            raise ValueError("options must contain the same names for every environment")
         start = {name: np.array([options[name] for options in chosen]) for name in names}
         return self.flights.start(start)

@@ -135,7 +135,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     center of its distribution and divided by half of its range (normal: by its standard deviation).
 
     Args:
-        task: Your own task, laid over the task of the id (in place of the class of `LookAround`,
+        task: Your task, which overrides the id's task (in place of the class of `LookAround`,
             `StaleRace` or `OutageDash`): a `quad_gym.Task`, its class, or "module:name" of either.
             Without an id, also the name of a kind of task, such as "hover".
         base: Kind of task under your own; `gymnasium.make` sets it from the id. None: the circle.

@@ -224,7 +224,7 @@ def write_report(matrix: ComparisonResults) -> list[Path]:
     """Write numbers, figures and the page; the last file is the page."""
     comparison, trainings = matrix.comparison, matrix.comparison.trainings
     recipe, seconds = comparison.recipe, sum(t.record()["training_seconds"] for t in trainings)
-    report = Report(comparison.folder, f"{comparison.env_id}: what the estimate costs")
+    report = Report(comparison.folder, f"{comparison.env_id}: cost of flying on the estimate")
     report.files += _write_numbers(matrix)
     report.add(
         "p",

@@ -33,7 +33,7 @@ def train_all(
 ) -> "Driver":
     """Complete trainings in processes, with their output in `folder`, and show the progress.
 
-    `jobs` limits the number of simultaneous trainings; a training that died is restarted `retries`
+    `jobs` limits the number of parallel trainings; a training that died is restarted `retries`
     times; the bar is hidden by default (None) if stderr is no terminal. Returns the driver, with
     the failures.
     """

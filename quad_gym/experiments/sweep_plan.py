@@ -42,7 +42,7 @@ def read(file: Path) -> dict[str, Any]:
     try:
         found = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is no valid TOML: {error}") from None
+        raise ValueError(f"{file} is not valid TOML: {error}") from None
     for name, value in found.items():
         check.choice(f"a key of {file}", name, tuple(DEFAULTS))
         if name in TABLES and not isinstance(value, dict):

@@ -58,9 +58,7 @@ class Search:
             errors = np.where(episodes.crashed, np.nan, episodes.mean_error)
             if env_id not in self._initial:  # the first candidate
                 if episodes.crashed.all():
-                    raise ValueError(
-                        f"every episode of {env_id} crashes with the gains at the start"
-                    )
+                    raise ValueError(f"every episode of {env_id} crashes with the initial gains")
                 self._initial[env_id] = float(np.nanmean(errors))
             scale = self._initial[env_id]
             logs.append(math.log(np.nan_to_num(errors, nan=CRASH_FACTOR * scale).mean() / scale))

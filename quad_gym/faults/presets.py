@@ -59,8 +59,8 @@ def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
                 raise ValueError(f"faults must be faults or names of presets, got {fault!r}")
             if found[fault.kind] is not None:
                 raise ValueError(
-                    f"faults must hold one of each kind, got two {type(fault).__name__}; a fault "
-                    "that recurs has a rate"
+                    f"faults must contain one of each kind, got two {type(fault).__name__}; a "
+                    "fault that recurs has a rate"
                 )
             fault.check_suite(sensors)
             found[fault.kind] = fault

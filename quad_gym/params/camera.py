@@ -17,10 +17,10 @@ Positive2 = Annotated[Vector, partial(check.vector, length=2, least=0.0, open_en
 def _features(name: str, value: Any) -> Matrix:
     """`value` as positions of at least one and at most MAX_FEATURES features."""
     if np.size(value) == 0:
-        raise ValueError(f"{name} must hold at least one feature, got none")
+        raise ValueError(f"{name} must contain at least one feature, got none")
     found = check.matrix(name, value, rows=None, columns=3)
     if len(found) > MAX_FEATURES:
-        raise ValueError(f"{name} must hold at most {MAX_FEATURES} features, got {len(found)}")
+        raise ValueError(f"{name} must contain at most {MAX_FEATURES} features, got {len(found)}")
     return found
 
 

@@ -98,7 +98,7 @@ def check_obstacles(name: str, obstacles: tuple[Obstacle, ...]) -> None:
     """Refuse anything that is not an obstacle, and obstacles that follow a later one."""
     for k, obstacle in enumerate(obstacles):
         if not isinstance(obstacle, Wall | Cylinder):
-            raise ValueError(f"{name} must hold Wall and Cylinder, got {obstacle!r}")
+            raise ValueError(f"{name} must contain Wall and Cylinder, got {obstacle!r}")
         if obstacle.follows is not None and obstacle.follows >= k:
             raise ValueError(
                 f"{name}[{k}].follows must be the index of an earlier obstacle, less than {k}, got "

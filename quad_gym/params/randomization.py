@@ -103,7 +103,7 @@ class Randomization:
             raise ValueError(f"randomization of {name!r} must be {wanted}, got {given!r}")
         for part in given:
             if not (part is None or isinstance(part, Distribution)):
-                raise ValueError(f"randomization of {name!r} must hold distributions, got {part!r}")
+                raise ValueError(f"randomization of {name!r} must be distributions, got {part!r}")
         return tuple(given)
 
 

@@ -27,7 +27,7 @@ class State:
                 )
             values = np.asarray(value)
             if values.dtype.kind not in _KINDS:
-                raise ValueError(f"state must hold numbers, got {value!r} for {name!r}")
+                raise ValueError(f"state must contain numbers, got {value!r} for {name!r}")
             first[name] = values.astype(_KINDS[values.dtype.kind])
         row = np.zeros(1, [(name, value.dtype, value.shape) for name, value in first.items()])
         for name, value in first.items():

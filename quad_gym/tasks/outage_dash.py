@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 PROGRESS_WEIGHT = 5.0  #: reward for each meter along the course, up to the rewarded speed [1/m]
 
-PAID_SPEED = 5.0
+REWARDED_SPEED = 5.0
 """Highest rewarded speed [m/s]; at higher speeds, many gaps would be flown in one outage."""
 
 CRASH_COST = 50.0
@@ -213,5 +213,5 @@ def gaps_behind(gaps: Gaps, position: Floats) -> NDArray[np.intp]:
 def westward(view: "View") -> Floats:
     """Rewarded true speed along the course, (n,) [m/s]; 0 beyond the finish."""
     finish = gaps_of(view).centers[:, -1, 0]
-    speed = np.minimum(-view.velocity[:, 0], PAID_SPEED)
+    speed = np.minimum(-view.velocity[:, 0], REWARDED_SPEED)
     return np.where(view.position[:, 0] > finish, speed, 0.0)

@@ -177,7 +177,7 @@ def resolve_task(given: Any) -> Task:
                 f"{name} of {label(found)} must be True or False, got {getattr(found, name)!r}"
             )
     if isinstance(found.keeps, str) or not all(isinstance(name, str) for name in found.keeps):
-        raise ValueError(f"keeps of {label(found)} must hold names, got {found.keeps!r}")
+        raise ValueError(f"keeps of {label(found)} must contain names, got {found.keeps!r}")
     for name, part in found.observes.items():
         if not isinstance(part, ObservationSpec) or not part.low < part.high:
             raise ValueError(

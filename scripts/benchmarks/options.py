@@ -54,7 +54,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "measurements 10 ms late": _late("lab", 0.01),
     "thrust and rates, commanded": {"control": Control.CTBR},
     "thrust and rates, commanded and late": {"control": Control.CTBR, "action_delay": 1.0},
-    "IMU errs in scale and alignment": _lab(
+    "IMU with errors of scale and alignment": _lab(
         "imu", accel_scale_sigma=0.002, accel_misalignment_sigma=0.002
     ),
     "IMU vibrates": _lab("imu", accel_vibration=0.1, gyro_vibration=0.005),
@@ -68,7 +68,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "battery": _world(battery=quad_gym.BatteryParams()),
     "world breeze": {"world": "breeze"},
     "all faults": {"faults": "all"},
-    "mass drawn anew each episode": {
+    "mass drawn for each episode": {
         "randomization": {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
     },
     **{f"suite {name}": {"sensors": name} for name in SUITES if name != "lab"},

@@ -84,7 +84,7 @@ def _step(env: Any, actions: Any) -> None:
 SECTION = timing.Section(
     time_own_task,
     {
-        "The circle, shipped and as a task of one's own, 50 Hz, estimate": {
+        "The circle, built-in and as a user-defined task, 50 Hz, estimate": {
             "task": timing.NAME,
             "steps/s": timing.per_second,
             "spread": timing.SPREAD,

@@ -158,7 +158,7 @@ DRAWS = [
     ({"mass": 0.8}, "'mass' must be a distribution"),
     ({"mass": None}, "'mass' must be a distribution"),
     ({"inertia": (Uniform(1, 2), Uniform(1, 2))}, "'inertia' must be a distribution or 3"),
-    ({"inertia": (Uniform(1, 2), 3.0, None)}, "'inertia' must hold distributions"),
+    ({"inertia": (Uniform(1, 2), 3.0, None)}, "'inertia' must be distributions"),
     ({"inertia": [Uniform(1e-3, 2e-3)] * 2 + [Uniform(4.1e-3, 5e-3)]}, "of 'inertia'"),
     ({"mass": Uniform(0.0, 1.0)}, "'mass' .* bounds .* got 0: .*mass must be greater than 0"),
     ({"mass": Uniform(-0.5, 0.5, relative=True)}, "'mass' .*mass must be greater than 0"),
@@ -366,7 +366,7 @@ def test_seeds_are_refused_by_name(seed):
             env.reset(seed=seed)
     with pytest.raises(ValueError, match="seed must be"):
         quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", seed=seed)
-    for seeds, message in (([seed, 1], "seeds must be"), (seed, "seeds must hold 2")):
+    for seeds, message in (([seed, 1], "seeds must be"), (seed, "seeds must contain 2")):
         with pytest.raises(ValueError, match=message):
             FlightBatch(2).reset(seeds=seeds)
     if seed != ():

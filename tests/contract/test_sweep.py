@@ -61,7 +61,7 @@ def test_options_override_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("seeds = [", "is no valid TOML"),
+        ("seeds = [", "is not valid TOML"),
         ("sedes = 3", "must be one of env_ids, algorithm"),
         ("env = 3", "env in bad.toml must be a table, got 3"),
         ("seeds = [1, 1]", "seeds must be different numbers, at least one, got [1, 1]"),

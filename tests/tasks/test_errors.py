@@ -238,7 +238,7 @@ def test_flight_with_a_state_that_is_not_finite_ends():
     ("attributes", "message"),
     [
         ({"state": {"a b": 1.0}}, "names in state must be identifiers"),
-        ({"state": {"a": "text"}}, "state must hold numbers"),
+        ({"state": {"a": "text"}}, "state must contain numbers"),
         ({**SEES, "observes": {"a": 3}}, "must map names to ObservationSpec"),
         ({**SEES, "observes": {"b": quad_gym.ObservationSpec()}}, "'b', which observe does not"),
         ({"observe": lambda v: {"up": v.time}}, "must not return 'up'"),

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from baselines import PDPolicy
-from baselines.pd import UNSURE
+from baselines.pd import UNCERTAIN
 from baselines.policies import keywords_of_policy, load_policy
 from quad_gym.commands.main import main
 from quad_gym.experiments.flown import fly
@@ -108,7 +108,7 @@ def test_rule_that_looks_when_uncertain_earns_more(facing):
     env = gymnasium.make_vec(ID, num_envs=60, include_std=True)
     rule = fly(PDPolicy(env, faces="features_when_uncertain"), env, 0, ViewRecorder(["sigma"]))
     assert rule.episodes.returns.mean() > facing.episodes.returns.mean()
-    assert UNSURE < np.nanmax(rule.recorded["sigma"]) < 3.0
+    assert UNCERTAIN < np.nanmax(rule.recorded["sigma"]) < 3.0
     assert rule.episodes.crashed.mean() < 0.1
 
 

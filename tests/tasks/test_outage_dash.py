@@ -59,7 +59,7 @@ def test_task_that_replaces_the_observation_keeps_named_parts():
     np.testing.assert_array_equal(ours["privileged"], shipped["privileged"])
     wrong = quad_gym.Task.of(replaces_observation=True, observe=height)
     wrong.keeps = "up"
-    with pytest.raises(ValueError, match="keeps of Task must hold names, got 'up'"):
+    with pytest.raises(ValueError, match="keeps of Task must contain names, got 'up'"):
         gymnasium.make("QuadGym/Circle-v0", task=wrong)
 
 

@@ -284,7 +284,7 @@ def test_reset_draws_new_obstacle_positions_and_clears_collisions():
     ("obstacles", "message"),
     [
         ((Wall(follows=0),), r"obstacles\[0\].follows must be"),
-        (("wall",), "must hold Wall and Cylinder, got 'wall'"),
+        (("wall",), "must contain Wall and Cylinder, got 'wall'"),
         ((Wall(),) * (MAX_OBSTACLES + 1), f"at most {MAX_OBSTACLES}, got {MAX_OBSTACLES + 1}"),
     ],
 )

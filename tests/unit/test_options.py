@@ -141,6 +141,16 @@ def test_help_has_no_empty_default_and_no_none(command, capsys):
     assert "if not given" not in text
 
 
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_help_is_wrapped_to_the_width_of_the_terminal(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    examples = ("    ", "  quad-gym")
+    assert max(len(line) for line in lines if not line.startswith(examples)) <= 100
+
+
 def test_hint_after_an_unknown_option_names_the_command(capsys):
     with pytest.raises(SystemExit):
         main(["circle", "--nonsense", "3"])

@@ -248,7 +248,7 @@ def small(**changes):
         ({"gyro": None}, "must have a column gyro_x"),
         ({"time": np.array([0.0, 10.0, 20.0, 30.0])}, "at most 1 s apart, got none from 0.000 s"),
         ({"time": np.zeros(3)}, "equal lengths"),
-        ({"time": np.array(["a", "b", "c", "d"])}, "column time must hold numbers"),
+        ({"time": np.array(["a", "b", "c", "d"])}, "column time must contain numbers"),
         ({"gyro": np.zeros((4, 2))}, "gyro must have shape"),
         ({"accel": np.full((4, 3), np.inf)}, "accel must be finite"),
         ({"accel": np.full((4, 3), np.nan)}, "at least two IMU samples"),
@@ -304,7 +304,7 @@ def test_missing_or_invalid_files_are_refused(tmp_path):
     file = tmp_path / "broken.csv"
     for text, message in (
         ("time,gyro_x\n0.0\n", "2 cells in each row, got 1 in row 1"),
-        ("time,gyro_x\n0.0,x\n", "must hold numbers"),
+        ("time,gyro_x\n0.0,x\n", "must contain numbers"),
         ("time,time\n0.0,1.0\n", "must have distinct column names"),
         ("", "must have at least one row of numbers"),
         ("time,gyro_x\n", "must have at least one row of numbers"),

@@ -94,7 +94,10 @@ def test_fields_missing_in_file_come_from_its_base(tmp_path):
         ('base = "rtk"\n[imu]\nlever_arm_B = [1, 2]', r"lever_arm_B must have shape \(3\)"),
         ('base = "rtk"\n[imu]\nlever_arm_B = 1', r"lever_arm_B must have shape \(3\)"),
         ('base = "rtk"\n[gnss]\nrate = 7', "GnssParams.rate must divide the IMU rate"),
-        ('base = "rtk"\n[camera]\nfeatures_I = []', "CameraParams.features_I must hold at least"),
+        (
+            'base = "rtk"\n[camera]\nfeatures_I = []',
+            "CameraParams.features_I must contain at least",
+        ),
         ("[imu]\nrate = 200", r"there must be a table \[gnss\], or base = "),
         ("", r"there must be a table \[imu\]"),
     ],

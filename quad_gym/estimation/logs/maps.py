@@ -118,7 +118,7 @@ def _column(given: Mapping[Any, Any], name: str) -> Floats:
     try:
         return np.asarray(given[name], np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"column {name} must hold numbers") from None
+        raise ValueError(f"column {name} must contain numbers") from None
 
 
 def _listed(entry: Mapping[str, Any], word: str, default: Any, count: int) -> Sequence[Any]:

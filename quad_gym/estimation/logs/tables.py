@@ -68,7 +68,7 @@ def _number(path: Path, cell: str, row: int) -> float:
     try:
         return float(cell) if cell.strip() else np.nan
     except ValueError as error:
-        raise ValueError(f"{path.name} must hold numbers: {error} in row {row}") from None
+        raise ValueError(f"{path.name} must contain numbers: {error} in row {row}") from None
 
 
 def checked_columns(given: Mapping[Any, Any]) -> Columns:
@@ -87,7 +87,7 @@ def checked_columns(given: Mapping[Any, Any]) -> Columns:
             try:
                 array_ = np.asarray(value, dtype=np.float64)
             except (TypeError, ValueError):
-                raise ValueError(f"column {name} must hold numbers") from None
+                raise ValueError(f"column {name} must contain numbers") from None
         if name == "pixels" and array_.ndim == 3 and array_.shape[2] == 2:
             for i in range(array_.shape[1]):
                 for j, axis in enumerate("uv"):
