@@ -33,6 +33,7 @@ from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.first_motion import SPAN
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Log
+from quad_gym.estimation.logs.parts import running_motors
 from quad_gym.estimation.player import Player
 from quad_gym.estimation.sets import run_sets
 from quad_gym.packing.aids import blocks_of
@@ -53,7 +54,6 @@ _VIBRATES = 3.0  #: ratio of the vibration in flight and in the quietest second 
 _TURNS, _TILTS = 0.05, 0.5
 """Change of mean rates [rad/s] and of mean specific force [m/s^2] that no vehicle at rest shows."""
 _CALM = 5.0  #: longest time without vibration and motion in flight [s]
-_RUNNING = 0.4  #: command of running motors, over their largest [-]
 
 
 def in_flight(log: Log, times: Floats) -> Any:
@@ -82,11 +82,10 @@ def in_flight(log: Log, times: Floats) -> Any:
     calm = max(1, round(_CALM / dt))
     flies = minimum_filter1d(maximum_filter1d(flies, calm), calm)
     found = np.interp(times, time, flies.astype(float)) > 0.5
-    motors = None if log.motors is None else next(iter(log.motors.values.values())).mean(axis=1)
-    if motors is not None and (most := float(np.nanpercentile(motors, 95.0))) > 0.0:
+    if (running := running_motors(log)) is not None:
         assert log.motors is not None
         held = np.clip(np.searchsorted(log.motors.time, times, side="right") - 1, 0, None)
-        found &= motors[held] > _RUNNING * most
+        found &= running[held]
     return found
 
 

@@ -18,6 +18,7 @@ from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.fits import FEWEST, Fit, correlations, exceeds, fit_of, larger
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.logs.clocks import PAUSE
+from quad_gym.estimation.logs.parts import running_motors
 from quad_gym.estimation.plausibility import implausible, nothing_in_common
 from quad_gym.estimation.results import Measured, Replay, by_sensor
 from quad_gym.params.sensors import SensorSuite
@@ -65,7 +66,11 @@ OF_SENSOR = {"barometer": "height", "range_finder": "height"} | dict.fromkeys(
 
 
 def with_verdict(log: Log, body: str, suite: SensorSuite, result: Replay) -> Replay:
-    """Return a replay with its findings, the worst first, and the verdict in a line."""
+    """Return a replay with its findings, the worst first, and the verdict in a line.
+
+    If the log has commands of the motors, it ends for the verdict where they stop for good.
+    """
+    whole, result = result, _until_landing(log, result)
     found = [
         Finding(quantity="log", severity=Severity.LOST, text=text)
         for text in (*log.problems, *implausible(log, body))
@@ -81,7 +86,29 @@ def with_verdict(log: Log, body: str, suite: SensorSuite, result: Replay) -> Rep
         found += _misfit(name, sensors[name], fit, fits)
     found += [*_changes(log, result), *_biases(result, suite), *_unknown_heading(result)]
     found.sort(key=lambda finding: -finding.severity)
-    return replace(result, findings=tuple(found), verdict=in_one_line(found, fits))
+    return replace(whole, findings=tuple(found), verdict=in_one_line(found, fits))
+
+
+def _until_landing(log: Log, result: Replay) -> Replay:
+    """Return the rows and measurements of a replay until the motors stop."""
+    running = running_motors(log)
+    if running is None or not running.any():
+        return result
+    assert log.motors is not None
+    landing = float(log.motors.time[np.flatnonzero(running)[-1]])
+    rows = result.time <= landing
+    if rows.all() or rows.sum() < 2:
+        return result
+    cut: dict[str, Any] = {
+        name: value[rows]
+        for name, value in vars(result).items()
+        if isinstance(value, np.ndarray) and len(value) == len(rows)
+    }
+    measured = {
+        name: Measured(*(value[m.time <= landing] for value in vars(m).values()))
+        for name, m in result.measured.items()
+    }
+    return replace(result, **cut, measured=measured)
 
 
 def _lost(quantity: str, text: str) -> Finding:

@@ -66,6 +66,16 @@ def test_gnss_that_drifts_while_a_camera_holds_the_position_is_a_problem():
     assert any("GNSS position refused for" in problem for problem in result.problems)
 
 
+@pytest.mark.parametrize(("stop", "usable"), [(35.0, True), (60.0, False)])
+def test_errors_after_the_motors_have_stopped_do_not_count(stop, usable):
+    def change(table, rng, suite):
+        time = table["time"]
+        table["gnss_enu"][time > 36.0] += (300.0, 0.0, 0.0)
+        table["motors"] = np.where(time[:, np.newaxis] < stop, 5.0, 0.0) * np.ones(4)
+
+    assert bool(judged(change).problems) != usable
+
+
 def test_measurements_of_another_clock_are_named_with_the_difference():
     log, _ = flight()
     table = log | {"time": np.where(np.isfinite(log["gyro"][:, 0]), log["time"], log["time"] - 1.5)}

@@ -11,7 +11,17 @@ import numpy as np
 from quad_gym.estimation.logs.clocks import PAUSE
 from quad_gym.estimation.logs.log import Log
 
+RUNNING = 0.4  #: command of running motors, over their largest [-]
 SHORTEST = 1.0  #: shorter parts of a log with pauses are left out [s]
+
+
+def running_motors(log: Log) -> Any:
+    """Return True for the rows of `log.motors` with running motors, or None without commands."""
+    if log.motors is None or not len(log.motors):
+        return None
+    commands = next(iter(log.motors.values.values())).mean(axis=1)
+    most = float(np.nanpercentile(commands, 95.0))
+    return commands > RUNNING * most if most > 0.0 else None
 
 
 def parts_of(log: Log) -> list[Log]:
