@@ -66,9 +66,9 @@ class FilterParams(Checked):
     reset_timeout: check.Positive = 1.0
     """time for which a sensor is rejected before the states that only it measures are reset to it
     [s]; as `no_aid_timeout_max` of PX4 EKF2"""
-    glitch_timeout: check.Positive = 10.0
-    """the same if its innovations have begun with a step, which an IMU does not make [s]; as
-    `posRetryTimeUseVel_ms` of ArduPilot NavEKF3"""
+    glitch_timeout: check.Positive = 25.0
+    """the same if its innovations have begun with a step, which an IMU does not make [s]; ArduPilot
+    NavEKF3 waits for 10 s (`posRetryTimeUseVel_ms`), and dead reckoning bridges faults of 20 s"""
     max_direction_sigma: check.Positive = 0.2
     """standard deviation of a feature's predicted direction above which a filter with an innovation
     gate ignores the feature [rad]; half the square of this angle, which a linear model neglects, is

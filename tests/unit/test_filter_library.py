@@ -171,6 +171,18 @@ def test_example_refuses_measurements_older_than_its_memory(tmp_path):
     np.testing.assert_array_equal(found, np.array(list(result.columns().values())).T)
 
 
+@needs_compiler
+def test_example_refuses_samples_of_another_origin(tmp_path):
+    table = turned_table()
+    far = 1.05 * np.array(TURNED.gnss.reference_antenna_G)
+    for axis, ecef, center in zip(("east", "north", "up"), "xyz", far, strict=True):
+        table[f"gnss_{ecef}"] = center + table.pop(f"gnss_{axis}")
+    replay(table, sensors="rtk", samples=tmp_path / "samples.csv")
+    command = [example("rtk", "x86-64"), tmp_path / "samples.csv"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, "--log LOG" in done.stderr) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("without", "start", "message"),
     [

@@ -178,7 +178,6 @@ def test_a_jump_does_not_lock_the_filter_out_for_ever(name):
     assert (abs(state_errors(batch)[:, FIX]) < 5 * sigma).all()
 
 
-@pytest.mark.xfail(reason="bounded weights correct most headings without a reset", strict=False)
 def test_a_wrong_heading_does_not_lock_the_baseline_out_for_ever():
     suite = quad_gym.sensor_suite("rtk").simplified().replace(camera=None)
     batch = fly(suite, 200, task="hover")
@@ -188,11 +187,11 @@ def test_a_wrong_heading_does_not_lock_the_baseline_out_for_ever():
     shifted(batch, R_hat=lambda R: np.einsum("nijl,jk->nikl", R, turn))
     steps(batch, suite.estimator.glitch_timeout + 10.0)  # it may be a step of the baseline
     yaw = np.degrees(abs(state_errors(batch)[:, 8]))
-    assert (batch.record("resets")[:, 1] >= 1.0).all()
+    since = batch.record("tick") - batch.record("accepted_tick")[:, BASELINE_BLOCK]
+    assert (since < suite.imu.rate).all()  # by a reset, or as bounded weights corrected it
     assert np.quantile(yaw, 0.99) < 5.0
 
 
-@pytest.mark.xfail(reason="a wrong feature with a bounded weight costs up to 8 cm", strict=False)
 def test_one_wrong_feature_stays_out_while_the_others_agree():
     batch = fly("rtk", 50, task="hover")
     steps(batch, 3.0)

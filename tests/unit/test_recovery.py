@@ -47,7 +47,6 @@ def test_filter_is_flagged_diverged_within_1_s_of_a_bias_step():
     assert (wrong & ~lost).mean() <= 0.01
 
 
-@pytest.mark.xfail(reason="biases are reset to their variances at the start: 5 % take longer")
 def test_filter_with_magnetometer_recovers_from_a_gyro_bias_step():
     """No other sensor measures the heading; its innovations drift before any is rejected."""
     batch = fly("consumer", 128, task="circle", filter_start="warm", faults=STEP)

@@ -25,10 +25,11 @@ from quad_gym.kernels.filter.recovery import (
     accept_group,
     count_rejections,
     glitches,
+    limit_of,
     supported,
 )
 from quad_gym.kernels.filter.rows import columns_of
-from quad_gym.kernels.maths.elementary import clip, minimum
+from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or
 from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_outers_of_rows
 from quad_gym.kernels.simd.blocks import reset
@@ -131,14 +132,16 @@ def _weigh(flight, p, settings, group, s, valid, nis, limit, again):
     """Lanes in which block s is rejected, and lanes in which its noise is increased.
 
     An innovation beyond the gate is an error of the sensor, or else of the IMU; then it has a
-    bounded weight.
+    bounded weight. A feature is wrong where the others of its image agree with the estimate.
     """
     rejected, weakened = nis < 0.0, nis < 0.0  # all false
     if (settings.form & FilterForm.GATE.value) != 0:
-        beyond = valid & (nis > limit)
+        beyond = valid & (nis > limit_of(flight, group, limit))
         if any_of(beyond):
             hard = supported(flight, p, settings, group)
             hard = hard | glitches(flight, p, settings, group, nis, limit)
+            if group == FEATURE_BLOCKS:  # most features of the last image agreed
+                hard = hard | (flight.rejected_in_row[group] < 1.0)
             rejected = beyond & hard
             weakened = beyond & logical_not(hard)
     rejected = _decide(flight, s, valid, rejected, again, GateDecision.REJECTED)
@@ -150,7 +153,8 @@ def _weigh(flight, p, settings, group, s, valid, nis, limit, again):
 def weaken(work, k, weakened, share, P_zz):
     """Add a share of P_zz to the noise of the block at row k, in the lanes `weakened`."""
     if any_of(weakened):
-        more = load_block(work.Rz, k, k) + select(weakened, share, 0.0) * P_zz
+        share = select(weakened, maximum(share, 0.0), 0.0)  # a later step may be within the gate
+        more = load_block(work.Rz, k, k) + share * P_zz
         store_block(work.Rz, k, k, more)
 
 

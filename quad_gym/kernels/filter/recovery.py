@@ -65,6 +65,9 @@ VELOCITY_BIT = int(Observes.VELOCITY).bit_length() - 1
 OUTLIER = 4.0
 """Ratio of NIS and gate beyond which a first refusal is a step of the sensor: an innovation of
 twice the largest one that the gate explains."""
+_STRICT = 0.5
+"""Ratio of the limits for a receiver that is used again and the gate: its false-alarm probability,
+for position and velocity, is about the root of the gate's."""
 _MORE = 16.0  #: factor on the variances of position and velocity where the biases are reset
 MAX_ANGLE = math.pi / math.sqrt(3.0)
 """Largest standard deviation of an angle [rad], when it is unknown."""
@@ -137,6 +140,24 @@ def supported(flight, p, settings, refused):
 
 
 @kernel
+def limit_of(flight, group, limit):
+    """Gate of a group, from its usual `limit`; zero if all its measurements are beyond it.
+
+    A receiver whose velocity has stepped is wrong, its positions too, which integrate the velocity.
+    It is used again when both pass a stricter test, as the uncertainty of dead reckoning grows.
+    """
+    if group in (POSITION_BLOCK, VELOCITY_BLOCK):
+        v, strict = VELOCITY_BLOCK, _STRICT * limit
+        wrong = (flight.stepped[v] > 0.0) & (flight.rejected_in_row[v] >= 2.0)
+        if group == POSITION_BLOCK:
+            strict = 0.0 * limit
+        row, nis = flight.rejected_in_row[POSITION_BLOCK], flight.refused_nis[POSITION_BLOCK]
+        bound = select((row > 0.0) & (nis > strict), 0.0, strict)
+        limit = select(wrong, bound, limit)
+    return limit
+
+
+@kernel
 def glitches(flight, p, settings, group, nis, limit):
     """Lanes in which an innovation beyond the gate is an error of the sensor, not of the IMU.
 
@@ -164,6 +185,7 @@ def _dead_reckons(flight, p, settings):
     That is, over the time `RECENT`; the position cannot have drifted off then.
     """
     precise = p.velocity_sigma * RECENT < p.position_sigma_I[0]
+    precise = precise & (flight.tick * p.dt >= RECENT)
     return precise & _confirmed(flight, p, settings, POSITION_BLOCK, VELOCITY_BIT)
 
 
@@ -327,9 +349,13 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
     if slow is not None:
         states = 15 + slow.slow_states
         fill_slow(flight, slow, P)
-    drifted, corrected_a = work.drifted > 0.0, select(accel, corrected_a, 0.0)
-    _reset_motion(flight, p, P, states, drifted, corrected_a, select(gyro, corrected_g, 0.0))
+    drifted = work.drifted > 0.0
+    _reset_motion(flight, p, P, states, drifted, corrected_a, corrected_g)
     if slow is not None:
+        iron = slow.aid_vector[Aid.MAGNETOMETER]
+        if iron >= 0:  # it was estimated with the attitude
+            own = p.slow_sigma[iron] * p.slow_sigma[iron]
+            reset_variances(P, D + iron, states, drifted, (own, own, own))
         if slow.estimates_drift:
             _reset_drift(flight, p, P, states, moved)
     call_sensors(flight, p, p, settings, work, stages, Act.RESET, 0)

@@ -182,10 +182,11 @@ def _gate(flight, p, work, settings, k):
 
     A feature whose predicted direction is too uncertain for a linear model is masked, too: the
     error of a direction is bounded, so it would pass any gate, and its update would be wrong and
-    overconfident. An image counts as rejected if most of its features are.
+    overconfident. An image counts as rejected if most of its features are; otherwise rejected ones
+    do not count.
     """
     again, zero = work.again > 0.0, 0.0 * p.sigma_beta
-    seen, refused, total, scatter, side, up = zero, zero, zero, zero, zero, zero
+    seen, refused, total, kept, scatter, side, up = zero, zero, zero, zero, zero, zero, zero
     for i in range(settings.feature_count):
         block = FEATURE_BLOCKS + i
         if any_of(flight.block_valid[block] > 0.0):
@@ -194,19 +195,20 @@ def _gate(flight, p, work, settings, k):
                 flight, p, work, settings, k, block, FEATURE_BLOCKS, valid, p.gate_uncertainty
             )
             counted = valid & logical_not(unsure | again)
+            used = counted & logical_not(beyond)
             seen = seen + select(counted, 1.0, 0.0)
             refused = refused + select(counted & beyond, 1.0, 0.0)
-            total = total + select(counted, nis, 0.0)
+            total, kept = total + select(counted, nis, 0.0), kept + select(used, nis, 0.0)
             scatter = scatter + select(counted, change, 0.0)
-            side = side + select(counted, clip(scaled[0], -LARGEST, LARGEST), 0.0)
-            up = up + select(counted, clip(scaled[1], -LARGEST, LARGEST), 0.0)
+            side = side + select(used, clip(scaled[0], -LARGEST, LARGEST), 0.0)
+            up = up + select(used, clip(scaled[1], -LARGEST, LARGEST), 0.0)
             mask_rejected(flight, work, settings, k, block, valid, 3.0)
             k += 3
     first, most = seen > 0.0, refused > 0.5 * seen
-    count, s = maximum(seen, 1.0), FEATURE_BLOCKS
-    mean, scatter, limit = total / count, scatter / count, p.gate_direction
+    count, few, s = maximum(seen, 1.0), maximum(seen - refused, 1.0), FEATURE_BLOCKS
+    mean, scatter, limit = select(most, total / count, kept / few), scatter / count, p.gate_direction
     judge(flight, p, work, settings, s, first, first & most, mean, scatter, 2.0, limit)
-    root = math.sqrt(count)
+    root = math.sqrt(few)
     follow_mean(flight, s, first & logical_not(most), (side / root, up / root, zero))
 
 
