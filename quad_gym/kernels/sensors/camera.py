@@ -206,7 +206,11 @@ def _gate(flight, p, work, settings, k):
             k += 3
     first, most = seen > 0.0, refused > 0.5 * seen
     count, few, s = maximum(seen, 1.0), maximum(seen - refused, 1.0), FEATURE_BLOCKS
-    mean, scatter, limit = select(most, total / count, kept / few), scatter / count, p.gate_direction
+    mean, scatter, limit = (
+        select(most, total / count, kept / few),
+        scatter / count,
+        p.gate_direction,
+    )
     judge(flight, p, work, settings, s, first, first & most, mean, scatter, 2.0, limit)
     root = math.sqrt(few)
     follow_mean(flight, s, first & logical_not(most), (side / root, up / root, zero))
