@@ -115,6 +115,7 @@ def test_noise_of_a_barometer_makes_the_height_uncertain_only():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The filter kept its last good state")  # of gyros in deg/s
 @pytest.mark.parametrize("faulty", [False, True])
 def test_verdicts_on_sixty_flights_are_wrong_three_times_at_most(faulty):
     kinds = verdicts.FAULTS if faulty else verdicts.HARMLESS
