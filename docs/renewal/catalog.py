@@ -160,7 +160,7 @@ CATALOG = {
                 ),
                 "std_certainty_privileged",
             ),
-            figures=texts.figures_of("look_around", "learning.png", "glance.png"),
+            figures=texts.figures_of("look_around", "glance.png"),
         ),
         Result(
             name="look_around_film",
@@ -192,7 +192,7 @@ CATALOG = {
             texts=texts.study(
                 "stale_race", "pd", "truth", "residual", "std", "truth_delay_compensated"
             ),
-            figures=texts.figures_of("stale_race", "film.webp", "learning.png", "pace.png"),
+            figures=texts.figures_of("stale_race", "film.webp", "pace.png"),
         ),
         Result(
             name="masked",
@@ -211,7 +211,7 @@ CATALOG = {
             ],
             flights=("OutageDash", "OutageDash, truth"),
             texts=texts.study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),
-            figures=texts.figures_of("outage_dash", "film.webp", "learning.png", "pace.png"),
+            figures=texts.figures_of("outage_dash", "film.webp", "pace.png"),
         ),
         Result(
             name="sb3_defaults",
