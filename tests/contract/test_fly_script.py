@@ -55,7 +55,7 @@ def test_fly_uses_default_action_and_faults_of_task():
     flights = script.make_env(script.FlyArgs(env_id="outage_dash")).unwrapped.flights
     assert flights.action == "velocity"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
-    given = script.FlyArgs(env_id="outage_dash", action="ctbr", faults=("rotor_loss",))
+    given = script.FlyArgs(env_id="outage_dash", env={"action": "ctbr"}, faults=("rotor_loss",))
     flights = script.make_env(given).unwrapped.flights
     assert flights.action == "ctbr"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["RotorLoss"]

@@ -59,7 +59,7 @@ def test_links_are_absolute_where_a_release_names_the_repository(metadata):
     }
     for link in of_files:
         place = link.removeprefix("https://example.org/us/it/").partition("/v")
-        kind, path = place[0], place[2].partition("/")[2]
+        kind, path = place[0], place[2].partition("/")[2].partition("#")[0]
         assert kind == ("raw" if path.endswith(".webp") else "blob"), link
         assert (ROOT / path).exists(), link
 

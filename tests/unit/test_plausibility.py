@@ -99,7 +99,7 @@ def test_axes_of_the_other_frame_are_named(axes, body, sentence):
 
 def test_wrong_noise_of_a_suite_is_named_by_sensor():
     table = turntable()
-    wrong = np.random.default_rng(2).normal(0.0, 3.0, (COUNT, 3))
+    wrong = np.random.default_rng(2).normal(0.0, 0.5, (COUNT, 3))
     table["gnss_velocity_enu"] = table["gnss_velocity_enu"] + wrong
     sentences = [p for p in replayed(table).problems if "GNSS velocity: NIS per degree" in p]
     assert sentences[0].endswith("rejected: this suite does not describe this log")

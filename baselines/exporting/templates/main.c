@@ -68,14 +68,20 @@ static void print_numbers(const double *numbers, int n)
 
 static void print_estimate(void)
 {
+    static double last[4]; // so that the sign of the quaternion does not change
     qg_estimate e;
     demand(qg_state(&filter, &e), "estimate");
+    double product = 0.0;
+    for (int i = 0; i < 4; i++)
+        product += e.quaternion[i] * last[i];
+    for (int i = 0; i < 4; i++)
+        last[i] = product < 0.0 ? -e.quaternion[i] : e.quaternion[i];
     if (silent)
         return;
     printf("%.17g", e.time);
     print_numbers(e.position, 3);
     print_numbers(e.velocity, 3);
-    print_numbers(e.quaternion, 4);
+    print_numbers(last, 4);
     print_numbers(e.accel_bias, 3);
     print_numbers(e.gyro_bias, 3);
     print_numbers(e.sigma, 15);
