@@ -64,7 +64,7 @@ class FlightBatch(FlightMemory):
 
     @takes(FlightConfiguration)
     def __init__(self, *values: Any, **keywords: Any) -> None:
-        ready = isinstance(values[0], FlightConfiguration) if len(values) == 1 else False
+        ready = len(values) == 1 and not keywords and isinstance(values[0], FlightConfiguration)
         c: FlightConfiguration = values[0] if ready else FlightConfiguration(*values, **keywords)
         self.configuration, self.count = c, int(c.count)
         self.vehicle, self.sensors, self.task, self.world = c.vehicle, c.sensors, c.task, c.world

@@ -32,6 +32,7 @@ from quad_gym.faults import (
     WrongAssociations,
 )
 from quad_gym.faults.presets import faults_of
+from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.records import Control, Source
 from tests.builders import MAKERS, single_env
 
@@ -298,9 +299,11 @@ REFUSED = [
         )
         for suite, name, needed in ABSENT
     ),
+    (partial(FlightBatch, FlightConfiguration(1), threads=1), "count must be a number"),
     *OTHERS,
 ]
 ACCEPTED = [
+    partial(FlightBatch, FlightConfiguration(1)),
     lambda: QuadEnv("hover", observation="truth", include_std=True, filter_start="warm"),
     lambda: QuadEnv("hover", observation="noisy", innovations=True, filter_start="warm"),
     lambda: QuadEnv("hover", observation="truth", estimator=None),
