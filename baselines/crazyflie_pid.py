@@ -28,17 +28,17 @@ class CrazyflieGains(Checked):
     """desired velocity per position error [1/s]"""
     position_integral: Vector3 = (0.0, 0.0, 0.5)
     """desired velocity per integral of the position error [1/s^2]"""
-    most_velocity: Vector3 = (1.1, 1.1, 1.1)
+    max_velocity: Vector3 = (1.1, 1.1, 1.1)
     """limit of the desired velocity [m/s]"""
     velocity: Vector3 = (25.0, 25.0, 25e3)
     """tilt [deg], and along z thrust, per velocity error"""
     velocity_integral: Vector3 = (1.0, 1.0, 15e3)
     """tilt [deg], and along z thrust, per integral of the velocity error"""
-    most_change: Vector3 = (20.0, 20.0, 32767.0)
+    max_change: Vector3 = (20.0, 20.0, 32767.0)
     """limit of the desired tilt [deg], and of the change of thrust"""
     base_thrust: float = 36e3
     """thrust without errors"""
-    least_thrust: float = 20e3
+    min_thrust: float = 20e3
     """limit of the thrust"""
     attitude: Vector3 = (6.0, 6.0, 6.0)
     """desired body rate per angle error [1/s]"""
@@ -46,7 +46,7 @@ class CrazyflieGains(Checked):
     """desired body rate per integral of the angle error [1/s^2]"""
     attitude_derivative: Vector3 = (0.0, 0.0, 0.35)
     """change of the desired body rate per angular rate [-]"""
-    most_angle_integral: Vector3 = (20.0, 20.0, 360.0)
+    max_angle_integral: Vector3 = (20.0, 20.0, 360.0)
     """limit of the integral of the angle error [deg s]"""
     body_rates: Vector3 = (250.0, 250.0, 120.0)
     """thrust per error of the body rate [s/deg]"""
@@ -54,9 +54,9 @@ class CrazyflieGains(Checked):
     """thrust per integral of this error [1/deg]"""
     body_rates_derivative: Vector3 = (2.5, 2.5, 0.0)
     """thrust per angular acceleration [s^2/deg]"""
-    most_rate_integral: Vector3 = (33.3, 33.3, 166.7)
+    max_rate_integral: Vector3 = (33.3, 33.3, 166.7)
     """limit of the integral of the rate error [deg]"""
-    largest_force: check.Positive = 0.12
+    max_force: check.Positive = 0.12
     """force of a rotor at a thrust of 65,535 [N]"""
     force_curve: Annotated[Vector, partial(check.vector, length=4)] = (
         *(-0.02476538, 0.06523794),
@@ -143,7 +143,7 @@ class CrazyfliePID:
         if m.step % self._every == 0:
             m = self._slow(part, angle, m)
         thrusts, m = self._fast(part["reference_heading"], angle, rate, m)
-        volts = np.interp(thrusts / 65535.0 * self.gains.largest_force, *self._curve)
+        volts = np.interp(thrusts / 65535.0 * self.gains.max_force, *self._curve)
         excess = volts.max(axis=1, keepdims=True) - self.battery
         volts = np.maximum(volts - np.maximum(excess, 0.0), 0.0)
         action = np.clip(volts / self._hover - 1.0, -1.0, 1.0)
@@ -156,12 +156,12 @@ class CrazyfliePID:
         error = _turned(part["reference_position"] - part["position"], yaw)
         of_position = m.of_position + dt * error
         wanted = g["position"] * error + g["position_integral"] * of_position
-        wanted = np.clip(wanted, -g["most_velocity"], g["most_velocity"])
+        wanted = np.clip(wanted, -g["max_velocity"], g["max_velocity"])
         error = wanted - _turned(part["velocity"], yaw)
         of_velocity = m.of_velocity + dt * error
         change = g["velocity"] * error + g["velocity_integral"] * of_velocity
-        change = np.clip(change, -g["most_change"], g["most_change"])
-        thrust = np.clip(change[:, 2] + g["base_thrust"], g["least_thrust"], 65535.0)
+        change = np.clip(change, -g["max_change"], g["max_change"])
+        thrust = np.clip(change[:, 2] + g["base_thrust"], g["min_thrust"], 65535.0)
         held = np.stack([-change[:, 1], change[:, 0], thrust], axis=1)
         return m._replace(of_position=of_position, of_velocity=of_velocity, held=held)
 
@@ -171,11 +171,11 @@ class CrazyfliePID:
         yaw = np.degrees(np.arctan2(heading[:, 1], heading[:, 0]))
         error = np.column_stack([m.held[:, :2], yaw]) - angle
         error[:, 2] = _wrapped(error[:, 2])
-        limit = g["most_angle_integral"]
+        limit = g["max_angle_integral"]
         of_angle = np.clip(m.of_angle + dt * error, -limit, limit)
         wanted = g["attitude"] * error + g["attitude_integral"] * of_angle
         wanted -= g["attitude_derivative"] * _wrapped(angle - m.angle) / dt
-        error, limit = wanted - rate, g["most_rate_integral"]
+        error, limit = wanted - rate, g["max_rate_integral"]
         of_rate = np.clip(m.of_rate + dt * error, -limit, limit)
         turn = g["body_rates"] * error + g["body_rates_integral"] * of_rate
         turn -= g["body_rates_derivative"] * (rate - m.rate) / dt

@@ -109,19 +109,17 @@ def summary_of(table: list[dict[str, Any]]) -> dict[str, float]:
 @plots.house_style()
 def prediction_figure(table: list[dict[str, Any]]) -> Any:
     """Figure of predicted over logged tracking errors, with intervals and the factor."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2, 4.6))
-    axes = figure.subplots()
+    figure, ((axes,),) = plots.panels(1, 1, (5.2, 4.6))
     ends = np.array([0.2, 1.0])
     axes.plot(ends, ends, color=plots.INK, linewidth=0.8)
-    axes.fill_between(ends, ends / FACTOR, ends * FACTOR, color=plots.PALE, zorder=0, linewidth=0)
+    band: dict[str, Any] = {"color": plots.PALE, "zorder": 0, "linewidth": 0}
+    axes.fill_between(ends, ends / FACTOR, ends * FACTOR, label=f"a factor of {FACTOR}", **band)
     for kind, color in ((True, plots.GREY), (False, plots.BLUE)):
         some = [row for row in table if row["fitted"] == kind]
         x, y, low, high = (
             np.array([row[key] for row in some]) for key in ("logged", "predicted", "low", "high")
         )
-        label = "thrust fitted to it" if kind else "not used before"
+        label = "used for the fit" if kind else "not used for the fit"
         style: dict[str, Any] = {
             "fmt": "o",
             "markersize": 4.5,
@@ -136,8 +134,10 @@ def prediction_figure(table: list[dict[str, Any]]) -> Any:
             axes.annotate("crashes", place, (5, -10), textcoords="offset points")
     axes.set(xscale="log", yscale="log", xlim=ends, ylim=(0.1, 1.4))
     for axis in (axes.xaxis, axes.yaxis):
+        axis.set_ticks([0.1, 0.2, 0.3, 0.5, 1.0])
         axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter("{x:.1g}")
+        axis.set_minor_formatter("")
+    axes.set_xlim(ends)
     axes.set(xlabel="logged tracking error [m]", ylabel="predicted tracking error [m]")
     axes.legend(loc="upper left")
     return figure
