@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.seeding import stream_keys
 from quad_gym.batch.surroundings import require_room
 from quad_gym.params import checks as check
 from quad_gym.params.task import TaskParams
@@ -12,17 +13,6 @@ from quad_gym.params.world import WorldParams
 
 MAX_SPEED = 1e4
 """Largest initial speed [m/s]: several times faster than any bullet, with drag still integrable."""
-
-
-def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
-    """Draw the key of a flight's random stream, (2,) words."""
-    return rng.integers(0, 2**64, size=2, dtype=np.uint64, endpoint=False)
-
-
-def stream_keys(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
-    """Return keys for flights seeded one by one, as in Gymnasium; None uses fresh entropy."""
-    checked = [check.seed("seeds", seed) for seed in seeds]
-    return np.array([stream_key(np.random.Generator(np.random.PCG64(seed))) for seed in checked])
 
 
 def checked_keys(

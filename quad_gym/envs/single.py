@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import gymnasium
 import numpy as np
 
-from quad_gym.batch.resets import stream_key
+from quad_gym.batch.seeding import stream_key
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
 from quad_gym.envs.flights import Flights, checked_actions
 from quad_gym.envs.keywords import EnvKeywords, checked, shows

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from quad_gym.batch.resets import stream_keys
+from quad_gym.batch.seeding import stream_keys
 from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults, start_info
 from quad_gym.envs.flights import Flights, checked_actions, named_options
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
