@@ -250,8 +250,9 @@ class FlightBatch(FlightMemory):
 
     def _calls_of_threads(self) -> Calls:
         """Return the arguments with which the threads call the compiled code."""
-        self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
-        words = {**self.memory_of_call(), Call.STAGES: linked_table(self._stages)}
+        table = linked_table(self._stages)
+        table["paths"], table["pieces"] = map(address_of, self._paths)
+        words = {**self.memory_of_call(), Call.STAGES: table}
         return Calls(self._blocks, self._room, words, self._paths)
 
     def memory_of_call(self) -> dict[Call, Word]:

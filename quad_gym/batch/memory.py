@@ -37,16 +37,12 @@ _PARTS_OF = {
 """Names of parts of fields, for suites with GNSS drift."""
 
 
-_NO_CONFIGURATION = ("paths", "pieces", "max_steps")
-"""Settings that are addresses, or that `FlightBatch.limit` changes."""
-
-
 def configuration_digest(*records: NDArray[Any]) -> int:
     """Return a digest of records of settings, parameters and trajectories, as a word."""
     digest = hashlib.blake2b(digest_size=8)
     for record in records:
         for name in record.dtype.names or ():
-            if name not in _NO_CONFIGURATION:
+            if name != "max_steps":  # which `FlightBatch.limit` changes
                 digest.update(np.ascontiguousarray(record[name]).tobytes())
     return int.from_bytes(digest.digest(), "little")
 

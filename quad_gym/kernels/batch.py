@@ -24,6 +24,7 @@ from quad_gym.records import (
     FIRST_BLOCK,
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
+    REGISTER,
     SENSORS,
     SETTINGS,
     SHOWN_SIZE,
@@ -72,18 +73,18 @@ def _observe(call, flight, world, model, settings, work, stages):
 @kernel
 def _write_rows(call, address, index, work, chosen):
     """Copy observations from the workspace to the rows of an array, where `chosen`."""
-    size, first = call[Call.SIZE], index * WIDTH
+    size, first = call[Call.SIZE], index * WIDTH + call[Call.LANE]
     pitch = 4 * size
     address = address + first * pitch
-    if all_of(chosen) and first + WIDTH <= call[Call.COUNT] and size >= WIDTH:
-        for k in range(0, size - WIDTH, WIDTH):
+    if all_of(chosen) and first + REGISTER <= call[Call.COUNT] and size >= REGISTER:
+        for k in range(0, size - REGISTER, REGISTER):
             store_tile(address + 4 * k, pitch, work.observation, k)
-        k = size - WIDTH
+        k = size - REGISTER
         store_tile(address + 4 * k, pitch, work.observation, k)
     else:
         work.begins = select(chosen, 1.0, 0.0)
         plain = _plain_work_at(call[Call.WORK])
-        for lane in range(min(WIDTH, call[Call.COUNT] - first)):
+        for lane in range(min(REGISTER, call[Call.COUNT] - first)):
             if plain.begins[lane] > 0.0:
                 row = _singles_at(address + lane * pitch, size)
                 for k in range(size):
@@ -98,7 +99,7 @@ def _load_actions(call, flight, index):
     for i in range(4):
         flight.last_action[i] = flight.action[i]
     for i in range(4):
-        for lane in range(WIDTH):
+        for lane in range(REGISTER):
             block.action[i, lane] = rows[4 * lane + i]
 
 
@@ -126,7 +127,7 @@ def _write_results(call, flight, work, index):
         store_lanes(here + (_FIRST_TERM + k) * pitch, work.reward_term[k])
     block = _plain_flight_at(block_address(call, index))
     status = _floats_at(here + Result.FILTER_STATUS * pitch, WIDTH)
-    for lane in range(WIDTH):
+    for lane in range(REGISTER):
         status[lane] = block.filter_status[lane]
 
 
@@ -259,9 +260,10 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
             _bytes_at(call[Call.RESETS], call[Call.COUNT]),
             _plain_work_at(call[Call.WORK]),
         )
-        for lane in range(WIDTH):
-            known = index * WIDTH + lane < call[Call.COUNT]
-            plain.begins[lane] = resets[index * WIDTH + lane] if known else 1.0
+        first = index * WIDTH + call[Call.LANE]
+        for lane in range(REGISTER):
+            known = first + lane < call[Call.COUNT]
+            plain.begins[lane] = resets[first + lane] if known else 1.0
         begins = work.begins > 0.0
     else:
         if command == Command.FINISH:

@@ -224,8 +224,11 @@ SOURCES = (
 """Every function of a stage, the longest to compile first. A slot with several functions gets the
 first one that is needed."""
 
-STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
-"""The addresses of the stages, 0 where a slot is empty."""
+STAGE_TABLE = np.dtype(
+    [("address", "u8", (len(Stage),)), ("paths", "i8"), ("pieces", "i8")], align=True
+)
+"""Addresses of the stages, 0 where a slot is empty, of a task's trajectories, (path_count,) of
+PATH, and of their segments, of PIECE."""
 
 
 def _chosen(settings: Any) -> dict[Stage, Kernel]:

@@ -38,4 +38,5 @@ class Call(IntEnum):
     EXCHANGE = auto()  #: EXCHANGE_BLOCK of each block of flights, for a user's estimator
     SHOWN = auto()  #: (SHOWN_SIZE, blocks WIDTH) float64, written if the setting `shown` is on
     SHOWN_PITCH = auto()  #: bytes from one row of SHOWN to the next
+    LANE = auto()  #: index in a block of the first flight that this call flies, if it flies only one
 # fmt: on

@@ -35,8 +35,6 @@ SETTINGS_FIELDS = (
     Field("task", (), "-", "see TaskKind", "i8"),
     Field("harmonics", (), "-", "terms of the reference's series in use; FOLLOWED: it is a trajectory", "i8"),
     Field("path_count", (), "-", "trajectories that flights may follow", "i8"),
-    Field("paths", (), "bytes", "address of the trajectories, (path_count,) of PATH", "i8"),
-    Field("pieces", (), "bytes", "address of their segments, of PIECE", "i8"),
     Field("layout", (), "-", "layout of the observation, see Layout", "i8"),
     Field("include_std", (), "0 or 1", "1 if the observation holds standard deviations", "i8"),
     Field("privileged", (), "0 or 1", "1 if the observation ends with the truth", "i8"),

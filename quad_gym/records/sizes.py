@@ -3,6 +3,8 @@
 from typing import NamedTuple
 
 from quad_gym.records.enums import AID_FREEDOMS, BLOCK_FREEDOMS, Aid, Block, FaultKind, Sensor
+from quad_gym.records.width import REGISTER as REGISTER
+from quad_gym.records.width import WARP as WARP
 from quad_gym.records.width import WIDTH as WIDTH
 
 # fmt: off

@@ -1,8 +1,9 @@
-"""Number of flights in a block: as many as the float64 in a vector register of this machine."""
+"""Number of flights in a block, and of those that a kernel computes at once."""
 
 import os
 
 WIDTHS = (1, 2, 4, 8)  #: supported numbers of lanes; 1 is for filters on other processors
+WARP = 32  #: number of flights in a block on a GPU, whose threads fly one each
 _NEEDED = {
     8: {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"},
     4: {"avx2"},
@@ -14,7 +15,7 @@ def lanes_of_machine() -> int:
     """Return QUAD_GYM_LANES, or 8 lanes with AVX-512, 4 with AVX2, else 2."""
     wanted = os.environ.get("QUAD_GYM_LANES")
     if wanted:
-        if wanted not in map(str, WIDTHS):
+        if wanted not in map(str, (*WIDTHS, WARP)):
             raise ValueError(f"QUAD_GYM_LANES must be 2, 4 or 8, got {wanted!r}")
         return int(wanted)
     features = _features()
@@ -48,4 +49,8 @@ def _features() -> set[str]:
 
 
 WIDTH = lanes_of_machine()
-"""Number of flights in a block. No result depends on it, not even in the last bit."""
+"""Number of flights in a block: as many as the float64 in a vector register of this machine, or
+WARP. No result depends on it, not even in the last bit."""
+
+REGISTER = 1 if WIDTH == WARP else WIDTH
+"""Number of flights that a kernel computes at once."""

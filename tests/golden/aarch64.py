@@ -36,7 +36,7 @@ class Memory:
         from quad_gym.records import Call
 
         self.batch, self._arrays, size = batch, [], 0
-        words, self._settings = np.zeros(len(Call), np.int64), batch._settings.copy()
+        words = np.zeros(len(Call), np.int64)
 
         def put(array: Any) -> int:
             nonlocal size
@@ -45,9 +45,7 @@ class Memory:
             return PLACE + size - -(-max(array.nbytes, 1) // LINE) * LINE
 
         for word, value in batch.memory_of_call().items():
-            if word == Call.SETTINGS:
-                words[word] = put(self._settings)
-            elif isinstance(value, int):
+            if isinstance(value, int):
                 words[word] = value
             else:  # of a list, one for each thread, the first
                 words[word] = put(value[0] if isinstance(value, list) else value)
@@ -55,17 +53,16 @@ class Memory:
             words[Call.SHOWN], words[Call.SHOWN_PITCH] = put(batch._shown), batch._shown.strides[0]
         words[Call.BLOCKS] = put(batch._blocks) - batch._room.skipped
         words[Call.PITCH] = batch._room.dtype.itemsize
-        for name, array in zip(("paths", "pieces"), batch._paths, strict=True):
-            self._settings[name] = put(array)
+        table = np.zeros(1, STAGE_TABLE)
+        table["paths"], table["pieces"] = map(put, batch._paths)
         self.compared = size
-        words[Call.STAGES] = self.table = put(np.zeros(1, STAGE_TABLE))
+        words[Call.STAGES] = self.table = put(table)
         board = board_of(len(batch._blocks), 1, batch._group)
         self.board, self.board_size, self.call = put(board), board.size, put(words)
         self.size = size
 
     def content(self) -> np.ndarray:
         """Return the current bytes."""
-        self._settings["max_steps"] = self.batch._settings["max_steps"]
         content = np.zeros(self.size, np.uint8)
         for place, array in self._arrays:
             content[place : place + array.nbytes] = np.frombuffer(array.tobytes(), np.uint8)

@@ -40,10 +40,8 @@ ELSEWHERE = {
 def packed(**keywords):
     """Return all parameter data of a batch that kernels read."""
     batch = FlightBatch(1, **{"sensors": SENSORS, "task": TASK, "world": WORLD} | keywords)
-    settings = batch._settings.copy()
-    settings["paths"] = settings["pieces"] = 0  # addresses
     paths = [array.tobytes() for array in batch._paths]
-    return [batch._model.tobytes(), batch._world.tobytes(), settings.tobytes(), *paths]
+    return [batch._model.tobytes(), batch._world.tobytes(), batch._settings.tobytes(), *paths]
 
 
 def changed(value):

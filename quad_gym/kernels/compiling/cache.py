@@ -25,7 +25,7 @@ from numba.core.serialize import dumps
 
 from quad_gym.kernels.digest import digest_of_function
 from quad_gym.kernels.library import say
-from quad_gym.records import WIDTH
+from quad_gym.records import REGISTER, WIDTH
 
 _FORM = 5
 """Version of the files' contents and of the compilation; after a change, no older file is found."""
@@ -77,7 +77,7 @@ def _compiler(context: Any) -> str:
     """The compiler, its options, and the processor that it compiles for."""
     options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
     versions = f"{numba.__version__} {llvmlite.__version__}"
-    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {WIDTH} {options}"
+    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {WIDTH} {REGISTER} {options}"
 
 
 def _needed(module: Any) -> tuple[str, ...]:

@@ -93,16 +93,22 @@ def object_of(name: str, processor: Processor) -> bytes:
     Raises:
         RuntimeError: If the code calls a function.
     """
-    file, ir_file = _file(name, processor), _file(name)
+    file = _file(name, processor)
     made = _read(file)
     if made is None:
-        linked = _read(ir_file)
-        if linked is None:
-            linked = _linked(name).encode()
-            _write(ir_file, linked)
-        made = emitted(linked.decode(), processor)
+        made = emitted(linked(name), processor)
         _write(file, made)
     return made
+
+
+def linked(name: str) -> str:
+    """Return the IR of an entry with all kernels that it reaches, cached by its sources."""
+    file = _file(name)
+    found = _read(file)
+    if found is None:
+        found = _linked(name).encode()
+        _write(file, found)
+    return found.decode()
 
 
 def _file(name: str, processor: Processor | None = None) -> Path | None:
@@ -166,14 +172,28 @@ def emitted(text: str, processor: Processor) -> bytes:
     Raises:
         RuntimeError: If the code calls a function.
     """
+    return bytes(machine_of(processor).emit_object(optimized(text, processor)))
+
+
+def machine_of(processor: Processor) -> Any:
+    """Return LLVM's code generator for a processor."""
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    machine = llvm.Target.from_triple(processor.triple).create_target_machine(
+    return llvm.Target.from_triple(processor.triple).create_target_machine(
         cpu=processor.cpu,
         opt=processor.level,
         reloc=processor.reloc,
         codemodel="small",
     )
+
+
+def optimized(text: str, processor: Processor) -> Any:
+    """Return the module of IR, optimized for a processor.
+
+    Raises:
+        RuntimeError: If the code calls a function that is not ours.
+    """
+    machine = machine_of(processor)
     text = _with_pauses(text, processor.triple.partition("-")[0])
     if processor.tune:
         text = re.sub(r"(?m)^attributes #\d+ = \{", rf'\g<0> "tune-cpu"="{processor.tune}"', text)
@@ -186,11 +206,11 @@ def emitted(text: str, processor: Processor) -> bytes:
     missing = [
         function.name
         for function in module.functions
-        if function.is_declaration and not function.name.startswith("llvm.")
+        if function.is_declaration and not function.name.startswith(("llvm.", "qg_"))
     ]
     if missing:
         raise RuntimeError(f"kernels must not call {', '.join(missing)}")
-    return bytes(machine.emit_object(module))
+    return module
 
 
 def _with_pauses(text: str, family: str) -> str:

@@ -18,9 +18,9 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
 
-from quad_gym.records import WIDTH
+from quad_gym.records import REGISTER
 
-_LANES_BYTES = 8 * WIDTH
+_LANES_BYTES = 8 * REGISTER
 
 
 class _AlignedLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]

@@ -5,13 +5,14 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling.decorators import entry, kernel
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.stages import STAGE_TABLE
-from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK
+from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WARP, WIDTH, WORK_BLOCK
 
 _DTYPES = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)
 _ARGUMENTS = (*map(from_dtype, _DTYPES), types.int64)
@@ -58,9 +59,36 @@ def _call(typing_context, address, flight, world, model, settings, work, stages,
     return types.none(address, flight, world, model, settings, work, stages, flag), lower
 
 
+SLOT = "qg_call_slot"
+"""Function that calls the stage of a slot by its name, as a GPU must: `compiling/device.py` writes
+it for a configuration."""
+
+
+@intrinsic
+def _call_slot(typing_context, stage, flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        byte, word = ir.IntType(8).as_pointer(), ir.IntType(64)
+        kind = ir.FunctionType(ir.VoidType(), [word, *[byte] * 6, word])
+        function = cgutils.get_or_insert_function(builder.module, kind, SLOT)
+        numbers = [context.cast(builder, args[k], sig.args[k], types.int64) for k in (0, 7)]
+        pointers = [builder.bitcast(value, byte) for value in args[1:7]]
+        builder.call(function, [numbers[0], *pointers, numbers[1]])
+        return context.get_dummy_value()
+
+    return types.none(stage, flight, world, model, settings, work, stages, flag), lower
+
+
 @kernel
-def call_stage(stages, stage, flight, world, model, settings, work, flag):
-    """Call a stage unless its slot is empty; the records are those that it is compiled for."""
+def _call_by_name(stages, stage, flight, world, model, settings, work, flag):
+    _call_slot(stage, flight, world, model, settings, work, stages, flag)
+
+
+@kernel
+def _call_by_address(stages, stage, flight, world, model, settings, work, flag):
     address = stages.address[stage]
     if address != 0:
         _call(address, flight, world, model, settings, work, stages, flag)
+
+
+call_stage = _call_by_name if WIDTH == WARP else _call_by_address
+"""Call a stage unless its slot is empty; the records are those that it is compiled for."""

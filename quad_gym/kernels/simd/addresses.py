@@ -15,7 +15,7 @@ from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.simd.blocks import LaneRecord
 from quad_gym.kernels.simd.lanes import lanes, words
-from quad_gym.records import WIDTH
+from quad_gym.records import REGISTER
 
 _BYTES = ir.IntType(8).as_pointer()
 _INDEX = ir.IntType(32)
@@ -95,7 +95,7 @@ def gather_lanes(typing_context, addresses, offset):  # type: ignore[no-untyped-
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         value = ir.Constant(lanes.llvm_type, ir.Undefined)
-        for lane in range(WIDTH):
+        for lane in range(REGISTER):
             number = builder.load(_lane_pointer(builder, *args, lane), align=8)
             value = builder.insert_element(value, number, _INDEX(lane))
         return value
@@ -110,7 +110,7 @@ def scatter_lanes(typing_context, addresses, offset, value):  # type: ignore[no-
         return None
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        for lane in range(WIDTH):
+        for lane in range(REGISTER):
             number = builder.extract_element(args[2], _INDEX(lane))
             builder.store(number, _lane_pointer(builder, *args[:2], lane), align=8)
         return context.get_dummy_value()
@@ -135,7 +135,7 @@ def prefetch(typing_context, address):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def store_tile(typing_context, address, pitch, source, first):  # type: ignore[no-untyped-def]
-    """Write WIDTH elements of an array of lanes, from `first` on, as float32, one row per lane.
+    """Write REGISTER elements of an array of lanes, from `first` on, as float32, one row per lane.
 
     The first lane's row is at `address`; each next one is `pitch` bytes further.
     """
@@ -144,11 +144,11 @@ def store_tile(typing_context, address, pitch, source, first):  # type: ignore[n
         begin, pitch, _, first = args
         array = context.make_array(sig.args[2])(context, builder, args[2])
         rows = []
-        for k in range(WIDTH):
+        for k in range(REGISTER):
             place = builder.add(first, context.get_constant(types.intp, k))
             pointer = cgutils.get_item_pointer(context, builder, sig.args[2], array, [place])
             wide = builder.load(pointer, align=8)
-            rows.append(builder.fptrunc(wide, ir.VectorType(_SINGLE, WIDTH)))
+            rows.append(builder.fptrunc(wide, ir.VectorType(_SINGLE, REGISTER)))
         for lane, row in enumerate(_transposed(builder, rows)):
             offset = builder.mul(pitch, context.get_constant(types.int64, lane))
             pointer = builder.inttoptr(builder.add(begin, offset), row.type.as_pointer())
@@ -161,12 +161,12 @@ def store_tile(typing_context, address, pitch, source, first):  # type: ignore[n
 def _transposed(builder: ir.IRBuilder, rows: list[Any]) -> list[Any]:
     """Transpose a square matrix of vectors by swapping off-diagonal blocks of doubling size."""
     size = 1
-    while size < WIDTH:
+    while size < REGISTER:
         # indices of the sources of rows i and i + size in the concatenation of both rows
-        upper = [k if k & size == 0 else WIDTH + k - size for k in range(WIDTH)]
-        lower = [k + size if k & size == 0 else WIDTH + k for k in range(WIDTH)]
-        masks = [ir.Constant(ir.VectorType(_INDEX, WIDTH), chosen) for chosen in (upper, lower)]
-        for i in range(WIDTH):
+        upper = [k if k & size == 0 else REGISTER + k - size for k in range(REGISTER)]
+        lower = [k + size if k & size == 0 else REGISTER + k for k in range(REGISTER)]
+        masks = [ir.Constant(ir.VectorType(_INDEX, REGISTER), chosen) for chosen in (upper, lower)]
+        for i in range(REGISTER):
             if i & size == 0:
                 pair = rows[i], rows[i + size]
                 rows[i], rows[i + size] = (builder.shuffle_vector(*pair, m) for m in masks)

@@ -11,7 +11,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from quad_gym.kernels.simd.lanes import call_llvm, lanes, splat, words
-from quad_gym.records import WIDTH
+from quad_gym.records import REGISTER
 
 _FLOAT = ir.DoubleType()
 _INT = ir.IntType(64)
@@ -19,7 +19,7 @@ _INT = ir.IntType(64)
 
 def _like(value: ir.Value, scalar: ir.Type) -> ir.Type:
     """Return `scalar`, or a vector of it if `value` is a vector."""
-    return ir.VectorType(scalar, WIDTH) if isinstance(value.type, ir.VectorType) else scalar
+    return ir.VectorType(scalar, REGISTER) if isinstance(value.type, ir.VectorType) else scalar
 
 
 def _constant(builder: ir.IRBuilder, like: ir.Value, number: Any, scalar: ir.Type = _INT) -> Any:

@@ -27,7 +27,18 @@ from numba.extending import (
 from numba.np.arrayobj import make_array, populate_array
 
 from quad_gym.kernels.simd.lanes import ASKED_FIRST, lanes, vector_of, words
-from quad_gym.records import WIDTH
+from quad_gym.records import REGISTER, WIDTH
+
+_PITCH = 8 * WIDTH  #: bytes from a number of a flight to its next one
+
+
+def _array_of_lanes(element: Any, axes: int) -> Any:
+    """Type of an array of lanes in a block: if they are not the whole block, with gaps.
+
+    Copies of whole blocks may be unaligned, and unaligned loads are as fast.
+    """
+    whole = REGISTER == WIDTH
+    return types.Array(element, axes, "C" if whole else "A", aligned=not whole)
 
 
 class LaneRecord(types.Type):
@@ -47,8 +58,7 @@ class LaneRecord(types.Type):
         element = words if nested.dtype == types.uint64 else lanes
         if nested.ndim == 1:
             return element
-        # aligned=False: copies of a block may be unaligned, and unaligned loads are as fast
-        return types.Array(element, nested.ndim - 1, "C", aligned=False)
+        return _array_of_lanes(element, nested.ndim - 1)
 
 
 @register_model(LaneRecord)
@@ -100,7 +110,7 @@ def _get_field(context, builder, block, pointer, name):  # type: ignore[no-untyp
 def _array_of(context: Any, builder: ir.IRBuilder, kind: Any, data: Any, shape: Any) -> Any:
     """Return an array of lanes in memory."""
     strides: list[int] = []
-    size = WIDTH * 8
+    size = _PITCH
     for length in reversed(shape):
         strides.insert(0, size)
         size *= length
@@ -110,7 +120,7 @@ def _array_of(context: Any, builder: ir.IRBuilder, kind: Any, data: Any, shape: 
         data=data,
         shape=cgutils.pack_array(builder, [context.get_constant(types.intp, n) for n in shape]),
         strides=cgutils.pack_array(builder, [context.get_constant(types.intp, s) for s in strides]),
-        itemsize=context.get_constant(types.intp, WIDTH * 8),
+        itemsize=context.get_constant(types.intp, REGISTER * 8),
         meminfo=None,
         parent=None,
     )
@@ -122,7 +132,7 @@ def numbers_of(typing_context, block):  # type: ignore[no-untyped-def]
     """Return all numbers of a block as one array of lanes, in the order of its fields."""
     if not isinstance(block, LaneRecord):
         return None
-    kind = types.Array(lanes, 1, "C", aligned=False)
+    kind = _array_of_lanes(lanes, 1)
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         data = builder.bitcast(args[0], kind.dtype.llvm_type.as_pointer())
@@ -170,7 +180,7 @@ def reset(typing_context, block, chosen, value, names):  # type: ignore[no-untyp
             element = kind.dtype if isinstance(kind, types.Array) else kind
             number = vector_of(context, builder, args[2], types.unliteral(value), element)
             first = _field_pointer(builder, block, args[0], name, element)
-            for k in range(block.record.typeof(name).nitems // WIDTH):
+            for k in range(0, block.record.typeof(name).nitems // REGISTER, WIDTH // REGISTER):
                 pointer = builder.gep(first, [ir.Constant(ir.IntType(32), k)])
                 before = builder.load(pointer, align=8)
                 builder.store(builder.select(args[1], number, before), pointer, align=8)

@@ -1,14 +1,14 @@
 r"""Number type of the kernels: one float64 for each of several flights.
 
 A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats, it
-serves the classes for one vehicle and the tests; compiled for `Lanes`, it computes WIDTH flights on
-the SIMD unit. This file defines three value types for Numba, and the operations on them:
+serves the classes for one vehicle and the tests; compiled for `Lanes`, it computes REGISTER flights
+on the SIMD unit. This file defines three value types for Numba, and the operations on them:
 
-| type      | WIDTH of | plain counterpart | operations                                           |
-|-----------|----------|-------------------|------------------------------------------------------|
-| `Lanes`   | float64  | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt`          |
-| `Mask`    | bool     | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`            |
-| `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, operations of `bits.py`           |
+| type      | REGISTER of | plain counterpart | operations                                  |
+|-----------|-------------|-------------------|---------------------------------------------|
+| `Lanes`   | float64     | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt` |
+| `Mask`    | bool        | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`   |
+| `Words`   | uint64      | `uint64`          | `+ ^ & \\|`, `==`, operations of `bits.py`  |
 
 There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. Lanes do not
 affect each other, so a flight does not depend on the other flights in its block, even if they are
@@ -16,7 +16,7 @@ NaN.
 
 Results are defined by the source alone. A product that is added or subtracted in the same
 expression is always fused into a multiply-add, and no other operation is: no fast-math flag lets
-LLVM decide. Results depend neither on WIDTH nor on inlining, nor on the processor: if it has no
+LLVM decide. Results depend neither on REGISTER nor on inlining, nor on the processor: if it has no
 fused multiply-add, LLVM calls the C library's, which is slow but bitwise identical.
 """
 
@@ -35,11 +35,11 @@ from numba.core.typeconv.rules import default_type_manager
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, overload, register_model
 
-from quad_gym.records import WIDTH
+from quad_gym.records import REGISTER
 
-_FLOATS = ir.VectorType(ir.DoubleType(), WIDTH)
-_WORDS = ir.VectorType(ir.IntType(64), WIDTH)
-_BITS = ir.VectorType(ir.IntType(1), WIDTH)
+_FLOATS = ir.VectorType(ir.DoubleType(), REGISTER)
+_WORDS = ir.VectorType(ir.IntType(64), REGISTER)
+_BITS = ir.VectorType(ir.IntType(1), REGISTER)
 
 
 class _VectorType(types.Type):
@@ -87,11 +87,11 @@ class _VectorModel(models.PrimitiveModel):
 
 def splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
     """Return the LLVM vector with `scalar` in every lane."""
-    vector = ir.VectorType(scalar.type, WIDTH)
+    vector = ir.VectorType(scalar.type, REGISTER)
     first = builder.insert_element(
         ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0)
     )
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), REGISTER), [0] * REGISTER)
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
 
 
@@ -253,7 +253,7 @@ def call_llvm(builder: ir.IRBuilder, name: str, value: ir.Value, *others: ir.Val
     """Call the LLVM intrinsic `name` (such as `llvm.sqrt`) for the type of its first argument."""
     kind = value.type
     scalar = "f64" if "double" in str(kind) else "i64"
-    suffix = f"v{WIDTH}{scalar}" if isinstance(kind, ir.VectorType) else scalar
+    suffix = f"v{REGISTER}{scalar}" if isinstance(kind, ir.VectorType) else scalar
     arguments = (value, *others)
     function = cgutils.get_or_insert_function(
         builder.module, ir.FunctionType(kind, [a.type for a in arguments]), f"{name}.{suffix}"
@@ -326,7 +326,7 @@ def logical_not(typing_context, asked):  # type: ignore[no-untyped-def]
 @intrinsic
 def _bits_of_mask(typing_context, asked):  # type: ignore[no-untyped-def]
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.zext(builder.bitcast(args[0], ir.IntType(WIDTH)), ir.IntType(64))
+        return builder.zext(builder.bitcast(args[0], ir.IntType(REGISTER)), ir.IntType(64))
 
     return types.uint64(asked), lower
 
@@ -353,7 +353,7 @@ def _any_of(asked):  # type: ignore[no-untyped-def]
 @overload(all_of)
 def _all_of(asked):  # type: ignore[no-untyped-def]
     if asked == mask:
-        return lambda asked: _bits_of_mask(asked) == (1 << WIDTH) - 1
+        return lambda asked: _bits_of_mask(asked) == (1 << REGISTER) - 1
     if isinstance(asked, types.Boolean):
         return lambda asked: asked
     return None

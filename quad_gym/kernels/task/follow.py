@@ -22,8 +22,8 @@ from quad_gym.records import (
     HEADING_VELOCITY,
     PATH,
     PIECE,
+    REGISTER,
     TERMS,
-    WIDTH,
     Control,
 )
 
@@ -50,12 +50,12 @@ def draw_path(flight, settings, stream, mask):
 
 
 @kernel
-def _piece_of(settings, path, time):
+def _piece_of(table, path, time):
     """Return the last segment that begins at or before a time; else the first one."""
     low, high = path.first, path.first + path.pieces - 1
     while low < high:
         middle = (low + high + 1) // 2
-        if _piece_at(settings.pieces + middle * _PIECE_SIZE).begin <= time:
+        if _piece_at(table.pieces + middle * _PIECE_SIZE).begin <= time:
             low = middle
         else:
             high = middle - 1
@@ -63,10 +63,10 @@ def _piece_of(settings, path, time):
 
 
 @kernel
-def _look_up(flight, work, settings):
+def _look_up(flight, work, table):
     """Copy the segment of each lane's trajectory at `path_time` to the workspace."""
-    for lane in range(WIDTH):
-        path = _path_at(settings.paths + int(flight.path[lane]) * _PATH_SIZE)
+    for lane in range(REGISTER):
+        path = _path_at(table.paths + int(flight.path[lane]) * _PATH_SIZE)
         time, span = work.path_time[lane], path.duration
         before, beyond = 0.0, 0.0
         if path.closed > 0:
@@ -77,7 +77,7 @@ def _look_up(flight, work, settings):
             beyond = 1.0 if time >= span else 0.0
         work.path_still[lane] = 1.0 if path.closed == 0 and (time < 0.0 or time > span) else 0.0
         time = min(max(time, 0.0), span)
-        piece = _piece_at(settings.pieces + _piece_of(settings, path, time) * _PIECE_SIZE)
+        piece = _piece_at(table.pieces + _piece_of(table, path, time) * _PIECE_SIZE)
         work.path_time[lane] = time - piece.begin
         for k in range(TERMS):
             for i in range(4):
@@ -135,11 +135,11 @@ def follow_stage(flight, world, model, settings, work, stages, flag):
     time = flying.tick * lanes_of(model).dt
     for i in range(2):
         room.path_time = time + settings.preview[i]
-        _look_up(flight, work, settings)
+        _look_up(flight, work, stages)
         (x, _, _), (y, _, _), (z, _, _) = _value(room, 0), _value(room, 1), _value(room, 2)
         store(flying.path_ahead[i], _turned(flying, x, y, z))
     room.path_time = time
-    _look_up(flight, work, settings)
+    _look_up(flight, work, stages)
     (x, vx, ax), (y, vy, ay), (z, vz, az) = _value(room, 0), _value(room, 1), _value(room, 2)
     still, none = room.path_still > 0.0, (0.0 * x, 0.0 * x, 0.0 * x)
     v = select(still, none, (vx, vy, vz))
