@@ -30,6 +30,7 @@ from quad_gym.records import (
     MAX_STATES,
     MEASUREMENT,
     NOISE_FIELDS,
+    OPERATION,
     PARAMS_BLOCK,
     PARTS,
     POSITION_BLOCK,
@@ -39,12 +40,21 @@ from quad_gym.records import (
     VELOCITY_BLOCK,
     WORK_BLOCK,
     Aid,
+    Operation,
     offset_of,
     room_of,
 )
+from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW, Kept
 
-_ENTRIES = tuple(f"quad_gym.kernels.exported:{n}" for n in ("predict", "update", "start", "keep"))
+_ENTRIES = tuple(
+    f"quad_gym.kernels.exported:{name}" for name in ("take", "predict", "update", "start", "keep")
+)
 _LEVEL = "quad_gym.kernels.exported:start_level"
+_RECORDS = {
+    **{"sample": SAMPLE, "measurement": MEASUREMENT, "start": START, "operation": OPERATION},
+    **{"input": INPUT, "event": EVENT, "pending": PENDING, "window": WINDOW},
+}
+"""Records in the memory of an exported filter, by their names there."""
 _AID_NOTES = {
     Aid.BAROMETER: "height in I from static pressure [m]",
     Aid.MAGNETOMETER: "magnetic field in B [T]",
@@ -166,8 +176,7 @@ class Sources:
             fields[name.upper()] = name
         values |= {f"OF_{key}": offset_of(FLIGHT_BLOCK, name) for key, name in fields.items()}
         values["STRUCTS"] = "\n".join(
-            _struct(f"qg_{name}_record", kind)
-            for name, kind in (("sample", SAMPLE), ("measurement", MEASUREMENT), ("start", START))
+            _struct(f"qg_{name}_record", kind) for name, kind in _RECORDS.items()
         )
         values["STAGE_DECLARATIONS"] = "\n".join(
             f"QGI_STAGE({core_symbol(name)});" for name in self.stages.values()
@@ -176,6 +185,8 @@ class Sources:
             f"    f->table[{int(s)}] = (uint64_t)(uintptr_t){core_symbol(name)};"
             for s, name in self.stages.items()
         )
+        values |= {f"A_{kind.name}": int(kind) for kind in Kept}
+        values |= {operation.name: int(operation) for operation in Operation}
         noise = [f"    r.{name} = NAN;" for name in NOISE_FIELDS[1:]]
         noise += [f"    r.position_sigma_I[{i}] = NAN;" for i in range(3)]
         noise += [f"    r.aid_sigma[{int(aid)}] = NAN;" for aid in Aid]
@@ -193,10 +204,11 @@ class Sources:
         words = sum(
             (
                 self.room.dtype.itemsize + PARAMS_BLOCK.itemsize + WORK_BLOCK.itemsize,
-                STEP_BLOCK.itemsize + 8 * len(Stage) + START.itemsize + 64,
-                events * (24 + SAMPLE.itemsize) + 16 * (MEASUREMENT.itemsize + 16),
-                measurements * (MEASUREMENT.itemsize + 1),
-                copies * (1 + 8 * sum(length for _, length in self.copied)),
+                STEP_BLOCK.itemsize + 8 * len(Stage) + START.itemsize + WINDOW.itemsize + 24,
+                (events + copies + 72) * OPERATION.itemsize + 16 * PENDING.itemsize,
+                events * EVENT.itemsize + (events + 36) * SAMPLE.itemsize,
+                (measurements + 16) * MEASUREMENT.itemsize,
+                copies * 8 * sum(length for _, length in self.copied),
             )
         )
         rest = state_at_rest(suite, (0.0, 0.0, 0.0), 0.0, 0.0)["covariance"]
@@ -221,8 +233,9 @@ class Sources:
 
     def _sensor_values(self) -> dict[str, Any]:
         suite, gnss = self.suite, self.suite.gnss
-        parts = ("AID_MACROS", "AID_FIELDS", "AID_TAKE", "AID_API", "AID_SOURCE", "AID_ROWS")
-        texts = dict.fromkeys(parts, "")
+        texts = dict.fromkeys(
+            ("AID_MACROS", "AID_FIELDS", "AID_TAKE", "AID_API", "AID_SOURCE", "AID_ROWS"), ""
+        )
         for aid in suite.aids:
             name, count, note = aid.name.lower(), AID_FREEDOMS[aid], _AID_NOTES[aid]
             value = f"double {name}" if count == 1 else f"const double {name}[{count}]"
@@ -240,13 +253,27 @@ class Sources:
             )
             texts["AID_TAKE"] += filled("aid_take.c", given)
             texts["AID_SOURCE"] += filled("aid_update.c", given)
-        values: dict[str, Any] = {
-            **texts,
+        has = {
             "CAMERA": suite.camera is not None,
-            "FEATURES": 0 if suite.camera is None else len(suite.camera.features_I),
             "GNSS": gnss is not None,
             "BASELINE": gnss is not None and gnss.has_baseline,
             "VELOCITY": gnss is not None and gnss.velocity_sigma is not None,
+        }
+        names = {aid.name.lower(): [aid.name.lower()] for aid in suite.aids}
+        if has["CAMERA"]:
+            names["camera"] = ["pixels"]
+        parts = {"gnss_position": "GNSS", "gnss_baseline": "BASELINE", "gnss_velocity": "VELOCITY"}
+        names["gnss"] = [name for name, part in parts.items() if has[part]]
+        ranks = (
+            f"{' || '.join(f'm->{name}' for name in names[stream])} ? {rank} : "
+            for rank, stream in enumerate(sorted(names), 1)
+            if names[stream]
+        )
+        values: dict[str, Any] = {
+            **texts,
+            **has,
+            "RANK": f"{''.join(ranks)}{len(names) + 1}",
+            "FEATURES": 0 if suite.camera is None else len(suite.camera.features_I),
             "BAROMETER": Aid.BAROMETER in suite.aids,
             "MAGNETOMETER": Aid.MAGNETOMETER in suite.aids,
             **{"FEATURE_BLOCKS": FEATURE_BLOCKS, "POSITION_BLOCK": POSITION_BLOCK},

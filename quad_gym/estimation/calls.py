@@ -17,6 +17,7 @@ Samples are rotated to B, and time stamps corrected by the suite's delays. Posit
 velocities are in G, positions relative to the reference antenna; their sigmas are in I.
 """
 
+import bisect
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -24,9 +25,10 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.samples import Measurement, Sample
+from quad_gym.estimation.samples import Measurement
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
+from quad_gym.records.inputs import SAME_TIME, Outcome
 
 _STARTS = (
     *("gnss_position_G", "gnss_sigma", "gnss_baseline_G", "gnss_velocity_G", "velocity_sigma"),
@@ -40,6 +42,7 @@ class FilterCalls:
 
     def __init__(self, suite: SensorSuite) -> None:
         self._suite, self.rows = suite, list[str]()
+        self._waiting: list[tuple[float, str, int, Measurement]] = []  # ahead of the filter
         if suite.gnss is not None:
             self._add("origin", *suite.gnss.reference_antenna_G)
 
@@ -75,11 +78,27 @@ class FilterCalls:
         if barometer_from_start and self._suite.barometer is not None:
             self._add("level")
 
-    def predict(self, sample: Sample) -> None:
-        """Add a prediction."""
-        self._add("imu", *sample.gyro, *sample.accel, sample.dt)
+    def take(self, given: Any, name: str, place: int, measurement: Measurement | None) -> None:
+        """Add the calls for an INPUT that a filter has taken: a sample, or a row of a stream."""
+        now, time = float(given["now"]), float(given["time"])
+        if measurement is not None:
+            if given["outcome"] == Outcome.OK:
+                bisect.insort(self._waiting, (time, name, place, measurement))
+                self._update_until(now)
+            return
+        if given["keeps"]:
+            self.keep()
+        if time - now > SAME_TIME and math.isfinite(given["gyro"][0]):
+            self._update_until(time)
+            self._add("imu", *given["gyro"], *given["accel"], time - now)
 
-    def update(self, name: str, time: float, given: Measurement) -> None:
+    def _update_until(self, time: float) -> None:
+        """Add the updates up to a time."""
+        while self._waiting and self._waiting[0][0] <= time + SAME_TIME:
+            stamp, name, _, measurement = self._waiting.pop(0)
+            self._update(name, stamp, measurement)
+
+    def _update(self, name: str, time: float, given: Measurement) -> None:
         """Add the measurement of a stream with its time stamp."""
         if name == "gnss":
             vectors = (

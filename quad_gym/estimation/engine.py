@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.samples import Measurement, Sample
+from quad_gym.estimation.samples import Measurement
 from quad_gym.estimation.tape import BLANK, ONE_PREDICTION, ONE_UPDATE, Tape, write_measurement
 from quad_gym.kernels import entries
 from quad_gym.kernels.linked import linked_table
@@ -169,10 +169,9 @@ class Engine:
             block = self.blocks[k : k + 1]
             entries.start_filter(block, self.params, self.settings, self._work, x_I)
 
-    def predict(self, sample: Sample) -> None:
-        """Propagate the estimate over the time of a sample."""
-        for name in SAMPLE.names or ():
-            self._sample[name] = getattr(sample, name)
+    def predict(self, sample: Any) -> None:
+        """Propagate the estimate over the time of a SAMPLE."""
+        self._sample[0] = sample
         self._run_one(ONE_PREDICTION)
 
     def update(self, measurement: Measurement) -> None:

@@ -12,12 +12,13 @@ from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.estimate import FilterEstimate
 from quad_gym.estimation.first_fix import FirstFix, filter_start
 from quad_gym.estimation.headings import RESOLVED, collapse, moments, update_and_weigh
-from quad_gym.estimation.history import SAME_TIME, InputHistory
-from quad_gym.estimation.samples import Measurement, Sample, checked_measurement
+from quad_gym.estimation.history import InputHistory
+from quad_gym.estimation.samples import Measurement, checked_measurement
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.shown import takes
-from quad_gym.records import FilterForm, FilterStatus
+from quad_gym.records import FilterForm, FilterStatus, Operation
+from quad_gym.records.inputs import SAME_TIME
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
@@ -39,10 +40,10 @@ class KalmanFilter(FilterEstimate):
         length = check.number("window", window, least=0.0, most=60.0)
         self.sensors = sensors
         self._engine = Engine(sensors, self._kind)
-        self._history = InputHistory(length, self._apply, self._copy, self._restore)
+        self._history = InputHistory(length, max(LONGEST_STEP, sensors.imu.dt))
+        self._measurements: dict[int, Measurement] = {}
+        self._copies: dict[int, Any] = {}
         self._log_weights, self._moments = None, None
-        self._gyro: NDArray[np.float64] | None = None
-        self._awaited: Measurement | None = None
         self._report, self._reported = None, Measurement()
         self._running = False
 
@@ -157,9 +158,9 @@ class KalmanFilter(FilterEstimate):
         step = tick
         if dt is not None:
             step = check.positive("dt", dt, least=1e-9, most=max(LONGEST_STEP, tick))
-        status, earlier = self.status, self._gyro
-        self._gyro = rates
-        self._history.add(Sample(rates, force, step, rates if earlier is None else earlier))
+        status, given = self.status, self._history.one
+        given["rank"], given["dt"], given["gyro"], given["accel"] = 0, step, rates, force
+        self._take_one(None)
         self.warn_of_news(status)
 
     def update(
@@ -174,7 +175,7 @@ class KalmanFilter(FilterEstimate):
     ) -> None:
         """Update the estimate with measurements of one instant; None: not measured.
 
-        Delayed measurements are processed at their time stamps, see `quad_gym.estimation.history`.
+        Delayed measurements are processed at their time stamps, see `quad_gym.kernels.window`.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
@@ -202,25 +203,22 @@ class KalmanFilter(FilterEstimate):
         measurement = checked_measurement(
             self.sensors, gnss_position_G, gnss_baseline_G, pixels, gnss_velocity_G, others
         )
-        status, now = self.status, self._history.time
+        now = self._history.time
         stamp = now if time is None else check.number("time", time)
         if stamp > now + SAME_TIME:
             raise ValueError(
                 f"time must not be later than the filter, which is at {now:.6f} s, got "
                 f"{stamp:.6f} s: predict up to it first"
             )
-        if stamp >= now - SAME_TIME:
-            self._history.add(measurement)
-            self._report, self._reported = None, measurement
-        elif stamp < self.oldest_time - SAME_TIME:
+        if stamp < self.oldest_time - SAME_TIME:
             raise ValueError(
                 f"time must be at least {self.oldest_time:.6f} s, as the filter keeps "
                 f"{self._history.window:g} s of data (window=) since its start, got "
                 f"{stamp:.6f} s"
             )
-        else:
-            self._awaited = measurement
-            self._history.insert(measurement, stamp)
+        status, given = self.status, self._history.one
+        given["rank"], given["time"] = 1, stamp
+        self._take_one(measurement)
         self.warn_of_news(status)
 
     @property
@@ -238,22 +236,58 @@ class KalmanFilter(FilterEstimate):
     def _begin(self, time: float, flights: int = 1) -> None:
         """Clear all memory, and make room for flights."""
         self._log_weights, self._moments = None, None
-        self._gyro, self._report, self._reported = None, None, Measurement()
+        self._report, self._reported = None, Measurement()
+        self._measurements, self._copies = {}, {}
         self._choose_form()
         if flights > 1 or len(self._engine.blocks) > 1:
             self._engine.allocate(flights)
         self._history.begin(time)
 
-    def _apply(self, given: Sample | Measurement) -> None:
-        """Process a sample or a measurement."""
+    def _take_one(self, measurement: Measurement | None) -> None:
+        """Process the one input of the history, a measurement or else a sample."""
+        history = self._history
+        for part in history.take(history.one):
+            if measurement is not None:
+                self._measurements[int(history.one["index"][0])] = measurement
+            operations = part.tolist()
+            for k, (code, index, target) in enumerate(operations):
+                given = self._measurements[index] if code == Operation.UPDATE else None
+                self._operate((code, index, target), history.samples, given, self._copies)
+                if given is not None and target >= 0:
+                    self._report, self._reported = None, given
+                    if k + 1 < len(operations):  # what follows overwrites its innovations
+                        self._report = self._innovations(given.blocks)
+
+    def _operate(
+        self,
+        operation: tuple[int, int, int],
+        samples: NDArray[Any],
+        measurement: Measurement | None,
+        copies: dict[int, Any],
+    ) -> None:
+        """Run an operation of a tape.
+
+        Args:
+            operation: OPERATION.
+            samples: (n,) SAMPLE.
+            measurement: What an update processes.
+            copies: Copies of the filter's memory by number.
+        """
+        code, index, number = operation
         self._moments = None
-        if isinstance(given, Sample):
-            self._engine.predict(given)
-            return
-        if not given.empty:
-            self._condition(given)
-        if given is self._awaited:
-            self._report = self._innovations(given.blocks)
+        match code:
+            case Operation.PREDICT:
+                self._engine.predict(samples[index])
+            case Operation.UPDATE:
+                assert measurement is not None
+                if not measurement.empty:
+                    self._condition(measurement)
+            case Operation.COPY:
+                copies[number] = self._engine.copy(), self._log_weights
+            case Operation.RESTORE:
+                words, self._log_weights = copies[number]
+                self._engine.restore(words)
+                self._choose_form()
 
     def _condition(self, measurement: Measurement) -> None:
         """Update the estimate, or the bank of filters until a single one is left."""
@@ -266,15 +300,6 @@ class KalmanFilter(FilterEstimate):
             collapse(self._engine, self._log_weights, mixed)
             self._log_weights = None
             self._choose_form()
-
-    def _copy(self) -> Any:
-        return self._engine.copy(), self._log_weights
-
-    def _restore(self, state: Any) -> None:
-        words, self._log_weights = state
-        self._moments = None
-        self._engine.restore(words)
-        self._choose_form()
 
     def _choose_form(self) -> None:
         """Use the gate only with a single flight: unlikely innovations weigh headings."""

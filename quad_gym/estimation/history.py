@@ -1,115 +1,93 @@
-"""Inputs of a filter within a window of time, for the processing of delayed measurements.
+"""The window of past inputs of a filter: Python's side of `quad_gym.kernels.window`."""
 
-A delayed measurement is inserted at its time stamp, and everything since then is filtered again:
-the result is bitwise the result with the same samples and measurements in the order of their
-stamps. An IMU sample whose interval contains the stamp is split there, with the same sample on both
-sides.
-
-Flights in an environment use another method, `kernels/filter/delayed.py`: they keep sums of the IMU
-samples, and retrodict estimate and covariance over them. That costs less, but requires stamps on
-ticks and sensors whose measurements arrive in order, and is exact to first order only.
-"""
-
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from quad_gym.estimation.samples import Measurement, Sample
+import numpy as np
+from numpy.typing import NDArray
 
-SAME_TIME = 1e-6  #: time stamps that differ by less are equal [s]; PX4 counts microseconds
+from quad_gym.kernels import entries
+from quad_gym.records import OPERATION, SAMPLE
+from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW
 
 _EVERY = 8  #: events between two copies of the state: a copy costs about as much as an event
-
-
-@dataclass(slots=True)
-class _Event:
-    given: Sample | Measurement
-    time: float  #: time after the event
-    start: float  #: time at which the event begins
-    before: Any = None  #: copy of the state before the event, or None
+_ROOM = {EVENT: 256, SAMPLE: 256, PENDING: 16, OPERATION: 2048}  #: records in memory at first
+_OPERATIONS = list(_ROOM).index(OPERATION)
 
 
 class InputHistory:
-    """The samples and measurements of a window of time, and states to filter them again from.
+    """The samples and measurements of a window of time, and the operations that process them.
 
     Args:
         window: Length of the window [s].
-        apply: Processes a sample or a measurement with the filter.
-        copy: Returns a copy of the filter's state.
-        restore: Restores such a copy.
+        longest: Longest duration of a sample [s].
+        numbered: True: samples, measurements and copies are numbered in the order of their arrival;
+            False: numbers of those that have left the window are used again.
     """
 
-    def __init__(
-        self,
-        window: float,
-        apply: Callable[[Sample | Measurement], None],
-        copy: Callable[[], Any],
-        restore: Callable[[Any], None],
-    ) -> None:
-        self.window = window
-        self._apply, self._copy, self._restore = apply, copy, restore
-        self._events: list[_Event] = []
-        self._since_copy = 0
-        self.time = 0.0
+    def __init__(self, window: float, longest: float, numbered: bool = False) -> None:
+        self.window, self._longest, self._numbered = window, longest, numbered
+        self._state, self.one = np.zeros(1, WINDOW), np.zeros(1, INPUT)
+        self._call: Callable[[], Any] | None = None
+        self._memory = [np.zeros(count, kind) for kind, count in _ROOM.items()]
+        self.begin(0.0)
 
     def begin(self, time: float) -> None:
         """Begin at a time [s], with no events."""
-        self.time, self._events = time, []
+        self._state[:] = np.zeros(1, WINDOW)
+        settings = {"length": self.window, "longest": self._longest, "ahead": math.inf}
+        for name, value in {**settings, "copy_every": _EVERY, "time": time}.items():
+            self._state[name] = value
+        self._limit_numbers()
+
+    @property
+    def time(self) -> float:
+        """Time up to which the inputs reach [s]."""
+        return float(self._state["time"][0])
 
     @property
     def oldest(self) -> float:
         """Earliest time stamp that can still be included [s]."""
-        reach = self.time - self.window
-        return max(reach, self._events[0].start) if self._events else self.time
+        if not self._state["events"][0]:
+            return self.time
+        return max(self.time - self.window, float(self._memory[0]["start"][0]))
 
-    def add(self, given: Sample | Measurement) -> None:
-        """Process the next input."""
-        time = self.time + (given.dt if isinstance(given, Sample) else 0.0)
-        event = _Event(given, time, self.time)
-        if self.window > 0.0:
-            self._since_copy += 1
-            if not self._events or self._since_copy >= _EVERY:
-                event.before, self._since_copy = self._copy(), 0
-            self._events.append(event)
-        self.time = time
-        self._apply(given)
-        self._forget()
+    @property
+    def samples(self) -> NDArray[Any]:
+        """Samples (n,) SAMPLE, by their numbers."""
+        return self._memory[1]
 
-    def insert(self, measurement: Measurement, time: float) -> None:
-        """Insert a measurement at an earlier time, and filter again all inputs after it."""
-        events = self._events
-        i = len(events) - 1  # the first event that ends later
-        while i and events[i - 1].time > time + SAME_TIME:
-            i -= 1
-        first = i
-        while events[first].before is None:
-            first -= 1
-        old = events[i]
-        assert isinstance(old.given, Sample)
-        elapsed = time - old.start
-        if elapsed > SAME_TIME:
-            one, two = old.given.split(elapsed)
-            first_part = _Event(one, time, old.start, old.before)
-            events[i : i + 1] = [
-                *(first_part, _Event(measurement, time, time)),
-                _Event(two, old.time, time),
-            ]
-        else:
-            events.insert(i, _Event(measurement, old.start, old.start, old.before))
-            old.before = None
-        self._restore(events[first].before)
-        for k in range(first, len(events)):
-            if k > first and events[k].before is not None:
-                events[k].before = self._copy()
-            self._apply(events[k].given)
+    def take(self, inputs: NDArray[Any]) -> Iterator[NDArray[Any]]:
+        """Yield the operations (n,) OPERATION that process inputs (n,) INPUT, part by part.
 
-    def _forget(self) -> None:
-        """Drop events before the last copy that is older than the window."""
-        reach, events = self.time - self.window, self._events
-        keep = 0
-        for k, event in enumerate(events):
-            if event.start > reach:
-                break
-            if event.before is not None:
-                keep = k
-        del events[:keep]
+        Operations are valid until the next part. After an input with an error it takes no more.
+        """
+        first = 0
+        while first < len(inputs):
+            if inputs is not self.one:
+                entries.take_inputs(self._state, *self._memory, inputs[first:])
+            else:
+                if self._call is None:
+                    self._call = entries.take_inputs.bound(self._state, *self._memory, inputs)
+                self._call()
+            _, _, _, operations = self._memory
+            yield operations[: self._state["operations"][0]]
+            taken, shortage = int(self._state["taken"][0]), int(self._state["shortage"][0])
+            first += taken
+            if shortage < 0 and first < len(inputs):
+                return
+            if shortage >= 0 and not (taken and shortage == _OPERATIONS):
+                old = self._memory[shortage]
+                self._memory[shortage] = np.concatenate([old, np.zeros_like(old)])
+                self._call = None
+                self._limit_numbers()
+
+    def _limit_numbers(self) -> None:
+        """Use numbers again as far as memory for what they refer to suffices."""
+        events, samples, _, _ = map(len, self._memory)
+        self._state["room"] = 0 if self._numbered else (samples, events, events)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without addresses, which another process or copy does not share."""
+        return self.__dict__ | {"_call": None}

@@ -31,7 +31,6 @@ import numpy as np
 from quad_gym.estimation.collecting import name_of
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.first_motion import SPAN
-from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.logs.parts import running_motors
 from quad_gym.estimation.player import Player
@@ -39,6 +38,7 @@ from quad_gym.estimation.sets import run_sets
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FREEDOMS
+from quad_gym.records.inputs import SAME_TIME
 
 NU = (5.0, 8.0, 15.0, 100.0)
 """Degrees of freedom of Student's t; of 5, a tenth of its weight lies beyond two scales."""

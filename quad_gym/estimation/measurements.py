@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.logs import Floats, Log
@@ -74,6 +75,19 @@ class LogMeasurements:
         """Return measurement k of a stream, of which something was measured, by its number."""
         found = self.at(self._names[number], k)
         assert found is not None
+        return found
+
+    def present(self, number: int, rows: Any) -> NDArray[np.bool_]:
+        """Return True for the rows of a stream, by its number, in which something was measured."""
+        name = self._names[number]
+        found = np.full(len(rows), name in ("camera", "attitude"))
+        values, wanted = self.streams[name].values, [name]
+        if name == "gnss":
+            quantities = ("position", "baseline", "velocity")[: 3 if self.takes_velocity else 2]
+            wanted = [f"{quantity}_{frame}" for quantity in quantities for frame in "GI"]
+        for key in wanted:
+            if key in values and not found.all():
+                found |= np.isfinite(values[key][rows]).reshape(len(rows), -1).all(axis=1)
         return found
 
     def at(self, name: str, k: int) -> Measurement | None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.collecting import name_of
-from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.own import Estimator, checked_estimate, factors, own_copy
 from quad_gym.estimation.player import Player
@@ -21,6 +20,7 @@ from quad_gym.records import (
     Aid,
     FilterStatus,
 )
+from quad_gym.records.inputs import SAME_TIME
 from quad_gym.records.reading import SensorReading
 from quad_gym.records.state import State
 from quad_gym.rotations import dcm_to_quaternion

@@ -1,11 +1,9 @@
 """A filter that processes a log event by event, in the order of arrival.
 
-Times alone determine which samples and measurements are processed, and when. The operations are
-therefore written to a tape first, which compiled code then runs.
+Times alone determine which samples and measurements are processed, and when. Compiled code
+(`kernels/window.py`) therefore writes the operations to a tape first, which other code then runs.
 """
 
-import bisect
-from array import array
 from typing import Any
 
 import numpy as np
@@ -20,18 +18,18 @@ from quad_gym.estimation.filters import (
 )
 from quad_gym.estimation.first_motion import with_wide_start
 from quad_gym.estimation.held_position import SENTENCE, held, lacks_position
-from quad_gym.estimation.history import SAME_TIME, InputHistory
+from quad_gym.estimation.history import InputHistory
 from quad_gym.estimation.log_start import LogStart
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.measurements import LogMeasurements
 from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
 from quad_gym.estimation.results import Replay
 from quad_gym.estimation.running import run_filter
-from quad_gym.estimation.samples import Sample
 from quad_gym.estimation.tape import TapeWriter
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import POSITION_BLOCK
+from quad_gym.records.inputs import INPUT, Outcome
 
 ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
 
@@ -73,17 +71,11 @@ class Player:
         tilted = wide is not suite and not self.in_order
         self.start = LogStart(self.measured, start, self.in_order, tilted)
         self.averages = suite.imu.samples == "average"
-        self.gyros, self.accels = log.imu.values["gyro"], log.imu.values["accel"]
-        self.running = False
-        self.held: list[int] = []  # samples before the start
-        self.waiting: list[tuple[float, str, int]] = []  # time stamps after the filter's time
-        self.before: int | None = None  # the sample that holds now, of an IMU of instants
         self.late: dict[str, list[float]] = {}  # ages of what came too late, by sensor
-        self.times = array("d")
-        self.stamps = array("d")  # of all updates, each with its arrival
-        self.gyro: Floats | None = None  # of the prediction before
-        self.writer = writer = TapeWriter(self.measured.by_number)
-        self.history = InputHistory(self.window, writer.apply, writer.copy, writer.restore)
+        self.history = InputHistory(self.window, max(LONGEST_STEP, suite.imu.dt), numbered=True)
+        self.writer = TapeWriter(self.measured.by_number, self.history)
+        self.times = np.empty(0)  #: of the estimates
+        self.stamps = np.empty((0, 2))  #: of all updates, each with its arrival
 
     # ---- the log, event by event ---------------------------------------------------------------
 
@@ -99,18 +91,12 @@ class Player:
         received = np.concatenate([getattr(self.streams[name], arrivals) for name in names])
         kinds = np.concatenate([np.full(len(self.streams[n]), k) for k, n in enumerate(names)])
         places = np.concatenate([np.arange(len(self.streams[n])) for n in names])
-        if self.start.at_rest:
-            self._begin()
         order = np.lexsort((places, kinds, received))
-        for first in range(0, len(order), _AT_ONCE):
-            some = order[first : first + _AT_ONCE]
-            for kind, place in zip(kinds[some].tolist(), places[some].tolist(), strict=True):
-                if kind == 0:
-                    self._take_sample(place)
-                else:
-                    self._take_measurement(names[kind], place)
-        self._keep_row()
-        if not self.times:
+        kinds, places = kinds[order], places[order]
+        first = self._begin(names, kinds, places)
+        if first is not None:
+            self._write_inputs(names, kinds, places, first)
+        if not len(self.times):
             if self.unused and len(self.streams) == 1:
                 raise MisfitError(
                     f"{nothing_in_common(self.unused)}: use a suite with these sensors"
@@ -128,14 +114,14 @@ class Player:
             run_filter(self.filter, self.writer),
             blocks_of(self.filter.sensors),
             len(self.times),
-            np.array(self.stamps).reshape(-1, 2),
+            self.stamps,
         )
         if self.holds:
             measured.pop(POSITION_BLOCK, None)
         return Replay(
             estimator=self.estimator,
             sensors=self.assumed,
-            time=np.array(self.times),
+            time=self.times,
             **columns,
             status=self.filter.status,
             measured={name_of(block): found for block, found in measured.items()},
@@ -150,101 +136,96 @@ class Player:
         self.start.begin(kf, suite)
         return kf
 
-    def _begin(self) -> None:
-        """Start the filter, and process the samples since the time of the start."""
+    def _begin(self, names: list[str], kinds: Any, places: Any) -> int | None:
+        """Start the filter; return the number of arrivals before, or None without a start."""
+        arrivals = enumerate(zip(kinds.tolist(), places.tolist(), strict=True))
+        found = (k for k, (kind, i) in arrivals if kind and self.start.found_in(names[kind], i))
+        fix = -1 if self.start.at_rest else next(found, None)
+        if fix is None:
+            return None
         self.start.begin(self.filter, self.suite)
-        self.running, begin = True, self.filter.time
+        begin = self.filter.time
         self.history.begin(begin)
         if self.calls is not None:
             given = self.start.from_fix or {"time": begin, **self.start.given}
             self.calls.start(given, self.filter.sensors, self.log.barometer_from_start)
-        for i in self.held:
-            if self.log.imu.time[i] > begin + SAME_TIME:
-                self._predict(i)
-            else:
-                self.before = i
-        self.held = []
+        return fix + 1
 
-    def _take_sample(self, i: int) -> None:
-        if not self.running:
-            self.held.append(i)
-            return
-        self._keep_row()
-        self._predict(i)
+    def _write_inputs(self, names: list[str], kinds: Any, places: Any, first: int) -> None:
+        """Write the samples, and the measurements after the start, to the tape.
 
-    def _keep_row(self) -> None:
-        """Store the estimate before the next sample arrives."""
-        if self.running:
-            self.times.append(self.history.time)
-            self.writer.keep()
-            if self.calls is not None:
-                self.calls.keep()
+        Args:
+            names: Names of the streams.
+            kinds: (n,) numbers of the streams in which something arrives.
+            places: (n,) rows there.
+            first: Number of arrivals before the start, of which only samples count.
+        """
+        chosen = kinds == 0
+        for number in range(1, len(names)):
+            own = first + np.flatnonzero(kinds[first:] == number)
+            chosen[own] = self.measured.present(number, places[own])
+        taken = np.flatnonzero(chosen)
+        ranks = np.argsort(np.argsort(names)) + 1  # by name
+        ranks[0] = 0
+        times: list[Floats] = []
+        before = -1  # the sample that holds now, of an IMU of instants
+        for k in range(0, len(taken), _AT_ONCE):
+            some = taken[k : k + _AT_ONCE]
+            inputs = self._inputs(kinds[some], places[some], ranks, before)
+            inputs["keeps"] = (kinds[some] == 0) & (some >= first)
+            self.writer.write(inputs)
+            self._require_samples(inputs)
+            times.append(inputs["now"][inputs["keeps"] > 0])
+            self._note(inputs, names, kinds[some], places[some])
+            samples = places[some][kinds[some] == 0]
+            before = int(samples[-1]) if len(samples) else before
+        self.writer.keep()
+        if self.calls is not None:
+            self.calls.keep()
+        self.times = np.append(np.concatenate([np.empty(0), *times]), self.history.time)
+        rows = np.array(self.writer.rows, np.int64).reshape(-1, 2)[self.writer.updates]
+        self.stamps = np.empty((len(rows), 2))
+        for number, stream in enumerate(self.streams.values()):
+            own = rows[:, 0] == number
+            self.stamps[own, 0] = stream.time[rows[own, 1]]
+            self.stamps[own, 1] = stream.received[rows[own, 1]]
 
-    def _predict(self, i: int) -> None:
-        """Propagate the estimate to the time of a sample."""
-        time, now = float(self.log.imu.time[i]), self.history.time
-        chosen = i if self.averages else self.before
-        self.before = i
-        step = time - now
-        if step <= SAME_TIME or chosen is None:
-            return
-        if step > max(LONGEST_STEP, self.suite.imu.dt):
+    def _inputs(self, kinds: Any, places: Any, ranks: Any, before: int) -> Any:
+        """Return arrivals as INPUT (n,); an IMU of instants measures at the start of its time."""
+        inputs = np.zeros(len(kinds), INPUT)
+        inputs["rank"], inputs["dt"] = ranks[kinds], np.nan
+        for kind, stream in enumerate(self.streams.values()):
+            inputs["time"][kinds == kind] = stream.time[places[kinds == kind]]
+        imu, rows = kinds == 0, places[kinds == 0]
+        chosen = rows if self.averages else np.append(before, rows)[:-1]
+        for name in ("gyro", "accel"):
+            values = self.log.imu.values[name][chosen]
+            values[chosen < 0] = np.nan  # none holds before the first one
+            inputs[name][imu] = values
+        return inputs
+
+    def _require_samples(self, inputs: Any) -> None:
+        """Refuse samples that are too far apart."""
+        far = inputs[inputs["outcome"] == Outcome.OUT_OF_RANGE]
+        if len(far):
             usual = float(np.median(np.diff(self.log.imu.time)))
             unit = "ms" if usual < 1e3 else "us" if usual < 1e6 else "ns"
             cause = "cut the log there" if usual < LONGEST_STEP else f"time in {unit}?"
             raise ValueError(
                 f"samples of the IMU must be at most {LONGEST_STEP:g} s apart, got none from "
-                f"{now:.3f} s to {time:.3f} s: {cause}"
+                f"{far['now'][0]:.3f} s to {far['time'][0]:.3f} s: {cause}"
             )
-        gyro, accel = self.gyros[chosen], self.accels[chosen]
-        sample = Sample(gyro, accel, step, gyro if self.gyro is None else self.gyro)
-        self.gyro = gyro
+
+    def _note(self, inputs: Any, names: list[str], kinds: Any, places: Any) -> None:
+        """Note which measurements were taken and which came too late, and the calls."""
+        measures, old = inputs["rank"] > 0, inputs["outcome"] == Outcome.TOO_OLD
+        took = measures & ~old
+        self.writer.rows.extend(np.column_stack([kinds, places])[took].ravel().tolist())
+        for kind, place in zip(kinds[old].tolist(), places[old].tolist(), strict=True):
+            stream = self.streams[names[kind]]
+            age = float(stream.received[place] - stream.time[place])
+            self.late.setdefault(names[kind], []).append(age)
         if self.calls is not None:
-            for stamp, name, k in self.waiting:
-                if stamp <= time + SAME_TIME:
-                    self._call_update(name, k)
-            self.calls.predict(sample)
-        while self.waiting and self.waiting[0][0] < time - SAME_TIME:  # taken within the sample
-            stamp, name, k = self.waiting.pop(0)
-            if (elapsed := stamp - self.history.time) > SAME_TIME:
-                first, sample = sample.split(elapsed)
-                self.history.add(first)
-            self._update(name, k)
-        self.history.add(sample)
-        while self.waiting and self.waiting[0][0] <= self.history.time + SAME_TIME:
-            _, name, k = self.waiting.pop(0)
-            self._update(name, k)
-
-    def _take_measurement(self, name: str, k: int) -> None:
-        stamp = float(self.streams[name].time[k])
-        if not self.running:
-            if self.start.found_in(name, k):
-                self._begin()
-        elif stamp > self.history.time + SAME_TIME:
-            if self.measured.at(name, k) is not None:
-                bisect.insort(self.waiting, (stamp, name, k))
-        elif stamp < self.history.oldest - SAME_TIME:
-            received = float(self.streams[name].received[k])
-            self.late.setdefault(name, []).append(received - stamp)
-        else:
-            self._call_update(name, k)
-            self._update(name, k)
-
-    def _call_update(self, name: str, k: int) -> None:
-        if self.calls is not None:
-            measurement = self.measured.at(name, k)
-            if measurement is not None:
-                self.calls.update(name, float(self.streams[name].time[k]), measurement)
-
-    def _update(self, name: str, k: int) -> None:
-        stream, history = self.streams[name], self.history
-        measurement = self.measured.at(name, k)
-        if measurement is None:
-            return
-        stamp = float(stream.time[k])
-        self.writer.awaited, self.writer.place = measurement, (self.measured.number(name), k)
-        if stamp >= history.time - SAME_TIME:
-            history.add(measurement)
-        else:
-            history.insert(measurement, stamp)
-        self.stamps.extend((stamp, float(stream.received[k])))
+            for given, kind, place in zip(inputs, kinds.tolist(), places.tolist(), strict=True):
+                measurement = self.measured.at(names[kind], place) if kind else None
+                self.calls.take(given, names[kind], place, measurement)

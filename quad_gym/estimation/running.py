@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.filters import KalmanFilter
-from quad_gym.estimation.samples import Measurement, Sample
+from quad_gym.estimation.samples import Measurement
 from quad_gym.estimation.tape import Tape, TapeWriter
 from quad_gym.records import KEPT, WIDTH, Operation
 
@@ -76,20 +76,14 @@ def run_while_unknown(
     for k, (code, index, target) in enumerate(tape.operations.tolist()):
         if kf.heading_known and all(weights is None for _, weights in copies.values()):
             return k, estimates, innovations
-        match code:
-            case Operation.PREDICT:
-                kf._apply(Sample.of_record(tape.samples[index]))
-            case Operation.UPDATE:
-                measurement = writer.measurement(tape.first + index)
-                kf._apply(measurement)
-                if target >= 0:
-                    innovations.append(_innovations(kf, measurement))
-            case Operation.COPY:
-                copies[target] = kf._copy()
-            case Operation.RESTORE:
-                kf._restore(copies[target])
-            case Operation.KEEP:
-                estimates.append(_estimate(kf))
+        if code == Operation.KEEP:
+            estimates.append(_estimate(kf))
+            continue
+        updates = code == Operation.UPDATE
+        measurement = writer.measurement(tape.first + index) if updates else None
+        kf._operate((code, index, target), tape.samples, measurement, copies)
+        if measurement is not None and target >= 0:
+            innovations.append(_innovations(kf, measurement))
     return len(tape.operations), estimates, innovations
 
 

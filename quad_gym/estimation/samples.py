@@ -24,33 +24,6 @@ SIGMA_KEYWORDS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
-    """An IMU sample that propagates the estimate over a time."""
-
-    gyro: Floats  #: (3,) angular rate in B [rad/s]
-    accel: Floats  #: (3,) specific force in B [m/s^2]
-    dt: float  #: duration of the sample [s]
-    gyro_before: Floats
-    """(3,) angular rate of the sample before; the lever arm's acceleration follows from both
-    [rad/s]"""
-
-    @classmethod
-    def of_record(cls, record: Any) -> "Sample":
-        """Return the sample of a record of a tape."""
-        return cls(record["gyro"], record["accel"], float(record["dt"]), record["gyro_before"])
-
-    def split(self, first: float) -> tuple["Sample", "Sample"]:
-        """Return this sample over the first part [s] of its time, and over the rest.
-
-        The gyro's rate of change is the whole sample's in both.
-        """
-        change = (self.gyro - self.gyro_before) / self.dt
-        parts = (first, self.dt - first)
-        one, two = (Sample(self.gyro, self.accel, t, self.gyro - t * change) for t in parts)
-        return one, two
-
-
-@dataclass(frozen=True, eq=False)
 class Measurement:
     """Measurements of one instant; None: not measured."""
 

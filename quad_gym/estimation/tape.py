@@ -3,13 +3,14 @@
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.samples import Measurement, Sample
+from quad_gym.estimation.history import InputHistory
+from quad_gym.estimation.samples import Measurement
 from quad_gym.records import (
     AID_BLOCKS,
     BASELINE_BLOCK,
@@ -18,7 +19,6 @@ from quad_gym.records import (
     NOISE_FIELDS,
     OPERATION,
     POSITION_BLOCK,
-    SAMPLE,
     VELOCITY_BLOCK,
     Operation,
 )
@@ -29,7 +29,6 @@ _TRIPLES = (
     ("velocity_G", "gnss_velocity", VELOCITY_BLOCK),
 )
 _NOISE = (*NOISE_FIELDS, "aid_sigma")
-_SAMPLE_SIZE = SAMPLE.itemsize // 8  #: numbers of a sample
 _PREDICT, _UPDATE = int(Operation.PREDICT), int(Operation.UPDATE)
 
 BLANK = np.zeros(1, MEASUREMENT)
@@ -96,96 +95,81 @@ _AT_ONCE = 4096  #: operations of a piece of a tape
 class TapeWriter:
     """Writes the operations that process inputs in the order of their arrival.
 
-    Its methods `apply`, `copy` and `restore` are those that an `InputHistory` asks for. It keeps
-    numbers, not objects: a long log has millions of inputs. A measurement is made from the log
-    again when its piece of the tape is run.
+    It keeps numbers, not objects: a long log has millions of inputs. A measurement is made from the
+    log again when its piece of the tape is run.
     """
 
     make: Callable[[int, int], Measurement]
     """returns a measurement by the numbers of its stream and row"""
-    place: tuple[int, int] = (0, 0)  #: stream and row of the next new measurement
-    awaited: Measurement | None = None  #: measurement whose next update is reported
-    kept: int = 0
-    reported: int = 0
-    _samples: "array[float]" = field(default_factory=lambda: array("d"))
-    _rows: "array[int]" = field(default_factory=lambda: array("i"))
-    _operations: "array[int]" = field(default_factory=lambda: array("i"))
-    _numbers: WeakKeyDictionary[Sample | Measurement, int] = field(
-        default_factory=WeakKeyDictionary
-    )
-    _copies: int = 0
-    _oldest: int = 1  #: age of the oldest copy that was restored, in copies
+    history: InputHistory
+    rows: "array[int]" = field(default_factory=lambda: array("q"))
+    """stream and row of each measurement"""
+    _parts: list[NDArray[np.int32]] = field(default_factory=list)
 
-    def apply(self, given: Sample | Measurement) -> None:
-        """Process a sample or a measurement."""
-        index = self._numbers.get(given)
-        if isinstance(given, Sample):
-            if index is None:
-                index = self._numbers[given] = len(self._samples) // _SAMPLE_SIZE
-                for values in (given.gyro, given.accel, (given.dt,), given.gyro_before):
-                    self._samples.extend(values)
-            self._operations.extend((_PREDICT, index, -1))
-            return
-        if index is None:
-            index = self._numbers[given] = len(self._rows) // 2
-            self._rows.extend(self.place)
-        target = -1
-        if given is self.awaited:
-            self.awaited, target = None, self.reported
-            self.reported += 1
-        self._operations.extend((_UPDATE, index, target))
-
-    def copy(self) -> int:
-        """Copy the memory; return the number of the copy."""
-        self._operations.extend((Operation.COPY, 0, self._copies))
-        self._copies += 1
-        return self._copies - 1
-
-    def restore(self, number: int) -> None:
-        """Restore a copy."""
-        self._oldest = max(self._oldest, self._copies - number)
-        self._operations.extend((Operation.RESTORE, 0, number))
+    def write(self, inputs: NDArray[Any]) -> None:
+        """Write the operations that process inputs (n,) INPUT."""
+        for operations in self.history.take(inputs):
+            self._parts.append(operations.view(np.int64).reshape(-1, 3).astype(np.int32))
 
     def keep(self) -> None:
-        """Store the estimate."""
-        self._operations.extend((Operation.KEEP, 0, self.kept))
-        self.kept += 1
+        """Store the estimate at the end."""
+        kept = sum(int((part[:, 0] == Operation.KEEP).sum()) for part in self._parts)
+        self._parts.append(np.array([[Operation.KEEP, 0, kept]], np.int32))
+
+    @cached_property
+    def _operations(self) -> NDArray[np.int32]:
+        """(n, 3) all operations."""
+        return np.concatenate([np.empty((0, 3), np.int32), *self._parts])
+
+    @cached_property
+    def slots(self) -> int:
+        """Number of copies that exist at a time.
+
+        A copy overwrites the oldest one that is not restored any more.
+        """
+        codes, _, targets = self._operations.T
+        copies = np.maximum.accumulate(np.where(codes == Operation.COPY, targets + 1, 0))
+        return 1 + int((copies - targets)[codes == Operation.RESTORE].max(initial=1))
+
+    @property
+    def updates(self) -> NDArray[np.int32]:
+        """(n,) numbers of the measurements in the order in which they are reported."""
+        codes, indices, targets = self._operations.T
+        return indices[(codes == Operation.UPDATE) & (targets >= 0)]
 
     def measurement(self, index: int) -> Measurement:
         """Return a measurement of the tape."""
-        return self.make(*self._rows[2 * index : 2 * index + 2])
+        return self.make(*self.rows[2 * index : 2 * index + 2])
 
     def tape(self) -> Tape:
-        """Return the tape; a copy overwrites the oldest one that is not restored any more."""
-        return self._piece(0, len(self._operations) // 3)
+        """Return the tape."""
+        return self._piece(0, len(self._operations))
 
     def pieces(self) -> Iterator[Tape]:
         """Yield the tape in pieces, each with its own inputs and numbers of results."""
-        count = len(self._operations) // 3
+        count = len(self._operations)
         for first in range(0, max(count, 1), _AT_ONCE):
             yield self._piece(first, min(first + _AT_ONCE, count))
 
     def _piece(self, first: int, end: int) -> Tape:
         """Return the operations from one up to another, with numbers that begin at zero."""
-        numbers = np.array(self._operations[3 * first : 3 * end], np.int64).reshape(-1, 3)
+        numbers = self._operations[first:end].astype(np.int64)
         codes, indices, targets = numbers.T
         updates, keeps = codes == Operation.UPDATE, codes == Operation.KEEP
         copies = (codes == Operation.COPY) | (codes == Operation.RESTORE)
-        slots = self._oldest + 1
-        targets[copies] %= slots
+        targets[copies] %= self.slots
         kept = _from_zero(targets, keeps)
         reported = _from_zero(targets, updates & (targets >= 0))
         samples = _from_zero(indices, codes == Operation.PREDICT)
         measured = _from_zero(indices, updates)
-        given = np.array(self._samples[_SAMPLE_SIZE * samples[0] : _SAMPLE_SIZE * samples[1]])
         records = np.repeat(BLANK, measured[1] - measured[0])
         for row, index in zip(records, range(*measured), strict=True):
             write_measurement(row, self.measurement(index))
         return Tape(
-            given.view(SAMPLE),
+            self.history.samples[slice(*samples)].copy(),
             records,
             numbers.view(OPERATION).ravel(),
-            slots,
+            self.slots,
             kept[1] - kept[0],
             reported[1] - reported[0],
             measured[0],

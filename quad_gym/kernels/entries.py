@@ -28,6 +28,7 @@ from quad_gym.records import (
     WORK_BLOCK,
     Sensor,
 )
+from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW
 
 
 class Rows(NamedTuple):
@@ -129,6 +130,9 @@ run_tape = Entry(
     *(_INDICES, _WORDS, _SLOTS),
     *(int, int),
 )
+take_inputs = Entry(
+    "window:take_inputs", *map(Rows, (WINDOW, EVENT, SAMPLE, PENDING, OPERATION, INPUT))
+)
 start_filter = Entry("single:start_filter", _BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
 run_stage = Entry(
     "single:run_stage",
@@ -163,7 +167,7 @@ hide_points = Entry("single:hide_points", _MATRIX, _CUBE, _CUBE, _SETTINGS, _MAS
 
 FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
 """Stages that a filter runs, as far as it needs them."""
-FILTER_ENTRIES = (start_filter.name, run_tape.name)
+FILTER_ENTRIES = (start_filter.name, run_tape.name, take_inputs.name)
 """Names of the entries that a filter calls, the slowest to compile first."""
 _SENSORS_AND_VEHICLE = (
     *(sense_features, sense_gnss, body_accelerations_in_air, integrate_flight),
@@ -173,6 +177,6 @@ _SENSORS_AND_VEHICLE = (
 )
 SENSORS_AND_VEHICLE = tuple(entry.name for entry in _SENSORS_AND_VEHICLE)
 """Names of the entries for sensors and vehicles, the slowest to compile first."""
-_ENTRIES = (fly, run_tape, start_filter, run_stage, *_SENSORS_AND_VEHICLE)
+_ENTRIES = (fly, run_tape, start_filter, take_inputs, run_stage, *_SENSORS_AND_VEHICLE)
 ENTRIES = {entry.name: entry for entry in _ENTRIES}
 """All entries by their names."""

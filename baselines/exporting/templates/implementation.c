@@ -13,13 +13,13 @@
 extern "C" {
 #endif
 
-#define QGI_SAME_TIME 1e-6
 #define QGI_STAGE(name) \
     extern int name(void *, void *, void *, void *, void *, void *, void *, void *, int64_t)
 
 typedef int qgi_run(void *, void *, void *, void *, const void *, void *, const void *, void *,
                     void *, const void *);
 extern qgi_run qg_core_predict, qg_core_update;
+extern int qg_core_take(void *, void *, void *, int64_t, int64_t, int64_t, int64_t, void *);
 extern int qg_core_start(void *, void *, void *, void *, const void *, void *, const void *);
 extern int qg_core_start_level(void *, void *, void *);
 extern int qg_core_keep(void *, void *, const void *, int64_t);
@@ -62,14 +62,6 @@ static void qgi_run_on(qg_filter *f, qgi_run *run, const void *input)
         f->work, f->table, input);
 }
 
-static void qgi_apply(qg_filter *f, const qg_event *e)
-{
-    if (e->measurement < 0)
-        qgi_run_on(f, qg_core_predict, &e->sample);
-    else
-        qgi_run_on(f, qg_core_update, &f->measurement[e->measurement]);
-}
-
 static const int qgi_parts[][2] = {@COPIED@}; /* offsets and lengths of what is copied, in doubles */
 
 static void qgi_copy(qg_filter *f, double *copy, int restores)
@@ -85,228 +77,59 @@ static void qgi_copy(qg_filter *f, double *copy, int restores)
     }
 }
 
-/* ---- inputs within the window, to filter them again ---- */
+/* ---- inputs ---- */
 
-static int qgi_free(const char *used, int n)
+static int64_t qgi_address(const void *place)
 {
-    for (int k = 0; k < n; k++)
-        if (!used[k])
-            return k;
-    return -1;
+    return (int64_t)(uintptr_t)place;
 }
 
-static void qgi_drop(qg_filter *f, int count)
+/* Take an input into the window, and run the operations that process it. */
+static int qgi_take(qg_filter *f, qg_input_record *input, const qg_measurement_record *measured)
 {
-    for (int k = 0; k < count; k++) {
-        if (f->event[k].measurement >= 0)
-            f->measurement_used[f->event[k].measurement] = 0;
-        if (f->event[k].copy >= 0)
-            f->copy_used[f->event[k].copy] = 0;
+    void *result, *raised;
+    qg_core_take(&result, &raised, &f->window, qgi_address(f->event), qgi_address(f->sample),
+                 qgi_address(f->waits), qgi_address(f->operation), input);
+    if (measured && input->outcome == QG_OK)
+        f->measurement[input->index] = *measured;
+    for (int k = 0; k < f->window.operations; k++) {
+        const qg_operation_record *o = &f->operation[k];
+        if (o->code == @PREDICT@)
+            qgi_run_on(f, qg_core_predict, &f->sample[o->index]);
+        else if (o->code == @UPDATE@)
+            qgi_run_on(f, qg_core_update, &f->measurement[o->index]);
+        else
+            qgi_copy(f, f->copy[o->target], o->code == @RESTORE@);
     }
-    f->events -= count;
-    memmove(f->event, f->event + count, (size_t)f->events * sizeof f->event[0]);
-}
-
-/* Drop the events before the last copy that is older than a time. */
-static void qgi_forget(qg_filter *f, double reach)
-{
-    int keep = 0;
-    for (int k = 0; k < f->events && f->event[k].start <= reach; k++)
-        if (f->event[k].copy >= 0)
-            keep = k;
-    qgi_drop(f, keep);
-}
-
-/* Drop the events before the second copy, where memory is short: the window shrinks. */
-static void qgi_shrink(qg_filter *f)
-{
-    int k = 1;
-    while (k < f->events && f->event[k].copy < 0)
-        k++;
-    qgi_drop(f, k);
-}
-
-/* Make room for two more events, and for a measurement; return its place. */
-static int qgi_room(qg_filter *f)
-{
-    int place;
-    while (f->events > QG_EVENTS - 2)
-        qgi_shrink(f);
-    while ((place = qgi_free(f->measurement_used, QG_MEASUREMENTS)) < 0)
-        qgi_shrink(f);
-    return place;
-}
-
-static void qgi_add(qg_filter *f, qg_event e)
-{
-    e.start = f->time;
-    e.time = f->time + (e.measurement < 0 ? e.sample.dt : 0.0);
-    e.copy = -1;
-    f->since_copy++;
-    if (!f->events || f->since_copy >= QG_COPY_EVERY) {
-        e.copy = qgi_free(f->copy_used, QG_COPIES);
-        if (e.copy >= 0) {
-            f->copy_used[e.copy] = 1;
-            qgi_copy(f, f->copy[e.copy], 0);
-            f->since_copy = 0;
-        }
-    }
-    f->event[f->events++] = e;
-    f->time = e.time;
-    qgi_apply(f, &e);
-    qgi_forget(f, f->time - QG_WINDOW);
-}
-
-/* Split a sample after a time: the gyro's rate of change is the whole sample's in both parts. */
-static void qgi_split(const qg_sample_record *whole, double first, qg_sample_record part[2])
-{
-    part[0] = part[1] = *whole;
-    part[0].dt = first;
-    part[1].dt = whole->dt - first;
-    for (int k = 0; k < 2; k++)
-        for (int i = 0; i < 3; i++)
-            part[k].gyro_before[i] =
-                whole->gyro[i] - part[k].dt * ((whole->gyro[i] - whole->gyro_before[i]) / whole->dt);
-}
-
-/* Insert a measurement at its time stamp, and filter again everything after it. */
-static void qgi_insert(qg_filter *f, int place, double time)
-{
-    qg_event *e = f->event, taken;
-    int i = f->events - 1, first, added = 1;
-    while (i > 0 && e[i - 1].time > time + QGI_SAME_TIME)
-        i--;
-    for (first = i; e[first].copy < 0;)
-        first--;
-    taken.measurement = place;
-    taken.copy = -1;
-    if (time - e[i].start > QGI_SAME_TIME) {
-        qg_sample_record part[2];
-        qgi_split(&e[i].sample, time - e[i].start, part);
-        memmove(e + i + 2, e + i, (size_t)(f->events - i) * sizeof *e);
-        e[i].sample = part[0];
-        e[i].time = time;
-        e[i + 2].sample = part[1];
-        e[i + 2].start = time;
-        e[i + 2].copy = -1;
-        taken.start = taken.time = time;
-        e[i + 1] = taken;
-        added = 2;
-    } else {
-        memmove(e + i + 1, e + i, (size_t)(f->events - i) * sizeof *e);
-        taken.start = taken.time = e[i].start;
-        taken.copy = e[i].copy;
-        e[i + 1].copy = -1;
-        e[i] = taken;
-    }
-    f->events += added;
-    qgi_copy(f, f->copy[e[first].copy], 1);
-    for (int k = first; k < f->events; k++) {
-        if (k > first && e[k].copy >= 0)
-            qgi_copy(f, f->copy[e[k].copy], 0);
-        qgi_apply(f, &e[k]);
-    }
-}
-
-static void qgi_take(qg_filter *f, const qg_measurement_record *record, double time)
-{
-    qg_event e;
-    int place = qgi_room(f);
-    f->measurement[place] = *record;
-    f->measurement_used[place] = 1;
-    memset(&e, 0, sizeof e);
-    e.measurement = place;
-    if (time >= f->time - QGI_SAME_TIME || !f->events)
-        qgi_add(f, e);
-    else
-        qgi_insert(f, place, time);
-}
-
-static void qgi_take_first_waiting(qg_filter *f)
-{
-    qg_pending first = f->waits[0];
-    f->waiting--;
-    memmove(f->waits, f->waits + 1, (size_t)f->waiting * sizeof f->waits[0]);
-    qgi_take(f, &first.record, first.time);
+    f->window.operations = 0;
+    return (int)input->outcome;
 }
 
 int qg_predict(qg_filter *f, const double gyro[3], const double accel[3], double dt)
 {
-    qg_event e;
-    double end;
+    qg_input_record input;
     if (!f->started)
         return QG_NOT_STARTED;
     if (!qgi_finite(gyro, 3) || !qgi_finite(accel, 3) || !isfinite(dt))
         return QG_NOT_FINITE;
-    if (dt < 1e-9 || dt > QG_LONGEST_STEP)
-        return QG_OUT_OF_RANGE;
-    memset(&e, 0, sizeof e);
-    e.measurement = -1;
-    for (int i = 0; i < 3; i++) {
-        e.sample.gyro[i] = gyro[i];
-        e.sample.accel[i] = accel[i];
-        e.sample.gyro_before[i] = f->has_gyro ? f->gyro[i] : gyro[i];
-        f->gyro[i] = gyro[i];
-    }
-    f->has_gyro = 1;
-    e.sample.dt = dt;
-    end = f->time + dt;
-    while (f->waiting && f->waits[0].time < end - QGI_SAME_TIME) {
-        double elapsed = f->waits[0].time - f->time;
-        if (elapsed > QGI_SAME_TIME) {
-            qg_sample_record part[2];
-            qgi_split(&e.sample, elapsed, part);
-            e.sample = part[0];
-            qgi_room(f);
-            qgi_add(f, e);
-            e.sample = part[1];
-        }
-        qgi_take_first_waiting(f);
-    }
-    qgi_room(f);
-    qgi_add(f, e);
-    while (f->waiting && f->waits[0].time <= f->time + QGI_SAME_TIME)
-        qgi_take_first_waiting(f);
-    return QG_OK;
+    memset(&input, 0, sizeof input);
+    memcpy(input.gyro, gyro, sizeof input.gyro);
+    memcpy(input.accel, accel, sizeof input.accel);
+    input.dt = dt;
+    return qgi_take(f, &input, 0);
 }
 
 double qg_time(const qg_filter *f)
 {
-    return f->time;
+    return f->window.time;
 }
 
 double qg_oldest_time(const qg_filter *f)
 {
-    double reach = f->time - QG_WINDOW;
-    if (!f->events)
-        return f->time;
+    double reach = f->window.time - f->window.length;
+    if (!f->window.events)
+        return f->window.time;
     return reach > f->event[0].start ? reach : f->event[0].start;
-}
-
-static int qgi_update(qg_filter *f, const qg_measurement_record *record, double time, int rank)
-{
-    int k;
-    if (time > f->time + QGI_SAME_TIME) {
-        if (time > f->time + QG_LONGEST_STEP)
-            return QG_TOO_NEW;
-        if (f->waiting == QG_WAITING)
-            return QG_FULL;
-        for (k = f->waiting; k > 0; k--) {
-            const qg_pending *before = &f->waits[k - 1];
-            if (before->time < time || (before->time == time && before->rank <= rank))
-                break;
-            f->waits[k] = *before;
-        }
-        f->waits[k].record = *record;
-        f->waits[k].time = time;
-        f->waits[k].rank = rank;
-        f->waiting++;
-        return QG_OK;
-    }
-    if (time < qg_oldest_time(f) - QGI_SAME_TIME)
-        return QG_TOO_OLD;
-    qgi_take(f, record, time);
-    return QG_OK;
 }
 
 /* The noise of a measurement: standard deviations of at least a limit. */
@@ -358,7 +181,8 @@ static int qgi_baseline(const double *given, double out[3])
 int qg_update(qg_filter *f, const qg_measurements *m, double time)
 {
     qg_measurement_record r;
-    int error = QG_OK, rank = 4;
+    qg_input_record input;
+    int error = QG_OK;
     if (!f->started)
         return QG_NOT_STARTED;
     if (!isfinite(time))
@@ -398,26 +222,12 @@ int qg_update(qg_filter *f, const qg_measurements *m, double time)
     if (!error && m->velocity_sigma != 0.0)
         error = qgi_noise(m->gnss_velocity, &m->velocity_sigma, 1, 1e-12, &r.velocity_sigma);
 @END@
-    /* the order of measurements that wait with equal time stamps, as in a replay */
-@IF MAGNETOMETER@
-    rank = m->magnetometer ? 3 : rank;
-@END@
-@IF GNSS@
-    rank = m->gnss_position ? 2 : rank;
-@END@
-@IF BASELINE@
-    rank = m->gnss_baseline ? 2 : rank;
-@END@
-@IF VELOCITY@
-    rank = m->gnss_velocity ? 2 : rank;
-@END@
-@IF CAMERA@
-    rank = m->pixels ? 1 : rank;
-@END@
-@IF BAROMETER@
-    rank = m->barometer ? 0 : rank;
-@END@
-    return error ? error : qgi_update(f, &r, time, rank);
+    if (error)
+        return error;
+    memset(&input, 0, sizeof input);
+    input.time = time;
+    input.rank = @RANK@; /* as in a replay */
+    return qgi_take(f, &input, &r);
 }
 
 @AID_SOURCE@@IF CAMERA@
@@ -474,7 +284,15 @@ static void qgi_begin(qg_filter *f, double time)
     memcpy(&f->first, qg_core_first, sizeof f->first);
 @FILL_TABLE@
     *(double *)(void *)((char *)f->work + @OF_MASK@) = 1.0;
-    f->time = time;
+    f->window.time = time;
+    f->window.length = QG_WINDOW;
+    f->window.longest = f->window.ahead = QG_LONGEST_STEP;
+    f->window.copy_every = QG_COPY_EVERY;
+    f->window.event_room = QG_EVENTS;
+    f->window.waiting_room = QG_WAITING;
+    f->window.room[@A_SAMPLE@] = sizeof f->sample / sizeof f->sample[0];
+    f->window.room[@A_MEASUREMENT@] = sizeof f->measurement / sizeof f->measurement[0];
+    f->window.room[@A_COPY@] = QG_COPIES;
 }
 
 static void qgi_start(qg_filter *f)
@@ -710,7 +528,7 @@ int qg_state(const qg_filter *f, qg_estimate *estimate)
     if (!f->started)
         return QG_NOT_STARTED;
     qg_core_keep(&result, &raised, qgi_flight(f), (int64_t)(uintptr_t)row);
-    estimate->time = f->time;
+    estimate->time = f->window.time;
     memcpy(estimate->position, row, 3 * 8);
     memcpy(estimate->velocity, row + 3, 3 * 8);
     memcpy(estimate->R_BI, row + 6, 9 * 8);
@@ -757,7 +575,7 @@ int qg_action(qg_filter *f, const qg_reference *reference, float action[4])
     static const double zero[3] = {0.0, 0.0, 0.0}, up[3] = {0.0, 0.0, 1.0};
     float observation[@SIZE@], *o = observation, found[4];
     qg_estimate e;
-    if (qg_state(f, &e) != QG_OK || !f->has_gyro)
+    if (qg_state(f, &e) != QG_OK || !f->window.has_gyro)
         return QG_NOT_STARTED;
     (void)zero, (void)up;
     @FIELDS@

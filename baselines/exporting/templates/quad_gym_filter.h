@@ -199,31 +199,18 @@ int qg_policy(const float observation[@SIZE@], float action[4]);
 /* ---- memory: use the functions above ---- */
 
 @STRUCTS@
-typedef struct {
-    double start, time; /* when it begins, and the time after it */
-    qg_sample_record sample;
-    int measurement; /* index of a measurement; -1: a sample */
-    int copy;        /* index of a copy of the filter before it; -1: none */
-} qg_event;
-
-typedef struct {
-    qg_measurement_record record;
-    double time;
-    int rank; /* order among equal time stamps */
-    int used;
-} qg_pending;
-
 struct qg_filter {
     double flight[@FLIGHT_WORDS@], params[@PARAMS_WORDS@], work[@WORK_WORDS@], steps[@STEPS_WORDS@];
     uint64_t table[@STAGES@];
     qg_start_record first;
-    double time, gyro[3];
     float last_action[4];
-    int started, has_gyro, events, since_copy, waiting;
-    qg_event event[QG_EVENTS];
-    qg_pending waits[QG_WAITING];
-    qg_measurement_record measurement[QG_MEASUREMENTS];
-    char measurement_used[QG_MEASUREMENTS], copy_used[QG_COPIES];
+    int started;
+    qg_window_record window;
+    qg_event_record event[QG_EVENTS];
+    qg_pending_record waits[QG_WAITING];
+    qg_operation_record operation[QG_EVENTS + QG_COPIES + 4 * QG_WAITING + 8];
+    qg_sample_record sample[QG_EVENTS + 2 * QG_WAITING + 4];
+    qg_measurement_record measurement[QG_MEASUREMENTS + QG_WAITING];
     double copy[QG_COPIES][@COPY_WORDS@];
 };
 
