@@ -82,9 +82,9 @@ class FlightScene:
         if len(self.trajectory_times):
             return self._trajectory(np.atleast_1d(times) + self.trajectory_phase)
         harmonics = np.arange(1, len(self.reference_cos) + 1)
-        angles = self.reference_omega * np.outer(times, harmonics)
-        swing = np.cos(angles) @ self.reference_cos + np.sin(angles) @ self.reference_sin
-        return np.asarray(self.reference_center + swing)
+        angles = self.reference_omega * np.outer(times, harmonics)[..., np.newaxis]
+        swing = self.reference_cos * np.cos(angles) + self.reference_sin * np.sin(angles)
+        return np.asarray(self.reference_center + swing.sum(axis=1))
 
     @property
     def reference_period(self) -> float:

@@ -141,11 +141,10 @@ class FlightRecorder:
         if not self._copies:
             return
         batch, self._copies = self._batch.with_records(self._copies), []
-        for k in range(batch.count):
-            if self._count == len(self._rows):
-                self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-            _fill(self._rows[self._count], batch, np.array([k]), scene)
-            self._count += 1
+        begin, self._count = self._count, self._count + batch.count
+        while self._count > len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        _fill(self._rows[begin : self._count], batch, scene)
 
     def _scene_of_episode(self) -> FlightScene:
         batch, model, world = self._batch, self._model, self._batch.world
@@ -194,31 +193,45 @@ class FlightRecorder:
         )
 
 
-def _fill(row: Any, batch: FlightBatch, which: NDArray[np.intp], scene: FlightScene) -> None:
-    """Fill a row of `COLUMNS` with the present instant of one flight, of index (1,)."""
+def _fill(rows: NDArray[Any], batch: FlightBatch, scene: FlightScene) -> None:
+    """Fill rows of `COLUMNS` with the instants of one flight, which `batch` has as flights."""
     for name in READ:
         if batch.run_filter or name not in WITH_FILTER:
-            row[name] = batch.read(name, which)[0]
-    row["reference_position"] = scene.reference(row["time"])[0]
-    if scene.task == "waypoints":
-        row["reference_position"] = batch.record("ref_center", which)[0]
+            rows[name] = batch.read(name)
+    course = scene.task == "waypoints"
+    rows["reference_position"] = (
+        batch.record("ref_center") if course else scene.reference(rows["time"])
+    )
     if not batch.run_filter:
         for name in WITH_FILTER:
-            row[name] = np.nan
+            rows[name] = np.nan
         return
-    L, R_hat, gate = (batch.record(name, which)[0] for name in ("L", "R_hat", "gate"))
-    row["covariance"] = L @ L.T
-    words = ("position", "velocity", "accel_bias", "gyro_bias")
-    truth = {word: row[word] for word in words}
-    estimate = {word: row[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
-    try:
-        truth["R_BI"] = quaternion_to_dcm(row["quaternion"])
-        error = state_error(truth, estimate, rotation_vector=batch.sensors.flow_alone)
-        row["nees"] = nees(error, row["covariance"])
-    except ValueError:  # a state that is not finite, or a singular covariance
-        row["nees"] = np.nan
+    L, gate = batch.record("L"), batch.record("gate")
+    rows["covariance"] = L @ np.swapaxes(L, 1, 2)
+    rows["nees"] = _nees(rows, batch.record("R_hat"), rotation_vector=batch.sensors.flow_alone)
     for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):
-        row["gnss_decision"][block] = np.nan if np.isnan(row[name]).all() else gate[block]
-    seen = np.isfinite(row["pixels"]).all(axis=1)
-    decisions = gate[FEATURE_BLOCKS:AID_BLOCKS][: len(seen)]
-    row["feature_decision"] = np.where(seen, decisions, np.nan)
+        measured = ~np.isnan(rows[name]).all(axis=1)
+        rows["gnss_decision"][:, block] = np.where(measured, gate[:, block], np.nan)
+    seen = np.isfinite(rows["pixels"]).all(axis=2)
+    decisions = gate[:, FEATURE_BLOCKS:AID_BLOCKS][:, : seen.shape[1]]
+    rows["feature_decision"] = np.where(seen, decisions, np.nan)
+
+
+def _nees(
+    rows: NDArray[Any], R_hat: NDArray[np.float64], *, rotation_vector: bool
+) -> NDArray[np.float64]:
+    """NEES (n,) of rows, by `state_error`; NaN where it is undefined."""
+    words = ("position", "velocity", "accel_bias", "gyro_bias")
+    estimate = {word: rows[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
+    try:
+        truth = {word: rows[word] for word in words} | {
+            "R_BI": quaternion_to_dcm(rows["quaternion"])
+        }
+        error = state_error(truth, estimate, rotation_vector=rotation_vector)
+        return nees(error, rows["covariance"])
+    except ValueError:  # a state that is not finite, or a singular covariance: which row has it?
+        if len(rows) == 1:
+            return np.array([np.nan])
+        parts = (slice(len(rows) // 2), slice(len(rows) // 2, None))
+        found = [_nees(rows[p], R_hat[p], rotation_vector=rotation_vector) for p in parts]
+        return np.concatenate(found)
