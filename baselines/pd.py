@@ -80,6 +80,14 @@ def _require_plain_observations(env: Any) -> None:
         layer = inner
 
 
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products of vectors (n, 3), in a tenth of the time of `numpy.cross` for n = 1."""
+    return a.take(_NEXT, 1) * b.take(_LAST, 1) - a.take(_LAST, 1) * b.take(_NEXT, 1)
+
+
 def _unit(vectors: Array) -> Array:
     """Vectors (n, 3) divided by their lengths."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
@@ -277,8 +285,8 @@ class PDPolicy:
     @staticmethod
     def _attitude_error(z_wanted: Array, heading: Array) -> Array:
         """Return e (n, 3), `[e x] = R_E^T - R_E`: twice the rotation vector of small errors [-]."""
-        b = _unit(np.cross(z_wanted, heading))
-        a = np.cross(b, z_wanted)
+        b = _unit(_cross(z_wanted, heading))
+        a = _cross(b, z_wanted)
         return np.stack(
             [b[:, 2] - z_wanted[:, 1], z_wanted[:, 0] - a[:, 2], a[:, 1] - b[:, 0]], axis=1
         )
@@ -302,7 +310,7 @@ class PDPolicy:
         if self._action == "velocity":
             return np.hstack([self._velocity(F, seen), self._yaw(rates)])
         w = seen.body_rates
-        gyroscopic = np.cross(w, w @ np.array(vehicle.inertia).T)
+        gyroscopic = _cross(w, w @ np.array(vehicle.inertia).T)
         torque = np.array(g.attitude) * e - np.array(g.body_rates) * w + gyroscopic
         if self._action == "wrench":
             return np.hstack([collective, torque / vehicle.hover_torques])
@@ -315,7 +323,7 @@ class PDPolicy:
     def _level_axes(up: Array) -> tuple[Array, Array]:
         """Horizontal unit vectors ahead and to the left, in B."""
         ahead = _unit(np.array([1.0, 0.0, 0.0]) - up[:, :1] * up)
-        return ahead, np.cross(up, ahead)
+        return ahead, _cross(up, ahead)
 
     def _tilt(self, z_wanted: Array, up: Array) -> Array:
         """Roll and pitch of the desired thrust axis, scaled, (n, 2)."""

@@ -118,10 +118,11 @@ def roll_out(
         if step > limit // 2:
             late[flying] += info["position_error"][flying]
         over = flying & (terminated | truncated)
-        ending[over] = [str(Ending(number)) for number in info["ending"][over]]
-        crashed |= over & terminated & ~np.isin(info["ending"], NO_CRASHES)
-        gates[over] = info["gates_passed"][over]
-        flying &= ~over
+        if over.any():
+            ending[over] = [str(Ending(number)) for number in info["ending"][over]]
+            crashed |= over & terminated & ~np.isin(info["ending"], NO_CRASHES)
+            gates[over] = info["gates_passed"][over]
+            flying &= ~over
         if watch is not None:
             watch(step, quads.flights.batch, flying | (over & (lengths == limit)))
         if not flying.any():

@@ -239,6 +239,7 @@ def save_figure(figure: Any, stem: Path | str) -> list[Path]:
     files = {Path(f"{stem}.png"): {"Software": None}, Path(f"{stem}.svg"): {"Date": None}}
     for file, metadata in files.items():
         figure.savefig(file, metadata=metadata)
+        figure.set_layout_engine(None)  # the second file keeps the layout of the first
     return list(files)
 
 

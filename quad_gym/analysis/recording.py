@@ -143,18 +143,17 @@ class Tracer:
             self._flying, self._crashed = flying.copy(), np.zeros(len(flying), bool)
             if batch.task.kind == "waypoints":
                 self._gates = batch.record("gates", first)[0, : batch.task.gate_count]
-        ended = self._flying & ~flying
-        regular = (Ending.TIME_LIMIT, *NO_CRASHES)
-        self._crashed[ended] = ~np.isin(batch.result("ending")[ended], regular)
+        if (ended := self._flying & ~flying).any():
+            regular = (Ending.TIME_LIMIT, *NO_CRASHES)
+            self._crashed[ended] = ~np.isin(batch.result("ending")[ended], regular)
         self._flying = flying.copy()
         counted = np.where(self._crashed, batch.task.out_of_bounds, errors)[flying | self._crashed]
         shares = np.percentile(counted, (5.0, 50.0, 95.0)) if counted.size else [np.nan] * 3
         self._percentiles.append(np.asarray(shares))
         self._shares.append(1.0 - float(self._crashed.mean()))
         if flying[0]:
-            heading = quaternion_to_dcm(batch.record("q", first)[0])[0, :2]
-            place, reference = batch.record("r", first)[0], batch.read("reference_position", first)
-            self._path.append((place, heading, reference[0], errors[0]))
+            q, place = batch.record("q", first)[0], batch.record("r", first)[0]
+            self._path.append((place, q, batch.read("reference_position", first)[0], errors[0]))
 
     @property
     def time(self) -> Floats:
@@ -177,6 +176,6 @@ class Tracer:
 
     def trace(self) -> Trace:
         """Path of the first flight, up to its end."""
-        position, heading, reference, error = map(np.array, zip(*self._path, strict=True))
-        places = reference if self._gates is None else self._gates
-        return Trace(self.time[: len(position)], position, heading, places, error)
+        position, q, reference, error = map(np.array, zip(*self._path, strict=True))
+        places, heading = reference if self._gates is None else self._gates, quaternion_to_dcm(q)
+        return Trace(self.time[: len(position)], position, heading[:, 0, :2], places, error)
