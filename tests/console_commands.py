@@ -4,7 +4,9 @@ import contextlib
 import io
 import re
 import sys
+from pathlib import Path
 from typing import NamedTuple
+from unittest import mock
 
 import pytest
 
@@ -24,12 +26,22 @@ def line(command, *options):
     return [sys.executable, "-m", "quad_gym", command, *map(str, options)]
 
 
-def run(command, *options, where=None):
-    """Run `quad-gym COMMAND` with its options, in the folder `where` if it is given."""
+def without_figures():
+    """Figures are empty files: drawing takes most of the time of a short run."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return contextlib.nullcontext()
+    return mock.patch.object(Figure, "savefig", lambda self, file, **_: Path(file).touch())
+
+
+def run(command, *options, where=None, figures=False):
+    """Run `quad-gym COMMAND` with its options, in the folder `where`; `figures`: draw them."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.redirect_stdout(out))
         stack.enter_context(contextlib.redirect_stderr(err))
+        stack.enter_context(contextlib.nullcontext() if figures else without_figures())
         if where is not None:
             stack.enter_context(contextlib.chdir(where))
         try:

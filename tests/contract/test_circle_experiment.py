@@ -9,6 +9,7 @@ import pytest
 from quad_gym import pd_gains
 from quad_gym.commands import circle as script
 from quad_gym.commands.options import parse
+from tests.console_commands import without_figures
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("tqdm")
@@ -22,9 +23,9 @@ def run(folder, line=""):
 
 
 @pytest.fixture
-def no_figures(monkeypatch):
-    """Skip the figures, which take most of the time of a short run."""
-    monkeypatch.setattr(script.circle, "write_figures", lambda results, setup: [])
+def no_figures():
+    with without_figures():
+        yield
 
 
 @pytest.fixture(scope="module")

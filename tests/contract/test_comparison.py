@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from quad_gym.commands import evaluate
-from quad_gym.commands.main import main
 from tests.console_commands import refused, run
 
 pytest.importorskip("stable_baselines3")
@@ -24,7 +23,9 @@ def test_evaluate_writes_the_printed_numbers(tmp_path):
     done = run(
         "evaluate",
         *("--policy", "pd", "pd:lab", "pretrained", "--episodes", 20, "--output", tmp_path / "out"),
+        *("--env", "duration=10.0"),
         where=tmp_path,
+        figures=True,
     )
     assert done.returncode == 0, done.stderr
     rows = read_csv(tmp_path / "out/episodes.csv")
@@ -77,14 +78,14 @@ def test_evaluate_without_included_policy_flies_pd(tmp_path, capsys):
         assert told in capsys.readouterr().out
 
 
-def compare(where, *more):
+def compare(where, *more, figures=False):
     line = ["--quick", "--engine", "compiled", "--steps", 4096, "--output", where / "out"]
     line += ["--env", "duration=0.4"]
-    return run("compare", *line, *more, where=where)
+    return run("compare", *line, *more, where=where, figures=figures)
 
 
 def test_compare_writes_report_and_continues(tmp_path):
-    done = compare(tmp_path)
+    done = compare(tmp_path, figures=True)
     assert done.returncode == 0, done.stderr
     for part in ("trained on the estimate", "PD, tuned", "A single training seed is not concl"):
         assert part in done.stdout
@@ -104,18 +105,17 @@ def test_compare_writes_report_and_continues(tmp_path):
     assert "contains a run of another plan (different: environment)" in other.stderr
 
 
-def test_evaluate_replaces_results_only_with_overwrite(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_evaluate_replaces_results_only_with_overwrite(tmp_path, capsys):
     few = "--policy pd --observation truth --episodes 2 --env duration=0.4"
     line = ["evaluate", "hover", *few.split()]
-    main(line)
+    run(*line, where=tmp_path)
     folder = tmp_path / "results" / "evaluate"
     file = folder / "hover" / "summary.json"
     before = file.read_text()
-    main([*line, "--seed", "5"])
+    run(*line, "--seed", 5, where=tmp_path)
     assert (folder / "hover_2" / "summary.json").exists()
     assert "--overwrite" in refused([*line, "--output", str(file.parent)], capsys)
     assert file.read_text() == before
-    main([*line, "--seed", "5", "--overwrite"])
+    run(*line, "--seed", 5, "--overwrite", where=tmp_path)
     assert file.read_text() != before
     assert not (folder / "hover_3").exists()

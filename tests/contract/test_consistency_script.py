@@ -10,17 +10,16 @@ import pytest
 import quad_gym
 from quad_gym.analysis.consistency import MeanSquare
 from quad_gym.analysis.consistency_flights import Findings
-from quad_gym.experiments import consistency
 from tests import console_commands
 
 
-def run(output, *options):
+def run(output, *options, figures=False):
     common = "--sensors lab --form corrected --no-camera --episodes 64 --duration 1 --output"
-    return console_commands.run("consistency", *common.split(), output, *options)
+    return console_commands.run("consistency", *common.split(), output, *options, figures=figures)
 
 
 def test_command_writes_figures_numbers_and_configuration(tmp_path):
-    done = run(tmp_path, "--estimator", "ekf")
+    done = run(tmp_path, "--estimator", "ekf", figures=True)
     assert done.returncode == 0, done.stderr
     assert "NEES" in done.stdout
     assert "Filters with a numerical failure: 0." in done.stdout
@@ -35,8 +34,7 @@ def test_command_writes_figures_numbers_and_configuration(tmp_path):
     assert len(found["nees"]["state"]["mean"]) == len(found["rms_errors"]) == 21
 
 
-def test_wrong_noise_is_called_overconfident_or_too_cautious(tmp_path, monkeypatch):
-    monkeypatch.setattr(consistency, "save_figure", lambda figure, stem: [])
+def test_wrong_noise_is_called_overconfident_or_too_cautious(tmp_path):
     assert run(tmp_path, "--noise-factor", "1.5").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
     assert not found["consistent"]
@@ -72,7 +70,7 @@ class Held(quad_gym.Estimator):
 
 def test_estimator_without_covariance_has_errors_but_no_verdict(tmp_path):
     options = f"--estimator {__name__}:Held --sensors rtk --episodes 16 --duration 0.5"
-    done = console_commands.run("consistency", *options.split(), "--output", tmp_path)
+    done = console_commands.run("consistency", *options.split(), "--output", tmp_path, figures=True)
     assert done.returncode == 0, done.stderr
     assert "has no covariance, so its consistency cannot be tested" in done.stdout
     assert "nan" not in done.stdout

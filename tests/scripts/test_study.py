@@ -13,7 +13,7 @@ from scripts.studies import __main__ as command
 from scripts.studies.arms import Arm
 from scripts.studies.study import Study
 from scripts.studies.tasks import STUDIED, stays
-from tests.console_commands import plain
+from tests.console_commands import plain, without_figures
 from tests.scripts.running import run
 
 QUICK = ["look_around", "--quick", "--steps", "4096", "--env", "duration=0.6"]
@@ -45,7 +45,8 @@ def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     before = kept.stat().st_mtime_ns, (gone / "best.npz").read_bytes()
     for file in gone.iterdir():
         file.unlink()
-    run(words)
+    with without_figures():
+        run(words)
     assert kept.stat().st_mtime_ns == before[0]
     again = json.loads((folder / "summary.json").read_text())
     assert again["rows"] == summary["rows"]  # the repeated training is bitwise equal

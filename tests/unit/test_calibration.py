@@ -164,7 +164,7 @@ def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
     rows = [f"0.{k},0,0,0,0,0,9.8" for k in range(3)]
     (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *rows]))
     options = ["--no-delays", "--output", "mine", "--vehicle", "body.toml", "--body", "frd"]
-    ended = run("calibrate", "flight.csv", *options, where=tmp_path)
+    ended = run("calibrate", "flight.csv", *options, where=tmp_path, figures=True)
     assert ended.returncode == 0, ended.stderr
     assert "Wrote no body.toml: the log has no motor voltages" in ended.stdout
     assert (

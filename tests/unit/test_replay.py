@@ -324,7 +324,7 @@ def test_command_writes_estimates_and_innovations(recorded, tmp_path):
     pytest.importorskip("matplotlib")
     recorded.write_csv(tmp_path / "flight.csv")
     options = ("flight.csv", "--sensors", "rtk", "--output", "out")
-    ended = run("replay", *options, where=tmp_path)
+    ended = run("replay", *options, where=tmp_path, figures=True)
     assert ended.returncode == 0, ended.stderr
     assert "features" in ended.stdout
     out = tmp_path / "out"
