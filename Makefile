@@ -4,8 +4,8 @@ JOBS ?= 2
 VENV := .venv
 OLDEST := .venv-oldest
 BIN := $(VENV)/bin
-# pip compiles to bytecode one file after the other, and the tests of all packages
-BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
+# pip compiles to bytecode one file after the other, and also what nobody imports
+BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/|/dialects/|/pip/|/debugpy/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
 .PHONY: setup demo circle results test test-oldest test-clients test-arm test-slow soak golden lint benchmark docs reference kernels wheel wheel-arm clean
