@@ -63,6 +63,14 @@ def test_layout_before_2015_has_the_clock_of_the_vehicle(flight, dataflash):
     np.testing.assert_allclose(read_log(path).gnss.received, flight.fix_time + BOOT + 0.2)
 
 
+def test_layout_before_2015_without_a_receiver_keeps_heights_only(flight, dataflash):
+    rows = [row for row in foreign.ardupilot_rows(flight, old=True) if row[1] != "GPS"]
+    path = dataflash(lambda _: rows, old=True, layouts=foreign.OLD_LAYOUTS)
+    result = replay(path, sensors=CONSUMER, start={"position": (0.0, 0.0, 0.0), "heading": 0.3})
+    assert np.abs(flight.errors(result, BOOT)[:, 2]).max() < CLOSE[2]
+    has(result.problems, "position: nothing corrects it", "dead reckoning")
+
+
 @pytest.mark.parametrize("place", [0, 350, 699])
 @pytest.mark.parametrize("hours", [1.0, -0.002])
 def test_a_wrong_stamp_costs_one_row(flight, dataflash, place, hours):
@@ -103,6 +111,24 @@ def test_receiver_with_a_fix_is_taken(flight, dataflash, lost):
         has(chosen.notes, "no data", "--instance gnss=1")
     with pytest.raises(ValueError, match=r"flight.bin: instance of gnss must be .*\(0, 1\), got 5"):
         read_log(path, instance={"gnss": 5})
+
+
+@pytest.mark.parametrize(
+    ("damage", "kept", "sentence"),
+    [(b"\xff" * 700, 690, "skipped: 7"), (b"\xa3\x95\xee", 300, "type is unknown")],
+)
+def test_damage_of_a_file_is_counted_and_not_printed(
+    flight, dataflash, capfd, damage, kept, sentence
+):
+    path = dataflash()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:20_000] + damage + whole[20_000:])
+    log = read_log(path)
+    assert len(log.imu) > kept
+    has(log.notes, sentence)
+    assert capfd.readouterr() == ("", "")
+    path.write_bytes(whole)
+    assert not any("damaged" in note for note in read_log(path).notes)
 
 
 def test_receiver_that_could_take_over_in_flight_is_named(flight, dataflash):
@@ -465,6 +491,29 @@ def test_clocks_with_nothing_in_common_are_refused_with_both_ranges(flight):
     pattern = r"gnss.*from 1700000000\.000 s to .* and the IMU from 0\.020 s to 14\.000 s"
     with pytest.raises(ValueError, match=pattern):
         replay(table, sensors=CONSUMER)
+
+
+def test_headings_in_degrees_are_named_and_left_out(flight):
+    table, gnss = flight.table(), CONSUMER.gnss
+    suite = CONSUMER.replace(
+        magnetometer=None, gnss=gnss.replace(secondary_antenna_B=(-1.0, 0.0, 0.0))
+    )
+    turns = 0.3 + np.concatenate([[0.0], np.cumsum(flight.gyro[1:, 2] * np.diff(flight.time))])
+    headings = np.full(len(table["time"]), np.nan)
+    rows = np.isfinite(table["gyro"]).all(axis=1)
+    headings[rows] = 90.0 + np.degrees(turns)
+    result = replay(table | {"heading": headings}, sensors=suite, start={"heading": 0.3})
+    has(result.problems, "headings reach 1", "in degrees?", "left out")
+    assert "gnss_baseline" not in result.measured
+    headings[rows] = turns
+    assert compared(read_log(table | {"heading": headings}), suite).problems == ()
+
+
+def test_log_without_measurements_is_dead_reckoning(flight):
+    imu = {name: getattr(flight, name) for name in ("time", "gyro", "accel")}
+    start = {"position": (0.0, 0.0, 0.0), "heading": 0.3}
+    result = replay(imu, sensors=CONSUMER, start=start)
+    has(result.problems, "position: nothing corrects it for 14 s", "dead reckoning")
 
 
 def test_calm_flight_gives_no_false_finding():

@@ -23,11 +23,15 @@ for receivers of unknown type.
 Source: ArduPilot, "Onboard Message Log Messages"; `AP_GPS_Backend::get_lag`.
 """
 
+import os
 import re
 from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 
@@ -75,7 +79,8 @@ def read_bin(path: Path | str) -> RawLog:
         ValueError: If the file is no such log, or has no IMU samples.
         OSError: If there is no such file.
     """
-    with reading(path, "a log of ArduPilot", "logs of ArduPilot", "pymavlink", "ardupilot") as file:
+    kind = "a log of ArduPilot", "logs of ArduPilot", "pymavlink", "ardupilot"
+    with reading(path, *kind) as file, _quiet() as printed:
         tables, parameters = _tables(file)
     if "IMU" not in tables:
         raise ValueError(f"{file.name} must be a log of ArduPilot with messages IMU, got none")
@@ -88,7 +93,31 @@ def read_bin(path: Path | str) -> RawLog:
             *_aids(tables, parameters),
         ],
         barometer_from_start=True,
+        notes=list(_damage(printed)),
     )
+
+
+def _damage(printed: bytearray) -> Iterator[str]:
+    """Yield sentences on damaged parts of a file, from what pymavlink has printed."""
+    if count := printed.count(b"bad header"):
+        yield f"damaged bytes of the file that are skipped: {count}"
+    if b"unknown msg type" in printed:
+        yield "the file is not read beyond a damaged message, whose type is unknown"
+
+
+@contextmanager
+def _quiet() -> Iterator[bytearray]:
+    """Keep from the terminal what pymavlink prints, a line for each damaged byte; yield it."""
+    printed, kept = bytearray(), os.dup(2)  # as its indexer is in C
+    with TemporaryFile() as file, redirect_stdout(StringIO()), redirect_stderr(StringIO()) as lines:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield printed
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            printed += file.read() + lines.getvalue().encode()
 
 
 def _tables(file: Path) -> tuple[_Tables, dict[str, float]]:

@@ -170,6 +170,9 @@ def compared(log: Log, suite: SensorSuite) -> Log:
     if suite.barometer is not None:
         checks += [_unit_of_barometer, _level_of_barometer]
     problems = list(log.problems)
+    for changes, sentence in _unit_of_heading(log):
+        log = replace(log, **changes)
+        problems.append(sentence)
     origin_G = None if gnss is None else np.array(gnss.reference_antenna_G)
     for check in checks:
         for changes, sentence in check(log, *_places(log, origin_G)):
@@ -354,6 +357,21 @@ def _level_of_barometer(log: Log, time: Floats, places: Floats) -> _Found:
             {"barometer_from_start": True},
             f"heights of the barometer are {apart:.0f} m above those of GNSS in the median: above "
             "sea level beside heights above home? Only their changes are used",
+        )
+
+
+def _unit_of_heading(log: Log) -> _Found:
+    """Headings beyond a whole turn and what the vehicle has turned."""
+    headings = None if log.attitude is None else log.attitude.values.get("heading")
+    if headings is None or not len(headings):
+        return
+    turned = np.cumsum(log.imu.values["gyro"][1:, 2] * np.diff(log.imu.time))
+    largest, most = float(np.abs(headings).max()), 2.0 * math.pi + 1.5 * float(np.ptp(turned))
+    if largest > most:
+        yield (
+            {"attitude": None},
+            f"headings reach {largest:.3g} rad, at most {most:.3g} expected: in degrees? They are "
+            "left out",
         )
 
 
