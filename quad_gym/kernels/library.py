@@ -18,6 +18,7 @@ from quad_gym.kernels.sources import digest_in, sources_digest
 from quad_gym.records.width import WIDTH, runs_lanes
 
 FOLDER = Path(__file__).with_name("libraries")
+DEVICE_KERNEL = "qg_fly"  #: kernel of a module for a GPU: call (address), blocks, command
 _CHOICES = ("", "library", "numba")
 
 

@@ -6,6 +6,7 @@ calls the entries. Records depend on the number of lanes, so each library has a 
 """
 
 import concurrent.futures
+import functools
 import gc
 import multiprocessing
 import os
@@ -14,8 +15,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from quad_gym.kernels.compiling.foreign import Processor, object_of
 from quad_gym.kernels.cores import available_cores
@@ -39,6 +41,7 @@ _GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "QUAD_GYM_KER
 _LINK = ("-shared", "-fPIC", "-O2", "-s", "-Wl,-Bsymbolic,-z,noexecstack,--no-undefined")
 _WITH_LIBM = {("x86_64", 2)}
 """Libraries that call the C library's `fma`, `rint` and `floor`, which processors may lack."""
+Result = TypeVar("Result")
 _TYPES = {int: "int64_t", bool: "uint8_t", float: "double"}
 
 
@@ -131,11 +134,18 @@ def objects_of(names: Sequence[str], processor: Processor, jobs: int | None = No
         processor: Processor to emit code for.
         jobs: Number of processes that compile; None: one for each core.
     """
+    return in_processes(functools.partial(object_of, processor=processor), names, jobs)
+
+
+def in_processes(
+    function: Callable[[str], Result], names: Sequence[str], jobs: int | None = None
+) -> list[Result]:
+    """Return a function's results for all names; jobs None: a process for each core."""
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(
         jobs or available_cores(), context, gc.disable
     ) as pool:
-        return [task.result() for task in [pool.submit(object_of, n, processor) for n in names]]
+        return list(pool.map(function, names))
 
 
 def calls(digest: str) -> str:

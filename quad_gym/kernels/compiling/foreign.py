@@ -9,6 +9,7 @@ import hashlib
 import os
 import re
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,9 +78,9 @@ class _ForeignLowering(typed_passes.NativeLowering):  # type: ignore[misc]
 _ForeignCompiler = compiler_with(_ForeignLowering)
 
 
-def is_cached(name: str, processor: Processor) -> bool:
-    """Return True if `object_of` need not compile."""
-    file = _file(name, processor)
+def is_cached(name: str, processor: Processor | None = None) -> bool:
+    """Return True if `object_of` need not compile; without a processor, `linked`."""
+    file = _file(name, "ir" if processor is None else "o", processor)
     return file is not None and file.is_file()
 
 
@@ -93,32 +94,36 @@ def object_of(name: str, processor: Processor) -> bytes:
     Raises:
         RuntimeError: If the code calls a function.
     """
-    file = _file(name, processor)
-    made = _read(file)
-    if made is None:
-        made = emitted(linked(name), processor)
-        _write(file, made)
-    return made
+    return cached(name, "o", processor, lambda: emitted(linked(name), processor))
 
 
 def linked(name: str) -> str:
     """Return the IR of an entry with all kernels that it reaches, cached by its sources."""
-    file = _file(name)
-    found = _read(file)
-    if found is None:
-        found = _linked(name).encode()
-        _write(file, found)
-    return found.decode()
+    return cached(name, "ir", None, lambda: _linked(name).encode()).decode()
 
 
-def _file(name: str, processor: Processor | None = None) -> Path | None:
-    """Return the cached object of an entry, or its linked IR; None: no folder is writable."""
+def cached(name: str, suffix: str, key: Any, make: Callable[[], bytes]) -> bytes:
+    """Return what `make` returns, cached by the sources of an entry and the text of a key."""
+    file = _file(name, suffix, key)
+    made = _read(file)
+    if made is None:
+        made = make()
+        _write(file, made)
+    return made
+
+
+def code_of(name: str) -> str:
+    """Return the name of the code of an entry, which depends on its sources."""
     entry = dispatcher_of(name)
-    if entry._cache.folder is None:
-        return None
-    code = entry._cache._name(entry.signature, cpu_target.target_context).removesuffix(".code")
-    digest = hashlib.sha256(repr((processor, _FORM)).encode()).hexdigest()[:12]
-    return Path(entry._cache.folder, f"{code}.{digest}.{'ir' if processor is None else 'o'}")
+    code: str = entry._cache._name(entry.signature, cpu_target.target_context)
+    return code.removesuffix(".code")
+
+
+def _file(name: str, suffix: str, key: Any) -> Path | None:
+    """Return a cached file of an entry; None: no folder is writable."""
+    folder = dispatcher_of(name)._cache.folder
+    digest = hashlib.sha256(repr((key, _FORM)).encode()).hexdigest()[:12]
+    return None if folder is None else Path(folder, f"{code_of(name)}.{digest}.{suffix}")
 
 
 def _read(file: Path | None) -> bytes | None:
