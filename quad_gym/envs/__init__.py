@@ -134,7 +134,7 @@ def make_torch_vec_env(
     Args:
         env_id: One of `IDS`, with or without the prefix "quad_gym:", or an id of `register_task`.
         num_envs: Number of flights.
-        device: Device of the tensors, "cpu".
+        device: Device of the flights and tensors: "cpu", or "cuda" for an NVIDIA GPU.
         autoreset_mode: "NextStep", "SameStep" or "Disabled", as in Gymnasium.
         keywords: Keywords of `QuadEnv`, `threads` and `render_flights`.
 
@@ -143,8 +143,8 @@ def make_torch_vec_env(
 
     Raises:
         TypeError: If a keyword is unknown; the exception is also a ValueError.
-        ValueError: If the id is unknown, or a value is invalid.
-        ImportError: If torch is not installed.
+        ValueError: If the id is unknown, a value is invalid, or there is no such GPU.
+        ImportError: If torch is not installed; on a GPU, also if cuda-core or Numba is not.
     """
     given: dict[str, Any] = keywords_of(env_id) | dict(keywords)
     try:
@@ -153,4 +153,8 @@ def make_torch_vec_env(
         raise ImportError(
             'make_torch_vec_env needs torch: pip install "quad-gym[train]"'
         ) from error
+    if str(device).partition(":")[0] == "cuda":
+        from quad_gym.envs.device_env import QuadDeviceVecEnv
+
+        return QuadDeviceVecEnv(num_envs, device=device, autoreset_mode=autoreset_mode, **given)
     return QuadTorchVecEnv(num_envs, device=device, autoreset_mode=autoreset_mode, **given)

@@ -173,7 +173,7 @@ class Flights:
 
             self.batch, self.table = batch_with_task(own_task, c, self.table)
         self.space = observation_space(self.table)
-        self._split = policy_size(self.table) if c.privileged else None
+        self.policy_size = policy_size(self.table) if c.privileged else None
 
     def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
         """The start values in the options of a reset, checked before anything changes."""
@@ -188,11 +188,11 @@ class Flights:
 
     def split(self, observations: NDArray[np.float32]) -> Any:
         """Observations (..., n) as the space wants them: an array, or a Dict of parts."""
-        if self._split is None:
+        if self.policy_size is None:
             return observations
         return {
-            "policy": observations[..., : self._split].copy(),
-            "privileged": observations[..., self._split :].copy(),
+            "policy": observations[..., : self.policy_size].copy(),
+            "privileged": observations[..., self.policy_size :].copy(),
         }
 
 

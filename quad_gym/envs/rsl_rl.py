@@ -39,7 +39,7 @@ class RslRlVecEnv(VecEnv):
         self.env, self.device, self.num_envs = env, env.device, env.num_envs
         self.num_actions = int(env.single_action_space.shape[0])  # type: ignore[index]
         self.max_episode_length = batch.max_steps
-        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long)
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.cfg = {"env_id": env.spec.id if env.spec else env.flights.name, "seed": seed}
         self._observations = env.reset(seed=seed)[0]
 

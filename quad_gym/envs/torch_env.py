@@ -98,12 +98,9 @@ def _checked_device(device: str | torch.device) -> torch.device:
     try:
         found = torch.device(device)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f'device must be "cpu", got {device!r}') from error
+        raise ValueError(f'device must be "cpu" or "cuda", got {device!r}') from error
     if found.type != "cpu":
-        raise ValueError(
-            f'device must be "cpu", because flights are computed on the processor, got {device!r}; '
-            "move the returned tensors to another device with .to(device)"
-        )
+        raise ValueError(f'device must be "cpu" or "cuda", got {device!r}')
     return found
 
 

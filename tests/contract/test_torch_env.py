@@ -74,7 +74,7 @@ def test_privileged_observations_are_a_dictionary_of_tensors():
     }
 
 
-@pytest.mark.parametrize("device", ["cuda", "meta", "tpu-9", 3.5])
+@pytest.mark.parametrize("device", ["cudas", "meta", "tpu-9", 3.5])
 def test_another_device_is_refused(device):
     with pytest.raises(ValueError, match='device must be "cpu"'):
         quad_gym.make_torch_vec_env(ENV_ID, 2, device=device)

@@ -1,0 +1,1 @@
+"""Flights on a GPU: their memory as torch tensors, and the launches of their kernel."""

@@ -1,0 +1,151 @@
+"""Flights whose records are a tensor: steps and resets are one launch each, without a wait.
+
+It needs NumPy and torch, and no compiler: plan and kernel may be made elsewhere.
+"""
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from quad_gym.device.plan import DevicePlan, Words
+from quad_gym.kernels.stages import STAGE_TABLE
+from quad_gym.records import WARP, Call, Command
+
+
+class Launcher(Protocol):
+    """Flies the blocks of a call."""
+
+    warps: int  #: warps in flight at once, each with its own workspace
+
+    def __call__(self, call: int, blocks: int, command: int) -> None:
+        """Fly so many blocks; `call`: address of the words of the call on the device."""
+
+
+class DeviceBatch:
+    """N flights of one configuration on a device.
+
+    All tensors are views of the memory that the kernel reads and writes: the next step overwrites
+    observations and results, and writing to a field changes the flights.
+
+    Args:
+        plan: The configuration.
+        count: Number of flights.
+        launcher: Flies them.
+        device: Device of the tensors.
+    """
+
+    def __init__(
+        self, plan: DevicePlan, count: int, launcher: Launcher, device: str | torch.device = "cuda"
+    ) -> None:
+        self.plan, self.count, self.device = plan, count, torch.device(device)
+        self._launch, size = launcher, plan.low.size
+        blocks = -(-count // WARP)
+        warps = min(launcher.warps, blocks)
+        self._blocks = self._repeated(plan.flight, blocks)
+        self.observations = self._zeros(count, size, kind=torch.float32)
+        """(n, k) float32, written by steps and resets"""
+        self.final_observations = torch.zeros_like(self.observations)
+        """(n, k) float32, written where one episode ends and the next begins in a step"""
+        self._actions = self._zeros(blocks * WARP, 4)
+        self._resets = self._zeros(count, kind=torch.uint8)
+        self._results = self._zeros(len(plan.results), blocks * WARP)
+        self._paths, table = (
+            list(map(self._put, (plan.paths, plan.pieces))),
+            np.zeros(1, STAGE_TABLE),
+        )
+        table["paths"], table["pieces"] = (tensor.data_ptr() for tensor in self._paths)
+        self._memory = {
+            Call.BLOCKS: self._blocks,
+            Call.RESETS: self._resets,
+            Call.WORLD: self._repeated(plan.world, 1),
+            Call.OWN: self._repeated(plan.world, warps),
+            Call.MODEL: self._repeated(plan.model, 1),
+            Call.BELIEVED: self._repeated(plan.model, warps),
+            Call.WORK: self._zeros(warps, plan.work, WARP),
+            Call.STAGES: self._put(table.view(np.int64)),
+            Call.ACTIONS: self._actions,
+            Call.LOW: self._put(plan.low),
+            Call.HIGH: self._put(plan.high),
+            Call.OBSERVATIONS: self.observations,
+            Call.FINAL_OBSERVATIONS: self.final_observations,
+            Call.RESULTS: self._results,
+        }
+        words = np.zeros(len(Call), np.int64)
+        for word, tensor in self._memory.items():
+            words[word] = tensor.data_ptr()
+        words[Call.BLOCKS] -= 8 * WARP * plan.skipped
+        words[Call.PITCH] = 8 * WARP * len(plan.flight)
+        words[Call.COUNT], words[Call.SIZE] = count, size
+        words[Call.RESULT_PITCH] = 8 * self._results.shape[1]
+        self._call = self._put(words)
+
+    def reset(self, keys: Words | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Begin episodes.
+
+        Args:
+            keys: (n, 2) keys of the random streams, see `quad_gym.batch.seeding`; None: the
+                streams continue.
+            mask: (n,) bool, flights to reset; None: all.
+
+        Returns:
+            The observations.
+        """
+        self._resets.fill_(1) if mask is None else self._resets.copy_(mask)
+        if keys is not None:
+            chosen = self._resets.bool()
+            given = self._put(keys.view(np.int64))
+            self.write("key", torch.where(chosen[:, None], given, self.record("key")))
+            for name in ("instant", "episode"):
+                self.write(name, self.record(name).masked_fill_(chosen, 0))
+        self._fly(Command.RESET)
+        return self.observations
+
+    def step(self, actions: torch.Tensor) -> torch.Tensor:
+        """Fly one control period; return the observations, see `result` for the rest.
+
+        Args:
+            actions: (n, 4); they are clipped to [-1, 1], and not checked for NaN, which would wait.
+        """
+        self._actions[: self.count].copy_(actions.detach()).clamp_(-1.0, 1.0)
+        self._fly(Command.STEP)
+        return self.observations
+
+    def _fly(self, command: Command) -> None:
+        self._launch(self._call.data_ptr(), len(self._blocks), int(command))
+
+    def result(self, name: str) -> torch.Tensor:
+        """Return one of the results of the last step, (n,) float64."""
+        return self._results[self.plan.results.index(name), : self.count]
+
+    def record(self, name: str) -> torch.Tensor:
+        """Return a copy of a field of all flights by its name in the kernels, (n, ...)."""
+        field = self._field(name)
+        return field.movedim(-1, 1).flatten(0, 1)[: self.count].clone()
+
+    def write(self, name: str, values: torch.Tensor) -> None:
+        """Write a field of all flights, (n, ...)."""
+        field = self._field(name)
+        flights = field.movedim(-1, 1)
+        whole, rest = divmod(self.count, WARP)
+        flights[:whole] = values[: whole * WARP].unflatten(0, (whole, WARP))
+        if rest:
+            flights[whole, :rest] = values[whole * WARP :]
+
+    def _field(self, name: str) -> torch.Tensor:
+        """Return a view of a field, (blocks, ..., WARP)."""
+        field = self.plan.fields[name]
+        part = self._blocks[:, field.first : field.first + int(np.prod(field.shape))]
+        part = part.view(torch.float64) if field.kind == "f8" else part
+        return part.unflatten(1, field.shape) if field.shape else part[:, 0]
+
+    def _put(self, array: Any) -> torch.Tensor:
+        return torch.from_numpy(np.array(array)).to(self.device)
+
+    def _zeros(self, *shape: int, kind: torch.dtype = torch.float64) -> torch.Tensor:
+        return torch.zeros(shape, dtype=kind, device=self.device)
+
+    def _repeated(self, words: Words, times: int) -> torch.Tensor:
+        """Return a record for all flights of so many blocks, (times, words, WARP)."""
+        one = self._put(words.view(np.int64))
+        return one[:, None].expand(times, -1, WARP).contiguous()

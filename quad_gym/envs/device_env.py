@@ -1,0 +1,163 @@
+"""`QuadDeviceVecEnv`: many flights on a GPU as a vector environment of torch tensors."""
+
+from collections.abc import Callable
+from typing import Any, Unpack
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from quad_gym.batch.seeding import Words, keys_of, stream_keys
+from quad_gym.device.emission import plan_of, ptx_of
+from quad_gym.device.flights import DeviceBatch, Launcher
+from quad_gym.device.launching import CudaLauncher
+from quad_gym.device.plan import DevicePlan
+from quad_gym.envs.flights import named_options
+from quad_gym.envs.keywords import VectorKeywords, shows
+from quad_gym.envs.torch_env import QuadTorchVecEnv
+from quad_gym.envs.vector import seeds_of
+from quad_gym.packing.configuration import MAX_FLIGHTS
+from quad_gym.params import checks as check
+
+_ON_PROCESSOR = ("threads", "render_mode", "render_flights")
+
+
+class QuadDeviceVecEnv(QuadTorchVecEnv):
+    """N flights on a GPU; flight i has the bits of a `QuadEnv` seeded with seed + i.
+
+    A step is one launch of the kernel, without a copy to the host or a wait. The tensors of
+    observations and `info` are views of the memory of the flights, which the next step overwrites.
+    `info` has "position_error" and "estimation_error", with `reward_terms=True` also these; with
+    `autoreset_mode="SameStep"`, "final_obs" and its mask "_final_obs". `batch.result` has the other
+    results of a step, and `batch.record` the records of the flights.
+
+    Args:
+        num_envs: Number of flights.
+        device: Device of the flights, such as "cuda" or "cuda:1".
+        launcher: Makes the launcher of a plan's kernel; None: on the GPU.
+        keywords: Keywords of `QuadEnv`.
+
+    Raises:
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
+        ValueError: If there is no GPU, the value of a keyword is invalid, or the configuration
+            needs Python during a step: tasks and estimators in Python, and rendering.
+        ImportError: If cuda-core or Numba is not installed.
+    """
+
+    @shows(VectorKeywords)
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        device: str | torch.device = "cuda",
+        base: str | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        launcher: Callable[[DevicePlan], Launcher] | None = None,
+        **keywords: Unpack[VectorKeywords],
+    ) -> None:
+        given: dict[str, Any] = dict(keywords)
+        for name in _ON_PROCESSOR:
+            if given.pop(name, None) is not None:
+                raise ValueError(f"{name} is of flights on the processor, and must not be given")
+        check.whole("num_envs", num_envs, most=MAX_FLIGHTS)
+        on_gpu = torch.device(device)
+        if launcher is None and not torch.cuda.is_available():
+            raise ValueError(
+                f'device "{on_gpu}" needs an NVIDIA GPU and a torch with CUDA, and '
+                "torch.cuda.is_available() is False"
+            )
+        super().__init__(1, base=base, autoreset_mode=autoreset_mode, threads=1, **given)
+        plan = plan_of(self.flights.batch)
+        make = launcher or (lambda plan: CudaLauncher(ptx_of(plan), on_gpu))
+        self.device, self.num_envs = on_gpu, num_envs
+        self.batch = DeviceBatch(plan, num_envs, make(plan), on_gpu)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        errors = ["position_error", "estimation_error"]
+        self._infos: dict[str, Any] = {name: self.batch.result(name) for name in errors}
+        if self.flights.reward_terms:
+            names = [name for name in plan.results if name.startswith("reward_")]
+            terms = {name.removeprefix("reward_"): self.batch.result(name) for name in names}
+            kept = self.flights.batch.reward_terms()
+            self._infos["reward_terms"] = {name: terms[name] for name in kept}
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes.
+
+        Args:
+            seed: A number s: flight i has the seed s + i; a list: one seed per flight; None:
+                continue the present streams.
+            options: "reset_mask" (n,) bool, a tensor: the flights to reset.
+
+        Returns:
+            Observations of all flights, and `info`, which is empty.
+
+        Raises:
+            ValueError: If an option is unknown, or the seeds do not fit the flights.
+        """
+        options = named_options(options)
+        mask = options.pop("reset_mask", None)
+        if options:
+            raise ValueError(
+                f"options on a GPU must be reset_mask alone, got {next(iter(options))}"
+            )
+        if mask is not None and (mask.dtype != torch.bool or mask.shape != (self.num_envs,)):
+            raise ValueError(
+                f"options['reset_mask'] must be a tensor ({self.num_envs},) of booleans, got "
+                f"{tuple(mask.shape)} of {mask.dtype}"
+            )
+        seen = self.batch.reset(self._keys(seed), mask if self._seeded else None)
+        self._seeded = True
+        return self._split(seen), {}
+
+    def _keys(self, seed: int | list[int | None] | None) -> Words | None:
+        """Return keys (n, 2) of the flights' streams; None: they continue."""
+        if seed is None:
+            rng = np.random.default_rng()
+            fresh = rng.integers(0, 2**64, (self.num_envs, 2), np.uint64, endpoint=False)
+            return None if self._seeded else fresh
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            return stream_keys(seeds_of(list(seed), self.num_envs))
+        first = check.seed("seed", seed) or 0
+        if first >= 1 << 63:
+            return stream_keys(seeds_of(first, self.num_envs))
+        return keys_of(np.arange(self.num_envs, dtype=np.uint64) + np.uint64(first))
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Fly one control period.
+
+        Args:
+            actions: (n, 4) on the device, in [-1, 1]; larger values are clipped, and NaN is not
+                detected. Gradients do not pass.
+
+        Returns:
+            Observations, rewards, terminated, truncated, `info`.
+
+        Raises:
+            ValueError: If the actions have another shape.
+            gymnasium.error.ResetNeeded: Before the first reset.
+        """
+        if tuple(actions.shape) != (self.num_envs, 4):
+            raise ValueError(
+                f"action must have shape {(self.num_envs, 4)}, got {tuple(actions.shape)}"
+            )
+        if not self._seeded:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        seen, result = self.batch.step(actions), self.batch.result
+        terminated, truncated = result("terminated") > 0.0, result("truncated") > 0.0
+        infos = dict(self._infos)
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            infos["final_obs"] = self._split(self.batch.final_observations)
+            infos["_final_obs"] = terminated | truncated
+        return self._split(seen), result("reward").float(), terminated, truncated, infos
+
+    def _split(self, seen: torch.Tensor) -> Any:
+        """Return observations as the space has them: a tensor, or a dictionary of parts."""
+        size = self.flights.policy_size
+        return seen if size is None else {"policy": seen[:, :size], "privileged": seen[:, size:]}

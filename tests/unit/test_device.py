@@ -1,0 +1,129 @@
+"""Flights on a GPU: device code on this processor flies as the batch does."""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.device.emission import plan_of, ptx_of
+from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.kernels.compiling.building import PROCESSORS
+from quad_gym.kernels.library import machine
+from quad_gym.params.suites import SUITES
+from quad_gym.records import WARP
+from tests.builders import vec_env
+from tests.golden import device, ptx
+from tests.golden.flights import trajectories
+
+torch = pytest.importorskip("torch")
+from quad_gym.envs.device_env import QuadDeviceVecEnv  # noqa: E402
+
+COUNT = 40  # a block, and a part of one
+TRUTH = {"observation": "truth", "max_episode_steps": 25, "max_tilt": 0.6}
+pytestmark = pytest.mark.skipif(machine() not in PROCESSORS, reason="no code for this processor")
+
+
+def launcher_of_ptx(plan):
+    """Return the launcher of a plan's PTX, translated to C."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, file = Path(folder, "flights.c"), f"{folder}/flights.so"
+        source.write_text(ptx.c_of(ptx_of(plan).decode(), -(-COUNT // WARP)))
+        options = ["-O1", "-w", "-fPIC", "-ffp-contract=off", "-fno-strict-aliasing", "-fwrapv"]
+        subprocess.run(["cc", *options, "-shared", "-o", file, source, "-lm"], check=True)
+        return device.HostLauncher(file)
+
+
+def device_env(base, count=COUNT, launcher=device.launcher_of, **keywords):
+    return QuadDeviceVecEnv(count, device="cpu", base=base, launcher=launcher, **keywords)
+
+
+def assert_flights_equal(base, mode, launcher=device.launcher_of, **keywords):
+    """Fly device code and the batch with the same actions; return the number of episodes."""
+    envs = device_env(base, launcher=launcher, autoreset_mode=mode, **keywords)
+    others = vec_env(base, COUNT, autoreset_mode=mode, **keywords)
+    seen, expected, episodes = envs.reset(seed=3)[0], others.reset(seed=3)[0], 0
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        assert np.array_equal(seen.numpy(), expected)
+        actions = rng.uniform(-1.2, 1.2, (COUNT, 4)).astype(np.float32)
+        seen, rewards, *over, infos = envs.step(torch.from_numpy(actions))
+        expected, wanted, *ended, known = others.step(actions)
+        assert np.array_equal(rewards.numpy(), wanted.astype(np.float32))
+        for flags, truths in zip(over, ended, strict=True):
+            assert np.array_equal(flags.numpy(), truths)
+        for i in np.flatnonzero(known.get("_final_obs", [])):
+            assert np.array_equal(infos["final_obs"][i].numpy(), known["final_obs"][i])
+        episodes += np.logical_or(*ended).sum()
+    for name in envs.batch.plan.fields:
+        values = others.flights.batch.record(name)
+        assert np.array_equal(envs.batch.record(name).numpy().view(values.dtype), values, True), (
+            name
+        )
+    return episodes
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_flights_of_device_code_equal_those_of_the_batch(mode):
+    assert assert_flights_equal("circle", mode, **TRUTH) > COUNT
+
+
+def test_flights_of_ptx_equal_those_of_the_batch():
+    assert assert_flights_equal("circle", "NextStep", launcher_of_ptx, **TRUTH) > COUNT
+
+
+@pytest.mark.slow  # compiles the filter
+@pytest.mark.parametrize("keywords", [{}, {"sensors": "rtk", "faults": "gnss_outage"}])
+def test_filtered_flights_of_device_code_equal_those_of_the_batch(keywords):
+    assert assert_flights_equal("circle", "NextStep", max_tilt=0.6, **keywords) > 0
+
+
+def test_reset_mask_of_device_flights_begins_these_episodes_alone():
+    envs = device_env("circle", 3, autoreset_mode="Disabled", **TRUTH)
+    envs.reset(seed=0)
+    before = envs.step(torch.zeros(3, 4))[0].clone()
+    after, _ = envs.reset(options={"reset_mask": torch.tensor([False, True, False])})
+    assert torch.equal(after[[0, 2]], before[[0, 2]])
+    assert not torch.equal(after[1], before[1])
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"base": "look_around"}, "a task in Python runs in Python"),
+        ({"render_mode": "rgb_array"}, "render_mode is of flights on the processor"),
+        ({"threads": 2}, "threads is of flights on the processor"),
+        (
+            {"innovations": True, "autoreset_mode": "SameStep"},
+            'innovations with autoreset_mode="SameStep" runs in Python',
+        ),
+    ],
+)
+def test_flights_that_need_python_are_refused_on_a_gpu(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        device_env(**{"base": "circle", "count": 2} | keywords)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_missing_gpu_is_named():
+    with pytest.raises(ValueError, match="needs an NVIDIA GPU and a torch with CUDA"):
+        quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 2, device="cuda")
+
+
+@pytest.mark.slow  # compiles all kernels
+@pytest.mark.parametrize("kind", [[], ["--modules", "Circle, standard", "many options"]])
+def test_golden_flights_are_the_same_by_device_code(kind):
+    command = [sys.executable, "-m", "tests.golden.device", *kind]
+    assert subprocess.run(command, cwd=device.ROOT, check=False).returncode == 0
+
+
+@pytest.mark.slow  # compiles all kernels
+@pytest.mark.parametrize("task", TASK_DEFAULTS)
+@pytest.mark.parametrize("sensors", SUITES)
+def test_every_suite_and_task_has_ptx(task, sensors):
+    keywords = {"trajectory": trajectories()} if task == "trajectory" else {}
+    batch = vec_env(task, 1, sensors=sensors, **keywords).flights.batch
+    assert b"visible .entry qg_fly" in ptx_of(plan_of(batch))
