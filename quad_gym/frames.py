@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.portable import norm
+from quad_gym.params.portable import atan2, cos, hypot, norm, sin
 
 WGS84_SEMI_MAJOR_AXIS = 6378137.0  #: semi-major axis of the WGS-84 ellipsoid [m]
 WGS84_FLATTENING = 1.0 / 298.257223563
@@ -68,18 +68,18 @@ def _checked_place(name: str, value: ArrayLike) -> NDArray[np.float64]:
 def _geodetic(r_G: NDArray[np.float64]) -> tuple[float, float, float]:
     x, y, z = map(float, r_G)
     eccentricity2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING)
-    p = math.hypot(x, y)
-    lat = math.atan2(z, p * (1.0 - eccentricity2))
+    p = hypot(x, y)
+    lat = atan2(z, p * (1.0 - eccentricity2))
     for _ in range(50):
-        sin_lat = math.sin(lat)
-        radius = WGS84_SEMI_MAJOR_AXIS / math.sqrt(1.0 - eccentricity2 * sin_lat**2)
-        previous, lat = lat, math.atan2(z + eccentricity2 * radius * sin_lat, p)
+        sin_lat = sin(lat)
+        radius = WGS84_SEMI_MAJOR_AXIS / math.sqrt(1.0 - eccentricity2 * (sin_lat * sin_lat))
+        previous, lat = lat, atan2(z + eccentricity2 * radius * sin_lat, p)
         if lat == previous:
             break
     sin_lat, cos_lat = math.sin(lat), math.cos(lat)
     radius = WGS84_SEMI_MAJOR_AXIS / math.sqrt(1.0 - eccentricity2 * sin_lat**2)
     height = p * cos_lat + z * sin_lat - WGS84_SEMI_MAJOR_AXIS**2 / radius
-    return float(lat), float(math.atan2(y, x)), float(height)
+    return float(lat), float(atan2(y, x)), float(height)
 
 
 def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
@@ -98,7 +98,7 @@ def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
         ValueError: If `r0_G` is not three finite numbers on the Earth.
     """
     lat, lon, _ = _geodetic(_checked_place("r0_G", r0_G))
-    sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
+    (sin_lat, sin_lon), (cos_lat, cos_lon) = map(sin, (lat, lon)), map(cos, (lat, lon))
     return np.array(
         [
             [-sin_lon, cos_lon, 0.0],

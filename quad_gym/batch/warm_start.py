@@ -142,8 +142,8 @@ def _turned_east(q: Floats, sensors: SensorSuite) -> Floats:
 
 def drift_sigma(gnss: GnssParams) -> Floats:
     """Return the standard deviation (3,) of the GNSS drift `WARM_UP` after it was zero [m]."""
-    decay = math.exp(-2.0 * WARM_UP / gnss.drift_tau)
-    return np.array(gnss.drift_sigma_I) * math.sqrt(1.0 - decay)
+    share = portable.approached(2.0 * WARM_UP / gnss.drift_tau)
+    return np.array(gnss.drift_sigma_I) * math.sqrt(share)
 
 
 def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:

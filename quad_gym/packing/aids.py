@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.params import portable
 from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import MIN_DRIFT
 from quad_gym.params.sensors import SensorSuite
@@ -69,17 +70,13 @@ def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
 
 def decay_and_drive(error: SlowError, time: float) -> tuple[float, float]:
     """Return the decay of a slow error over a time [s], and its driving noise's sigma."""
-    decay = math.exp(-time / error.tau)
-    return decay, error.sigma * math.sqrt(-math.expm1(-2.0 * time / error.tau))
+    drive = error.sigma * math.sqrt(portable.approached(2.0 * time / error.tau))
+    return portable.exp(-time / error.tau), drive
 
 
 def gate_limit(freedoms: int, false_alarm: float) -> float:
     """Return the NIS above which a measurement is rejected, a quantile of chi-square."""
-    if false_alarm == 0.0:
-        return float("inf")
-    from scipy.special import chdtri  # takes 0.1 s, needed with gates only
-
-    return float(chdtri(freedoms, false_alarm))
+    return portable.chi_square_limit(freedoms, false_alarm) if false_alarm else math.inf
 
 
 def pack_aids(p: Any, sensors: SensorSuite) -> None:

@@ -97,7 +97,7 @@ def _pack_imu(p: Any, sensors: SensorSuite, vehicle: VehicleParams) -> None:
     hover_speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
     for sensor in ("accel", "gyro"):
         p[f"{sensor}_sigma"] = getattr(imu, f"{sensor}_noise_density") / math.sqrt(imu.dt)
-        p[f"{sensor}_vibration"] = getattr(imu, f"{sensor}_vibration") / hover_speed**2
+        p[f"{sensor}_vibration"] = getattr(imu, f"{sensor}_vibration") / (hover_speed * hover_speed)
 
 
 def pack_tick(p: Any, sensors: SensorSuite) -> None:
@@ -159,7 +159,8 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
     alarm = estimator.false_alarm_probability
     p["gate_position"] = gate_limit(FREEDOMS[POSITION_BLOCK], alarm)
     p["gate_direction"] = gate_limit(FREEDOMS[BASELINE_BLOCK], alarm)
-    p["gate_uncertainty"] = np.inf if sensors.gnss is None else estimator.max_direction_sigma**2
+    sigma = math.inf if sensors.gnss is None else estimator.max_direction_sigma
+    p["gate_uncertainty"] = sigma * sigma
 
 
 def form_of(sensors: SensorSuite, innovations: bool = False, lever_arm: int = 0) -> FilterForm:

@@ -1,6 +1,5 @@
 """Settings as a record: the options of a batch of flights for kernels."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from quad_gym.packing.faults import pack_faults
 from quad_gym.packing.flight import form_of, lever_form
 from quad_gym.packing.world import pack_options, pack_places
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.sensors import delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.records import (
@@ -70,7 +70,7 @@ def _pack_task(s: Any, task: TaskParams) -> None:
     s["near_decay"], s["fine_decay"] = weights.near_decay, weights.fine_decay
     s["harmonics"] = _HARMONICS.get(kind, MAX_HARMONICS)
     s["path_count"] = len(task.trajectories)
-    s["min_up"] = math.cos(task.max_tilt)
+    s["min_up"] = portable.cos(task.max_tilt)
     for name in (
         *("randomize_reference", "radius", "period", "height", "preview"),
         *("max_speed", "max_acceleration", "gate_count", "gate_radius"),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.params import portable
 from quad_gym.params.obstacles import Obstacle
 from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomization
 from quad_gym.params.sensors import SensorSuite
@@ -87,7 +88,7 @@ def _pack_limits(s: Any, world: WorldParams) -> None:
         # ground contact ends an episode by a crash only; a vehicle far below has fallen through
         s["min_height"] = min(s["min_height"], world.ground_height - FALLEN_THROUGH)
         s["hard_speed"] = world.ground.max_touchdown_speed
-        s["hard_up"] = math.cos(world.ground.max_touchdown_tilt)
+        s["hard_up"] = portable.cos(world.ground.max_touchdown_tilt)
     s["contacts"] = bool(world.obstacles) or world.geofence is not None
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.checked import Checked
 from quad_gym.records import LOG_UNIFORM, NORMAL, UNIFORM
 
@@ -91,7 +92,7 @@ class LogUniform(_Between, kw_only=False):
 
     def placed(self, factor: float, shift: float) -> Affine:
         """Return the log-uniform distribution between the multiplied bounds."""
-        return Affine(LOG_UNIFORM, factor * self.low, math.log(self.high / self.low))
+        return Affine(LOG_UNIFORM, factor * self.low, portable.log(self.high / self.low))
 
 
 def _bound(name: str, value: Any) -> float:
@@ -121,7 +122,7 @@ class Normal(Distribution, kw_only=False):
     def _probabilities(self) -> tuple[float, float]:
         """Probability of a draw below `low`, and of one between the bounds."""
         below, under = (
-            0.5 * math.erfc((self.mean - bound) / (self.sigma * math.sqrt(2.0)))
+            0.5 * portable.erfc((self.mean - bound) / (self.sigma * math.sqrt(2.0)))
             for bound in (self.low, self.high)
         )
         return below, under - below

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.aids import SensorBase
 
 MIN_DRIFT = 1e-6
@@ -111,7 +112,7 @@ class GnssParams(SensorBase):
     @property
     def first_baseline_sigma(self) -> float:
         """Standard deviation of a single baseline's direction, all errors included [rad]."""
-        return math.hypot(self.baseline_sigma, self.heading_error_sigma)
+        return portable.hypot(self.baseline_sigma, self.heading_error_sigma)
 
     @property
     def baseline_noise(self) -> float:
@@ -123,4 +124,4 @@ class GnssParams(SensorBase):
         observes it.
         """
         count = max(self.rate * HEADING_MEMORY, 1.0)
-        return math.hypot(self.baseline_sigma, math.sqrt(count) * self.heading_error_sigma)
+        return portable.hypot(self.baseline_sigma, math.sqrt(count) * self.heading_error_sigma)

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.aids import SensorBase
 
 MANEUVER = 0.5
@@ -89,7 +90,7 @@ class ImuParams(SensorBase):
         The value is for hover; the filter scales the vibration in it with the measured specific
         force, as vibration is proportional to thrust.
         """
-        return math.hypot(self.accel_noise_density / math.sqrt(self.dt), self.accel_vibration)
+        return portable.hypot(self.accel_noise_density / math.sqrt(self.dt), self.accel_vibration)
 
     @property
     def accel_error_noise(self) -> float:
@@ -100,10 +101,10 @@ class ImuParams(SensorBase):
         as white noise whose samples are larger by the square root of the number of samples.
         """
         scale, misalignment = self.accel_scale_sigma, self.accel_misalignment_sigma
-        mean_square = (scale**2 + 2.0 * misalignment**2) / 3.0  # over the axes
+        mean_square = (scale * scale + 2.0 * (misalignment * misalignment)) / 3.0  # over the axes
         return math.sqrt(mean_square * MANEUVER / self.dt)
 
     @property
     def gyro_noise(self) -> float:
         """Standard deviation that the filter assumes for a gyro's white noise [rad/s]."""
-        return math.hypot(self.gyro_noise_density / math.sqrt(self.dt), self.gyro_vibration)
+        return portable.hypot(self.gyro_noise_density / math.sqrt(self.dt), self.gyro_vibration)

@@ -4,6 +4,7 @@ import math
 from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.aids import AidParams, SlowError
 from quad_gym.records import Aid
 
@@ -55,11 +56,11 @@ class MagnetometerParams(AidParams):
     @property
     def field_I(self) -> tuple[float, float, float]:
         """The Earth's field (3,) east, north, up [T]."""
-        level = self.strength * math.cos(self.inclination)
+        level = self.strength * portable.cos(self.inclination)
         return (
-            level * math.sin(self.declination),
-            level * math.cos(self.declination),
-            -self.strength * math.sin(self.inclination),
+            level * portable.sin(self.declination),
+            level * portable.cos(self.declination),
+            -self.strength * portable.sin(self.inclination),
         )
 
     @property
@@ -70,7 +71,7 @@ class MagnetometerParams(AidParams):
     @property
     def assumed_vector(self) -> SlowError:
         """Hard iron, increased by the effect of soft iron on the field, per axis [T]."""
-        sigma = math.hypot(self.hard_iron_sigma, self.soft_iron_sigma * self.strength)
+        sigma = portable.hypot(self.hard_iron_sigma, self.soft_iron_sigma * self.strength)
         return SlowError(sigma, self.hard_iron_tau)
 
     @property

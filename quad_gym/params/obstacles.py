@@ -4,11 +4,11 @@ They are upright, at places in the inertial frame I (east, north, up). A vehicle
 to one than its radius collides with it, and the camera cannot see features behind one.
 """
 
-import math
 from functools import partial
 from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
 from quad_gym.records import Shape
@@ -75,7 +75,7 @@ class Wall(Obstacle):
     @property
     def axis(self) -> Vector:
         """Horizontal direction (2,) of the length, east and north [-]."""
-        return (math.cos(self.yaw), math.sin(self.yaw))
+        return (portable.cos(self.yaw), portable.sin(self.yaw))
 
 
 class Cylinder(Obstacle):

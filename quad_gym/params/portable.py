@@ -1,17 +1,124 @@
 """Small computations with bitwise identical results on every processor.
 
-NumPy and LAPACK choose their code by the processor, and with it the order of sums and the
-polynomial of a sine. The results here become parameters of flights, so they are computed with
-Python's floats, in a fixed order, and the C library's functions.
+NumPy, SciPy and the C library choose or compile their code by the processor, and with it the order
+of sums and the last bit of a sine. The results here become parameters of flights, so sums are
+Python's, in a fixed order, and other functions are computed with many decimal digits and rounded
+once. (`x**2` is a function of the C library, too; `x * x` is not.)
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from decimal import MAX_EMAX, MIN_EMIN, Context, Decimal, localcontext
+from functools import cache, wraps
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+
+_PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
+_PRECISE = Context(prec=50, Emax=MAX_EMAX, Emin=MIN_EMIN, traps=[])
+
+
+def _rounded_once(function: Callable[..., Decimal]) -> Callable[..., float]:
+    """Make a function of decimal numbers one of floats."""
+
+    @wraps(function)
+    def rounded(*values: float) -> float:
+        with localcontext(_PRECISE):
+            return float(function(*map(Decimal, values)))
+
+    return rounded
+
+
+@_rounded_once
+def exp(x: Decimal) -> Decimal:
+    """Exponential function."""
+    return x.exp()
+
+
+@_rounded_once
+def approached(x: Decimal) -> Decimal:
+    """The share 1 - exp(-x), without cancellation for small x."""
+    return 1 - (-x).exp()
+
+
+@_rounded_once
+def log(x: Decimal) -> Decimal:
+    """Natural logarithm of x > 0."""
+    return x.ln()
+
+
+@_rounded_once
+def hypot(*components: Decimal) -> Decimal:
+    """Length of a vector; `norm` rounds each square."""
+    return Decimal(sum(x * x for x in components)).sqrt()
+
+
+def _sin_cos(angle: Decimal) -> tuple[Decimal, Decimal]:
+    """Sine and cosine, by their series."""
+    angle, term, sums = angle.remainder_near(2 * _PI), Decimal(1), [Decimal(0)] * 4
+    for n in range(60):
+        sums[n % 4] += term
+        term *= angle / (n + 1)
+    return sums[1] - sums[3], sums[0] - sums[2]
+
+
+@_rounded_once
+def sin(angle: Decimal) -> Decimal:
+    """Sine of an angle [rad]."""
+    return _sin_cos(angle)[0]
+
+
+@_rounded_once
+def cos(angle: Decimal) -> Decimal:
+    """Cosine of an angle [rad]."""
+    return _sin_cos(angle)[1]
+
+
+@_rounded_once
+def atan2(y: Decimal, x: Decimal) -> Decimal:
+    """Angle of a vector (x, y) [rad]: the C library's, and a step of Newton's method."""
+    near = Decimal(math.atan2(y, x))
+    s, c = _sin_cos(near)
+    return near + (y * c - x * s) / (x * c + y * s) if x or y else near
+
+
+def _beyond(freedoms: Decimal, limit: Decimal) -> tuple[Decimal, Decimal]:
+    """Probability of chi-square beyond a limit, of one to three freedoms, and its density there."""
+    half, y = freedoms / 2, limit / 2
+    if y > 800:  # less than the smallest float
+        return Decimal(0), Decimal(0)
+    term = y if freedoms == 2 else 2 * (y / _PI).sqrt() * (y / half if freedoms == 3 else 1)
+    term *= (-y).exp()
+    density, tail, fraction = term * half / limit, Decimal(1), y
+    if y > 20:  # the continued fraction, which does not cancel
+        for n in range(60, 0, -1):
+            fraction = y + 2 * n - 1 - half - n * (n - half) / fraction
+        return term * half / fraction, density
+    for n in range(150):
+        tail -= term
+        term *= y / (half + n + 1)
+    return tail, density
+
+
+@cache
+@_rounded_once
+def chi_square_limit(freedoms: Decimal, beyond: Decimal) -> Decimal:
+    """The limit that chi-square of one to three freedoms exceeds with a probability below 1/2."""
+    limit = step = -2 * beyond.ln()  # exact for two freedoms
+    while abs(step) > limit * Decimal("1e-25"):  # Newton's method for the logarithm, concave
+        tail, density = _beyond(freedoms, limit)
+        step = tail / density * (tail / beyond).ln()
+        limit += step
+    return limit
+
+
+@_rounded_once
+def erfc(x: Decimal) -> Decimal:
+    """Complementary error function."""
+    tail = _beyond(Decimal(1), 2 * x * x)[0] if x else Decimal(1)
+    return tail if x > 0 else 2 - tail
 
 
 def norm(vector: Sequence[float] | Floats) -> float:
@@ -74,7 +181,7 @@ def lower_root(matrix: ArrayLike, scale: ArrayLike) -> Floats:
 
 def euler_dcm(e: Sequence[float]) -> Floats:
     """R(e) (3, 3) of the 3-1-2 Euler angles (roll, pitch, yaw) [rad]."""
-    (sphi, sth, spsi), (cphi, cth, cpsi) = map(math.sin, e), map(math.cos, e)
+    (sphi, sth, spsi), (cphi, cth, cpsi) = map(sin, e), map(cos, e)
     return np.array(
         [
             [cpsi * cth - sphi * spsi * sth, cth * spsi + cpsi * sphi * sth, -cphi * sth],

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.distributions import Distribution, Uniform
 from quad_gym.params.draw_limits import Ranges, check_bounds, check_hovering
 from quad_gym.params.sensors import SensorSuite
@@ -224,8 +225,8 @@ def nominal_values(
         "wind_east": east,
         "wind_north": north,
         "wind_up": up,
-        "wind_speed": math.hypot(east, north),
-        "wind_direction": math.atan2(north, east),
+        "wind_speed": portable.hypot(east, north),
+        "wind_direction": portable.atan2(north, east),
     }
     values, parts = np.zeros(DRAWN_SIZE), parts_of(vehicle, sensors, world)
     for drawable in DRAWABLES:

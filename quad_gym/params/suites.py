@@ -40,6 +40,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.filter import FilterParams
@@ -186,7 +187,7 @@ def _on_walls(distance: float, low: float, high: float) -> tuple[tuple[float, ..
     points = []
     for k in range(16):
         azimuth = 2.0 * math.pi * (k + 0.5) / 16
-        direction = np.array([math.cos(azimuth), math.sin(azimuth)])
+        direction = np.array([portable.cos(azimuth), portable.sin(azimuth)])
         x, y = distance * direction / np.abs(direction).max()
         points.append((float(x), float(y), high if k % 2 else low))
     return tuple(points)

@@ -118,7 +118,8 @@ class VehicleParams(Checked, Saved):
     @property
     def max_rotor_force(self) -> float:
         """Thrust of one rotor at full voltage [N]."""
-        return self.thrust_coefficient * (self.motor_speed_per_volt * self.max_voltage) ** 2
+        speed = self.motor_speed_per_volt * self.max_voltage
+        return self.thrust_coefficient * (speed * speed)
 
     @property
     def hover_voltage(self) -> float:

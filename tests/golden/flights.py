@@ -170,14 +170,19 @@ def cases():
     }
 
 
-def fly(case, flights=FLIGHTS, threads=None):
-    """Return the digest of a case's first FLIGHTS flights; it must not depend on the others."""
+def made(case, flights=FLIGHTS, threads=None):
+    """Return the environment of a case."""
     keywords = dict(case)
     task = keywords.pop("id", "Circle")
     name = f"QuadGym/{task}-v0"
     if task == "Circle":  # most cases take off; the default start is a separate case
         keywords.setdefault("start", "ground")
-    env = gymnasium.make_vec(name, num_envs=flights, threads=threads, **keywords)
+    return gymnasium.make_vec(name, num_envs=flights, threads=threads, **keywords)
+
+
+def fly(case, flights=FLIGHTS, threads=None):
+    """Return the digest of a case's first FLIGHTS flights; it must not depend on the others."""
+    env = made(case, flights, threads)
     digest = hashlib.sha256()
     observations, _ = env.reset(seed=SEED)
     rng, batch = np.random.default_rng(SEED), env.unwrapped.flights.batch

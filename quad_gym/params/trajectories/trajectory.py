@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-import math
 from collections.abc import Callable
 from functools import cached_property, partial, wraps
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
@@ -156,7 +155,7 @@ class Trajectory(Checked, eq=False):
         turn = checks.number("angle", angle)
         if turn == 0.0:
             return self
-        c, s = math.cos(turn), math.sin(turn)
+        c, s = portable.cos(turn), portable.sin(turn)
         terms = self.coefficients.copy()
         terms[..., 0] = c * self.coefficients[..., 0] - s * self.coefficients[..., 1]
         terms[..., 1] = s * self.coefficients[..., 0] + c * self.coefficients[..., 1]
