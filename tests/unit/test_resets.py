@@ -170,6 +170,17 @@ def test_protection_does_no_harm_where_noise_is_three_times_as_large():
     assert rms[0] < 2.0 * rms[1], rms
 
 
+def test_drift_of_fixes_that_a_camera_does_not_confirm_resets_nothing():
+    """16 flights of 15 s, with a drift as large as the noise of a fix, 1 cm."""
+    suite = quad_gym.sensor_suite("rtk")
+    drift = {"drift_sigma_I": suite.gnss.position_sigma_I, "drift_tau": 60.0}
+    true = suite.replace(gnss=suite.gnss.replace(**drift))
+    batch = fly(suite, 16, filter_start="warm", true_sensors=true)
+    for _ in range(30):
+        steps(batch, 0.5)
+        assert not batch.record("diverged").any()
+
+
 def circle():
     """Log of the real flight, with positions every 0.1 s and 1 cm of noise; its truth."""
     with gzip.open(CIRCLE, "rt") as file:

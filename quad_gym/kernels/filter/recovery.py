@@ -294,7 +294,10 @@ def _choose(flight, p, work, settings, mask, drifted):
         first, refused = FIRST_GROUP[sensor], none
         for group in range(first, first + GROUP_COUNT[sensor]):
             refused = refused | (flight.rejected_in_row[group] >= 2.0)
-            drifted = drifted | (mask & biased(flight, p, group))
+            colored = mask & biased(flight, p, group)
+            if group == POSITION_BLOCK:  # fixes drift
+                colored = colored & logical_not(supported(flight, p, settings, group))
+            drifted = drifted | colored
         sensors = sensors + select(refused, 1.0, 0.0)
     work.drifted = select(drifted, 1.0, 0.0)
     if not any_of((mask & (sensors > 0.0)) | drifted):
