@@ -71,11 +71,11 @@ def _split_turns(flight, work, c, form):
 @kernel
 def _innovate(work, n, c):
     """Fill work.nu, the innovation: the measurement minus the mean of the sigma points."""
-    S, mu = work.E, work.mu
+    even, mu = work.E, work.mu
     for k in range(n):
-        total = S[0, k]
+        total = even[0, k]
         for j in range(1, 9):
-            total = total + S[j, k]
+            total = total + even[j, k]
         mu[k] = total / c
         work.nu[k] = work.z[k] - work.z_hat[k] - mu[k]
 
@@ -83,13 +83,13 @@ def _innovate(work, n, c):
 @kernel
 def _sum_noise(p, work, n, factor):
     """Multiply the measurement noise in work.Rz by `factor` and add the even parts' share."""
-    S, mu = work.E, work.mu
+    even, mu = work.E, work.mu
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     for i in range(0, n, 3):
         mu_i = excess * vector(mu[i], mu[i + 1], mu[i + 2])
         for j in range(0, i + 3, 3):
             mu_j = vector(mu[j], mu[j + 1], mu[j + 2])
-            block = sum_of_outers_of_rows(S, S, i, j, 9) + outer(mu_i, mu_j)
+            block = sum_of_outers_of_rows(even, even, i, j, 9) + outer(mu_i, mu_j)
             if i == j:
                 block = factor * load_block(work.Rz, i, i) + block
             store_block(work.Rz, i, j, block)
@@ -201,10 +201,10 @@ def _show_hidden(flight, work, settings, mask):
 def _whiten(work, n, columns):
     """Solve the update; return the NIS, and the lanes in which the noise is positive definite.
 
-    On return, work.K is the factor K of I + C C^T = K K^T with C = A^T Rz^(-T/2), and work.y is
-    K^-1 C Rz^(-1/2) nu.
+    On return, work.M is the factor M of I + C C^T = M M^T with C = A^T Rz^(-T/2), and work.y is
+    M^-1 C Rz^(-1/2) nu.
     """
-    A, nu, K, y = work.A, work.nu, work.K, work.y
+    A, nu, M, y = work.A, work.nu, work.M, work.y
     pivot = cholesky(work.Rz, n, work.inverse_diagonal)
     solve_right(A, columns, work.Rz, n, work.inverse_diagonal, 0)  # rows of C
     solve_left_vector(work.Rz, nu, n, work.inverse_diagonal)
@@ -219,11 +219,11 @@ def _whiten(work, n, columns):
     for i in range(0, columns, 3):
         for j in range(0, i + 3, 3):
             if i == j:
-                store_block(K, i, i, add_to_diagonal(sum_of_squares(A, i, n), 1.0))
+                store_block(M, i, i, add_to_diagonal(sum_of_squares(A, i, n), 1.0))
             else:
-                store_block(K, i, j, sum_of_outers(A, i, A, j, n))
-    cholesky(K, columns, work.inverse_diagonal)
-    solve_left_vector(K, y, columns, work.inverse_diagonal)
+                store_block(M, i, j, sum_of_outers(A, i, A, j, n))
+    cholesky(M, columns, work.inverse_diagonal)
+    solve_left_vector(M, y, columns, work.inverse_diagonal)
     for j in range(columns):
         nis = nis - y[j] * y[j]
     return nis, pivot > 0.0
@@ -231,9 +231,9 @@ def _whiten(work, n, columns):
 
 @kernel
 def _correct(flight, work, states, columns, slow):
-    """Fill work.L9 with L9 K^-T, the updated factor, and work.dx; return the sum of dx.
+    """Fill work.L9 with L9 M^-T, the updated factor, and work.dx; return the sum of dx.
 
-    With the columns last first, L9 K^-T is the updated factor's, last first again.
+    With the columns last first, L9 M^-T is the updated factor's, last first again.
     """
     L, L9, y, dx, last = flight.L, work.L9, work.y, work.dx, columns - 1
     for i in range(15):
@@ -241,7 +241,7 @@ def _correct(flight, work, states, columns, slow):
             L9[i, last - j] = L[i, j]
     if slow is not None:
         load_slow(flight, slow, L9)
-    solve_right(L9, states, work.K, columns, work.inverse_diagonal, columns - 3)
+    solve_right(L9, states, work.M, columns, work.inverse_diagonal, columns - 3)
     total = 0.0 * work.spread
     for i in range(states):
         shift = L9[i, 0] * y[0]
