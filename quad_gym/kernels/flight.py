@@ -13,7 +13,7 @@ import numpy as np
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.measurements import call_sensor, call_sensors
 from quad_gym.kernels.maths.linalg import load3, norm
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Act
 
@@ -117,6 +117,6 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
         call_sensor(flight, world, model, settings, work, stages, sensor, Act.ALIGN, 0)
     run(Stage.UPDATE, here)
     run(Stage.LOOK, here)
-    r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
+    r_ref, _, _, _ = evaluate_reference(flight, zero_like(flight.tick), settings.harmonics)
     error = norm(r_ref - load3(flight.r))
     flight.position_error = select(mask, error, flight.position_error)

@@ -19,7 +19,7 @@ from quad_gym.kernels.simd.addresses import (
     scatter_lanes,
 )
 from quad_gym.kernels.simd.blocks import numbers_of
-from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 from quad_gym.records import (
     DELAY_SLOTS,
     FIRST_BLOCK,
@@ -53,9 +53,9 @@ def block_address(call, index):
 @kernel
 def _kind(flight, settings):
     """Return the sensors with a measurement in each lane: a bit for each; 0: none."""
-    kind, bit = 0.0 * flight.tick, 1.0
+    kind, bit = zero_like(flight.tick), 1.0
     for sensor in range(SENSORS):
-        first, valid = FIRST_BLOCK[sensor], 0.0 * kind
+        first, valid = FIRST_BLOCK[sensor], zero_like(kind)
         for block in range(first, first + settings.sensor_blocks[sensor]):
             valid = valid + flight.block_valid[block]
         kind = kind + select(valid > 0.0, bit, 0.0)

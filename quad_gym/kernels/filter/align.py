@@ -20,7 +20,7 @@ from quad_gym.kernels.maths.matrices import load_block
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import DRAW_MARK
 
 _NOTHING = (0.0, 0.0, 0.0)
@@ -31,7 +31,7 @@ _STEEP = 0.2  #: level share of a baseline 12 degrees from the vertical: too sma
 @kernel
 def lever_of_attitude(R_BI, l_B):
     """J = R_hat^T [l x]: with R = R(e) R_hat, the error of r = antenna - R^T l grows by J e."""
-    zero = 0.0 * l_B[0]
+    zero = zero_like(l_B[0])
     x, y, z = l_B
     return R_BI.T @ ((zero, -z, y), (z, zero, -x), (-y, x, zero))
 
@@ -79,7 +79,7 @@ def initialize(flight, p, mask, x_I, v_I=_NOTHING, v_variance=_NOTHING, tilt_var
 
     R_IG = load33(p.R_IG)
     baseline_I = unit_or(R_IG @ load3(flight.gnss_baseline), (0.0, 0.0, 1.0))
-    nothing = 0.0 * x_I
+    nothing = zero_like(x_I)
     x_B = (nothing[0] + 1.0, nothing[1], nothing[2])
     ahead = outer(x_B, select(placed, x_I, nothing))
     profile = outer(baseline_B, baseline_I) + rounded(ahead)
@@ -119,7 +119,7 @@ def known_velocity(flight, settings):
 
     A velocity given by the caller of a reset is known; its variance is zero.
     """
-    known, zero = load3(flight.start_given[3:]), 0.0 * flight.tick
+    known, zero = load3(flight.start_given[3:]), zero_like(flight.tick)
     drawn = load3(settings.start_velocity_variance)
     return (
         (_or(known[0], zero), _or(known[1], zero), _or(known[2], zero)),
@@ -141,7 +141,7 @@ def _or(given, other):
 def look_along_mark(flight, p):
     """Level direction in I of the body x axis, as accurate as the place of the start gives it."""
     R_BI = quaternion_to_dcm(load4(flight.q))
-    zero = 0.0 * p.dt
+    zero = zero_like(p.dt)
     x_I = unit_or((R_BI[0][0], R_BI[0][1], zero), (zero + 1.0, zero, zero))
     n, _ = normal_pair(stream_of(flight), DRAW_MARK)
     s, c = sin_cos(p.heading_sigma * n)

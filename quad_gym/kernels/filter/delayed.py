@@ -37,7 +37,7 @@ from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import keep, load3, load33, outer, store
 from quad_gym.kernels.maths.matrices import load_column3, store_block, store_column3, sum_of_outers
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import SENSORS, FilterForm, FilterStatus
 
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
@@ -119,7 +119,7 @@ def _factor_columns(flight, p, work, noise, slow, back):
 @kernel
 def _load_factor(flight, work, form):
     """Fill the first fifteen columns of work.columns with L."""
-    zero = 0.0 * work.since_time
+    zero = zero_like(work.since_time)
     for i in range(15):
         for j in range(15):
             work.columns[i, j] = flight.L[i, j] if j <= i else zero

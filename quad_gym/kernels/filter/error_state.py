@@ -31,6 +31,7 @@ from quad_gym.kernels.maths.matrices import (
     store_column3,
     sum_of_outers,
 )
+from quad_gym.kernels.simd.lanes import zero_like
 
 R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
 """First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
@@ -42,7 +43,7 @@ def reset_matrix(m):
     """S(m)^-1, the Jacobian of the reset of error Euler angles with mean m [rad]."""
     s_phi, c_phi = sin_cos(m[0])
     s_th, c_th = sin_cos(m[1])
-    zero = 0.0 * c_th
+    zero = zero_like(c_th)
     return (
         (c_th, zero, -c_phi * s_th),
         (zero, zero + 1.0, s_phi),
@@ -100,4 +101,4 @@ def _clear(L9, row, kept, cleared, rows):
         a, b = L9[i, kept], L9[i, cleared]
         L9[i, kept] = c * a + s * b
         L9[i, cleared] = c * b - s * a
-    L9[row, cleared] = 0.0 * x
+    L9[row, cleared] = zero_like(x)

@@ -33,7 +33,7 @@ from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or
 from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_outers_of_rows
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, Act, FilterForm, GateDecision
 
 _GAIN = 0.05  #: change of a factor on the noise by one measurement
@@ -69,7 +69,7 @@ def _nis_of_triple(P_zz, nu):
 @kernel
 def _across(u, P_zz, nu):
     """Innovation and covariance of a direction, across u: (side, up), (P_ss, P_us, P_uu)."""
-    side = unit_or((-u[1], u[0], 0.0 * u[0]), (1.0, 0.0, 0.0))  # vertical x u
+    side = unit_or((-u[1], u[0], zero_like(u[0])), (1.0, 0.0, 0.0))  # vertical x u
     up = cross(u, side)
     P_side, P_up = P_zz @ side, P_zz @ up
     return (dot(side, nu), dot(up, nu)), (dot(side, P_side), dot(up, P_side), dot(up, P_up))
@@ -89,7 +89,7 @@ def _nis_of_direction(P_zz, nu):
 def _minus(nu, last, numbers):
     """Difference of an innovation and the last one; zero behind its `numbers`."""
     if numbers < 3.0:
-        return (nu[0] - last[0], 0.0 * nu[0], 0.0 * nu[0])
+        return (nu[0] - last[0], zero_like(nu[0]), zero_like(nu[0]))
     return (nu[0] - last[0], nu[1] - last[1], nu[2] - last[2])
 
 
@@ -134,7 +134,7 @@ def _weigh(flight, p, settings, group, s, valid, nis, limit, again):
     An innovation beyond the gate is an error of the sensor, or else of the IMU; then it has a
     bounded weight. A feature is wrong where the others of its image agree with the estimate.
     """
-    rejected, weakened = nis < 0.0, nis < 0.0  # all false
+    rejected, weakened = no_lane(nis), no_lane(nis)
     if (settings.form & FilterForm.GATE.value) != 0:
         beyond = valid & (nis > limit_of(flight, group, limit))
         if any_of(beyond):
@@ -187,9 +187,9 @@ def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers):
     sigma = (math.sqrt(P_suite[0][0]), math.sqrt(P_suite[1][1]), math.sqrt(P_suite[2][2]))
     nis_suite = _nis_of_triple(P_suite, nu)
     if numbers < 3.0:
-        none = np.nan + 0.0 * nis
+        none = np.nan + zero_like(nis)
         nu, sigma = (nu[0], none, none), (sigma[0], none, none)
-        scaled = (scaled[0], 0.0 * nis, 0.0 * nis)
+        scaled = (scaled[0], zero_like(nis), zero_like(nis))
     first = valid & logical_not(again)
     _store_innovation(flight, s, first, nu, sigma, nis_suite, rejected, nis < nis, weakened)
     beyond = rejected | weakened
@@ -221,7 +221,7 @@ def gate_direction(flight, p, work, settings, k, s, group, valid, limit):
     sure, most = valid & logical_not(unsure), p.gate_direction
     rejected, weakened = _weigh(flight, p, settings, group, s, sure, nis, most, again)
     weaken(work, k, weakened, nis / most - 1.0, whole)
-    none = np.nan + 0.0 * nis
+    none = np.nan + zero_like(nis)
     scaled = (nu[0] / math.sqrt(P_zz[0]), nu[1] / math.sqrt(P_zz[2]))
     sigma = (math.sqrt(P_suite[0]), math.sqrt(P_suite[2]), none)
     nis_suite = _nis_of_direction(P_suite, nu)
@@ -246,7 +246,7 @@ def mask_rejected(flight, work, settings, k, s, valid, numbers):
 def scale_noise(flight, work, settings, k, group):
     """Multiply the noise of the block at row k by the factor of its group; return the increase."""
     R = load_block(work.Rz, k, k)
-    more = 0.0 * R
+    more = zero_like(R)
     if (settings.form & FilterForm.GATE.value) != 0:
         more = (flight.noise_factor[group] - 1.0) * R
         store_block(work.Rz, k, k, R + more)
@@ -299,7 +299,7 @@ def gate_innovations(flight, p, work, settings, stages, mask, again):
     Where measurements are processed in steps, the first step decides for all: `again` are the lanes
     in a later step. On return, work.left_out counts the masked numbers of each lane.
     """
-    zero = 0.0 * p.sigma_beta
+    zero = zero_like(p.sigma_beta)
     work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
     work.judged_nis, work.judged_freedoms, work.left_out = zero, zero, zero
     call_measured(flight, p, work, settings, stages, Act.GATE)

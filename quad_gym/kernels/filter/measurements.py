@@ -8,7 +8,7 @@ with an `Act` and an argument. The filter accesses sensors by these calls only.
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 from quad_gym.records import (
     BLOCK_NUMBERS,
     FIRST_BLOCK,
@@ -70,7 +70,7 @@ def _rows_of(flight, settings, sensor):
 @kernel
 def count_measured(flight, work, settings):
     """Count the measured numbers of each lane in work.measured; return the rows of all sensors."""
-    work.measured = 0.0 * flight.tick
+    work.measured = zero_like(flight.tick)
     k = 0
     for sensor in range(SENSORS):
         first = FIRST_BLOCK[sensor]

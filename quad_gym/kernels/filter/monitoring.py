@@ -19,7 +19,7 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, D, R
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 from quad_gym.records import SENSOR_GROUPS
 
 RECENT = 1.0  #: time within which a measurement still counts [s]
@@ -87,7 +87,7 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
     kept = maximum(1.0 - passed / _CORRECTION_TIME, 0.0)
     kept_long = maximum(1.0 - passed / _LONG_TIME, 0.0)
     for i in range(6):
-        removed = 0.0 * kept
+        removed = zero_like(kept)
         for j in range(columns):
             if j < 15:
                 removed = removed + L[BA + i, j] * L[BA + i, j]
@@ -109,7 +109,7 @@ def add_correction(sums, variances, i, ok, kept, shift, variance):
 @kernel
 def variance_of(flight, row):
     """Variance of a state, from its row of the factor."""
-    variance = 0.0 * flight.tick
+    variance = zero_like(flight.tick)
     for j in range(15):
         if j <= row:
             variance = variance + flight.L[row, j] * flight.L[row, j]
@@ -123,7 +123,7 @@ def one_way(flight, first):
     Their sum must exceed the standard deviation of the bias: a smaller one is harmless, and may be
     a rounding error of corrections by measurements that do not observe biases yet.
     """
-    largest, square = -1.0 + 0.0 * flight.tick, 0.0 * flight.tick
+    largest, square = -1.0 + zero_like(flight.tick), zero_like(flight.tick)
     together = square
     for i in range(first, first + 3):
         own = _HARMLESS * variance_of(flight, BA + i)
@@ -153,7 +153,7 @@ def follow_drift_corrections(flight, p, L9, dx, columns, ok):
     kept = maximum(1.0 - (flight.tick - flight.corrected_tick) * p.dt / _JUMP_TIME, 0.0)
     sums, variances = flight.drift_corrected, flight.drift_corrected_variance
     for i in range(3):
-        removed = 0.0 * kept
+        removed = zero_like(kept)
         for j in range(columns):
             before, after = flight.L_slow[i, j], L9[D + i, j]
             removed = removed + before * before - after * after
@@ -166,7 +166,7 @@ def drifts_suddenly(flight):
 
     Corrections below that standard deviation are harmless.
     """
-    square, limit = 0.0 * flight.tick, select(flight.diverged > 0.0, _LIKELY, _SUDDEN)
+    square, limit = zero_like(flight.tick), select(flight.diverged > 0.0, _LIKELY, _SUDDEN)
     for i in range(3):
         own = variance_of(flight, R + i)
         total, variance = flight.drift_corrected[i], flight.drift_corrected_variance[i]
@@ -209,7 +209,7 @@ def flag_biased(flight, p, mask):
     gyro, _ = one_way(flight, 3)
     drifting = mask & (drifting | accel | gyro)
     if any_of(drifting):
-        memory = ALARM_TIME + 0.0 * p.dt
+        memory = ALARM_TIME + zero_like(p.dt)
         for i in range(3):
             memory = maximum(memory, _memory(flight, p, i, p.accel_bias_drive))
             memory = maximum(memory, _memory(flight, p, 3 + i, p.gyro_bias_drive))

@@ -66,7 +66,7 @@ from quad_gym.kernels.maths.rotation import (
     turn_pair_back,
     vector_to_dcm,
 )
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import FilterForm, FilterStatus
 
 
@@ -121,7 +121,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
     first = (form & FilterForm.FIRST_ESTIMATES.value) != 0
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
     inverse_c = 1.0 / c
-    zero = 0.0 * c
+    zero = zero_like(c)
     nothing = (zero, zero, zero)
     mean_a, mean_e = nothing, nothing
     f_start, full = f_B, half
@@ -230,7 +230,7 @@ def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
     variance = accel_variance(p, f_B)
     extended, midpoint = (form & FilterForm.EKF.value) != 0, (form & FilterForm.MIDPOINT.value) != 0
-    angle = 0.0 * dt if midpoint else dt * gyro_sigma(p, f_B)
+    angle = zero_like(dt) if midpoint else dt * gyro_sigma(p, f_B)
     gyro_variance = angle * angle
 
     for i in range(0, 9, 3):

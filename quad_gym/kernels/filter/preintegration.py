@@ -32,7 +32,7 @@ from quad_gym.kernels.maths.linalg import cross, diagonal, dot, keep, load3, loa
 from quad_gym.kernels.maths.matrices import load_column3, store_column3
 from quad_gym.kernels.maths.rotation import euler_to_dcm, vector_to_dcm
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import FilterForm
 
 NOISE = 15  #: first of the six columns of white noise, after the fifteen of the covariance's factor
@@ -151,7 +151,7 @@ def put_noise(p, work, R_s, dR, dv):
     root = math.sqrt(p.dt * T)
     force = select(T > 0.0, 1.0 / T, 0.0) * dv  # its mean
     a, g = root * math.sqrt(accel_variance(p, force)), root * gyro_sigma(p, force)
-    zero = 0.0 * T
+    zero = zero_like(T)
     for k in range(6):
         for i in range(15):
             M[i, NOISE + k] = zero

@@ -39,7 +39,7 @@ from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import diagonal, dot, load33, outer
 from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.records import (
     AID_GROUPS,
     FEATURE_BLOCKS,
@@ -110,7 +110,7 @@ def accept_group(flight, group, accepted):
 @kernel
 def _confirmed(flight, p, settings, refused, bit):
     """Lanes in which another group than `refused` has lately measured a quantity of `Observes`."""
-    found = flight.tick < 0.0  # all false
+    found = no_lane(flight.tick)
     for sensor in range(SENSORS):
         if settings.sensor_blocks[sensor] > 0:
             first = FIRST_GROUP[sensor]
@@ -132,7 +132,7 @@ def supported(flight, p, settings, refused):
     """
     if refused == FEATURE_BLOCKS:
         return flight.tick < 0.0
-    found = flight.tick >= 0.0  # all true
+    found = logical_not(no_lane(flight.tick))
     for bit in range(QUANTITIES):
         if (GROUP_OBSERVES[refused] >> bit) & 1:
             found = found & _confirmed(flight, p, settings, refused, bit)
@@ -150,7 +150,7 @@ def limit_of(flight, group, limit):
         v, strict = VELOCITY_BLOCK, _STRICT * limit
         wrong = (flight.stepped[v] > 0.0) & (flight.rejected_in_row[v] >= 2.0)
         if group == POSITION_BLOCK:
-            strict = 0.0 * limit
+            strict = zero_like(limit)
         row, nis = flight.rejected_in_row[POSITION_BLOCK], flight.refused_nis[POSITION_BLOCK]
         bound = select((row > 0.0) & (nis > strict), 0.0, strict)
         limit = select(wrong, bound, limit)
@@ -228,7 +228,7 @@ def reset_heading(P, R_BI, states, lanes, variance):
     """Cut the covariances of the heading, the angle about the vertical, and set its variance."""
     k = R_BI.T[2]
     cut, P_ee = select(lanes, 1.0, 0.0), load_block(P, E, E)
-    one = 0.0 * cut + 1.0
+    one = zero_like(cut) + 1.0
     M = diagonal((one, one, one)) + outer(-cut * k, k)
     for j in range(0, E, 3):
         store_block(P, E, j, M @ load_block(P, E, j))
@@ -254,7 +254,7 @@ def _reset_motion(flight, p, P, states, lanes, accel, gyro):
     tilt = select(level, p.initial_tilt_sigma, p.first_baseline_sigma)
     tilt = tilt * tilt
     speed = p.gravity * p.gravity * tilt * RECENT * RECENT
-    for row, least in ((R, 0.0 * speed), (V, speed)):
+    for row, least in ((R, zero_like(speed)), (V, speed)):
         own = load_block(P, row, row)
         x, y = maximum(_MORE * own[0][0], least), maximum(_MORE * own[1][1], least)
         reset_variances(P, row, states, lanes, (x, y, _MORE * own[2][2]))
@@ -271,7 +271,7 @@ def _reset_motion(flight, p, P, states, lanes, accel, gyro):
 @kernel
 def _reset_drift(flight, p, P, states, lanes):
     """Reset position and drift after a jump, by the square of the drift's corrections."""
-    mean = 0.0 * flight.tick
+    mean = zero_like(flight.tick)
     for i in range(3):
         mean = mean + flight.drift_corrected[i] * flight.drift_corrected[i] / 3.0
     for i in range(3):
@@ -289,7 +289,7 @@ def _choose(flight, p, work, settings, mask, drifted):
         Lanes in which any state is reset.
     """
     none = flight.tick < 0.0
-    sensors, late = 0.0 * flight.tick, none
+    sensors, late = zero_like(flight.tick), none
     for sensor in range(SENSORS):
         first, refused = FIRST_GROUP[sensor], none
         for group in range(first, first + GROUP_COUNT[sensor]):
@@ -302,8 +302,8 @@ def _choose(flight, p, work, settings, mask, drifted):
     work.drifted = select(drifted, 1.0, 0.0)
     if not any_of((mask & (sensors > 0.0)) | drifted):
         for group in range(SENSOR_GROUPS):
-            work.reset[group] = 0.0 * flight.tick
-            work.alone[group] = 0.0 * flight.tick
+            work.reset[group] = zero_like(flight.tick)
+            work.alone[group] = zero_like(flight.tick)
         return none
     for group in range(SENSOR_GROUPS):
         row, stepped = flight.rejected_in_row[group], flight.stepped[group] > 0.0
@@ -338,7 +338,7 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
     gyro, corrected_g = one_way(flight, 3)
     accel, gyro = mask & accel, mask & gyro
     alarmed = _choose(flight, p, work, settings, mask, accel | gyro)
-    moved = flight.tick < 0.0  # all false
+    moved = no_lane(flight.tick)
     if slow is not None:
         if slow.estimates_drift:
             altered = (work.reset[_BAROMETER] > 0.0) & (work.alone[_BAROMETER] > 0.0)
@@ -348,7 +348,7 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
     if not any_of(alarmed):
         return
     P, states = work.P, 15
-    put_covariance(P, flight.L, 1.0 + 0.0 * flight.tick)
+    put_covariance(P, flight.L, 1.0 + zero_like(flight.tick))
     if slow is not None:
         states = 15 + slow.slow_states
         fill_slow(flight, slow, P)

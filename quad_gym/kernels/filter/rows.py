@@ -7,7 +7,7 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, E
 from quad_gym.kernels.maths.linalg import cross, load33
 from quad_gym.kernels.maths.matrices import load_column3
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import FilterForm
 
 
@@ -37,7 +37,7 @@ def put_block(work, settings, k, valid, z, z_hat, noise):
             work.Rz[k + i, k + j] = select(valid, noise[i][j], 1.0 if i == j else 0.0)
     for row in range(columns_of(settings) - 9):
         for i in range(3):
-            work.A[row, k + i] = 0.0 * work.spread
+            work.A[row, k + i] = zero_like(work.spread)
 
 
 @kernel
@@ -52,6 +52,6 @@ def lever_column(flight, work, settings, j, R_BI, l_B):
     """Half-difference and half-sum of R^T l along column j, or derivative and zero in an EKF."""
     if (settings.form & FilterForm.EKF.value) != 0:
         a = R_BI.T @ cross(load_column3(flight.L, E, j), l_B)
-        return a, 0.0 * a
+        return a, zero_like(a)
     odd, even, inverse_c = load33(work.odd[j]), load33(work.even[j]), work.inverse_spread
     return R_BI.T @ (inverse_c * (odd.T @ l_B)), R_BI.T @ (inverse_c * (even.T @ l_B))

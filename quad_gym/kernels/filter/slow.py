@@ -36,7 +36,7 @@ from quad_gym.kernels.maths.matrices import (
     sum_of_squares,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import Aid
 
 
@@ -46,7 +46,7 @@ def begin_slow(flight, p, slow, mask):
     for i in range(slow.slow_states):
         flight.slow_hat[i] = select(mask, 0.0, flight.slow_hat[i])
         for j in range(D + slow.slow_states):
-            value = p.slow_sigma[i] if j == D + i else 0.0 * p.slow_sigma[i]
+            value = p.slow_sigma[i] if j == D + i else zero_like(p.slow_sigma[i])
             flight.L_slow[i, j] = select(mask, value, flight.L_slow[i, j])
     forget_drift_corrections(flight, mask)
 
@@ -126,7 +126,7 @@ def load_slow(flight, slow, columns):
     last = D + slow.slow_states - 1
     for i in range(D):
         for j in range(D, last + 1):
-            columns[i, last - j] = 0.0 * flight.slow_hat[0]
+            columns[i, last - j] = zero_like(flight.slow_hat[0])
     for i in range(slow.slow_states):
         for j in range(last + 1):
             columns[D + i, last - j] = flight.L_slow[i, j]
@@ -153,7 +153,7 @@ def turn_iron(flight, slow, p, L9, T, correction, columns):
     first = slow.aid_vector[Aid.MAGNETOMETER]
     if first >= 0:
         m, delta = load3(p.aid_numbers[Aid.MAGNETOMETER]), slow.aid_scalar[Aid.MAGNETOMETER]
-        turned = (m[1], -m[0], 0.0 * m[2])
+        turned = (m[1], -m[0], zero_like(m[2]))
         field_I = flight.slow_hat[delta] * turned + m
         before = load33(flight.R_hat) @ field_I
         after = euler_to_dcm(correction) @ before
@@ -190,7 +190,7 @@ def fill_slow(flight, slow, P):
 def begin_to_carry_slow(slow, p, work, ticks):
     """Fill work.slow_decay with alpha over a number of ticks; one where nothing is delayed."""
     for i in range(slow.slow_states):
-        decay = 1.0 + 0.0 * p.dt
+        decay = 1.0 + zero_like(p.dt)
         for _ in range(ticks):
             decay = decay * p.slow_decay[i]
         work.slow_decay[i] = select(work.since_time > 0.0, decay, 1.0)

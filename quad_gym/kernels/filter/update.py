@@ -52,7 +52,7 @@ from quad_gym.kernels.maths.matrices import (
     sum_of_squares,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation, split_turn, vector_to_dcm
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.records import FEATURE_BLOCKS, Act, FilterForm, GateDecision
 
 
@@ -119,7 +119,7 @@ def update(flight, p, work, settings, stages, slow):
     Nonlinear Estimation", IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
     """
     mask, first, form = work.mask > 0.0, _LAST, settings.form
-    loose = mask & (p.sigma_spread < 0.0)  # all false
+    loose = no_lane(p.sigma_spread)
     hidden, vague = loose, loose
     if (form & FilterForm.GRADUAL.value) != 0 and settings.feature_count > 0:
         loose, vague = _are_loose(flight, p, work, settings.feature_count)
@@ -155,7 +155,7 @@ def _are_loose(flight, p, work, feature_count):
     position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
     attitude = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
     too_much, r = p.recursive_update_threshold * p.recursive_update_threshold, load3(flight.r_hat)
-    loose = attitude < 0.0  # all false
+    loose = no_lane(attitude)
     vague = loose
     for i in range(feature_count):
         offset = load3(p.features[i]) - r
@@ -174,7 +174,7 @@ def _hide_unsure(flight, work, feature_count, mask):
 
     Each step would infer a wrong distance from a wrong direction and make the filter overconfident.
     """
-    some = work.hidden[0] < 0.0  # all false
+    some = no_lane(work.hidden[0])
     for i in range(feature_count):
         hidden = mask & (work.hidden[i] > 0.0)
         some = some | hidden
@@ -242,7 +242,7 @@ def _correct(flight, work, states, columns, slow):
     if slow is not None:
         load_slow(flight, slow, L9)
     solve_right(L9, states, work.M, columns, work.inverse_diagonal, columns - 3)
-    total = 0.0 * work.spread
+    total = zero_like(work.spread)
     for i in range(states):
         shift = L9[i, 0] * y[0]
         for j in range(1, columns):

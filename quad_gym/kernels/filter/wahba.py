@@ -10,7 +10,7 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import cross, dot, outer, rounded, unit_or
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 
 _SWEEPS = 10
 
@@ -66,7 +66,7 @@ def wahba(B):
         them.
     """
     a0, a1, a2 = B.T
-    one, zero = 1.0 + 0.0 * B[0][0], 0.0 * B[0][0]
+    one, zero = 1.0 + zero_like(B[0][0]), zero_like(B[0][0])
     v0, v1, v2 = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for _ in range(_SWEEPS):
         a0, a1, v0, v1 = _rotate_pair(a0, a1, v0, v1)

@@ -16,7 +16,7 @@ from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of
 from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import (
     AIDS,
     DRAW_FIRST_BIASES,
@@ -30,7 +30,7 @@ from quad_gym.records import (
 @kernel
 def _heading(R_BI):
     """Rotation about the vertical from east to the direction of the body x axis: v_I = T v_0."""
-    zero = 0.0 * R_BI[0][0]
+    zero = zero_like(R_BI[0][0])
     one = zero + 1.0
     c, s, _ = unit_or((R_BI[0][0], R_BI[0][1], zero), (one, zero, zero))
     return ((c, -s, zero), (s, c, zero), (zero, zero, one))
@@ -118,7 +118,7 @@ def _start_warm(flight, settings, work, slow):
     keep(flight.b_a_hat, mask, load3(flight.b_a) - load3(d[BA : BA + 3]))
     keep(flight.b_g_hat, mask, load3(flight.b_g) - load3(d[BG : BG + 3]))
 
-    one = 1.0 + 0.0 * T[0][0]
+    one = 1.0 + zero_like(T[0][0])
     eye = diagonal((one, one, one))
     for i in range(0, states, 3):
         left = T if i < E else eye  # the rest is in B

@@ -6,7 +6,7 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import minimum
 from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block
 from quad_gym.kernels.maths.vectors import outer
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 
 
 @kernel
@@ -33,7 +33,7 @@ def cholesky33(m):
 @kernel
 def lower33(factor, diagonal):
     """The lower Cholesky factor itself, from the results of `cholesky33`."""
-    zero = 0.0 * diagonal[0]
+    zero = zero_like(diagonal[0])
     return (
         (diagonal[0], zero, zero),
         (factor[1][0], diagonal[1], zero),

@@ -12,7 +12,7 @@ from quad_gym.kernels.maths.vectors import outer as outer
 from quad_gym.kernels.maths.vectors import rounded as rounded
 from quad_gym.kernels.maths.vectors import store as store
 from quad_gym.kernels.maths.vectors import vector as vector
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 
 
 @kernel
@@ -46,7 +46,7 @@ def unit_or(a, fallback):
 @kernel
 def diagonal(d):
     """The matrix diag(d)."""
-    zero = 0.0 * d[0]
+    zero = zero_like(d[0])
     return ((d[0], zero, zero), (zero, d[1], zero), (zero, zero, d[2]))
 
 

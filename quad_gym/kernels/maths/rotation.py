@@ -8,7 +8,7 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import atan2, sin_cos, sin_cos_minus_one
 from quad_gym.kernels.maths.linalg import unit_or
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 
 
 @kernel
@@ -198,7 +198,7 @@ def quaternion_rate(q, w_B):
 @kernel
 def level_attitude(v_B, v_I):
     """The level attitude R_BI in which a vector in B has the heading that it has in I."""
-    zero = 0.0 * v_B[0]
+    zero = zero_like(v_B[0])
     east = (zero + 1.0, zero, zero)
     b = unit_or((v_B[0], v_B[1], zero), east)
     i = unit_or((v_I[0], v_I[1], zero), east)

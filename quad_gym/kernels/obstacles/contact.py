@@ -7,7 +7,7 @@ from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import stream_of, uniform_pair
 from quad_gym.kernels.obstacles.shapes import distance_from
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import logical_not, select
+from quad_gym.kernels.simd.lanes import logical_not, select, zero_like
 from quad_gym.records import DRAW_OBSTACLES, Ending
 
 
@@ -33,7 +33,7 @@ def _place_obstacles(flight, settings, mask):
 def _touch(flight, settings, mask):
     """Find the nearest obstacle, contact with it, and departure from the fence, where `mask`."""
     r_I = load3(flight.r)
-    zero = 0.0 * flight.tick
+    zero = zero_like(flight.tick)
     nearest, vector = zero + math.inf, (zero, zero, zero)
     for k in range(settings.obstacle_count):
         distance, there = distance_from(r_I, load3(flight.obstacle_center[k]), settings, k)

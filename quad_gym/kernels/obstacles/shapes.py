@@ -9,7 +9,7 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.linalg import load3, norm
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import Shape
 
 AT_THE_END = 1e-3
@@ -41,7 +41,7 @@ def _outward(p, inside):
 @kernel
 def _from_wall(p, half):
     """(distance, vector to the nearest point of the surface) of a point in a wall's axes."""
-    zero = 0.0 * p[0]
+    zero = zero_like(p[0])
     q = (abs(p[0]) - half[0], abs(p[1]) - half[1], abs(p[2]) - half[2])
     deepest = maximum(maximum(q[0], q[1]), q[2])
     outside = (
@@ -60,7 +60,7 @@ def _from_wall(p, half):
 @kernel
 def _from_cylinder(p, half):
     """(distance, vector to the nearest point of the surface) of a point in a cylinder's axes."""
-    zero = 0.0 * p[0]
+    zero = zero_like(p[0])
     rho = math.sqrt(p[0] * p[0] + p[1] * p[1])
     aside = rho > _PARALLEL
     per_rho = 1.0 / select(aside, rho, 1.0)

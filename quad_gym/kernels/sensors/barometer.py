@@ -13,7 +13,7 @@ from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import diagonal, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.sensors.aid import aid_stage
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import DRAW_AID, Aid
 
 _S = Aid.BAROMETER
@@ -23,14 +23,14 @@ _S = Aid.BAROMETER
 def _measure(flight, p):
     n, _ = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
     altitude = flight.r[2] + flight.aid_scalar[_S] + p.aid_sigma[_S] * n
-    return (altitude, 0.0 * altitude, 0.0 * altitude), flight.tick >= 0.0
+    return (altitude, zero_like(altitude), zero_like(altitude)), flight.tick >= 0.0
 
 
 @kernel
 def _expect(flight, p, work, settings, k, valid):
     """Fill rows k to k + 2: the altitude, and two masked ones."""
     first, sigma, last = settings.aid_scalar[_S], p.aid_sigma[_S], columns_of(settings) - 1
-    altitude, zero = flight.r_hat[2] + flight.slow_hat[first], 0.0 * sigma
+    altitude, zero = flight.r_hat[2] + flight.slow_hat[first], zero_like(sigma)
     noise = diagonal((sigma * sigma, zero + 1.0, zero + 1.0))
     z = load3(flight.aid_measurement[_S])
     put_block(work, settings, k, valid, z, (altitude, zero, zero), noise)

@@ -35,7 +35,7 @@ from quad_gym.kernels.sensors.latency import (
     stamp,
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import (
     DRAW_FEATURE,
     DRAW_PHASE,
@@ -152,7 +152,7 @@ def _column(flight, p, work, settings, k, j, A, S, R_BI):
                 u_B = load3(work.z_hat[k : k + 3])
                 v = per_distance * (cross(X_B, d) - dr_B)
                 put_three(A, k, valid, v + -dot(u_B, v) * u_B)
-                put_three(S, k, valid, 0.0 * v)
+                put_three(S, k, valid, zero_like(v))
             else:
                 # (I + even +- odd) (X_B -+ dr_B) - l_c
                 v_odd, v_even = turn_pair(even, odd, X_B, dr_B)
@@ -185,7 +185,7 @@ def _gate(flight, p, work, settings, k):
     overconfident. An image counts as rejected if most of its features are; otherwise rejected ones
     do not count.
     """
-    again, zero = work.again > 0.0, 0.0 * p.sigma_beta
+    again, zero = work.again > 0.0, zero_like(p.sigma_beta)
     seen, refused, total, kept, scatter, side, up = zero, zero, zero, zero, zero, zero, zero
     for i in range(settings.feature_count):
         block = FEATURE_BLOCKS + i
@@ -223,7 +223,7 @@ def _reset(flight, p, work, settings):
     The variance of the attitude is the square of the largest innovation, the variance of the
     position that of the corresponding offset at the feature's distance.
     """
-    angle, offset, P = 0.0 * flight.tick, 0.0 * flight.tick, work.P
+    angle, offset, P = zero_like(flight.tick), zero_like(flight.tick), work.P
     lanes, states = work.reset[FEATURE_BLOCKS] > 0.0, D + settings.slow_states
     for i in range(settings.feature_count):
         nu = flight.innovation[FEATURE_BLOCKS + i]

@@ -2,18 +2,18 @@
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.sensors.latency import forget_stamps
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import FIRST_BLOCK
 
 
 @kernel
 def _first_wait(phase, period, share):
     """Ticks to a sensor's first measurement: its phase, or random within its period."""
-    ticks = 0.0 * share
+    ticks = zero_like(share)
     for k in range(1, period):
         ticks = ticks + select(share * period >= 1.0 * k, 1.0, 0.0)
     if phase >= 0:
-        ticks = 0.0 * share + phase
+        ticks = zero_like(share) + phase
     return ticks
 
 

@@ -14,7 +14,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import clip, log, sin_cos
 from quad_gym.kernels.maths.linalg import dot, keep, load3, load33, load44, store
 from quad_gym.kernels.maths.random import stream_of, uniform_pair
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import (
     DRAW_FAULTS,
     DRAW_HIDDEN,
@@ -66,7 +66,7 @@ def _draw_what(flight, settings, stream, k, mask):
     _, u = uniform_pair(stream, _draw_of(k, 1))
     size = settings.fault_size[k, 0] + settings.fault_size[k, 1] * u
     given, drawn = load3(settings.fault_direction[k]), _any_direction(stream, _draw_of(k, 2))
-    direction = select(dot(given, given) + 0.0 * size > 0.0, given, drawn)
+    direction = select(dot(given, given) + zero_like(size) > 0.0, given, drawn)
     pick, _ = uniform_pair(stream, _draw_of(k, 3))
     pick = settings.fault_pick[0] + settings.fault_pick[1] * pick
     flight.fault_size[k] = select(mask, size, flight.fault_size[k])
@@ -110,7 +110,7 @@ def _apply_rotor_faults(flight, world, settings):
 @kernel
 def _advance(flight, settings, stream, mask):
     """Begin and end the faults of all kinds at the present instant, in the lanes `mask`."""
-    bits, bit = 0.0 * flight.tick, 1.0
+    bits, bit = zero_like(flight.tick), 1.0
     for k in range(FAULT_KINDS):
         if settings.fault_on[k]:
             if settings.fault_rate[k] > 0.0:
@@ -197,7 +197,7 @@ def _draw_outlier(flight, p, settings, mask):
 @kernel
 def _nth(count, share, total):
     """The whole number below `total` at a share of it, at most `count` - 1."""
-    place, number = total * share, 0.0 * share
+    place, number = total * share, zero_like(share)
     for i in range(1, count):
         number = select(place >= 1.0 * i, 1.0 * i, number)
     return number
@@ -210,7 +210,7 @@ def _mistake_features(flight, settings, mask):
     The two are the `first`-th and the `second`-th visible ones, counted from zero.
     """
     k, stream, count = FaultKind.WRONG_ASSOCIATIONS, stream_of(flight), settings.feature_count
-    zero = 0.0 * flight.tick
+    zero = zero_like(flight.tick)
     seen = zero
     for i in range(count):
         seen = seen + flight.block_valid[FEATURE_BLOCKS + i]
@@ -292,7 +292,7 @@ def saturate_imu_stage(flight, world, model, settings, work, stages, flag):
 def corrupt_gnss_stage(flight, world, model, settings, work, stages, flag):
     """Add ramp, jump and outliers to the GNSS position that has just been measured."""
     active, mask = flight.fault_active, work.mask > 0.0
-    zero = 0.0 * flight.tick
+    zero = zero_like(flight.tick)
     offset_I = (zero, zero, zero)
     if settings.fault_on[FaultKind.GNSS_RAMP]:
         seconds = (flight.tick - flight.fault_from[FaultKind.GNSS_RAMP]) * world.dt

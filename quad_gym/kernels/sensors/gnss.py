@@ -18,7 +18,7 @@ from quad_gym.kernels.sensors.latency import (
     stamp,
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import (
     BASELINE_BLOCK,
     DRAW_GNSS,
@@ -77,7 +77,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     delayed, period = settings.sensor_delay[_GNSS] > 0, settings.sensor_ticks[_GNSS]
     arrives = find_arrivals(flight, work, settings, _GNSS, mask)
     if not starting and not any_of(due | arrives):
-        nothing = 0.0 * flight.tick
+        nothing = zero_like(flight.tick)
         _flag(flight.block_valid, mask, nothing, nothing, settings)
         return
     if delayed:
@@ -99,7 +99,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     unpaired = measured & logical_not(paired)
     if starting or not delayed:
         fresh = measured & (period > 0)
-        one = 1.0 + 0.0 * flight.tick
+        one = 1.0 + zero_like(flight.tick)
         _flag(flight.block_fresh, fresh, one, select(unpaired, 0.0, one), settings)
     if starting and settings.reuse_first_fix == 0 and not settings.warm:
         due = due & (period < 0)  # none

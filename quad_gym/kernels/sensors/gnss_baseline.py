@@ -29,7 +29,7 @@ from quad_gym.kernels.maths.linalg import (
     outer,
     rounded,
 )
-from quad_gym.kernels.simd.lanes import logical_not, select
+from quad_gym.kernels.simd.lanes import logical_not, select, zero_like
 from quad_gym.records import BASELINE_BLOCK
 
 _COARSE = 0.05
@@ -84,7 +84,7 @@ def gate(flight, p, work, settings, k):
     )
     first = valid & logical_not(work.again > 0.0)
     judge(flight, p, work, settings, s, first, beyond, nis, scatter, 2.0, p.gate_direction)
-    follow_mean(flight, s, first & logical_not(beyond), (scaled[0], scaled[1], 0.0 * nis))
+    follow_mean(flight, s, first & logical_not(beyond), (scaled[0], scaled[1], zero_like(nis)))
     mask_rejected(flight, work, settings, k, s, valid, 3.0)
 
 

@@ -19,7 +19,7 @@ from quad_gym.kernels.maths.elementary import exp, log
 from quad_gym.kernels.maths.linalg import diagonal, dot, keep, load3, load33, rounded, vector
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, VELOCITY_BLOCK
 
 
@@ -76,7 +76,7 @@ def reset(flight, p, work, settings, states, lanes, nu):
     as much as the position in the time since the last accepted fix.
     """
     square, T = dot(nu, nu), time_of(flight, p, POSITION_BLOCK)
-    zero, speed = 0.0 * square, 4.0 * square / (T * T)
+    zero, speed = zero_like(square), 4.0 * square / (T * T)
     drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
     reset_variances(work.P, V, states, drifted, (speed, speed, speed))
     drift = (zero, zero, zero)

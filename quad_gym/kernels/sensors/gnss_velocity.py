@@ -15,6 +15,7 @@ from quad_gym.kernels.maths.linalg import cross, diagonal, keep, load3, load4, l
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.simd.lanes import zero_like
 from quad_gym.records import DRAW_VELOCITY
 
 
@@ -36,7 +37,7 @@ def expect(flight, p, work, settings, k, valid):
     put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
     for j in range(9):
         dv = load_column3(flight.L, V, j)
-        s = 0.0 * dv
+        s = zero_like(dv)
         if settings.slow_states > 0:
             a, s = lever_column(flight, work, settings, j, R_BI, lever_B)
             dv = dv + a

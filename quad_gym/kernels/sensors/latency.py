@@ -7,7 +7,7 @@ Each is stored with its time stamp: the sums of the IMU when it was taken, with 
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.kernels.simd.lanes import any_of, no_lane, select, zero_like
 from quad_gym.records import DELAY_SLOTS, FIRST_BLOCK, STAMP
 
 
@@ -47,7 +47,7 @@ def keep_arrived(work, block, values, numbers):
 def find_arrivals(flight, work, settings, sensor, mask):
     """Fill work.arrives with the slot that arrives now; return the lanes in which one does."""
     stamps, delay = flight.stamps[sensor], settings.sensor_delay[sensor]
-    some = mask & (flight.tick < 0.0)  # all false
+    some = no_lane(flight.tick)
     for slot in range(settings.under_way[sensor]):
         here = mask & (stamps[slot, 0] == flight.tick - delay)
         work.arrives[slot] = select(here, 1.0, 0.0)
@@ -58,7 +58,7 @@ def find_arrivals(flight, work, settings, sensor, mask):
 @kernel
 def stamp(flight, settings, sensor, mask):
     """Stamp the measurements just taken; return the lanes that have any."""
-    first, valid = FIRST_BLOCK[sensor], 0.0 * flight.tick
+    first, valid = FIRST_BLOCK[sensor], zero_like(flight.tick)
     for block in range(first, first + settings.sensor_blocks[sensor]):
         valid = valid + flight.block_valid[block]
     taken = mask & (valid > 0.0)
@@ -82,7 +82,7 @@ def exchange(flight, work, block, values, numbers, under_way, mask, taken):
         taken: Lanes in which the sensor has measured.
     """
     waiting, flags = flight.waiting[block], flight.waiting_valid[block]
-    valid, arrived = flight.block_valid[block], 0.0 * flight.tick
+    valid, arrived = flight.block_valid[block], zero_like(flight.tick)
     for slot in range(under_way):
         here = work.arrives[slot] > 0.0
         for i in range(numbers):

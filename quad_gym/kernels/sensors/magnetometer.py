@@ -47,7 +47,7 @@ from quad_gym.kernels.maths.matrices import load_block, load_column3, store_bloc
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.MAGNETOMETER
@@ -80,7 +80,7 @@ def _align(flight, p, work, settings, mask):
     put_covariance(P, L, 1.0)
     for i in range(settings.slow_states):
         for j in range(D + i):
-            P[D + i, j] = 0.0 * p.dt
+            P[D + i, j] = zero_like(p.dt)
         sigma = p.slow_sigma[i]
         P[D + i, D + i] = select(sigma > 0.0, sigma * sigma, 1.0)  # GNSS has not drifted yet
     iron, delta = D + settings.aid_vector[_S], D + settings.aid_scalar[_S]
@@ -103,7 +103,7 @@ def _align(flight, p, work, settings, mask):
 @kernel
 def _tie_heading(p, P, m, R_BI, iron, delta):
     """Replace the error of the heading in P by the error of the field's heading, see above."""
-    zero = 0.0 * p.dt
+    zero = zero_like(p.dt)
     level = math.sqrt(m[0] * m[0] + m[1] * m[1])
     h, k = R_BI @ (m[0] / level, m[1] / level, zero), R_BI @ (zero, zero, zero + 1.0)
     s, steep = cross(k, h), m[2] / level
@@ -148,7 +148,7 @@ def _full(P):
 def _expected_field(flight, p, settings):
     """R_BI (m_I + delta m_I x e3) and R_BI (m_I x e3)."""
     m, R_BI = load3(p.aid_numbers[_S]), load33(flight.R_hat)
-    g = (m[1], -m[0], 0.0 * m[2])
+    g = (m[1], -m[0], zero_like(m[2]))
     return R_BI @ (flight.slow_hat[settings.aid_scalar[_S]] * g + m), R_BI @ g
 
 
@@ -163,7 +163,7 @@ def _expect(flight, p, work, settings, k, valid):
     put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
     for j in range(last + 1):
         db, turned = load_column3(M, first, j), M[delta, j] * g_B
-        a, s = turned + db, 0.0 * db
+        a, s = turned + db, zero_like(db)
         if j < 9:
             if (settings.form & FilterForm.EKF.value) != 0:
                 a = a + cross(f_B, load_column3(L, E, j))

@@ -29,7 +29,7 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.sensors.range_finder import MIN_COSINE, ground_range
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.OPTICAL_FLOW
@@ -46,19 +46,19 @@ def _measure(flight, p):
     x, y = g * v_B[0] - w[1], g * v_B[1] + w[0]
     most, sigma = p.aid_numbers[_S, 1], p.aid_sigma[_S]
     within = within & (abs(x) <= most) & (abs(y) <= most)
-    return (x + sigma * n_x, y + sigma * n_y, 0.0 * x), within
+    return (x + sigma * n_x, y + sigma * n_y, zero_like(x)), within
 
 
 @kernel
 def _flow(g, v_B):
     """Contribution of a velocity to the flow; its third number is masked."""
-    return (g * v_B[0], g * v_B[1], 0.0 * g)
+    return (g * v_B[0], g * v_B[1], zero_like(g))
 
 
 @kernel
 def _put_center(flight, p, work, settings, k, valid, G, W):
     """Fill the rows of measurement, prediction and noise."""
-    w, zero = load3(flight.w_meas) - load3(flight.b_g_hat), 0.0 * G
+    w, zero = load3(flight.w_meas) - load3(flight.b_g_hat), zero_like(G)
     z_hat = vector(-w[1], w[0], zero) + _flow(G, W)
     variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
     noise = diagonal((variance, variance, zero + 1.0))
@@ -71,7 +71,7 @@ def _expect(flight, p, work, settings, k, valid):
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
     h, W = maximum(h, 0.5 * p.aid_numbers[_S, 0]), R_BI @ load3(flight.v_hat)
-    G, z_B, zero = u / h, R_BI.T[2], 0.0 * h
+    G, z_B, zero = u / h, R_BI.T[2], zero_like(h)
     _put_center(flight, p, work, settings, k, valid, G, W)
     for j in range(9):
         dV, dh = R_BI @ load_column3(L, V, j), L[R + 2, j] if j <= R + 2 else zero

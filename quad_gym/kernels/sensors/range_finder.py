@@ -19,7 +19,7 @@ from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.RANGE_FINDER
@@ -40,7 +40,7 @@ def _measure(flight, p):
     steep = u < MIN_COSINE
     distance = h / select(steep, 1.0, u)
     within = (distance >= p.aid_numbers[_S, 0]) & (distance <= p.aid_numbers[_S, 1])
-    zero = 0.0 * distance
+    zero = zero_like(distance)
     return (distance + p.aid_sigma[_S] * n, zero, zero), within & (u >= MIN_COSINE)
 
 
@@ -49,7 +49,7 @@ def _expect(flight, p, work, settings, k, valid):
     """Fill rows k to k + 2: the distance, and two masked ones."""
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
-    zero, sigma = 0.0 * u, p.aid_sigma[_S]
+    zero, sigma = zero_like(u), p.aid_sigma[_S]
     u = maximum(u, MIN_COSINE)
     z, noise = load3(flight.aid_measurement[_S]), (sigma * sigma, zero + 1.0, zero + 1.0)
     put_block(work, settings, k, valid, z, (h / u, zero, zero), diagonal(noise))

@@ -314,6 +314,36 @@ def _cast(context: Any, builder: ir.IRBuilder, value: Any, source: Any, target: 
 
 
 @intrinsic
+def zero_like(typing_context, value):  # type: ignore[no-untyped-def]
+    """Return zero times a number, vector or matrix: zero of its type, and NaN where it is NaN."""
+
+    def times_zero(context, builder, number, kind):  # type: ignore[no-untyped-def]
+        if isinstance(kind, types.BaseTuple):
+            parts = [builder.extract_value(number, i) for i in range(len(kind))]
+            zeros = [times_zero(context, builder, *each) for each in zip(parts, kind, strict=True)]
+            return context.make_tuple(builder, kind, zeros)
+        if kind != lanes:
+            number = context.cast(builder, number, kind, types.float64)
+        return builder.fmul(ir.Constant(number.type, None), number)
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return times_zero(context, builder, args[0], value)
+
+    plain = isinstance(value, (types.Float, types.Integer))
+    return (types.float64 if plain else value)(value), lower
+
+
+@intrinsic
+def no_lane(typing_context, value):  # type: ignore[no-untyped-def]
+    """Return a mask without any lane, or False where the number `value` is a plain one."""
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return context.get_constant_null(sig.return_type)
+
+    return (mask if value == lanes else types.boolean)(value), lower
+
+
+@intrinsic
 def logical_not(typing_context, asked):  # type: ignore[no-untyped-def]
     """Return the negation of a mask or boolean."""
 

@@ -7,7 +7,7 @@ from quad_gym.kernels.maths.elementary import minimum, sin_cos
 from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.task.follow import draw_path
 from quad_gym.kernels.task.heights import GATE_SPREAD, LOWEST_GATE, RANDOM_RISE
 from quad_gym.kernels.task.start import draw_start
@@ -40,7 +40,7 @@ def _draw_series(flight, settings, stream, mask):
     |r'| <= sum k w |c_k| and |r''| <= sum (k w)^2 |c_k|, so the bounds hold at all times.
     """
     omega = 2.0 * math.pi / settings.period
-    zero = 0.0 * flight.tick
+    zero = zero_like(flight.tick)
     speed, acceleration, extent = zero, zero, zero
     for k in range(MAX_HARMONICS):
         n_a, n_b = six_normals(stream, DRAW_SERIES + 3 * k)
@@ -90,7 +90,7 @@ def draw_reference(flight, settings, stream, mask):
     """Set the reference of a new episode, where `mask`; at random if the settings require it."""
     u_phase, u_radius = uniform_pair(stream, DRAW_COURSE)
     u_period, u_sense = uniform_pair(stream, DRAW_COURSE + 1)
-    zero = 0.0 * u_phase
+    zero = zero_like(u_phase)
     radius, period, phase, sense = zero + settings.radius, zero + settings.period, zero, zero + 1.0
     if settings.randomize_reference:
         phase = 2.0 * math.pi * u_phase

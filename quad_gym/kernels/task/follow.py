@@ -14,7 +14,7 @@ from quad_gym.kernels.maths.linalg import store
 from quad_gym.kernels.maths.random import uniform_pair
 from quad_gym.kernels.simd.addresses import record_at
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.task.reference import direction_of
 from quad_gym.records import (
     DRAW_PATH,
@@ -36,7 +36,7 @@ def draw_path(flight, settings, stream, mask):
     """Draw the trajectory of a new episode, where `mask`; also its phase and rotation, if set."""
     u_path, u_share = uniform_pair(stream, DRAW_PATH)
     u_turn, _ = uniform_pair(stream, DRAW_PATH + 1)
-    zero = 0.0 * u_path
+    zero = zero_like(u_path)
     chosen, share, turn = zero, zero, zero
     for k in range(1, settings.path_count):
         chosen = select(u_path * settings.path_count >= 1.0 * k, 1.0 * k, chosen)
@@ -94,7 +94,7 @@ def _value(work, i):
     """Return a polynomial and its first two derivatives, by Horner's rule."""
     t = work.path_time
     value = work.path_terms[0, i]
-    rate, bend = 0.0 * t, 0.0 * t
+    rate, bend = zero_like(t), zero_like(t)
     for k in range(1, TERMS):
         bend = bend * t + rate
         rate = rate * t + value
@@ -112,7 +112,7 @@ def _turned(flight, x, y, z):
 @kernel
 def _heading(flight, work, r, v):
     """Return the desired direction of body x, rotated like the trajectory."""
-    zero = 0.0 * r[0]
+    zero = zero_like(r[0])
     rule = work.path_heading
     yaw, _, _ = _value(work, 3)
     s, c = sin_cos(yaw)
@@ -141,7 +141,7 @@ def follow_stage(flight, world, model, settings, work, stages, flag):
     room.path_time = time
     _look_up(flight, work, stages)
     (x, vx, ax), (y, vy, ay), (z, vz, az) = _value(room, 0), _value(room, 1), _value(room, 2)
-    still, none = room.path_still > 0.0, (0.0 * x, 0.0 * x, 0.0 * x)
+    still, none = room.path_still > 0.0, (zero_like(x), zero_like(x), zero_like(x))
     v = select(still, none, (vx, vy, vz))
     store(flying.path_r, _turned(flying, x, y, z))
     store(flying.path_v, _turned(flying, v[0], v[1], v[2]))

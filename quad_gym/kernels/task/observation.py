@@ -5,7 +5,7 @@ import math
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import load3, load4, load33
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
 from quad_gym.records import (
     AID_BLOCKS,
@@ -93,7 +93,7 @@ def _put_absolute(flight, p, settings, row):
     if settings.source == Source.ESTIMATE:
         b_a, b_g = load3(flight.b_a_hat), load3(flight.b_g_hat)
     elif settings.source == Source.NOISY:
-        b_a, b_g = 0.0 * b_a, 0.0 * b_g
+        b_a, b_g = zero_like(b_a), zero_like(b_g)
     k = _put3(row, k, b_a)
     k = _put3(row, k, b_g)
     k = _put3(row, k, load3(flight.w_seen))

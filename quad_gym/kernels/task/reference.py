@@ -8,7 +8,7 @@ trajectory is looked up by the stage of `follow.py`, and read here.
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.linalg import load3, unit_or
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import FOLLOWED, HEADING_ALONG, HEADING_VELOCITY, MAX_HARMONICS
 
 
@@ -16,7 +16,7 @@ from quad_gym.records import FOLLOWED, HEADING_ALONG, HEADING_VELOCITY, MAX_HARM
 def position_on_reference(flight, t, harmonics=MAX_HARMONICS):
     """Return r*(t) in I [m]."""
     x, y, z = load3(flight.ref_center)
-    s1, c1 = 0.0 * x, 0.0 * x
+    s1, c1 = zero_like(x), zero_like(x)
     if harmonics > 0:
         s1, c1 = sin_cos(flight.ref_omega * t)
     s, c = s1, c1
@@ -40,7 +40,7 @@ def heading(flight, r_ref, v_ref):
     rule = flight.ref_heading_rule
     along = select(rule == HEADING_VELOCITY, v_ref, point - r_ref)
     direction = select(rule == HEADING_ALONG, point, along)
-    return direction_of(direction, 0.0 * r_ref[0])
+    return direction_of(direction, zero_like(r_ref[0]))
 
 
 @kernel
@@ -66,7 +66,7 @@ def evaluate_reference(flight, t, harmonics=MAX_HARMONICS):
 def _evaluate_series(flight, t, harmonics):
     omega = flight.ref_omega
     x, y, z = load3(flight.ref_center)
-    zero = 0.0 * x
+    zero = zero_like(x)
     s1, c1 = zero, zero
     if harmonics > 0:
         s1, c1 = sin_cos(omega * t)

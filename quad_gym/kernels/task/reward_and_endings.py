@@ -4,7 +4,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import exp, is_finite
 from quad_gym.kernels.maths.linalg import dot, keep, load3, load4, norm
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import logical_not, select
+from quad_gym.kernels.simd.lanes import logical_not, select, zero_like
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import MAX_GATES, Ending, RewardTerm, TaskKind
 
@@ -34,7 +34,7 @@ def _reward(flight, p, settings, work, active, R_BI, w_B):
     roundings.
     """
     seconds, weight, term = p.dt * settings.ticks_per_step, settings.reward_weight, work.reward_term
-    change, spin = 0.0 * seconds, dot(w_B, w_B)
+    change, spin = zero_like(seconds), dot(w_B, w_B)
     for i in range(4):
         gap = flight.action[i] - flight.last_action[i]
         change = change + gap * gap

@@ -6,7 +6,7 @@ from quad_gym.kernels.maths.linalg import dot, keep, load3, vector
 from quad_gym.kernels.maths.random import normal_pair, six_normals, uniform_pair
 from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm
 from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import (
     COLUMNS,
@@ -44,9 +44,9 @@ def _given_or(given, drawn):
 @kernel
 def draw_start(flight, p, model, settings, work, stream, mask):
     """Set the true state at the start of an episode, where `mask`; mark lanes on the ground."""
-    (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
+    (x, y, z), _, _, x_ref = evaluate_reference(flight, zero_like(flight.tick), settings.harmonics)
     yaw = atan2(x_ref[1], x_ref[0])
-    zero = 0.0 * yaw
+    zero = zero_like(yaw)
     v_I = (zero, zero, zero)
     roll, pitch, rotor_speed = zero, zero, zero
     on_ground = mask

@@ -10,7 +10,7 @@ from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import dot, keep, load3, load4, load33
 from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.vehicle.dynamics import (
     accelerations,
     advance,
@@ -43,7 +43,7 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
     `v_air_I` is the velocity relative to the air [m/s].
     """
     W = rotor_speeds
-    zero = 0.0 * r_I[0]
+    zero = zero_like(r_I[0])
     force_I, torque_B = (zero, zero, zero), (zero, zero, zero)
     if settings.linear_drag:
         v_B = R_BI @ v_air_I
@@ -155,7 +155,7 @@ def supply_stage(flight, world, model, settings, work, stages, flag):
     p, limit = world, world.max_voltage
     if settings.supply == Supply.BATTERY:
         W = load4(flight.rotor_speeds)
-        power, current = 0.0 * W[0], 0.0 * W[0]
+        power, current = zero_like(W[0]), zero_like(W[0])
         for i in range(4):
             torque = p.effectiveness[0, i] * p.torque_coefficient * W[i] * W[i]
             power = power + torque * W[i]

@@ -18,7 +18,7 @@ from quad_gym.kernels.maths.linalg import (
     store,
     unit_or,
 )
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Control
 
@@ -33,7 +33,7 @@ def allocate(thrust, torque, p):
     that the thrust alone overloads, as unequal arms allow, is limited to Fmax.
     """
     limit = p.max_rotor_force
-    zero = 0.0 * thrust
+    zero = zero_like(thrust)
     base = load44(p.allocation) @ (minimum(thrust, 3.6 * limit), zero, zero, zero)
     turn = load44(p.allocation) @ (zero, torque[0], torque[1], torque[2])
     alpha = zero + 1.0
@@ -94,7 +94,7 @@ def rate_torque(w_desired, w_B, p):
 def level_axes(R_BI):
     """The axes of the level frame in I: x ahead along the body's heading, y to its left, z up."""
     x_B_I = R_BI[0]
-    zero = 0.0 * x_B_I[0]
+    zero = zero_like(x_B_I[0])
     ahead = unit_or((x_B_I[0], x_B_I[1], zero), (1.0, 0.0, 0.0))
     return (ahead, (-ahead[1], ahead[0], zero), (zero, zero, zero + 1.0))
 
@@ -121,7 +121,7 @@ def act(flight, a, p, mode, reference):
         for i in range(4):
             flight.voltages[i] = minimum(hover * (1.0 + a[i]), limit)
     else:
-        torque = (0.0 * thrust, 0.0 * thrust, 0.0 * thrust)
+        torque = (zero_like(thrust), zero_like(thrust), zero_like(thrust))
         if mode == Control.WRENCH:
             scales = p.torque_scale
             torque = (scales[0] * a[1], scales[1] * a[2], scales[2] * a[3])

@@ -20,7 +20,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum, sin_cos
 from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, load4, load33, rounded, store
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.kernels.vehicle.dynamics import air_accelerations, load_start
 from quad_gym.records import Ending
 
@@ -49,7 +49,7 @@ def _effective_mass(arm, along, inverse_inertia_I, inverse_mass):
 @kernel
 def _prepare(work, p, R_BI, inverse_inertia_I, height):
     """Set arms in I, effective masses and gaps of all points, and zero impulses."""
-    zero, inverse_mass = 0.0 * height, 1.0 / p.mass
+    zero, inverse_mass = zero_like(height), 1.0 / p.mass
     one = zero + 1.0
     for i in range(_POINTS):
         arm = R_BI.T @ _point(p, i)
@@ -72,7 +72,7 @@ def _pushed(v_I, w_I, arm, j_I, inverse_inertia_I, inverse_mass):
 @kernel
 def _sweep(work, v_I, w_I, inverse_inertia_I, inverse_mass, friction, rate):
     """One sweep over all points; returns velocity and body rates in I after it."""
-    zero = 0.0 * v_I[0]
+    zero = zero_like(v_I[0])
     for i in range(_POINTS):
         arm, mass = load3(work.ground_arm[i]), load3(work.ground_mass[i])
         old = load3(work.ground_impulse[i])
@@ -129,7 +129,7 @@ def _can_hold(work, F, T, friction):
     Normal forces are the least-squares solution among the four; static friction is evaluated for
     the whole vehicle, as if the feet shared the load.
     """
-    zero = 0.0 * F[0]
+    zero = zero_like(F[0])
     c_x, c_y, c_z = zero, zero, zero
     n, y, x, yy, xx, xy = zero, zero, zero, zero, zero, zero
     for i in range(_FEET):
@@ -172,7 +172,7 @@ def carry(p, settings, work, pose, rates, free, ahead):
     R_BI, rate, J = quaternion_to_dcm(q), 1.0 / p.dt, load33(p.inertia)
     friction = settings.friction
     inverse_inertia_I = R_BI.T @ (load33(p.inertia_inverse) @ R_BI)
-    inverse_mass, zero = 1.0 / p.mass, 0.0 * r_I[0]
+    inverse_mass, zero = 1.0 / p.mass, zero_like(r_I[0])
     w_I = R_BI.T @ w_free
     _prepare(work, p, R_BI, inverse_inertia_I, r_I[2] - p.ground_height)
     meets, hard, still = zero > 1.0, zero > 1.0, zero < 1.0
@@ -214,7 +214,7 @@ def _feel(flight, p, R_BI, gained, mask):
     """
     a_I, dw_B = air_accelerations(flight, p, R_BI)
     push = R_BI @ (gained[0] - a_I) + cross(gained[1] - dw_B, load3(p.imu_lever_arm))
-    zero = 0.0 * p.dt
+    zero = zero_like(p.dt)
     store(flight.ground_push, select(mask, push, (zero, zero, zero)))
 
 
@@ -256,7 +256,7 @@ def stand_stage(flight, world, model, settings, work, stages, flag):
         gained = rate * (v - v_I), rate * (w - w_B)
         _feel(flight, p, quaternion_to_dcm(load4(flight.q)), gained, meets)
     else:
-        zero = 0.0 * p.dt
+        zero = zero_like(p.dt)
         store(flight.ground_push, (zero, zero, zero))
 
 
