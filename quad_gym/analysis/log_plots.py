@@ -23,14 +23,14 @@ from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 _MAX_POINTS = 4000  #: points of a curve
 _AXES = (BLUE, ORANGE, GREEN)
 _SENSORS = {
-    "gnss_position": "NIS of positions",
-    "gnss_velocity": "NIS of velocities",
-    "gnss_baseline": "NIS of baselines",
-    "features": "NIS of features",
-    "barometer": "NIS of the barometer",
-    "magnetometer": "NIS of the magnetometer",
-    "optical_flow": "NIS of the optical flow",
-    "range_finder": "NIS of the range finder",
+    "gnss_position": "positions",
+    "gnss_velocity": "velocities",
+    "gnss_baseline": "baselines",
+    "features": "features",
+    "barometer": "barometer",
+    "magnetometer": "magnetometer",
+    "optical_flow": "optical flow",
+    "range_finder": "range finder",
 }
 
 
@@ -41,8 +41,9 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
     first, unit = {"position": (0, "m"), "velocity": (3, "m/s"), "attitude": (6, "deg")}[name]
     labels, scale = ("east", "north", "up"), 1.0
     if name == "attitude":
-        angles = dcm_to_euler(quaternion_to_dcm(result.quaternion[some]))
-        values, labels, scale = np.unwrap(angles, axis=0), ("roll", "pitch", "yaw"), 180.0 / np.pi
+        values = dcm_to_euler(quaternion_to_dcm(result.quaternion[some]))
+        labels, scale = ("roll", "pitch", "yaw"), 180.0 / np.pi
+        values[1:][np.abs(np.diff(values, axis=0)) > np.pi] = np.nan  # no line across the figure
     else:
         values = getattr(result, name)[some]
     for i, (label, color) in enumerate(zip(labels, _AXES, strict=True)):
@@ -50,7 +51,7 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
         band = (curve - 2.0 * sigma, curve + 2.0 * sigma)
         axes.fill_between(time, *band, color=color, alpha=0.2, linewidth=0.0)
         axes.plot(time, curve, color=color, linewidth=1.1, label=label)
-    low, high = np.percentile(scale * values, [0.0, 100.0])
+    low, high = scale * np.nanmin(values), scale * np.nanmax(values)
     margin = 0.1 * max(high - low, 1e-3)
     axes.set_ylim(low - margin, high + margin)
     axes.set_title(f"{name} [{unit}], with two standard deviations")
@@ -58,7 +59,7 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
 
 
 def draw_nis(axes: Any, measured: Measured, title: str) -> None:
-    """Draw NIS per degree of freedom, rejected measurements, and the 99 % quantile."""
+    """Draw the NIS per degree of freedom (DOF), rejected measurements, and the 99 % quantile."""
     freedoms = measured.innovation.shape[1]
     bound = chi_square_quantile(freedoms, 0.99) / freedoms
     nis, known = measured.nis / freedoms, np.isfinite(measured.nis)
@@ -70,8 +71,8 @@ def draw_nis(axes: Any, measured: Measured, title: str) -> None:
     # values beyond the limits are drawn at the edge
     high = np.minimum(nis[left_out], 0.97 * top)
     axes.plot(measured.time[left_out], high, "x", color=VERMILLION, markersize=5.0)
-    mean = f": {nis[known].mean():.2f} per degree of freedom" if known.any() else ""
-    axes.set_title(f"{title}{mean}; rejected: {int(left_out.sum())}")
+    mean = f"NIS/DOF {nis[known].mean():.2f}, " if known.any() else ""
+    axes.set_title(f"{title}: {mean}{left_out.sum()} rejected")
     axes.set_ylim(0.0, top)
 
 
