@@ -8,9 +8,6 @@ import torch
 from quad_gym.kernels.library import DEVICE_KERNEL
 from quad_gym.records.width import WARP
 
-_WARPS_PER_PROCESSOR = 4
-"""Warps of a multiprocessor: more hide more latency, and their workspaces leave the caches."""
-
 
 class _Stream:
     """A stream of torch, as cuda-core accepts it."""
@@ -28,12 +25,14 @@ class CudaLauncher:
     Args:
         ptx: The module.
         device: GPU with the memory of the flights.
+        per_processor: Warps of a multiprocessor: more hide more latency, and their workspaces
+            leave the caches.
 
     Raises:
         ImportError: If cuda-core is not installed.
     """
 
-    def __init__(self, ptx: bytes, device: torch.device) -> None:
+    def __init__(self, ptx: bytes, device: torch.device, per_processor: int = 4) -> None:
         try:
             from cuda import core
         except ImportError as error:
@@ -48,7 +47,7 @@ class CudaLauncher:
         self._core: Any = core
         self._torch_device = torch.device("cuda", number)
         processors = torch.cuda.get_device_properties(number).multi_processor_count
-        self.warps = _WARPS_PER_PROCESSOR * processors
+        self.warps = per_processor * processors
 
     def __call__(self, call: int, blocks: int, command: int) -> None:
         """Fly blocks: each warp its share."""

@@ -4,7 +4,13 @@ Only the instructions that kernels use are known, and floating-point ones only i
 forms, which ptxas never fuses: `fma.rn`, `add.rn` and so on.
 """
 
+import ctypes
 import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+from quad_gym.records import WARP
 
 HEAD = """
 #include <stdint.h>
@@ -31,11 +37,11 @@ static inline u32 funnel(u32 low, u32 high, u32 by) { by &= 31;
 static u32 tid, ctaid, ntid = 32, nctaid = 1;
 """
 TAIL = """
-int qg_core_fly_one(void *r, void *e, u64 call, u64 index, u64 lane, u64 worker, u64 command) {
+void thread(u64 lane, u64 call, u64 blocks, u64 command) {
   tid = lane;
-  if (index == 0) qg_fly(call, BLOCKS, command); /* a thread flies all blocks of its warp */
-  return 0; }
+  qg_fly(call, blocks, command); }
 """
+OPTIONS = ("-O1", "-w", "-fPIC", "-ffp-contract=off", "-fno-strict-aliasing", "-fwrapv", "-shared")
 SPECIAL = {"%tid.x": "tid", "%ctaid.x": "ctaid", "%ntid.x": "ntid", "%nctaid.x": "nctaid"}
 ORDERS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 SIGNS = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|", "xor": "^"}
@@ -59,8 +65,26 @@ FLOATS = {
 }
 
 
-def c_of(text, blocks):
-    """Return the C source of a module of PTX, as `HostLauncher` calls it for so many blocks."""
+class PtxLauncher:
+    """Launches a module of PTX on this processor: a warp, thread after thread."""
+
+    warps = 1
+
+    def __init__(self, text):
+        with tempfile.TemporaryDirectory() as folder:
+            source, file = Path(folder, "flights.c"), f"{folder}/flights.so"
+            source.write_text(c_of(text))
+            subprocess.run(["cc", *OPTIONS, "-o", file, source, "-lm"], check=True)
+            self._thread = ctypes.CDLL(file)["thread"]
+        self._thread.argtypes = [ctypes.c_int64] * 4
+
+    def __call__(self, call, blocks, command):
+        for lane in range(WARP):
+            self._thread(lane, call, blocks, command)
+
+
+def c_of(text):
+    """Return the C source of a module of PTX."""
     constants = re.findall(r"\.global [^;\n]*?\.b8 (\w+)\[(\d+)\](?: = \{([^}]*)\})?;", text)
     words = re.findall(
         r"\.global [^;\n]*?\.u64 (\w+)\[(\d+)\]", text
@@ -80,7 +104,7 @@ def c_of(text, blocks):
         lines.append(f"{heads[name]};")
     for name, _, body in functions:
         lines += [f"{heads[name]} {{", *_body(body, places), "}"]
-    return "\n".join([*lines, TAIL.replace("BLOCKS", str(blocks))])
+    return "\n".join([*lines, TAIL])
 
 
 def _body(text, places):

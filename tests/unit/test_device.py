@@ -2,8 +2,6 @@
 
 import subprocess
 import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.kernels.compiling.building import PROCESSORS
 from quad_gym.kernels.library import machine
 from quad_gym.params.suites import SUITES
-from quad_gym.records import WARP
 from tests.builders import vec_env
 from tests.golden import device, ptx
 from tests.golden.flights import trajectories
@@ -29,12 +26,7 @@ pytestmark = pytest.mark.skipif(machine() not in PROCESSORS, reason="no code for
 
 def launcher_of_ptx(plan):
     """Return the launcher of a plan's PTX, translated to C."""
-    with tempfile.TemporaryDirectory() as folder:
-        source, file = Path(folder, "flights.c"), f"{folder}/flights.so"
-        source.write_text(ptx.c_of(ptx_of(plan).decode(), -(-COUNT // WARP)))
-        options = ["-O1", "-w", "-fPIC", "-ffp-contract=off", "-fno-strict-aliasing", "-fwrapv"]
-        subprocess.run(["cc", *options, "-shared", "-o", file, source, "-lm"], check=True)
-        return device.HostLauncher(file)
+    return ptx.PtxLauncher(ptx_of(plan).decode())
 
 
 def device_env(base, count=COUNT, launcher=device.launcher_of, **keywords):

@@ -24,6 +24,7 @@ from quad_gym.kernels.compiling.foreign import (
     optimized,
 )
 from quad_gym.kernels.compiling.stages import SLOT
+from quad_gym.kernels.compiling.workers import kernels
 from quad_gym.kernels.device import SETTINGS_SYMBOL
 from quad_gym.kernels.library import DEVICE_KERNEL, core_symbol, say
 from quad_gym.kernels.stages import Stage
@@ -133,7 +134,7 @@ def ptx_of(settings: bytes, stages: Mapping[Stage, str]) -> bytes:
 
     def emit() -> bytes:
         if missing := [name for name in names if not is_cached(name)]:
-            say(f"quad_gym: compiling {len(missing)} kernels for a GPU (once)")
+            say(f"quad_gym: compiling {kernels(len(missing))} for a GPU (once)")
             in_processes(linked, missing)
         text: str = machine_of(GPU).emit_assembly(module_of(settings, stages))
         return text.encode()

@@ -1,0 +1,193 @@
+"""Flights on a GPU: golden flights number by number, steps/s, memory. Never run on a GPU yet.
+
+    python -m scripts.benchmarks.gpu prepare FOLDER     # on any machine, in a clone with all extras
+    python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine, in 8 minutes
+
+The second part needs the clone and FOLDER, and of packages NumPy, torch and cuda-core. It writes
+FOLDER/results.json after every measurement and skips those that are there: where it was interrupted
+or ran out of time, run it again.
+"""
+
+import functools
+import importlib
+import json
+import pickle
+import sys
+import time
+import types
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+SECONDS = 400.0  #: time after which no measurement begins; the driver compiles a module in 20 s
+CASES = (
+    *("observation truth", "Circle, standard", "trajectories", "obstacles", "ground"),
+    *("many options", "features drawn", "crazyflie, late, ekf, warm, raw", "Waypoints, rtk"),
+)
+"""Golden cases, in the order in which they are flown."""
+TIMED = CASES[:2]
+SIZES = tuple((count, warps) for warps in (4, 2, 8) for count in (4_096, 65_536, 1_048_576))
+"""Numbers of flights, and of warps for each multiprocessor."""
+DURATION = 2.0  #: of a measurement of steps/s [s]
+TICKS, FLIGHTS, STEPS, SEED = 30, 8, 300, 2026
+Make = Callable[[bytes, int], Any]
+"""Make the launcher of a module of PTX, with a number of warps for each multiprocessor."""
+
+
+def prepare(folder: Path, cases: tuple[str, ...] = CASES) -> None:
+    """Write a file for each case: its plan, its PTX, and the numbers of its flights here."""
+    import gymnasium
+
+    from quad_gym.device.emission import plan_of, ptx_of
+
+    golden: Any = importlib.import_module("tests.golden.flights")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in cases:
+        keywords = dict(golden.cases()[name])
+        task = keywords.pop("id", "Circle")
+        if task == "Circle":
+            keywords.setdefault("start", "ground")
+        env: Any = gymnasium.make_vec(f"QuadGym/{task}-v0", num_envs=FLIGHTS, **keywords)
+        flights = env.unwrapped.flights
+        plan = plan_of(flights.batch)
+        env.reset(seed=SEED)
+        content = {"plan": plan, "ptx": ptx_of(plan), "keys": flights.batch.record("key")}
+        names = [state for state in golden.STATES if state in plan.fields]
+
+        def step(actions: Any, env: Any = env) -> list[Any]:
+            seen, rewards, *_ = env.step(actions)
+            parts = list(seen.values()) if isinstance(seen, dict) else [seen]
+            return [np.concatenate(parts, axis=1), rewards]
+
+        content |= {"names": names, "flown": list(_flown(step, flights.batch.record, names))}
+        file = folder / f"{CASES.index(name)}.case"
+        file.write_bytes(zlib.compress(pickle.dumps((name, content))))
+        print(f"{name}: PTX of {len(content['ptx']) / 1e3:.0f} kB", flush=True)
+
+
+def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
+    """Fly the actions of golden flights; yield observations, rewards and states now and then."""
+    rng = np.random.default_rng(SEED)
+    for k in range(STEPS):
+        results = step(rng.uniform(-0.1, 0.1, (FLIGHTS, 4)))
+        if k % TICKS == TICKS - 1:
+            yield [*results, *(record(name) for name in names)]
+
+
+def run(
+    folder: Path, make: Make, device: str, sizes: tuple[tuple[int, int], ...] = SIZES
+) -> dict[str, Any]:
+    """Measure what is missing in FOLDER/results.json while there is time; return its content."""
+    begin, file = time.monotonic(), folder / "results.json"
+    found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
+    cases = {}
+    for path in sorted(folder.glob("*.case")):
+        name, content = pickle.loads(zlib.decompress(path.read_bytes()))
+        cases[name] = content
+    todo: dict[str, Callable[[], Any]] = {}
+    for name, content in cases.items():
+        todo[f"golden: {name}"] = functools.partial(_differences, content, make, device)
+        for count, warps in sizes if name in TIMED else ():
+            what = f"{name}, {count} flights, {warps} warps"
+            todo[what] = functools.partial(_speed, content, make, device, count, warps)
+    for what, measure in todo.items():
+        done = what in found and "failed" not in found[what]
+        if not done and time.monotonic() - begin < SECONDS:
+            try:
+                found[what] = measure()
+            except Exception as error:  # the others may work
+                found[what] = {"failed": f"{type(error).__name__}: {error}"}
+            print(f"{time.monotonic() - begin:.0f} s, {what}: {found[what]}", flush=True)
+            file.write_text(json.dumps(found, indent=1) + "\n")
+    return found
+
+
+def _differences(content: dict[str, Any], make: Make, device: str) -> dict[str, Any]:
+    """Return how many numbers of golden flights differ from those on the processor, by name."""
+    import torch
+
+    from quad_gym.device.flights import DeviceBatch
+
+    batch = DeviceBatch(content["plan"], FLIGHTS, make(content["ptx"], 4), device)
+    batch.reset(content["keys"])
+
+    def step(actions: Any) -> list[Any]:
+        seen = batch.step(torch.from_numpy(actions).to(device))
+        return [seen.cpu().numpy().copy(), batch.result("reward").cpu().numpy().copy()]
+
+    def record(name: str) -> Any:
+        return batch.record(name).cpu().numpy()
+
+    names, wrong, count = ["observations", "rewards", *content["names"]], dict[str, int](), 0
+    for here, there in zip(_flown(step, record, content["names"]), content["flown"], strict=True):
+        for name, x, y in zip(names, here, there, strict=True):
+            x = x.view(y.dtype)
+            same = (x == y) & (np.signbit(x) == np.signbit(y)) | (x != x) & (y != y)
+            wrong[name] = wrong.get(name, 0) + int((~same).sum())
+            count += y.size
+    return {"numbers": count, "differing": {name: n for name, n in wrong.items() if n}}
+
+
+def _speed(content: dict[str, Any], make: Make, device: str, count: int, warps: int) -> Any:
+    """Return steps/s with random actions, and the memory of a flight [bytes]."""
+    import torch
+
+    from quad_gym.batch.seeding import keys_of
+    from quad_gym.device.flights import DeviceBatch
+
+    on_gpu = device != "cpu"
+    before = torch.cuda.memory_allocated() if on_gpu else 0
+    batch = DeviceBatch(content["plan"], count, make(content["ptx"], warps), device)
+    after = torch.cuda.memory_allocated() if on_gpu else 0
+    batch.reset(keys_of(np.arange(count, dtype=np.uint64)))
+    actions = [0.2 * torch.randn(count, 4, device=device) for _ in range(8)]
+
+    def flown(steps: int) -> float:
+        begin = time.perf_counter()
+        for k in range(steps):
+            batch.step(actions[k % 8])
+        batch.result("reward").sum().item()  # waits
+        return time.perf_counter() - begin
+
+    flown(2)
+    once = flown(4) / 4
+    steps = max(8, min(1000, int(DURATION / once)))
+    return {"steps/s": count * steps / flown(steps), "bytes": (after - before) / count}
+
+
+def _on_cuda(ptx: bytes, warps: int) -> Any:
+    """Return the launcher on the GPU."""
+    import torch
+
+    from quad_gym.device.launching import CudaLauncher
+
+    return CudaLauncher(ptx, torch.device("cuda"), warps)
+
+
+def _without_gymnasium() -> None:
+    """Import `quad_gym` without what its environments need."""
+    package = types.ModuleType("quad_gym")
+    package.__path__ = [str(ROOT / "quad_gym")]
+    sys.modules["quad_gym"] = package
+
+
+def main() -> None:
+    """Prepare or run, as the arguments say."""
+    verb, folder = sys.argv[1], Path(sys.argv[2])
+    if verb == "prepare":
+        prepare(folder)
+        return
+    sys.path[0] = str(ROOT)
+    _without_gymnasium()
+    import torch
+
+    print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}", flush=True)
+    run(folder, _on_cuda, "cuda")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""The script for a GPU: it flies golden flights and measures once, here by PTX in C."""
+
+import json
+
+import pytest
+
+from quad_gym.kernels.compiling.building import PROCESSORS
+from quad_gym.kernels.library import machine
+from tests.golden.ptx import PtxLauncher
+
+pytest.importorskip("torch")
+from scripts.benchmarks import gpu
+
+
+@pytest.mark.skipif(machine() not in PROCESSORS, reason="no code for this processor")
+def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(gpu, "DURATION", 0.0)
+    gpu.prepare(tmp_path, gpu.CASES[:1])
+    launchers = []
+
+    def make(text, warps):
+        launchers.append(warps)
+        return PtxLauncher(text.decode())
+
+    found = gpu.run(tmp_path, make, "cpu", ((40, 2),))
+    golden, speed = (
+        found["golden: observation truth"],
+        found["observation truth, 40 flights, 2 warps"],
+    )
+    assert golden["differing"] == {}
+    assert golden["numbers"] > 4_000
+    assert speed["steps/s"] > 0
+    assert launchers == [4, 2]
+    capsys.readouterr()
+    assert gpu.run(tmp_path, make, "cpu", ((40, 2),)) == found
+    assert (launchers, capsys.readouterr().out) == ([4, 2], "")
+    assert json.loads((tmp_path / "results.json").read_text()) == found
