@@ -8,7 +8,7 @@ from typing import Annotated, Any, Union, get_type_hints
 
 from tyro.conf import subcommand
 
-from quad_gym.commands.options import parse, with_plain_help
+from quad_gym.commands.options import USAGE_ERROR, parse, with_plain_help
 
 COMMANDS = {
     "circle": "reproduce the report's experiment over many seeds: tables and figures",
@@ -49,10 +49,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return CLOSED_PIPE
     except (KeyboardInterrupt, Exception) as error:
-        if not _interrupted(error):
-            raise
-        print("\nStopped by Ctrl-C.", file=sys.stderr)
-        return INTERRUPTED
+        from quad_gym.kernels.library import NoKernelsError
+
+        if _cause(error, KeyboardInterrupt):
+            print("\nStopped by Ctrl-C.", file=sys.stderr)
+            return INTERRUPTED
+        if missing := _cause(error, NoKernelsError):
+            print(f"\nerror: {missing}", file=sys.stderr)
+            return USAGE_ERROR
+        raise
     finally:
         if reports := sys.modules.get("quad_gym.analysis.reports"):
             reports.remove_unused_folders()
@@ -103,8 +108,8 @@ def options_of(module: Any) -> Any:
     return with_plain_help(get_type_hints(module.main)["args"])
 
 
-def _interrupted(error: BaseException | None) -> bool:
-    """True if an error was caused by Ctrl-C, which compilations turn into other errors."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+def _cause(error: BaseException | None, kind: type[BaseException]) -> BaseException | None:
+    """Return the error of a kind that caused an error, as compilations turn Ctrl-C into others."""
+    while error is not None and not isinstance(error, kind):
         error = error.__cause__ or error.__context__
-    return error is not None
+    return error

@@ -49,6 +49,10 @@ def say(text: str, end: str = "\n") -> None:
         print(text, file=sys.stderr, end=end, flush=True)
 
 
+class NoKernelsError(ImportError):
+    """There is no library of compiled kernels for this machine, and no Numba."""
+
+
 class Library:
     """A loaded library."""
 
@@ -83,7 +87,7 @@ def library() -> Library | None:
     QUAD_GYM_KERNELS selects one of both, "library" or "numba".
 
     Raises:
-        ImportError: If there is neither, with the reason.
+        NoKernelsError: If there is neither, with the reason and what to install.
     """
     choice = os.environ.get("QUAD_GYM_KERNELS", "")
     if choice not in _CHOICES:
@@ -95,9 +99,9 @@ def library() -> Library | None:
     if isinstance(found, Library):
         return found
     if choice == "library":
-        raise ImportError(f"the library of compiled kernels cannot be used: {found}")
+        raise NoKernelsError(f"the library of compiled kernels cannot be used: {found}")
     if importlib.util.find_spec("numba") is None:
-        raise ImportError(
+        raise NoKernelsError(
             "quad_gym has no compiled kernels for this machine, and Numba, which would compile "
             f'them, is not installed ({found}): pip install "quad-gym[compile]"'
         )

@@ -12,6 +12,7 @@ import pytest
 from quad_gym.commands import circle
 from quad_gym.commands.main import COMMANDS, main
 from tests import console_commands
+from tests.builders import run_python
 from tests.console_commands import plain
 
 NEEDS = {"compare": "stable_baselines3", "fly": "pygame"}
@@ -179,6 +180,24 @@ def test_ctrl_c_ends_a_command_with_a_message(again, monkeypatch, capsys):
     monkeypatch.setattr(circle, "main", interrupted)
     assert main(["circle"]) == 130
     assert capsys.readouterr().err == "\nStopped by Ctrl-C.\n"
+
+
+def test_command_without_compiled_kernels_and_numba_says_what_to_install(tmp_path):
+    code = f"""
+import sys
+from pathlib import Path
+sys.modules["numba"] = None  # as if it were not installed
+from quad_gym.commands.main import main
+from quad_gym.kernels import library
+library.FOLDER = Path("missing")
+words = ["evaluate", "circle", "--policy", "pd", "--episodes", "2", "--video", "none"]
+raise SystemExit(main([*words, "--output", {str(tmp_path / "it")!r}]))"""
+    done = run_python("-c", code, QUAD_GYM_KERNELS="")
+    assert done.returncode == 2
+    assert re.search(
+        r"(?m)^error: .*not installed .*: pip install \"quad-gym.compile.\"$", done.stderr
+    )
+    assert "Traceback" not in done.stderr
 
 
 def test_other_errors_are_raised(monkeypatch):
