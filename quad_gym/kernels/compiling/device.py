@@ -26,14 +26,16 @@ from quad_gym.kernels.compiling.foreign import (
 from quad_gym.kernels.compiling.stages import SLOT
 from quad_gym.kernels.compiling.workers import kernels
 from quad_gym.kernels.device import SETTINGS_SYMBOL
+from quad_gym.kernels.digest import digest_of
 from quad_gym.kernels.library import DEVICE_KERNEL, core_symbol, say
 from quad_gym.kernels.stages import Stage
+from quad_gym.records import WARP
 
 ENTRY = "quad_gym.kernels.device:fly_one"
 GPU = Processor("nvptx64-nvidia-cuda", "sm_80", level=3)
 _RECORDS = ("flight", "world", "model", "settings", "work", "stages")
 _STAGE = r"@qg_core_\w+_stage\("
-_THREADS = 128
+_RESIDENT = 8  #: blocks of a warp for which a multiprocessor has 255 registers for each thread
 
 _KERNEL = """
 declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()
@@ -42,7 +44,8 @@ declare i32 @llvm.nvvm.read.ptx.sreg.ntid.x()
 declare i32 @llvm.nvvm.read.ptx.sreg.nctaid.x()
 declare i32 @{core}(ptr, ptr, i64, i64, i64, i64, i64)
 
-define ptx_kernel void @{kernel}(i64 %call, i64 %blocks, i64 %command) "nvvm.maxntid"="{threads}" {{
+define ptx_kernel void @{kernel}(i64 %call, i64 %blocks, i64 %command) \
+"nvvm.maxntid"="{warp}" "nvvm.minctasm"="{resident}" {{
 entry:
   %ret = alloca ptr
   %exc = alloca ptr
@@ -112,7 +115,9 @@ def module_of(settings: bytes, stages: Mapping[Stage, str], processor: Processor
     names, public = sorted(set(stages.values())), core_symbol(ENTRY)
     texts = [linked(ENTRY), *map(linked, names), dispatcher(settings, stages)]
     if processor is GPU:
-        texts.append(_KERNEL.format(core=public, kernel=DEVICE_KERNEL, threads=_THREADS))
+        texts.append(
+            _KERNEL.format(core=public, kernel=DEVICE_KERNEL, warp=WARP, resident=_RESIDENT)
+        )
         public = DEVICE_KERNEL
     module = llvm.parse_assembly(_plain(texts[0]))
     for text in texts[1:]:
@@ -139,7 +144,8 @@ def ptx_of(settings: bytes, stages: Mapping[Stage, str]) -> bytes:
         text: str = machine_of(GPU).emit_assembly(module_of(settings, stages))
         return text.encode()
 
-    return cached(ENTRY, "ptx", (settings, sorted(stages), list(map(code_of, names)), GPU), emit)
+    key = (settings, sorted(stages), list(map(code_of, names)), digest_of(__name__))
+    return cached(ENTRY, "ptx", key, emit)
 
 
 def write() -> None:
