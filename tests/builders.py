@@ -1,5 +1,6 @@
 """Builders of environments, batches, flights and processes for tests."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -108,11 +109,14 @@ def part(env, observations, name):
     return observations[..., field.slice]
 
 
+@functools.cache
 def actions_of(flight, steps=STEPS):
     """Random actions (steps, 4) with an offset, so that flights end at different times."""
     rng = np.random.default_rng([flight, 77])
     lean = rng.uniform(-0.5, 0.5, 4)
-    return np.clip(lean + rng.uniform(-0.6, 0.6, (steps, 4)), -1.0, 1.0).astype(np.float32)
+    found = np.clip(lean + rng.uniform(-0.6, 0.6, (steps, 4)), -1.0, 1.0).astype(np.float32)
+    found.setflags(write=False)
+    return found
 
 
 def actions_for(flights, steps=STEPS):

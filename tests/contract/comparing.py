@@ -33,7 +33,7 @@ def assert_same(left, right, where="root"):
         assert left.shape == right.shape, f"{where}: {left.shape} is not {right.shape}"
         if left.dtype == object:
             assert_same(list(left.ravel()), list(right.ravel()), where)
-        else:
+        elif left.tobytes() != right.tobytes():  # 0.0 equals -0.0
             np.testing.assert_array_equal(left, right, err_msg=where, strict=True)
     else:
         assert left == right, f"{where}: {left!r} is not {right!r}"

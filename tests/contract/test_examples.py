@@ -59,7 +59,7 @@ def test_options_apply_to_training_and_evaluation(script, monkeypatch):
 
 def test_number_of_evaluations_does_not_change_training(script, capsys):
     options = {"algorithm": "sac", "total_timesteps": 160, "evaluate": 4}
-    for every in (20, 160):
+    for every in (80, 160):
         script.main(script.Args(**options, every=every))
     often, once = capsys.readouterr().out.split("160 steps:")[1:]
     assert often.splitlines()[0] == once.splitlines()[0]
@@ -70,13 +70,13 @@ def tune(*options):
 
 
 def test_tune_finds_gains_better_than_initial_gains(tmp_path):
-    tiny = ["--candidates", 64, "--episodes", 4, "--fresh-episodes", 8, "--env", "duration=3.0"]
+    tiny = ["--candidates", 32, "--episodes", 4, "--fresh-episodes", 8, "--env", "duration=3.0"]
     done = tune("--env-ids", "hover", *tiny, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "gains.json").read_text())
     rows = (tmp_path / "search.csv").read_text().splitlines()
     errors = [float(row.split(",")[0]) for row in rows[1:]]
-    assert len(errors) == record["candidates"] == 64
+    assert len(errors) == record["candidates"] == 32
     assert errors[0] == 1.0  # the initial gains are flown first
     assert min(errors) < 1.0
     best = rows[1:][errors.index(min(errors))].split(",")

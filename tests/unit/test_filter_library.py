@@ -506,11 +506,11 @@ def test_archive_is_readable_by_ar(tmp_path):
 
 @pytest.mark.parametrize("target", ["cortex-m7", slow("wasm32")])
 def test_library_for_a_foreign_processor_has_its_format(target):
-    library = (exported("crazyflie", target) / LIBRARY).read_bytes()
+    library = (exported("rtk", target) / LIBRARY).read_bytes()
     member = library[8 + 60 + int(library[8 + 48 : 8 + 58]) :].lstrip(b"\n")[60:]
     machine = {"cortex-m7": b"\x7fELF\x01\x01", "wasm32": b"\0asm\x01\0\0\0"}[target]
     assert member.startswith(machine)
-    text = (exported("crazyflie", target) / "README.md").read_text()
+    text = (exported("rtk", target) / "README.md").read_text()
     assert "@" not in text
 
 
