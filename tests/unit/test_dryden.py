@@ -96,28 +96,30 @@ def gusts(batch):
 
 @pytest.fixture(scope="module")
 def history():
-    """Gusts of 4,000 flights at ticks 0, 1, 40, 400 and 4,000: {tick: (n, 3)}."""
-    batch, found = hovering_in_gusts(4000), {}
-    for tick in range(4001):
-        if tick in (0, 1, 40, 400, 4000):
-            found[tick] = gusts(batch)
-        batch.step()
-    np.testing.assert_allclose(batch.record("r"), [[0.0, 0.0, HEIGHT]] * 4000, atol=1e-6)
+    """Gusts of 4,000 flights at some times [s]: {time: (n, 3)}."""
+    found = {}
+    for dt, ticks in ((0.005, (0, 1, 40, 400)), (0.05, (400,))):
+        batch = hovering_in_gusts(4000, dt=dt)
+        for tick in range(401):
+            if tick in ticks:
+                found[tick * dt] = gusts(batch)
+            batch.step()
+        np.testing.assert_allclose(batch.record("r"), [[0.0, 0.0, HEIGHT]] * 4000, atol=1e-6)
     return found
 
 
-@pytest.mark.parametrize("tick", [0, 1, 4000])
-def test_gusts_are_normal_with_the_specified_intensities(history, tick):
-    assert_normal(history[tick], np.zeros(3), np.eye(3))
+@pytest.mark.parametrize("time", [0.0, 0.005, 20.0])
+def test_gusts_are_normal_with_the_specified_intensities(history, time):
+    assert_normal(history[time], np.zeros(3), np.eye(3))
 
 
-@pytest.mark.parametrize("tick", [1, 40, 400])
-def test_autocorrelation_of_gusts_matches_dryden_spectra(history, tick):
+@pytest.mark.parametrize("time", [0.005, 0.2, 2.0])
+def test_autocorrelation_of_gusts_matches_dryden_spectra(history, time):
     _, _, L_u, L_w = military_scales(HEIGHT, WIND)
-    x, z = np.array([L_u, L_u, L_w]), WIND * tick * 0.005
+    x, z = np.array([L_u, L_u, L_w]), WIND * time
     first_order_decay = np.exp(-z / x)
     expected = first_order_decay * np.array([1.0, 1.0 - 0.5 * z / L_u, 1.0 - 0.5 * z / L_w])
-    start, now = history[0], history[tick]
+    start, now = history[0.0], history[time]
     # given the first gust, the innovation of the second is normal with a known variance
     innovation = (now - expected * start) / np.sqrt(1.0 - expected**2)
     assert_normal(np.hstack([start, innovation]), np.zeros(6), np.eye(6))

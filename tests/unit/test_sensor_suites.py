@@ -74,16 +74,16 @@ def test_random_phases_are_uniform_and_new_in_each_episode():
 
 
 def test_gnss_drift_grows_as_gauss_markov_process():
-    gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=2.0, phase=0.0)
+    gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=0.8, phase=0.0)
     batch = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover")
     np.testing.assert_array_equal(batch.record("gnss_drift"), 0.0)
-    steps(batch, 1.0)
+    steps(batch, 0.4)
     early = batch.record("gnss_drift")
-    steps(batch, 1.5)
+    steps(batch, 0.6)
     late = batch.record("gnss_drift")
     variance = np.square([0.6, 0.3, 1.0])
-    v_1, v_2 = (variance * -np.expm1(-2.0 * t / 2.0) for t in (1.0, 2.5))
-    between = v_1 * np.exp(-1.5 / 2.0)
+    v_1, v_2 = (variance * -np.expm1(-2.0 * t / 0.8) for t in (0.4, 1.0))
+    between = v_1 * np.exp(-0.6 / 0.8)
     covariance = np.block([[np.diag(v_1), np.diag(between)], [np.diag(between), np.diag(v_2)]])
     assert_normal(np.hstack([early, late]), np.zeros(6), covariance)
 
