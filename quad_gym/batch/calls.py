@@ -56,6 +56,8 @@ class Calls:
 
 
 def address_of(array: NDArray[Any]) -> int:
-    """Return the address of an array's memory."""
-    address: int = array.__array_interface__["data"][0]
-    return address
+    """Return the address of an array's memory.
+
+    `array.__array_interface__` would write out the data type, which takes 0.3 ms for a record.
+    """
+    return array.ctypes.data

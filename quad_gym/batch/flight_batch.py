@@ -83,7 +83,11 @@ class FlightBatch(FlightMemory):
         check_standing(c.task, c.flown_vehicle, c.world, c.draws)
         ground = WorldParams(ground_height=c.world.ground_height)  # what a filter models of it
         model = params_record(c.vehicle, c.sensors, c.pd_gains, c.actions, ground)
-        true = params_record(c.flown_vehicle, c.flown_sensors, c.pd_gains, c.actions, c.world)
+        vehicle, sensors, world = c.flown_vehicle, c.flown_sensors, c.world
+        if (vehicle, sensors, world) == (c.vehicle, c.sensors, ground):
+            true = model.copy()
+        else:
+            true = params_record(vehicle, sensors, c.pd_gains, c.actions, world)
         true["action_delay"] = c.action_delay
         self._model, self._world = params_block(model), params_block(true)
         self._settings, self._paths = settings_record(c), pack_paths(c.task.trajectories)

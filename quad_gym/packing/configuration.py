@@ -166,7 +166,7 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
                     f"must have the value of a preset, got {value!r}"
                 )
 
-    @property
+    @cached_property
     def pd_gains(self) -> PDGains:
         """Gains of `Control.PD`."""
         if isinstance(self.gains, str | None):

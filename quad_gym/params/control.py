@@ -54,6 +54,9 @@ _GAINS = {
 }
 
 
+_LAB = VehicleParams()
+
+
 def pd_gains(name: str, vehicle: VehicleParams | None = None) -> PDGains:
     """Return PD gains: "lab", the report's, or "tuned", for small errors on all tracking tasks.
 
@@ -63,8 +66,7 @@ def pd_gains(name: str, vehicle: VehicleParams | None = None) -> PDGains:
     gains = _GAINS[check.choice("gains", name, tuple(_GAINS))]
     if vehicle is None:
         return gains
-    lab = VehicleParams()
-    mass, turn = vehicle.mass / lab.mass, np.diag(vehicle.inertia) / np.diag(lab.inertia)
+    mass, turn = vehicle.mass / _LAB.mass, np.diag(vehicle.inertia) / np.diag(_LAB.inertia)
     return PDGains(
         position=mass * gains.position,
         velocity=mass * gains.velocity,

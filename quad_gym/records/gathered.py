@@ -1,5 +1,6 @@
 """The words of a flight's record that an update of its filter reads and writes."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,14 @@ def words_of_update(settings: Any, used: frozenset[str]) -> tuple[NDArray[np.uin
     Words that an update writes come first; the second value is their number. `used` names the parts
     of a flight's record that are in use.
     """
+    blocks = tuple(map(int, settings["sensor_blocks"]))
+    return _words(used, int(settings["feature_count"]), int(settings["slow_states"]), blocks)
+
+
+@functools.cache
+def _words(
+    used: frozenset[str], features: int, slow: int, sensor_blocks: tuple[int, ...]
+) -> tuple[NDArray[np.uint64], int]:
     written: list[NDArray[np.int64]] = []
     read: list[NDArray[np.int64]] = []
     for part, fields in PARTS:
@@ -37,14 +46,17 @@ def words_of_update(settings: Any, used: frozenset[str]) -> tuple[NDArray[np.uin
             if chosen and name not in _NOT_READ:
                 first = offset_of(FLIGHT_BLOCK, name) // (8 * WIDTH)
                 words = first + np.arange(np.prod(shape, dtype=int)).reshape(shape)
-                (read if name in _NOT_WRITTEN else written).append(_in_use(name, words, settings))
+                (read if name in _NOT_WRITTEN else written).append(
+                    _in_use(name, words, features, slow, sensor_blocks)
+                )
     words = np.concatenate([*written, *read])
     return WIDTH * words.astype(np.uint64), sum(map(len, written))
 
 
-def _in_use(name: str, words: NDArray[np.int64], settings: Any) -> NDArray[np.int64]:
+def _in_use(
+    name: str, words: NDArray[np.int64], features: int, slow: int, sensor_blocks: tuple[int, ...]
+) -> NDArray[np.int64]:
     """The words of a field that a configuration uses."""
-    features, slow = int(settings["feature_count"]), int(settings["slow_states"])
     if name == "L":
         return words[np.tril_indices(len(words))]
     if name == "L_slow":
@@ -56,7 +68,7 @@ def _in_use(name: str, words: NDArray[np.int64], settings: Any) -> NDArray[np.in
     elif words.ndim > 0 and len(words) == MAX_BLOCKS:
         blocks = [
             first + k
-            for first, count in zip(FIRST_BLOCK, settings["sensor_blocks"], strict=True)
+            for first, count in zip(FIRST_BLOCK, sensor_blocks, strict=True)
             for k in range(count)
         ]
         words = words[blocks]
