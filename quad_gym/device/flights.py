@@ -25,8 +25,8 @@ class Launcher(Protocol):
 class DeviceBatch:
     """N flights of one configuration on a device.
 
-    All tensors are views of the memory that the kernel reads and writes: the next step overwrites
-    observations and results, and writing to a field changes the flights.
+    Observations and results are views of the memory that the kernel writes. The next step
+    overwrites results, and the one after it observations, which training loops store after a step.
 
     Args:
         plan: The configuration.
@@ -43,17 +43,14 @@ class DeviceBatch:
         blocks = -(-count // WARP)
         warps = min(launcher.warps, blocks)
         self._blocks = self._repeated(plan.flight, blocks)
-        self.observations = self._zeros(count, size, kind=torch.float32)
-        """(n, k) float32, written by steps and resets"""
-        self.final_observations = torch.zeros_like(self.observations)
+        self._seen = [self._zeros(count, size, kind=torch.float32) for _ in range(2)]
+        self.final_observations = torch.zeros_like(self._seen[0])
         """(n, k) float32, written where one episode ends and the next begins in a step"""
         self._actions = self._zeros(blocks * WARP, 4)
         self._resets = self._zeros(count, kind=torch.uint8)
         self._results = self._zeros(len(plan.results), blocks * WARP)
-        self._paths, table = (
-            list(map(self._put, (plan.paths, plan.pieces))),
-            np.zeros(1, STAGE_TABLE),
-        )
+        self._paths = [self._put(array) for array in (plan.paths, plan.pieces)]
+        table = np.zeros(1, STAGE_TABLE)
         table["paths"], table["pieces"] = (tensor.data_ptr() for tensor in self._paths)
         self._memory = {
             Call.BLOCKS: self._blocks,
@@ -67,7 +64,6 @@ class DeviceBatch:
             Call.ACTIONS: self._actions,
             Call.LOW: self._put(plan.low),
             Call.HIGH: self._put(plan.high),
-            Call.OBSERVATIONS: self.observations,
             Call.FINAL_OBSERVATIONS: self.final_observations,
             Call.RESULTS: self._results,
         }
@@ -78,7 +74,10 @@ class DeviceBatch:
         words[Call.PITCH] = 8 * WARP * len(plan.flight)
         words[Call.COUNT], words[Call.SIZE] = count, size
         words[Call.RESULT_PITCH] = 8 * self._results.shape[1]
-        self._call = self._put(words)
+        self._calls = []
+        for seen in self._seen:  # in turn
+            words[Call.OBSERVATIONS] = seen.data_ptr()
+            self._calls.append(self._put(words))
 
     def reset(self, keys: Words | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Begin episodes.
@@ -98,8 +97,7 @@ class DeviceBatch:
             self.write("key", torch.where(chosen[:, None], given, self.record("key")))
             for name in ("instant", "episode"):
                 self.write(name, self.record(name).masked_fill_(chosen, 0))
-        self._fly(Command.RESET)
-        return self.observations
+        return self._fly(Command.RESET)
 
     def step(self, actions: torch.Tensor) -> torch.Tensor:
         """Fly one control period; return the observations, see `result` for the rest.
@@ -108,11 +106,14 @@ class DeviceBatch:
             actions: (n, 4); they are clipped to [-1, 1], and not checked for NaN, which would wait.
         """
         self._actions[: self.count].copy_(actions.detach()).clamp_(-1.0, 1.0)
-        self._fly(Command.STEP)
-        return self.observations
+        return self._fly(Command.STEP)
 
-    def _fly(self, command: Command) -> None:
-        self._launch(self._call.data_ptr(), len(self._blocks), int(command))
+    def _fly(self, command: Command) -> torch.Tensor:
+        """Launch a command; return the observations, (n, k) float32."""
+        self._seen.reverse()
+        self._calls.reverse()
+        self._launch(self._calls[0].data_ptr(), len(self._blocks), int(command))
+        return self._seen[0]
 
     def result(self, name: str) -> torch.Tensor:
         """Return one of the results of the last step, (n,) float64."""

@@ -28,7 +28,8 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
     """N flights on a GPU; flight i has the bits of a `QuadEnv` seeded with seed + i.
 
     A step is one launch of the kernel, without a copy to the host or a wait. The tensors of
-    observations and `info` are views of the memory of the flights, which the next step overwrites.
+    observations and `info` are views of the memory of the flights: the next step overwrites `info`,
+    and the one after it the observations.
     `info` has "position_error" and "estimation_error", with `reward_terms=True` also these; with
     `autoreset_mode="SameStep"`, "final_obs" and its mask "_final_obs". `batch.result` has the other
     results of a step, and `batch.record` the records of the flights.

@@ -73,6 +73,14 @@ def test_filtered_flights_of_device_code_equal_those_of_the_batch(keywords):
     assert assert_flights_equal("circle", "NextStep", max_tilt=0.6, **keywords) > 0
 
 
+def test_observations_of_device_flights_stay_for_one_more_step():
+    envs = device_env("circle", 3, **TRUTH)
+    begun = envs.reset(seed=0)[0]
+    kept, (seen, *_) = begun.clone(), envs.step(torch.zeros(3, 4))
+    assert torch.equal(begun, kept)
+    assert not torch.equal(seen, begun)
+
+
 def test_reset_mask_of_device_flights_begins_these_episodes_alone():
     envs = device_env("circle", 3, autoreset_mode="Disabled", **TRUTH)
     envs.reset(seed=0)
