@@ -63,7 +63,7 @@ GROUPS = {
 def drawn(prior, log, rng):
     """Return drawn numbers of a vehicle, by name, and its suite."""
     suite, true = prior, {}
-    for number in numbers_in(prior, log, delays=True):
+    for number in numbers_in(prior, log, delays=True, rotation=True):
         before = number.of(prior)
         if number.positive:
             low = -0.2 if number.ends(before)[0] > -1.0 else -1.0
@@ -105,7 +105,7 @@ def simulated(index):
         base = base.replace(camera=None)
     seconds = SECONDS.get(name, LONG)
     log = read_log(Recorded(flown(base, 1.0), base, lost=0.0, jitter=0.0).table())
-    prior = _prior_of(base, log)
+    prior = _prior_of(base, log, rotation=True)
     if base.magnetometer is not None:  # the field of the suite, not the field measured in 1 s
         own = base.magnetometer
         compass = prior.magnetometer.replace(strength=own.strength, inclination=own.inclination)
