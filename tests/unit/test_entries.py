@@ -5,7 +5,7 @@ import inspect
 import numpy as np
 import pytest
 
-from quad_gym.kernels import batch, entries, single, tape
+from quad_gym.kernels import batch, entries, single, tape, window
 from quad_gym.kernels.compiling.decorators import EntryDispatcher
 from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.records import FLIGHT, PARAMS
@@ -20,7 +20,7 @@ def test_catalog_and_stages_are_imported_without_numba():
 
 
 def test_catalog_has_the_entries_of_kernels_with_their_arguments():
-    modules = (batch, single, tape)
+    modules = (batch, single, tape, window)
     found = {
         f"{module.__name__}:{name}"
         for module in modules
