@@ -3,8 +3,10 @@
 Records must have one lane, see `filter_process`.
 """
 
+import itertools
 import math
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,12 +15,10 @@ from baselines.exporting.filter_library import HEADER, TARGETS
 from baselines.exporting.source import filled
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
-from quad_gym.estimation.first_fix import FARTHEST_FIX, MIN_COURSE
-from quad_gym.estimation.starts import LEVEL_SIGMA, state_at_rest
+from quad_gym.estimation.starts import empty_fix, level_start
 from quad_gym.kernels.entries import FILTER_STAGES
 from quad_gym.kernels.library import core_symbol
 from quad_gym.kernels.stages import Stage, needed_stages
-from quad_gym.packing.aids import slow_states
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
     AID_BLOCKS,
@@ -27,9 +27,7 @@ from quad_gym.records import (
     FEATURE_BLOCKS,
     FLIGHT_BLOCK,
     KEPT,
-    MAX_STATES,
     MEASUREMENT,
-    NOISE_FIELDS,
     OPERATION,
     PARAMS_BLOCK,
     PARTS,
@@ -44,22 +42,65 @@ from quad_gym.records import (
     offset_of,
     room_of,
 )
-from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW, Kept
+from quad_gym.records.inputs import EVENT, FIX, INPUT, PENDING, WINDOW, Kept, Outcome
 
 _ENTRIES = tuple(
-    f"quad_gym.kernels.exported:{name}" for name in ("take", "predict", "update", "start", "keep")
+    f"quad_gym.kernels.exported:{name}"
+    for name in ("take", "predict", "update", "prepare", "start", "keep")
 )
-_LEVEL = "quad_gym.kernels.exported:start_level"
 _RECORDS = {
-    **{"sample": SAMPLE, "measurement": MEASUREMENT, "start": START, "operation": OPERATION},
-    **{"input": INPUT, "event": EVENT, "pending": PENDING, "window": WINDOW},
+    **{"sample": SAMPLE, "measurement": MEASUREMENT, "start": START, "fix": FIX, "input": INPUT},
+    **{"operation": OPERATION, "event": EVENT, "pending": PENDING, "window": WINDOW},
 }
 """Records in the memory of an exported filter, by their names there."""
+_OUTCOMES = {
+    Outcome.OK: "done",
+    Outcome.NOT_STARTED: "call an init function first",
+    Outcome.NOT_FINITE: "an argument is infinite or not a number",
+    Outcome.OUT_OF_RANGE: "an argument is out of the range that its comment states",
+    Outcome.TOO_OLD: "the time stamp is before qg_oldest_time",
+    Outcome.TOO_NEW: "the time stamp is more than QG_LONGEST_STEP later than the filter",
+    Outcome.FULL: "too many measurements wait for the prediction up to their time stamps",
+    Outcome.NO_HEADING: "a start needs one of: baseline, heading, magnetometer, course",
+    Outcome.CONTRADICTION: "arguments that exclude each other, or that the suite lacks",
+}
+
+
+class _Port(NamedTuple):
+    """A measurement of one sensor, as an exported filter takes it."""
+
+    name: str
+    numbers: int  #: of the measurement
+    block: int  #: block of innovations
+    place: str  #: field of MEASUREMENT
+    note: str  #: what it is, for a comment
+    sigma: str  #: name of its standard deviation
+    sigma_place: str  #: field of MEASUREMENT
+    sigma_note: str  #: unit, for a comment
+
+
+_GNSS_PORTS = (
+    _Port(
+        *("gnss_position", 3, POSITION_BLOCK, "gnss_position"),
+        "primary antenna minus reference antenna, in G [m]",
+        *("gnss_sigma", "position_sigma_I", "3 standard deviations of it: east, north, up [m]"),
+    ),
+    _Port(
+        *("gnss_baseline", 3, BASELINE_BLOCK, "gnss_baseline"),
+        "primary to secondary antenna, in G [m]",
+        *("baseline_sigma", "baseline_sigma", "of its direction [rad]"),
+    ),
+    _Port(
+        *("gnss_velocity", 3, VELOCITY_BLOCK, "gnss_velocity"),
+        "of the primary antenna, in G [m/s]",
+        *("velocity_sigma", "velocity_sigma", "[m/s]"),
+    ),
+)
 _AID_NOTES = {
-    Aid.BAROMETER: "height in I from static pressure [m]",
-    Aid.MAGNETOMETER: "magnetic field in B [T]",
-    Aid.OPTICAL_FLOW: "optical flow [rad/s], see quad_gym.OpticalFlowParams",
-    Aid.RANGE_FINDER: "range to the ground [m]",
+    Aid.BAROMETER: ("height in I from static pressure [m]", "[m]"),
+    Aid.MAGNETOMETER: ("magnetic field in B [T]", "[T]"),
+    Aid.OPTICAL_FLOW: ("optical flow [rad/s], see quad_gym.OpticalFlowParams", "[rad/s]"),
+    Aid.RANGE_FINDER: ("range to the ground [m]", "[m]"),
 }
 _WINDOW = 0.5  #: longest delay of measurements beyond the suite's `log_delays` [s], as in a replay
 
@@ -84,8 +125,6 @@ class Sources:
         self.engine = Engine(suite, suite.estimator.kind)
         needed = needed_stages(self.engine.settings[0])
         self.stages = {stage: needed[stage] for stage in FILTER_STAGES if stage in needed}
-        self.slow = slow_states(suite)
-        self.first = self._first()
         used = {"core", "filter", "watch"}
         if self.engine.slow_states:
             used.add("slow")
@@ -97,8 +136,7 @@ class Sources:
     @property
     def functions(self) -> tuple[str, ...]:
         """Names of the compiled functions in the library."""
-        level = (_LEVEL,) if self.suite.gnss is not None else ()
-        return (*self.stages.values(), *_ENTRIES, *level)
+        return (*self.stages.values(), *_ENTRIES)
 
     @property
     def constants(self) -> dict[str, bytes]:
@@ -108,7 +146,8 @@ class Sources:
             "qg_core_params": engine.params.tobytes(),
             "qg_core_steps": engine.steps.tobytes(),
             "qg_core_settings": engine.settings.tobytes(),
-            "qg_core_first": self.first.tobytes(),
+            "qg_core_first": level_start(self.suite).tobytes(),
+            "qg_core_fix": empty_fix(self.suite).tobytes(),
         }
 
     def texts(self, flash: int) -> dict[str, bytes]:
@@ -122,21 +161,6 @@ class Sources:
         return {name: filled(source, values).encode() for name, source in files.items()}
 
     # ---- numbers ------------------------------------------------------------------------------
-
-    def _first(self) -> Any:
-        """Return a START record with the numbers of the suite."""
-        suite, slow = self.suite, self.slow.first_sigmas
-        record = np.zeros(1, START)
-        record["T"] = np.eye(3)
-        record["tilt_sigma"] = suite.estimator.initial_tilt_sigma or LEVEL_SIGMA
-        record["heading_sigma"] = suite.initial_pose.heading_sigma
-        record["velocity_sigma"] = math.sqrt(suite.estimator.initial_velocity_variance)
-        record["accel_bias_sigma"] = suite.imu.accel_bias_sigma
-        record["gyro_bias_sigma"] = suite.imu.gyro_bias_sigma
-        record["slow_sigma"][0, : len(slow)], record["slow_states"] = slow, len(slow)
-        if suite.gnss is not None:
-            record["lever_B"] = suite.gnss.primary_antenna_B
-        return record
 
     def _copied(self, used: set[str]) -> list[tuple[int, int]]:
         """Return places and lengths of the used parts in memory, in doubles."""
@@ -163,18 +187,11 @@ class Sources:
             "SKIPPED": self.room.skipped,
             "STAGES": len(Stage),
             "KEPT": KEPT,
-            "L_SLOW_PITCH": MAX_STATES,
             "OF_MASK": offset_of(WORK_BLOCK, "mask"),
-            "OF_POSITION_SIGMA": offset_of(PARAMS_BLOCK, "position_sigma_I"),
-            "OF_TILT_SIGMA": offset_of(PARAMS_BLOCK, "initial_tilt_sigma"),
             "OF_LEVEL": offset_of(STEP_BLOCK, "level"),
-            "OF_VELOCITY_VARIANCE": offset_of(PARAMS_BLOCK, "initial_velocity_variance"),
+            "OF_L": offset_of(FLIGHT_BLOCK, "L"),
+            "OF_STATUS": offset_of(FLIGHT_BLOCK, "filter_status"),
         }
-        fields = {"POSITION": "r_hat", "VELOCITY": "v_hat", "STATUS": "filter_status"}
-        fields |= {"ACCEL_BIAS": "b_a_hat", "GYRO_BIAS": "b_g_hat"}
-        for name in ("R_hat", "L", "L_slow", "w_before", "gnss_position", "gnss_baseline"):
-            fields[name.upper()] = name
-        values |= {f"OF_{key}": offset_of(FLIGHT_BLOCK, name) for key, name in fields.items()}
         values["STRUCTS"] = "\n".join(
             _struct(f"qg_{name}_record", kind) for name, kind in _RECORDS.items()
         )
@@ -185,16 +202,16 @@ class Sources:
             f"    f->table[{int(s)}] = (uint64_t)(uintptr_t){core_symbol(name)};"
             for s, name in self.stages.items()
         )
+        values["OUTCOMES"] = "".join(
+            f"    QG_{outcome.name} = {int(outcome)}, /* {words} */\n"
+            for outcome, words in _OUTCOMES.items()
+        )
         values |= {f"A_{kind.name}": int(kind) for kind in Kept}
         values |= {operation.name: int(operation) for operation in Operation}
-        noise = [f"    r.{name} = NAN;" for name in NOISE_FIELDS[1:]]
-        noise += [f"    r.position_sigma_I[{i}] = NAN;" for i in range(3)]
-        noise += [f"    r.aid_sigma[{int(aid)}] = NAN;" for aid in Aid]
-        values["BLANK"] = "\n".join(noise)
         return values
 
     def _suite_values(self) -> dict[str, Any]:
-        suite, engine = self.suite, self.engine
+        suite = self.suite
         sensors = [s for s in (suite.gnss, suite.camera, *suite.aids.values()) if s is not None]
         window = _WINDOW + max(0.0, *vars(suite.log_delays).values())
         rate = sum(sensor.rate for sensor in sensors)
@@ -204,14 +221,13 @@ class Sources:
         words = sum(
             (
                 self.room.dtype.itemsize + PARAMS_BLOCK.itemsize + WORK_BLOCK.itemsize,
-                STEP_BLOCK.itemsize + 8 * len(Stage) + START.itemsize + WINDOW.itemsize + 24,
+                STEP_BLOCK.itemsize + 8 * len(Stage) + WINDOW.itemsize + 24,
                 (events + copies + 72) * OPERATION.itemsize + 16 * PENDING.itemsize,
                 events * EVENT.itemsize + (events + 36) * SAMPLE.itemsize,
                 (measurements + 16) * MEASUREMENT.itemsize,
                 copies * 8 * sum(length for _, length in self.copied),
             )
         )
-        rest = state_at_rest(suite, (0.0, 0.0, 0.0), 0.0, 0.0)["covariance"]
         return {
             "TITLE": f"State estimator: {suite.estimator.kind.upper()} of the sensor suite "
             f'"{self.label}", quad_gym {quad_gym.__version__}.',
@@ -226,82 +242,88 @@ class Sources:
             "EVENTS": events,
             "MEASUREMENTS": measurements,
             "RAM": f"{words:,}",
-            "REST_SIGMA": _numbers(np.sqrt(np.diag(rest))),
             "REFERENCE": _numbers(suite.gnss.reference_antenna_G if suite.gnss else (0, 0, 0)),
-            "R_IG": _numbers(engine.params["R_IG"].ravel()),
         }
 
-    def _sensor_values(self) -> dict[str, Any]:
+    @property
+    def _ports(self) -> Iterator[_Port]:
+        """Measurements of the suite."""
         suite, gnss = self.suite, self.suite.gnss
-        texts = dict.fromkeys(
-            ("AID_MACROS", "AID_FIELDS", "AID_TAKE", "AID_API", "AID_SOURCE", "AID_ROWS"), ""
-        )
         for aid in suite.aids:
-            name, count, note = aid.name.lower(), AID_FREEDOMS[aid], _AID_NOTES[aid]
-            value = f"double {name}" if count == 1 else f"const double {name}[{count}]"
-            call = f"int qg_update_{name}(qg_filter *f, {value}, double time)"
-            given = {
-                **{"NAME": name, "COUNT": count, "BLOCK": AID_BLOCKS + aid, "INDEX": int(aid)},
-                **{"CALL": call, "ADDRESS": f"&{name}" if count == 1 else name},
-            }
-            texts["AID_MACROS"] += f"#define QG_{aid.name} 1\n"
-            texts["AID_FIELDS"] += f"    const double *{name}; /* {count}: {note} */\n"
-            texts["AID_FIELDS"] += f"    double {name}_sigma;\n"
-            texts["AID_API"] += f"{call}; /* {note} */\n"
-            texts["AID_ROWS"] += (
-                f'    if (!strcmp(name, "{name}"))\n        m.{name} = x + 1;\n    else\n'
-            )
-            texts["AID_TAKE"] += filled("aid_take.c", given)
-            texts["AID_SOURCE"] += filled("aid_update.c", given)
-        has = {
-            "CAMERA": suite.camera is not None,
-            "GNSS": gnss is not None,
-            "BASELINE": gnss is not None and gnss.has_baseline,
-            "VELOCITY": gnss is not None and gnss.velocity_sigma is not None,
-        }
+            name, (note, unit), index = aid.name.lower(), _AID_NOTES[aid], int(aid)
+            place, sigma = f"aid_measurement[{index}]", f"aid_sigma[{index}]"
+            rest = note, f"{name}_sigma", sigma, unit
+            yield _Port(name, AID_FREEDOMS[aid], AID_BLOCKS + aid, place, *rest)
+        if gnss is not None:
+            has = (True, gnss.has_baseline, gnss.velocity_sigma is not None)
+            yield from itertools.compress(_GNSS_PORTS, has)
+
+    def _sensor_values(self) -> dict[str, Any]:
+        suite, ports = self.suite, list(self._ports)
+        texts = dict.fromkeys(("MACROS", "FIELDS_OF_MEASUREMENTS", "TAKE", "API", "SOURCE"), "")
+        rows = {aid.name.lower(): f"m.{aid.name.lower()} = x + 1" for aid in suite.aids}
         names = {aid.name.lower(): [aid.name.lower()] for aid in suite.aids}
-        if has["CAMERA"]:
-            names["camera"] = ["pixels"]
-        parts = {"gnss_position": "GNSS", "gnss_baseline": "BASELINE", "gnss_velocity": "VELOCITY"}
-        names["gnss"] = [name for name, part in parts.items() if has[part]]
+        for port in ports:
+            name, several = port.name, port.sigma == "gnss_sigma"
+            value = f"const double {name}[{port.numbers}]" if port.numbers > 1 else f"double {name}"
+            sigma = f"const double *{port.sigma}" if several else f"double {port.sigma}"
+            given = f", {sigma}" if name in ("gnss_position", "gnss_velocity") else ""
+            call = f"int qg_update_{name}(qg_filter *f, {value}{given}, double time)"
+            texts["MACROS"] += f"#define QG_{name.upper()} 1\n"
+            texts["FIELDS_OF_MEASUREMENTS"] += (
+                f"    const double *{name}; /* {port.numbers}: {port.note} */\n"
+                f"    {sigma}; /* {port.sigma_note} */\n"
+            )
+            texts["API"] += f"{call}; /* {port.note} */\n"
+            texts["TAKE"] += (
+                f"    r.valid[{port.block}] = qgi_put(r.{port.place}, m->{name}, {port.numbers});\n"
+            )
+            texts["TAKE"] += (
+                f"    qgi_put(r.{port.sigma_place}, m->{port.sigma}, 3);\n"
+                if several
+                else f"    r.{port.sigma_place} = m->{port.sigma};\n"
+            )
+            values = {
+                "CALL": call,
+                "NAME": name,
+                "ADDRESS": name if port.numbers > 1 else f"&{name}",
+            }
+            values["SIGMA"] = f"    m.{port.sigma} = {port.sigma};\n" if given else ""
+            texts["SOURCE"] += filled("update.c", values)
+        if suite.camera is not None:
+            call = "int qg_update_pixels(qg_filter *f, const double *pixels, double time)"
+            values = {"CALL": call, "NAME": "pixels", "ADDRESS": "pixels", "SIGMA": ""}
+            texts["MACROS"] += f"#define QG_FEATURES {len(suite.camera.features_I)}\n"
+            texts["API"] += f"{call}; /* see qg_measurements */\n"
+            texts["SOURCE"] += filled("update.c", values)
+            rows["camera"], names["camera"] = "m.pixels = x + 1", ["pixels"]
+        gnss = [port.name for port in ports if port.name.startswith("gnss")]
+        if gnss:
+            names["gnss"] = gnss
+            parts = {"gnss_position": 1, "gnss_sigma": 4, "gnss_baseline": 7, "gnss_velocity": 10}
+            columns = [
+                f"m.{name} = given({k})"
+                for name, k in parts.items()
+                if name in (*gnss, "gnss_sigma")
+            ]
+            columns += ["m.velocity_sigma = number(13)"] if "gnss_velocity" in gnss else []
+            rows["gnss"] = ", ".join(columns)
         ranks = (
             f"{' || '.join(f'm->{name}' for name in names[stream])} ? {rank} : "
             for rank, stream in enumerate(sorted(names), 1)
-            if names[stream]
         )
-        values: dict[str, Any] = {
+        return {
             **texts,
-            **has,
             "RANK": f"{''.join(ranks)}{len(names) + 1}",
-            "FEATURES": 0 if suite.camera is None else len(suite.camera.features_I),
+            "ROWS": "".join(
+                f'    if (!strcmp(name, "{name}"))\n        {statement};\n    else\n'
+                for name, statement in rows.items()
+            ),
+            "CAMERA": suite.camera is not None,
+            "GNSS": suite.gnss is not None,
             "BAROMETER": Aid.BAROMETER in suite.aids,
-            "MAGNETOMETER": Aid.MAGNETOMETER in suite.aids,
-            **{"FEATURE_BLOCKS": FEATURE_BLOCKS, "POSITION_BLOCK": POSITION_BLOCK},
-            **{"BASELINE_BLOCK": BASELINE_BLOCK, "VELOCITY_BLOCK": VELOCITY_BLOCK},
+            "FEATURE_BLOCKS": FEATURE_BLOCKS,
         }
-        return values if gnss is None else {**values, **self._start_values()}
-
-    def _start_values(self) -> dict[str, Any]:
-        suite, compass = self.suite, self.suite.magnetometer
-        assert suite.gnss is not None
-        values: dict[str, Any] = {
-            "VELOCITY_SIGMA": repr(float(suite.gnss.velocity_sigma or 0.0)),
-            "MIN_COURSE": repr(MIN_COURSE),
-            "FARTHEST": repr(FARTHEST_FIX),
-            "HAS_BASELINE": int(suite.gnss.has_baseline),
-            "ROOT_SCALE": repr(math.sqrt(suite.estimator.initial_covariance_scale)),
-        }
-        zeros = ("FIELD_I", "STRENGTH", "FIELD_SIGMA", "IRON", "DECLINATION")
-        values |= dict.fromkeys(zeros, "0")
-        if compass is not None:
-            values |= {
-                "FIELD_I": _numbers(compass.field_I),
-                "STRENGTH": repr(float(compass.strength)),
-                "FIELD_SIGMA": repr(float(compass.noise_sigma)),
-                "IRON": self.slow.vectors[Aid.MAGNETOMETER],
-                "DECLINATION": self.slow.scalars[Aid.MAGNETOMETER],
-            }
-        return values
 
 
 def _numbers(values: Any) -> str:

@@ -81,7 +81,7 @@ static __attribute__((noinline)) void measure(void)
         total += instructions(from);
     }
     report("predict", total / CALLS);
-#ifdef QG_GNSS
+#ifdef QG_GNSS_POSITION
     UPDATE("gnss_position", gnss_position, nothing);
 #endif
 #ifdef QG_GNSS_BASELINE

@@ -7,7 +7,7 @@ from quad_gym.estimation.filters import (
     ExtendedKalmanFilter,
     UnscentedKalmanFilter,
 )
-from quad_gym.estimation.first_fix import FARTHEST_FIX, FirstFix
+from quad_gym.estimation.first_fix import FirstFix
 from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Reading, Stream, read_log
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Measured, Replay, Smoothed
@@ -15,6 +15,7 @@ from quad_gym.estimation.search import Calibrated
 from quad_gym.estimation.smoothing import smooth
 from quad_gym.estimation.starts import solve_wahba
 from quad_gym.estimation.vehicle_fit import FittedNumber, FittedVehicle, fit_vehicle
+from quad_gym.records.inputs import FARTHEST_FIX
 
 __all__ = [
     "FARTHEST_FIX",

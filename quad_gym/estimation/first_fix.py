@@ -2,36 +2,30 @@
 
 import math
 from dataclasses import KW_ONLY, dataclass, field
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.estimation.engine import Engine, Floats
 from quad_gym.estimation.headings import COUNT, SPACING, write_starts
 from quad_gym.estimation.samples import checked_baseline, gnss_noise, require_gnss
 from quad_gym.estimation.starts import (
-    LEVEL,
-    LEVEL_SIGMA,
     FirstEstimate,
-    FirstHeading,
-    Tilt,
-    baseline_heading,
-    known_heading,
-    magnetic_heading,
-    resting_tilt,
+    empty_fix,
+    head_by_baseline,
+    level,
+    level_start,
+    rest,
     still_start,
 )
 from quad_gym.frames import ecef_to_enu
+from quad_gym.kernels import entries
 from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import Aid
-
-FARTHEST_FIX = 1e6
-"""Largest distance of a fix from the reference antenna [m]; the center of the Earth is farther."""
-
-MIN_COURSE = 5.0
-"""Speed divided by its standard deviation from which a course determines the heading."""
+from quad_gym.records.inputs import FARTHEST_FIX, MIN_COURSE
 
 
 @dataclass(frozen=True)
@@ -135,15 +129,15 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
         fix.refuse("not be given with gnss_baseline_G", *others, "accel_sigma", "course")
         x_I = np.zeros(3)
         if fix.heading is not None:
-            angle = check.number("heading", fix.heading)
-            x_I[:2] = math.cos(angle), math.sin(angle)
+            x_I = level(check.number("heading", fix.heading))[0]
         return FilterStart(position, sigmas, velocity, speeds, baseline, x_I)
-    tilt = _first_tilt(sensors, fix)
-    headings = _first_headings(sensors, fix, tilt, velocity, float(speeds[0]), baseline)
-    antenna_I = turned(ecef_to_enu(sensors.gnss.reference_antenna_G), position)
+    start = _first_tilt(sensors, fix)
+    start["antenna_I"] = turned(ecef_to_enu(sensors.gnss.reference_antenna_G), position)
     root = math.sqrt(sensors.estimator.initial_covariance_scale) * np.diag(sigmas)
+    start["position_root"], start["velocity_sigma"] = root, speeds
     still = np.zeros(3) if velocity is None else velocity
-    found = [still_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
+    starts = _first_headings(sensors, fix, start, velocity, float(speeds[0]), baseline)
+    found = [still_start(start, still) for start in starts]
     return FilterStart(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), found)
 
 
@@ -173,31 +167,31 @@ def _first_velocity(sensors: SensorSuite, fix: FirstFix) -> tuple[Floats | None,
     return turned(ecef_to_enu(gnss.reference_antenna_G), v_G), np.full(3, noise)
 
 
-def _first_tilt(sensors: SensorSuite, fix: FirstFix) -> Tilt:
-    """Return a level tilt, or the tilt from an accelerometer at rest."""
+def _first_tilt(sensors: SensorSuite, fix: FirstFix) -> NDArray[Any]:
+    """Return a start (1,) START that is level, or tilted as an accelerometer at rest shows."""
+    start = level_start(sensors)
     if fix.accel is None:
         fix.refuse("come with accel", "accel_sigma")
-        sigma = sensors.estimator.initial_tilt_sigma or LEVEL_SIGMA
         if fix.tilt_sigma is not None:
-            sigma = check.positive("tilt_sigma", fix.tilt_sigma, most=1.0)
-        return LEVEL._replace(sigma=sigma)
+            start["tilt_sigma"] = check.positive("tilt_sigma", fix.tilt_sigma, most=1.0)
+        return start
     fix.refuse("not be given with accel, which measures the tilt", "tilt_sigma")
     white = sensors.imu.accel_noise_density / math.sqrt(sensors.imu.dt)
     if fix.accel_sigma is not None:
         white = check.positive("accel_sigma", fix.accel_sigma)
-    force = check.array("accel", fix.accel, (3,))
-    return resting_tilt(force, white, sensors.estimator.gravity)
+    rest(start, check.array("accel", fix.accel, (3,)), white, sensors.estimator.gravity)
+    return start
 
 
 def _first_headings(
     sensors: SensorSuite,
     fix: FirstFix,
-    tilt: Tilt,
+    start: NDArray[Any],
     velocity: Floats | None,
     speed_sigma: float,
     baseline_G: Floats | None,
-) -> list[FirstHeading]:
-    """Return the heading at the start, or all headings if it is unknown."""
+) -> list[NDArray[Any]]:
+    """Return the start with its heading, or with all headings if it is unknown."""
     given = {
         "heading": fix.heading is not None,
         "magnetometer": fix.magnetometer is not None,
@@ -211,40 +205,42 @@ def _first_headings(
         )
     if fix.magnetometer is None:
         fix.refuse("come with magnetometer", "magnetometer_sigma")
-    sigma = sensors.initial_pose.heading_sigma
     if fix.heading is None and not fix.course:
         fix.refuse("come with heading or course", "heading_sigma")
     if fix.heading_sigma is not None:
-        sigma = check.positive("heading_sigma", fix.heading_sigma, most=math.pi)
+        start["heading_sigma"] = check.positive("heading_sigma", fix.heading_sigma, most=math.pi)
+    known, failure = empty_fix(sensors), ""
     if fix.heading is not None:
-        return [known_heading(check.number("heading", fix.heading), sigma, tilt)]
-    if fix.magnetometer is not None:
+        known["heading"] = check.number("heading", fix.heading)
+    elif fix.magnetometer is not None:
         if Aid.MAGNETOMETER not in sensors.aids:
             raise ValueError("the sensor suite has no magnetometer to initialize with")
-        white = fix.magnetometer_sigma
-        if white is not None:
-            white = check.positive("magnetometer_sigma", white)
+        if fix.magnetometer_sigma is not None:
+            known["field_sigma"] = check.positive("magnetometer_sigma", fix.magnetometer_sigma)
         field_B = check.array("magnetometer", fix.magnetometer, (3,))
-        return [magnetic_heading(sensors, field_B, white, tilt)]
-    if fix.course:
-        return [_by_course(velocity, speed_sigma, sigma, tilt)]
-    if baseline_G is not None:
+        known["has_field"], known["field_B"] = 1, field_B
+        failure = f"magnetometer must measure a level part of the field, got {field_B}"
+    elif fix.course:
+        if velocity is None:
+            raise ValueError("course must come with gnss_velocity_G")
+        known["course"], known["velocity_I"], known["velocity_sigma"] = 1, velocity, speed_sigma
+        failure = (
+            f"course must belong to a moving vehicle, at least {MIN_COURSE * speed_sigma:g} m/s "
+            f"over the ground, got {math.hypot(velocity[0], velocity[1]):g} m/s"
+        )
+    elif baseline_G is not None:
         assert sensors.gnss is not None
         R_IG = ecef_to_enu(sensors.gnss.reference_antenna_G)
-        return [baseline_heading(sensors, turned(R_IG, baseline_G), tilt)]
-    # with half the spacing as standard deviation they overlap to a uniform distribution
-    return [known_heading(k * SPACING, 0.5 * SPACING, tilt) for k in range(COUNT)]
-
-
-def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) -> FirstHeading:
-    if velocity is None:
-        raise ValueError("course must come with gnss_velocity_G")
-    speed = math.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
-    if speed < MIN_COURSE * sigma:
-        raise ValueError(
-            f"course must belong to a moving vehicle, at least {MIN_COURSE * sigma:g} m/s over "
-            f"the ground, got {speed:g} m/s"
-        )
-    angle = math.atan2(velocity[1], velocity[0])
-    across = sigma / speed
-    return known_heading(angle, math.sqrt(own * own + across * across), tilt)
+        head_by_baseline(start, sensors, turned(R_IG, baseline_G))
+        return [start]
+    else:  # with half the spacing as standard deviation they overlap to a uniform distribution
+        start["heading_sigma"] = 0.5 * SPACING
+        starts = [start.copy() for _ in range(COUNT)]
+        for k, each in enumerate(starts):
+            known["heading"] = k * SPACING
+            entries.first_heading(each, known)
+        return starts
+    entries.first_heading(start, known)
+    if known["outcome"][0]:
+        raise ValueError(failure)
+    return [start]

@@ -7,7 +7,7 @@ All that is uncertain at the start is a linear function of independent errors s,
 so that `L L^T = G diag(s^2) G^T` follows from a QR factorization, also where it is singular. The
 position depends on the attitude, as the antenna was measured and not the center of mass: with r =
 antenna - R^T l its error is the error of the fix plus J e, J = R_hat^T [l x]. The heading depends
-on its source (`magnetic_heading`, `baseline_heading`).
+on its source (`kernels/filter/still.py`, `head_by_baseline`).
 
 R_hat is T level(heading): T turns the level frame, whose x axis is the body's without its vertical
 part, into B. Errors are taken in the level frame and turned, e = T e_L. A resting accelerometer
@@ -27,12 +27,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels import entries
 from quad_gym.packing.aids import slow_states
 from quad_gym.params import checks as check
-from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import START, Aid
+from quad_gym.records.inputs import FIX
 
 Floats = NDArray[np.float64]
 
@@ -53,30 +54,6 @@ the heading; as in `kernels/filter/align.py`."""
 _D = 15  #: the first time-correlated error among the states
 
 
-class FirstHeading(NamedTuple):
-    """A heading, and the errors on which it depends."""
-
-    angle: float  #: heading of the body x axis, from east toward north [rad]
-    sigma: float  #: standard deviation of its independent error [rad]
-    of_tilt: tuple[float, float] = (0.0, 0.0)
-    """error of the heading per error of the tilt, about the first two axes of the level frame
-    [-]"""
-    of_slow: dict[int, float] = {}  # noqa: RUF012  (a NamedTuple's default is not changed)
-    """error of the heading per time-correlated sensor error, by its index [rad per unit]"""
-
-
-class Tilt(NamedTuple):
-    """Direction of the vertical in the body, and the errors on which it depends."""
-
-    T: Floats  #: (3, 3) rotation from the level frame to B
-    sigma: float  #: standard deviation of its independent error, about each level axis [rad]
-    of_bias: float = 0.0
-    """error of the tilt per accelerometer bias across the vertical [rad s^2/m]"""
-
-
-LEVEL = Tilt(np.eye(3), 0.0)  #: a level vehicle
-
-
 class FirstEstimate(NamedTuple):
     """First estimate of a filter."""
 
@@ -89,14 +66,50 @@ class FirstEstimate(NamedTuple):
 
 def level(angle: float) -> Floats:
     """Return R_BI of a level vehicle whose x axis has a heading."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    start = np.zeros(1, START)
+    start["T"], start["heading"] = np.eye(3), angle
+    entries.start_level(start)
+    return start["R_BI"][0].copy()
 
 
-def resting_tilt(accel: Floats, sigma: float, gravity: float) -> Tilt:
-    """Return the tilt of a vehicle at rest from its accelerometer.
+def level_start(sensors: SensorSuite) -> NDArray[Any]:
+    """Return the start of a level vehicle, (1,) START, with the numbers of a suite."""
+    slow, imu = slow_states(sensors).first_sigmas, sensors.imu
+    start = np.zeros(1, START)
+    start["T"] = np.eye(3)
+    start["tilt_sigma"] = sensors.estimator.initial_tilt_sigma or LEVEL_SIGMA
+    start["heading_sigma"] = sensors.initial_pose.heading_sigma
+    start["velocity_sigma"] = math.sqrt(sensors.estimator.initial_velocity_variance)
+    start["accel_bias_sigma"], start["gyro_bias_sigma"] = imu.accel_bias_sigma, imu.gyro_bias_sigma
+    start["slow_sigma"][0, : len(slow)], start["slow_states"] = slow, len(slow)
+    if sensors.gnss is not None:
+        start["lever_B"] = sensors.gnss.primary_antenna_B
+    return start
+
+
+def empty_fix(sensors: SensorSuite) -> NDArray[Any]:
+    """Return a fix without measurements, (1,) FIX, with the numbers of a suite."""
+    fix, gnss, compass = np.zeros(1, FIX), sensors.gnss, sensors.magnetometer
+    fix["R_IG"], fix["sigma"], fix["baseline"] = np.eye(3), 1.0, (1.0, 0.0, 0.0)
+    fix["scale"] = math.sqrt(sensors.estimator.initial_covariance_scale)
+    fix["place_sigma"] = sensors.initial_pose.position_sigma
+    if gnss is not None:
+        fix["R_IG"], fix["sigma"] = ecef_to_enu(gnss.reference_antenna_G), gnss.position_sigma_I
+        fix["velocity_sigma"] = gnss.velocity_sigma or 0.0
+        fix["takes_baseline"] = gnss.has_baseline
+    if compass is not None:
+        states = slow_states(sensors)
+        fix["field_I"], fix["field_sigma"] = compass.field_I, compass.noise_sigma
+        fix["iron"] = states.vectors[Aid.MAGNETOMETER]
+        fix["declination"] = states.scalars[Aid.MAGNETOMETER]
+    return fix
+
+
+def rest(start: NDArray[Any], accel: Floats, sigma: float, gravity: float) -> None:
+    """Give a start the tilt of a vehicle at rest from its accelerometer.
 
     Args:
+        start: (1,) START; changed.
         accel: (3,) measured specific force in B [m/s^2].
         sigma: Standard deviation of its white noise, per axis [m/s^2].
         gravity: Gravitational acceleration that the filter assumes [m/s^2].
@@ -116,58 +129,12 @@ def resting_tilt(accel: Floats, sigma: float, gravity: float) -> Tilt:
     if share < STEEPEST_NOSE:
         raise ValueError(f"accel must be from a vehicle whose x axis is not vertical, got {k}")
     x /= share
-    return Tilt(np.column_stack([x, np.cross(k, x), k]), sigma / gravity, 1.0 / gravity)
+    start["T"] = np.column_stack([x, np.cross(k, x), k])
+    start["tilt_sigma"], start["tilt_of_bias"] = sigma / gravity, 1.0 / gravity
 
 
-def known_heading(angle: float, sigma: float, tilt: Tilt) -> FirstHeading:
-    """Return a given heading of the body x axis, which roll changes if that axis is not level."""
-    return FirstHeading(angle, sigma, (float(tilt.T[0, 2] / tilt.T[0, 0]), 0.0))
-
-
-def magnetic_heading(
-    sensors: SensorSuite, field_B: Floats, sigma: float | None, tilt: Tilt = LEVEL
-) -> FirstHeading:
-    """Return the heading of a vehicle of known tilt from its magnetometer.
-
-    To first order `m = f + f x e + delta g + T^T b + v` in the level frame with f = R m_I and g = R
-    (m_I x e3), where R is the rotation by the heading. The heading makes the part of m across the
-    level field f_h u vanish, along t = e3 x u:
-
-        e_z = (f_z u . e + delta t . g + T t . b + t . v) / f_h
-
-    Args:
-        sensors: A suite with a magnetometer.
-        field_B: (3,) measured field [T].
-        sigma: Standard deviation of the white noise, per axis [T]; None: the suite's value.
-        tilt: Tilt of the vehicle.
-
-    Raises:
-        ValueError: If the measured field has no level part.
-    """
-    magnetometer = sensors.magnetometer
-    assert magnetometer is not None
-    field = turned(tilt.T.T, field_B)
-    m_I = np.array(magnetometer.field_I)
-    strength = math.sqrt(field[0] * field[0] + field[1] * field[1])
-    if strength < 1e-3 * magnetometer.strength:
-        raise ValueError(f"magnetometer must measure a level part of the field, got {field_B}")
-    angle = math.atan2(m_I[1], m_I[0]) - math.atan2(field[1], field[0])
-    R_hat = level(angle)
-    f, g = turned(R_hat, m_I), turned(R_hat, (m_I[1], -m_I[0], 0.0))
-    f_h = math.sqrt(f[0] * f[0] + f[1] * f[1])
-    u = np.array([f[0], f[1], 0.0]) / f_h
-    t = np.array([-u[1], u[0], 0.0])
-    states = slow_states(sensors)
-    iron, declination = states.vectors[Aid.MAGNETOMETER], states.scalars[Aid.MAGNETOMETER]
-    of_slow = {iron + i: float(by / f_h) for i, by in enumerate(turned(tilt.T, t))}
-    of_slow[declination] = float((t[0] * g[0] + t[1] * g[1]) / f_h)
-    white = magnetometer.noise_sigma if sigma is None else sigma
-    of_tilt = (float(f[2] * u[0] / f_h), float(f[2] * u[1] / f_h))
-    return FirstHeading(angle, white / f_h, of_tilt, of_slow)
-
-
-def baseline_heading(sensors: SensorSuite, baseline_I: Floats, tilt: Tilt) -> FirstHeading:
-    """Return the heading by two antennas, for a vehicle of known tilt.
+def head_by_baseline(start: NDArray[Any], sensors: SensorSuite, baseline_I: Floats) -> None:
+    """Give a start (1,) START of known tilt the heading by two antennas.
 
     The baseline, (3,) from the primary antenna, acts as a magnetic field whose direction is
     measured in I.
@@ -179,53 +146,24 @@ def baseline_heading(sensors: SensorSuite, baseline_I: Floats, tilt: Tilt) -> Fi
     baseline_B = np.array(sensors.gnss.baseline_B)
     scale = math.sqrt(sensors.estimator.initial_covariance_scale)
     sigma = scale * sensors.gnss.first_baseline_sigma
-    f = tilt.T.T @ (baseline_B / np.linalg.norm(baseline_B))
+    f = start["T"][0].T @ (baseline_B / np.linalg.norm(baseline_B))
     f_h = math.hypot(f[0], f[1])
     if f_h < STEEP or math.hypot(baseline_I[0], baseline_I[1]) == 0.0:
         raise ValueError(
             "gnss_baseline_G must not be within 12 degrees of the vertical where accel gives the "
             "tilt: use a heading in its place"
         )
-    angle = math.atan2(baseline_I[1], baseline_I[0]) - math.atan2(f[1], f[0])
     slope = f[2] / f_h
-    return FirstHeading(angle, sigma / f_h, (float(slope * f[0] / f_h), float(slope * f[1] / f_h)))
+    start["heading"] = math.atan2(baseline_I[1], baseline_I[0]) - math.atan2(f[1], f[0])
+    start["heading_sigma"] = sigma / f_h
+    start["heading_of_tilt"] = slope * f[0] / f_h, slope * f[1] / f_h
 
 
-def still_start(
-    sensors: SensorSuite,
-    antenna_I: Floats,
-    position_root: Floats,
-    velocity: Floats,
-    velocity_sigma: Floats,
-    tilt: Tilt,
-    heading: FirstHeading,
-) -> FirstEstimate:
+def still_start(start: NDArray[Any], velocity: Floats) -> FirstEstimate:
     """Return the first estimate of a vehicle of known tilt, with the factor of its covariance."""
-    assert sensors.gnss is not None
-    imu, slow = sensors.imu, slow_states(sensors).first_sigmas
-    record = np.zeros(1, START)
-    given = {
-        "antenna_I": antenna_I,
-        "position_root": position_root,
-        "velocity_sigma": velocity_sigma,
-        "T": tilt.T,
-        "tilt_sigma": tilt.sigma,
-        "tilt_of_bias": tilt.of_bias,
-        "heading": heading.angle,
-        "heading_sigma": heading.sigma,
-        "heading_of_tilt": heading.of_tilt,
-        "lever_B": sensors.gnss.primary_antenna_B,
-        "accel_bias_sigma": imu.accel_bias_sigma,
-        "gyro_bias_sigma": imu.gyro_bias_sigma,
-        "slow_states": len(slow),
-    }
-    for name, value in given.items():
-        record[name] = value
-    record["slow_sigma"][0, : len(slow)] = slow
-    for place, gain in heading.of_slow.items():
-        record["heading_of_slow"][0, place] = gain
-    entries.start_level(record)
-    found, n = record[0], _D + len(slow)
+    entries.start_level(start)
+    found = start[0]
+    n = _D + int(found["slow_states"])
     factor = found["factor"][:n, :n].copy()
     return FirstEstimate(found["position"].copy(), velocity, found["R_BI"].copy(), factor)
 

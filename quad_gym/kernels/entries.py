@@ -28,7 +28,7 @@ from quad_gym.records import (
     WORK_BLOCK,
     Sensor,
 )
-from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW
+from quad_gym.records.inputs import EVENT, FIX, INPUT, PENDING, WINDOW
 
 
 class Rows(NamedTuple):
@@ -152,6 +152,7 @@ sense_imu = Entry("single:sense_imu", _FLIGHT, _PARAMS)
 body_accelerations = Entry(
     "single:body_accelerations", _MATRIX, *[_VECTOR] * 4, _PARAMS, _VECTOR, _VECTOR
 )
+first_heading = Entry("single:first_heading", _START, Rows(FIX))
 start_level = Entry("single:start_level", _START)
 wahba_of_vectors = Entry(
     "single:wahba_of_vectors", _VECTOR, _MATRIX, _MATRIX, _MATRIX, returns=float
@@ -171,7 +172,7 @@ FILTER_ENTRIES = (start_filter.name, run_tape.name, take_inputs.name)
 """Names of the entries that a filter calls, the slowest to compile first."""
 _SENSORS_AND_VEHICLE = (
     *(sense_features, sense_gnss, body_accelerations_in_air, integrate_flight),
-    *(sense_imu_average, sense_imu, body_accelerations, start_level),
+    *(sense_imu_average, sense_imu, body_accelerations, start_level, first_heading),
     *(wahba_of_vectors, step_biases, step_gnss_drift, draw_sensor_errors),
     *(disturb_imu, turn_gnss_baseline, limit_features, nearest_obstacles, hide_points),
 )

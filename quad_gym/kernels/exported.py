@@ -3,12 +3,15 @@
 They do what `single.start_filter` and `tape.run_tape` do, one operation a call, on records.
 """
 
+import math
+
 from numba import types
 from numba.np.numpy_support import from_dtype
 
-from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.filter.still import start_still
-from quad_gym.kernels.maths.linalg import load3
+from quad_gym.kernels.compiling import entry, kernel
+from quad_gym.kernels.filter.still import set_heading, start_still, turned
+from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.linalg import load3, store
 from quad_gym.kernels.simd.addresses import array_at
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.single import begin_filter
@@ -16,17 +19,32 @@ from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.kernels.tape import keep_estimate, predict_sample, update_with
 from quad_gym.kernels.window import take_input
 from quad_gym.records import (
+    AID_BLOCKS,
+    AIDS,
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
     FLIGHT_BLOCK,
+    MAX_FEATURES,
     MEASUREMENT,
     OPERATION,
     PARAMS_BLOCK,
+    POSITION_BLOCK,
     SAMPLE,
     SETTINGS,
     START,
     STEP_BLOCK,
+    VELOCITY_BLOCK,
     WORK_BLOCK,
 )
-from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW
+from quad_gym.records.inputs import (
+    EVENT,
+    FARTHEST_FIX,
+    FIX,
+    INPUT,
+    PENDING,
+    WINDOW,
+    Outcome,
+)
 
 _FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _SAMPLE, _MEASUREMENT, _START = map(
     from_dtype,
@@ -35,7 +53,9 @@ _FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _SAMPLE, _MEASUREMENT, _STAR
         *(SAMPLE, MEASUREMENT, START),
     ),
 )
-_WINDOW, _INPUT = map(from_dtype, (WINDOW, INPUT))
+_WINDOW, _INPUT, _FIX = map(from_dtype, (WINDOW, INPUT, FIX))
+_OK, _, _NOT_FINITE, _RANGE, _, _, _, _NO_HEADING, _CONTRADICTION = map(int, Outcome)
+_NOTHING = (0.0, 0.0, 0.0)
 _events_at, _samples_at, _waits_at, _operations_at = map(
     array_at, (EVENT, SAMPLE, PENDING, OPERATION)
 )
@@ -56,29 +76,206 @@ def update(flight, params, ticks, steps, settings, work, table, measurement):
     update_with(lanes_of(flight), params, ticks, steps, settings, work, table, mask, measurement)
 
 
-@entry(signature=types.none(_WINDOW, *[types.int64] * 4, _INPUT))
-def take(window, events, samples, waits, operations, given):
+@kernel
+def _is_all_finite(values):
+    found = True
+    for i in range(len(values)):
+        found &= math.isfinite(values[i])
+    return found
+
+
+@kernel
+def scale_baseline(v):
+    """Scale a baseline by a power of two: its length is not used; return the outcome."""
+    if not _is_all_finite(v):
+        return _NOT_FINITE
+    largest = max(abs(v[0]), abs(v[1]), abs(v[2]))
+    if largest == 0.0:
+        return _RANGE
+    while largest >= 1.0 or largest < 0.5:
+        factor = 0.5 if largest >= 1.0 else 2.0
+        largest = factor * largest
+        for i in range(3):
+            v[i] = factor * v[i]
+    return _OK
+
+
+@kernel
+def _check_sigma(value, least, measured):
+    """Check a standard deviation, 0: the parameters' one; return it, or NaN, and the outcome."""
+    if value == 0.0:
+        return math.nan, _OK
+    if not measured > 0.0:
+        return math.nan, _CONTRADICTION
+    if not math.isfinite(value):
+        return math.nan, _NOT_FINITE
+    return value, _OK if value >= least else _RANGE
+
+
+@kernel
+def _check_triple(values, measured):
+    return _OK if measured <= 0.0 or _is_all_finite(values) else _NOT_FINITE
+
+
+@kernel
+def check_measurement(m):
+    """Check a MEASUREMENT, and complete it; return the first outcome that is not OK."""
+    valid, o = m.valid, _check_triple(m.gnss_position, m.valid[POSITION_BLOCK])
+    for i in range(3):
+        m.position_sigma_I[i], found = _check_sigma(
+            m.position_sigma_I[i], 1e-9, valid[POSITION_BLOCK]
+        )
+        o = o if o != _OK else found
+    if o == _OK and valid[BASELINE_BLOCK] > 0.0:
+        o = scale_baseline(m.gnss_baseline)
+    sigma, found = _check_sigma(m.baseline_sigma, 1e-12, valid[BASELINE_BLOCK])
+    o = o if o != _OK else found
+    m.baseline_sigma = min(sigma, math.pi) if sigma == sigma else sigma
+    m.baseline_noise = m.baseline_sigma
+    found = _check_triple(m.gnss_velocity, valid[VELOCITY_BLOCK])
+    o = o if o != _OK else found
+    m.velocity_sigma, found = _check_sigma(m.velocity_sigma, 1e-12, valid[VELOCITY_BLOCK])
+    o = o if o != _OK else found
+    seen = 0.0
+    for k in range(MAX_FEATURES):
+        found = _check_triple(m.pixels[k], valid[FEATURE_BLOCKS + k])
+        o = o if o != _OK else found
+        seen = max(seen, valid[FEATURE_BLOCKS + k])
+    m.pixel_sigma, found = _check_sigma(m.pixel_sigma, 1e-12, seen)
+    o = o if o != _OK else found
+    for aid in range(AIDS):
+        found = _check_triple(m.aid_measurement[aid], valid[AID_BLOCKS + aid])
+        o = o if o != _OK else found
+        m.aid_sigma[aid], found = _check_sigma(m.aid_sigma[aid], 1e-12, valid[AID_BLOCKS + aid])
+        o = o if o != _OK else found
+    return o
+
+
+@entry(signature=types.none(_WINDOW, *[types.int64] * 4, _INPUT, _MEASUREMENT))
+def take(window, events, samples, waits, operations, given, measurement):
     """Write the operations that process an input; the memory is at these addresses."""
-    given.outcome = take_input(
-        window,
-        _events_at(events, window.event_room),
-        _samples_at(samples, window.room[0]),
-        _waits_at(waits, window.waiting_room),
-        _operations_at(operations, 0),
-        given,
+    known = math.isfinite(given.time) and math.isfinite(given.dt)
+    if not (known and _is_all_finite(given.gyro) and _is_all_finite(given.accel)):
+        given.outcome = _NOT_FINITE
+    elif given.rank > 0:
+        given.outcome = check_measurement(measurement)
+    if given.outcome == _OK:
+        given.outcome = take_input(
+            window,
+            _events_at(events, window.event_room),
+            _samples_at(samples, window.room[0]),
+            _waits_at(waits, window.waiting_room),
+            _operations_at(operations, 0),
+            given,
+        )
+
+
+@kernel
+def _check_fix(fix):
+    """Check the numbers of a FIX, and scale its baseline; return the outcome."""
+    if not (fix.has_position and _is_all_finite(fix.position) and math.isfinite(fix.time)):
+        return _NOT_FINITE
+    if (fix.has_heading and not math.isfinite(fix.heading)) or not _is_all_finite(fix.sigma):
+        return _NOT_FINITE
+    if not (_is_all_finite(fix.velocity) and _is_all_finite(fix.field_B)):
+        return _NOT_FINITE
+    for i in range(3):
+        if abs(fix.position[i]) > FARTHEST_FIX and not fix.rest:
+            return _RANGE
+        if fix.sigma[i] < 1e-9:
+            return _RANGE
+    if not (0.0 <= fix.tilt_sigma <= 1.0 and 0.0 <= fix.rest_sigma < math.inf):
+        return _RANGE
+    if (fix.has_velocity and not fix.velocity_sigma > 0.0) or not fix.field_sigma >= 0.0:
+        return _RANGE
+    if fix.has_baseline:
+        return scale_baseline(fix.baseline)
+    return _OK
+
+
+@kernel
+def _prepared(s, fix):
+    outcome = _check_fix(fix)
+    if outcome != _OK:
+        return outcome
+    if fix.tilt_sigma > 0.0:
+        s.tilt_sigma = fix.tilt_sigma
+    store(fix.velocity_I, turned(fix.R_IG, load3(fix.velocity)))
+    store(s.antenna_I, load3(fix.position) if fix.rest else turned(fix.R_IG, load3(fix.position)))
+    for i in range(3):
+        s.position_root[i, i] = fix.place_sigma if fix.rest else fix.scale * fix.sigma[i]
+        if fix.has_velocity:
+            s.velocity_sigma[i] = fix.velocity_sigma
+        elif fix.rest_sigma > 0.0:
+            s.velocity_sigma[i] = fix.rest_sigma
+        if fix.rest:
+            s.lever_B[i] = 0.0
+    fix.levels = 0 if fix.has_baseline else 1
+    if fix.has_baseline:
+        if fix.has_field or fix.course or not fix.takes_baseline:
+            return _CONTRADICTION
+        if fix.has_heading:
+            sine, cosine = sin_cos(fix.heading)
+            s.x_I[0], s.x_I[1] = cosine, sine
+        return _OK
+    sources = int(fix.has_heading != 0) + int(fix.has_field != 0) + int(fix.course != 0)
+    if sources == 0:
+        return _NO_HEADING
+    without = (fix.has_field and load3(fix.field_I) == _NOTHING) or (
+        fix.course and not fix.has_velocity
     )
+    if sources > 1 or without:
+        return _CONTRADICTION
+    outcome = set_heading(s, fix)
+    if outcome == _OK:
+        start_still(s)
+    return outcome
 
 
-@entry(signature=types.none(_FLIGHT, _PARAMS, _SETTINGS, _WORK, _START))
-def start(flight, params, settings, work, first):
-    """Start the filter from its first fix."""
-    begin_filter(flight, params, settings, work, load3(first.x_I))
+@entry(signature=types.none(_START, _FIX))
+def prepare(first, fix):
+    """Compute the first estimate that follows from a fix, with the suite's numbers in `first`."""
+    fix.outcome = _prepared(first, fix)
 
 
-@entry(signature=types.none(_START))
-def start_level(first):
-    """Compute the first estimate of a vehicle of known tilt."""
-    start_still(first)
+@entry(signature=types.none(_FLIGHT, _PARAMS, _SETTINGS, _WORK, _START, _FIX))
+def start(block, params, settings, work, first, fix):
+    """Start the filter from a fix that `prepare` has accepted."""
+    flight, p = lanes_of(block), lanes_of(params)
+    noise, tilt, speed = (
+        load3(p.position_sigma_I),
+        p.initial_tilt_sigma,
+        p.initial_velocity_variance,
+    )
+    for i in range(3):
+        flight.w_before[i] = math.nan
+        flight.gnss_position[i] = 0.0 if fix.rest else fix.position[i]
+        flight.gnss_baseline[i] = 0.0 if fix.rest else fix.baseline[i]
+        p.position_sigma_I[i] = fix.sigma[i]
+    if fix.tilt_sigma > 0.0:
+        p.initial_tilt_sigma = fix.tilt_sigma
+    if fix.rest_sigma > 0.0:
+        p.initial_velocity_variance = fix.rest_sigma * fix.rest_sigma
+    begin_filter(block, params, settings, work, load3(first.x_I))
+    store(p.position_sigma_I, noise)
+    p.initial_tilt_sigma, p.initial_velocity_variance = tilt, speed
+    if fix.levels:
+        n = 15 if fix.rest else 15 + first.slow_states
+        for i in range(3):
+            flight.r_hat[i] = first.position[i]
+            for j in range(3):
+                flight.R_hat[i, j] = first.R_BI[i, j]
+        for i in range(n):
+            for j in range(n):
+                if i >= 15:
+                    flight.L_slow[i - 15, j] = first.factor[i, j]
+                elif j < 15:
+                    flight.L[i, j] = first.factor[i, j]
+    if fix.levels or fix.has_velocity:
+        for i in range(3):
+            flight.v_hat[i] = fix.velocity_I[i]
+            if not fix.levels:
+                flight.L[3 + i, 3 + i] = fix.velocity_sigma
 
 
 @entry(signature=types.none(_FLIGHT, types.int64))

@@ -12,7 +12,7 @@ from quad_gym.kernels.compiling.signatures import signature_of
 from quad_gym.kernels.filter.align import initialize
 from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
-from quad_gym.kernels.filter.still import start_still
+from quad_gym.kernels.filter.still import set_heading, start_still
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.linalg import diagonal, load3, load4, load33, outer, store
 from quad_gym.kernels.obstacles.shapes import crosses, distance_from
@@ -57,6 +57,12 @@ def start_filter(blocks, params, settings, work, x_I):
     x_I: (3,) known direction of body x in I, or zeros if unknown.
     """
     begin_filter(blocks[0], params[0], settings[0], work[0], load3(x_I))
+
+
+@_entry
+def first_heading(starts, fixes):
+    """Set the heading of starts[0] from fixes[0], see `set_heading`."""
+    fixes[0].outcome = set_heading(starts[0], fixes[0])
 
 
 @_entry

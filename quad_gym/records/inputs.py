@@ -4,21 +4,27 @@ from enum import IntEnum, auto
 
 import numpy as np
 
+FARTHEST_FIX = 1e6
+"""Largest distance of a fix from the reference antenna [m]; the center of the Earth is farther."""
+
+MIN_COURSE = 5.0
+"""Speed divided by its standard deviation from which a course determines the heading."""
+
 SAME_TIME = 1e-6  #: time stamps that differ by less are equal [s]; PX4 counts microseconds
 
 
 class Outcome(IntEnum):
-    """Results of a call of a filter, with the names and numbers of an exported library."""
+    """Results of a call of a filter; an exported library has the same, explained in its header."""
 
     OK = 0
-    NOT_STARTED = auto()  #: call an init function first
-    NOT_FINITE = auto()  #: an argument is infinite or not a number
-    OUT_OF_RANGE = auto()  #: an argument is out of the range that its comment states
-    TOO_OLD = auto()  #: the time stamp is before qg_oldest_time
-    TOO_NEW = auto()  #: the time stamp is more than QG_LONGEST_STEP later than the filter
-    FULL = auto()  #: too many measurements wait for the prediction up to their time stamps
-    NO_HEADING = auto()  #: a start needs one of: baseline, heading, magnetometer, course
-    CONTRADICTION = auto()  #: arguments that exclude each other
+    NOT_STARTED = auto()
+    NOT_FINITE = auto()
+    OUT_OF_RANGE = auto()
+    TOO_OLD = auto()
+    TOO_NEW = auto()
+    FULL = auto()
+    NO_HEADING = auto()
+    CONTRADICTION = auto()
 
 
 class Kept(IntEnum):
@@ -88,3 +94,35 @@ WINDOW = np.dtype(
     ]
 )
 """State of the window of past inputs of a filter."""
+
+FIX = np.dtype(
+    [
+        ("time", "f8"),  # [s]
+        ("rest", "i8"),  # 1: at rest at `position` in I, with `heading`
+        # what was measured, where `has_...` is 1
+        *((f"has_{name}", "i8") for name in ("position", "baseline", "velocity")),
+        *((name, "f8", 3) for name in ("position", "sigma", "baseline", "velocity")),
+        ("has_heading", "i8"),
+        ("heading", "f8"),  # [rad]
+        ("has_field", "i8"),
+        ("field_B", "f8", 3),  # [T]
+        ("field_sigma", "f8"),  # of its white noise [T]
+        ("course", "i8"),  # 1: the vehicle flies nose first
+        ("velocity_sigma", "f8"),  # [m/s]
+        ("tilt_sigma", "f8"),  # [rad]; 0: as in the START record
+        ("rest_sigma", "f8"),  # of an unmeasured velocity [m/s]; 0: as in the START record
+        # the suite
+        ("R_IG", "f8", (3, 3)),
+        ("place_sigma", "f8"),  # of a given place [m]
+        ("scale", "f8"),  # of standard deviations of the fix
+        ("takes_baseline", "i8"),
+        ("field_I", "f8", 3),  # [T]; zero: the suite has no magnetometer
+        ("iron", "i8"),  # places of the magnetometer's errors among the slow states
+        ("declination", "i8"),
+        # results
+        ("velocity_I", "f8", 3),
+        ("levels", "i8"),  # 1: the estimate is the START record's, not of Wahba's problem
+        ("outcome", "i8"),
+    ]
+)
+"""A first fix, and measurements of the attitude; see `quad_gym.estimation.first_fix`."""

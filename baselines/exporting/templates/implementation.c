@@ -19,11 +19,12 @@ extern "C" {
 typedef int qgi_run(void *, void *, void *, void *, const void *, void *, const void *, void *,
                     void *, const void *);
 extern qgi_run qg_core_predict, qg_core_update;
-extern int qg_core_take(void *, void *, void *, int64_t, int64_t, int64_t, int64_t, void *);
-extern int qg_core_start(void *, void *, void *, void *, const void *, void *, const void *);
-extern int qg_core_start_level(void *, void *, void *);
+extern int qg_core_take(void *, void *, void *, int64_t, int64_t, int64_t, int64_t, void *, void *);
+extern int qg_core_prepare(void *, void *, void *, void *);
+extern int qg_core_start(void *, void *, void *, void *, const void *, void *, void *, void *);
 extern int qg_core_keep(void *, void *, const void *, int64_t);
-extern const char qg_core_params[], qg_core_steps[], qg_core_settings[], qg_core_first[];
+extern const char qg_core_params[], qg_core_steps[], qg_core_settings[], qg_core_first[],
+    qg_core_fix[];
 @STAGE_DECLARATIONS@
 
 /* The address of the full record, of which only the used parts are in memory. */
@@ -37,21 +38,13 @@ static double *qgi_field(const qg_filter *f, int offset)
     return (double *)(void *)(qgi_flight(f) + offset);
 }
 
-static int qgi_finite(const double *x, int n)
+/* Copy n numbers; return 0 without any. */
+static int qgi_put(double *to, const double *from, int n)
 {
-    for (int i = 0; i < n; i++)
-        if (!isfinite(x[i]))
-            return 0;
-    return 1;
+    for (int i = 0; from && i < n; i++)
+        to[i] = from[i];
+    return from != 0;
 }
-
-#ifdef QG_GNSS
-static void qgi_turn(const double m[9], const double v[3], double out[3])
-{
-    for (int i = 0; i < 3; i++)
-        out[i] = m[3 * i] * v[0] + m[3 * i + 1] * v[1] + m[3 * i + 2] * v[2];
-}
-#endif
 
 /* ---- one operation of the filter ---- */
 
@@ -85,12 +78,14 @@ static int64_t qgi_address(const void *place)
 }
 
 /* Take an input into the window, and run the operations that process it. */
-static int qgi_take(qg_filter *f, qg_input_record *input, const qg_measurement_record *measured)
+static int qgi_take(qg_filter *f, qg_input_record *input, qg_measurement_record *measured)
 {
     void *result, *raised;
+    if (!f->started)
+        return QG_NOT_STARTED;
     qg_core_take(&result, &raised, &f->window, qgi_address(f->event), qgi_address(f->sample),
-                 qgi_address(f->waits), qgi_address(f->operation), input);
-    if (measured && input->outcome == QG_OK)
+                 qgi_address(f->waits), qgi_address(f->operation), input, measured);
+    if (input->rank && input->outcome == QG_OK)
         f->measurement[input->index] = *measured;
     for (int k = 0; k < f->window.operations; k++) {
         const qg_operation_record *o = &f->operation[k];
@@ -108,15 +103,11 @@ static int qgi_take(qg_filter *f, qg_input_record *input, const qg_measurement_r
 int qg_predict(qg_filter *f, const double gyro[3], const double accel[3], double dt)
 {
     qg_input_record input;
-    if (!f->started)
-        return QG_NOT_STARTED;
-    if (!qgi_finite(gyro, 3) || !qgi_finite(accel, 3) || !isfinite(dt))
-        return QG_NOT_FINITE;
     memset(&input, 0, sizeof input);
-    memcpy(input.gyro, gyro, sizeof input.gyro);
-    memcpy(input.accel, accel, sizeof input.accel);
+    qgi_put(input.gyro, gyro, 3);
+    qgi_put(input.accel, accel, 3);
     input.dt = dt;
-    return qgi_take(f, &input, 0);
+    return qgi_take(f, &input, f->measurement);
 }
 
 double qg_time(const qg_filter *f)
@@ -132,159 +123,40 @@ double qg_oldest_time(const qg_filter *f)
     return reach > f->event[0].start ? reach : f->event[0].start;
 }
 
-/* The noise of a measurement: standard deviations of at least a limit. */
-static int qgi_noise(const double *measured, const double *sigma, int n, double least, double *out)
-{
-    if (!measured)
-        return QG_CONTRADICTION;
-    for (int i = 0; i < n; i++) {
-        if (!isfinite(sigma[i]))
-            return QG_NOT_FINITE;
-        if (sigma[i] < least)
-            return QG_OUT_OF_RANGE;
-        out[i] = sigma[i];
-    }
-    return QG_OK;
-}
-
-/* The numbers of a measurement; NULL: not measured. */
-static int qgi_block(const double *given, int n, double *valid, double *place)
-{
-    if (!given)
-        return QG_OK;
-    if (!qgi_finite(given, n))
-        return QG_NOT_FINITE;
-    *valid = 1.0;
-    memcpy(place, given, 8 * (size_t)n);
-    return QG_OK;
-}
-
-#ifdef QG_GNSS
-/* Scale a baseline by a power of two: its length is not used. */
-static int qgi_baseline(const double *given, double out[3])
-{
-    double largest = 0.0;
-    int exponent;
-    if (!qgi_finite(given, 3))
-        return QG_NOT_FINITE;
-    for (int i = 0; i < 3; i++)
-        largest = fabs(given[i]) > largest ? fabs(given[i]) : largest;
-    if (largest == 0.0)
-        return QG_OUT_OF_RANGE;
-    frexp(largest, &exponent);
-    for (int i = 0; i < 3; i++)
-        out[i] = ldexp(given[i], -exponent);
-    return QG_OK;
-}
-#endif
-
 int qg_update(qg_filter *f, const qg_measurements *m, double time)
 {
     qg_measurement_record r;
     qg_input_record input;
-    int error = QG_OK;
-    if (!f->started)
-        return QG_NOT_STARTED;
-    if (!isfinite(time))
-        return QG_NOT_FINITE;
     memset(&r, 0, sizeof r);
-@BLANK@
-@AID_TAKE@@IF CAMERA@
-    for (int i = 0; !error && m->pixels && i < QG_FEATURES; i++) {
-        const double *pixel = m->pixels + 2 * i;
-        if (!isnan(pixel[0]) && !isnan(pixel[1]))
-            error = qgi_block(pixel, 2, &r.valid[@FEATURE_BLOCKS@ + i], r.pixels[i]);
-    }
-    if (!error && m->pixel_sigma != 0.0)
-        error = qgi_noise(m->pixels, &m->pixel_sigma, 1, 1e-12, &r.pixel_sigma);
-@END@
-@IF GNSS@
-    if (!error)
-        error = qgi_block(m->gnss_position, 3, &r.valid[@POSITION_BLOCK@], r.gnss_position);
-    if (!error && m->gnss_sigma)
-        error = qgi_noise(m->gnss_position, m->gnss_sigma, 3, 1e-9, r.position_sigma_I);
-@END@
-@IF BASELINE@
-    if (!error && m->gnss_baseline) {
-        error = qgi_baseline(m->gnss_baseline, r.gnss_baseline);
-        r.valid[@BASELINE_BLOCK@] = 1.0;
-    }
-    if (!error && m->baseline_sigma != 0.0) {
-        error = qgi_noise(m->gnss_baseline, &m->baseline_sigma, 1, 1e-12, &r.baseline_sigma);
-        if (r.baseline_sigma > 3.141592653589793)
-            r.baseline_sigma = 3.141592653589793;
-        r.baseline_noise = r.baseline_sigma;
-    }
-@END@
-@IF VELOCITY@
-    if (!error)
-        error = qgi_block(m->gnss_velocity, 3, &r.valid[@VELOCITY_BLOCK@], r.gnss_velocity);
-    if (!error && m->velocity_sigma != 0.0)
-        error = qgi_noise(m->gnss_velocity, &m->velocity_sigma, 1, 1e-12, &r.velocity_sigma);
-@END@
-    if (error)
-        return error;
     memset(&input, 0, sizeof input);
+@TAKE@@IF CAMERA@
+    for (int i = 0; m->pixels && i < QG_FEATURES; i++) {
+        qgi_put(r.pixels[i], m->pixels + 2 * i, 2);
+        r.valid[@FEATURE_BLOCKS@ + i] = !isnan(r.pixels[i][0]) && !isnan(r.pixels[i][1]);
+    }
+    r.pixel_sigma = m->pixel_sigma;
+@END@
     input.time = time;
     input.rank = @RANK@; /* as in a replay */
     return qgi_take(f, &input, &r);
 }
 
-@AID_SOURCE@@IF CAMERA@
-int qg_update_pixels(qg_filter *f, const double *pixels, double time)
-{
-    qg_measurements m;
-    memset(&m, 0, sizeof m);
-    m.pixels = pixels;
-    return qg_update(f, &m, time);
-}
+@SOURCE@/* ---- start ---- */
 
-@END@
-@IF GNSS@
-int qg_update_gnss_position(qg_filter *f, const double position[3], const double *sigma,
-                            double time)
+static int qgi_init(qg_filter *f, qg_fix_record *fix)
 {
-    qg_measurements m;
-    memset(&m, 0, sizeof m);
-    m.gnss_position = position;
-    m.gnss_sigma = sigma;
-    return qg_update(f, &m, time);
-}
-
-@END@
-@IF BASELINE@
-int qg_update_gnss_baseline(qg_filter *f, const double baseline[3], double time)
-{
-    qg_measurements m;
-    memset(&m, 0, sizeof m);
-    m.gnss_baseline = baseline;
-    return qg_update(f, &m, time);
-}
-
-@END@
-@IF VELOCITY@
-int qg_update_gnss_velocity(qg_filter *f, const double velocity[3], double sigma,
-                            double time)
-{
-    qg_measurements m;
-    memset(&m, 0, sizeof m);
-    m.gnss_velocity = velocity;
-    m.velocity_sigma = sigma;
-    return qg_update(f, &m, time);
-}
-
-@END@
-/* ---- start ---- */
-
-static void qgi_begin(qg_filter *f, double time)
-{
+    void *result, *raised;
+    qg_start_record first;
+    memcpy(&first, qg_core_first, sizeof first);
+    qg_core_prepare(&result, &raised, &first, fix);
+    if (fix->outcome)
+        return (int)fix->outcome;
     memset(f, 0, sizeof *f);
     memcpy(f->params, qg_core_params, sizeof f->params);
     memcpy(f->steps, qg_core_steps, sizeof f->steps);
-    memcpy(&f->first, qg_core_first, sizeof f->first);
 @FILL_TABLE@
     *(double *)(void *)((char *)f->work + @OF_MASK@) = 1.0;
-    f->window.time = time;
+    f->window.time = fix->time;
     f->window.length = QG_WINDOW;
     f->window.longest = f->window.ahead = QG_LONGEST_STEP;
     f->window.copy_every = QG_COPY_EVERY;
@@ -293,41 +165,21 @@ static void qgi_begin(qg_filter *f, double time)
     f->window.room[@A_SAMPLE@] = sizeof f->sample / sizeof f->sample[0];
     f->window.room[@A_MEASUREMENT@] = sizeof f->measurement / sizeof f->measurement[0];
     f->window.room[@A_COPY@] = QG_COPIES;
-}
-
-static void qgi_start(qg_filter *f)
-{
-    void *result, *raised;
-    for (int i = 0; i < 3; i++)
-        qgi_field(f, @OF_W_BEFORE@)[i] = NAN;
-    qg_core_start(&result, &raised, qgi_flight(f), f->params, qg_core_settings, f->work, &f->first);
+    qg_core_start(&result, &raised, qgi_flight(f), f->params, qg_core_settings, f->work, &first,
+                  fix);
     f->started = 1;
+    return QG_OK;
 }
 
 int qg_init_at_rest(qg_filter *f, const double position[3], double heading, double time)
 {
-    static const double sigma[15] = {@REST_SIGMA@};
-    double *R, *L;
-    if (!qgi_finite(position, 3) || !isfinite(heading) || !isfinite(time))
-        return QG_NOT_FINITE;
-    qgi_begin(f, time);
-    qgi_start(f);
-    R = qgi_field(f, @OF_R_HAT@);
-    L = qgi_field(f, @OF_L@);
-    R[0] = R[4] = cos(heading);
-    R[1] = sin(heading);
-    R[3] = -R[1];
-    R[2] = R[5] = R[6] = R[7] = 0.0;
-    R[8] = 1.0;
-    for (int i = 0; i < 3; i++) {
-        qgi_field(f, @OF_POSITION@)[i] = position[i];
-        qgi_field(f, @OF_VELOCITY@)[i] = qgi_field(f, @OF_ACCEL_BIAS@)[i] = 0.0;
-        qgi_field(f, @OF_GYRO_BIAS@)[i] = 0.0;
-    }
-    for (int i = 0; i < 15; i++)
-        for (int j = 0; j < 15; j++)
-            L[15 * i + j] = i == j ? sigma[i] : 0.0;
-    return QG_OK;
+    qg_fix_record fix;
+    memcpy(&fix, qg_core_fix, sizeof fix);
+    fix.rest = 1;
+    fix.has_position = qgi_put(fix.position, position, 3);
+    fix.has_heading = qgi_put(&fix.heading, &heading, 1);
+    fix.time = time;
+    return qgi_init(f, &fix);
 }
 
 @IF BAROMETER@
@@ -338,164 +190,23 @@ void qg_barometer_from_start(qg_filter *f)
 
 @END@
 @IF GNSS@
-/* Heading by the magnetometer of a level vehicle. */
-static int qgi_magnetic(qg_start_record *s, const double field[3], double white)
-{
-#ifdef QG_MAGNETOMETER
-    static const double m_I[3] = {@FIELD_I@};
-    const double cross[3] = {m_I[1], -m_I[0], 0.0};
-    double angle, R[9] = {0}, f[3], g[3], f_h, u[2], t[2];
-    double strength = sqrt(field[0] * field[0] + field[1] * field[1]);
-    if (!qgi_finite(field, 3))
-        return QG_NOT_FINITE;
-    if (strength < 1e-3 * @STRENGTH@)
-        return QG_OUT_OF_RANGE;
-    angle = atan2(m_I[1], m_I[0]) - atan2(field[1], field[0]);
-    R[0] = R[4] = cos(angle);
-    R[1] = sin(angle);
-    R[3] = -R[1];
-    R[8] = 1.0;
-    qgi_turn(R, m_I, f);
-    qgi_turn(R, cross, g);
-    f_h = sqrt(f[0] * f[0] + f[1] * f[1]);
-    u[0] = f[0] / f_h;
-    u[1] = f[1] / f_h;
-    t[0] = -u[1];
-    t[1] = u[0];
-    s->heading = angle;
-    s->heading_sigma = (white > 0.0 ? white : @FIELD_SIGMA@) / f_h;
-    s->heading_of_slow[@IRON@] = t[0] / f_h;
-    s->heading_of_slow[@IRON@ + 1] = t[1] / f_h;
-    s->heading_of_slow[@DECLINATION@] = (t[0] * g[0] + t[1] * g[1]) / f_h;
-    s->heading_of_tilt[0] = f[2] * u[0] / f_h;
-    s->heading_of_tilt[1] = f[2] * u[1] / f_h;
-    return QG_OK;
-#else
-    (void)s, (void)field, (void)white;
-    return QG_CONTRADICTION;
-#endif
-}
-
-/* Heading of a vehicle that flies nose first. */
-static int qgi_course(qg_start_record *s, const double velocity[3], double sigma)
-{
-    double speed = sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1]), across;
-    if (speed < @MIN_COURSE@ * sigma)
-        return QG_OUT_OF_RANGE;
-    across = sigma / speed;
-    s->heading = atan2(velocity[1], velocity[0]);
-    s->heading_sigma = sqrt(s->heading_sigma * s->heading_sigma + across * across);
-    return QG_OK;
-}
-
-/* The first estimate of a level vehicle, in place of the one by Wahba's problem. */
-static void qgi_level(qg_filter *f)
-{
-    const qg_start_record *s = &f->first;
-    const int n = 15 + (int)s->slow_states;
-    void *result, *raised;
-    qg_core_start_level(&result, &raised, &f->first);
-    memcpy(qgi_field(f, @OF_POSITION@), s->position, sizeof s->position);
-    memcpy(qgi_field(f, @OF_R_HAT@), s->R_BI, sizeof s->R_BI);
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j < n; j++) {
-            if (i >= 15)
-                qgi_field(f, @OF_L_SLOW@)[@L_SLOW_PITCH@ * (i - 15) + j] = s->factor[i][j];
-            else if (j < 15)
-                qgi_field(f, @OF_L@)[15 * i + j] = s->factor[i][j];
-        }
-}
-
-/* A number of the parameters. */
-static double *qgi_number(qg_filter *f, int place)
-{
-    return (double *)(void *)((char *)f->params + place);
-}
-
 int qg_init(qg_filter *f, const qg_start *s)
 {
-    static const double R_IG[9] = {@R_IG@};
-    const int headings = (s->heading != 0) + (s->magnetometer != 0) + (s->course != 0);
-    const double *suite;
-    qg_start_record first;
-    double baseline[3] = {1.0, 0.0, 0.0}, velocity[3] = {0.0, 0.0, 0.0}, sigmas[3];
-    double speed_sigma = s->velocity_sigma > 0.0 ? s->velocity_sigma : @VELOCITY_SIGMA@;
-    double tilt_sigma, velocity_variance;
-    int error = QG_OK;
-    memcpy(&first, qg_core_first, sizeof first);
-    if (!s->gnss_position || !qgi_finite(s->gnss_position, 3) || !isfinite(s->time))
-        return QG_NOT_FINITE;
-    for (int i = 0; i < 3; i++)
-        if (fabs(s->gnss_position[i]) > @FARTHEST@)
-            return QG_OUT_OF_RANGE;
-    suite = (const double *)(const void *)(qg_core_params + @OF_POSITION_SIGMA@);
-    memcpy(sigmas, suite, sizeof sigmas);
-    if (s->gnss_sigma && (error = qgi_noise(s->gnss_position, s->gnss_sigma, 3, 1e-9, sigmas)))
-        return error;
-    if (!(s->tilt_sigma >= 0.0 && s->tilt_sigma <= 1.0 && s->rest_sigma >= 0.0) ||
-        isinf(s->rest_sigma))
-        return QG_OUT_OF_RANGE;
-    if (s->tilt_sigma > 0.0)
-        first.tilt_sigma = s->tilt_sigma;
-    for (int i = 0; i < 3 && s->rest_sigma > 0.0; i++)
-        first.velocity_sigma[i] = s->rest_sigma;
-    if (s->gnss_velocity) {
-        if (!qgi_finite(s->gnss_velocity, 3))
-            return QG_NOT_FINITE;
-        if (!(speed_sigma > 0.0))
-            return QG_OUT_OF_RANGE;
-        qgi_turn(R_IG, s->gnss_velocity, velocity);
-        for (int i = 0; i < 3; i++)
-            first.velocity_sigma[i] = speed_sigma;
-    }
-    if (s->heading && !isfinite(*s->heading))
-        return QG_NOT_FINITE;
-    if (s->gnss_baseline) {
-        if (!@HAS_BASELINE@ || s->magnetometer || s->course)
-            return QG_CONTRADICTION;
-        error = qgi_baseline(s->gnss_baseline, baseline);
-        if (s->heading) {
-            first.x_I[0] = cos(*s->heading);
-            first.x_I[1] = sin(*s->heading);
-        }
-    } else if (headings != 1) {
-        return headings ? QG_CONTRADICTION : QG_NO_HEADING;
-    } else if (s->heading) {
-        first.heading = *s->heading;
-    } else if (s->magnetometer) {
-        error = qgi_magnetic(&first, s->magnetometer, s->magnetometer_sigma);
-    } else {
-        error = s->gnss_velocity ? qgi_course(&first, velocity, speed_sigma) : QG_CONTRADICTION;
-    }
-    if (error)
-        return error;
-    qgi_begin(f, s->time);
-    tilt_sigma = *qgi_number(f, @OF_TILT_SIGMA@);
-    velocity_variance = *qgi_number(f, @OF_VELOCITY_VARIANCE@);
-    f->first = first;
-    qgi_turn(R_IG, s->gnss_position, f->first.antenna_I);
-    for (int i = 0; i < 3; i++) {
-        qgi_field(f, @OF_GNSS_POSITION@)[i] = s->gnss_position[i];
-        qgi_field(f, @OF_GNSS_BASELINE@)[i] = baseline[i];
-        f->first.position_root[i][i] = @ROOT_SCALE@ * sigmas[i];
-        qgi_number(f, @OF_POSITION_SIGMA@)[i] = sigmas[i];
-    }
-    if (s->tilt_sigma > 0.0)
-        *qgi_number(f, @OF_TILT_SIGMA@) = s->tilt_sigma;
-    if (s->rest_sigma > 0.0)
-        *qgi_number(f, @OF_VELOCITY_VARIANCE@) = s->rest_sigma * s->rest_sigma;
-    qgi_start(f);
-    *qgi_number(f, @OF_TILT_SIGMA@) = tilt_sigma;
-    *qgi_number(f, @OF_VELOCITY_VARIANCE@) = velocity_variance;
-    memcpy((char *)f->params + @OF_POSITION_SIGMA@, suite, 3 * 8);
-    if (!s->gnss_baseline)
-        qgi_level(f);
-    if (s->gnss_velocity || !s->gnss_baseline)
-        memcpy(qgi_field(f, @OF_VELOCITY@), velocity, sizeof velocity);
-    if (s->gnss_velocity && s->gnss_baseline)
-        for (int i = 3; i < 6; i++)
-            qgi_field(f, @OF_L@)[16 * i] = speed_sigma;
-    return QG_OK;
+    qg_fix_record fix;
+    memcpy(&fix, qg_core_fix, sizeof fix);
+    fix.time = s->time;
+    fix.has_position = qgi_put(fix.position, s->gnss_position, 3);
+    qgi_put(fix.sigma, s->gnss_sigma, 3);
+    fix.has_baseline = qgi_put(fix.baseline, s->gnss_baseline, 3);
+    fix.has_velocity = qgi_put(fix.velocity, s->gnss_velocity, 3);
+    fix.has_heading = qgi_put(&fix.heading, s->heading, 1);
+    fix.has_field = qgi_put(fix.field_B, s->magnetometer, 3);
+    fix.course = s->course;
+    qgi_put(&fix.velocity_sigma, s->velocity_sigma > 0.0 ? &s->velocity_sigma : 0, 1);
+    qgi_put(&fix.field_sigma, s->magnetometer_sigma > 0.0 ? &s->magnetometer_sigma : 0, 1);
+    fix.tilt_sigma = s->tilt_sigma;
+    fix.rest_sigma = s->rest_sigma;
+    return qgi_init(f, &fix);
 }
 
 @END@

@@ -88,7 +88,7 @@ static void print_estimate(void)
     printf(",%d\n", e.diverged);
 }
 
-#ifdef QG_GNSS
+#ifdef QG_GNSS_POSITION
 static void start(void)
 {
     qg_start s;
@@ -114,26 +114,7 @@ static int update(const char *name)
     qg_measurements m;
     memset(&m, 0, sizeof m);
     (void)given, (void)number;
-#ifdef QG_GNSS
-    if (!strcmp(name, "gnss")) {
-        m.gnss_position = given(1);
-        m.gnss_sigma = given(4);
-#ifdef QG_GNSS_BASELINE
-        m.gnss_baseline = given(7);
-#endif
-#ifdef QG_GNSS_VELOCITY
-        m.gnss_velocity = given(10);
-        m.velocity_sigma = number(13);
-#endif
-    } else
-#endif
-#ifdef QG_FEATURES
-    if (!strcmp(name, "camera"))
-        m.pixels = x + 1;
-    else
-#endif
-@AID_ROWS@
-        return 0;
+@ROWS@        return 0;
     demand(qg_update(&filter, &m, x[0]), name);
     return 1;
 }
@@ -161,7 +142,7 @@ static void call(char *row)
         print_estimate();
     else if (!strcmp(name, "rest"))
         demand(qg_init_at_rest(&filter, x, x[3], x[4]), name);
-#ifdef QG_GNSS
+#ifdef QG_GNSS_POSITION
     else if (!strcmp(name, "start"))
         start();
     else if (!strcmp(name, "origin")) {

@@ -23,16 +23,7 @@ extern "C" {
 #endif
 
 enum qg_result {
-    QG_OK = 0,
-    QG_NOT_STARTED,    /* call an init function first */
-    QG_NOT_FINITE,     /* an argument is infinite or not a number */
-    QG_OUT_OF_RANGE,   /* an argument is out of the range that its comment states */
-    QG_TOO_OLD,        /* the time stamp is before qg_oldest_time */
-    QG_TOO_NEW,        /* the time stamp is more than QG_LONGEST_STEP later than the filter */
-    QG_FULL,           /* too many measurements wait for the prediction up to their time stamps */
-    QG_NO_HEADING,     /* a start needs one of: baseline, heading, magnetometer, course */
-    QG_CONTRADICTION   /* arguments that exclude each other */
-};
+@OUTCOMES@};
 
 #define QG_TICK @TICK@ /* period of the IMU for which the noise is stated [s] */
 #define QG_IMU_AVERAGES @AVERAGES@ /* 1: IMU samples are means over their time; 0: values at its start */
@@ -53,19 +44,7 @@ enum qg_result {
 #define QG_WAITING 16 /* measurements that may wait for later samples */
 #define QG_COPIES (QG_EVENTS / QG_COPY_EVERY + 2)
 
-@AID_MACROS@@IF CAMERA@
-#define QG_FEATURES @FEATURES@ /* features of the camera */
-@END@
-@IF GNSS@
-#define QG_GNSS 1
-@END@
-@IF BASELINE@
-#define QG_GNSS_BASELINE 1
-@END@
-@IF VELOCITY@
-#define QG_GNSS_VELOCITY 1
-@END@
-
+@MACROS@
 typedef struct qg_filter qg_filter; /* see the end of this header */
 
 /* ---- start ---- */
@@ -109,21 +88,9 @@ int qg_predict(qg_filter *filter, const double gyro[3], const double accel[3], d
 /* Measurements of one instant, for one joint update. NULL: not measured. Standard deviations are
  * per axis; 0 or NULL: the suite's. */
 typedef struct {
-@AID_FIELDS@@IF CAMERA@
+@FIELDS_OF_MEASUREMENTS@@IF CAMERA@
     const double *pixels; /* [QG_FEATURES][2] from the image's center; NaN: not seen */
     double pixel_sigma;   /* [pixels] */
-@END@
-@IF GNSS@
-    const double *gnss_position; /* primary antenna minus reference antenna, in G [m] */
-    const double *gnss_sigma;    /* 3 standard deviations of it: east, north, up [m] */
-@END@
-@IF BASELINE@
-    const double *gnss_baseline; /* primary to secondary antenna, in G [m] */
-    double baseline_sigma;       /* of its direction [rad] */
-@END@
-@IF VELOCITY@
-    const double *gnss_velocity; /* of the primary antenna, in G [m/s] */
-    double velocity_sigma;       /* [m/s] */
 @END@
 } qg_measurements;
 
@@ -133,21 +100,7 @@ typedef struct {
 int qg_update(qg_filter *filter, const qg_measurements *measured, double time);
 
 /* The same for one measurement alone. */
-@AID_API@@IF CAMERA@
-int qg_update_pixels(qg_filter *f, const double *pixels, double time);
-@END@
-@IF GNSS@
-int qg_update_gnss_position(qg_filter *f, const double position[3], const double *sigma,
-                            double time); /* in G [m]; sigma: 3, or NULL */
-@END@
-@IF BASELINE@
-int qg_update_gnss_baseline(qg_filter *f, const double baseline[3], double time); /* in G [m] */
-@END@
-@IF VELOCITY@
-int qg_update_gnss_velocity(qg_filter *f, const double velocity[3], double sigma,
-                            double time); /* in G [m/s]; sigma: 0: the suite's */
-@END@
-
+@API@
 /* ---- outputs ---- */
 
 typedef struct {
@@ -202,7 +155,6 @@ int qg_policy(const float observation[@SIZE@], float action[4]);
 struct qg_filter {
     double flight[@FLIGHT_WORDS@], params[@PARAMS_WORDS@], work[@WORK_WORDS@], steps[@STEPS_WORDS@];
     uint64_t table[@STAGES@];
-    qg_start_record first;
     float last_action[4];
     int started;
     qg_window_record window;

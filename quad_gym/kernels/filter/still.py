@@ -6,10 +6,77 @@
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.elementary import atan2, sin_cos
 from quad_gym.kernels.maths.linalg import cross, load3, load33, store, vector
+from quad_gym.records.inputs import MIN_COURSE, Outcome
 
+_OK, _RANGE = int(Outcome.OK), int(Outcome.OUT_OF_RANGE)
 _R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
+
+
+@kernel
+def turned(R, v):
+    """The product of a matrix (3, 3) and a vector, with plain sums."""
+    return vector(
+        R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
+        R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
+        R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2],
+    )
+
+
+@kernel
+def set_heading(s, fix):
+    """Set the heading of a START record from a FIX, and the errors on which it depends.
+
+    Its source is a magnetic field, the course, or else a given number. Roll changes the heading of
+    an axis that is not level.
+    """
+    for i in range(s.slow_states):
+        s.heading_of_slow[i] = 0.0
+    if fix.has_field:
+        return _set_magnetic_heading(s, fix)
+    s.heading_of_tilt[0], s.heading_of_tilt[1] = s.T[0, 2] / s.T[0, 0], 0.0
+    if fix.course:
+        x, y = fix.velocity_I[0], fix.velocity_I[1]
+        speed = math.sqrt(x * x + y * y)
+        if speed < MIN_COURSE * fix.velocity_sigma:
+            return _RANGE
+        across = fix.velocity_sigma / speed
+        s.heading = atan2(y, x)
+        s.heading_sigma = math.sqrt(s.heading_sigma * s.heading_sigma + across * across)
+    else:
+        s.heading = fix.heading
+    return _OK
+
+
+@kernel
+def _set_magnetic_heading(s, fix):
+    """Set the heading of a vehicle of known tilt from its magnetometer.
+
+    To first order `m = f + f x e + delta g + T^T b + v` in the level frame with f = R m_I and g = R
+    (m_I x e3), where R is the rotation by the heading. The heading makes the part of m across the
+    level field f_h u vanish, along t = e3 x u:
+
+        e_z = (f_z u . e + delta t . g + T t . b + t . v) / f_h
+    """
+    m_I, m_B = fix.field_I, load3(fix.field_B)
+    x, y, _ = turned(s.T.T, m_B)
+    strength = math.sqrt(m_I[0] * m_I[0] + m_I[1] * m_I[1] + m_I[2] * m_I[2])
+    if not math.sqrt(x * x + y * y) >= 1e-3 * strength:
+        return _RANGE
+    s.heading = atan2(m_I[1], m_I[0]) - atan2(y, x)
+    sine, cosine = sin_cos(s.heading)
+    f_x, f_y = cosine * m_I[0] + sine * m_I[1], cosine * m_I[1] - sine * m_I[0]
+    g_x, g_y = cosine * m_I[1] - sine * m_I[0], -sine * m_I[1] - cosine * m_I[0]
+    f_h = math.sqrt(f_x * f_x + f_y * f_y)
+    u_x, u_y = f_x / f_h, f_y / f_h
+    s.heading_sigma = fix.field_sigma / f_h
+    s.heading_of_tilt[0], s.heading_of_tilt[1] = m_I[2] * u_x / f_h, m_I[2] * u_y / f_h
+    by = turned(s.T, vector(-u_y, u_x, 0.0))
+    for i in range(3):
+        s.heading_of_slow[fix.iron + i] = by[i] / f_h
+    s.heading_of_slow[fix.declination] = (u_x * g_y - u_y * g_x) / f_h
+    return _OK
 
 
 @kernel

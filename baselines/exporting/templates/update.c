@@ -3,6 +3,6 @@
     qg_measurements m;
     memset(&m, 0, sizeof m);
     m.@NAME@ = @ADDRESS@;
-    return qg_update(f, &m, time);
+@SIGMA@    return qg_update(f, &m, time);
 }
 
