@@ -137,8 +137,10 @@ def circling(world, **options):
 
 def test_the_kernels_find_the_same_distances_inside_and_outside():
     batch, inside = circling(CROSSED, control_rate=50.0), 0
-    for _ in range(400):
+    for step in range(400):
         batch.step()
+        if step % 4:
+            continue
         distance, vector = nearest_obstacle(
             CROSSED.obstacles, centers(CROSSED.obstacles, 8), batch.record("r")
         )
