@@ -1,7 +1,7 @@
 """Flights on a GPU: golden flights number by number, steps/s, memory. Never run on a GPU yet.
 
     python -m scripts.benchmarks.gpu prepare FOLDER     # on any machine, in a clone with all extras
-    python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine, in 8 minutes
+    python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine
 
 The second part needs the clone and FOLDER, and of packages NumPy, torch and cuda-core. It writes
 FOLDER/results.json after every measurement and skips those that are there: where it was interrupted
