@@ -255,6 +255,15 @@ def cases(kinds, count):
     return found[:count]
 
 
+def start_of(suite, truth):
+    """The true pose, where no sensor shows it."""
+    if suite.gnss is not None:
+        return {}
+    w, x, y, z = truth["quaternion"][0]
+    heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return {"position": truth["position"][0], "heading": float(heading)}
+
+
 def judged(name, change, log, truth, seed):
     """Replay a changed log; return the result and its largest position error after 10 s [m]."""
     rng, suite = np.random.default_rng(seed), sensor_suite(name)
@@ -264,12 +273,7 @@ def judged(name, change, log, truth, seed):
         table = changed
     elif changed is not None:
         suite = changed
-    start = {}
-    if suite.gnss is None:
-        w, x, y, z = truth["quaternion"][0]
-        heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        start = {"position": truth["position"][0], "heading": float(heading)}
-    result = replay(table, sensors=suite, start=start)
+    result = replay(table, sensors=suite, start=start_of(suite, truth))
     true = [np.interp(result.time, truth["time"], axis) for axis in truth["position"].T]
     error = np.linalg.norm(np.transpose(true) - result.position, axis=1)
     return result, float(error[result.time > 10.0].max())

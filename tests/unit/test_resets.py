@@ -32,11 +32,15 @@ def started(deviations, seed=0):
     return ukf
 
 
-def refuse(ukf, off, *, stepped):
-    """Update with a velocity that is `off` [m/s], after velocities were refused for too long."""
+def refuse(ukf, off, *, stepped, corrected=0.0):
+    """Update with a velocity that is `off` [m/s], after velocities were refused for too long.
+
+    The biases have been `corrected` by this much [m/s^2], [rad/s] before.
+    """
     blocks = ukf._engine.blocks
     blocks["tick"] += 2.0 * SUITE.estimator.glitch_timeout * SUITE.imu.rate
     blocks["accepted_tick"][:] = 0.0
+    blocks["corrected"][:], blocks["corrected_tick"][:] = corrected, blocks["tick"]
     blocks["rejected_in_row"][:, VELOCITY_BLOCK] = 20.0
     blocks["stepped"][:, VELOCITY_BLOCK] = stepped
     lever = np.cross(ukf._engine.read("w_meas")[0] - ukf.gyro_bias, SUITE.gnss.primary_antenna_B)
@@ -96,6 +100,13 @@ def test_reset_of_a_drifted_estimate_restores_the_variances_of_the_start():
     others = cut(P, np.arange(6, 15))
     np.testing.assert_array_equal(P[6:9, :6], others[6:9, :6])
     assert (np.linalg.eigvalsh(P / np.outer(sigma, sigma)) > 0.0).all()
+
+
+def test_reset_after_large_corrections_leaves_biases_that_sensors_can_have():
+    ukf = started(DEVIATIONS)
+    refuse(ukf, np.array([5.0, -3.0, 2.0]), stepped=False, corrected=1.0)
+    sigma = np.sqrt(np.diag(ukf.covariance))
+    np.testing.assert_allclose(sigma[9:], np.repeat([0.5, 0.09], 3))
 
 
 def at_rest(offsets, sigma=1.0, seed=0):
@@ -223,18 +234,23 @@ def test_protection_does_no_harm_to_a_real_flight():
     assert rms[0] < 2.0 * rms[1], rms
 
 
-def test_receiver_that_drifts_off_in_a_real_flight_is_left_out_until_it_is_right_again():
-    """Positions and velocities drift off at 4 m/s for 20 s, in the air; the rest is as recorded."""
+def drifting_receiver(rate, start=70.0, end=90.0):
+    """Logs of a real flight: as recorded, and with fixes that drift off to the east [m/s]."""
     with gzip.open(HOBBY, "rt") as file:
         d = np.genfromtxt(file, delimiter=",", names=True)
-    log = {name: d[name] for name in d.dtype.names}
-    start, end = 70.0, 90.0
-    log = {name: values[log["time"] < end + 6.0] for name, values in log.items()}
-    wrong = (log["time"] >= start) & (log["time"] < end)
+    log = {name: d[name][d["time"] < end + 6.0] for name in d.dtype.names}
     drifting = {name: values.copy() for name, values in log.items()}
-    meters = 4.0 * (log["time"] - start)[wrong]
+    wrong = (log["time"] >= start) & (log["time"] < end)
+    meters = rate * (log["time"] - start)[wrong]
     drifting["gnss_lon"][wrong] += np.degrees(meters / (6.378e6 * np.cos(np.radians(37.87))))
-    drifting["gnss_velocity_east"][wrong] += 4.0
+    drifting["gnss_velocity_east"][wrong] += rate
+    return log, drifting
+
+
+def test_receiver_that_drifts_off_in_a_real_flight_is_left_out_until_it_is_right_again():
+    """Positions and velocities drift off at 4 m/s for 20 s, in the air; the rest is as recorded."""
+    start, end = 70.0, 90.0
+    log, drifting = drifting_receiver(4.0, start, end)
     right, result = replay(log, sensors="field"), replay(drifting, sensors="field")
     error = np.linalg.norm(result.position - right.position, axis=1)
     sigma = np.linalg.norm(result.sigma[:, :3], axis=1)

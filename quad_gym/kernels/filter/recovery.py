@@ -69,6 +69,8 @@ _STRICT = 0.5
 """Ratio of the limits for a receiver that is used again and the gate: its false-alarm probability,
 for position and velocity, is about the root of the gate's."""
 _MORE = 16.0  #: factor on the variances of position and velocity where the biases are reset
+_ACCEL_OFFSET, _GYRO_OFFSET = 0.5, 0.09
+"""Largest offsets of cheap sensors in data sheets [m/s^2], [rad/s]: TDK ICM-20948."""
 MAX_ANGLE = math.pi / math.sqrt(3.0)
 """Largest standard deviation of an angle [rad], when it is unknown."""
 
@@ -245,7 +247,7 @@ def _reset_motion(flight, p, P, states, lanes, accel, gyro):
     Position and velocity follow from them: their variances are multiplied by `_MORE`, and the
     velocity's are at least those that such a tilt causes in the time `RECENT`.
     Those of the biases are at least nine times the squares of corrections, `accel` and `gyro`, that
-    have gone one way.
+    have gone one way, but no sensor has larger offsets than `_ACCEL_OFFSET` and `_GYRO_OFFSET`.
     """
     R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
     k, start = R_BI.T[2], p.heading_sigma * p.heading_sigma
@@ -262,9 +264,11 @@ def _reset_motion(flight, p, P, states, lanes, accel, gyro):
     P_ee = load_block(P, E, E)
     more = maximum(heading - dot(k, P_ee @ k), 0.0)
     store_block(P, E, E, P_ee + outer(more * k, k))
-    accel = maximum(p.accel_bias_sigma * p.accel_bias_sigma, 9.0 * accel)
+    accel = minimum(9.0 * accel, _ACCEL_OFFSET * _ACCEL_OFFSET)
+    accel = maximum(p.accel_bias_sigma * p.accel_bias_sigma, accel)
     reset_variances(P, BA, states, lanes, (accel, accel, accel))
-    gyro = maximum(p.gyro_bias_sigma * p.gyro_bias_sigma, 9.0 * gyro)
+    gyro = minimum(9.0 * gyro, _GYRO_OFFSET * _GYRO_OFFSET)
+    gyro = maximum(p.gyro_bias_sigma * p.gyro_bias_sigma, gyro)
     reset_variances(P, BG, states, lanes, (gyro, gyro, gyro))
 
 
