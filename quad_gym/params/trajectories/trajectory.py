@@ -185,11 +185,20 @@ class Trajectory(Checked, eq=False):
         for row, (end, inner) in enumerate(((0.0, near), (self.duration, self.duration - near))):
             # the end's own, unless it is at rest there but for rounding
             for time, least in ((inner, 1e-10), (end, 1e-4)):
-                velocity = self._polynomials(0, 2)(time, 1)
+                velocity = self._level_velocity(time)
                 speed = portable.norm(velocity)  # BLAS would round it by the processor
                 if speed > least:
                     found[row] = velocity / speed
         return found
+
+    def _level_velocity(self, time: float) -> Floats:
+        """Return the velocity east and north; unlike SciPy's, with the same bits everywhere."""
+        piece = min(int(np.searchsorted(self.times, time, "right")), len(self.times) - 1) - 1
+        velocity, power = np.zeros(2), 1.0
+        for n, terms in enumerate(self.coefficients[-2::-1, piece, :2], 1):
+            velocity += terms * power * n
+            power *= float(time - self.times[piece])
+        return velocity
 
     def _polynomials(self, first: int, last: int) -> "PPoly":
         """Return the polynomials of some of x, y, z and yaw, as SciPy's."""
