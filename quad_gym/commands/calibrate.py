@@ -7,9 +7,9 @@
     quad-gym calibrate flight.csv --vehicle mine-vehicle.toml
 
 The first part of the log, or the first ones of several logs, are for the search, the rest for
-validation. The result is a suite with the rates, delays and noise of this vehicle, for `replay`,
-`train` and all other commands. The verdict is in the last lines; if the suite is not usable, the
-exit code is 1.
+validation; of several logs, all then enter the suite. The result is a suite with the rates, delays
+and noise of this vehicle, for `replay`, `train` and all other commands. The verdict is in the last
+lines; if the suite is not usable, the exit code is 1.
 """
 
 import math

@@ -1,7 +1,8 @@
 """Calibration: the numbers of a sensor suite from logs of flights.
 
 The first part of a log, or the first ones of several logs, are for the search (`search.py`); the
-rest validates its result. Biases of the IMU are found first, for each flight by itself.
+rest validates its result. Of several logs, all then enter the numbers: the search goes on from the
+validated ones. Biases of the IMU are found first, for each flight by itself.
 """
 
 import math
@@ -45,9 +46,11 @@ class Calibration:
     prior: SensorSuite  #: the suite before
     numbers: tuple[Calibrated, ...]
     before: Validation  #: the suite before, on the validation part of the log
-    after: Validation  #: the suite with the numbers that were found, on this part
+    after: Validation
+    """the suite with the numbers that were found, on this part; of several logs, with the numbers
+    of the first ones"""
     split: float  #: time at which this part begins [s]; of several logs, all of the later ones
-    used: int = 1  #: number of logs that the search used
+    used: int = 1  #: number of logs with which the validated numbers were found
 
     @property
     def verdict(self) -> str:
@@ -98,7 +101,7 @@ def calibrate(
         start: Keywords of `initialize`, such as `{"heading": 0.5}`; a list of them for several
             logs, or one for all.
         share: Share of the log, from its beginning, that the search uses, or of the logs; the rest
-            is for validation.
+            is for validation. Of several logs, all enter the numbers after the validation.
         delays: True: find delays of time stamps, too; False: keep the suite's.
         rotation: True: find the rotation from the IMU to the axes of the body; False: the axes of
             the IMU are the body's, and the magnetometer is rotated.
@@ -130,36 +133,51 @@ def calibrate(
         (whole,), used = logs, 1
         time = whole.imu.time
         split = float(time[0] + share * (time[-1] - time[0]))
-        parts, judged = [whole.until(split)], {"": 0}
+        flights, judged = [whole.until(split)], {"": 0}
     else:
         used, split = max(1, min(len(logs) - 1, round(share * len(logs)))), -math.inf
-        parts = logs[:used]
+        flights = logs
         judged = {_name_of(logs[k], k): k for k in range(used, len(logs))}
     report("Biases of the IMU")
-    biases = [turn_on_biases(*each, prior) for each in zip(parts, begins, strict=False)]
-    parts = [_without(part, found) for part, found in zip(parts, biases, strict=True)]
-    found = _searched(NumberSearch(parts, prior, begins[:used], delays, rotation), report)
-    new = prior
-    for number in found:
-        new = number.number.put(new, number.value)
-    new = _with_biases(_like_the_log(new, logs[0]), biases)
+    biases = [turn_on_biases(*each, prior) for each in zip(flights, begins, strict=True)]
+    flights = [_without(part, found) for part, found in zip(flights, biases, strict=True)]
+
+    def searched(
+        count: int, before: NumberSearch | None = None
+    ) -> tuple[NumberSearch, tuple[Calibrated, ...], SensorSuite]:
+        """Return the search in the first logs, its numbers, and the suite with them."""
+        search = NumberSearch(flights[:count], prior, begins[:count], delays, rotation)
+        found, new = _searched(search, report, before), prior
+        for number in found:
+            new = number.number.put(new, number.value)
+        return search, found, _with_biases(_like_the_log(new, logs[0]), biases[:count])
+
+    search, found, new = searched(used)
     report("Validation")
     before, after = (
         pooled({n: validate(logs[k], s, begins[k], split) for n, k in judged.items()})
         for s in (prior, new)
     )
+    if used < len(flights):
+        _, found, new = searched(len(flights), search)
     return Calibration(new, prior, found, before, after, split, used)
 
 
-def _searched(search: NumberSearch, report: Callable[[str], None]) -> tuple[Calibrated, ...]:
-    """Return the numbers that a search finds."""
-    report(f"Search for {len(search.numbers)} numbers in a part of the flight")
-    search.begin()
-    report("Search in all that is not for validation")
-    search.fit()
-    report("Search with the tails and correlations of the innovations")
-    search.adapt()
-    search.fit()
+def _searched(
+    search: NumberSearch, report: Callable[[str], None], before: NumberSearch | None
+) -> tuple[Calibrated, ...]:
+    """Return the numbers that a search finds, from its beginning or after one in fewer logs."""
+    if before is not None:
+        report("Search in all logs")
+        search.take(before)
+        search.fit()
+    else:
+        report(f"Search for {len(search.numbers)} numbers in a part of the flight")
+        search.begin()
+        report("Search in all that is not for validation")
+        search.fit()
+        report("Search with the tails and correlations of the innovations")
+        search.adapt()
     report("Intervals")
     found = search.intervals()
     return search.intervals() if search.keep_priors(found) else found

@@ -107,6 +107,12 @@ def thinned(log: Log) -> Log:
     return replace(log, **changes)
 
 
+def loss_of(nis: Floats, sigma: Floats, nu: float = NU[0]) -> Floats:
+    """Return the losses (n,) of measurements with NIS (n,) and predicted sigmas (n, d)."""
+    d = sigma.shape[1]
+    return np.asarray(0.5 * (nu + d) * np.log1p(nis / (nu - 2.0)) + np.log(sigma).sum(axis=1))
+
+
 def tails(nis: Floats, d: int) -> float:
     """Return the degrees of freedom of Student's t that describe NIS (n,) of d numbers best."""
     from scipy.special import gammaln
@@ -213,8 +219,7 @@ class _LogLosses:
         for row, block in enumerate(blocks_of(self.suite)):
             have, d = self._valid[:, block], FREEDOMS[block]
             nis, sigma = found[have, row, 6], found[have, row, 3 : 3 + d]
-            nu = self.nu.get(name_of(block), NU[0])
-            some = 0.5 * (nu + d) * np.log1p(nis / (nu - 2.0)) + np.log(sigma).sum(axis=1)
+            some = loss_of(nis, sigma, self.nu.get(name_of(block), NU[0]))
             losses[have] += self.weights.get(name_of(block), 1.0) * some
         # a filter that failed is as unlikely as one that is wrong by far
         counted = np.nan_to_num(losses[self.counts], nan=1e3, posinf=1e3)

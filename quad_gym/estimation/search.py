@@ -6,10 +6,11 @@ the flight. Newton steps follow, whose derivatives are differences between filte
 numbers of the suite, on a log each for delays and the mounting of the IMU. Their second derivatives
 are exact on the diagonal, and otherwise as correlated as the scores of parts of the log.
 
-The likelihood alone makes noise too small where errors are correlated in time, as near motors:
-innovations are as small as predicted, but not white. Noise of such sensors becomes larger by
+The likelihood alone may make noise too small where errors are correlated in time, as near motors:
+innovations are as small as predicted, but not white. Noise of such sensors then becomes larger by
 sqrt(tau) (`widening`), where tau is the integrated autocorrelation time of the innovations in
-samples, before the other numbers are fitted again.
+samples, and the other numbers are fitted again. The log decides: the wider noise stays if fixes
+that are left out for a second are more likely with it.
 """
 
 import math
@@ -18,13 +19,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quad_gym.estimation.differences import curvature, derivatives, lowest, spread_between
 from quad_gym.estimation.engine import Floats
 from quad_gym.estimation.fits import correlation_time
-from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, tails
+from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, loss_of, tails
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.logs.parts import naming
 from quad_gym.estimation.numbers import Number, numbers_in
 from quad_gym.estimation.replaying import replay
+from quad_gym.estimation.validation import left_out
 from quad_gym.params.sensors import SensorSuite
 
 _SILENT = 0.8
@@ -38,7 +41,6 @@ _FINE, _LONG = 0.3, 3.0
 """Steps for intervals over those of the search: of numbers in which the loss is smooth, and of
 delays in which it is not."""
 _KINKED = 0.4  #: share of a second derivative that remains with long steps if kinks cause it
-_RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are estimates
 _SHORT = 45.0  #: time of flight that is enough for the first search [s]
 _CLUSTER, _CLUSTERS = 5.0, 20
 """Length of independent parts of a log [s], shorter in short logs; their least number."""
@@ -59,9 +61,6 @@ _WHITE = {
 }
 """White noise that is inflated where innovations are correlated: their sensor, its axes, and the
 largest factor, which is smaller where the filter estimates a correlated error of the sensor."""
-_SMALL = 0.13
-"""Mean squared innovation over its variance below which noise is not inflated, because the filter
-already assumes much more noise than the innovations have."""
 
 
 class Calibrated(NamedTuple):
@@ -179,7 +178,7 @@ class NumberSearch:
                 places = self.x[k] + _COARSE / number.spread
                 places = places[(places >= self.low[k]) & (places <= self.high[k])]
                 points = [np.where(np.arange(len(self.x)) == k, x, self.x) for x in places]
-                self.x[k] = _lowest(places, self.total(points))
+                self.x[k] = lowest(places, self.total(points))
         little = np.where([n.name in _COARSE_NOISE for n in self.numbers], 0.0, self.x)
         tried = [self._descend(x, ~self.of_log, _FEW_STEPS) for x in (self.x, little)]
         self.x = min(tried, key=lambda found: found[1])[0]
@@ -195,7 +194,7 @@ class NumberSearch:
                 self.x, _ = self._descend(self.x, self.of_log, 2)
             self.x, _ = self._descend(self.x, ~self.of_log, _STEPS)
             if again and self.nu:
-                self._describe()
+                self.describe()
 
     def _descend(self, x: Floats, chosen: Any, steps: int) -> tuple[Floats, float]:
         """Return where Newton steps over the chosen coordinates end, and the loss there."""
@@ -205,9 +204,9 @@ class NumberSearch:
         for _ in range(steps):
             losses = self.losses([x, *(x + s * step for step in axes for s in (1.0, -1.0))])
             loss = float(losses[:, 0].sum() + 0.5 * x @ x)
-            scores, bends = _derivatives(losses, np.diag(self.steps)[index])
+            scores, bends = derivatives(losses, np.diag(self.steps)[index])
             slope, place = scores.sum(axis=0) + x[index], x[index]
-            H = _curvature(scores, bends) + np.eye(len(index))
+            H = curvature(scores, bends) + np.eye(len(index))
             held = (place <= self.low[index]) & (slope > 0.0)
             held |= (place >= self.high[index]) & (slope < 0.0)
             free, step = np.flatnonzero(~held), np.zeros(len(x))
@@ -224,21 +223,53 @@ class NumberSearch:
         return x, loss
 
     def adapt(self) -> None:
-        """Find the tails of the innovations, and widen noise where these are correlated in time."""
-        scaled = self._describe()
+        """Fit with the tails of the innovations, and with wider noise where they are correlated.
+
+        The wider noise stays if fixes that are left out for a second are more likely with it.
+        """
+        self.describe()
+        self.fit()
+        wide = self.widened(self.describe())
+        if (wide == self.low).all():
+            return
+        narrow = self.x, self.low, dict(self.nu), set(self.white)
+        loss = self._left_out()
+        self.low, self.x = wide, np.maximum(self.x, wide)
+        self.fit()
+        if not self._left_out() < loss:
+            self.x, self.low, self.nu, self.white = narrow
+            self._known = {}
+
+    def widened(self, scaled: dict[str, Floats]) -> Floats:
+        """Return lower ends of the numbers with wider noise, from innovations over their sigmas."""
+        low = self.low.copy()
         for k, number in enumerate(self.numbers):
             sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
-            if len(scaled.get(sensor, ())) <= _FEWEST:
-                continue
-            factor = widening(scaled[sensor][:, axes], most)
-            if factor == 1.0:
-                continue
-            value = factor * number.value(self.values[k], float(self.x[k]))
-            wide = number.coordinate(self.values[k], value)
-            self.low[k] = min(max(self.low[k], wide), self.high[k] - 0.1)
-        self.x = np.maximum(self.x, self.low)
+            if len(scaled.get(sensor, ())) > _FEWEST:
+                factor = widening(scaled[sensor][:, axes], most)
+                value = factor * number.value(self.values[k], float(self.x[k]))
+                wide = number.coordinate(self.values[k], value)
+                if factor > 1.0:
+                    low[k] = min(max(low[k], wide), self.high[k] - 0.1)
+        return low
 
-    def _describe(self) -> dict[str, Floats]:
+    def _left_out(self) -> float:
+        """Return the loss of fixes that are left out for a second; infinite without fixes."""
+        suite, total = self.suite(self.x, gate=True), math.inf
+        for log, start in zip(self.logs, self.starts, strict=True):
+            if (found := left_out(log, suite, start)) is not None:
+                losses = loss_of(found.nis, found.sigma)[in_flight(log, found.received)]
+                total = float(losses.sum()) + (0.0 if total == math.inf else total)
+        return total
+
+    def take(self, other: "NumberSearch") -> None:
+        """Begin where the search in some of the logs has ended."""
+        self.nu, self.white = other.nu, other.white
+        for number, x, low in zip(other.numbers, other.x, other.low, strict=True):
+            k = self.numbers.index(number)
+            self.x[k], self.low[k] = x, low
+
+    def describe(self) -> dict[str, Floats]:
         """Find tails and whiteness of the innovations; return the innovations over their sigmas."""
         suite = self.suite(self.x, gate=True)
         values: dict[str, list[Floats]] = {}
@@ -277,7 +308,7 @@ class NumberSearch:
         points = [self.x, *(self.x + s * e for e in axes for s in (1.0, -1.0))]
         points += [self.x + axes[i] + axes[j] for i, j in zip(row, column, strict=True)]
         losses = self.losses(points)
-        scores, bends = _derivatives(losses, h)
+        scores, bends = derivatives(losses, h)
         total = losses.sum(axis=0)
         ahead, both = total[1 : 2 * n : 2], total[2 * n + 1 :]
         H = np.diag(bends)
@@ -291,7 +322,7 @@ class NumberSearch:
         sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
         sums -= sums.mean(axis=0)  # not zero at a bound
         root = np.linalg.solve(information, np.linalg.cholesky(sums.T @ sums + np.eye(n)))
-        between = _spread_between(losses, h, self._sizes, length)
+        between = spread_between(losses, h, self._sizes, length)
         sigmas = np.minimum(np.sqrt((root**2).sum(axis=1) + between), 1.0)
         sigmas = np.where(self.kept, 1.0, sigmas)
         curved = np.maximum(bends, 0.0)
@@ -330,20 +361,9 @@ class NumberSearch:
         for k in np.flatnonzero([number.sensor == "log_delays" for number in self.numbers]):
             ends = [s * share * self.steps[k] for share in (1.0, _LONG) for s in (1.0, -1.0)]
             losses = self.losses([self.x, *(self.x + end for end in ends)])
-            _, (short, long) = _derivatives(losses, steps[k] * np.array([1.0, _LONG]))
+            _, (short, long) = derivatives(losses, steps[k] * np.array([1.0, _LONG]))
             chosen[k] = _LONG if short <= 0.0 or long < _KINKED * short else 1.0
         return steps * chosen
-
-
-def _derivatives(losses: Floats, steps: Floats) -> tuple[Floats, Floats]:
-    """Return scores (parts, n), and second derivatives (n,) of the sum over all parts.
-
-    The losses (parts, 1 + 2 n) are at a point, and a step (n,) ahead and back along each axis.
-    """
-    count = 2 * len(steps) + 1
-    ahead, back = losses[:, 1:count:2], losses[:, 2:count:2]
-    bends = (ahead + back).sum(axis=0) - 2.0 * losses[:, 0].sum()
-    return (ahead - back) / (2.0 * steps), bends / steps**2
 
 
 def _begin_of(log: Log, seconds: float) -> Log:
@@ -354,47 +374,10 @@ def _begin_of(log: Log, seconds: float) -> Log:
     return log.until(float(time[min(last, len(time) - 1)]))
 
 
-def _spread_between(losses: Floats, h: Floats, sizes: Sequence[int], length: int) -> Floats:
-    """Return the variances (n,) of numbers between logs, from losses as in `_derivatives`.
-
-    Each log has its best number one Newton step from the common one; the variance of these beyond
-    the uncertainty within each log is the method of moments of DerSimonian and Laird, Controlled
-    Clinical Trials 7(3), 1986, with equal weights.
-    """
-    steps, errors = [], []
-    for rows in np.split(losses, np.cumsum(sizes)[:-1]):
-        scores, bends = _derivatives(rows, h)
-        H = np.maximum(bends, 0.0) + 1.0
-        sums = np.add.reduceat(scores, np.arange(0, len(scores), length))
-        steps.append(-scores.sum(axis=0) / H)
-        errors.append((sums**2).sum(axis=0) / H**2)
-    if len(steps) < 2:
-        return np.zeros(len(h))
-    return np.maximum(np.var(steps, axis=0, ddof=1) - np.mean(errors, axis=0), 0.0)
-
-
-def _curvature(scores: Floats, bends: Floats) -> Floats:
-    """Return second derivatives with the correlations of the scores."""
-    squares = scores.T @ scores
-    squares += np.diag(_RIDGE * np.diag(squares) + 1e-9)
-    sizes = np.sqrt(np.maximum(bends, 0.0) / np.diag(squares))
-    return squares * sizes * sizes[:, np.newaxis]
-
-
-def _lowest(places: Floats, losses: Floats) -> float:
-    """Return the minimum of a parabola through the lowest loss on a grid and its neighbors."""
-    k = int(np.clip(np.argmin(losses), 1, len(losses) - 2))
-    bend, slope, _ = np.polyfit(places[k - 1 : k + 2] - places[k], losses[k - 1 : k + 2], 2)
-    reach = float(places[1] - places[0])
-    move = -0.5 * slope / bend if bend > 0.0 else 0.0
-    return float(places[k] + np.clip(move, -reach, reach))
-
-
 def widening(scaled: Floats, most: float) -> float:
     """Return the factor of noise whose innovations (n, axes), over their sigmas, are correlated.
 
-    It is sqrt(tau), but at most `most`, and not so large that the mean squared innovation over its
-    variance falls below `_SMALL`.
+    It is sqrt(tau), but at most `most`.
     """
     tau = max(correlation_time(column) for column in scaled.T)
-    return math.sqrt(max(1.0, min(tau, most**2, float((scaled**2).mean()) / _SMALL)))
+    return math.sqrt(min(tau, most**2))

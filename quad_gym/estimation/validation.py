@@ -3,14 +3,14 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.fits import Fit, fit_of
 from quad_gym.estimation.likelihood import SETTLING
-from quad_gym.estimation.logs import Log
+from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.replaying import replay
 from quad_gym.estimation.results import Replay, by_sensor
 from quad_gym.estimation.verdict import in_one_line
@@ -56,7 +56,7 @@ def validate(
         if fit := fit_of(m, m.time > split):
             sensors[name] = fit
     diverged = float(np.mean(result.diverged[result.time > split]))
-    held_out = _held_out(log, suite, start, split)
+    held_out = _held_out(left_out(log, suite, start, split))
     return Validation(sensors, *held_out, diverged, result.findings, result)
 
 
@@ -95,14 +95,23 @@ def pooled(validations: Mapping[str, Validation]) -> Validation:
     )
 
 
-def _held_out(
-    log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float
-) -> tuple[Any, Any, Any]:
-    """Return errors, mean NIS and ratios of the first fixes after a second without."""
+class LeftOut(NamedTuple):
+    """First fixes after a second without, predicted by the filter."""
+
+    received: Floats  #: times of arrival, (n,) [s]
+    error: Floats  #: measurement minus prediction, (n, 3) in I [m]
+    sigma: Floats  #: its predicted standard deviations, (n, 3) [m]
+    nis: Floats  #: (n,)
+
+
+def left_out(
+    log: Log, suite: SensorSuite, start: Mapping[str, Any] | None, split: float = -math.inf
+) -> LeftOut | None:
+    """Return the first fixes after each second without, later than a time; None: no fixes."""
     gnss = log.gnss
     if gnss is None or suite.gnss is None or len(gnss) < 3:
-        return None, None, None
-    errors, sigmas, nis = [], [], []
+        return None
+    parts = []
     period = float(np.median(np.diff(gnss.time)))
     begin = max(split, float(gnss.time[0]) + SETTLING)  # the start needs all fixes
     for first in range(0, _PERIOD, _GAP):
@@ -115,15 +124,19 @@ def _held_out(
         result = replay(some, sensors=suite, start=start, reported_noise=False)
         fixes = result.measured.get("gnss_position")
         if fixes is None:
-            return None, None, None
+            return None
         after = np.isin(fixes.received, gnss.received[kept[skipped]]) & np.isfinite(fixes.nis)
-        errors.append(fixes.innovation[after])
-        sigmas.append(fixes.sigma[after])
-        nis.append(fixes.nis[after])
-    error, sigma = np.concatenate(errors), np.concatenate(sigmas)
-    if not len(error):
+        columns = fixes.received, fixes.innovation, fixes.sigma, fixes.nis
+        parts.append([column[after] for column in columns])
+    found = LeftOut(*(np.concatenate(some) for some in zip(*parts, strict=True)))
+    return found if len(found.nis) else None
+
+
+def _held_out(found: LeftOut | None) -> tuple[Any, Any, Any]:
+    """Return errors, mean NIS and ratios of fixes that were left out."""
+    if found is None:
         return None, None, None
-    squares = (error**2).mean(axis=0)
+    squares = (found.error**2).mean(axis=0)
     level, up = math.sqrt(squares[0] + squares[1]), math.sqrt(squares[2])
-    ratios = tuple(((error / sigma) ** 2).mean(axis=0).tolist())
-    return (level, up), float(np.concatenate(nis).mean() / 3.0), ratios
+    ratios = tuple(((found.error / found.sigma) ** 2).mean(axis=0).tolist())
+    return (level, up), float(found.nis.mean() / 3.0), ratios

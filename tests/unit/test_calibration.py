@@ -12,12 +12,13 @@ import quad_gym
 from quad_gym import estimation
 from quad_gym.estimation import calibrate, read_log, replay
 from quad_gym.estimation.calibration import turn_on_biases
+from quad_gym.estimation.differences import spread_between
 from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.fits import correlation_time
 from quad_gym.estimation.likelihood import NU, SETTLING, SPACING, Likelihood, in_flight, tails
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import MAX_SPREAD, NUMBERS
-from quad_gym.estimation.search import NumberSearch, _spread_between, widening
+from quad_gym.estimation.search import NumberSearch, widening
 from quad_gym.estimation.validation import validate
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suites import CONSUMER
@@ -203,16 +204,41 @@ def test_correlation_time_of_an_autoregression_is_the_closed_form():
         assert correlation_time(values) == pytest.approx((1 + a) / (1 - a), rel=0.15)
 
 
-def test_noise_is_widened_for_correlated_innovations_that_are_not_small():
-    """An AR(1) process with coefficient 0.5 and unit variance has tau = 3."""
-    rng, values = np.random.default_rng(4), np.zeros((40_000, 1))
+def autoregression(count, rng):
+    """An AR(1) process (count, 1) with coefficient 0.5, unit variance and tau = 3."""
+    values = np.zeros((count, 1))
     for k in range(1, len(values)):
         values[k] = 0.5 * values[k - 1] + np.sqrt(0.75) * rng.normal()
+    return values
+
+
+def test_noise_is_widened_for_correlated_innovations():
+    rng = np.random.default_rng(4)
+    values = autoregression(40_000, rng)
     assert widening(values, 2.0) == pytest.approx(np.sqrt(3.0), rel=0.1)
     assert widening(values, 1.5) == 1.5
-    assert widening(0.5 * values, 2.0) == pytest.approx(np.sqrt(0.25 / 0.13), rel=0.05)
-    assert widening(0.2 * values, 2.0) == 1.0
+    assert widening(0.2 * values, 2.0) == pytest.approx(widening(values, 2.0))
     assert widening(rng.normal(size=(40_000, 3)), 2.0) == 1.0
+
+
+@pytest.mark.parametrize(("factor", "wider"), [(1.0, False), (0.2, True)])
+def test_wider_noise_stays_if_fixes_left_out_are_more_likely_with_it(
+    table, found, monkeypatch, factor, wider
+):
+    """Noise of velocity is wider by the square root of three if it is a fifth of the true one."""
+    search = NumberSearch([read_log(table)], found.prior, [{}], delays=True, rotation=True)
+    search.x = np.array([n.number.coordinate(n.prior, n.value) for n in found.numbers])
+    noise = [n.number.name for n in found.numbers].index("gnss.velocity_sigma")
+    number, prior = found.numbers[noise].number, found.numbers[noise].prior
+    search.x[noise] = number.coordinate(prior, factor * TRUE.gnss.velocity_sigma)
+    before = search.x[noise]
+    correlated = np.tile(autoregression(2000, np.random.default_rng(3)), 3)
+    monkeypatch.setattr(search, "describe", lambda: {"gnss_velocity": correlated})
+    monkeypatch.setattr(search, "fit", lambda: None)
+    search.adapt()
+    ratio = number.value(prior, search.x[noise]) / number.value(prior, before)
+    assert ratio == pytest.approx(np.sqrt(3.0) if wider else 1.0, rel=0.1)
+    assert (search.low[noise] == search.x[noise]) == wider
 
 
 def test_loss_counts_every_measurement_of_sensors_with_white_innovations():
@@ -300,10 +326,9 @@ def test_sensor_that_stops_early_does_not_stop_a_calibration(table, found):
         if name.startswith("magnet"):
             stopped[name][table["time"] > 4.5] = np.nan
     search = NumberSearch([read_log(stopped)], found.prior, [{}], delays=True, rotation=True)
-    before = search.low.copy()
-    search.adapt()
+    low = search.widened(search.describe())
     noise = [n.name for n in search.numbers].index("magnetometer.noise_sigma")
-    assert search.low[noise] == before[noise]
+    assert low[noise] == search.low[noise]
     assert "magnetometer" not in search.white
 
 
@@ -378,17 +403,31 @@ def test_replay_rotates_the_compass_into_body_axes():
     np.testing.assert_allclose(askew.quaternion, body.quaternion, atol=1e-9)
 
 
-def test_spread_between_flights_is_the_variance_of_their_numbers():
+def testspread_between_flights_is_the_variance_of_their_numbers():
     """Quadratic losses of ten logs with other minima, plus noise in their parts."""
     rng, parts, spread = np.random.default_rng(5), 200, 0.6
     h, losses = np.array([0.1]), []
     for best in spread * rng.normal(size=10):
         centers = best + rng.normal(0.0, 1.0, parts)
         losses.append(np.stack([0.5 * (x - centers) ** 2 for x in (0.0, 0.1, -0.1)], axis=1))
-    found = _spread_between(np.concatenate(losses), h, [parts] * 10, 10)
+    found = spread_between(np.concatenate(losses), h, [parts] * 10, 10)
     assert found[0] == pytest.approx(spread**2, rel=0.6)
     same = [np.stack([0.5 * (x - rng.normal(0.0, 1.0, parts)) ** 2 for x in (0.0, 0.1, -0.1)], 1)]
-    assert _spread_between(np.concatenate(same), h, [parts], 10)[0] == 0.0
+    assert spread_between(np.concatenate(same), h, [parts], 10)[0] == 0.0
+
+
+def test_search_in_all_logs_begins_where_the_search_in_some_has_ended(table, found):
+    """The first of all logs has no barometer, so that the numbers have another order."""
+    without = {name: c for name, c in table.items() if name != "barometer"}
+    logs = [read_log(without), read_log(table)]
+    some, every = (
+        NumberSearch(each, found.prior, [{}] * len(each), delays=True, rotation=True)
+        for each in (logs[1:], logs)
+    )
+    assert [n.name for n in every.numbers] != [n.name for n in some.numbers]
+    some.x = np.array([n.number.coordinate(n.prior, n.value) for n in found.numbers])
+    every.take(some)
+    assert every.suite(every.x) == some.suite(some.x)
 
 
 @pytest.mark.slow
