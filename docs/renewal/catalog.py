@@ -163,6 +163,15 @@ CATALOG = {
             figures=texts.figures_of("look_around", "glance.png"),
         ),
         Result(
+            name="look_around_included",
+            commands=[
+                "evaluate look_around --policy pd pd:features_when_uncertain pretrained:truth "
+                "pretrained --observation estimate --episodes 2000 --output OUT"
+            ],
+            flights=("LookAround",),
+            texts=texts.included("look_around"),
+        ),
+        Result(
             name="look_around_film",
             commands=[
                 "evaluate look_around --policy pretrained:truth pretrained --observation estimate "
@@ -248,6 +257,13 @@ CATALOG = {
             ],
             flights=("RandomTrajectory, *", "Circle, *", "fault *"),
             texts=texts.filters,
+        ),
+        Result(
+            name="replay",
+            commands=["replay tests/data/flights/ardupilot.csv.gz --sensors field --output OUT"],
+            flights=("RandomTrajectory, consumer",),
+            texts=lambda _, __: {},
+            figures={"0/replay.png": "docs/images/replay.png"},
         ),
         Result(
             name="outage",

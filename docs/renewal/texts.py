@@ -9,7 +9,7 @@ from typing import Any
 
 from docs.renewal.pages import console as block
 from docs.renewal.pages import table
-from quad_gym.analysis.intervals import Estimated
+from quad_gym.analysis.intervals import Estimated, rate_interval
 from scripts.studies.report import number, share
 
 Texts = Callable[[Path, Sequence[str]], dict[str, str]]
@@ -276,6 +276,21 @@ def study(name: str, *arms: str) -> Texts:
         }
         for arm, row in summary["rows"].items():
             found[f"{name}.{arm}.crashed"] = cell(row["crashed"], "crashed")
+        return found
+
+    return texts
+
+
+def included(name: str) -> Texts:
+    """Crashes of each controller of an evaluation, with intervals."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        found = {}
+        for case in _read(folder / "0/summary.json")["cases"]:
+            policy = case["policy"].replace(":", "_")
+            rate, n = case["crash_rate"], case["episodes"]
+            interval = rate_interval(round(rate * n), n)
+            found[f"{name}.{policy}"] = share(Estimated(rate, *interval))
         return found
 
     return texts
