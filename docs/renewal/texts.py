@@ -260,7 +260,7 @@ def flown(estimators: Sequence[str]) -> Texts:
 
 
 def study(name: str, *arms: str) -> Texts:
-    """Conclusions, success and crashes of arms, crashes of each; a CSV file has all columns."""
+    """Conclusions, success and crashes of arms; a CSV file has all columns."""
 
     def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
         summary = _read(folder / "0/summary.json")
@@ -270,13 +270,10 @@ def study(name: str, *arms: str) -> Texts:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerows([each.strip() for each in r.split("|")[1:-1]] for r in (first, *rows))
         concluded = "\n".join(line for line in lines if line.startswith("- "))
-        found = {
+        return {
             f"{name}.conclusions": f"\n{concluded}\n",
             f"{name}.short": study_rows(summary, "trained on", arms, ("success", "crashed")),
         }
-        for arm, row in summary["rows"].items():
-            found[f"{name}.{arm}.crashed"] = cell(row["crashed"], "crashed")
-        return found
 
     return texts
 

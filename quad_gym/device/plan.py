@@ -12,7 +12,7 @@ Words = NDArray[np.uint64]
 
 
 class FieldPlace(NamedTuple):
-    """FieldPlace of a field in the record of a flight."""
+    """Place of a field in the record of a flight."""
 
     first: int  #: index of its first word
     shape: tuple[int, ...]

@@ -87,11 +87,10 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin episodes.
+        """Begin episodes, as `QuadVectorEnv.reset` does.
 
         Args:
-            seed: A number s: flight i has the seed s + i; a list: one seed per flight; None:
-                continue the present streams.
+            seed: As in `QuadVectorEnv.reset`.
             options: "reset_mask" (n,) bool, a tensor: the flights to reset.
 
         Returns:
@@ -118,9 +117,9 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
     def _keys(self, seed: int | list[int | None] | None) -> Words | None:
         """Return keys (n, 2) of the flights' streams; None: they continue."""
         if seed is None:
-            rng = np.random.default_rng()
-            fresh = rng.integers(0, 2**64, (self.num_envs, 2), np.uint64, endpoint=False)
-            return None if self._seeded else fresh
+            if self._seeded:
+                return None
+            return np.random.default_rng().integers(0, 2**64, (self.num_envs, 2), np.uint64)
         if isinstance(seed, (list, tuple, np.ndarray)):
             return stream_keys(seeds_of(list(seed), self.num_envs))
         first = check.seed("seed", seed) or 0

@@ -1,4 +1,4 @@
-"""Functions of a filter's library for other processors (`baselines/exporting/library.py`).
+"""Functions of a filter's library for other processors (`baselines/exporting/filter_library.py`).
 
 They do what `single.start_filter` and `tape.run_tape` do, one operation a call, on records.
 """

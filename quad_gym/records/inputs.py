@@ -37,10 +37,7 @@ class Kept(IntEnum):
 
 INPUT = np.dtype(
     [
-        (
-            "rank",
-            "i8",
-        ),  # 0: an IMU sample; or a measurement's order among equal time stamps, from 1
+        ("rank", "i8"),  # 0: a sample; from 1: a measurement's order among equal time stamps
         ("time", "f8"),  # of the end of the sample, or of the measurement [s]
         ("dt", "f8"),  # duration of the sample [s]; NaN: from the filter's time to `time`
         ("gyro", "f8", 3),  # NaN: no sample, only `keeps`

@@ -8,6 +8,7 @@ FOLDER/results.json after every measurement and skips those that are there: wher
 or ran out of time, run it again.
 """
 
+import argparse
 import functools
 import importlib
 import json
@@ -40,18 +41,12 @@ Make = Callable[[bytes, int], Any]
 
 def prepare(folder: Path, cases: tuple[str, ...] = CASES) -> None:
     """Write a file for each case: its plan, its PTX, and the numbers of its flights here."""
-    import gymnasium
-
     from quad_gym.device.emission import plan_of, ptx_of
 
     golden: Any = importlib.import_module("tests.golden.flights")
     folder.mkdir(parents=True, exist_ok=True)
     for name in cases:
-        keywords = dict(golden.cases()[name])
-        task = keywords.pop("id", "Circle")
-        if task == "Circle":
-            keywords.setdefault("start", "ground")
-        env: Any = gymnasium.make_vec(f"QuadGym/{task}-v0", num_envs=FLIGHTS, **keywords)
+        env = golden.made(golden.cases()[name], FLIGHTS)
         flights = env.unwrapped.flights
         plan = plan_of(flights.batch)
         env.reset(seed=SEED)
@@ -177,8 +172,14 @@ def _without_gymnasium() -> None:
 
 def main() -> None:
     """Prepare or run, as the arguments say."""
-    verb, folder = sys.argv[1], Path(sys.argv[2])
-    if verb == "prepare":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("part", choices=("prepare", "run"))
+    parser.add_argument("folder", type=Path, help="folder of the cases and of results.json")
+    args = parser.parse_args()
+    folder: Path = args.folder
+    if args.part == "prepare":
         prepare(folder)
         return
     sys.path[0] = str(ROOT)

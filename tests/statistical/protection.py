@@ -17,7 +17,7 @@ from quad_gym.estimation.dead_reckoning import changes
 from quad_gym.params.suites import ALL_SUITES, sensor_suite
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.many_logs import logs_of
-from tests.statistical.verdicts import rows, start_of
+from tests.statistical.verdicts import position_errors, rows, start_of
 from tests.unit.test_resets import drifting_receiver
 
 SETTLED, EVERY = 5.0, 0.25  #: first evaluation, and time between two [s]
@@ -68,9 +68,8 @@ def late_rms(suite, flights):
         order = np.argsort(table["received"], kind="stable")
         table = {column: values[order] for column, values in table.items()}
         found = replay(table, sensors=suite, start=start_of(suite, truth))
-        true = [np.interp(found.time, truth["time"], axis) for axis in truth["position"].T]
-        error = np.transpose(true) - found.position
-        squares.append(np.square(error[found.time > SETTLED]).sum(axis=1).mean())
+        error = position_errors(found, truth)
+        squares.append(np.square(error[found.time > SETTLED]).mean())
     return float(np.sqrt(np.mean(squares)))
 
 

@@ -264,6 +264,12 @@ def start_of(suite, truth):
     return {"position": truth["position"][0], "heading": float(heading)}
 
 
+def position_errors(result, truth):
+    """Errors of the replayed positions (n,) [m]."""
+    true = [np.interp(result.time, truth["time"], axis) for axis in truth["position"].T]
+    return np.linalg.norm(np.transpose(true) - result.position, axis=1)
+
+
 def judged(name, change, log, truth, seed):
     """Replay a changed log; return the result and its largest position error after 10 s [m]."""
     rng, suite = np.random.default_rng(seed), sensor_suite(name)
@@ -274,8 +280,7 @@ def judged(name, change, log, truth, seed):
     elif changed is not None:
         suite = changed
     result = replay(table, sensors=suite, start=start_of(suite, truth))
-    true = [np.interp(result.time, truth["time"], axis) for axis in truth["position"].T]
-    error = np.linalg.norm(np.transpose(true) - result.position, axis=1)
+    error = position_errors(result, truth)
     return result, float(error[result.time > 10.0].max())
 
 
