@@ -17,7 +17,7 @@ from quad_gym.kernels.simd.addresses import (
     store_tile,
 )
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
-from quad_gym.kernels.simd.lanes import all_of, any_of, select
+from quad_gym.kernels.simd.lanes import all_of, any_of, logical_not, no_lane, select
 from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.records import (
     EXCHANGE_BLOCK,
@@ -287,7 +287,7 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
         _write_results(call, flight, work, index)
     if observing:
         _observe(call, flight, true, believed, settings, work, stages)
-        _write_rows(call, call[Call.OBSERVATIONS], index, work, flight.tick >= 0.0)
+        _write_rows(call, call[Call.OBSERVATIONS], index, work, logical_not(no_lane(flight.tick)))
     if settings.shown:
         _show(call, index, flight, true, believed, settings, work, stages)
 

@@ -133,7 +133,7 @@ def supported(flight, p, settings, refused):
     An image of several features supports itself, so nothing overrules it.
     """
     if refused == FEATURE_BLOCKS:
-        return flight.tick < 0.0
+        return no_lane(flight.tick)
     found = logical_not(no_lane(flight.tick))
     for bit in range(QUANTITIES):
         if (GROUP_OBSERVES[refused] >> bit) & 1:
@@ -174,7 +174,7 @@ def glitches(flight, p, settings, group, nis, limit):
         other = POSITION_BLOCK + VELOCITY_BLOCK - group
         found = found | ((flight.stepped[other] > 0.0) & (flight.rejected_in_row[other] > 0.0))
     if group in _WITH_OWN_ERROR:
-        found = flight.tick >= 0.0  # their error state would take up the error
+        found = logical_not(no_lane(flight.tick))  # their error state would take up the error
     if group == POSITION_BLOCK:
         found = found | _dead_reckons(flight, p, settings)
     return found
@@ -292,7 +292,7 @@ def _choose(flight, p, work, settings, mask, drifted):
     Returns:
         Lanes in which any state is reset.
     """
-    none = flight.tick < 0.0
+    none = no_lane(flight.tick)
     sensors, late = zero_like(flight.tick), none
     for sensor in range(SENSORS):
         first, refused = FIRST_GROUP[sensor], none

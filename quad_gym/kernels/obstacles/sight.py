@@ -4,7 +4,7 @@ from quad_gym.kernels.compiling import stage
 from quad_gym.kernels.maths.linalg import load3, load4
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.obstacles.shapes import crosses
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import no_lane, select
 from quad_gym.records import FEATURE_BLOCKS
 
 
@@ -13,7 +13,7 @@ def hide_features_stage(flight, world, model, settings, work, stages, flag):
     """Remove features behind an obstacle from the image just taken."""
     camera_I = load3(flight.r) + quaternion_to_dcm(load4(flight.q)).T @ load3(world.camera)
     for i in range(settings.feature_count):
-        X_I, hidden = load3(world.features[i]), flight.tick < 0.0
+        X_I, hidden = load3(world.features[i]), no_lane(flight.tick)
         for k in range(settings.obstacle_count):
             center_I = load3(flight.obstacle_center[k])
             hidden = hidden | crosses(camera_I, X_I, center_I, settings, k)

@@ -13,7 +13,7 @@ from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import diagonal, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.sensors.aid import aid_stage
-from quad_gym.kernels.simd.lanes import select, zero_like
+from quad_gym.kernels.simd.lanes import logical_not, no_lane, select, zero_like
 from quad_gym.records import DRAW_AID, Aid
 
 _S = Aid.BAROMETER
@@ -23,7 +23,7 @@ _S = Aid.BAROMETER
 def _measure(flight, p):
     n, _ = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
     altitude = flight.r[2] + flight.aid_scalar[_S] + p.aid_sigma[_S] * n
-    return (altitude, zero_like(altitude), zero_like(altitude)), flight.tick >= 0.0
+    return (altitude, zero_like(altitude), zero_like(altitude)), logical_not(no_lane(flight.tick))
 
 
 @kernel

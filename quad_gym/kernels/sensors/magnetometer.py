@@ -47,7 +47,7 @@ from quad_gym.kernels.maths.matrices import load_block, load_column3, store_bloc
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
-from quad_gym.kernels.simd.lanes import select, zero_like
+from quad_gym.kernels.simd.lanes import logical_not, no_lane, select, zero_like
 from quad_gym.records import DRAW_AID, Aid, FilterForm
 
 _S = Aid.MAGNETOMETER
@@ -68,7 +68,7 @@ def _measure(flight, p):
     field_I = (t * m[0] + s * m[1], t * m[1] - s * m[0], m[2])
     field_B = quaternion_to_dcm(load4(flight.q)) @ field_I
     field_B = field_B + load33(flight.aid_matrix[_S]) @ field_B + load3(flight.aid_vector[_S])
-    return p.aid_sigma[_S] * vector(a, b, c) + field_B, flight.tick >= 0.0
+    return p.aid_sigma[_S] * vector(a, b, c) + field_B, logical_not(no_lane(flight.tick))
 
 
 @kernel

@@ -10,7 +10,7 @@ from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import dot, keep, load3, load4, load33
 from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import select, zero_like
+from quad_gym.kernels.simd.lanes import logical_not, no_lane, select, zero_like
 from quad_gym.kernels.vehicle.dynamics import (
     accelerations,
     advance,
@@ -146,7 +146,7 @@ def move_in_air_stage(flight, world, model, settings, work, stages, flag):
     integrate_in_air(flight, world, settings)
     if settings.gusts:
         carry_gust(flight, world)
-    set_air(flight, world, settings, flight.tick >= 0.0)
+    set_air(flight, world, settings, logical_not(no_lane(flight.tick)))
 
 
 @stage
