@@ -148,12 +148,12 @@ def make_torch_vec_env(
     """
     given: dict[str, Any] = keywords_of(env_id) | dict(keywords)
     try:
-        from quad_gym.envs.torch_env import QuadTorchVecEnv
+        from quad_gym.envs.torch_env import QuadTorchVecEnv, checked_device
     except ImportError as error:
         raise ImportError(
             'make_torch_vec_env needs torch: pip install "quad-gym[train]"'
         ) from error
-    if str(device).partition(":")[0] == "cuda":
+    if checked_device(device).type == "cuda":
         from quad_gym.envs.device_env import QuadDeviceVecEnv
 
         return QuadDeviceVecEnv(num_envs, device=device, autoreset_mode=autoreset_mode, **given)

@@ -16,7 +16,7 @@ from quad_gym.device.launching import CudaLauncher
 from quad_gym.device.plan import DevicePlan
 from quad_gym.envs.flights import named_options
 from quad_gym.envs.keywords import VectorKeywords, shows
-from quad_gym.envs.torch_env import QuadTorchVecEnv
+from quad_gym.envs.torch_env import QuadTorchVecEnv, checked_device
 from quad_gym.envs.vector import seeds_of
 from quad_gym.packing.configuration import MAX_FLIGHTS
 from quad_gym.params import checks as check
@@ -63,7 +63,7 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
             if given.pop(name, None) is not None:
                 raise ValueError(f"{name} is of flights on the processor, and must not be given")
         check.whole("num_envs", num_envs, most=MAX_FLIGHTS)
-        on_gpu = torch.device(device)
+        on_gpu = checked_device(device)
         if launcher is None and not torch.cuda.is_available():
             raise ValueError(
                 f'device "{on_gpu}" needs an NVIDIA GPU and a torch with CUDA, and '
@@ -91,7 +91,7 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
 
         Args:
             seed: As in `QuadVectorEnv.reset`.
-            options: "reset_mask" (n,) bool, a tensor: the flights to reset.
+            options: "reset_mask" (n,) bool, a tensor or an array: the flights to reset.
 
         Returns:
             Observations of all flights, and `info`, which is empty.
@@ -100,19 +100,27 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
             ValueError: If an option is unknown, or the seeds do not fit the flights.
         """
         options = named_options(options)
-        mask = options.pop("reset_mask", None)
+        mask = self._mask_on_gpu(options.pop("reset_mask", None))
         if options:
             raise ValueError(
                 f"options on a GPU must be reset_mask alone, got {next(iter(options))}"
             )
-        if mask is not None and (mask.dtype != torch.bool or mask.shape != (self.num_envs,)):
-            raise ValueError(
-                f"options['reset_mask'] must be a tensor ({self.num_envs},) of booleans, got "
-                f"{tuple(mask.shape)} of {mask.dtype}"
-            )
         seen = self.batch.reset(self._keys(seed), mask if self._seeded else None)
         self._seeded = True
         return self._split(seen), {}
+
+    def _mask_on_gpu(self, mask: Any) -> torch.Tensor | None:
+        """Return the flights to reset; None: all. The values of a tensor are not waited for."""
+        if mask is None:
+            return None
+        if not isinstance(mask, torch.Tensor):
+            return torch.from_numpy(self._checked_mask(mask)).to(self.device)
+        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
+            raise ValueError(
+                f"options['reset_mask'] must have shape ({self.num_envs},) and booleans, got "
+                f"{tuple(mask.shape)} and {mask.dtype}"
+            )
+        return mask
 
     def _keys(self, seed: int | list[int | None] | None) -> Words | None:
         """Return keys (n, 2) of the flights' streams; None: they continue."""

@@ -39,7 +39,9 @@ class QuadTorchVecEnv(QuadVectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **keywords: Unpack[VectorKeywords],
     ) -> None:
-        self.device = _checked_device(device)
+        self.device = checked_device(device)
+        if self.device.type != "cpu":
+            raise ValueError(f'device must be "cpu", got {device!r}')
         given: dict[str, Any] = dict(keywords)
         super().__init__(num_envs, base=base, autoreset_mode=autoreset_mode, **given)
 
@@ -93,13 +95,13 @@ class QuadTorchVecEnv(QuadVectorEnv):
         )
 
 
-def _checked_device(device: str | torch.device) -> torch.device:
-    """Return the device of the tensors; refuse all but the processor."""
+def checked_device(device: str | torch.device) -> torch.device:
+    """Return the device of the tensors: the processor, or an NVIDIA GPU."""
     try:
         found = torch.device(device)
     except (RuntimeError, TypeError) as error:
         raise ValueError(f'device must be "cpu" or "cuda", got {device!r}') from error
-    if found.type != "cpu":
+    if found.type not in ("cpu", "cuda"):
         raise ValueError(f'device must be "cpu" or "cuda", got {device!r}')
     return found
 

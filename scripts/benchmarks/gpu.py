@@ -1,4 +1,4 @@
-"""Flights on a GPU: golden flights number by number, steps/s, memory. Never run on a GPU yet.
+"""Flights on a GPU: golden flights number by number, steps/s, memory, a training. Never run yet.
 
     python -m scripts.benchmarks.gpu prepare FOLDER     # on any machine, in a clone with all extras
     python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine
@@ -35,6 +35,10 @@ SIZES = tuple((count, warps) for warps in (4, 2, 8) for count in (4_096, 65_536,
 """Numbers of flights, and of warps for each multiprocessor."""
 DURATION = 2.0  #: of a measurement of steps/s [s]
 TICKS, FLIGHTS, STEPS, SEED = 30, 8, 300, 2026
+TRAINING = {"num_envs": 8192, "num_minibatches": 32, "total_timesteps": 20_000_000}
+"""Options of `docs/examples/torch_ppo.py`; they are multiples of the defaults."""
+TRAINED = {"autoreset_mode": "SameStep", "start": "mixed"}
+"""Keywords of the flights of the training."""
 Make = Callable[[bytes, int], Any]
 """Make the launcher of a module of PTX, with a number of warps for each multiprocessor."""
 
@@ -62,6 +66,11 @@ def prepare(folder: Path, cases: tuple[str, ...] = CASES) -> None:
         file = folder / f"{CASES.index(name)}.case"
         file.write_bytes(zlib.compress(pickle.dumps((name, content))))
         print(f"{name}: PTX of {len(content['ptx']) / 1e3:.0f} kB", flush=True)
+    builders: Any = importlib.import_module("quad_gym")
+    env = builders.make_torch_vec_env("QuadGym/Circle-v0", 1, **TRAINED)
+    plan = plan_of(env.flights.batch)
+    content = {"plan": plan, "ptx": ptx_of(plan)}
+    (folder / "training").write_bytes(zlib.compress(pickle.dumps(content)))
 
 
 def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
@@ -89,6 +98,8 @@ def run(
         for count, warps in sizes if name in TIMED else ():
             what = f"{name}, {count} flights, {warps} warps"
             todo[what] = functools.partial(_speed, content, make, device, count, warps)
+    training = pickle.loads(zlib.decompress((folder / "training").read_bytes()))
+    todo["training: Circle, standard"] = functools.partial(_training, training, make, device)
     for what, measure in todo.items():
         done = what in found and "failed" not in found[what]
         if not done and time.monotonic() - begin < SECONDS:
@@ -152,6 +163,44 @@ def _speed(content: dict[str, Any], make: Make, device: str, count: int, warps: 
     once = flown(4) / 4
     steps = max(8, min(1000, int(DURATION / once)))
     return {"steps/s": count * steps / flown(steps), "bytes": (after - before) / count}
+
+
+class _Flights:
+    """What the PPO of the examples needs of an environment, without Gymnasium."""
+
+    def __init__(self, batch: Any) -> None:
+        self._batch = batch
+
+    def reset(self, seed: int) -> tuple[Any, dict[str, Any]]:
+        from quad_gym.batch.seeding import keys_of
+
+        return self._batch.reset(keys_of(np.arange(self._batch.count, dtype=np.uint64) + seed)), {}
+
+    def step(self, actions: Any) -> Any:
+        seen, result = self._batch.step(actions), self._batch.result
+        over = (result("terminated") > 0.0, result("truncated") > 0.0)
+        final = {"final_obs": self._batch.final_observations}
+        return seen, result("reward").float(), *over, final
+
+
+def _training(content: dict[str, Any], make: Make, device: str) -> Any:
+    """Train on Circle; return seconds, steps/s, and the mean position error afterwards [m]."""
+    import torch
+
+    from quad_gym.device.flights import DeviceBatch
+
+    sys.path.insert(0, str(ROOT / "docs" / "examples"))
+    script = importlib.import_module("torch_ppo")
+    args = script.Args(device=device, **TRAINING)
+    batch = DeviceBatch(content["plan"], args.num_envs, make(content["ptx"], 4), device)
+    begin, env = time.perf_counter(), _Flights(batch)
+    agent = script.train(env, content["plan"].low.size, 4, args)
+    seconds, seen = time.perf_counter() - begin, env.reset(0)[0]
+    with torch.no_grad():
+        for _ in range(STEPS):
+            seen = env.step(agent.actor(seen))[0]
+    error = float(batch.result("position_error").mean())
+    return {"seconds": seconds, "steps/s": args.total_timesteps / seconds, "error": error}
 
 
 def _on_cuda(ptx: bytes, warps: int) -> Any:

@@ -15,6 +15,10 @@ from scripts.benchmarks import gpu
 @pytest.mark.skipif(machine() not in PROCESSORS, reason="no code for this processor")
 def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gpu, "DURATION", 0.0)
+    sizes = {"num_envs": 40, "num_minibatches": 2, "total_timesteps": 40 * 32}
+    monkeypatch.setattr(gpu, "TRAINING", sizes)
+    monkeypatch.setattr(gpu, "TRAINED", {**gpu.TRAINED, "observation": "truth"})
+    monkeypatch.setattr(gpu, "STEPS", 60)
     gpu.prepare(tmp_path, gpu.CASES[:1])
     launchers = []
 
@@ -28,10 +32,11 @@ def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monke
         found["observation truth, 40 flights, 2 warps"],
     )
     assert golden["differing"] == {}
-    assert golden["numbers"] > 4_000
+    assert golden["numbers"] > 800
     assert speed["steps/s"] > 0
-    assert launchers == [4, 2]
+    assert 0.0 < found["training: Circle, standard"]["error"] < 10.0
+    assert launchers == [4, 2, 4]
     capsys.readouterr()
     assert gpu.run(tmp_path, make, "cpu", ((40, 2),)) == found
-    assert (launchers, capsys.readouterr().out) == ([4, 2], "")
+    assert (launchers, capsys.readouterr().out) == ([4, 2, 4], "")
     assert json.loads((tmp_path / "results.json").read_text()) == found

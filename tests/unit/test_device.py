@@ -91,6 +91,26 @@ def test_reset_mask_of_device_flights_begins_these_episodes_alone():
 
 
 @pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (torch.ones(3), r"shape \(3,\) and booleans, got \(3,\) and torch.float32"),
+        (torch.ones(2, dtype=torch.bool), r"shape \(3,\) and booleans, got \(2,\)"),
+        (np.ones(2, bool), r"shape \(3,\), got \(2,\)"),
+        ([True, False, True], "an array of booleans"),
+    ],
+)
+def test_wrong_reset_mask_of_device_flights_is_refused(mask, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        device_env("circle", 3, **TRUTH).reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize("device", ["cuda:x", "CUDA", "meta", 5.0])
+def test_device_that_is_no_processor_or_gpu_is_refused(device):
+    with pytest.raises(ValueError, match='device must be "cpu" or "cuda", got'):
+        quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 2, device=device)
+
+
+@pytest.mark.parametrize(
     ("keywords", "message"),
     [
         ({"base": "look_around"}, "a task in Python runs in Python"),
