@@ -24,11 +24,11 @@ from torch.distributions import Normal
 
 @dataclass
 class Args:
-    """Options; the defaults are those of `quad-gym train circle`."""
+    """Options, with the defaults of `quad-gym train circle`."""
 
     env_id: str = "QuadGym/Circle-v0"
     observation: str = "estimate"
-    """"estimate" or "truth": what the policy observes in training"""
+    """"estimate" or "truth", the observation in training"""
     device: str = "cpu"
     """device of flights and networks, "cpu" or "cuda\""""
     seed: int = 1
@@ -75,7 +75,7 @@ class Agent(nn.Module):
     def features(
         self, observations: torch.Tensor, begins: torch.Tensor, state: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what policy and value see, (T, n, k), and the memory after it, (n, units).
+        """Return inputs of policy and value, (T, n, k), and the memory after them, (n, units).
 
         Args:
             observations: (T, n, inputs).
@@ -179,7 +179,7 @@ def updater(agent, optimizer, args) -> Callable[[list[torch.Tensor]], None]:
 
 @torch.no_grad()
 def rollout(env, agent, seen, begins, state, args):
-    """Fly `num_steps` steps; return what updates need, and where the next rollout begins."""
+    """Fly `num_steps` steps; return their tensors, the last values, and the next start."""
     parts: list[list[torch.Tensor]] = [[] for _ in range(7)]
     for _ in range(args.num_steps):
         features, after = agent.features(seen[None], begins[None], state)

@@ -166,7 +166,7 @@ def _speed(content: dict[str, Any], make: Make, device: str, count: int, warps: 
 
 
 class _Flights:
-    """What the PPO of the examples needs of an environment, without Gymnasium."""
+    """Flights as an environment for the PPO of the examples, without Gymnasium."""
 
     def __init__(self, batch: Any) -> None:
         self._batch = batch
@@ -213,7 +213,7 @@ def _on_cuda(ptx: bytes, warps: int) -> Any:
 
 
 def _without_gymnasium() -> None:
-    """Import `quad_gym` without what its environments need."""
+    """Import `quad_gym` without the packages of its environments."""
     package = types.ModuleType("quad_gym")
     package.__path__ = [str(ROOT / "quad_gym")]
     sys.modules["quad_gym"] = package
