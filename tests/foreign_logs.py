@@ -240,12 +240,13 @@ def write_px4(path, f, fields=(None,), parameters=(), ellipsoid=True, combined=F
 
 
 class Bag:
-    """Messages of a bag of ROS 1, with stamps in the UNIX epoch plus `clock` of a topic."""
+    """Messages of a bag of ROS 1 or 2, with stamps in the UNIX epoch plus `clock` of a topic."""
 
-    def __init__(self):
+    def __init__(self, version=1):
         from rosbags.typesys import Stores, get_typestore
 
-        self.store, self.rows = get_typestore(Stores.ROS1_NOETIC), []
+        self.version, self.rows = version, []
+        self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
         self._count = 0
 
     def header(self, stamp):
@@ -253,7 +254,8 @@ class Bag:
         self._count += 1
         ns = round(1e9 * stamp) if stamp else 0
         time = self.store.types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
-        return self.store.types["std_msgs/msg/Header"](seq=self._count, stamp=time, frame_id="b")
+        extra = {"seq": self._count} if self.version == 1 else {}
+        return self.store.types["std_msgs/msg/Header"](stamp=time, frame_id="b", **extra)
 
     def vector(self, v):
         """Vector3 of three numbers."""
@@ -307,15 +309,16 @@ class Bag:
             self.add(topic, "sensor_msgs/msg/MagneticField", t, EPOCH + t, *contents)
 
     def write(self, path):
-        """Write the file."""
-        from rosbags import rosbag1
+        """Write the file, or the folder of version 2."""
+        from rosbags import rosbag1, rosbag2
 
         path.unlink(missing_ok=True)
-        topics = {}
-        with rosbag1.Writer(path) as writer:
+        topics, first = {}, self.version == 1
+        serialize = self.store.serialize_ros1 if first else self.store.serialize_cdr
+        with rosbag1.Writer(path) if first else rosbag2.Writer(path, version=9) as writer:
             for recorded, topic, kind, message in sorted(self.rows, key=lambda row: row[0]):
                 if topic not in topics:
                     topics[topic] = writer.add_connection(topic, kind, typestore=self.store)
-                raw = self.store.serialize_ros1(message, kind)
-                writer.write(topics[topic], round(1e9 * (EPOCH + recorded)), raw)
+                time = round(1e9 * (EPOCH + recorded))
+                writer.write(topics[topic], time, serialize(message, kind))
         return path
