@@ -85,7 +85,7 @@ def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
         assert found["sd"] is None
 
 
-def test_crashes_are_counted(tmp_path, capsys):
+def test_crashes_are_counted(tmp_path, capsys, no_figures):
     summary = run(tmp_path, "--no-camera --episodes 3 --duration 4 --radius 30 --period 3")
     for case in summary["cases"].values():
         assert (case["finished"], case["crashed"]) == (0, 3)

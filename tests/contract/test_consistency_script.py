@@ -45,7 +45,7 @@ def test_wrong_noise_is_called_overconfident_or_too_cautious(tmp_path):
 
 
 def test_small_innovations_of_a_constant_error_are_expected(tmp_path):
-    line = ["--episodes", "100", "--duration", "2", "--output", str(tmp_path)]
+    line = ["--episodes", "64", "--duration", "1", "--output", str(tmp_path)]
     assert console_commands.run("consistency", "--sensors", "rtk", *line).returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
     verdicts = found["verdicts"]

@@ -98,14 +98,3 @@ def test_a_policy_becomes_an_onnx_model(tmp_path, capsys):
 def test_names_of_files_become_names_of_functions(tmp_path):
     main(["export", "policy", "pretrained", "QuadGym/Hover-v0", "--output", "2nd-try.c"])
     assert "int policy_2nd_try(" in (tmp_path / "2nd-try.c").read_text()
-
-
-def test_a_filter_becomes_a_folder_with_a_library(tmp_path, capsys):
-    assert main(["export", "filter", "--sensors", "rtk", "--target", "cortex-m7"]) == 0
-    folder = tmp_path / "results" / "export" / "filter_rtk_cortex-m7"
-    names = ["CMakeLists.txt", "README.md", "libquad_gym_filter.a", "main.c", "quad_gym_filter.h"]
-    assert sorted(file.name for file in folder.iterdir()) == names
-    assert "int qg_update_pixels(" in (folder / "quad_gym_filter.h").read_text()
-    assert "README.md" in capsys.readouterr().out
-    line = "export filter --sensors rtk --target cortex-m7"
-    assert "libquad_gym_filter.a exists: use --overwrite" in refused(line, capsys)

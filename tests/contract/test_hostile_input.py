@@ -26,6 +26,10 @@ NUMBERS += [1e308, -1e308, 1e15, 1e12, 1e9, 1e6, -1e6, 1e4, 1e-308, 1e-14, 1e-9,
 OTHERS = ["three", b"3", True, (), [], {}, [[1.0]], [np.nan] * 3, np.zeros((2, 2)), object(), 3j]
 
 
+HALVES = [0, pytest.param(1, marks=pytest.mark.slow)]
+"""The first of each two values, and the others for the slow run."""
+
+
 def vectors(size):
     return [(value,) * size for value in NUMBERS if isinstance(value, float)]
 
@@ -90,16 +94,17 @@ def fly(interface, task, **keywords):
     return seen
 
 
+@pytest.mark.parametrize("half", HALVES)
 @pytest.mark.parametrize("name", [*environment_keywords(), "threads"])
 @pytest.mark.parametrize("interface", INTERFACES)
-def test_any_value_of_environment_keyword_is_refused_by_name_or_flown(interface, name):
+def test_any_value_of_environment_keyword_is_refused_by_name_or_flown(interface, name, half):
     if name == "render_mode" or (interface, name) == ("make", "max_episode_steps"):
         pytest.skip("Gymnasium itself handles this keyword")
     if name.startswith("render"):
         pytest.skip("it has no effect without render_mode")
     task = ONE_TASK.get(name, "Circle")
     some = 1 if interface == "make" else 4  # interfaces share their checks
-    for value in [*NUMBERS, *OTHERS][::some]:
+    for value in [*NUMBERS, *OTHERS][half::2][::some]:
         assert_refused_or_flown(lambda v: fly(interface, task, **{name: v}), name, value)
 
 
@@ -199,8 +204,9 @@ FIELDS_OF_PARAMETERS = [
 ]
 
 
+@pytest.mark.parametrize("half", HALVES)
 @pytest.mark.parametrize(("nominal", "use", "name"), FIELDS_OF_PARAMETERS)
-def test_any_value_of_parameter_field_is_refused_by_name_or_flown(nominal, use, name):
+def test_any_value_of_parameter_field_is_refused_by_name_or_flown(nominal, use, name, half):
     controls = {
         quad_gym.VehicleParams: (Control.PD, Control.VELOCITY),
         TaskParams: (Control.PD, Control.VELOCITY),
@@ -210,7 +216,7 @@ def test_any_value_of_parameter_field_is_refused_by_name_or_flown(nominal, use, 
     values = [*NUMBERS, *OTHERS]
     if isinstance(present, tuple):
         values += vectors(len(present))
-    for value in values:
+    for value in values[half::2]:
         assert_refused_or_flown(
             lambda v: fly_batch(controls, **use(nominal.replace(**{name: v}))), name, value
         )
@@ -248,12 +254,13 @@ FAULTS = [
 """The fields of every kind; those that all have, each with some kinds."""
 
 
+@pytest.mark.parametrize("half", HALVES)
 @pytest.mark.parametrize(("kind", "name"), FAULTS, ids=lambda part: getattr(part, "__name__", part))
-def test_any_value_of_fault_field_is_refused_by_name_or_flown(kind, name):
+def test_any_value_of_fault_field_is_refused_by_name_or_flown(kind, name, half):
     needed, sensors = {}, RTK
     if kind is fault_kinds.SensorLoss:
         needed, sensors = {"sensor": "barometer"}, RTK.replace(barometer=BarometerParams())
-    for value in [*NUMBERS, *OTHERS, *vectors(2), *vectors(3), (0.2, 0.1)]:
+    for value in [*NUMBERS, *OTHERS, *vectors(2), *vectors(3), (0.2, 0.1)][half::2]:
         assert_refused_or_flown(
             lambda v: fly_batch((Control.PD,), sensors=sensors, faults=kind(**{**needed, name: v})),
             name,

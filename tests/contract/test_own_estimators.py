@@ -422,15 +422,11 @@ def named(monkeypatch):
 
 def test_commands_fly_on_an_estimator(named, tmp_path):
     own = ("--estimator", named)
-    evaluated = console_commands.run(
-        *("evaluate", "hover", "--policy", "pd", "--episodes", 3, "--output", tmp_path / "e"), *own
-    )
+    line = ("evaluate", "hover", "--policy", "pd", "--episodes", 3, "--env", "duration=3.0")
+    evaluated = console_commands.run(*line, "--output", tmp_path / "e", *own)
     assert evaluated.returncode == 0, evaluated.stderr
     cases = json.loads((tmp_path / "e" / "summary.json").read_text())["cases"]
-    built_in = console_commands.run(
-        *("evaluate", "hover", "--policy", "pd", "--episodes", 3, "--output", tmp_path / "b"),
-        *("--observation", "estimate"),
-    )
+    built_in = console_commands.run(*line, "--output", tmp_path / "b", "--observation", "estimate")
     assert built_in.returncode == 0
     (other,) = json.loads((tmp_path / "b" / "summary.json").read_text())["cases"]
     assert cases[1]["estimation_error"] > 1.5 * other["estimation_error"]
@@ -449,7 +445,7 @@ def test_commands_fly_on_an_estimator(named, tmp_path):
 
 def test_consistency_command_uses_own_estimator(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
-    options = ("--sensors", "lab", "--episodes", 4, "--duration", 0.2, "--output", tmp_path)
+    options = ("--sensors", "lab", "--episodes", 2, "--duration", 0.1, "--output", tmp_path)
     done = console_commands.run("consistency", *options, "--estimator", "ukf:PlainUKF")
     assert done.returncode == 0, done.stderr
     own = json.loads((tmp_path / "consistency.json").read_text())

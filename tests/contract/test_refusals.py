@@ -26,6 +26,7 @@ REFUSED = [
     ("consistency --output text.toml", "cannot write to --output text.toml: File exists"),
     # ---- training
     ("train --stepz 4", "Unrecognized options: --stepz"),
+    ("circle --nonsense 3", "quad-gym circle --help"),
     ("train --algorithm pp", "invalid choice 'pp' for argument '--algorithm'"),
     ("train --output /dev/null/run", "cannot write to --output"),
     ("train --steps 0", "--steps must be at least 1, got 0"),
@@ -152,10 +153,17 @@ def test_a_wrong_suite_is_refused_before_a_missing_package(monkeypatch):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_all_commands_and_their_descriptions(command):
+def test_help_has_all_commands_and_their_descriptions_in_the_width_of_the_terminal(
+    command, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "100")
     done = console_commands.run(*command.split(), "--help")
     assert done.returncode == 0
     assert f"usage: quad-gym {command}" in done.stdout
+    for empty in ("{None}", "(default: )", "(default: None)", "if not given"):
+        assert empty not in " ".join(done.stdout.split())
+    examples = ("    ", "  quad-gym")
+    assert all(len(x) <= 100 for x in done.stdout.splitlines() if not x.startswith(examples))
     assert COMMANDS[command] not in plain(done.stdout)  # it has the full text instead
     above = console_commands.run(*command.split()[:-1], "--help")
     assert COMMANDS[command] in plain(above.stdout)

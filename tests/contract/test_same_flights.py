@@ -15,8 +15,8 @@ from tests.contract.configurations import CONFIGURATIONS
 
 STANDARD = quad_gym.sensor_suite("standard")
 QUIETER = STANDARD.replace(camera=STANDARD.camera.replace(pixel_sigma=19.0))
-MANY, HALF = range(40), 30
-SOME = np.random.default_rng(1).permutation(40)[:11].tolist()
+MANY, HALF = range(24), 30
+SOME = np.random.default_rng(1).permutation(24)[:7].tolist()
 
 
 def twin_of(env, pickled):

@@ -60,13 +60,20 @@ def assert_same(first, second):
         np.testing.assert_array_equal(value, second[name], err_msg=name)
 
 
-def test_equal_seeds_give_equal_policies_and_others_do_not(tmp_path):
-    for name in "ab":
-        assert train(small_plan(), tmp_path / name, **QUIET).finished
-    train(small_plan(seed=1), tmp_path / "c", **QUIET)
-    assert_same(weights(tmp_path / "a"), weights(tmp_path / "b"))
-    other = weights(tmp_path / "c")["action_net.weight"]
-    assert not np.array_equal(weights(tmp_path / "a")["action_net.weight"], other)
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of a finished training of the small plan, which tests only read."""
+    folder = tmp_path_factory.mktemp("trained")
+    assert train(small_plan(), folder, **QUIET).finished
+    return folder
+
+
+def test_equal_seeds_give_equal_policies_and_others_do_not(trained, tmp_path):
+    for seed in (0, 1):
+        train(small_plan(seed=seed), tmp_path / f"{seed}", **QUIET)
+    assert_same(weights(trained), weights(tmp_path / "0"))
+    other = weights(tmp_path / "1")["action_net.weight"]
+    assert not np.array_equal(weights(trained)["action_net.weight"], other)
 
 
 def test_keywords_of_the_environment_hold_in_training_too():
@@ -184,16 +191,15 @@ def test_resume_without_run_starts_new_run_with_message(tmp_path):
     assert "no run to resume" not in again.stdout
 
 
-def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
-    train(small_plan(), tmp_path, **QUIET)
+def test_a_folder_with_a_run_is_not_overwritten(trained):
     with pytest.raises(ValueError, match="already contains a run"):
-        train(small_plan(), tmp_path, **QUIET)
+        train(small_plan(), trained, **QUIET)
     with pytest.raises(ValueError, match=r"another plan \(different: seed, first_flights\)"):
-        train(small_plan(seed=3), tmp_path, resume=True, **QUIET)
-    record = json.loads((tmp_path / "training.json").read_text())
+        train(small_plan(seed=3), trained, resume=True, **QUIET)
+    record = json.loads((trained / "training.json").read_text())
     assert record["finished"]
     assert record["plan"]["recipe"]["flights"] == {"start": "mixed", "randomize_reference": True}
-    assert os.path.getsize(tmp_path / "evaluations.csv") > 0
+    assert os.path.getsize(trained / "evaluations.csv") > 0
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3", "tqc"])
@@ -208,17 +214,16 @@ def test_plain_weights_act_as_the_model_does(tmp_path, algorithm):
     np.testing.assert_allclose(loaded.predict(observations)[0], want, atol=2e-6)
 
 
-def test_policies_that_do_not_fit_are_refused(tmp_path):
-    train(small_plan(), tmp_path, **QUIET)
-
+def test_policies_that_do_not_fit_are_refused(trained, tmp_path):
     def env(**keywords):
         return gymnasium.make_vec(CIRCLE, num_envs=2, **keywords)
 
-    assert load_policy(str(tmp_path / "best.zip"), env()) is not None
+    best = str(trained / "best.zip")
+    assert load_policy(best, env()) is not None
     with pytest.raises(ValueError, match="trained with action ctbr"):
-        load_policy(str(tmp_path / "best.zip"), env(action="motor"))
+        load_policy(best, env(action="motor"))
     with pytest.raises(ValueError, match="trained with observation"):
-        load_policy(str(tmp_path / "best.zip"), env(layout="absolute"))
+        load_policy(best, env(layout="absolute"))
     with pytest.raises(ValueError, match="there is no policy"):
         load_policy(str(tmp_path / "none.zip"), env())
     (tmp_path / "broken.zip").write_bytes(b"PK nonsense")

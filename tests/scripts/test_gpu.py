@@ -1,5 +1,6 @@
 """The script for a GPU: it flies golden flights and measures once, here by PTX in C."""
 
+import functools
 import json
 
 import pytest
@@ -20,11 +21,11 @@ def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monke
     monkeypatch.setattr(gpu, "TRAINED", {**gpu.TRAINED, "observation": "truth"})
     monkeypatch.setattr(gpu, "STEPS", 60)
     gpu.prepare(tmp_path, gpu.CASES[:1])
-    launchers = []
+    launchers, compiled = [], functools.cache(lambda text: PtxLauncher(text.decode()))
 
     def make(text, warps):
         launchers.append(warps)
-        return PtxLauncher(text.decode())
+        return compiled(text)
 
     found = gpu.run(tmp_path, make, "cpu", ((40, 2),))
     golden, speed = (

@@ -5,14 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from baselines.recipes import recipe
-from quad_gym import IDS
 from quad_gym.evaluation import Episodes
 from quad_gym.experiments.flown import Flown
 from scripts.studies import __main__ as command
 from scripts.studies.arms import Arm
-from scripts.studies.study import Study
-from scripts.studies.tasks import STUDIED, stays
+from scripts.studies.tasks import stays
 from tests.console_commands import plain, without_figures
 from tests.scripts.running import run
 
@@ -100,21 +97,6 @@ def test_reward_of_an_arm_applies_in_training_only():
     assert type(learned.own_task).__name__ == "WithStdCertaintyReward"
     assert type(judged.own_task).__name__ == "WithStd"
     assert judged.task.out_of_bounds == 8.0
-
-
-def study_of(task, arms, folder, seeds=(0, 1, 2, 3, 4)):
-    (env_id,) = (name for name, each in IDS.items() if each == task)
-    return Study(
-        env_id=env_id,
-        arms=arms,
-        seeds=seeds,
-        recipes={"ppo": recipe(env_id)},
-        environment={},
-        episodes=40,
-        first_episode=0,
-        about=STUDIED[task],
-        folder=folder,
-    )
 
 
 def flown(returns, crashed, error):

@@ -10,7 +10,9 @@ import pytest
 
 import quad_gym
 from quad_gym import estimation
+from quad_gym.commands import calibrate as command
 from quad_gym.estimation import calibrate, read_log, replay
+from quad_gym.estimation import search as search_module
 from quad_gym.estimation.calibration import turn_on_biases
 from quad_gym.estimation.differences import spread_between
 from quad_gym.estimation.findings import Finding, Severity
@@ -53,7 +55,10 @@ def table():
 
 @pytest.fixture(scope="module")
 def found(table):
-    return calibrate(table, sensors="consumer", rotation=True)
+    """The calibration, by a search that ends with a larger gain of the likelihood than usual."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search_module, "_MIN_GAIN", 0.3)
+        return calibrate(table, sensors="consumer", rotation=True)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +122,9 @@ def test_suite_has_the_values_of_the_numbers_found(found):
 
 
 @pytest.mark.parametrize("name", ["log_delays.gnss", "log_rotation[2]"])
-def test_undetermined_number_keeps_its_prior_if_the_prior_is_as_likely(table, found, name):
+def test_undetermined_number_keeps_its_prior_if_the_prior_is_as_likely(
+    table, found, name, monkeypatch
+):
     """Both count as undetermined here; the true delay differs from its prior, the rotation not."""
     logs = [read_log(table).until(found.split)]
     search = NumberSearch(logs, found.prior, [{}], delays=True, rotation=True)
@@ -130,9 +137,10 @@ def test_undetermined_number_keeps_its_prior_if_the_prior_is_as_likely(table, fo
         assert not search.keep_priors(loose)
         assert search.x[k] == before
     else:
+        monkeypatch.setattr(search_module, "_FEW_STEPS", 1)
         assert search.keep_priors(loose)
-        again = search.intervals()[k]
-        assert (again.value, again.determined) == (0.0, False)
+        assert found.numbers[k].number.of(search.suite(search.x)) == 0.0
+        assert search.kept[k]
 
 
 def test_uncertain_sigma_is_at_most_twice_its_most_likely_value(found):
@@ -281,6 +289,7 @@ def test_suite_that_does_not_describe_the_validation_part_exits_with_one(
     after = replace(found.after, findings=(finding,))
     wrong = replace(found, after=after, suite=found.suite.replace(range_finder=RangeFinderParams()))
     monkeypatch.setattr(estimation, "calibrate", lambda log, **options: wrong)
+    monkeypatch.setattr(command, "write_page", lambda *_: [])
     (tmp_path / "flight 1.csv").write_text("time")
     ended = run("calibrate", "flight 1.csv", "--output", "mine", where=tmp_path)
     assert ended.returncode == 1
@@ -403,7 +412,7 @@ def test_replay_rotates_the_compass_into_body_axes():
     np.testing.assert_allclose(askew.quaternion, body.quaternion, atol=1e-9)
 
 
-def testspread_between_flights_is_the_variance_of_their_numbers():
+def test_spread_between_flights_is_the_variance_of_their_numbers():
     """Quadratic losses of ten logs with other minima, plus noise in their parts."""
     rng, parts, spread = np.random.default_rng(5), 200, 0.6
     h, losses = np.array([0.1]), []

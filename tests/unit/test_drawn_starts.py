@@ -1,5 +1,7 @@
 """Moving and drawn starts: their distribution, and the consistency of the filter."""
 
+import itertools
+
 import gymnasium
 import numpy as np
 import pytest
@@ -114,8 +116,13 @@ def worst(batch):
     return max(found)
 
 
-@pytest.mark.parametrize("drawn", [*DRAWS, "moving"])
-@pytest.mark.parametrize("name", SUITES)
+ONE_EACH = list(zip(SUITES, [*DRAWS, "moving"], strict=True))
+OTHERS = [pair for pair in itertools.product(SUITES, [*DRAWS, "moving"]) if pair not in ONE_EACH]
+
+
+@pytest.mark.parametrize(
+    ("name", "drawn"), [*ONE_EACH, *(pytest.param(*p, marks=pytest.mark.slow) for p in OTHERS)]
+)
 def test_filter_is_consistent_after_drawn_or_moving_start(name, drawn):
     suite = quad_gym.sensor_suite(name)
     how = {"start": "moving"} if drawn == "moving" else {"randomization": DRAWS[drawn]}

@@ -17,8 +17,10 @@ import pytest
 import quad_gym
 from baselines.exporting import controller_of, export_filter
 from baselines.exporting.filter_library import LIBRARY, archive
+from quad_gym.commands.main import main
 from quad_gym.estimation import UnscentedKalmanFilter, replay
 from quad_gym.estimation.starts import state_at_rest
+from tests.console_commands import refused
 from tests.logged_flights import Recorded, flown
 
 FOLDER = Path(tempfile.mkdtemp(prefix="quad_gym_filters_"))
@@ -512,6 +514,18 @@ def test_library_for_a_foreign_processor_has_its_format(target):
     assert member.startswith(machine)
     text = (exported("rtk", target) / "README.md").read_text()
     assert "@" not in text
+
+
+def test_command_writes_a_folder_and_replaces_none(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = "export filter --sensors rtk --target cortex-m7"
+    assert main(line.split()) == 0
+    folder = tmp_path / "results" / "export" / "filter_rtk_cortex-m7"
+    names = ["CMakeLists.txt", "README.md", "libquad_gym_filter.a", "main.c", "quad_gym_filter.h"]
+    assert sorted(file.name for file in folder.iterdir()) == names
+    assert "int qg_update_pixels(" in (folder / "quad_gym_filter.h").read_text()
+    assert "README.md" in capsys.readouterr().out
+    assert "libquad_gym_filter.a exists: use --overwrite" in refused(line, capsys)
 
 
 def test_unknown_target_is_refused(tmp_path):

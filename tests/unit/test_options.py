@@ -8,7 +8,6 @@ from typing import Literal
 import pytest
 
 from quad_gym.commands import consistency, evaluate, fly, train
-from quad_gym.commands.main import COMMANDS, main
 from quad_gym.commands.options import (
     EnvId,
     Keywords,
@@ -127,31 +126,3 @@ def test_ids_may_be_short_without_the_command_line(tmp_path):
     assert fly.make_env(fly.FlyArgs(env_id="circle")).unwrapped.flights.name == "circle"
     assert consistency.ConsistencyArgs(env_id="circle").env_id == "QuadGym/Circle-v0"
     assert parse(train.TrainArgs, ["Mine/Task-v0"]).env_id == "Mine/Task-v0"
-
-
-@pytest.mark.parametrize("command", list(COMMANDS))
-def test_help_has_no_empty_default_and_no_none(command, capsys):
-    with pytest.raises(SystemExit) as done:
-        main([*command.split(), "--help"])
-    assert done.value.code == 0
-    text = " ".join(capsys.readouterr().out.split())
-    assert "{None}" not in text
-    assert "(default: )" not in text
-    assert "(default: None)" not in text
-    assert "if not given" not in text
-
-
-@pytest.mark.parametrize("command", list(COMMANDS))
-def test_help_is_wrapped_to_the_width_of_the_terminal(command, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
-    with pytest.raises(SystemExit):
-        main([*command.split(), "--help"])
-    lines = capsys.readouterr().out.splitlines()
-    examples = ("    ", "  quad-gym")
-    assert max(len(line) for line in lines if not line.startswith(examples)) <= 100
-
-
-def test_hint_after_an_unknown_option_names_the_command(capsys):
-    with pytest.raises(SystemExit):
-        main(["circle", "--nonsense", "3"])
-    assert "quad-gym circle --help" in " ".join(capsys.readouterr().err.split())

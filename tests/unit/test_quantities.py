@@ -1,6 +1,5 @@
 """Quantities have equal public names and equal values in all interfaces."""
 
-import gymnasium
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -73,24 +72,6 @@ def test_reference_quantities_equal_the_view_of_tasks(task):
         np.testing.assert_allclose(
             batch.read(f"reference_{name}"), getattr(view, f"reference_{name}"), atol=1e-11
         )
-    np.testing.assert_array_equal(batch.read("position"), view.position)
-    np.testing.assert_array_equal(batch.read("time"), view.time)
-
-
-def test_measurements_equal_the_view_and_are_nan_if_absent():
-    suite = AIDED.with_rates(gnss=10.0, camera=20.0)
-    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=quad_gym.Task(), sensors=suite)
-    env.reset(seed=2)
-    batch, fixes = env.unwrapped.flights.batch, 0
-    for _ in range(20):
-        env.step(np.zeros((3, 4)))
-        measured = batch.view.measured
-        for name in ("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity", "pixels"):
-            np.testing.assert_allclose(
-                batch.read(name), getattr(measured, name), atol=1e-9, err_msg=name
-            )
-        fixes += np.isfinite(batch.read("gnss_position")[0, 0])
-    assert 0 < fixes < 20
 
 
 def test_unknown_quantities_are_refused_and_drawn_ones_are_read():

@@ -13,6 +13,7 @@ from quad_gym.estimation import LOG_COLUMNS, Stream, read_log, replay
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
 from quad_gym.params.suites import CONSUMER
 from tests.console_commands import run
+from tests.estimators import Simple
 from tests.filter_states import at_rest
 from tests.logged_flights import PX4, RTK, Recorded, errors_in_flight, errors_in_replay, flown
 
@@ -289,6 +290,10 @@ def test_fixes_long_before_the_imu_start_no_filter(name):
         ({"start": "x"}, "^start must be values by name, or None, got 'x'"),
         ({"start": {"course": True}, "sensors": "lab"}, "sensors take none: GnssParams.velocity_s"),
         ({"start": {"course": True}}, "must have a GNSS velocity, but the first fix of the log"),
+        (
+            {"estimator": Simple(), "samples": "it.csv"},
+            "samples must not be given with an estimator",
+        ),
     ],
 )
 def test_invalid_options_raise_errors_that_name_them(options, message):

@@ -19,18 +19,14 @@ class Still:
         return np.tile([self.thrust, 0.0, 0.0, 0.0], (len(observation), 1)), None
 
 
-def side_of(task, steps, label="trained on truth", crashed=False, course=None):
+def side_of(task, steps, label="trained on truth", crashed=False):
     flight = record_flight(Still(0.0), f"QuadGym/{task}-v0", seed=1, max_episode_steps=steps)
-    return Side(flight, label, "collision" if crashed else "time_limit", crashed, course)
+    return Side(flight, label, "collision" if crashed else "time_limit", crashed)
 
 
 @pytest.fixture(scope="module")
 def sides():
     return [side_of("LookAround", 10, crashed=True), side_of("LookAround", 25, "trained on more")]
-
-
-def has(frame, color):
-    return bool((abs(frame.astype(int) - color) < 8).all(axis=-1).any())
 
 
 def test_flight_that_has_ended_keeps_its_last_frame(sides):

@@ -3,15 +3,14 @@
 import dataclasses
 import math
 
-import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
 from baselines.plans import Plan, description
 from quad_gym.commands.compare import CompareArgs, configure
-from quad_gym.commands.main import main
 from quad_gym.params.suites import ALL_SUITES
+from tests import console_commands
 from tests.contract.test_sweep import pretend
 
 
@@ -119,38 +118,21 @@ def test_binary_missing_and_wrongly_named_files_are_refused(tmp_path):
         quad_gym.sensor_suite("consumr")
 
 
-def test_an_environment_flies_with_a_suite_in_a_file(tmp_path):
-    file = quad_gym.sensor_suite("standard").save(tmp_path / "mine.toml")
-    observations = []
-    for sensors in ("standard", str(file)):
-        env = gymnasium.make("QuadGym/Hover-v0", sensors=sensors)
-        env.reset(seed=3)
-        observations.append(env.step(env.action_space.low)[0])
-    np.testing.assert_array_equal(*observations)
-
-
-def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder").mkdir()
-    quad_gym.sensor_suite("rtk").save("folder/my-suite.toml")
-    for name in ("rtk", "folder/my-suite.toml"):
-        main(["export", "filter", "--sensors", name])
-    preset, own = (
-        tmp_path / "results/export" / f"filter_{name}_x86-64" for name in ("rtk", "my-suite")
-    )
-    for file in ("libquad_gym_filter.a", "main.c"):
-        assert (preset / file).read_bytes() == (own / file).read_bytes()
-    header = (own / "quad_gym_filter.h").read_text()
-    assert header == (preset / "quad_gym_filter.h").read_text().replace('"rtk"', '"my-suite"')
+def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys):
+    file = quad_gym.sensor_suite("rtk").save(tmp_path / "my-suite.toml")
+    line = "evaluate hover --policy pd --episodes 2 --env duration=0.2 --output"
+    for name, sensors in (("preset", "rtk"), ("own", str(file))):
+        words = (*line.split(), tmp_path / name, "--sensors", sensors)
+        assert console_commands.run(*words).returncode == 0
+    preset, own = ((tmp_path / name / "episodes.csv").read_text() for name in ("preset", "own"))
+    assert own == preset
+    (tmp_path / "wrong.toml").write_text('base = "rtk"\n[imus]\n')
     for name, message in (
         ("none.toml", "none.toml does not exist"),
         ("wrong.toml", "wrong.toml: imus is not a field of SensorSuite; did you mean imu?"),
     ):
-        (tmp_path / "wrong.toml").write_text('base = "rtk"\n[imus]\n')
-        with pytest.raises(SystemExit) as ended:
-            main(["export", "filter", "--sensors", name, "--overwrite"])
-        assert ended.value.code == 2
-        assert message in capsys.readouterr().err
+        words = [*line.split(), str(tmp_path / "new"), "--sensors", str(tmp_path / name)]
+        assert message in console_commands.refused(words, capsys)
 
 
 def test_the_record_of_a_training_has_the_contents_of_the_file(tmp_path):
