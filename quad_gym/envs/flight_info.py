@@ -68,7 +68,7 @@ def final_parts(infos: dict[str, Any], batch: FlightBatch, over: NDArray[np.bool
     found: Parts = {}
     if "faults" in infos:
         faults = infos["faults"].items()
-        found["faults"] = {name: values & over for name, values in faults if name[0] != "_"}
+        found["faults"] = {name: values & over for name, values in faults}
     if batch.innovations:
         found["innovations"] = batch.final_innovations
     return found

@@ -59,8 +59,8 @@ class QuadTorchVecEnv(QuadVectorEnv):
         """
         if isinstance(options, dict):
             options = {name: _array(value) for name, value in options.items()}
-        observations, infos = super().reset(seed=seed, options=options)
-        return _tensors(observations), _tensors(infos)
+        seen, infos = super().reset(seed=seed, options=options)
+        return _tensors(seen), _tensors(infos)
 
     def step(  # type: ignore[override]
         self, actions: torch.Tensor
@@ -78,20 +78,16 @@ class QuadTorchVecEnv(QuadVectorEnv):
                 then.
             gymnasium.error.ResetNeeded: As in `QuadVectorEnv.step`.
         """
-        observations, rewards, terminated, truncated, infos = super().step(_array(actions))
-        ended = infos.pop("_final_obs", None)
-        if ended is not None:
-            finals = self.flights.batch.final_observations.copy()
-            infos |= {"final_obs": self.flights.split(finals), "_final_obs": ended}
-            infos.pop("_final_info")
-            infos["final_info"] = _without_masks(infos["final_info"])
-        kept = _without_masks(infos) | ({} if ended is None else {"_final_obs": ended})
+        seen, rewards, terminated, truncated, infos, finals = self._flown(_array(actions))
+        if finals is not None:
+            last = self.flights.split(self.flights.batch.final_observations.copy())
+            infos |= {"final_obs": last, "_final_obs": self._over.copy(), "final_info": finals}
         return (
-            _tensors(observations),
+            _tensors(seen),
             torch.from_numpy(rewards).float(),
             torch.from_numpy(terminated),
             torch.from_numpy(truncated),
-            _tensors(kept),
+            _tensors(infos),
         )
 
 
@@ -119,12 +115,3 @@ def _tensors(values: Any) -> Any:
     if isinstance(values, dict):
         return {name: _tensors(value) for name, value in values.items()}
     return torch.from_numpy(values)
-
-
-def _without_masks(infos: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of an `info` without their masks `_name`."""
-    return {
-        name: _without_masks(value) if isinstance(value, dict) else value
-        for name, value in infos.items()
-        if not name.startswith("_")
-    }

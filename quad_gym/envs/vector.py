@@ -140,6 +140,24 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
             gymnasium.error.ResetNeeded: Before the first reset, or with autoreset disabled if an
                 episode is over.
         """
+        observations, rewards, terminated, truncated, infos, finals = self._flown(actions)
+        infos = _masked(infos, self._everyone)
+        if finals is not None:
+            infos |= {
+                "final_obs": self._final_objects(),
+                "_final_obs": self._over.copy(),
+                "final_info": _masked(finals, self._over),
+                "_final_info": self._over.copy(),
+            }
+        return observations, rewards, terminated, truncated, infos
+
+    def _flown(self, actions: Any) -> tuple[Any, ...]:
+        """Fly one control period; return the results without masks.
+
+        Returns:
+            Observations, rewards, terminated, truncated, `info`, and `final_info` if episodes have
+            ended and the next ones have begun, otherwise None.
+        """
         numbers = checked_actions(actions, (self.num_envs, 4))
         if not self._seeded:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
@@ -152,23 +170,17 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         batch = self.flights.batch
         same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
         flown_with = batch.drawn() if same_step else {}
-        observations = batch.step(numbers)
+        observations = self.flights.split(batch.step(numbers))
         results = batch.results
         terminated = results[:, Result.TERMINATED] > 0.0
         truncated = results[:, Result.TRUNCATED] > 0.0
         self._over = terminated | truncated
         if self.rendering is not None:
             self.rendering.observe()
-        infos = _masked(self._step_infos(results), self._everyone)
-        if same_step and self._over.any():
-            infos = self._with_finals(infos, flown_with)
-        return (
-            self.flights.split(observations),
-            results[:, Result.REWARD].copy(),
-            terminated,
-            truncated,
-            infos,
-        )
+        infos, rewards = self._step_infos(results), results[:, Result.REWARD].copy()
+        ended = same_step and self._over.any()
+        finals = self._taken_finals(infos, flown_with) if ended else None
+        return observations, rewards, terminated, truncated, infos, finals
 
     def render(self) -> Any:
         """Return the output that `render_mode` selects, for the flights in `render_flights`.
@@ -214,36 +226,34 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
             infos["reward_terms"] = batch.reward_terms()
         return infos
 
-    def _with_finals(
+    def _final_objects(self) -> NDArray[np.object_]:
+        """Return the last observations of ended episodes, (n,); None for the others."""
+        finals = self.flights.batch.final_observations
+        objects = np.full(self.num_envs, None, object)
+        for i in np.flatnonzero(self._over):
+            objects[i] = self.flights.split(finals[i].copy())
+        return objects
+
+    def _taken_finals(
         self, infos: dict[str, Any], flown_with: dict[str, NDArray[np.float64]]
     ) -> dict[str, Any]:
-        """Move ended episodes to `final_obs` and `final_info`; describe the new ones instead."""
-        over = self._over.copy()
-        finals = self.flights.batch.final_observations
-        final_obs = np.full(self.num_envs, None, object)
-        for i in np.flatnonzero(over):
-            final_obs[i] = self.flights.split(finals[i].copy())
-        final_info: dict[str, Any] = {
+        """Return `final_info` of ended episodes; describe the new ones in `infos` instead."""
+        batch, over = self.flights.batch, self._over
+        finals: dict[str, Any] = {
             name: np.where(over, values, values.dtype.type(0))
             for name, values in infos.items()
-            if not (name.startswith("_") or isinstance(values, dict))
+            if not isinstance(values, dict)
         }
-        final_info |= final_parts(infos, self.flights.batch, over)
+        finals |= final_parts(infos, batch, over)
         if flown_with:
-            final_info["drawn"] = flown_with
-        batch, began = self.flights.batch, np.flatnonzero(over)  # the new episodes begin
+            finals["drawn"] = flown_with
+        began = np.flatnonzero(over)
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = batch.record(name, began)
         infos["filter_diverged"][began] = batch.record("diverged", began) > 0.0
         infos["ending"][began] = infos["gates_passed"][began] = 0
         replace_faults(infos, batch, began)
-        infos |= {
-            "final_obs": final_obs,
-            "_final_obs": over,
-            "final_info": _masked(final_info, over),
-            "_final_info": over.copy(),
-        }
-        return infos
+        return finals
 
     def _checked_mask(self, mask: Any) -> NDArray[np.bool_]:
         if mask is None:
