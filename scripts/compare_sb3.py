@@ -53,11 +53,11 @@ def errors(options: Comparison, source: Source) -> dict[str, list[tuple[float, f
 def main(options: Comparison) -> None:
     """Train, fly and print."""
     torch.set_num_threads(1)  # small networks: more threads are slower
-    print("trained on   flown on     mean error [cm]   crashed")
+    print("trained on   evaluated on   mean error [cm]   crashed")
     for source in SOURCES:
         for flown, results in errors(options, source).items():
             error, crashed = np.mean(results, axis=0)
-            print(f"{source:10}   {flown:10}   {100.0 * error:15.1f}   {crashed:7.0%}", flush=True)
+            print(f"{source:10}   {flown:12}   {100.0 * error:15.1f}   {crashed:7.0%}", flush=True)
 
 
 if __name__ == "__main__":

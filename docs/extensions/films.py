@@ -35,8 +35,8 @@ def film_of(env_id: str) -> str:
     flies = {"pd": "PD control", "pretrained": "the included trained policy"}[policy_of(env_id)]
     kind = quad_gym.IDS[env_id]
     return (
-        f"![An episode of {env_id}, flown by {flies}](/{FOLDER}/{kind}.webp)\n\n"
-        f"An episode on the estimate, flown by {flies}, at twice the speed:\n\n"
+        f"![An episode of {env_id}, controller: {flies}](/{FOLDER}/{kind}.webp)\n\n"
+        f"An episode on the estimate at twice the speed, controller: {flies}:\n\n"
         f"```sh\nquad-gym fly {kind} --policy {policy_of(env_id)} --speed {SPEED:g} "
         f"--output {kind}.webp\n```\n"
     )
@@ -47,7 +47,7 @@ def write_films(app: Sphinx) -> None:
     folder = Path(app.srcdir) / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     for env_id, kind in status_iterator(
-        quad_gym.IDS.items(), "filming... ", "brown", len(quad_gym.IDS)
+        quad_gym.IDS.items(), "rendering videos... ", "brown", len(quad_gym.IDS)
     ):
         film = folder / f"{kind}.webp"
         options = FlyArgs(

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.samples import Measurement
+from quad_gym.estimation.samples import HEADING_ALONE, Measurement
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records.inputs import SAME_TIME, Outcome
@@ -100,13 +100,17 @@ class FilterCalls:
 
     def _update(self, name: str, time: float, given: Measurement) -> None:
         """Add the measurement of a stream with its time stamp."""
-        if name == "gnss":
+        if given.noise.get("baseline_sigma") == HEADING_ALONE:
+            raise ValueError(
+                "a log for an exported filter must have attitudes or baselines, got headings alone"
+            )
+        if name in ("gnss", "attitude"):
             vectors = (
                 *(given.position_G, given.noise.get("position_sigma_I")),
                 *(given.baseline_G, given.velocity_G),
             )
             numbers = [number for vector in vectors for number in _three(vector)]
-            self._add(name, time, *numbers, given.noise.get("velocity_sigma", math.nan))
+            self._add("gnss", time, *numbers, given.noise.get("velocity_sigma", math.nan))
         elif given.pixels is not None:
             self._add(name, time, *given.pixels.ravel())
         else:

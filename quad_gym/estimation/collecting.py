@@ -1,5 +1,6 @@
 """Results of a replay from the pieces of its tape: estimates, and innovations by measurement."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -64,6 +65,8 @@ def _columns_of(kept: Floats) -> dict[str, Any]:
 def _measured(table: Floats, d: int) -> Measured:
     """Return innovations from rows of two times and REPORTED numbers."""
     values = table[:, 2:]
+    if d == 2 and (values[:, 4] > math.pi).all():
+        d = 1  # headings alone: nothing was measured upward
     return Measured(
         *(table[:, 0], table[:, 1], values[:, :d], values[:, 3 : 3 + d]),
         *(values[:, 6], values[:, 7]),

@@ -16,7 +16,7 @@ from quad_gym.estimation.results import Measured
 AT_LIMIT = 0.05
 """Probability with which a test rejects what is at the limit of the test; a consistent filter is
 far from the limits."""
-FEWEST = 50  #: number of innovations that shows their correlation
+MIN_COUNT = 50  #: number of innovations that shows their correlation
 
 
 class Fit(NamedTuple):

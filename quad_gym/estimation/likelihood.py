@@ -47,7 +47,7 @@ SPACING = 0.5
 """Time between the measurements of a sensor in the second, thinned log [s]: errors that are
 correlated over shorter times count less in it, and noise of the IMU more."""
 PART = 0.1  #: length of the parts of a log whose losses are told apart [s]
-_FEWEST = 50
+_MIN_COUNT = 50
 _TOGETHER = 64  #: suites, as their innovations take memory
 _WINDOW = 0.5  #: [s]
 _VIBRATES = 3.0  #: ratio of the vibration in flight and in the quietest second [-]
@@ -156,9 +156,9 @@ class Likelihood:
         right = log.corrected(suite)
         self._logs = [_LogLosses(each, suite, start, nu, span) for each in (right, thinned(right))]
         counts = [int(each.counts.sum()) for each in self._logs]
-        if counts[0] < _FEWEST:
+        if counts[0] < _MIN_COUNT:
             raise ValueError(
-                f"a calibration must have at least {_FEWEST} measurements in flight, from "
+                f"a calibration must have at least {_MIN_COUNT} measurements in flight, from "
                 f"{SETTLING:g} s after the start on, got {counts[0]}: use a longer part of the log "
                 "(share=, --share)"
             )

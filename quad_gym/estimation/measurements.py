@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.plausibility import MisfitError
-from quad_gym.estimation.samples import Measurement, checked_measurement
+from quad_gym.estimation.samples import (
+    HEADING_ALONE,
+    Measurement,
+    checked_baseline,
+    checked_measurement,
+)
 from quad_gym.estimation.starts import level
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params.portable import turned
@@ -102,9 +107,11 @@ class LogMeasurements:
             return Measurement(pixels=self.streams[name].values["pixels"][k])
         if name == "attitude":
             assert self.suite.gnss is not None
-            baseline = turned(self._attitude(k).T, self.suite.gnss.baseline_B)
-            return checked_measurement(
-                self.suite, None, turned(self.R_GI, baseline), None, None, {}
+            baseline_I = turned(self._attitude(k).T, self.suite.gnss.baseline_B)
+            alone = "heading" in self.streams[name].values
+            return Measurement(
+                baseline_G=checked_baseline(self.suite, turned(self.R_GI, baseline_I)),
+                noise={"baseline_sigma": HEADING_ALONE} if alone else {},
             )
         value = self.streams[name].values[name][k]
         if not np.isfinite(value).all():

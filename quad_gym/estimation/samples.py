@@ -13,6 +13,10 @@ from quad_gym.records import AID_BLOCKS, AID_FREEDOMS, FEATURE_BLOCKS, POSITION_
 
 Floats = NDArray[np.float64]
 
+HEADING_ALONE = 4.0
+"""Value of the noise `baseline_sigma`, above the largest one of pi, with which a filter uses only
+the heading of a baseline; its noise is then the suite's [rad]."""
+
 SIGMA_KEYWORDS = (
     "gnss_sigma",
     "baseline_sigma",

@@ -50,7 +50,7 @@ _WIDEST = math.log(2.0)
 exp(2 s^2), where s is the standard deviation of its logarithm if the other numbers are known. Its
 square is then the root mean square of the variance: noise that is too small costs more than noise
 that is too large."""
-_FEWEST = 30  #: number of innovations that describes their tails and correlations
+_MIN_COUNT = 30  #: number of innovations that describes their tails and correlations
 _COARSE = np.arange(-1.0, 1.01, 0.1)  #: first grid of a delay [s]
 _MARGIN = 0.2  #: time at the end of the log that changes of delays may reach [s]
 _WHITE = {
@@ -245,7 +245,7 @@ class NumberSearch:
         low = self.low.copy()
         for k, number in enumerate(self.numbers):
             sensor, axes, most = _WHITE.get(number.name, ("", slice(0), 1.0))
-            if len(scaled.get(sensor, ())) > _FEWEST:
+            if len(scaled.get(sensor, ())) > _MIN_COUNT:
                 factor = widening(scaled[sensor][:, axes], most)
                 value = factor * number.value(self.values[k], float(self.x[k]))
                 wide = number.coordinate(self.values[k], value)
@@ -283,12 +283,12 @@ class NumberSearch:
                 nis.setdefault(name, []).append(m.nis[counts])
         scaled = {name: np.concatenate(some) for name, some in values.items()}
         for name, some in nis.items():
-            if len(scaled[name]) > _FEWEST:
+            if len(scaled[name]) > _MIN_COUNT:
                 self.nu[name] = tails(np.concatenate(some), scaled[name].shape[1])
         self.white = {
             name
             for name, each in scaled.items()
-            if len(each) > _FEWEST and max(map(correlation_time, each.T)) == 1.0
+            if len(each) > _MIN_COUNT and max(map(correlation_time, each.T)) == 1.0
         }
         self._known = {}
         return scaled

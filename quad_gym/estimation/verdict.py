@@ -15,7 +15,7 @@ import numpy as np
 
 from quad_gym.estimation.dead_reckoning import SETTLED, Change, changes
 from quad_gym.estimation.findings import Finding, Severity
-from quad_gym.estimation.fits import FEWEST, Fit, correlations, exceeds, fit_of, larger
+from quad_gym.estimation.fits import MIN_COUNT, Fit, correlations, exceeds, fit_of, larger
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.logs.clocks import PAUSE
 from quad_gym.estimation.logs.parts import running_motors
@@ -177,7 +177,8 @@ def _misfit(name: str, m: Measured, fit: Fit, fits: Mapping[str, Fit]) -> Iterat
     many = exceeds(m.rejected[known], MAX_REJECTED)
     heavy = larger(nis, d, RATIO) and fit.mean_nis > 2.0 * ratio  # in the median, and in the mean
     if larger(nis, d, ratio) or heavy or (many and not shared):
-        text = f"{says}, {_percent(fit.rejected)} rejected: this suite does not describe this log"
+        share = _percent(fit.rejected)
+        text = f"{says}, {share} rejected: the suite's noise model does not fit this log"
         yield _lost(quantity, text)
     elif many or larger(nis, d, RATIO):
         factor = math.sqrt(max(fit.median_nis, 1.0))
@@ -194,7 +195,7 @@ def _misfit(name: str, m: Measured, fit: Fit, fits: Mapping[str, Fit]) -> Iterat
         if quantity == "position" and length >= PATIENCE:
             severity, text = Severity.LOST, f"{text}: it drifts or jumps, or others do"
         yield Finding(quantity=quantity, severity=severity, text=text)
-    if name.startswith("gnss") and len(nis) >= FEWEST:
+    if name.startswith("gnss") and len(nis) >= MIN_COUNT:
         yield from _correlated(name, m, quantity)
     if fit.mean_nis < PESSIMISTIC:
         factor = 1.0 / math.sqrt(max(fit.mean_nis, 1e-6))
@@ -209,7 +210,7 @@ def _correlated(name: str, m: Measured, quantity: str) -> Iterator[Finding]:
     """Innovations whose successive values are correlated, in the worst axis of each quantity."""
     scaled = (m.innovation / m.sigma)[np.isfinite(m.nis) & ~m.gated]
     scaled = scaled[len(scaled) // 5 :]
-    if len(scaled) < FEWEST:
+    if len(scaled) < MIN_COUNT:
         return
     rho, size = correlations(scaled), (scaled**2).mean(axis=0)
     parts = ((0, 1), "position"), ((2,), "height")
@@ -220,7 +221,7 @@ def _correlated(name: str, m: Measured, quantity: str) -> Iterator[Finding]:
         if sure > MAX_CORRELATED and size[worst] > PESSIMISTIC:
             text = (
                 f"{NAMES[name]}: successive innovations have a correlation of {rho[worst]:.2f}, 0 "
-                "expected: time stamps or noise of this suite do not describe this log"
+                "expected: check the suite's time stamps and noise"
             )
             severity = Severity.UNCERTAIN if part == "height" else Severity.LOST
             yield Finding(quantity=part, severity=severity, text=text)
@@ -297,8 +298,8 @@ def _biases(result: Replay, suite: SensorSuite) -> Iterator[Finding]:
         if not found <= max(MAX_BIAS[name], BEYOND * sigma):
             yield _lost(
                 "attitude",
-                f"{text}, which no sensor has: magnetic field, time stamps, mounting or noise of "
-                "this suite do not describe this log",
+                f"{text}, which no sensor has: check the suite's magnetic field, time stamps, "
+                "mounting and noise",
             )
         elif found > BEYOND * sigma:
             yield Finding(

@@ -128,7 +128,9 @@ def _replace_noise(p, m, own):
             p.position_sigma_I[i] = m.position_sigma_I[i]
     p.baseline_noise, p.baseline_sigma = own.baseline_noise, own.baseline_sigma
     if m.baseline_noise == m.baseline_noise:
-        p.baseline_noise, p.baseline_sigma = m.baseline_noise, m.baseline_sigma
+        p.baseline_noise = m.baseline_noise
+    if m.baseline_sigma == m.baseline_sigma:
+        p.baseline_sigma = m.baseline_sigma
     p.velocity_sigma, p.pixel_sigma = own.velocity_sigma, own.pixel_sigma
     if m.velocity_sigma == m.velocity_sigma:
         p.velocity_sigma = m.velocity_sigma

@@ -10,7 +10,8 @@ class OpticalFlowParams(AidParams):
 
     It measures `(V_x, V_y) u / h + (-w_y, w_x) + noise` with the velocity V and the body rates w in
     B, the height h above a level ground (`WorldParams.ground_height`) and the cosine u of the tilt.
-    Nothing is measured below `min_height`, beyond `max_rate`, and at a tilt above 60 degrees.
+    The sensor returns no measurement below `min_height`, beyond `max_rate`, and at a tilt above 60
+    degrees.
     """
 
     rate: float = 100.0

@@ -9,8 +9,8 @@ class RangeFinderParams(AidParams):
     """A time-of-flight sensor that looks down, such as a VL53L1X.
 
     It measures `h / u + noise` with the height h above a level ground (`WorldParams.ground_height`)
-    and the cosine u of the tilt. Nothing is measured outside of `min_range` and `max_range`, and at
-    a tilt above 60 degrees.
+    and the cosine u of the tilt. The sensor returns no measurement outside of `min_range` and
+    `max_range`, and at a tilt above 60 degrees.
     """
 
     rate: float = 25.0

@@ -1,6 +1,7 @@
 """Logs of others, with the defects that they have, replay to the truth or are refused by name."""
 
 import gzip
+import math
 import tomllib
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import quad_gym
 from quad_gym.estimation import read_log, replay
 from quad_gym.estimation.logs.quantities import compared
-from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.rotations import dcm_to_euler, euler_to_dcm, quaternion_to_dcm
 from tests import foreign_logs as foreign
 from tests.foreign_logs import BOOT, EPOCH, Bag
 
@@ -507,6 +508,38 @@ def test_headings_in_degrees_are_named_and_left_out(flight):
     assert "gnss_baseline" not in result.measured
     headings[rows] = turns
     assert compared(read_log(table | {"heading": headings}), suite).problems == ()
+
+
+def test_heading_alone_does_not_level_a_vehicle_that_rests_on_a_slope(tmp_path):
+    """A level baseline would pull the pitch by 0.24 rad, at a standard deviation of 0.006 rad."""
+    gnss = CONSUMER.gnss.replace(primary_antenna_B=(0, 0, 0), secondary_antenna_B=(1, 0, 0))
+    suite = CONSUMER.replace(magnetometer=None, barometer=None, gnss=gnss)
+    rng, n, R_BI = np.random.default_rng(0), 3000, euler_to_dcm(np.array([0.05, 0.25, 0.8]))
+    force, heading = R_BI @ [0.0, 0.0, 9.81], math.atan2(R_BI[0, 1], R_BI[0, 0])
+    fixes = {
+        "gnss_enu": rng.normal(size=(n, 3)) * gnss.position_sigma_I,
+        "gnss_velocity_enu": rng.normal(0.0, gnss.velocity_sigma, (n, 3)),
+        "heading": heading + rng.normal(0.0, gnss.baseline_noise, n),
+    }
+    for values in fixes.values():
+        values[np.arange(n) % 20 > 0] = np.nan
+    table = {
+        "time": 0.01 * np.arange(1, n + 1),
+        "gyro": rng.normal(0.0, 0.002, (n, 3)),
+        "accel": force + rng.normal(0.0, 0.05, (n, 3)),
+        **fixes,
+    }
+    start = {"accel": force, "heading": heading}
+    result = replay(table, sensors=suite, start=start)
+    errors = dcm_to_euler(R_BI @ np.swapaxes(quaternion_to_dcm(result.quaternion), 1, 2))[500:]
+    assert (np.abs(errors) < 4.0 * result.sigma[500:, 6:9]).all()
+    assert 0.001 < result.sigma[-1, 8] < 0.3 * gnss.baseline_noise  # it does measure the heading
+    assert result.problems == ()
+    fit = result.summary()["measurements"]["gnss_baseline"]
+    assert fit["degrees_of_freedom"] == 1
+    assert fit["mean_nis"] == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 150))
+    with pytest.raises(ValueError, match="got headings alone"):
+        replay(table, sensors=suite, start={"heading": heading}, samples=tmp_path / "samples.csv")
 
 
 def test_log_without_measurements_is_dead_reckoning(flight):

@@ -102,7 +102,7 @@ def test_wrong_noise_of_a_suite_is_named_by_sensor():
     wrong = np.random.default_rng(2).normal(0.0, 0.5, (COUNT, 3))
     table["gnss_velocity_enu"] = table["gnss_velocity_enu"] + wrong
     sentences = [p for p in replayed(table).problems if "GNSS velocity: NIS per degree" in p]
-    assert sentences[0].endswith("rejected: this suite does not describe this log")
+    assert sentences[0].endswith("rejected: the suite's noise model does not fit this log")
 
 
 def test_a_bias_that_the_suite_does_not_admit_is_a_note_if_a_sensor_can_have_it():

@@ -118,7 +118,7 @@ class Log:
     range_finder: Stream | None = None
     """distances to the ground along the body's -z: range_finder (n,) [m]"""
     attitude: Stream | None = None
-    """attitudes by motion capture: heading (n,) [rad], or quaternion (n, 4), body to inertial"""
+    """attitudes by motion capture: quaternion (n, 4), body to inertial; or heading (n,) [rad]"""
     motors: Stream | None = None
     """commands, no measurements, that hold until the next: motors (n, 4), voltages [V]; or commands
     (n, 4) from 0 to 1"""

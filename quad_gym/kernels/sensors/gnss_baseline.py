@@ -8,6 +8,9 @@ Noise n across a unit vector shortens its part along the direction by n^2 / 2, w
 2 sigma^4 for two axes of standard deviation sigma. It is added along the direction if sigma exceeds
 `_COARSE`: the sigma points of an uncertain attitude are shortened, too, so that the filter would
 attribute an innovation along the direction to the attitude.
+
+A heading alone is a level baseline of which only the horizontal component across it was measured.
+A sigma above pi says so: it adds this noise along the other two axes.
 """
 
 import math
@@ -21,6 +24,7 @@ from quad_gym.kernels.filter.monitoring import follow_mean
 from quad_gym.kernels.filter.recovery import reset_heading
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
 from quad_gym.kernels.maths.linalg import (
+    cross,
     dot,
     keep,
     load3,
@@ -28,6 +32,7 @@ from quad_gym.kernels.maths.linalg import (
     norm,
     outer,
     rounded,
+    unit_or,
 )
 from quad_gym.kernels.simd.lanes import logical_not, select, zero_like
 from quad_gym.records import BASELINE_BLOCK
@@ -68,6 +73,9 @@ def expect(flight, p, work, settings, k, valid):
     white = p.baseline_sigma * p.baseline_sigma
     along = select(p.baseline_sigma > _COARSE, 2.0 * white * white, 0.0)
     noise = noise + outer(along * u_I, u_I)
+    side = unit_or((-u_I[1], u_I[0], zero_like(u_I[0])), (1.0, 0.0, 0.0))
+    up = cross(u_I, side)
+    noise = noise + outer(select(p.baseline_sigma > math.pi, along, 0.0) * up, up)
     put_block(work, settings, k, valid, (1.0 / norm(z)) * z, u_I, noise)
     for j in range(9):
         a, s = lever_column(flight, work, settings, j, R_BI, u_B)
