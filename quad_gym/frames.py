@@ -1,6 +1,7 @@
 """Frames of the Earth: ECEF (G, WGS-84) and local east-north-up (I)."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -97,7 +98,12 @@ def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: If `r0_G` is not three finite numbers on the Earth.
     """
-    lat, lon, _ = _geodetic(_checked_place("r0_G", r0_G))
+    return _enu_at(_checked_place("r0_G", r0_G).tobytes()).copy()
+
+
+@lru_cache  # for bytes, as numbers that are equal have other bits at zero
+def _enu_at(place: bytes) -> NDArray[np.float64]:
+    lat, lon, _ = _geodetic(np.frombuffer(place))
     (sin_lat, sin_lon), (cos_lat, cos_lon) = map(sin, (lat, lon)), map(cos, (lat, lon))
     return np.array(
         [
