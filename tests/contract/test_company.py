@@ -77,7 +77,7 @@ def test_sb3_subproc_env_equals_flights_in_one_process(start_method):
 
 
 def test_environments_may_be_stepped_from_several_threads():
-    run = functools.partial(expected_run, 200, "SameStep", batch_threads=2)
+    run = functools.partial(expected_run, 64, "SameStep", batch_threads=2)
     with ThreadPoolExecutor(3) as pool:
         runs = [pool.submit(run, seed=seed) for seed in (1, 2, 3)]
         for seed, flown in zip((1, 2, 3), runs, strict=True):

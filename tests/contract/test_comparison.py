@@ -80,7 +80,7 @@ def test_evaluate_without_included_policy_flies_pd(tmp_path, capsys):
 
 def compare(where, *more, figures=False):
     line = ["--quick", "--engine", "compiled", "--steps", 4096, "--output", where / "out"]
-    line += ["--env", "duration=0.4"]
+    line += ["--env", "duration=0.4", "--train-on", "truth", "estimate"]
     return run("compare", *line, *more, where=where, figures=figures)
 
 
@@ -90,7 +90,7 @@ def test_compare_writes_report_and_continues(tmp_path):
     for part in ("trained on the estimate", "PD, tuned", "A single training seed is not concl"):
         assert part in done.stdout
     policies = read_csv(tmp_path / "out/policies.csv")
-    assert len(policies) == (1 + 3) * 2
+    assert len(policies) == (1 + 2) * 2
     page = (tmp_path / "out/report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert "http" not in page

@@ -161,7 +161,7 @@ def pairs():
     return {interface: (make(interface), make(interface)) for interface in INTERFACES}
 
 
-@settings(max_examples=500)
+@settings(max_examples=250)
 @given(action=rows)
 def test_single_env_flies_or_refuses_any_action(pairs, action):
     check_one(pairs["single"], action, (4,))
