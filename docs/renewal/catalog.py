@@ -101,7 +101,6 @@ CATALOG = {
             commands=["compare --engine compiled --sensors standard rtk --output OUT"],
             flights=("Circle, standard", "Circle, rtk", "observation truth", "observation noisy"),
             texts=texts.compare,
-            figures={"0/learning_standard.png": ".github/images/learning.png"},
         ),
         Result(
             name="consistency",

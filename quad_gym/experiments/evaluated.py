@@ -41,7 +41,7 @@ def evaluation_table(results: Evaluated, env: Any) -> str:
     ]
     tracking = {"tracking error [mm]": ["whole episode", "second half"]}
     if course:
-        tracking = {"course": ["gates passed", "time"]}
+        tracking = {"course": ["gates passed", "time if completed"]}
     return reports.text_table(
         {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
     )

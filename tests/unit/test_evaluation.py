@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 
 from baselines import PDPolicy
+from baselines.keeping import score
+from baselines.pd import pd_gains
 from baselines.policies import keywords_of_policy, load_policy, pretrained_file
 from quad_gym.analysis.comparison_plots import error_over_time_figure
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.evaluation import evaluate, roll_out
+from quad_gym.experiments import tuning
+from quad_gym.experiments.compare import MatrixCell
+from quad_gym.experiments.evaluated import evaluation_table
 from quad_gym.experiments.flown import PathRecorder, fly
 from quad_gym.records import Ending
 
@@ -135,6 +140,32 @@ def test_crashes_on_purpose_raise_errors_and_percentiles(share):
     if share == 1.0:
         assert low[-1] == middle[-1] == bound
         assert len(dropped["time"]) < len(flown["time"])
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_tables_and_selections_rank_a_controller_that_crashes_below_one_that_does_not(share):
+    env = QuadVectorEnv(10, "hover", duration=3.0)
+    policies = {"pd": PDPolicy(env), "quitting": Quitting(env, share)}
+    flown = {name: fly(policy, env, 0) for name, policy in policies.items()}
+    kept, lost = (each.episodes.summary() for each in flown.values())
+    shown = evaluation_table({(name, "truth"): each for name, each in flown.items()}, env)
+    errors = [float(line.split("|")[1].split("[")[0]) for line in shown.splitlines()[-2:]]
+    assert errors[1] > 2.0 * errors[0]
+    assert f"{share:.1%}" in shown.splitlines()[-1]
+    names = ("mean_error", "late_error", "crash_rate")
+    cells = [MatrixCell(*(np.array([each[n]]) for n in names), None) for each in (kept, lost)]
+    assert cells[1].in_mm()[0] > 2.0 * cells[0].in_mm()[0]
+    assert cells[1].texts()[2] == f"{share:.1%}"
+    judged = {"own_reward": 0.0, "gates_total": 0.0}  # of checkpoints
+    assert score(lost | judged, 3.0) < score(kept | judged, 3.0)
+
+
+def test_tuning_counts_a_crash_as_ten_times_the_initial_error(monkeypatch):
+    env = QuadVectorEnv(10, "hover", duration=3.0)
+    search = tuning.Search({"hover": env}, pd_gains("tuned"), False, 0)
+    search.cost(np.zeros(4))
+    monkeypatch.setattr(tuning, "PDPolicy", lambda env, gains: Quitting(env, 0.5))
+    assert search.cost(np.zeros(4)) > np.log(0.5 * 10.0)
 
 
 def test_figure_of_errors_ends_at_the_bound_and_shows_crashes():
