@@ -31,8 +31,9 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
     observations and `info` are views of the memory of the flights: the next step overwrites `info`,
     and the one after it the observations.
     `info` has "position_error" and "estimation_error", with `reward_terms=True` also these; with
-    `autoreset_mode="SameStep"`, "final_obs" and its mask "_final_obs". `batch.result` has the other
-    results of a step, and `batch.record` the records of the flights.
+    `autoreset_mode="SameStep"`, "final_obs" and its mask "_final_obs"; errors are then those at the
+    end of the episode that ended. `batch.result` has the other results of a step, and
+    `batch.record` the records of the flights.
 
     Args:
         num_envs: Number of flights.

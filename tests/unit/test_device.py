@@ -18,6 +18,10 @@ from tests.golden.flights import trajectories
 
 torch = pytest.importorskip("torch")
 from quad_gym.envs.device_env import QuadDeviceVecEnv  # noqa: E402
+from tests.contract.test_torch_env import (  # noqa: E402
+    assert_flights_equal,
+    assert_mask_begins_one_episode,
+)
 
 COUNT = 40  # a block, and a part of one
 TRUTH = {"observation": "truth", "max_episode_steps": 25, "max_tilt": 0.6}
@@ -33,23 +37,11 @@ def device_env(base, count=COUNT, launcher=device.launcher_of, **keywords):
     return QuadDeviceVecEnv(count, device="cpu", base=base, launcher=launcher, **keywords)
 
 
-def assert_flights_equal(base, mode, launcher=device.launcher_of, **keywords):
+def episodes_of(base, mode, launcher=device.launcher_of, **keywords):
     """Fly device code and the batch with the same actions; return the number of episodes."""
     envs = device_env(base, launcher=launcher, autoreset_mode=mode, **keywords)
     others = vec_env(base, COUNT, autoreset_mode=mode, **keywords)
-    seen, expected, episodes = envs.reset(seed=3)[0], others.reset(seed=3)[0], 0
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        assert np.array_equal(seen.numpy(), expected)
-        actions = rng.uniform(-1.2, 1.2, (COUNT, 4)).astype(np.float32)
-        seen, rewards, *over, infos = envs.step(torch.from_numpy(actions))
-        expected, wanted, *ended, known = others.step(actions)
-        assert np.array_equal(rewards.numpy(), wanted.astype(np.float32))
-        for flags, truths in zip(over, ended, strict=True):
-            assert np.array_equal(flags.numpy(), truths)
-        for i in np.flatnonzero(known.get("_final_obs", [])):
-            assert np.array_equal(infos["final_obs"][i].numpy(), known["final_obs"][i])
-        episodes += np.logical_or(*ended).sum()
+    episodes = assert_flights_equal(envs, others, steps=60, last=True)
     for name in envs.batch.plan.fields:
         values = others.flights.batch.record(name)
         assert np.array_equal(envs.batch.record(name).numpy().view(values.dtype), values, True), (
@@ -60,34 +52,33 @@ def assert_flights_equal(base, mode, launcher=device.launcher_of, **keywords):
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_flights_of_device_code_equal_those_of_the_batch(mode):
-    assert assert_flights_equal("circle", mode, **TRUTH) > COUNT
+    assert episodes_of("circle", mode, **TRUTH) > COUNT
 
 
 def test_flights_of_ptx_equal_those_of_the_batch():
-    assert assert_flights_equal("circle", "NextStep", launcher_of_ptx, **TRUTH) > COUNT
+    assert episodes_of("circle", "NextStep", launcher_of_ptx, **TRUTH) > COUNT
 
 
 @pytest.mark.slow  # compiles the filter
 @pytest.mark.parametrize("keywords", [{}, {"sensors": "rtk", "faults": "gnss_outage"}])
 def test_filtered_flights_of_device_code_equal_those_of_the_batch(keywords):
-    assert assert_flights_equal("circle", "NextStep", max_tilt=0.6, **keywords) > 0
+    assert episodes_of("circle", "NextStep", max_tilt=0.6, **keywords) > 0
 
 
-def test_observations_of_device_flights_stay_for_one_more_step():
-    envs = device_env("circle", 3, **TRUTH)
-    begun = envs.reset(seed=0)[0]
-    kept, (seen, *_) = begun.clone(), envs.step(torch.zeros(3, 4))
+@pytest.fixture(scope="module")
+def three():
+    return device_env("circle", 3, autoreset_mode="Disabled", **TRUTH)
+
+
+def test_observations_of_device_flights_stay_for_one_more_step(three):
+    begun = three.reset(seed=0)[0]
+    kept, (seen, *_) = begun.clone(), three.step(torch.zeros(3, 4))
     assert torch.equal(begun, kept)
     assert not torch.equal(seen, begun)
 
 
-def test_reset_mask_of_device_flights_begins_these_episodes_alone():
-    envs = device_env("circle", 3, autoreset_mode="Disabled", **TRUTH)
-    envs.reset(seed=0)
-    before = envs.step(torch.zeros(3, 4))[0].clone()
-    after, _ = envs.reset(options={"reset_mask": torch.tensor([False, True, False])})
-    assert torch.equal(after[[0, 2]], before[[0, 2]])
-    assert not torch.equal(after[1], before[1])
+def test_reset_mask_of_device_flights_begins_these_episodes_alone(three):
+    assert_mask_begins_one_episode(three)
 
 
 @pytest.mark.parametrize(
@@ -99,12 +90,12 @@ def test_reset_mask_of_device_flights_begins_these_episodes_alone():
         ([True, False, True], "an array of booleans"),
     ],
 )
-def test_wrong_reset_mask_of_device_flights_is_refused(mask, message):
+def test_wrong_reset_mask_of_device_flights_is_refused(mask, message, three):
     with pytest.raises((ValueError, TypeError), match=message):
-        device_env("circle", 3, **TRUTH).reset(options={"reset_mask": mask})
+        three.reset(options={"reset_mask": mask})
 
 
-@pytest.mark.parametrize("device", ["cuda:x", "CUDA", "meta", 5.0])
+@pytest.mark.parametrize("device", ["cuda:x", "cudas", "CUDA", "meta", 5.0])
 def test_device_that_is_no_processor_or_gpu_is_refused(device):
     with pytest.raises(ValueError, match='device must be "cpu" or "cuda", got'):
         quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 2, device=device)
