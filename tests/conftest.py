@@ -57,8 +57,7 @@ def pytest_collection_finish(session):
     gc.set_threshold(20_000)
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_pyfunc_call(pyfuncitem):
+def skip_without_extra():
     """Skip a test that needs an extra which is not installed; the reason names it."""
     try:
         return (yield)
@@ -67,3 +66,15 @@ def pytest_pyfunc_call(pyfuncitem):
         if named and not importlib.util.find_spec(named[1].lower().replace("-", "_")):
             pytest.skip(str(error))
         raise
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup():
+    """Skip a test whose fixtures need an extra."""
+    return (yield from skip_without_extra())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call():
+    """Skip a test that needs an extra."""
+    return (yield from skip_without_extra())

@@ -92,8 +92,7 @@ def test_an_absolute_position_does_not_start_a_filter():
 
 
 def test_pd_policy_refuses_transformed_observations():
-    from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
-
+    sb3_wrappers = pytest.importorskip("stable_baselines3.common.vec_env")
     single = gymnasium.make("QuadGym/Circle-v0")
     vector = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=2)
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", 2)
@@ -104,15 +103,15 @@ def test_pd_policy_refuses_transformed_observations():
         wrappers.FrameStackObservation(single, 2),
         wrappers.TimeLimit(wrappers.NormalizeObservation(single), 10),
         vector_wrappers.NormalizeObservation(vector),
-        VecNormalize(sb3),
-        VecFrameStack(sb3, 2),
+        sb3_wrappers.VecNormalize(sb3),
+        sb3_wrappers.VecFrameStack(sb3, 2),
     ):
         refused("env must return its original observations", PDPolicy, wrapped)
     for plain in (
         wrappers.TimeLimit(single, 10),
         wrappers.RecordEpisodeStatistics(single),
         vector_wrappers.RecordEpisodeStatistics(vector),
-        VecNormalize(sb3, norm_obs=False),
+        sb3_wrappers.VecNormalize(sb3, norm_obs=False),
     ):
         PDPolicy(plain)
 
