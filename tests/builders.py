@@ -80,16 +80,28 @@ def recorded_flight(task="circle", steps=12, seed=2, **keywords):
     return env, recorder.flight, np.array(observations)
 
 
-def run_python(*words, **environment):
-    """Run Python in a process with some variables of the environment; return it when it ended."""
+def run_python(*words, where=None, **environment):
+    """Run Python in a process in a folder; return it when it ended.
+
+    Variables of the environment are set or, with None, removed.
+    """
+    variables = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])} | environment
     return subprocess.run(
-        [sys.executable, *words],
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])} | environment,
+        [sys.executable, *map(str, words)],
+        cwd=where,
+        env={name: value for name, value in variables.items() if value is not None},
         capture_output=True,
         text=True,
         check=False,
         timeout=600,
     )
+
+
+class Still:
+    """A policy whose actions are zero."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 4)), None
 
 
 def put(flights, **fields):

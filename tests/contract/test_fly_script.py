@@ -1,31 +1,20 @@
 """Tests of the command `fly`."""
 
-import os
-import subprocess
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from quad_gym import IDS, Flight
 from quad_gym.commands import fly as script
 from tests import console_commands
+from tests.builders import run_python
 
-ROOT = Path(__file__).resolve().parents[2]
 pytest.importorskip("pygame")
 
 
 def fly(*options, cwd, **environment):
     if not environment:
         return console_commands.run("fly", *options, where=cwd)
-    return subprocess.run(
-        console_commands.line("fly", *options),
-        cwd=cwd,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
+    return run_python("-m", "quad_gym", "fly", *options, where=cwd, **environment)
 
 
 def test_fly_writes_video_and_flight_that_replays_to_same_video(tmp_path):

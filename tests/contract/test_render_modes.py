@@ -1,9 +1,7 @@
 """Every interface renders as Gymnasium specifies, and rendering does not change a flight."""
 
 import copy
-import os
 import pickle
-import subprocess
 import sys
 
 import gymnasium
@@ -14,7 +12,7 @@ from gymnasium.wrappers import RecordVideo
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from tests.builders import actions_of, vec_env
+from tests.builders import actions_of, run_python, vec_env
 from tests.contract.comparing import IDS, assert_same, state_of
 
 pytest.importorskip("pygame")
@@ -172,21 +170,15 @@ def test_gymnasium_records_videos(tmp_path):
         assert video.stat().st_size > 2000
 
 
-def run_python(code, **environment):
-    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
-    clean = {k: v for k, v in os.environ.items() if k not in hidden}
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env=clean | environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+def run_code(code, **environment):
+    """Run code in a process without a display."""
+    hidden = dict.fromkeys(("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
+    return run_python("-c", code, **hidden | environment)
 
 
 def test_pygame_is_imported_at_the_first_drawing():
     """Environment variables do not change, either."""
-    done = run_python(
+    done = run_code(
         """
 import os, sys, gymnasium, numpy as np, quad_gym
 from quad_gym.flights.record import FlightRecorder
@@ -211,7 +203,7 @@ assert dict(os.environ) == before
 
 def test_rendering_without_pygame_raises_a_hint():
     """Stable-Baselines3 requests "rgb_array" for every environment that it makes from an id."""
-    done = run_python(
+    done = run_code(
         """
 import sys
 sys.modules["pygame"] = None
@@ -236,7 +228,7 @@ for e in (env, vector):
 
 
 def test_a_window_shows_the_flight_and_closes_twice():
-    done = run_python(
+    done = run_code(
         """
 import numpy as np, pygame
 from tests.builders import single_env
@@ -267,7 +259,7 @@ except RuntimeError as error:
 @pytest.mark.parametrize("variables", [{}, {"SDL_VIDEODRIVER": "x11"}])
 def test_window_without_a_display_is_refused(variables):
     """SDL silently falls back to a driver without a display, and flights would not end."""
-    done = run_python(OPEN_A_WINDOW, **variables)
+    done = run_code(OPEN_A_WINDOW, **variables)
     assert "cannot open a window: " in done.stdout, done.stderr
     assert 'render_mode="rgb_array"' in done.stdout
     assert "SDL_VIDEODRIVER=dummy" in done.stdout

@@ -9,15 +9,9 @@ from quad_gym.records import GateDecision
 from quad_gym.rendering import Renderer, colors, record_flight, save_video, tile
 from quad_gym.rendering.geometry import fixed_view
 from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
+from tests.builders import Still
 
 pygame = pytest.importorskip("pygame")
-
-
-class Still:
-    """A policy whose actions are zero."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        return np.zeros((len(observation), 4)), None
 
 
 @pytest.fixture(scope="module")

@@ -5,22 +5,13 @@ import pytest
 
 from quad_gym.rendering import Side, SideBySide, record_flight, save_side_by_side
 from quad_gym.rendering.side_by_side import LEGEND, SIDE
+from tests.builders import Still
 
 pytest.importorskip("pygame")
 
 
-class Still:
-    """A policy with a constant command."""
-
-    def __init__(self, thrust):
-        self.thrust = thrust
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        return np.tile([self.thrust, 0.0, 0.0, 0.0], (len(observation), 1)), None
-
-
 def side_of(task, steps, label="trained on truth", crashed=False):
-    flight = record_flight(Still(0.0), f"QuadGym/{task}-v0", seed=1, max_episode_steps=steps)
+    flight = record_flight(Still(), f"QuadGym/{task}-v0", seed=1, max_episode_steps=steps)
     return Side(flight, label, "collision" if crashed else "time_limit", crashed)
 
 

@@ -1,10 +1,7 @@
 """Compiled code depends on every source that it reaches, and on no other."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +9,7 @@ import pytest
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.digest import digest_of_function
+from tests.builders import run_python
 
 ROOT = Path(__file__).parents[3]
 SCRIPT = """
@@ -87,15 +85,7 @@ def digests(tmp_path_factory):
         (folder / "tests" / name).write_text(text)
     edits = [(file, old, new) for file, old, new, _ in EDITS.values()]
     arguments = [json.dumps([MOVE, UPDATE, HELPER]), json.dumps(edits)]
-    process = subprocess.run(
-        [sys.executable, "-c", SCRIPT, *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    process = run_python("-c", SCRIPT, *arguments, where=folder, PYTHONPATH=str(folder))
     assert process.returncode == 0, process.stderr
     first, *edited = json.loads(process.stdout)
     return first, dict(zip(EDITS, edited, strict=True))
