@@ -27,7 +27,7 @@ LARGEST = 3.0  #: limit on each innovation in the mean, in standard deviations, 
 _MEMORY, _BIASED = 0.02, 0.55
 """Weight of the latest innovation in their mean, of standard deviation sqrt(0.02 / 1.98) = 0.1, and
 the mean beyond which they are not white: once in a million times by chance."""
-_CORRECTION_TIME, _ONE_WAY = 3.0, 5.0
+CORRECTION_TIME, _ONE_WAY = 3.0, 5.0
 """Time over which corrections of the biases are summed [s], and the standard deviations of their
 sum above which they go one way."""
 _LONG_TIME, _ONE_WAY_LONG = 12.0, 24.0
@@ -84,7 +84,7 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
     L is the factor before the update, L9 has the `columns` that the update has changed.
     """
     passed = (flight.tick - flight.corrected_tick) * p.dt
-    kept = maximum(1.0 - passed / _CORRECTION_TIME, 0.0)
+    kept = maximum(1.0 - passed / CORRECTION_TIME, 0.0)
     kept_long = maximum(1.0 - passed / _LONG_TIME, 0.0)
     for i in range(6):
         removed = zero_like(kept)

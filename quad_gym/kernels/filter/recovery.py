@@ -22,10 +22,13 @@ D'Souza (editors), Navigation Filter Best Practices, NASA/TP-2018-219822.
 
 import math
 
+import numpy as np
+
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covariance
 from quad_gym.kernels.filter.measurements import call_sensors, flag_failure
 from quad_gym.kernels.filter.monitoring import (
+    CORRECTION_TIME,
     RECENT,
     biased,
     drifts_suddenly,
@@ -33,7 +36,7 @@ from quad_gym.kernels.filter.monitoring import (
     forget_drift_corrections,
     one_way,
 )
-from quad_gym.kernels.filter.slow import fill_slow, keep_factor
+from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stationary
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import diagonal, dot, load33, outer
@@ -68,7 +71,6 @@ twice the largest one that the gate explains."""
 _STRICT = 0.5
 """Ratio of the limits for a receiver that is used again and the gate: its false-alarm probability,
 for position and velocity, is about the root of the gate's."""
-_MORE = 16.0  #: factor on the variances of position and velocity where the biases are reset
 _ACCEL_OFFSET, _GYRO_OFFSET = 0.5, 0.09
 """Largest offsets of cheap sensors in data sheets [m/s^2], [rad/s]: TDK ICM-20948."""
 MAX_ANGLE = math.pi / math.sqrt(3.0)
@@ -170,6 +172,8 @@ def glitches(flight, p, settings, group, nis, limit):
     since = (flight.tick - flight.accepted_tick[group]) * p.dt
     step = (nis > OUTLIER * maximum(flight.nis_ratio, 1.0) * limit) & (since < RECENT)
     found = ((row < 1.0) & step) | ((row > 0.0) & (flight.stepped[group] > 0.0))
+    if group == FEATURE_BLOCKS:  # most features of an image have no error in common
+        found = no_lane(flight.tick)
     if group in (POSITION_BLOCK, VELOCITY_BLOCK):  # of one receiver
         other = POSITION_BLOCK + VELOCITY_BLOCK - group
         found = found | ((flight.stepped[other] > 0.0) & (flight.rejected_in_row[other] > 0.0))
@@ -241,34 +245,43 @@ def reset_heading(P, R_BI, states, lanes, variance):
 
 
 @kernel
-def _reset_motion(flight, p, P, states, lanes, accel, gyro):
-    """Reset attitude and biases to their variances at the start, and cut their covariances.
+def _reset_motion(flight, p, slow, P, drifted, jumped, accel, gyro):
+    """Reset attitude and biases, and what follows from them: velocity, position and its drift.
 
-    Position and velocity follow from them: their variances are multiplied by `_MORE`, and the
-    velocity's are at least those that such a tilt causes in the time `RECENT`.
-    Those of the biases are at least nine times the squares of corrections, `accel` and `gyro`, that
-    have gone one way, but no sensor has larger offsets than `_ACCEL_OFFSET` and `_GYRO_OFFSET`.
+    Where the estimate has `drifted` off, attitude and biases get the variances of their start.
+    Where corrections show that a bias has `jumped`, their sum, of the squares `accel` and `gyro`,
+    may be a third of the jump. No sensor has larger offsets than `_ACCEL_OFFSET` and
+    `_GYRO_OFFSET`. The attitude has turned by the jump for the time of the sum, but by no more than
+    at the start.
     """
-    R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
-    k, start = R_BI.T[2], p.heading_sigma * p.heading_sigma
-    heading = select(lanes, maximum(dot(k, P_ee @ k), start), 0.0)
-    level = p.initial_tilt_sigma > 0.0
-    tilt = select(level, p.initial_tilt_sigma, p.first_baseline_sigma)
-    tilt = tilt * tilt
-    speed = p.gravity * p.gravity * tilt * RECENT * RECENT
-    for row, least in ((R, zero_like(speed)), (V, speed)):
-        own = load_block(P, row, row)
-        x, y = maximum(_MORE * own[0][0], least), maximum(_MORE * own[1][1], least)
-        reset_variances(P, row, states, lanes, (x, y, _MORE * own[2][2]))
+    k, lanes, P_ee = load33(flight.R_hat).T[2], drifted | jumped, load_block(P, E, E)
+    T, states = select(drifted, p.reset_timeout, CORRECTION_TIME), 15
+    accel = minimum(9.0 * accel, _ACCEL_OFFSET * _ACCEL_OFFSET)
+    gyro = minimum(9.0 * gyro, _GYRO_OFFSET * _GYRO_OFFSET)
+    turned = select(drifted, np.inf, T * T * gyro)
+    leaned = accel / (p.gravity * p.gravity) + turned
+    tilt = select(p.initial_tilt_sigma > 0.0, p.initial_tilt_sigma, p.first_baseline_sigma)
+    tilt = minimum(tilt * tilt, leaned)
+    heading = minimum(p.heading_sigma * p.heading_sigma, turned)
+    heading = select(lanes, maximum(dot(k, P_ee @ k), heading), 0.0)
+    own = select(drifted, 1.0, 0.0)
+    accel = maximum(accel, own * (p.accel_bias_sigma * p.accel_bias_sigma))
+    gyro = maximum(gyro, own * (p.gyro_bias_sigma * p.gyro_bias_sigma))
+    speed = (p.gravity * p.gravity * tilt + accel) * T * T
+    place = 0.25 * T * T * speed
+    if slow is not None:
+        states = 15 + slow.slow_states
+        if slow.estimates_drift:
+            for i in range(3):
+                drift = minimum(place, stationary(p, i))
+                reset_variance(P, D + i, states, lanes, drift)
+    reset_variances(P, R, states, lanes, (place, place, place))
+    reset_variances(P, V, states, lanes, (speed, speed, speed))
     reset_variances(P, E, states, lanes, (tilt, tilt, tilt))
     P_ee = load_block(P, E, E)
     more = maximum(heading - dot(k, P_ee @ k), 0.0)
     store_block(P, E, E, P_ee + outer(more * k, k))
-    accel = minimum(9.0 * accel, _ACCEL_OFFSET * _ACCEL_OFFSET)
-    accel = maximum(p.accel_bias_sigma * p.accel_bias_sigma, accel)
     reset_variances(P, BA, states, lanes, (accel, accel, accel))
-    gyro = minimum(9.0 * gyro, _GYRO_OFFSET * _GYRO_OFFSET)
-    gyro = maximum(p.gyro_bias_sigma * p.gyro_bias_sigma, gyro)
     reset_variances(P, BG, states, lanes, (gyro, gyro, gyro))
 
 
@@ -286,7 +299,18 @@ def _reset_drift(flight, p, P, states, lanes):
 
 
 @kernel
-def _choose(flight, p, work, settings, mask, drifted):
+def _colored(flight, p, settings):
+    """Lanes in which innovations of a sensor that no other supports are not white."""
+    found = no_lane(flight.tick)
+    for group in range(SENSOR_GROUPS):
+        colored = biased(flight, p, group)
+        if any_of(colored):
+            found = found | (colored & logical_not(supported(flight, p, settings, group)))
+    return found
+
+
+@kernel
+def _choose(flight, p, work, settings, mask):
     """Fill work.reset with the groups to which states are reset, and work.drifted.
 
     Returns:
@@ -298,13 +322,9 @@ def _choose(flight, p, work, settings, mask, drifted):
         first, refused = FIRST_GROUP[sensor], none
         for group in range(first, first + GROUP_COUNT[sensor]):
             refused = refused | (flight.rejected_in_row[group] >= 2.0)
-            colored = mask & biased(flight, p, group)
-            if group == POSITION_BLOCK:  # fixes drift
-                colored = colored & logical_not(supported(flight, p, settings, group))
-            drifted = drifted | colored
         sensors = sensors + select(refused, 1.0, 0.0)
-    work.drifted = select(drifted, 1.0, 0.0)
-    if not any_of((mask & (sensors > 0.0)) | drifted):
+    work.drifted, drifted = zero_like(flight.tick), none
+    if not any_of(mask & (sensors > 0.0)):
         for group in range(SENSOR_GROUPS):
             work.reset[group] = zero_like(flight.tick)
             work.alone[group] = zero_like(flight.tick)
@@ -340,8 +360,8 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
     """Reset states to sensors that were refused for too long, in the lanes `mask`."""
     accel, corrected_a = one_way(flight, 0)
     gyro, corrected_g = one_way(flight, 3)
-    accel, gyro = mask & accel, mask & gyro
-    alarmed = _choose(flight, p, work, settings, mask, accel | gyro)
+    jumped = mask & (accel | gyro | _colored(flight, p, settings))
+    alarmed = jumped | _choose(flight, p, work, settings, mask)
     moved = no_lane(flight.tick)
     if slow is not None:
         if slow.estimates_drift:
@@ -357,12 +377,12 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
         states = 15 + slow.slow_states
         fill_slow(flight, slow, P)
     drifted = work.drifted > 0.0
-    _reset_motion(flight, p, P, states, drifted, corrected_a, corrected_g)
+    _reset_motion(flight, p, slow, P, drifted, jumped, corrected_a, corrected_g)
     if slow is not None:
         iron = slow.aid_vector[Aid.MAGNETOMETER]
         if iron >= 0:  # it was estimated with the attitude
             own = p.slow_sigma[iron] * p.slow_sigma[iron]
-            reset_variances(P, D + iron, states, drifted, (own, own, own))
+            reset_variances(P, D + iron, states, drifted | jumped, (own, own, own))
         if slow.estimates_drift:
             _reset_drift(flight, p, P, states, moved)
     call_sensors(flight, p, p, settings, work, stages, Act.RESET, 0)
@@ -376,8 +396,8 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
         flight.resets[group] = flight.resets[group] + work.reset[group]
         row = flight.rejected_in_row[group]
         flight.rejected_in_row[group] = select(work.reset[group] > 0.0, 0.0, row)
-    reset(flight, drifted, 0.0, "innovation_mean")
-    forget_corrections(flight, drifted)
+    reset(flight, drifted | jumped, 0.0, "innovation_mean")
+    forget_corrections(flight, drifted | jumped)
     if slow is not None:
         if slow.estimates_drift:
             forget_drift_corrections(flight, alarmed)

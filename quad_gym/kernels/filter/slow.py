@@ -52,6 +52,13 @@ def begin_slow(flight, p, slow, mask):
 
 
 @kernel
+def stationary(p, i):
+    """Variance of a slow error in the long run."""
+    a, s = p.slow_decay[i], p.slow_drive[i]
+    return s * s / ((1.0 - a) * (1.0 + a))
+
+
+@kernel
 def _scale_rows(a, m):
     """Diag(a) M."""
     return (a[0] * m[0], a[1] * m[1], a[2] * m[2])

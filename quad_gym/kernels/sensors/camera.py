@@ -182,7 +182,7 @@ def _gate(flight, p, work, settings, k):
 
     A feature whose predicted direction is too uncertain for a linear model is masked, too: the
     error of a direction is bounded, so it would pass any gate, and its update would be wrong and
-    overconfident. An image counts as rejected if most of its features are; otherwise rejected ones
+    overconfident. An image counts as rejected if half of its features are; otherwise rejected ones
     do not count.
     """
     again, zero = work.again > 0.0, zero_like(p.sigma_beta)
@@ -204,7 +204,7 @@ def _gate(flight, p, work, settings, k):
             up = up + select(used, clip(scaled[1], -LARGEST, LARGEST), 0.0)
             mask_rejected(flight, work, settings, k, block, valid, 3.0)
             k += 3
-    first, most = seen > 0.0, refused > 0.5 * seen
+    first, most = seen > 0.0, refused >= 0.5 * seen
     count, few, s = maximum(seen, 1.0), maximum(seen - refused, 1.0), FEATURE_BLOCKS
     mean, scatter, limit = (
         select(most, total / count, kept / few),
@@ -229,7 +229,7 @@ def _reset(flight, p, work, settings):
         nu = flight.innovation[FEATURE_BLOCKS + i]
         seen = lanes & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
         square = select(seen, nu[0] * nu[0] + nu[1] * nu[1], 0.0)
-        distance = norm(load3(p.features[i]) - load3(flight.r_hat))
+        distance = minimum(norm(load3(p.features[i]) - load3(flight.r_hat)), p.max_range)
         angle = maximum(angle, square)
         offset = maximum(offset, square * distance * distance)
     T = time_of(flight, p, FEATURE_BLOCKS)

@@ -15,6 +15,7 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R, V
 from quad_gym.kernels.filter.recovery import reset_variances, time_of
 from quad_gym.kernels.filter.rows import columns_of, lever_column, put_block, put_column
+from quad_gym.kernels.filter.slow import stationary
 from quad_gym.kernels.maths.elementary import exp, log
 from quad_gym.kernels.maths.linalg import diagonal, dot, keep, load3, load33, rounded, vector
 from quad_gym.kernels.maths.matrices import load_column3
@@ -81,14 +82,7 @@ def reset(flight, p, work, settings, states, lanes, nu):
     reset_variances(work.P, V, states, drifted, (speed, speed, speed))
     drift = (zero, zero, zero)
     if settings.estimates_drift:
-        drift = (_stationary(p, 0), _stationary(p, 1), _stationary(p, 2))
+        drift = (stationary(p, 0), stationary(p, 1), stationary(p, 2))
         reset_variances(work.P, D, states, lanes, drift)
     squares = (square + drift[0], square + drift[1], square + drift[2])
     reset_variances(work.P, R, states, lanes, squares)
-
-
-@kernel
-def _stationary(p, i):
-    """Variance of the slow error of positions in the long run."""
-    a, s = p.slow_decay[i], p.slow_drive[i]
-    return s * s / ((1.0 - a) * (1.0 + a))
