@@ -575,6 +575,20 @@ def test_fictitious_position_keeps_the_tilt_without_gnss():
     assert result.sensors == suite
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time,accel_x\n0,1\n", "a log must have a column gyro_x"),
+        ("time,gyro\n0,inf\n", "columns of a log must be"),
+        ("time,barometer\n0,inf\n1,2\n", "column barometer must be finite"),
+    ],
+)
+def test_errors_of_tables_name_the_file(text, message, tmp_path):
+    (tmp_path / "mine.csv").write_text(text)
+    with pytest.raises(ValueError, match=f"^mine.csv: {message}"):
+        read_log(tmp_path / "mine.csv")
+
+
 def test_map_of_columns_converts_units_axes_clocks_and_makes_measurements(flight, tmp_path):
     """The table is in g, deg/s, mG and hPa, its body is forward, right, down, and time is in ms."""
     near = [int(np.argmin(np.abs(flight.baro_time - t))) for t in flight.time]

@@ -97,7 +97,10 @@ def _recording(log: Any, body: str, columns: Path | str | None) -> RawLog:
         if euroc.is_euroc(path):
             return euroc.read_euroc(path)
         given = tables.csv_columns(path)
-        return tables.recording_of(tables.checked_columns(given), body, path.name)
+        try:
+            return tables.recording_of(tables.checked_columns(given), body, path.name)
+        except ValueError as error:
+            raise ValueError(f"{path.name}: {error}") from None
     if isinstance(log, Mapping):
         given = log
     elif hasattr(log, "columns") and hasattr(log, "to_numpy"):
