@@ -26,7 +26,10 @@ def test_ppo_trains_from_an_id():
     assert model.get_env().render_mode == "rgb_array"
 
 
-@pytest.mark.parametrize("name", ["DummyVecEnv", "SubprocVecEnv"])
+@pytest.mark.parametrize(
+    "name",
+    ["DummyVecEnv", pytest.param("SubprocVecEnv", marks=pytest.mark.slow)],  # both import torch
+)
 def test_ppo_trains_in_vector_environments_of_stable_baselines(name):
     envs = env_util.make_vec_env(
         "quad_gym:QuadGym/Circle-v0",  # other processes import the module before the colon
