@@ -15,6 +15,7 @@ from baselines.exporting.filter_library import HEADER, TARGETS
 from baselines.exporting.source import filled
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.filters import LONGEST_STEP
+from quad_gym.estimation.results import COLUMNS
 from quad_gym.estimation.starts import empty_fix, level_start
 from quad_gym.kernels.entries import FILTER_STAGES
 from quad_gym.kernels.library import core_symbol
@@ -38,19 +39,19 @@ from quad_gym.records import (
     VELOCITY_BLOCK,
     WORK_BLOCK,
     Aid,
-    Operation,
     offset_of,
     room_of,
 )
-from quad_gym.records.inputs import EVENT, FIX, INPUT, PENDING, WINDOW, Kept, Outcome
+from quad_gym.records.inputs import EVENT, FIX, INPUT, MEMORY, PENDING, WINDOW, Kept, Outcome
 
 _ENTRIES = tuple(
     f"quad_gym.kernels.exported:{name}"
-    for name in ("take", "predict", "update", "prepare", "start", "keep")
+    for name in ("take", "prepare", "start", "state", "covariance", "seen")
 )
 _RECORDS = {
     **{"sample": SAMPLE, "measurement": MEASUREMENT, "start": START, "fix": FIX, "input": INPUT},
     **{"operation": OPERATION, "event": EVENT, "pending": PENDING, "window": WINDOW},
+    "memory": MEMORY,
 }
 """Records in the memory of an exported filter, by their names there."""
 _OUTCOMES = {
@@ -58,7 +59,7 @@ _OUTCOMES = {
     Outcome.NOT_STARTED: "call an init function first",
     Outcome.NOT_FINITE: "an argument is infinite or not a number",
     Outcome.OUT_OF_RANGE: "an argument is out of the range that its comment states",
-    Outcome.TOO_OLD: "the time stamp is before qg_oldest_time",
+    Outcome.TOO_OLD: "older than the memory of the filter, which export --log or QG_EVENTS extends",
     Outcome.TOO_NEW: "the time stamp is more than QG_LONGEST_STEP later than the filter",
     Outcome.FULL: "too many measurements wait for the prediction up to their time stamps",
     Outcome.NO_HEADING: "a start needs one of: baseline, heading, magnetometer, course",
@@ -148,6 +149,7 @@ class Sources:
             "qg_core_settings": engine.settings.tobytes(),
             "qg_core_first": level_start(self.suite).tobytes(),
             "qg_core_fix": empty_fix(self.suite).tobytes(),
+            "qg_core_parts": np.array([len(self.copied), *itertools.chain(*self.copied)]).tobytes(),
         }
 
     def texts(self, flash: int) -> dict[str, bytes]:
@@ -183,13 +185,10 @@ class Sources:
             "WORK_WORDS": WORK_BLOCK.itemsize // 8,
             "STEPS_WORDS": STEP_BLOCK.itemsize // 8,
             "COPY_WORDS": sum(length for _, length in self.copied),
-            "COPIED": ", ".join(f"{{{place}, {length}}}" for place, length in self.copied),
             "SKIPPED": self.room.skipped,
             "STAGES": len(Stage),
             "KEPT": KEPT,
-            "OF_MASK": offset_of(WORK_BLOCK, "mask"),
             "OF_LEVEL": offset_of(STEP_BLOCK, "level"),
-            "OF_L": offset_of(FLIGHT_BLOCK, "L"),
             "OF_STATUS": offset_of(FLIGHT_BLOCK, "filter_status"),
         }
         values["STRUCTS"] = "\n".join(
@@ -206,8 +205,9 @@ class Sources:
             f"    QG_{outcome.name} = {int(outcome)}, /* {words} */\n"
             for outcome, words in _OUTCOMES.items()
         )
+        values["WORDS"] = ", ".join(f'"{words}"' for words in _OUTCOMES.values())
+        values["COLUMNS"] = ",".join((*COLUMNS, "diverged"))
         values |= {f"A_{kind.name}": int(kind) for kind in Kept}
-        values |= {operation.name: int(operation) for operation in Operation}
         return values
 
     def _suite_values(self) -> dict[str, Any]:

@@ -17,7 +17,6 @@ Samples are rotated to B, and time stamps corrected by the suite's delays. Posit
 velocities are in G, positions relative to the reference antenna; their sigmas are in I.
 """
 
-import bisect
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -42,7 +41,6 @@ class FilterCalls:
 
     def __init__(self, suite: SensorSuite) -> None:
         self._suite, self.rows = suite, list[str]()
-        self._waiting: list[tuple[float, str, int, Measurement]] = []  # ahead of the filter
         if suite.gnss is not None:
             self._add("origin", *suite.gnss.reference_antenna_G)
 
@@ -78,25 +76,17 @@ class FilterCalls:
         if barometer_from_start and self._suite.barometer is not None:
             self._add("level")
 
-    def take(self, given: Any, name: str, place: int, measurement: Measurement | None) -> None:
+    def take(self, given: Any, name: str, measurement: Measurement | None) -> None:
         """Add the calls for an INPUT that a filter has taken: a sample, or a row of a stream."""
         now, time = float(given["now"]), float(given["time"])
         if measurement is not None:
             if given["outcome"] == Outcome.OK:
-                bisect.insort(self._waiting, (time, name, place, measurement))
-                self._update_until(now)
+                self._update(name, time, measurement)
             return
         if given["keeps"]:
             self.keep()
         if time - now > SAME_TIME and math.isfinite(given["gyro"][0]):
-            self._update_until(time)
             self._add("imu", *given["gyro"], *given["accel"], time - now)
-
-    def _update_until(self, time: float) -> None:
-        """Add the updates up to a time."""
-        while self._waiting and self._waiting[0][0] <= time + SAME_TIME:
-            stamp, name, _, measurement = self._waiting.pop(0)
-            self._update(name, stamp, measurement)
 
     def _update(self, name: str, time: float, given: Measurement) -> None:
         """Add the measurement of a stream with its time stamp."""

@@ -37,7 +37,7 @@ class InputHistory:
         """Begin at a time [s], with no events."""
         self._state[:] = np.zeros(1, WINDOW)
         settings = {"length": self.window, "longest": self._longest, "ahead": math.inf}
-        for name, value in {**settings, "copy_every": _EVERY, "time": time}.items():
+        for name, value in {**settings, "copy_every": _EVERY, "time": time, "oldest": time}.items():
             self._state[name] = value
         self._limit_numbers()
 
@@ -49,9 +49,7 @@ class InputHistory:
     @property
     def oldest(self) -> float:
         """Earliest time stamp that can still be included [s]."""
-        if not self._state["events"][0]:
-            return self.time
-        return max(self.time - self.window, float(self._memory[0]["start"][0]))
+        return float(self._state["oldest"][0])
 
     @property
     def samples(self) -> NDArray[Any]:

@@ -165,7 +165,8 @@ class Player:
             own = first + np.flatnonzero(kinds[first:] == number)
             chosen[own] = self.measured.present(number, places[own])
         taken = np.flatnonzero(chosen)
-        ranks = np.argsort(np.argsort(names)) + 1  # by name
+        kinds_of = ["gnss" if name == "attitude" else name for name in names]
+        ranks = np.unique(kinds_of, return_inverse=True)[1] + 1  # by name
         ranks[0] = 0
         times: list[Floats] = []
         before = -1  # the sample that holds now, of an IMU of instants
@@ -228,4 +229,4 @@ class Player:
         if self.calls is not None:
             for given, kind, place in zip(inputs, kinds.tolist(), places.tolist(), strict=True):
                 measurement = self.measured.at(names[kind], place) if kind else None
-                self.calls.take(given, names[kind], place, measurement)
+                self.calls.take(given, names[kind], measurement)

@@ -19,6 +19,17 @@ SIGMAS = tuple(
 )
 """Columns of the standard deviations of estimates."""
 
+COLUMNS = (
+    "time",
+    *(
+        f"{name}_{axis}"
+        for name in ("position", "velocity", "quaternion", "accel_bias", "gyro_bias")
+        for axis in ("wxyz" if name == "quaternion" else "xyz")
+    ),
+    *SIGMAS,
+)
+"""Columns of estimates in a table."""
+
 
 @dataclass(frozen=True, eq=False)
 class Measured:
@@ -74,12 +85,9 @@ class Estimates:
 
     def columns(self) -> dict[str, Floats]:
         """Return the estimates as a table: columns of one number each, by name."""
-        table = {"time": self.time}
-        for name in ("position", "velocity", "quaternion", "accel_bias", "gyro_bias"):
-            values = getattr(self, name)
-            axes = "wxyz" if values.shape[1] == 4 else "xyz"
-            table.update({f"{name}_{axis}": values[:, i] for i, axis in enumerate(axes)})
-        return table | dict(zip(SIGMAS, self.sigma.T, strict=True))
+        kinematics = self.time, self.position, self.velocity, self.quaternion
+        table = np.column_stack([*kinematics, self.accel_bias, self.gyro_bias, self.sigma])
+        return dict(zip(COLUMNS, table.T, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

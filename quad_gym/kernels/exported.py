@@ -1,10 +1,11 @@
 """Functions of a filter's library for other processors (`baselines/exporting/filter_library.py`).
 
-They do what `single.start_filter` and `tape.run_tape` do, one operation a call, on records.
+They do what `single.start_filter`, `window.take_inputs` and `tape.run_tape` do, one input a call.
 """
 
 import math
 
+import numpy as np
 from numba import types
 from numba.np.numpy_support import from_dtype
 
@@ -12,7 +13,7 @@ from quad_gym.kernels.compiling import entry, kernel
 from quad_gym.kernels.filter.still import set_heading, start_still, turned
 from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.linalg import load3, store
-from quad_gym.kernels.simd.addresses import array_at
+from quad_gym.kernels.simd.addresses import array_at, store_lanes
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.single import begin_filter
 from quad_gym.kernels.stages import STAGE_TABLE
@@ -24,6 +25,7 @@ from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     FLIGHT_BLOCK,
+    KEPT,
     MAX_FEATURES,
     MEASUREMENT,
     OPERATION,
@@ -35,45 +37,38 @@ from quad_gym.records import (
     STEP_BLOCK,
     VELOCITY_BLOCK,
     WORK_BLOCK,
+    Operation,
 )
 from quad_gym.records.inputs import (
+    ESTIMATE,
     EVENT,
     FARTHEST_FIX,
     FIX,
     INPUT,
+    MEMORY,
     PENDING,
     WINDOW,
     Outcome,
 )
 
-_FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _SAMPLE, _MEASUREMENT, _START = map(
+_FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _MEASUREMENT, _START = map(
     from_dtype,
     (
         *(FLIGHT_BLOCK, PARAMS_BLOCK, STEP_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE),
-        *(SAMPLE, MEASUREMENT, START),
+        *(MEASUREMENT, START),
     ),
 )
-_WINDOW, _INPUT, _FIX = map(from_dtype, (WINDOW, INPUT, FIX))
+_WINDOW, _INPUT, _FIX, _MEMORY, _ESTIMATE = map(from_dtype, (WINDOW, INPUT, FIX, MEMORY, ESTIMATE))
+_PREDICT, _UPDATE, _, _RESTORE, _ = map(int, Operation)
 _OK, _, _NOT_FINITE, _RANGE, _, _, _, _NO_HEADING, _CONTRADICTION = map(int, Outcome)
 _NOTHING = (0.0, 0.0, 0.0)
-_events_at, _samples_at, _waits_at, _operations_at = map(
-    array_at, (EVENT, SAMPLE, PENDING, OPERATION)
+_events_at, _samples_at, _waits_at, _operations_at, _measurements_at = map(
+    array_at, (EVENT, SAMPLE, PENDING, OPERATION, MEASUREMENT)
+)
+_words_at, _numbers_at, _reals_at, _singles_at = map(
+    array_at, (np.uint64, np.int64, np.float64, np.float32)
 )
 _NUMBERS = (_FLIGHT, _PARAMS, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE)
-
-
-@entry(signature=types.none(*_NUMBERS, _SAMPLE))
-def predict(flight, params, ticks, steps, settings, work, table, sample):
-    """Propagate the estimate over the time of a sample."""
-    mask = lanes_of(work).mask
-    predict_sample(lanes_of(flight), params, ticks, steps, settings, work, table, mask, sample)
-
-
-@entry(signature=types.none(*_NUMBERS, _MEASUREMENT))
-def update(flight, params, ticks, steps, settings, work, table, measurement):
-    """Update the estimate with the measurements of an instant."""
-    mask = lanes_of(work).mask
-    update_with(lanes_of(flight), params, ticks, steps, settings, work, table, mask, measurement)
 
 
 @kernel
@@ -138,6 +133,8 @@ def check_measurement(m):
     o = o if o != _OK else found
     seen = 0.0
     for k in range(MAX_FEATURES):
+        if m.pixels[k, 0] != m.pixels[k, 0] or m.pixels[k, 1] != m.pixels[k, 1]:
+            valid[FEATURE_BLOCKS + k] = 0.0  # not seen
         found = _check_triple(m.pixels[k], valid[FEATURE_BLOCKS + k])
         o = o if o != _OK else found
         seen = max(seen, valid[FEATURE_BLOCKS + k])
@@ -151,23 +148,66 @@ def check_measurement(m):
     return o
 
 
-@entry(signature=types.none(_WINDOW, *[types.int64] * 4, _INPUT, _MEASUREMENT))
-def take(window, events, samples, waits, operations, given, measurement):
-    """Write the operations that process an input; the memory is at these addresses."""
+@kernel
+def _copy(memory, parts, number, restores):
+    """Copy the used parts of the filter's memory, or restore them from a copy."""
+    words = _words_at(memory.flight, parts[1] + parts[2 * parts[0] - 1])
+    copy = _words_at(memory.copies + 8 * number * memory.copy_words, memory.copy_words)
+    k = 0
+    for part in range(parts[0]):
+        for i in range(parts[2 * part + 1], parts[2 * part + 1] + parts[2 * part + 2]):
+            if restores:
+                words[i] = copy[k]
+            else:
+                copy[k] = words[i]
+            k += 1
+
+
+@kernel
+def _run(flight, params, ticks, steps, settings, work, table, window, memory, parts):
+    """Run the operations that the window has written."""
+    block, mask = lanes_of(flight), lanes_of(work).mask
+    operations = _operations_at(memory.operations, window.operations)
+    samples = _samples_at(memory.samples, window.room[0])
+    measurements = _measurements_at(memory.measurements, window.room[1])
+    for k in range(window.operations):
+        code, i = operations[k].code, operations[k].index
+        if code == _PREDICT:
+            predict_sample(block, params, ticks, steps, settings, work, table, mask, samples[i])
+        elif code == _UPDATE:
+            update_with(block, params, ticks, steps, settings, work, table, mask, measurements[i])
+        else:
+            _copy(memory, parts, operations[k].target, code == _RESTORE)
+    window.operations = 0
+
+
+@entry(signature=types.none(*_NUMBERS, _WINDOW, _MEMORY, types.int64, _INPUT, _MEASUREMENT))
+def take(flight, params, ticks, steps, settings, work, table, window, memory, parts, given, m):
+    """Process a sample or the measurement m.
+
+    `parts` is the address of the number of parts of the filter's memory that copies have, and of
+    the place and length of each, in words.
+    """
     known = math.isfinite(given.time) and math.isfinite(given.dt)
     if not (known and _is_all_finite(given.gyro) and _is_all_finite(given.accel)):
         given.outcome = _NOT_FINITE
     elif given.rank > 0:
-        given.outcome = check_measurement(measurement)
+        given.outcome = check_measurement(m)
     if given.outcome == _OK:
         given.outcome = take_input(
             window,
-            _events_at(events, window.event_room),
-            _samples_at(samples, window.room[0]),
-            _waits_at(waits, window.waiting_room),
-            _operations_at(operations, 0),
+            _events_at(memory.events, window.event_room),
+            _samples_at(memory.samples, window.room[0]),
+            _waits_at(memory.waits, window.waiting_room),
+            _operations_at(memory.operations, 0),
             given,
         )
+    if given.outcome == _OK:
+        if given.rank > 0:
+            _measurements_at(memory.measurements, window.room[1])[given.index] = m
+        count = _numbers_at(parts, 1)[0]
+        numbers = _numbers_at(parts, 1 + 2 * count)
+        _run(flight, params, ticks, steps, settings, work, table, window, memory, numbers)
 
 
 @kernel
@@ -242,6 +282,7 @@ def prepare(first, fix):
 def start(block, params, settings, work, first, fix):
     """Start the filter from a fix that `prepare` has accepted."""
     flight, p = lanes_of(block), lanes_of(params)
+    work.mask[0] = 1.0
     noise, tilt, speed = (
         load3(p.position_sigma_I),
         p.initial_tilt_sigma,
@@ -278,7 +319,63 @@ def start(block, params, settings, work, first, fix):
                 flight.L[3 + i, 3 + i] = fix.velocity_sigma
 
 
-@entry(signature=types.none(_FLIGHT, types.int64))
-def keep(flight, address):
-    """Store the estimate in a row of numbers, see KEPT."""
+@kernel
+def _quaternion(R):
+    """The quaternion of R_BI, as `quad_gym.rotations.dcm_to_quaternion` rounds it."""
+    a, b, c, d, e, f, g, h, i = R[0], R[1], R[2], R[3], R[4], R[5], R[6], R[7], R[8]
+    q = (1.0 + a + e + i, f - h, g - c, b - d)
+    largest = q[0]
+    if 1.0 + a - e - i > largest:
+        largest = 1.0 + a - e - i
+        q = (f - h, largest, b + d, g + c)
+    if 1.0 - a + e - i > largest:
+        largest = 1.0 - a + e - i
+        q = (g - c, b + d, largest, f + h)
+    if 1.0 - a - e + i > largest:
+        q = (b - d, g + c, f + h, 1.0 - a - e + i)
+    return q, math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+
+
+@entry(signature=types.none(_FLIGHT, _WINDOW, types.int64, _ESTIMATE))
+def state(flight, window, address, e):
+    """Write the estimate; a row of KEPT numbers is at the address."""
     keep_estimate(lanes_of(flight), address)
+    row = _reals_at(address, KEPT)
+    q, size = _quaternion(row[6:15])
+    for i in range(3):
+        e.position[i], e.velocity[i] = row[i], row[3 + i]
+        e.accel_bias[i], e.gyro_bias[i] = row[15 + i], row[18 + i]
+        for j in range(3):
+            e.R_BI[i, j] = row[6 + 3 * i + j]
+    for i in range(4):
+        e.quaternion[i] = q[i] / size
+    for i in range(15):
+        e.sigma[i] = math.sqrt(row[21 + i])
+    e.time, e.diverged = window.time, int(row[36] > 0.0)
+
+
+@entry(signature=types.none(_FLIGHT, types.int64))
+def covariance(flight, address):
+    """Write the covariance, row by row."""
+    L = lanes_of(flight).L
+    for i in range(15):
+        for j in range(15):
+            total = L[i, 0] * L[j, 0]
+            for k in range(1, min(i, j) + 1):
+                total = total + L[i, k] * L[j, k]
+            store_lanes(address + 8 * (15 * i + j), total)
+
+
+@entry(signature=types.none(*[types.int64] * 4))
+def seen(observation, attitude, x, y):
+    """Write R (x - y) as three numbers of an observation."""
+    o, R, a, b = (
+        _singles_at(observation, 3),
+        _reals_at(attitude, 9),
+        _reals_at(x, 3),
+        _reals_at(y, 3),
+    )
+    for i in range(3):
+        o[i] = np.float32(
+            R[3 * i] * (a[0] - b[0]) + R[3 * i + 1] * (a[1] - b[1]) + R[3 * i + 2] * (a[2] - b[2])
+        )

@@ -213,14 +213,8 @@ def _take_sample(w, events, samples, waits, operations, given):
 
 
 @kernel
-def oldest_time(w, events):
-    """Oldest time stamp that can still be included [s]."""
-    return max(w.time - w.length, events[0].start) if w.events > 0 else w.time
-
-
-@kernel
 def _take_measurement(w, events, samples, waits, operations, given):
-    if given.time < oldest_time(w, events) - SAME_TIME:
+    if given.time < w.oldest - SAME_TIME:
         return _OLD
     if given.time > w.time + w.ahead:
         return _NEW
@@ -255,8 +249,11 @@ def take_input(w, events, samples, waits, operations, given):
     """Append the operations that process an input; return the outcome."""
     given.now = w.time
     if given.rank == 0:
-        return _take_sample(w, events, samples, waits, operations, given)
-    return _take_measurement(w, events, samples, waits, operations, given)
+        outcome = _take_sample(w, events, samples, waits, operations, given)
+    else:
+        outcome = _take_measurement(w, events, samples, waits, operations, given)
+    w.oldest = max(w.time - w.length, events[0].start) if w.events > 0 else w.time
+    return outcome
 
 
 @kernel

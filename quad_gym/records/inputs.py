@@ -76,6 +76,7 @@ WINDOW = np.dtype(
         ("room", "i8", len(Kept)),  # numbers in use at a time, by Kept; 0: none is used again
         # state
         ("time", "f8"),  # up to which the filter has predicted [s]
+        ("oldest", "f8"),  # oldest time stamp that can still be included [s]
         ("events", "i8"),
         ("waiting", "i8"),
         ("since_copy", "i8"),  # events since the last copy
@@ -91,6 +92,24 @@ WINDOW = np.dtype(
     ]
 )
 """State of the window of past inputs of a filter."""
+
+MEMORY = np.dtype(
+    [(name, "i8") for name in ("events", "samples", "waits", "operations")]
+    + [(name, "i8") for name in ("measurements", "copies", "copy_words", "flight")]
+)
+"""Addresses of the arrays of an exported filter; `copy_words` is the length of a copy."""
+
+ESTIMATE = np.dtype(
+    [
+        ("time", "f8"),
+        *((name, "f8", 3) for name in ("position", "velocity")),
+        *(("R_BI", "f8", (3, 3)), ("quaternion", "f8", 4)),
+        *((name, "f8", 3) for name in ("accel_bias", "gyro_bias")),
+        *(("sigma", "f8", 15), ("diverged", "i4")),
+    ],
+    align=True,
+)
+"""The estimate of an exported filter, `qg_estimate` in its header."""
 
 FIX = np.dtype(
     [

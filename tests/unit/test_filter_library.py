@@ -126,7 +126,9 @@ def calibrated():
 
 
 @needs_compiler
-@pytest.mark.parametrize("change", ["none", "motors", "early fix", "missing numbers", "Unix time"])
+@pytest.mark.parametrize(
+    "change", ["none", "motors", "early fix", "missing numbers", "Unix time", "attitudes"]
+)
 def test_example_of_a_calibrated_suite_prints_estimates_of_replay(change):
     """Rotation, delays of both signs and a lever arm, on logs that the replay reads."""
     table = turned_table()
@@ -143,6 +145,12 @@ def test_example_of_a_calibrated_suite_prints_estimates_of_replay(change):
         table["gnss_baseline_north"][200::3] = np.nan
     elif change == "Unix time":
         table["time"], table["received"] = table["time"] + 1.7e9, table["received"] + 1.7e9
+    elif change == "attitudes":  # of motion capture, which replace the baselines
+        found, fixes = replay(table, sensors=TURNED), np.isfinite(table["gnss_east"])
+        table = {name: v for name, v in table.items() if not name.startswith("gnss_baseline")}
+        for k, axis in enumerate("wxyz"):
+            values = np.interp(table["time"], found.time, found.quaternion[:, k])
+            table[f"attitude_{axis}"] = np.where(fixes, values, np.nan)
     require_equal(partial(estimates, calibrated()), table, TURNED, {})
 
 

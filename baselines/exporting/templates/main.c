@@ -28,12 +28,7 @@ static void stop(const char *what, const char *why)
 
 static void demand(int result, const char *what)
 {
-    static const char *const words[] = {
-        "", "the filter has not started", "a value is not finite", "a value is out of its range",
-        "a measurement is older than the memory of the filter: the IMU or the sensors are faster "
-        "than in the suite; export with --log, or compile with a larger -DQG_EVENTS and "
-        "-DQG_MEASUREMENTS", "a time stamp is too new", "too many measurements wait",
-        "the heading is unknown", "the suite has no such measurement"};
+    static const char *const words[] = {@WORDS@};
     if (result != QG_OK)
         stop(what, words[result]);
 }
@@ -46,18 +41,6 @@ static const double *given(int place)
 static double number(int place)
 {
     return isnan(x[place]) ? 0.0 : x[place];
-}
-
-static void print_names(void)
-{
-    static const char *const kinds[] = {"position", "velocity", "attitude", "accel_bias",
-                                        "gyro_bias"};
-    printf("time,position_x,position_y,position_z,velocity_x,velocity_y,velocity_z,quaternion_w,"
-           "quaternion_x,quaternion_y,quaternion_z,accel_bias_x,accel_bias_y,accel_bias_z,"
-           "gyro_bias_x,gyro_bias_y,gyro_bias_z");
-    for (int k = 0; k < 15; k++)
-        printf(",%s_sigma_%c", kinds[k / 3], 'x' + k % 3);
-    printf(",diverged\n");
 }
 
 static void print_numbers(const double *numbers, int n)
@@ -91,19 +74,8 @@ static void print_estimate(void)
 #ifdef QG_GNSS_POSITION
 static void start(void)
 {
-    qg_start s;
-    memset(&s, 0, sizeof s);
-    s.time = x[0];
-    s.gnss_position = given(1);
-    s.gnss_sigma = given(4);
-    s.gnss_baseline = given(7);
-    s.gnss_velocity = given(10);
-    s.velocity_sigma = number(13);
-    s.heading = given(14);
-    s.magnetometer = given(15);
-    s.course = x[18] != 0.0;
-    s.tilt_sigma = number(19);
-    s.rest_sigma = number(20);
+    const qg_start s = {x[0],       given(1),  given(4),  given(7),     given(10),  number(13),
+                        given(14), given(15), 0.0, x[18] != 0.0, number(19), number(20)};
     demand(qg_init(&filter, &s), "start");
 }
 #endif
@@ -111,8 +83,7 @@ static void start(void)
 /* Returns 0 for a row that is no measurement of the suite. */
 static int update(const char *name)
 {
-    qg_measurements m;
-    memset(&m, 0, sizeof m);
+    qg_measurements m = {0};
     (void)given, (void)number;
 @ROWS@        return 0;
     demand(qg_update(&filter, &m, x[0]), name);
@@ -171,7 +142,7 @@ int main(int count, char **words)
         stop("cannot read a file", "usage: example SAMPLES.csv [--time REPEATS]");
     silent = repeats > 0;
     if (!silent)
-        print_names();
+        printf("%s\n", "@COLUMNS@");
     do {
         rewind(file);
         for (; fgets(row, sizeof row, file); rows++)

@@ -1,7 +1,6 @@
 @CALL@
 {
-    qg_measurements m;
-    memset(&m, 0, sizeof m);
+    qg_measurements m = {0};
     m.@NAME@ = @ADDRESS@;
 @SIGMA@    return qg_update(f, &m, time);
 }
