@@ -3,6 +3,7 @@
 Each curve has its own color and line style.
 """
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -151,7 +152,7 @@ def paths_figure(traces: Mapping[str, plots.Trace], title: str = "") -> Any:
     shown = grid.ravel()[: len(traces)]
     for axes, (label, trace) in zip(shown, traces.items(), strict=True):
         plots.draw_path(axes, trace, legend=False)
-        axes.set_title(label)
+        axes.set_title(textwrap.fill(label, 32))
     for spare in grid.ravel()[len(traces) :]:
         spare.remove()
     for axis in ("x", "y"):
