@@ -6,10 +6,10 @@
     quad-gym train --sensors results/mine/suite.toml
     quad-gym calibrate flight.csv --vehicle mine-vehicle.toml
 
-The first part of the log, or the first ones of several logs, are for the search, the rest for
-validation; of several logs, all then enter the suite. The result is a suite with the rates, delays
-and noise of this vehicle, for `replay`, `train` and all other commands. The verdict is in the last
-lines; if the suite is not usable, the exit code is 1.
+The search uses the first part of the log, or the first of several logs, and the rest validates its
+result. The written suite is then fitted to all of several logs. It has the rates, delays and noise
+of this vehicle, for `replay`, `train` and all other commands. The verdict is in the last lines. If
+the suite is not usable, the exit code is 1.
 """
 
 import math
@@ -56,8 +56,8 @@ class CalibrateArgs(ReadingArgs):
     """write a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the log to
     this file"""
     vehicle_from: str | None = None
-    """vehicle whose mass, inertia and arms that file has: lab, crazyflie or a .toml file;
-    defaults to lab"""
+    """vehicle that provides mass, inertia and arms: lab, crazyflie or a .toml file; defaults to
+    lab"""
     output: Path | None = None
     """folder for the results, created if it is missing; defaults to results/calibrate/LOG"""
     overwrite: bool = False

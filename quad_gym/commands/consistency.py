@@ -63,7 +63,7 @@ class ConsistencyArgs:
     world: str = "calm"
     """air, ground and battery: calm, breeze or fresh_breeze"""
     faults: str | None = None
-    """faults of sensors and rotors: presets joined by +, as gnss_outage+rotor_loss"""
+    """faults of sensors and rotors: presets joined by +, such as gnss_outage+rotor_loss"""
     noise_factor: float = 1.0
     """true white noise, relative to the noise that the filter assumes"""
 

@@ -51,7 +51,7 @@ class TuneArgs:
     """number of candidate gain sets, including the initial one"""
     episodes: int = 32
     """number of episodes of each candidate on each task"""
-    fresh_episodes: int = 500
+    held_out_episodes: int = 500
     """number of episodes at the end, with seeds that the search does not use"""
     seed: int = 0
     """seed of the search, which determines its episodes, and of the first held-out episode"""
@@ -75,10 +75,10 @@ def configure(args: TuneArgs) -> Search:
     """Check all options before the search."""
     for env_id in args.env_ids:
         options.known_id("--env-ids", env_id, options.TRACKING)
-    options.require_at_least(args, candidates=1, episodes=1, fresh_episodes=2, seed=0, threads=1)
+    options.require_at_least(args, candidates=1, episodes=1, held_out_episodes=2, seed=0, threads=1)
     options.leave(args.env, *SEPARATE)
     options.refuse_overwriting(args.output / "gains.json", args.overwrite)
-    first_seed("test", args.seed, args.fresh_episodes)  # rejects seeds that are too large
+    first_seed("test", args.seed, args.held_out_episodes)  # rejects seeds that are too large
     envs = make_envs(args, args.episodes)
     for env in envs.values():
         PDPolicy(env, gains=args.gains)  # rejects actions and layouts that it does not support
@@ -96,11 +96,11 @@ def main(args: TuneArgs) -> None:
         search = configure(args)
     tuned = search.run(args.candidates, args.seed)
     gains = {f"initial gains ({args.gains})": search.start, "tuned gains": tuned}
-    seed = first_seed("test", args.seed, args.fresh_episodes)
-    text, numbers = compare_gains(make_envs(args, args.fresh_episodes), gains, seed)
+    seed = first_seed("test", args.seed, args.held_out_episodes)
+    text, numbers = compare_gains(make_envs(args, args.held_out_episodes), gains, seed)
     print(
         f"\nPD on the {args.observation}, sensors {args.sensors}; "
-        f"{args.fresh_episodes:,} held-out episodes of each task.\n\n{text}\n"
+        f"{args.held_out_episodes:,} held-out episodes of each task.\n\n{text}\n"
         "Change: mean over pairs of episodes that did not crash, with its 95 % interval\n"
         "(Student's t)."
     )
@@ -109,7 +109,7 @@ def main(args: TuneArgs) -> None:
         "gains": tuned,
         "start": search.start,
         "candidates": len(search.rows),
-        "fresh_episodes": numbers,
+        "held_out_episodes": numbers,
         "arguments": args,
         "versions": versions("numpy", "scipy", "numba"),
     }

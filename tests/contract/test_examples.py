@@ -70,7 +70,7 @@ def tune(*options):
 
 
 def test_tune_finds_gains_better_than_initial_gains(tmp_path):
-    tiny = ["--candidates", 32, "--episodes", 4, "--fresh-episodes", 8, "--env", "duration=3.0"]
+    tiny = ["--candidates", 32, "--episodes", 4, "--held-out-episodes", 8, "--env", "duration=3.0"]
     done = tune("--env-ids", "hover", *tiny, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "gains.json").read_text())
