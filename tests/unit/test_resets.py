@@ -109,6 +109,21 @@ def test_reset_after_large_corrections_leaves_biases_that_sensors_can_have():
     np.testing.assert_allclose(sigma[9:], np.repeat([0.5, 0.09], 3))
 
 
+def test_reset_without_rejections_is_as_large_as_the_corrections_explain():
+    """Of 0.01 m/s^2: three times as much, and the tilt, velocity and position that it causes."""
+    ukf = started(np.repeat([0.01, 0.01, 1e-3, 1e-3, 1e-4], 3))
+    blocks = ukf._engine.blocks
+    blocks["corrected"][:, 0], blocks["corrected_tick"][:] = 0.01, blocks["tick"]
+    lever = np.cross(ukf._engine.read("w_meas")[0] - ukf.gyro_bias, SUITE.gnss.primary_antenna_B)
+    ukf.update(gnss_velocity_G=R_IG.T @ (ukf.velocity + ukf.R_BI.T @ lever))
+    bias, time = 0.03, 3.0
+    speed = np.sqrt(2.0) * bias * time  # by the bias, and by the tilt that hides it
+    expected = [0.5 * time * speed, speed, bias / SUITE.estimator.gravity, bias]
+    sigma = np.sqrt(np.diag(ukf.covariance))
+    np.testing.assert_allclose(sigma[:12], np.repeat(expected, 3), rtol=1e-3)
+    assert (sigma[12:] < 1.01e-4).all()
+
+
 def at_rest(offsets, sigma=1.0, seed=0):
     """Update a filter at rest with fixes at 10 Hz, `offsets` (n, 3) [m] off, with scaled noise."""
     ukf, rng, found = quad_gym.UnscentedKalmanFilter(SUITE), np.random.default_rng(seed), []
