@@ -16,6 +16,9 @@ estimate is. Four known rules decide.
   to blame: velocity, tilt and biases, too, get no more than the variances of their start. The
   filter is flagged as diverged.
 
+Where innovations are not white although none is refused, a bias has jumped, or noise is colored.
+The reset is as large as the corrections of the biases explain, so that colored noise does no harm.
+
 Source: the time limits and resets of PX4 EKF2 and ArduPilot NavEKF3; J. R. Carpenter and C. N.
 D'Souza (editors), Navigation Filter Best Practices, NASA/TP-2018-219822.
 """
@@ -186,10 +189,7 @@ def glitches(flight, p, settings, group, nis, limit):
 
 @kernel
 def _dead_reckons(flight, p, settings):
-    """Lanes in which accepted velocities predict positions better than fixes measure them.
-
-    That is, over the time `RECENT`; the position cannot have drifted off then.
-    """
+    """Lanes in which accepted velocities predict positions over `RECENT` better than fixes."""
     precise = p.velocity_sigma * RECENT < p.position_sigma_I[0]
     precise = precise & (flight.tick * p.dt >= RECENT)
     return precise & _confirmed(flight, p, settings, POSITION_BLOCK, VELOCITY_BIT)
@@ -311,11 +311,7 @@ def _colored(flight, p, settings):
 
 @kernel
 def _choose(flight, p, work, settings, mask):
-    """Fill work.reset with the groups to which states are reset, and work.drifted.
-
-    Returns:
-        Lanes in which any state is reset.
-    """
+    """Fill work.reset and work.drifted; return the lanes in which states are reset to a sensor."""
     none = no_lane(flight.tick)
     sensors, late = zero_like(flight.tick), none
     for sensor in range(SENSORS):
