@@ -61,7 +61,7 @@ _OUTCOMES = {
     Outcome.OUT_OF_RANGE: "an argument is out of the range that its comment states",
     Outcome.TOO_OLD: "older than the memory of the filter, which export --log or QG_EVENTS extends",
     Outcome.TOO_NEW: "the time stamp is more than QG_LONGEST_STEP later than the filter",
-    Outcome.FULL: "too many measurements wait for the prediction up to their time stamps",
+    Outcome.FULL: "too many measurements wait for later samples, more than QG_WAITING",
     Outcome.NO_HEADING: "a start needs one of: baseline, heading, magnetometer, course",
     Outcome.CONTRADICTION: "arguments that exclude each other, or that the suite lacks",
 }

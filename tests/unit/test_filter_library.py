@@ -325,7 +325,7 @@ class Estimate(ctypes.Structure):
     )
 
 
-OK, NOT_STARTED, NOT_FINITE, OUT_OF_RANGE, TOO_OLD, TOO_NEW = range(6)
+OK, NOT_STARTED, NOT_FINITE, OUT_OF_RANGE, TOO_OLD, TOO_NEW, FULL = range(7)
 
 
 class Library:
@@ -454,6 +454,21 @@ def test_early_measurement_waits_for_the_imu_sample_of_its_time():
             assert c.call("update_range_finder", 0.81, 0.004) == OK
         whole.append(c.estimate())
     np.testing.assert_array_equal(whole[0], whole[1])
+
+
+@needs_compiler
+def test_only_so_many_measurements_wait_for_a_pausing_imu():
+    """They are included in their order with the next sample, and one more is refused."""
+    ukf, c = started("crazyflie")
+    times = [10.5 + 0.01 * k for k in range(16)]
+    for time in reversed(times):
+        assert c.call("update_range_finder", 0.81, time) == OK
+    assert c.call("update_range_finder", 0.81, 10.7) == FULL
+    assert c.call("predict", [0.0] * 3, [0.0, 0.0, 9.8], 0.9) == OK
+    ukf.predict([0.0] * 3, [0.0, 0.0, 9.8], dt=0.9)
+    for time in times:
+        ukf.update(range_finder=0.81, time=time)
+    np.testing.assert_array_equal(c.estimate()[:3], ukf.position)
 
 
 @needs_compiler

@@ -41,14 +41,14 @@ enum qg_result {
 #ifndef QG_MEASUREMENTS
 #define QG_MEASUREMENTS @MEASUREMENTS@ /* measurements among them */
 #endif
+#ifndef QG_WAITING
 #define QG_WAITING 16 /* measurements that may wait for later samples */
+#endif
 #define QG_COPIES (QG_EVENTS / QG_COPY_EVERY + 2)
-
 @MACROS@
 typedef struct qg_filter qg_filter; /* see the end of this header */
 
 /* ---- start ---- */
-
 @IF GNSS@
 /* A first fix; NULL: not measured. Without a baseline the vehicle is assumed level, and its heading
  * comes from exactly one of heading, magnetometer and course. */
