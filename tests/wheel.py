@@ -4,9 +4,9 @@
     python -m tests.wheel WHEEL --folder FOLDER        # keep environment and files there
 
 Installs the wheel with the extras `compile` and `plot` (for `replay`) in a new virtual environment.
-There, commands export the filter of a suite and compile it. Its example prints the estimates of a
-log, which must equal the output of `quad-gym replay`. The same test runs for AArch64 in an emulator
-if compiler and emulator are installed.
+There, commands export the filter of a suite and compile it. Its example prints the estimates of the
+samples of a log, which must equal the output of `quad-gym replay`. The same test runs for AArch64 in
+an emulator if compiler and emulator are installed.
 """
 
 import argparse
@@ -61,7 +61,8 @@ def main(argv=None):
         return subprocess.run(words, check=True, **options).stdout
 
     quad_gym = commands / "quad-gym"
-    run(quad_gym, "replay", log, "--sensors", SUITE, "--output", "replay", "--overwrite")
+    options = ("--output", "replay", "--samples", "samples.csv", "--overwrite")
+    run(quad_gym, "replay", log, "--sensors", SUITE, *options)
     wanted = numbers((folder / "replay" / "estimates.csv").read_text(encoding="utf-8"))
     emulated = shutil.which(GCC) and shutil.which(EMULATOR)
     for target, options, before in (
@@ -75,7 +76,7 @@ def main(argv=None):
         source = f"results/export/filter_{SUITE}_{target}"
         run("cmake", "-S", source, "-B", target, *options)
         run("cmake", "--build", target)
-        names, found = numbers(run(*before, f"./{target}/example", log))
+        names, found = numbers(run(*before, f"./{target}/example", "samples.csv"))
         if names != wanted[0] or not np.array_equal(found, wanted[1]):
             print(f"{target}: estimates differ from those of a replay", file=sys.stderr)
             return 1
