@@ -5,8 +5,8 @@
 
 Installs the wheel with the extras `compile` and `plot` (for `replay`) in a new virtual environment.
 There, commands export the filter of a suite and compile it. Its example prints the estimates of the
-samples of a log, which must equal the output of `quad-gym replay`. The same test runs for AArch64 in
-an emulator if compiler and emulator are installed.
+samples of a log, which must equal the output of `quad-gym replay`. The same test runs for AArch64
+in an emulator if compiler and emulator are installed.
 """
 
 import argparse
