@@ -1,6 +1,7 @@
 """Committed pages match the code, the ledger of results and the table of words."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,22 @@ def entries():
 
 def test_pages_hold_the_texts_of_the_ledger(entries):
     assert list(pages.wrong(ledger.texts(entries))) == []
+
+
+def test_no_line_of_a_page_begins_with_a_result():
+    """Markdown takes a line that begins with a comment as HTML, with links as they are typed."""
+    files = [
+        ROOT / "README.md",
+        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "docs/reference").glob("*.md"),
+    ]
+    found = [
+        f"{file.name}: {line}"
+        for file in files
+        for line in file.read_text(encoding="utf-8").splitlines()
+        if re.match(r"\s*<!-- =\S+ -->.*\S", line)
+    ]
+    assert not found
 
 
 def test_result_of_changed_flights_or_options_is_stale(tmp_path, monkeypatch):
