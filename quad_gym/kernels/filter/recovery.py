@@ -264,9 +264,8 @@ def _reset_motion(flight, p, slow, P, drifted, jumped, accel, gyro):
     tilt = minimum(tilt * tilt, leaned)
     heading = minimum(p.heading_sigma * p.heading_sigma, turned)
     heading = select(lanes, maximum(dot(k, P_ee @ k), heading), 0.0)
-    own = select(drifted, 1.0, 0.0)
-    accel = maximum(accel, own * (p.accel_bias_sigma * p.accel_bias_sigma))
-    gyro = maximum(gyro, own * (p.gyro_bias_sigma * p.gyro_bias_sigma))
+    accel = maximum(accel, select(drifted, p.accel_bias_sigma * p.accel_bias_sigma, 0.0))
+    gyro = maximum(gyro, select(drifted, p.gyro_bias_sigma * p.gyro_bias_sigma, 0.0))
     speed = (p.gravity * p.gravity * tilt + accel) * T * T
     place = 0.25 * T * T * speed
     if slow is not None:

@@ -34,7 +34,7 @@ from quad_gym.kernels.maths.linalg import (
     rounded,
     unit_or,
 )
-from quad_gym.kernels.simd.lanes import logical_not, select, zero_like
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import BASELINE_BLOCK
 
 _COARSE = 0.05
@@ -73,9 +73,11 @@ def expect(flight, p, work, settings, k, valid):
     white = p.baseline_sigma * p.baseline_sigma
     along = select(p.baseline_sigma > _COARSE, 2.0 * white * white, 0.0)
     noise = noise + outer(along * u_I, u_I)
-    side = unit_or((-u_I[1], u_I[0], zero_like(u_I[0])), (1.0, 0.0, 0.0))
-    up = cross(u_I, side)
-    noise = noise + outer(select(p.baseline_sigma > math.pi, along, 0.0) * up, up)
+    alone = p.baseline_sigma > math.pi
+    if any_of(alone):
+        side = unit_or((-u_I[1], u_I[0], zero_like(u_I[0])), (1.0, 0.0, 0.0))
+        up = cross(u_I, side)
+        noise = noise + outer(select(alone, along, 0.0) * up, up)
     put_block(work, settings, k, valid, (1.0 / norm(z)) * z, u_I, noise)
     for j in range(9):
         a, s = lever_column(flight, work, settings, j, R_BI, u_B)
