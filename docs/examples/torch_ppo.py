@@ -157,7 +157,7 @@ def updater(agent, optimizer, args) -> Callable[[list[torch.Tensor]], None]:
     def replay(batch):
         if not inputs:  # warm up beside the current stream, begin again from there, then capture
             inputs.extend(part.clone() for part in batch)
-            before = copy.deepcopy((agent.state_dict(), optimizer.state_dict()))
+            before = copy.deepcopy(agent.state_dict())
             stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
@@ -166,7 +166,7 @@ def updater(agent, optimizer, args) -> Callable[[list[torch.Tensor]], None]:
             torch.cuda.current_stream().wait_stream(stream)
             with torch.cuda.graph(graph):
                 update(inputs)
-            agent.load_state_dict(before[0])
+            agent.load_state_dict(before)
             for moments in optimizer.state.values():
                 for moment in moments.values():
                     moment.zero_()

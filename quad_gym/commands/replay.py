@@ -7,8 +7,8 @@
 
 A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
 some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. The last
-lines are the verdict. The exit code is 1 if units or axes are implausible, the
-suite's noise model does not fit the log, or the filter was lost.
+lines are the verdict. The exit code is 1 if units or axes are implausible, the suite's noise model
+does not fit the log, or the filter was lost.
 """
 
 import math

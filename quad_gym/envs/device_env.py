@@ -111,7 +111,7 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
         return self._split(seen), {}
 
     def _mask_on_gpu(self, mask: Any) -> torch.Tensor | None:
-        """Return the flights to reset; None: all. The values of a tensor are not waited for."""
+        """Return the flights to reset; None: all. Reading a tensor would wait for the GPU."""
         if mask is None:
             return None
         if not isinstance(mask, torch.Tensor):

@@ -1,4 +1,6 @@
-"""Flights on a GPU: golden flights number by number, steps/s, memory, a training. Never run yet.
+"""Compare golden flights on a GPU number by number; measure steps/s, memory and a training.
+
+It has never been run on a GPU.
 
     python -m scripts.benchmarks.gpu prepare FOLDER     # on any machine, in a clone with all extras
     python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine
@@ -37,7 +39,7 @@ DURATION = 2.0  #: of a measurement of steps/s [s]
 TICKS, FLIGHTS, STEPS, SEED = 30, 8, 300, 2026
 TRAINING = {"num_envs": 8192, "num_minibatches": 32, "total_timesteps": 20_000_000}
 """Options of `docs/examples/torch_ppo.py`; they are multiples of the defaults."""
-TRAINED = {"autoreset_mode": "SameStep", "start": "mixed"}
+TRAINED: dict[str, Any] = {"autoreset_mode": "SameStep", "start": "mixed"}
 """Keywords of the flights of the training."""
 Make = Callable[[bytes, int], Any]
 """Make the launcher of a module of PTX, with a number of warps for each multiprocessor."""
@@ -45,6 +47,7 @@ Make = Callable[[bytes, int], Any]
 
 def prepare(folder: Path, cases: tuple[str, ...] = CASES) -> None:
     """Write a file for each case: its plan, its PTX, and the numbers of its flights here."""
+    import quad_gym
     from quad_gym.device.emission import plan_of, ptx_of
 
     golden: Any = importlib.import_module("tests.golden.flights")
@@ -66,8 +69,7 @@ def prepare(folder: Path, cases: tuple[str, ...] = CASES) -> None:
         file = folder / f"{CASES.index(name)}.case"
         file.write_bytes(zlib.compress(pickle.dumps((name, content))))
         print(f"{name}: PTX of {len(content['ptx']) / 1e3:.0f} kB", flush=True)
-    builders: Any = importlib.import_module("quad_gym")
-    env = builders.make_torch_vec_env("QuadGym/Circle-v0", 1, **TRAINED)
+    env = quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 1, **TRAINED)
     plan = plan_of(env.flights.batch)
     content = {"plan": plan, "ptx": ptx_of(plan)}
     (folder / "training").write_bytes(zlib.compress(pickle.dumps(content)))

@@ -33,10 +33,7 @@ static int qgi_put(double *to, const double *from, int n)
     return from != 0;
 }
 
-static int64_t qgi_address(const void *place)
-{
-    return (int64_t)(uintptr_t)place;
-}
+static int64_t qgi_address(const void *place) { return (int64_t)(uintptr_t)place; }
 
 /* ---- inputs ---- */
 

@@ -74,8 +74,11 @@ static void print_estimate(void)
 #ifdef QG_GNSS_POSITION
 static void start(void)
 {
-    const qg_start s = {x[0],       given(1),  given(4),  given(7),     given(10),  number(13),
-                        given(14), given(15), 0.0, x[18] != 0.0, number(19), number(20)};
+    const qg_start s = {.time = x[0], .gnss_position = given(1), .gnss_sigma = given(4),
+                        .gnss_baseline = given(7), .gnss_velocity = given(10),
+                        .velocity_sigma = number(13), .heading = given(14),
+                        .magnetometer = given(15), .course = x[18] != 0.0,
+                        .tilt_sigma = number(19), .rest_sigma = number(20)};
     demand(qg_init(&filter, &s), "start");
 }
 #endif
