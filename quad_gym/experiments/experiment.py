@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from baselines.keeping import EVALUATIONS, best_file
 from baselines.plans import Plan
-from baselines.training import require_model, run_in
+from baselines.training import finished_run, require_model
 from quad_gym.experiments.flown import Flown, Trial
 
 Floats = NDArray[np.float64]
@@ -35,13 +35,8 @@ class Training:
         return f"{self.case}/seed_{self.plan.seed}"
 
     def record(self) -> dict[str, Any]:
-        """Contents of `training.json`; empty before the first checkpoint."""
-        return run_in(self.folder, self.plan, resume=True) or {}
-
-    @property
-    def finished(self) -> bool:
-        """True if all steps are completed."""
-        return bool(self.record().get("finished"))
+        """Contents of `training.json`; empty before the training is finished."""
+        return finished_run(self.folder, self.plan) or {}
 
     @property
     def best(self) -> str:
@@ -77,7 +72,7 @@ def make_trainings(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path
 
 def check_trainings(trainings: Iterable[Training]) -> None:
     """Check all folders, and make model and environment of each unfinished case once."""
-    for training in {each.case: each for each in trainings if not each.finished}.values():
+    for training in {each.case: each for each in trainings if not each.record()}.values():
         try:
             require_model(training.plan)
             training.plan.make_judge().close()
