@@ -8,8 +8,7 @@
 The blue vehicle is the truth. The orange ghost is the filter's estimate, with its 3-sigma
 ellipsoid; the controller flies on the estimate unless --observation selects another source.
 
-Keys in the window: C and G switch camera and GNSS off and on, F switches the --faults on and off,
-V changes the view, the space bar pauses, R begins the next episode, and Q or Escape quits.
+The window shows one episode after the other until it is closed.
 """
 
 import itertools
@@ -27,7 +26,6 @@ from tyro.conf import arg
 from baselines.policies import keywords_of_policy, load_policy
 from quad_gym import IDS, Flight, sensor_suite
 from quad_gym.analysis.reports import require_writable
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import options
 from quad_gym.evaluation import Policy
 from quad_gym.faults.presets import PRESETS, faults_of
@@ -86,28 +84,6 @@ class FlyArgs:
     """saved flight (.npz) to show instead of a new one"""
 
 
-class Switches:
-    """State of sensors and faults as switched by keys."""
-
-    def __init__(self) -> None:
-        self._on = {"gnss": True, "camera": True}
-        self._turn_faults = False
-
-    def press(self, key: str) -> None:
-        """Process a key."""
-        if (sensor := {"c": "camera", "g": "gnss"}.get(key)) is not None:
-            self._on[sensor] = not self._on[sensor]
-        self._turn_faults |= key == "f"
-
-    def apply(self, batch: FlightBatch) -> None:
-        """Apply the switches to a batch."""
-        batch.switch_sensors(**self._on)
-        if self._turn_faults:
-            active = any(flights.any() for flights in batch.active_faults().values())
-            batch.switch_faults(not active)
-            self._turn_faults = False
-
-
 def check_options(args: FlyArgs) -> None:
     """Check the options before the flight."""
     options.require_at_least(args, seed=0)
@@ -158,10 +134,9 @@ def make_env(args: FlyArgs) -> Any:
     )
 
 
-def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> Iterator[Flight]:
+def fly(env: Any, policy: Policy, seed: int, about: Any) -> Iterator[Flight]:
     """Run an episode, and yield the flight so far after each step."""
-    steps = fly_steps(policy, env, seed, about | {"seed": seed}, switches.apply)
-    for flight, ending in steps:  # noqa: B007 - the last one is printed
+    for flight, ending in fly_steps(policy, env, seed, about | {"seed": seed}):  # noqa: B007
         yield flight
     words = f"seed {seed}: {ending.replace('_', ' ')} after {flight['time'][-1]:.2f} s, "
     words += f"mean tracking error {1e3 * flight['position_error'].mean():.1f} mm"
@@ -170,33 +145,16 @@ def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> 
     print(words)
 
 
-def watch(flights: Iterator[Flight], args: FlyArgs, window: Window, switches: Switches) -> bool:
-    """Show a flight in a window; return True to continue with the next one."""
-    renderer, waiting, flight = Renderer(args.view, args.size), math.inf, None
+def watch(flights: Iterator[Flight], args: FlyArgs, window: Window) -> None:
+    """Show a flight in a window, until it ends or the window is closed."""
+    renderer, waiting = Renderer(args.view, args.size), math.inf
     for flight in flights:
         waiting += 1.0 / flight.scene.control_rate / args.speed
-        if waiting < 0.999 / WINDOW_RATE:
-            continue
-        seconds, waiting = min(waiting, 1.0), 0.0
-        window.show(renderer.draw(flight), seconds)
-        stopped = False
-        while True:
-            for key in window.pressed_keys():
-                if key in ("q", "escape"):
-                    return False
-                if key == "r":
-                    return True
-                if key == "space":
-                    stopped = not stopped
-                if key == "v":
-                    renderer = Renderer("chase" if renderer.view == "fixed" else "fixed", args.size)
-                switches.press(key)
-            if window.closed:
-                return False
-            if not stopped:
-                break
-            window.show(renderer.draw(flight), 1.0 / WINDOW_RATE)
-    return True
+        if waiting >= 0.999 / WINDOW_RATE:
+            window.show(renderer.draw(flight), min(waiting, 1.0))
+            waiting = 0.0
+        if window.closed:
+            return
 
 
 def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
@@ -214,19 +172,19 @@ def write(flight: Flight, path: Path, args: FlyArgs) -> list[Path]:
     return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
 
 
-def flights_of(args: FlyArgs) -> Callable[[int, Switches], Iterator[Flight]]:
+def flights_of(args: FlyArgs) -> Callable[[int], Iterator[Flight]]:
     """Check the options; return a function that runs the episode of a seed, or the saved flight."""
     check_options(args)
     if args.replay is not None:
         saved = Flight.load(args.replay)
-        return lambda seed, switches: (saved.until(time) for time in saved["time"])
+        return lambda seed: (saved.until(time) for time in saved["time"])
     env = make_env(args)
     if args.output and not env.unwrapped.flights.batch.max_steps:
         raise ValueError("--output needs a flight with a time limit: a --duration above 0")
     policy, sensors = load_policy(args.policy, env), options.sensors_of(args.env_id, args.sensors)
     about: dict[str, Any] = {"task": IDS[args.env_id], "policy": args.policy, "sensors": sensors}
     about["faults"] = args.faults
-    return lambda seed, switches: fly(env, policy, seed, switches, about)
+    return lambda seed: fly(env, policy, seed, about)
 
 
 def main(args: FlyArgs) -> None:
@@ -235,7 +193,7 @@ def main(args: FlyArgs) -> None:
         args = options.with_full_id(args)
         flights = flights_of(args)
     if args.output:
-        *_, flight = flights(args.seed, Switches())
+        *_, flight = flights(args.seed)
         for file in write(flight, args.output, args):
             print(f"Wrote {file} ({file.stat().st_size / 1e6:.1f} MB).")
         return
@@ -246,7 +204,6 @@ def main(args: FlyArgs) -> None:
             hint = "without a display, --output writes a video instead"
             raise OSError(f"{error}; {hint}") from None
     for seed in itertools.count(args.seed):
-        switches = Switches()
-        if not watch(flights(seed, switches), args, window, switches):
+        watch(flights(seed), args, window)
+        if window.closed:
             break
-    window.close()

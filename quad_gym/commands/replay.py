@@ -6,9 +6,9 @@
     quad-gym replay flight.csv --sensors rtk --estimator module:Class
 
 A log is a CSV table, a log of PX4 or ArduPilot, or a bag of ROS; some require an extra, such as
-`pip install 'quad-gym[ulog]'`. docs/logs.md describes them. The last lines are the verdict. The exit
-code is 1 if units or axes are implausible, the suite's noise model does not fit the log, or the
-filter was lost.
+`pip install 'quad-gym[ulog]'`. docs/logs.md describes them. The last lines are the verdict. The
+exit code is 1 if units or axes are implausible, the suite's noise model does not fit the log, or
+the filter was lost.
 """
 
 import math

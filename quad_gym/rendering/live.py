@@ -46,27 +46,20 @@ class Window:
         self.closed = False
 
     def show(self, frame: NDArray[np.uint8], seconds: float) -> None:
-        """Show a frame after the previous one has been visible for its duration [s]."""
+        """Show a frame after the previous one has been visible for its duration [s].
+
+        A window that its user has closed shows nothing.
+        """
+        if not self.closed and self._pygame.event.get(self._pygame.QUIT):
+            self.close()
         if self.closed:
             return
+        self._pygame.event.clear()
         image = self._pygame.image.frombuffer(frame.tobytes(), frame.shape[1::-1], "RGB")
         self._screen.blit(image, (0, 0))
         time.sleep(max(0.0, self._due - time.monotonic()))
         self._pygame.display.flip()
         self._due = max(self._due, time.monotonic() - 0.1) + seconds  # delays are not caught up
-
-    def pressed_keys(self) -> list[str]:
-        """Names of the keys pressed since the last call; also detects a closed window."""
-        pressed: list[str] = []
-        if self.closed:
-            return pressed
-        for event in self._pygame.event.get():
-            if event.type == self._pygame.QUIT:
-                self.close()
-                break
-            if event.type == self._pygame.KEYDOWN:
-                pressed.append(self._pygame.key.name(event.key))
-        return pressed
 
     def close(self) -> None:
         """Close the window, if it is open."""
@@ -162,7 +155,6 @@ class Rendering:
         picture = tile(list(self.frames()))
         if self._window is None:
             self._window = self._open((picture.shape[1], picture.shape[0]))
-        self._window.pressed_keys()
         self._window.show(picture, seconds)
 
     def _open(self, size: tuple[int, int]) -> Window:

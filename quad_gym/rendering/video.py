@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.flights.record import Flight, FlightRecorder
 from quad_gym.params import checks as check
 from quad_gym.records import Ending
@@ -46,11 +45,7 @@ def record_flight(
 
 
 def fly_steps(
-    policy: Any,
-    env: Any,
-    seed: int,
-    about: dict[str, Any],
-    before_step: Callable[[FlightBatch], None] = lambda batch: None,
+    policy: Any, env: Any, seed: int, about: dict[str, Any]
 ) -> Iterator[tuple[Flight, str]]:
     """Run an episode; yield the flight so far, at the start and after each step, and its ending.
 
@@ -59,7 +54,6 @@ def fly_steps(
         env: A vector environment of one flight.
         seed: Seed of the episode.
         about: Information to be stored with the flight.
-        before_step: Function that is called with the batch before each step.
     """
     batch = env.unwrapped.flights.batch
     recorder = FlightRecorder(batch, about=about)
@@ -68,7 +62,6 @@ def fly_steps(
     yield recorder.flight, "none"
     state, starts, over = None, np.ones(1, bool), False
     while not over:
-        before_step(batch)
         action, state = policy.predict(
             observation, state=state, episode_start=starts, deterministic=True
         )

@@ -81,44 +81,20 @@ def test_window_without_display_ends_with_hint_to_write_video(tmp_path):
     assert "without a display, --output writes a video instead" in done.stderr
 
 
-def test_keys_switch_sensors_and_faults_pause_and_end_flight():
-    class Keyboard:
-        """Window in which keys are pressed at given pictures."""
+def test_window_shows_every_picture_until_it_is_closed():
+    class Screen:
+        """Window that is closed after some pictures."""
 
-        def __init__(self, presses):
-            self.presses, self.shown, self.closed = presses, 0, False
+        def __init__(self, most):
+            self.shown, self.most = 0, most
+
+        closed = property(lambda self: self.shown == self.most)
 
         def show(self, frame, seconds):
             self.shown += 1
 
-        def pressed_keys(self):
-            return self.presses.pop(self.shown, [])
-
-    fault = {"faults": ("imu_bias_step",), "fault_time": (90.0, 99.0)}
-    args = script.FlyArgs(
-        env_id="QuadGym/Hover-v0", duration=2.0, camera=False, size=(320, 240), **fault
-    )
-    env = script.make_env(args)
-    policy = script.load_policy("pd", env)
-
-    def watched(presses):
-        switches, flights = script.Switches(), []
-        steps = script.fly(env, policy, 0, switches, {})
-        kept = (flights.append(flight) or flight for flight in steps)
-        window = Keyboard(presses)
-        return script.watch(kept, args, window, switches), flights[-1], window.shown
-
-    goes_on, flight, shown = watched(
-        {20: ["g"], 50: ["g"], 60: ["v"], 70: ["space"], 75: ["space"]}
-    )
-    assert goes_on
-    assert shown == len(flight) + 5  # the flight paused for five pictures
-    fixed = np.isfinite(flight["gnss_position"][:, 0])
-    np.testing.assert_array_equal(np.flatnonzero(~fixed), np.arange(20, 50))
-    _, flight, _ = watched({30: ["f"], 45: ["f"]})
-    np.testing.assert_array_equal(np.flatnonzero(flight["faults"]), np.arange(30, 45))
-    assert watched({10: ["r"]})[0]
-    for key in ("q", "escape"):
-        goes_on, flight, _ = watched({10: [key]})
-        assert not goes_on
-        assert len(flight) == 10
+    args = script.FlyArgs(env_id="QuadGym/Hover-v0", duration=0.4, size=(320, 240))
+    flights = script.flights_of(args)
+    for most, shown in ((100, 21), (10, 10)):
+        script.watch(flights(0), args, screen := Screen(most))
+        assert screen.shown == shown
