@@ -1,12 +1,12 @@
-"""Measure the speed of parts: filters, stages, options, tasks, compilation, learning, peers.
+"""Measure the speed of parts: filters, stages, tasks, compilation, learning, peers.
 
     python -m scripts.benchmarks filter
     python -m scripts.benchmarks filters --batch 64 --sensors rtk --estimators mine:Simple
 
 All ratios are measured within one run; see `quad-gym benchmark` for the rest. Learning trains the
 compiled PPO with ten seeds, and reports when each was first better than tuned PD control; filters
-compares the built-in filters and `--estimators` on the same flights; busy measures a tick next to
-busy processes; peers measures other simulators as far as they are installed.
+compares the built-in filters and `--estimators` on the same flights; peers measures other
+simulators as far as they are installed.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,11 @@ from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import WIDTH
 from scripts.benchmarks import (
-    busy,
     comparison,
     compiling,
     filter,
     filters,
     learning,
-    options,
     own_task,
     stages,
 )
@@ -39,17 +37,13 @@ SECTIONS = {
     "filter": filter.SECTION,
     "filters": filters.SECTION,
     "tick": stages.SECTION,
-    "busy": busy.SECTION,
     "peers": comparison.SECTION,
-    "options": options.SECTION,
     "tasks": own_task.SECTION,
     "compile": compiling.SECTION,
     "learning": learning.SECTION,
 }
 
-SectionName = Literal[
-    "filter", "filters", "tick", "busy", "peers", "options", "tasks", "compile", "learning"
-]
+SectionName = Literal["filter", "filters", "tick", "peers", "tasks", "compile", "learning"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +53,7 @@ class PartsArgs(BenchmarkArgs):
     section: Positional[SectionName] = "filter"
     """section to run"""
     batch: int = 256
-    """number of flights in the batches of filter, filters, tick and options, a multiple of eight"""
+    """number of flights in the batches of filter, filters and tick, a multiple of eight"""
     seeds: int = 10
     """number of training seeds of learning"""
     steps: int | None = None

@@ -11,7 +11,7 @@ class Scope(timing.Scope):
     """Extent of the measurements."""
 
     batch: int
-    """Number of flights in the batches of filter, filters, tick and options"""
+    """Number of flights in the batches of filter, filters and tick"""
     seeds: int
     """Number of training seeds"""
     steps: int | None
