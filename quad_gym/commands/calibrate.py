@@ -212,11 +212,7 @@ def next_command(args: CalibrateArgs, folder: Path) -> list[str]:
 
 
 def starts_of(args: CalibrateArgs) -> list[dict[str, Any]]:
-    """Return the starts of the logs.
-
-    Raises:
-        ValueError: If there are neither one heading nor one for each log.
-    """
+    """Return the starts of the logs."""
     starts: list[dict[str, Any]] = [{"course": True} if args.course else {} for _ in args.logs]
     if args.heading is not None:
         headings = args.heading * (len(starts) if len(args.heading) == 1 else 1)

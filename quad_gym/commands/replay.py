@@ -69,13 +69,7 @@ class ReplayArgs(ReadingArgs):
 
 
 def folder_of(args: ReplayArgs) -> Path:
-    """Check the output, and create its folder.
-
-    Raises:
-        ValueError: If results exist already, or options contradict each other.
-        OSError: If the folder is not writable.
-        ImportError: If matplotlib is missing.
-    """
+    """Check the output, and create its folder."""
     from quad_gym.analysis.plots import require_matplotlib
     from quad_gym.analysis.reports import require_writable
 

@@ -60,11 +60,7 @@ def register_task(
 
 
 def keywords_of(env_id: str) -> dict[str, Any]:
-    """Return the keywords of an id, "base" among them: of one of `IDS`, or of `register_task`.
-
-    Raises:
-        ValueError: If there is no such id.
-    """
+    """Return the keywords of an id, "base" among them: of one of `IDS`, or of `register_task`."""
     name = env_id.removeprefix("quad_gym:") if isinstance(env_id, str) else env_id
     spec = registry.get(name) if isinstance(name, str) else None
     if spec is None or spec.entry_point != _ENTRY_POINTS["entry_point"]:

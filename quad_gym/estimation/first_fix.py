@@ -108,11 +108,7 @@ class FilterStart:
 
 
 def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
-    """Return the start that follows from a first fix.
-
-    Raises:
-        ValueError: As in `initialize`.
-    """
+    """Return the start that follows from a first fix."""
     require_gnss(sensors, "initialize: start with set_state() instead")
     assert sensors.gnss is not None
     position = check.array("gnss_position_G", fix.gnss_position_G, (3,))

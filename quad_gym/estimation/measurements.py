@@ -35,9 +35,6 @@ class LogMeasurements:
         unused: Names of the others.
         takes_velocity: True if the suite uses velocities of GNSS.
         R_GI: (3, 3) axes of I in G.
-
-    Raises:
-        MisfitError: If images have other features than the suite.
     """
 
     def __init__(self, log: Log, suite: SensorSuite, reported_noise: bool) -> None:

@@ -101,10 +101,6 @@ def checked_estimate(method: str, given: Any, count: int, rows: Truths) -> dict[
         given: Its return value.
         count: Number of flights.
         rows: Flights whose values must be finite, (n,).
-
-    Raises:
-        ValueError: If it is not a dictionary, a name is missing or unknown, or a value has another
-            shape, is not finite, or is no rotation.
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"{method} must return a dictionary of arrays, got {given!r:.60}")
@@ -136,11 +132,7 @@ def checked_estimate(method: str, given: Any, count: int, rows: Truths) -> dict[
 
 
 def own_copy(given: Estimator) -> Estimator:
-    """Return a copy that shares nothing with the estimator.
-
-    Raises:
-        ValueError: If it holds something that cannot be copied.
-    """
+    """Return a copy that shares nothing with the estimator."""
     try:
         return copy.deepcopy(given)
     except Exception as error:  # of any library whose objects it holds
@@ -184,11 +176,7 @@ def _require(method: str, what: str, good: Any, values: Floats, rows: Truths) ->
 
 
 def factors(method: str, covariances: Floats, rows: Truths) -> Floats:
-    """Return lower Cholesky factors of covariances; NaN where not in `rows`.
-
-    Raises:
-        ValueError: If a covariance in `rows` is not symmetric positive definite.
-    """
+    """Return lower Cholesky factors of covariances; NaN where not in `rows`."""
     variances = np.einsum("nii->ni", covariances)
     with np.errstate(invalid="ignore"):  # of negative variances, which are refused below
         most = _ASYMMETRY * np.sqrt(variances[:, :, np.newaxis] * variances[:, np.newaxis])

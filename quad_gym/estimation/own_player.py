@@ -63,12 +63,7 @@ class OwnPlayer:
         self._features = np.array(features, np.float64).reshape(1, -1, 3)
 
     def play(self) -> Replay:
-        """Estimate along the whole log.
-
-        Raises:
-            ValueError: If the log has no start, the heading is unknown there, or an estimate is
-                invalid.
-        """
+        """Estimate along the whole log."""
         player, dt = self._player, self._suite.imu.dt
         player.start.tilted = False  # an estimator of a user's knows no unknown heading
         player.write_tape()

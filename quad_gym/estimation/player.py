@@ -80,12 +80,7 @@ class Player:
     # ---- the log, event by event ---------------------------------------------------------------
 
     def write_tape(self) -> None:
-        """Start the filter, and write the operations on the log to a tape.
-
-        Raises:
-            MisfitError: If the suite has no sensor of the log.
-            ValueError: If the log has no fix to start from, or its IMU samples have a gap.
-        """
+        """Start the filter, and write the operations on the log to a tape."""
         names = list(self.streams)  # the IMU first: it comes before what arrives with it
         arrivals = "time" if self.in_order else "received"
         received = np.concatenate([getattr(self.streams[name], arrivals) for name in names])

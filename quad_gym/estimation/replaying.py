@@ -160,9 +160,6 @@ def prepared(log: Any, sensors: SensorSuite | str, reading: Reading) -> tuple[Lo
     """Return a log without its delays, in the axes of B, and a suite with the origin of I.
 
     Quantities that other sensors contradict are left out.
-
-    Raises:
-        ValueError: As `replay`.
     """
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
@@ -183,11 +180,7 @@ def origin_of(log: Log, suite: SensorSuite) -> SensorSuite:
 
 
 def named_start(start: Mapping[str, Any] | None) -> dict[str, Any]:
-    """A start as keywords of `initialize`, or with a position as those that the player checks.
-
-    Raises:
-        ValueError: If it is none.
-    """
+    """A start as keywords of `initialize`, or with a position as those that the player checks."""
     if start is not None and not isinstance(start, Mapping):
         raise ValueError(f"start must be values by name, or None, got {start!r}")
     given = dict(start or {})

@@ -73,10 +73,6 @@ def checked_measurement(
         pixels: As in `update`.
         velocity_G: As in `update`.
         others: Measurements of aiding sensors by name, and noise by SIGMA_KEYWORDS.
-
-    Raises:
-        ValueError: If one has another shape or is not finite, the suite lacks its sensor, or noise
-            is given without its measurement.
     """
     aids = _checked_aids(sensors, others) if others else {}
     if position_G is not None or baseline_G is not None:
@@ -112,11 +108,7 @@ def require_gnss(sensors: SensorSuite, what: str) -> None:
 
 
 def checked_baseline(sensors: SensorSuite, gnss_baseline_G: ArrayLike) -> Floats:
-    """Return a baseline, scaled by a power of two: its length is not used.
-
-    Raises:
-        ValueError: If it has another shape, is not finite or zero, or GNSS has one antenna.
-    """
+    """Return a baseline, scaled by a power of two: its length is not used."""
     if sensors.gnss is not None and not sensors.gnss.has_baseline:
         raise ValueError("gnss_baseline_G must be None for GNSS with one antenna")
     baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))

@@ -125,11 +125,7 @@ class _Forward:
 
 
 def _filter_forward(player: Player) -> _Forward:
-    """Run the filter of a player.
-
-    Raises:
-        ValueError: As `Player.write_tape`, or if the heading is never known.
-    """
+    """Run the filter of a player."""
     player.write_tape()
     kf = player.filter
     tape, status = player.writer.tape(), kf.status

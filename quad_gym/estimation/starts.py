@@ -113,9 +113,6 @@ def rest(start: NDArray[Any], accel: Floats, sigma: float, gravity: float) -> No
         accel: (3,) measured specific force in B [m/s^2].
         sigma: Standard deviation of its white noise, per axis [m/s^2].
         gravity: Gravitational acceleration that the filter assumes [m/s^2].
-
-    Raises:
-        ValueError: If the measurement is not from a vehicle at rest, or its x axis is vertical.
     """
     size = float(np.linalg.norm(accel))
     if abs(size - gravity) > MAX_MOTION * gravity:
@@ -138,9 +135,6 @@ def head_by_baseline(start: NDArray[Any], sensors: SensorSuite, baseline_I: Floa
 
     The baseline, (3,) from the primary antenna, acts as a magnetic field whose direction is
     measured in I.
-
-    Raises:
-        ValueError: If the baseline is too steep.
     """
     assert sensors.gnss is not None
     baseline_B = np.array(sensors.gnss.baseline_B)

@@ -116,9 +116,6 @@ def digest_of_function(function: Callable[..., Any]) -> str:
 
     Functions made from one piece of source differ in their closures and defaults. Functions among
     these values count with their own modules, other values as they are.
-
-    Raises:
-        TypeError: If it closes over something other than functions, numbers, strings and tuples.
     """
     return hashlib.sha256("\n".join(_function(function, ())).encode()).hexdigest()
 

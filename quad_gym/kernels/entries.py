@@ -63,11 +63,7 @@ class Entry:
         return self.bound(*given)() if self._arrays else self._function(*given)
 
     def bound(self, *given: Any) -> Callable[[], Any]:
-        """Return a function that makes this call again and again, with the same memory.
-
-        Raises:
-            TypeError: If an array has another data type, number of axes or order.
-        """
+        """Return a function that makes this call again and again, with the same memory."""
         for k, wanted in self._arrays:
             _check(self.name, wanted, given[k])
         if library() is None:

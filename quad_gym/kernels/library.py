@@ -85,9 +85,6 @@ def library() -> Library | None:
     """Return the library for this machine and these sources; None: Numba compiles.
 
     QUAD_GYM_KERNELS selects one of both, "library" or "numba".
-
-    Raises:
-        NoKernelsError: If there is neither, with the reason and what to install.
     """
     choice = os.environ.get("QUAD_GYM_KERNELS", "")
     if choice not in _CHOICES:

@@ -49,9 +49,6 @@ class Checked:
     Subclasses are dataclasses without a decorator, with keyword-only fields by default. The rule of
     a field is part of its type, as in `Annotated[float, rule]`, or follows from it. Errors name a
     field with its class; `bare`: without it.
-
-    Raises:
-        UnknownKeywordError: If a keyword is no field.
     """
 
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]

@@ -115,9 +115,6 @@ def on_one_clock(recording: RawLog, sources: Sequence[LogSource]) -> list[LogSou
 
     Stamps of another clock than the recorder's are moved by the median difference, unless all
     sources have the same one, as in a log that was recorded again.
-
-    Raises:
-        ValueError: If streams without times of recording have nothing in common with the IMU.
     """
     lags = [
         0.0 if s.received is None or not len(s) else float(np.median(s.received - s.time))

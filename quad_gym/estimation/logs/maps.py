@@ -53,12 +53,7 @@ _PRESSURES = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1e3, "bar": 1e5}
 
 
 def read_table(path: Path, file: Path) -> RawLog:
-    """Return the contents of a comma-separated table by a map.
-
-    Raises:
-        ValueError: If table or map is invalid.
-        OSError: If one of the files does not exist.
-    """
+    """Return the contents of a comma-separated table by a map."""
     return mapped(tables.csv_columns(path), file, path.name)
 
 

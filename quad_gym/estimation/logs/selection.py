@@ -31,9 +31,6 @@ def select(
         sources: Its sources, cleaned.
         instance: Numbers that the caller chooses, by sensor.
         topic: Topics that the caller chooses, by sensor.
-
-    Raises:
-        ValueError: If the caller chooses a source that does not exist.
     """
     keywords(instance or {}, SENSORS, "instance")
     keywords(topic or {}, SENSORS, "topic")

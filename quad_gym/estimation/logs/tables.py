@@ -33,12 +33,7 @@ def opened(path: Path) -> TextIO:
 
 
 def csv_columns(path: Path) -> Columns:
-    """Return the columns of a file by their headings; an empty cell is NaN.
-
-    Raises:
-        ValueError: If it is no table of numbers with a line of distinct names.
-        OSError: If there is no such file.
-    """
+    """Return the columns of a file by their headings; an empty cell is NaN."""
     numbers, count = array("d"), 0
     try:
         with opened(path) as file:
@@ -72,12 +67,7 @@ def _number(path: Path, cell: str, row: int) -> float:
 
 
 def checked_columns(given: Mapping[Any, Any]) -> Columns:
-    """Return columns of one number each, checked.
-
-    Raises:
-        ValueError: If columns are missing, unknown, or of unequal length, or hold values that are
-            infinite or not numbers.
-    """
+    """Return columns of one number each, checked."""
     known = {name for column in LOG_COLUMNS.values() for name in column.names}
     found: dict[str, Floats] = {}
     for key, value in given.items():

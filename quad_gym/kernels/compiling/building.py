@@ -57,10 +57,6 @@ def build(
 
     Returns:
         All libraries, the new ones and those that are up to date.
-
-    Raises:
-        ValueError: If there are no libraries for the family, or with so many lanes.
-        RuntimeError: If there is no C compiler, or a library cannot be built.
     """
     family = family or machine()
     known = PROCESSORS.get(family, {}) if sys.platform == "linux" else {}
@@ -89,11 +85,7 @@ def build(
 
 
 def require_compiler() -> str:
-    """Return the C compiler that links.
-
-    Raises:
-        RuntimeError: If there is none.
-    """
+    """Return the C compiler that links."""
     name = os.environ.get("CC") or "cc"
     if shutil.which(name) is None:
         raise RuntimeError(

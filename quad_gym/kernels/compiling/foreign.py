@@ -90,9 +90,6 @@ def object_of(name: str, processor: Processor) -> bytes:
     Args:
         name: "module:function" of an entry.
         processor: Processor to emit code for.
-
-    Raises:
-        RuntimeError: If the code calls a function.
     """
     return cached(name, "o", processor, lambda: emitted(linked(name), processor))
 
@@ -172,11 +169,7 @@ def _linked(name: str) -> str:
 
 
 def emitted(text: str, processor: Processor) -> bytes:
-    """Return the object file of IR.
-
-    Raises:
-        RuntimeError: If the code calls a function.
-    """
+    """Return the object file of IR."""
     return bytes(machine_of(processor).emit_object(optimized(text, processor)))
 
 
@@ -193,11 +186,7 @@ def machine_of(processor: Processor) -> Any:
 
 
 def optimized(text: str, processor: Processor) -> Any:
-    """Return the module of IR, optimized for a processor.
-
-    Raises:
-        RuntimeError: If the code calls a function that is not ours.
-    """
+    """Return the module of IR, optimized for a processor."""
     machine = machine_of(processor)
     text = _with_pauses(text, processor.triple.partition("-")[0])
     if processor.tune:
