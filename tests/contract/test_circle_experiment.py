@@ -31,7 +31,8 @@ def no_figures():
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("circle")
-    return folder, run(folder, "--episodes 20")
+    with without_figures():
+        return folder, run(folder, "--episodes 20")
 
 
 def test_errors_are_within_expected_ranges(flown):
@@ -74,9 +75,10 @@ def test_figures_of_report_are_written_as_png_and_svg(flown):
     assert written == {f"{name}.{ending}" for name in names for ending in ("png", "svg")}
 
 
-def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
-    one = run(tmp_path / "one", "--seed 3 --episodes 1 --threads 1")
-    with (flown[0] / "flights.csv").open() as stream:
+def test_results_do_not_depend_on_batch_or_threads(tmp_path, no_figures):
+    run(tmp_path / "many", "--episodes 5 --duration 1")
+    one = run(tmp_path / "one", "--seed 3 --episodes 1 --duration 1 --threads 1")
+    with (tmp_path / "many/flights.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for case in CASES:
         want = next(r for r in rows if r["case"] == case and r["seed"] == "3")
