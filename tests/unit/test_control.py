@@ -1,5 +1,7 @@
 """Allocation, the report's PD controller and the inner loops, against their equations in NumPy."""
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -47,6 +49,7 @@ def act_on_lanes(blocks, params, mode, ref):
     act(flight, load4(flight.action), lanes_of(params[0]), mode, reference)
 
 
+@functools.cache
 def numbers_of(vehicle):
     return params_record(vehicle, quad_gym.SensorSuite(), GAINS, quad_gym.ActionParams())
 
