@@ -18,7 +18,7 @@ COMMANDS = {
     "sweep": "run sets of trainings, on one machine or on several that share a folder",
     "tune": "tune the gains of the PD controller",
     "fly": "show a flight in a window, or render a video",
-    "replay": "run the filter on the log of a real flight (CSV, PX4, ArduPilot, ROS)",
+    "replay": "run the filter on the log of a real flight (CSV, PX4, ArduPilot, ROS, EuRoC)",
     "calibrate": "find the noise and delays of a vehicle's sensors from the log of a flight",
     "consistency": "test the filter's consistency: NEES and NIS over many flights",
     "benchmark": "measure the speed of flights on this machine",

@@ -342,7 +342,7 @@ LogFile = Positional[
         Path,
         arg(
             metavar="LOG",
-            help="table (.csv, .csv.gz), log of PX4 (.ulg) or ArduPilot (.bin), bag",
+            help="table (.csv, .csv.gz), log of PX4 (.ulg) or ArduPilot (.bin), bag, EuRoC folder",
         ),
     ]
 ]

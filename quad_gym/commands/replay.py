@@ -5,10 +5,10 @@
     quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
     quad-gym replay flight.csv --sensors rtk --estimator module:Class
 
-A log is a CSV table, a log of PX4 or ArduPilot, or a bag of ROS; some require an extra, such as
-`pip install 'quad-gym[ulog]'`. docs/logs.md describes them. The last lines are the verdict. The
-exit code is 1 if units or axes are implausible, the suite's noise model does not fit the log, or
-the filter was lost.
+A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
+some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. The last
+lines are the verdict. The exit code is 1 if units or axes are implausible, the suite's noise model
+does not fit the log, or the filter was lost.
 """
 
 import math
@@ -69,7 +69,13 @@ class ReplayArgs(ReadingArgs):
 
 
 def folder_of(args: ReplayArgs) -> Path:
-    """Check the output, and create its folder."""
+    """Check the output, and create its folder.
+
+    Raises:
+        ValueError: If results exist already, or options contradict each other.
+        OSError: If the folder is not writable.
+        ImportError: If matplotlib is missing.
+    """
     from quad_gym.analysis.plots import require_matplotlib
     from quad_gym.analysis.reports import require_writable
 

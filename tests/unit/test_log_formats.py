@@ -93,3 +93,32 @@ def test_files_of_another_kind_and_missing_libraries_are_named(
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match="install it with pip install 'quad-gym"):
         read_log(tmp_path / name)
+
+
+@pytest.mark.parametrize("up", ["z", "x"])
+def test_euroc_folder_has_the_numbers_of_the_flight(flight, tmp_path, up):
+    """The IMU is rotated. If x is up, the body is EuRoC's, with z forward."""
+    T, R_BS = np.eye(4), np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    body = np.eye(3) if up == "z" else np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0]])
+    T[:3, :3] = R_BS
+    turned = (values @ body @ R_BS for values in (flight.gyro, flight.accel))
+    tables = {
+        "imu0": ("w_RS_S_x [rad s^-1],w_y,w_z,a_x,a_y,a_z", flight.time, np.hstack([*turned])),
+        "leica0": ("p_RS_R_x [m],p_y,p_z", flight.fix_time, flight.fixes),
+    }
+    for name, (columns, times, values) in tables.items():
+        lines = [f"#timestamp [ns],{columns}"]
+        for time, row in zip(times, values, strict=True):
+            cells = [round(1e9 * time) + 10**12, *map(float, row)]
+            lines.append(",".join(map(repr, cells)))
+        (tmp_path / "mav0" / name).mkdir(parents=True)
+        (tmp_path / "mav0" / name / "data.csv").write_text("\n".join(lines))
+    numbers = ", ".join(f"{x}" for x in T.ravel())
+    (tmp_path / "mav0/imu0/sensor.yaml").write_text(
+        f"sensor_type: imu\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers}]\nrate_hz: 200\n"
+    )
+    log = read_log(tmp_path)
+    np.testing.assert_allclose(log.imu.time - 1000.0, flight.time, atol=2e-6)
+    for name in ("gyro", "accel"):
+        np.testing.assert_allclose(log.imu.values[name], getattr(flight, name), atol=1e-12)
+    np.testing.assert_array_equal(log.gnss.values["position_I"], flight.fixes)

@@ -7,7 +7,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from quad_gym.estimation.logs import clocks, maps, quantities, tables
+from quad_gym.estimation.logs import clocks, euroc, maps, quantities, tables
 from quad_gym.estimation.logs.log import Log, Stream
 from quad_gym.estimation.logs.selection import select
 from quad_gym.estimation.logs.source import LogSource, RawLog
@@ -43,9 +43,9 @@ def read_log(
     Args:
         log: A pandas DataFrame, a mapping of columns, or a path: of a comma-separated table with a
             line of names (.csv, .csv.gz), of a log of PX4 (.ulg) or ArduPilot (.bin), of a bag of
-            ROS 1 (.bag) or ROS 2 (a folder); see the modules of `quad_gym.estimation.logs`. A
-            mapping may hold the numbers of a quantity together, such as `"gyro"` (n, 3). See
-            LOG_COLUMNS.
+            ROS 1 (.bag) or ROS 2 (a folder), or of a folder in the format of EuRoC; see the modules
+            of `quad_gym.estimation.logs`. A mapping may hold the numbers of a quantity together,
+            such as `"gyro"` (n, 3). See LOG_COLUMNS.
         body: Axes of IMU and magnetometer in a table: "flu" (x forward, y left, z up), or "frd" (x
             forward, y right, z down).
         instance: Numbers of the sensors to take, such as `{"magnetometer": 1}`; of others, the one
@@ -94,6 +94,8 @@ def _recording(log: Any, body: str, columns: Path | str | None) -> RawLog:
             from quad_gym.estimation.logs.ros import read_bag
 
             return read_bag(path)
+        if euroc.is_euroc(path):
+            return euroc.read_euroc(path)
         given = tables.csv_columns(path)
         try:
             return tables.recording_of(tables.checked_columns(given), body, path.name)
