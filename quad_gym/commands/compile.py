@@ -18,7 +18,10 @@ Numba is not even imported, for each number of lanes that processors like this o
 another `--family`. It takes minutes, and a C compiler. Libraries belong to the sources; after an
 edit, Numba compiles again.
 
-The exit code is 1 if code cannot be written to the cache.
+`--stage sensors.barometer:barometer` compiles one stage, while you write it, and says in a few
+lines which kernel and line is wrong, and why.
+
+The exit code is 1 if code cannot be written to the cache, or the stage does not compile.
 """
 
 import sys
@@ -42,6 +45,8 @@ class CompileArgs:
     """functions to compile: truth (for environments that observe the truth), plain (for default
     environments with sensors and filter), single (for single vehicles, such as
     UnscentedKalmanFilter), all (these, and every option of the environments)"""
+    stage: str | None = None
+    """a single stage, as MODULE:KERNEL of quad_gym.kernels"""
     jobs: int | None = None
     """number of processes that compile; defaults to one per core"""
     library: bool = False
@@ -57,6 +62,8 @@ class CompileArgs:
         if not self.stages:
             raise ValueError("--stages must have at least one value, got none")
         require_at_least(self, jobs=1)
+        if self.stage is not None and self.library:
+            raise ValueError("--stage must not come with --library")
         if (self.lanes or self.family) and not self.library:
             name = "lanes" if self.lanes else "family"
             raise ValueError(f"--{name} must come with --library")
@@ -91,6 +98,8 @@ def main(args: CompileArgs) -> int:
         Exit code.
     """
     with usage_errors((ValueError, RuntimeError, ImportError)):
+        if args.stage is not None:
+            return _compile_one(args.stage)
         found = None if args.library else library()
         if found is not None:
             print(f"nothing to compile: {found.file.name} has all functions")
@@ -117,6 +126,19 @@ def main(args: CompileArgs) -> int:
     if lost:
         print(f"error: {len(lost)} of them could not be written to the cache", file=sys.stderr)
     return 1 if lost else 0
+
+
+def _compile_one(name: str) -> int:
+    """Compile one stage; report its first error on stderr."""
+    check.package("numba", "compiling", "compile")
+    from quad_gym.kernels.compiling.diagnosis import StageError, compile_one
+
+    try:
+        print(f"compiled  {compile_one(name)}")
+    except StageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
 
 
 def _build(args: CompileArgs) -> int:

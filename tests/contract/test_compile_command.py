@@ -1,5 +1,6 @@
 """The command that compiles ahead of the first use."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -77,3 +78,42 @@ def test_compile_fails_if_code_cannot_be_written_to_cache(monkeypatch, capsys):
     assert main(["compile", "--stages", "truth"]) == 1
     count = len(names_of_kinds(["truth"]))
     assert f"error: {count} of them could not be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stage", "kernel", "reason"),
+    [
+        ("missing_argument", "_sum, .*:15: return _range", "missing a required .* 'anchor_I'"),
+        ("missing_field", "missing_field_stage, .*flight.altitude", "attribute 'altitude'"),
+        ("wrong_type", r"_range, .*: offset = r_I - anchor_I", r"sub\(vector, number\)"),
+        ("missing_name", "missing_name_stage, .*metres", "name 'metres' is not defined"),
+    ],
+)
+def test_wrong_stage_is_reported_by_kernel_line_and_reason(stage, kernel, reason, capsys):
+    assert main(["compile", "--stage", f"tests.wrong_stages:{stage}"]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("error: "))
+    assert len(lines) - first <= 10
+    assert f"{stage}_stage does not compile" in lines[first]
+    assert re.search(f"kernel: {kernel}", lines[first + 1])
+    assert re.search(f"reason: .*{reason}", lines[first + 2])
+
+
+def test_single_stage_is_compiled_by_its_name(capsys):
+    assert main(["compile", "--stage", "sensors.barometer:barometer"]) == 0
+    said = capsys.readouterr().out
+    assert said == "compiled  quad_gym.kernels.sensors.barometer:barometer_stage\n"
+
+
+@pytest.mark.parametrize(
+    ("stage", "message"),
+    [
+        ("sensors.barometre:barometer", "MODULE:KERNEL of quad_gym.kernels"),
+        ("sensors.barometer:barometre", "got barometre_stage; did you mean barometer_stage"),
+    ],
+)
+def test_unknown_stage_is_refused(stage, message, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["compile", "--stage", stage])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
