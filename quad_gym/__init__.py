@@ -15,7 +15,8 @@ from quad_gym.envs import (
     register_task,
 )
 from quad_gym.envs.keywords import EnvKeywords
-from quad_gym.params.barometer import BarometerParams
+from quad_gym.params import aid_table
+from quad_gym.params.aid_table import *  # noqa: F403
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.distributions import LogUniform, Normal, Uniform
@@ -23,11 +24,8 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.obstacles import Cylinder, Wall
-from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.randomization import Randomization
-from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.reward import RewardParams
 from quad_gym.params.sensors import (
     InitialPoseParams,
@@ -94,7 +92,6 @@ _LAZY = {
 __all__ = [
     "IDS",
     "ActionParams",
-    "BarometerParams",
     "BatteryParams",
     "CameraParams",
     "Cylinder",
@@ -112,17 +109,14 @@ __all__ = [
     "InitialPoseParams",
     "LogDelays",
     "LogUniform",
-    "MagnetometerParams",
     "Measurements",
     "NoisyObservationParams",
     "Normal",
     "ObservationSpec",
-    "OpticalFlowParams",
     "PDGains",
     "QuadEnv",
     "QuadVectorEnv",
     "Randomization",
-    "RangeFinderParams",
     "RewardParams",
     "SensorSuite",
     "Task",
@@ -146,4 +140,5 @@ __all__ = [
     "sensor_suite",
     "vehicle_params",
     "world_params",
+    *aid_table.__all__,
 ]

@@ -12,7 +12,7 @@ from baselines import PDPolicy
 from quad_gym import FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.frames import ecef_to_enu, ecef_to_geodetic
-from quad_gym.records import AID_BLOCKS, Aid
+from quad_gym.records import AID_BLOCKS, AID_ROW, Aid
 from quad_gym.rotations import quaternion_to_dcm
 
 RTK = quad_gym.sensor_suite("rtk")
@@ -86,12 +86,13 @@ class Recorded:
         )
         self.aids = []
         for aid, params in suite.aids.items():
-            found, latency = [], params.latency
-            for k in np.flatnonzero(np.isfinite(flight.about["aids"][:, aid, 0])):
+            found, latency, row = [], params.latency, AID_ROW[aid]
+            values = flight.about["aids"][:, row : row + params.blocks, : params.length]
+            for k in np.flatnonzero(np.isfinite(values).any(axis=(1, 2))):
                 if k == 0 or rng.random() >= lost:
                     arrival = time[k] + (rng.uniform(0.0, jitter) if k else 0.0)
                     stamp = time[k] - (latency if k else 0.0)
-                    found.append((stamp, arrival, flight.about["aids"][k, aid]))
+                    found.append((stamp, arrival, values[k].ravel()))
             self.aids.append(found)
         self.camera = measured(("pixels",), suite.camera.latency if suite.camera else 0.0)
 
@@ -102,7 +103,11 @@ class Recorded:
         for quantity in ("gnss", "gnss_baseline", "gnss_velocity"):
             names += [f"{quantity}_{axis}" for axis in ("east", "north", "up")]
         names += [f"pixel_{i}_{axis}" for i in range(features) for axis in "uv"]
-        aids = {Aid.BAROMETER: ["barometer"], Aid.MAGNETOMETER: AXES_OF_FIELD}
+        aids = {
+            Aid.BAROMETER: ["barometer"],
+            Aid.MAGNETOMETER: AXES_OF_FIELD,
+            Aid.UWB_RANGE: [f"uwb_range_{k}" for k in range(4)],
+        }
         names += [name for aid in self.suite.aids for name in aids[aid]]
         rows = []
 
@@ -120,7 +125,7 @@ class Recorded:
             add(time, received, dict(zip(names[17:], values["pixels"].ravel(), strict=True)))
         for aid, found in zip(self.suite.aids, self.aids, strict=True):
             for time, received, values in found:
-                add(time, received, dict(zip(aids[aid], values, strict=False)))
+                add(time, received, dict(zip(aids[aid], values, strict=True)))
         table = np.array(rows)
         table = table[np.argsort(table[:, 1], kind="stable")]
         return {name: table[:, i] for i, name in enumerate(names)}

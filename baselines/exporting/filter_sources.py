@@ -22,8 +22,8 @@ from quad_gym.kernels.library import core_symbol
 from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
-    AID_BLOCKS,
-    AID_FREEDOMS,
+    AID_BLOCK,
+    AID_ROW,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     FLIGHT_BLOCK,
@@ -38,7 +38,6 @@ from quad_gym.records import (
     STEP_BLOCK,
     VELOCITY_BLOCK,
     WORK_BLOCK,
-    Aid,
     offset_of,
     room_of,
 )
@@ -78,6 +77,7 @@ class _Port(NamedTuple):
     sigma: str  #: name of its standard deviation
     sigma_place: str  #: field of MEASUREMENT
     sigma_note: str  #: unit, for a comment
+    blocks: int = 1  #: number of blocks
 
 
 _GNSS_PORTS = (
@@ -97,12 +97,6 @@ _GNSS_PORTS = (
         *("velocity_sigma", "velocity_sigma", "[m/s]"),
     ),
 )
-_AID_NOTES = {
-    Aid.BAROMETER: ("height in I from static pressure [m]", "[m]"),
-    Aid.MAGNETOMETER: ("magnetic field in B [T]", "[T]"),
-    Aid.OPTICAL_FLOW: ("optical flow [rad/s], see quad_gym.OpticalFlowParams", "[rad/s]"),
-    Aid.RANGE_FINDER: ("range to the ground [m]", "[m]"),
-}
 _WINDOW = 0.5  #: longest delay of measurements beyond the suite's `log_delays` [s], as in a replay
 
 
@@ -249,11 +243,13 @@ class Sources:
     def _ports(self) -> Iterator[_Port]:
         """Measurements of the suite."""
         suite, gnss = self.suite, self.suite.gnss
-        for aid in suite.aids:
-            name, (note, unit), index = aid.name.lower(), _AID_NOTES[aid], int(aid)
-            place, sigma = f"aid_measurement[{index}]", f"aid_sigma[{index}]"
-            rest = note, f"{name}_sigma", sigma, unit
-            yield _Port(name, AID_FREEDOMS[aid], AID_BLOCKS + aid, place, *rest)
+        for aid, params in suite.aids.items():
+            name, unit = aid.name.lower(), f"[{params.unit}]"
+            place, sigma = f"aid_measurement[{AID_ROW[aid]}]", f"aid_sigma[{int(aid)}]"
+            missing = "; NAN: not measured" if params.most_blocks > 1 else ""
+            rest = f"{params.meaning} {unit}{missing}", f"{name}_sigma", sigma, unit
+            port = _Port(name, params.length * params.blocks, AID_BLOCK[aid], place, *rest)
+            yield port._replace(blocks=params.blocks)
         if gnss is not None:
             has = (True, gnss.has_baseline, gnss.velocity_sigma is not None)
             yield from itertools.compress(_GNSS_PORTS, has)
@@ -275,9 +271,16 @@ class Sources:
                 f"    {sigma}; /* {port.sigma_note} */\n"
             )
             texts["API"] += f"{call}; /* {port.note} */\n"
+            length = port.numbers // port.blocks
             texts["TAKE"] += (
-                f"    r.valid[{port.block}] = qgi_put(r.{port.place}, m->{name}, {port.numbers});\n"
+                f"    r.valid[{port.block}] = qgi_put(r.{port.place}, m->{name}, {length});\n"
             )
+            if port.blocks > 1:
+                one = f"(&r.{port.place})[i], m->{name} + {length} * i, {length}"
+                texts["TAKE"] += (
+                    f"    for (int i = 1; m->{name} && i < {port.blocks}; i++)\n"
+                    f"        r.valid[{port.block} + i] = qgi_put({one});\n"
+                )
             texts["TAKE"] += (
                 f"    qgi_put(r.{port.sigma_place}, m->{port.sigma}, 3);\n"
                 if several
@@ -321,7 +324,7 @@ class Sources:
             ),
             "CAMERA": suite.camera is not None,
             "GNSS": suite.gnss is not None,
-            "BAROMETER": Aid.BAROMETER in suite.aids,
+            "BAROMETER": suite.barometer is not None,
             "FEATURE_BLOCKS": FEATURE_BLOCKS,
         }
 

@@ -33,6 +33,7 @@ from quad_gym.envs.keywords import TASK_KEYWORDS
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.estimation.logs.log import LOG_COLUMNS, LogColumn
 from quad_gym.flights.columns import COLUMNS, FEATURES
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES
 from quad_gym.tasks.view import VIEW_FIELDS
@@ -259,8 +260,7 @@ def _suites_page() -> str:
         "imu": quad_gym.ImuParams,
         "gnss": quad_gym.GnssParams,
         "camera": quad_gym.CameraParams,
-        "barometer": quad_gym.BarometerParams,
-        "magnetometer": quad_gym.MagnetometerParams,
+        **AID_PARAMS,
         "initial_pose": quad_gym.InitialPoseParams,
         "estimator": quad_gym.FilterParams,
         "noisy": quad_gym.NoisyObservationParams,

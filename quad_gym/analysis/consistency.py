@@ -184,7 +184,10 @@ SENSOR_BLOCKS = {
     "baseline": (records.BASELINE_BLOCK,),
     "velocity": (records.VELOCITY_BLOCK,),
     "feature": tuple(range(records.FEATURE_BLOCKS, records.AID_BLOCKS)),
-    **{aid.name.lower(): (records.AID_BLOCKS + aid,) for aid in records.Aid},
+    **{
+        aid.name.lower(): tuple(range(first, first + most))
+        for aid, first, most in zip(records.Aid, records.AID_BLOCK, records.AID_MOST, strict=True)
+    },
 }
 """Blocks of the measurement by sensor. Errors of features in one image are correlated through
 attitude and position, so that only the first one is used: the values of an instant are independent.

@@ -18,6 +18,7 @@ from quad_gym.analysis.plots import (
 )
 from quad_gym.estimation.calibration import Calibration
 from quad_gym.estimation.results import Measured, Replay, by_sensor
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
 _MAX_POINTS = 4000  #: points of a curve
@@ -27,10 +28,7 @@ _SENSORS = {
     "gnss_velocity": "velocities",
     "gnss_baseline": "baselines",
     "features": "features",
-    "barometer": "barometer",
-    "magnetometer": "magnetometer",
-    "optical_flow": "optical flow",
-    "range_finder": "range finder",
+    **{name: name.replace("_", " ") for name in AID_PARAMS},
 }
 
 

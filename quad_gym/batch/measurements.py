@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.memory import FlightMemory
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
-    AID_BLOCKS,
-    AID_FREEDOMS,
+    AID_BLOCK,
+    AID_MOST,
+    AID_ROW,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     POSITION_BLOCK,
@@ -37,26 +39,12 @@ def _record(name: str, meaning: str) -> "cached_property[Floats]":
     return cached_property(read)
 
 
-def _aid(aid: Aid, meaning: str) -> "cached_property[SensorReading | None]":
-    """Make a property of the measurement of an aiding sensor."""
-
-    def read(self: "Measurements") -> SensorReading | None:
-        if getattr(self.sensors, aid.name.lower()) is None:
-            return None
-        numbers = AID_FREEDOMS[aid]
-        part = (slice(None), int(aid), 0 if numbers == 1 else slice(numbers))
-        new = self._new(AID_BLOCKS + aid, 1)[:, 0]
-        return self._reading("aid_measurement", new, Sensor[aid.name], *part)
-
-    read.__doc__ = meaning
-    return cached_property(read)
-
-
 class Measurements:
     """IMU sample of a tick, and the measurements that arrive at its end.
 
     Arrays have one row per flight, and are read when first used. Measurements are raw: with biases,
-    noise, latency and faults. A sensor that the suite lacks is None.
+    noise, latency and faults. A sensor that the suite lacks is None. Each sensor of
+    `quad_gym.params.aid_table` is an attribute with its name.
 
     Attributes:
         count: Number of flights, n.
@@ -132,10 +120,29 @@ class Measurements:
         new = self._new(FEATURE_BLOCKS, count)
         return self._reading("pixels", new, Sensor.CAMERA, slice(None), slice(count))
 
-    barometer = _aid(Aid.BAROMETER, "Altitude, (n,) [m].")
-    magnetometer = _aid(Aid.MAGNETOMETER, "Magnetic field, (n, 3) in B [T].")
-    optical_flow = _aid(Aid.OPTICAL_FLOW, "Angular rate of the ground below, (n, 2) in B [rad/s].")
-    range_finder = _aid(Aid.RANGE_FINDER, "Distance to the ground along body -z, (n,) [m].")
+    def __getattr__(self, name: str) -> SensorReading | None:
+        """Measurement of a sensor of `AID_PARAMS` by its name, (n, ...)."""
+        if name not in AID_PARAMS:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        params = getattr(self.sensors, name)
+        found = None
+        if params is not None:
+            aid = Aid[name.upper()]
+            new, row = self._new(AID_BLOCK[aid], params.blocks), AID_ROW[aid]
+            found = self._reading(
+                "aid_measurement",
+                new,
+                Sensor[aid.name],
+                slice(None),
+                slice(row, row + params.blocks),
+            )
+            numbers = found.value[..., : params.length].reshape(self.count, *params.shape)
+            found = found._replace(value=numbers, new=new[:, 0] if AID_MOST[aid] == 1 else new)
+        self.__dict__[name] = found
+        return found
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *AID_PARAMS]
 
     def _gnss(self, name: str, block: int, has: bool) -> SensorReading | None:
         if not has:

@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 from quad_gym.batch.memory import FlightMemory
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params import checks as check
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
     AID_FREEDOMS,
+    AID_MOST,
+    AID_ROW,
     BASELINE_BLOCK,
     FEATURE_SLICE,
     HEADING_ALONG,
@@ -170,12 +173,24 @@ def _aid(aid: Aid) -> Computed:
     """The measurement of a sensor other than GNSS and camera."""
 
     def of(batch: FlightMemory, flights: Flights) -> Floats:
-        measured = _measured(batch, flights)[:, AID_BLOCKS + aid, np.newaxis]
-        found = np.where(measured, batch.record("aid_measurement", flights)[:, aid], np.nan)
-        numbers = AID_FREEDOMS[aid]
-        return found[:, 0] if numbers == 1 else found[:, :numbers]
+        params = getattr(batch.sensors, aid.name.lower())
+        count = AID_MOST[aid] if params is None else params.blocks
+        blocks, rows = (slice(first[aid], first[aid] + count) for first in (AID_BLOCK, AID_ROW))
+        measured = _measured(batch, flights)[:, blocks, np.newaxis]
+        found = np.where(measured, batch.record("aid_measurement", flights)[:, rows], np.nan)
+        shape = (count,) * (AID_MOST[aid] > 1) + (AID_FREEDOMS[aid],) * (AID_FREEDOMS[aid] > 1)
+        return found[..., : AID_FREEDOMS[aid]].reshape(len(found), *shape)
 
     return of
+
+
+def _of_aid(name: str) -> Quantity:
+    params, aid = AID_PARAMS[name], Aid[name.upper()]
+    shape: list[int | str] = ["blocks"] * (params.most_blocks > 1)
+    shape += [params.length] * (params.length > 1)
+    return Quantity(
+        _aid(aid), tuple(shape), params.unit, params.frame, params.meaning, filtered=True
+    )
 
 
 # fmt: off
@@ -221,10 +236,7 @@ QUANTITIES = {
     "gnss_baseline": Quantity(_gnss("gnss_baseline", BASELINE_BLOCK), (3,), "m", "I", "primary to secondary antenna", filtered=True),
     "gnss_velocity": Quantity(_gnss("gnss_velocity", VELOCITY_BLOCK), (3,), "m/s", "I", "velocity of the primary antenna, where the receiver measures it", filtered=True),
     "pixels": Quantity(_pixels, ("features", 2), "pixels", "C", "features, from the image's center", filtered=True),
-    "barometer": Quantity(_aid(Aid.BAROMETER), (), "m", "-", "altitude", filtered=True),
-    "magnetometer": Quantity(_aid(Aid.MAGNETOMETER), (3,), "T", "B", "magnetic field", filtered=True),
-    "optical_flow": Quantity(_aid(Aid.OPTICAL_FLOW), (2,), "rad/s", "B", "angular rate of the ground below", filtered=True),
-    "range_finder": Quantity(_aid(Aid.RANGE_FINDER), (), "m", "B", "distance to the ground", filtered=True),
+    **{name: _of_aid(name) for name in AID_PARAMS},
     # the task
     "action": Quantity("action", (4,), "-", "-", "the present action, in [-1, 1]"),
     "last_action": Quantity("last_action", (4,), "-", "-", "the action before it"),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import given_suite
-from quad_gym.records import AID_FREEDOMS, COLUMNS, MAX_OBSERVATION, Control, Layout, Source
+from quad_gym.records import COLUMNS, MAX_OBSERVATION, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
 """Values of the keyword `observation`."""
@@ -106,8 +106,10 @@ def _sensor_fields(suite: SensorSuite) -> tuple[Part, ...]:
         fields.append((f"feature_{k}_valid", 1, "0 or 1", "-", _FLAG))
     for aid, params in suite.aids.items():
         name = aid.name.lower()
-        fields.append((name, AID_FREEDOMS[aid], *params.raw))
-        fields.append((f"{name}_valid", 1, "0 or 1", "-", _FLAG))
+        several = [f"{name}_{k}" for k in range(params.blocks)]
+        for block in several if params.most_blocks > 1 else [name]:
+            fields.append((block, params.length, *params.raw))
+            fields.append((f"{block}_valid", 1, "0 or 1", "-", _FLAG))
     return (*fields, *_REFERENCE)
 
 

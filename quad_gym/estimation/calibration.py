@@ -24,7 +24,7 @@ from quad_gym.estimation.search import Calibrated, NumberSearch
 from quad_gym.estimation.validation import Validation, pooled, validate
 from quad_gym.estimation.verdict import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.sensors import SENSOR_PARAMS, SensorSuite
 from quad_gym.params.suites import sensor_suite
 
 _IRON_TAU = 30.0
@@ -35,7 +35,6 @@ _DRIFT, _DRIFT_TAU = 3.0, 5.0
 time [s]: receivers filter their positions."""
 _INACCURATE = 5.0  #: reported standard deviation of a fix over the median that leaves it out [-]
 _AT_REST = 2.0  #: time at rest that shows the bias of the gyro [s]
-_AIDS = ("gnss", "camera", "barometer", "magnetometer", "optical_flow", "range_finder")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class Calibration:
         """Sentences on numbers that the log does not determine, and on sensors that it lacks."""
         silent = [n for n in self.numbers if not n.determined]
         found = {n.number.sensor for n in self.numbers}
-        absent = [name for name in _AIDS if getattr(self.suite, name) and name not in found]
+        absent = [name for name in SENSOR_PARAMS if getattr(self.suite, name) and name not in found]
         return (
             *(
                 f"the log does not determine {n.number.name} ({n.value:.3g}, {n.prior:.3g} before)"

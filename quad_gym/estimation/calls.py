@@ -105,7 +105,7 @@ class FilterCalls:
             self._add(name, time, *given.pixels.ravel())
         else:
             (value,) = given.aids.values()
-            self._add(name, time, *value)
+            self._add(name, time, *value.ravel())
 
     def keep(self) -> None:
         """Add the output of the estimate."""

@@ -1,5 +1,6 @@
 """Results of a replay from the pieces of its tape: estimates, and innovations by measurement."""
 
+import bisect
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.results import Measured
 from quad_gym.estimation.running import Results
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
+from quad_gym.records import AID_BLOCK, AID_BLOCKS, AID_MOST, FEATURE_BLOCKS, FREEDOMS, Aid
 from quad_gym.rotations import dcm_to_quaternion
 
 
@@ -78,5 +79,7 @@ def name_of(block: int) -> str:
     if block < FEATURE_BLOCKS:
         return ("gnss_position", "gnss_baseline", "gnss_velocity")[block]
     if block >= AID_BLOCKS:
-        return Aid(block - AID_BLOCKS).name.lower()
+        aid = Aid(bisect.bisect(AID_BLOCK, block) - 1)
+        number = f"_{block - AID_BLOCK[aid]}" if AID_MOST[aid] > 1 else ""
+        return f"{aid.name.lower()}{number}"
     return f"feature_{block - FEATURE_BLOCKS}"

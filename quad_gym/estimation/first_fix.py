@@ -209,7 +209,7 @@ def _first_headings(
     if fix.heading is not None:
         known["heading"] = check.number("heading", fix.heading)
     elif fix.magnetometer is not None:
-        if Aid.MAGNETOMETER not in sensors.aids:
+        if Aid["MAGNETOMETER"] not in sensors.aids:
             raise ValueError("the sensor suite has no magnetometer to initialize with")
         if fix.magnetometer_sigma is not None:
             known["field_sigma"] = check.positive("magnetometer_sigma", fix.magnetometer_sigma)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs import Log, Stream
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.sensors import SensorSuite
 
@@ -24,10 +25,11 @@ SENTENCE = (
 
 
 def lacks_position(log: Log, suite: SensorSuite) -> bool:
-    """Return True if a filter has neither GNSS nor a camera, nor optical flow, in a log."""
+    """Return True if no sensor of a filter measures position or velocity in a log."""
+    moving = [name for name, kind in AID_PARAMS.items() if "velocity" in kind.observes]
     return not any(
         getattr(suite, name) is not None and name in log.streams
-        for name in ("gnss", "camera", "optical_flow")
+        for name in ("gnss", "camera", *moving)
     )
 
 
@@ -38,7 +40,8 @@ def held(log: Log, suite: SensorSuite, place: Any) -> tuple[Log, SensorSuite]:
     """
     heights = any(
         getattr(suite, name) is not None and name in log.streams
-        for name in ("barometer", "range_finder")
+        for name, kind in AID_PARAMS.items()
+        if "height" in kind.observes
     )
     time = np.arange(log.imu.time[0], log.imu.time[-1], PERIOD)
     sigma = np.tile([SIGMA, SIGMA, np.inf if heights else SIGMA], (len(time), 1))

@@ -17,6 +17,7 @@ from quad_gym.estimation.samples import (
 )
 from quad_gym.estimation.starts import level
 from quad_gym.frames import ecef_to_enu
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.portable import turned
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import Aid
@@ -87,9 +88,11 @@ class LogMeasurements:
         if name == "gnss":
             quantities = ("position", "baseline", "velocity")[: 3 if self.takes_velocity else 2]
             wanted = [f"{quantity}_{frame}" for quantity in quantities for frame in "GI"]
+        several = name in AID_PARAMS and AID_PARAMS[name].most_blocks > 1
         for key in wanted:
             if key in values and not found.all():
-                found |= np.isfinite(values[key][rows]).reshape(len(rows), -1).all(axis=1)
+                known = np.isfinite(values[key][rows]).reshape(len(rows), -1)
+                found |= known.any(axis=1) if several else known.all(axis=1)
         return found
 
     def at(self, name: str, k: int) -> Measurement | None:
@@ -110,10 +113,13 @@ class LogMeasurements:
                 baseline_G=checked_baseline(self.suite, turned(self.R_GI, baseline_I)),
                 noise={"baseline_sigma": HEADING_ALONE} if alone else {},
             )
-        value = self.streams[name].values[name][k]
-        if not np.isfinite(value).all():
+        aid = Aid[name.upper()]
+        params, value = self.suite.aids[aid], self.streams[name].values[name][k]
+        values = np.reshape(value, (-1, params.length))[: params.blocks]
+        known = np.asarray(np.isfinite(values).all(axis=1))
+        if not known.any():
             return None
-        return Measurement(aids={Aid[name.upper()]: np.atleast_1d(value)})
+        return Measurement(aids={aid: np.where(known[:, np.newaxis], values, np.nan)})
 
     def fix(self, k: int) -> dict[str, Any]:
         """Return the GNSS measurements of one instant as keywords of `update`."""

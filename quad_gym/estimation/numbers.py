@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from quad_gym.estimation.logs import Log
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 
 
@@ -100,6 +101,17 @@ MAX_SPREAD, _MIN_SPREAD = 3.0, -0.3
 """Bounds of a coordinate; and of the logarithm of a standard deviation over the suite's."""
 
 # fmt: off
+_OF_AIDS = {
+    "barometer": (Number(sensor="barometer", field="bias_sigma", spread=_WIDE, unit="m"),),
+    "magnetometer": (
+        Number(sensor="magnetometer", field="hard_iron_sigma", spread=_WIDE, unit="T"),
+        Number(sensor="magnetometer", field="hard_iron_tau", spread=_NARROW, unit="s"),
+        Number(sensor="magnetometer", field="declination", spread=0.3, positive=False, unit="rad"),
+        Number(sensor="magnetometer", field="inclination", spread=0.1, positive=False, unit="rad",
+               limit=1.5),
+        Number(sensor="magnetometer", field="strength", spread=0.2, unit="T"),
+    ),
+}  #: further numbers of aiding sensors than their noise
 NUMBERS = (
     *(
         Number(
@@ -131,15 +143,14 @@ NUMBERS = (
         for k in range(3)
     ),
     Number(sensor="camera", field="pixel_sigma", spread=_WIDE, unit="pixels"),
-    Number(sensor="barometer", field="noise_sigma", spread=_WIDE, unit="m"),
-    Number(sensor="barometer", field="bias_sigma", spread=_WIDE, unit="m"),
-    Number(sensor="magnetometer", field="noise_sigma", spread=_WIDE, unit="T"),
-    Number(sensor="magnetometer", field="hard_iron_sigma", spread=_WIDE, unit="T"),
-    Number(sensor="magnetometer", field="hard_iron_tau", spread=_NARROW, unit="s"),
-    Number(sensor="magnetometer", field="declination", spread=0.3, positive=False, unit="rad"),
-    Number(sensor="magnetometer", field="inclination", spread=0.1, positive=False, unit="rad",
-           limit=1.5),
-    Number(sensor="magnetometer", field="strength", spread=0.2, unit="T"),
+    *(
+        number
+        for name, kind in AID_PARAMS.items()
+        for number in (
+            Number(sensor=name, field="noise_sigma", spread=_WIDE, unit=kind.unit),
+            *_OF_AIDS.get(name, ()),
+        )
+    ),
 )
 # fmt: on
 """Numbers that a calibration finds. The spreads are engineering judgment: data sheets describe a

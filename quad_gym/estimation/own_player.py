@@ -15,7 +15,7 @@ from quad_gym.estimation.samples import Measurement
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
-    AID_FREEDOMS,
+    AID_MOST,
     FREEDOMS,
     Aid,
     FilterStatus,
@@ -144,8 +144,11 @@ class OwnPlayer:
             seen = np.asarray(~np.isnan(given.pixels).any(axis=1))
             found["pixels"] = SensorReading(given.pixels[np.newaxis], seen[np.newaxis], age)
         for aid, value in given.aids.items():
-            one = value if AID_FREEDOMS[aid] == 1 else value[np.newaxis]
-            found[aid.name.lower()] = SensorReading(np.array(one), EVERYONE, age)
+            new = (
+                ~np.isnan(value[:, 0]) if AID_MOST[aid] == 1 else ~np.isnan(value[np.newaxis, :, 0])
+            )
+            one = np.reshape(value, (1, *self._suite.aids[aid].shape))
+            found[aid.name.lower()] = SensorReading(one.copy(), new, age)
         return found
 
     def _at(
@@ -161,11 +164,15 @@ class OwnPlayer:
         count = self._features.shape[1]
         shapes: dict[str, tuple[int, ...]] = {"pixels": (1, count, 2)}
         shapes |= dict.fromkeys(_OF_GNSS, (1, 3))
-        for aid, numbers in enumerate(AID_FREEDOMS):
-            shapes[Aid(aid).name.lower()] = (1,) if numbers == 1 else (1, numbers)
+        several = {"pixels": count}
+        for aid in Aid:
+            name, params = aid.name.lower(), self._suite.aids.get(aid)
+            shapes[name] = (1,) if params is None else (1, *params.shape)
+            if params is not None and params.most_blocks > 1:
+                several[name] = params.blocks
         for name, shape in shapes.items():
             if name not in readings:
-                new = np.zeros((1, count) if name == "pixels" else 1, bool)
+                new = np.zeros((1, several[name]) if name in several else 1, bool)
                 start[name] = (
                     SensorReading(np.full(shape, np.nan), new, 0.0) if self._has[name] else None
                 )

@@ -1,6 +1,7 @@
 """Results of a replay: estimates, innovations and problems; smoothed estimates."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
@@ -9,6 +10,7 @@ import numpy as np
 
 from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.logs import Floats
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FilterStatus, GateDecision
 
@@ -196,11 +198,13 @@ class Smoothed(Estimates):
 
 
 def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
-    """Return the innovations of a replay by sensor, with all features together as "features"."""
-    found = {name: m for name, m in measured.items() if not name.startswith("feature_")}
-    features = [m for name, m in measured.items() if name.startswith("feature_")]
-    if features:
-        found["features"] = stacked(features)
+    """Return the innovations of a replay by sensor, with all blocks of a sensor together."""
+    found = dict(measured)
+    several = {name: name for name, kind in AID_PARAMS.items() if kind.most_blocks > 1}
+    for word, together in {"feature": "features", **several}.items():
+        names = [name for name in measured if re.fullmatch(rf"{word}_\d+", name)]
+        if names:
+            found[together] = stacked([found.pop(name) for name in names])
     return found
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import AID_BLOCKS, AID_FREEDOMS, FEATURE_BLOCKS, POSITION_BLOCK, Aid
+from quad_gym.records import AID_BLOCK, FEATURE_BLOCKS, POSITION_BLOCK, Aid
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +36,7 @@ class Measurement:
     velocity_G: Floats | None = None  #: (3,) antenna velocity [m/s]
     pixels: Floats | None = None  #: (n_features, 2) image coordinates, NaN: not seen [pixels]
     aids: dict[Aid, Floats] = field(default_factory=dict)
+    """(blocks, length) measurements of aiding sensors, NaN: a block was not measured"""
     noise: dict[str, Any] = field(default_factory=dict)
     """fields of the parameter record that replace the suite's for this measurement"""
 
@@ -53,7 +54,9 @@ class Measurement:
         if self.pixels is not None:
             seen = ~np.isnan(self.pixels).any(axis=1)
             found += [FEATURE_BLOCKS + int(i) for i in np.flatnonzero(seen)]
-        return found + [AID_BLOCKS + int(aid) for aid in self.aids]
+        for aid, values in self.aids.items():
+            found += [AID_BLOCK[aid] + int(i) for i in np.flatnonzero(~np.isnan(values[:, 0]))]
+        return found
 
 
 def checked_measurement(
@@ -130,9 +133,11 @@ def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Flo
             continue
         if aid not in sensors.aids:
             raise ValueError(f"the sensor suite has no {name} to update with")
-        alone = AID_FREEDOMS[aid] == 1
+        params = sensors.aids[aid]
+        alone, several = params.shape == (), params.most_blocks > 1
         numbers = [check.number(name, value)] if alone else value
-        found[aid] = check.array(name, numbers, (AID_FREEDOMS[aid],))
+        values = check.array(name, numbers, params.shape or (1,), allow_nan=several)
+        found[aid] = values.reshape(params.blocks, params.length)
     return found
 
 

@@ -100,8 +100,8 @@ def empty_fix(sensors: SensorSuite) -> NDArray[Any]:
     if compass is not None:
         states = slow_states(sensors)
         fix["field_I"], fix["field_sigma"] = compass.field_I, compass.noise_sigma
-        fix["iron"] = states.vectors[Aid.MAGNETOMETER]
-        fix["declination"] = states.scalars[Aid.MAGNETOMETER]
+        fix["iron"] = states.vectors[Aid["MAGNETOMETER"]]
+        fix["declination"] = states.scalars[Aid["MAGNETOMETER"]]
     return fix
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from quad_gym.estimation.history import InputHistory
 from quad_gym.estimation.samples import Measurement
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
+    AID_ROW,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     MEASUREMENT,
@@ -78,8 +79,11 @@ def write_measurement(row: Any, m: Measurement) -> None:
         valid[FEATURE_BLOCKS : FEATURE_BLOCKS + len(seen)] = seen
         row["pixels"][: len(seen)] = np.where(seen[:, np.newaxis], m.pixels, 0.0)
     for aid, values in m.aids.items():
-        valid[AID_BLOCKS + aid] = 1.0
-        row["aid_measurement"][aid, : len(values)] = values
+        count, length = values.shape
+        known = ~np.isnan(values[:, 0])
+        valid[AID_BLOCK[aid] : AID_BLOCK[aid] + count] = known
+        place = row["aid_measurement"][AID_ROW[aid] : AID_ROW[aid] + count]
+        place[:, :length] = np.where(known[:, np.newaxis], values, 0.0)
     for name, value in m.noise.items():
         if name == "aid_sigma":
             for aid, sigma in value.items():

@@ -21,6 +21,7 @@ from quad_gym.estimation.logs.clocks import PAUSE
 from quad_gym.estimation.logs.parts import running_motors
 from quad_gym.estimation.plausibility import implausible, nothing_in_common
 from quad_gym.estimation.results import Measured, Replay, by_sensor
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 
 FALSE_ALARM = 1e-3  #: probability of a chance event that counts as a finding
@@ -47,21 +48,26 @@ NAMES = {
     "gnss_baseline": "GNSS baseline",
     "gnss_velocity": "GNSS velocity",
     "features": "camera features",
-    "barometer": "barometer",
-    "magnetometer": "magnetometer",
-    "optical_flow": "optical flow",
-    "range_finder": "range finder",
+    **{name: name.replace("_", " ") for name in AID_PARAMS},
 }
 """Sensors in sentences."""
+
+
+def _observing(quantity: str) -> tuple[str, ...]:
+    return tuple(name for name, kind in AID_PARAMS.items() if quantity in kind.observes)
+
+
 MEASURED_BY = {
-    "position": ("gnss_position", "gnss_velocity", "features", "optical_flow"),
-    "height": ("gnss_position", "gnss_velocity", "features", "barometer", "range_finder"),
-    "heading": ("gnss_baseline", "features", "magnetometer"),
+    "position": ("gnss_position", "gnss_velocity", "features", *_observing("velocity")),
+    "height": ("gnss_position", "gnss_velocity", "features", *_observing("height")),
+    "heading": ("gnss_baseline", "features", *_observing("heading")),
 }
 """Sensors that correct a quantity."""
-OF_SENSOR = {"barometer": "height", "range_finder": "height"} | dict.fromkeys(
-    ("magnetometer", "gnss_baseline"), "heading"
-)
+OF_SENSOR = {"gnss_baseline": "heading"} | {
+    name: kind.observes[0]
+    for name, kind in AID_PARAMS.items()
+    if kind.observes in (("height",), ("heading",))
+}
 """Quantities of sensors; the position for others."""
 
 

@@ -178,7 +178,7 @@ class SensorLoss(Fault):
     """
 
     sensor: Annotated[str, partial(check.choice, choices=tuple(aid.name.lower() for aid in Aid))]
-    """name of the lost sensor: "barometer", "magnetometer", "optical_flow" or "range_finder\""""
+    """name of the lost sensor, such as "barometer\""""
 
     @property
     def kind(self) -> FaultKind:  # type: ignore[override]

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from quad_gym.faults import kinds
 from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import AID_PARAMS, SensorSuite
+from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FAULT_KINDS
 
 FaultsGiven = str | Fault | Iterable[str | Fault] | None

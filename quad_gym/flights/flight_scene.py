@@ -41,6 +41,8 @@ class FlightScene:
     """(2,) half width and half height of the image [pixels]"""
     features_I: Floats
     """(n, 3) positions of the features in I [m]"""
+    anchors_I: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) places in I to which other sensors measure, such as anchors of radio ranges [m]"""
     gates_I: Floats
     """(n, 3) centers of the course's gates in I; (0, 3) for other tasks [m]"""
     gate_radius: float

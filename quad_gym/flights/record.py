@@ -162,6 +162,7 @@ class FlightRecorder:
             (float(o.shape), *center, *o.half_size, *o.axis)
             for o, center in zip(world.obstacles, read("obstacle_center"), strict=False)
         ]
+        anchors = [place for aid in batch.sensors.aids.values() for place in aid.places_I]
         path: dict[str, Any] = {}
         if (found := batch.trajectory(int(self._which[0]))) is not None:
             for name in ("times", "coefficients", "closed"):
@@ -181,6 +182,7 @@ class FlightRecorder:
             focal_length=float(model["focal_length"]),
             half_image=np.array(model["half_image"]),
             features_I=np.array(batch.feature_places()[self._which[0]]),
+            anchors_I=np.array(anchors).reshape(-1, 3),
             gates_I=read("gates")[:gate_count],
             gate_radius=batch.task.gate_radius,
             reference_omega=float(read("ref_omega")),

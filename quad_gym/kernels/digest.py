@@ -27,6 +27,8 @@ _NO_CODE = {
     *(f"{__package__}.{name}" for name in ("cores", "digest", "library", "linked", "sources")),
 }
 """Modules that determine when code is compiled, but do not change the code."""
+_TABLE = f"{PACKAGE}.params.aid_table"
+"""Module of parameters of which code depends on the values `AID_SHAPES` only."""
 
 
 def digest_of(module: str) -> str:
@@ -56,6 +58,8 @@ def _read(name: str) -> tuple[str, list[str]]:
     module = sys.modules.get(name)
     if name in _NO_CODE or module is None or module.__file__ is None:
         return "", []
+    if name == _TABLE:
+        return hashlib.sha256(repr(module.AID_SHAPES).encode()).hexdigest(), []
     return _parsed(Path(module.__file__).read_bytes(), module.__package__ or "")
 
 

@@ -20,7 +20,9 @@ from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.kernels.tape import keep_estimate, predict_sample, update_with
 from quad_gym.kernels.window import take_input
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
+    AID_MOST,
+    AID_ROW,
     AIDS,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
@@ -141,9 +143,15 @@ def check_measurement(m):
     m.pixel_sigma, found = _check_sigma(m.pixel_sigma, 1e-12, seen)
     o = o if o != _OK else found
     for aid in range(AIDS):
-        found = _check_triple(m.aid_measurement[aid], valid[AID_BLOCKS + aid])
-        o = o if o != _OK else found
-        m.aid_sigma[aid], found = _check_sigma(m.aid_sigma[aid], 1e-12, valid[AID_BLOCKS + aid])
+        measured = 0.0
+        for k in range(AID_MOST[aid]):
+            row, block = AID_ROW[aid] + k, AID_BLOCK[aid] + k
+            if AID_MOST[aid] > 1 and m.aid_measurement[row, 0] != m.aid_measurement[row, 0]:
+                valid[block] = 0.0  # one of several was not measured
+            found = _check_triple(m.aid_measurement[row], valid[block])
+            o = o if o != _OK else found
+            measured = max(measured, valid[block])
+        m.aid_sigma[aid], found = _check_sigma(m.aid_sigma[aid], 1e-12, measured)
         o = o if o != _OK else found
     return o
 

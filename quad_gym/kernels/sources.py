@@ -16,7 +16,7 @@ def sources_digest(package: Path) -> str:
         package: Folder of `quad_gym`.
     """
     digest = hashlib.sha256()
-    for folder in ("kernels", "records"):
+    for folder in ("kernels", "records", "params"):
         for file in sorted((package / folder).rglob("*.py")):
             content = file.read_bytes()
             name = file.relative_to(package).as_posix()

@@ -23,6 +23,7 @@ import numpy as np
 from quad_gym.records import (
     FIRST_AID,
     FOLLOWED,
+    Aid,
     FilterForm,
     Layout,
     Sensor,
@@ -87,10 +88,10 @@ class Stage(IntEnum):
     # sensors, last and in their order
     GNSS = auto()
     CAMERA = auto()
-    BAROMETER = auto()
-    MAGNETOMETER = auto()
-    OPTICAL_FLOW = auto()
-    RANGE_FINDER = auto()
+
+    _ignore_ = "aid"
+    for aid in Aid:
+        vars()[aid.name] = auto()
 
 
 class Kernel(NamedTuple):

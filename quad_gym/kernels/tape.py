@@ -14,6 +14,8 @@ from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import (
     AID_BLOCKS,
+    AID_ROW,
+    AID_ROWS,
     AIDS,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
@@ -31,7 +33,7 @@ from quad_gym.records.tape import (
 
 _PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
 _PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
-_BAROMETER = int(Aid.BAROMETER)
+_HEIGHT = AID_ROW[Aid["BAROMETER"]]
 _LANES = 8 * WIDTH  #: bytes
 
 
@@ -109,14 +111,12 @@ def _take_measurement(flight, step, m, features):
         if m.valid[FEATURE_BLOCKS + k] > 0.0:
             for i in range(2):
                 flight.pixels[k, i] = m.pixels[k, i]
-    for aid in range(AIDS):
-        if m.valid[AID_BLOCKS + aid] > 0.0:
-            for i in range(3):
-                flight.aid_measurement[aid, i] = m.aid_measurement[aid, i]
-    if m.valid[AID_BLOCKS + _BAROMETER] > 0.0:
-        height, level = m.aid_measurement[_BAROMETER, 0], step.level
+    for row in range(AID_ROWS):
+        _take_triple(flight.aid_measurement[row], m.aid_measurement[row], m.valid[AID_BLOCKS + row])
+    if m.valid[AID_BLOCKS + _HEIGHT] > 0.0:
+        height, level = m.aid_measurement[_HEIGHT, 0], step.level
         step.level = select(level == level, level, height - flight.r_hat[2])
-        flight.aid_measurement[_BAROMETER, 0] = height - step.level
+        flight.aid_measurement[_HEIGHT, 0] = height - step.level
 
 
 @kernel

@@ -11,8 +11,9 @@ from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import MIN_DRIFT
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
     AID_FREEDOMS,
+    AID_NUMBERS,
     AIDS,
     FEATURE_BLOCKS,
     FIRST_AID,
@@ -65,7 +66,10 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
 def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
     """Return the blocks of innovations of a suite: position, baseline, velocity, features, aids."""
     features = 0 if sensors.camera is None else len(sensors.camera.features_I)
-    return (*range(FEATURE_BLOCKS + features), *(AID_BLOCKS + aid for aid in sensors.aids))
+    found = list(range(FEATURE_BLOCKS + features))
+    for aid, params in sensors.aids.items():
+        found += range(AID_BLOCK[aid], AID_BLOCK[aid] + params.blocks)
+    return tuple(found)
 
 
 def decay_and_drive(error: SlowError, time: float) -> tuple[float, float]:
@@ -96,7 +100,8 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
                 decay, drive = decay_and_drive(slow, 1.0 / params.rate)
                 p[f"aid_{name}_sigma"][aid] = slow.sigma
                 p[f"aid_{name}_decay"][aid], p[f"aid_{name}_drive"][aid] = decay, drive
-        p["aid_numbers"][aid] = params.numbers
+        for row, numbers in enumerate(params.numbers, AID_NUMBERS[aid]):
+            p["aid_numbers"][row] = numbers
 
 
 def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
@@ -111,5 +116,5 @@ def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
     features = 0 if sensors.camera is None else len(sensors.camera.features_I)
     settings["sensor_blocks"][: Sensor.CAMERA + 1] = FEATURE_BLOCKS, features
     settings["feature_count"] = features
-    for aid in sensors.aids:
-        settings["sensor_blocks"][FIRST_AID + aid] = 1
+    for aid, params in sensors.aids.items():
+        settings["sensor_blocks"][FIRST_AID + aid] = params.blocks

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
-from quad_gym.records import Aid
 
 
 class SlowError(NamedTuple):
@@ -38,7 +37,11 @@ class SensorBase(Checked):
 
 
 class AidParams(SensorBase):
-    """An aiding sensor other than IMU, GNSS and camera."""
+    """An aiding sensor other than IMU, GNSS and camera.
+
+    A measurement has one block of up to three numbers, or several blocks, each of which may be
+    missing and is accepted or rejected by itself.
+    """
 
     rate: check.Positive = 50.0
     """measurement rate [Hz]; the IMU rate must be a whole multiple of it"""
@@ -53,9 +56,31 @@ class AidParams(SensorBase):
 
     _white_noise = ("noise_sigma",)
     _ideal: ClassVar = {"latency": 0.0}
-    aid: ClassVar[Aid]
+    length: ClassVar[int] = 1  #: numbers in a block of the measurement
+    most_blocks: ClassVar[int] = 1  #: largest number of blocks
+    rows: ClassVar[int] = 1  #: triples in `numbers`
+    observes: ClassVar[tuple[str, ...]]  #: observed states: "position", "height" and so on
+    unit: ClassVar[str]  #: of the measurement
+    frame: ClassVar[str]  #: of the measurement
+    meaning: ClassVar[str]  #: of the measurement, in a few words
     raw: ClassVar[tuple[str, str, float]]
     """unit, frame and bound of the measurement in raw observations"""
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks of the measurement."""
+        return 1
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of a measurement: of a number, of a block, or of several."""
+        several = () if self.most_blocks == 1 else (self.blocks,)
+        return several if self.length == 1 else (*several, self.length)
+
+    @property
+    def places_I(self) -> check.Matrix:
+        """Places (n, 3) in I to which it measures [m], for pictures of flights."""
+        return ()
 
     @property
     def slow_vector(self) -> SlowError | None:
@@ -83,6 +108,6 @@ class AidParams(SensorBase):
         return 1.0
 
     @property
-    def numbers(self) -> tuple[float, float, float]:
-        """Three further parameters of the sensor's kernel."""
-        return (0.0, 0.0, 0.0)
+    def numbers(self) -> check.Matrix:
+        """Further parameters of the sensor's kernel, at most `rows` triples."""
+        return ()

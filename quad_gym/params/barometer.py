@@ -2,7 +2,6 @@
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams, SlowError
-from quad_gym.records import Aid
 
 
 class BarometerParams(AidParams):
@@ -18,7 +17,8 @@ class BarometerParams(AidParams):
     """correlation time of the bias [s]: weather and sensor temperature change within minutes;
     engineering judgment. The filter estimates the bias as an augmented state"""
 
-    aid = Aid.BAROMETER
+    observes = ("height",)
+    unit, frame, meaning = "m", "I", "height by static pressure"
     raw = ("m", "I", 1000.0)
 
     @property

@@ -63,7 +63,9 @@ class Checked:
         cls._prefix = "" if bare else f"{cls.__name__}."
         split = {name: _rule_of(hint) for name, hint in inspect.get_annotations(cls).items()}
         cls.__annotations__ = {name: plain for name, (plain, _) in split.items()}
-        cls._rules = cls._rules | {name: rule for name, (_, rule) in split.items() if rule}
+        bases = reversed(cls.__mro__[1:])
+        inherited = {n: rule for base in bases for n, rule in vars(base).get("_rules", {}).items()}
+        cls._rules = inherited | {name: rule for name, (_, rule) in split.items() if rule}
         dataclasses.dataclass(frozen=True, kw_only=kw_only, eq=eq)(cls)
         create = cls.__init__
         known = [field.name for field in dataclasses.fields(cls) if field.init]

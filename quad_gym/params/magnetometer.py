@@ -6,7 +6,6 @@ from typing import Annotated, ClassVar
 from quad_gym.params import checks as check
 from quad_gym.params import portable
 from quad_gym.params.aids import AidParams, SlowError
-from quad_gym.records import Aid
 
 MICROTESLA = 1e-6  #: one microtesla [T]
 
@@ -44,7 +43,8 @@ class MagnetometerParams(AidParams):
     estimates the error in an augmented state"""
 
     _ideal: ClassVar = {"latency": 0.0, "soft_iron_sigma": 0.0}
-    aid = Aid.MAGNETOMETER
+    length, observes = 3, ("heading",)
+    unit, frame, meaning = "T", "B", "magnetic field"
     raw = ("of the field", "B", 10.0)
 
     def __post_init__(self) -> None:
@@ -90,6 +90,6 @@ class MagnetometerParams(AidParams):
         return self.strength
 
     @property
-    def numbers(self) -> tuple[float, float, float]:
+    def numbers(self) -> check.Matrix:
         """The Earth's field east, north, up [T]."""
-        return self.field_I
+        return (self.field_I,)

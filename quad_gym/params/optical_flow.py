@@ -2,7 +2,6 @@
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
-from quad_gym.records import Aid
 
 
 class OpticalFlowParams(AidParams):
@@ -24,10 +23,11 @@ class OpticalFlowParams(AidParams):
     max_rate: check.Positive = 7.4
     """largest rate, per axis [rad/s]; PixArt PMW3901 data sheet"""
 
-    aid = Aid.OPTICAL_FLOW
+    length, observes = 2, ("velocity",)
+    unit, frame, meaning = "rad/s", "B", "angular rate of the ground below"
     raw = ("rad/s", "B", 20.0)
 
     @property
-    def numbers(self) -> tuple[float, float, float]:
+    def numbers(self) -> check.Matrix:
         """Least height [m], largest rate [rad/s], 0."""
-        return (self.min_height, self.max_rate, 0.0)
+        return ((self.min_height, self.max_rate, 0.0),)

@@ -2,7 +2,6 @@
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
-from quad_gym.records import Aid
 
 
 class RangeFinderParams(AidParams):
@@ -23,7 +22,8 @@ class RangeFinderParams(AidParams):
     max_range: check.Positive = 3.6
     """longest distance [m]; ST VL53L1X user manual: in the dark, over a light floor"""
 
-    aid = Aid.RANGE_FINDER
+    observes = ("height",)
+    unit, frame, meaning = "m", "B", "distance to the ground along body -z"
     raw = ("m", "B", 100.0)
 
     def __post_init__(self) -> None:
@@ -33,6 +33,6 @@ class RangeFinderParams(AidParams):
             self._refuse("max_range", "be more than min_range", got)
 
     @property
-    def numbers(self) -> tuple[float, float, float]:
+    def numbers(self) -> check.Matrix:
         """Shortest and longest distance [m], 0."""
-        return (self.min_range, self.max_range, 0.0)
+        return ((self.min_range, self.max_range, 0.0),)

@@ -8,28 +8,17 @@ from dataclasses import field
 from typing import Annotated
 
 from quad_gym.params import checks as check
+from quad_gym.params.aid_table import AID_PARAMS, AidTable
 from quad_gym.params.aids import AidParams
-from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.checked import Checked
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.params.magnetometer import MagnetometerParams
-from quad_gym.params.optical_flow import OpticalFlowParams
-from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suite_files import Saved
-from quad_gym.records import MAX_UNDER_WAY, Aid
+from quad_gym.records import FEATURE_BLOCKS, MAX_TOGETHER, MAX_UNDER_WAY, Aid
 
 SensorParams = GnssParams | CameraParams | AidParams  #: parameters of a sensor other than the IMU
-
-AID_PARAMS: dict[str, type[AidParams]] = {
-    "barometer": BarometerParams,
-    "magnetometer": MagnetometerParams,
-    "optical_flow": OpticalFlowParams,
-    "range_finder": RangeFinderParams,
-}
-"""Parameters of other sensors by their fields in `SensorSuite`."""
 
 SENSOR_PARAMS: dict[str, type[SensorParams]] = {
     "gnss": GnssParams,
@@ -103,8 +92,8 @@ def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
     return ticks
 
 
-class SensorSuite(Checked, Saved):
-    """All sensors of a vehicle and the filter that fuses them."""
+class MainSensors(Checked):
+    """IMU, GNSS and camera."""
 
     imu: ImuParams = field(default_factory=ImuParams)
     """IMU, whose samples are the ticks of the simulation"""
@@ -112,14 +101,11 @@ class SensorSuite(Checked, Saved):
     """GNSS; None: no GNSS, and the filter starts from `initial_pose`"""
     camera: CameraParams | None = field(default_factory=CameraParams)
     """camera; None: no camera"""
-    barometer: BarometerParams | None = None
-    """barometer; None: no barometer"""
-    magnetometer: MagnetometerParams | None = None
-    """magnetometer; None: no magnetometer"""
-    optical_flow: OpticalFlowParams | None = None
-    """optical flow of the ground below; None: not measured"""
-    range_finder: RangeFinderParams | None = None
-    """range finder that looks down; None: no range finder"""
+
+
+class SensorSuite(AidTable, MainSensors, Saved):
+    """All sensors of a vehicle and the filter that fuses them."""
+
     initial_pose: InitialPoseParams = field(default_factory=InitialPoseParams)
     """accuracy of the initial pose where GNSS does not measure it"""
     estimator: FilterParams = field(default_factory=FilterParams)
@@ -145,6 +131,14 @@ class SensorSuite(Checked, Saved):
             label = type(sensor).__name__
             check.ticks(f"{label}.rate", sensor.rate, self.imu.rate)
             delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, self.imu.rate)
+        features = 0 if self.camera is None else len(self.camera.features_I)
+        count = FEATURE_BLOCKS + features + sum(params.blocks for params in self.aids.values())
+        if count > MAX_TOGETHER:
+            most = MAX_TOGETHER - FEATURE_BLOCKS
+            raise ValueError(
+                f"sensors must have at most {most} camera features and measurements of other "
+                f"sensors at an instant, got {count - FEATURE_BLOCKS}"
+            )
 
     @property
     def sensors(self) -> dict[str, SensorParams]:
@@ -162,12 +156,13 @@ class SensorSuite(Checked, Saved):
     def heading_aid(self) -> Aid | None:
         """Aiding sensor that initializes the heading where no baseline does; None: none."""
         alone = self.gnss is not None and not self.gnss.has_baseline
-        return Aid.MAGNETOMETER if alone and self.magnetometer is not None else None
+        return Aid["MAGNETOMETER"] if alone and self.magnetometer is not None else None
 
     @property
     def flow_alone(self) -> bool:
-        """True if the filter keeps the heading unobservable: flow, but neither GNSS nor camera."""
-        measures_in_I = self.gnss is not None or self.camera is not None
+        """True if the filter keeps the heading unobservable: flow, but no positions."""
+        places = any("position" in params.observes for params in self.aids.values())
+        measures_in_I = places or self.gnss is not None or self.camera is not None
         corrected = self.estimator.attitude_reset  # not the report's form
         return corrected and self.optical_flow is not None and not measures_in_I
 

@@ -10,12 +10,13 @@
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
 | `crazyflie` | none: starts from a mark; optical flow, range finder | none | as `indoor` |
+| `uwb` | none: starts from a mark; ranges to four anchors | none | as `indoor` |
 | `mocap` | positions and heading by motion capture, 50 Hz | none | as a Crazyflie's in flight |
 | `field` | as `consumer`, with noise and delay of a real flight | none | noise of that flight |
 
 `one_wall` and `stale` were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in
-one direction only, and a filter that ignores time stamps. They, `crazyflie`, `mocap` and `field`
-are not among SUITES, on which results for all tasks are based.
+one direction only, and a filter that ignores time stamps. They, `crazyflie`, `uwb`, `mocap` and
+`field` are not among SUITES, on which results for all tasks are based.
 
 The IMU runs at 200 Hz, so cameras of 30 Hz run at 25 Hz, which divides that rate. Except in `lab`,
 the phases of GNSS and camera are drawn in each episode, the fix that starts the filter is used
@@ -51,6 +52,7 @@ from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.sensors import NoisyObservationParams, SensorSuite
 from quad_gym.params.suite_files import is_params_file, read_params
+from quad_gym.params.uwb_range import UwbRangeParams
 
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
@@ -272,6 +274,15 @@ CRAZYFLIE = SensorSuite(
 """A small vehicle indoors that navigates by optical flow and a range finder: nothing observes its
 heading and horizontal position, whose errors grow."""
 
+UWB = CRAZYFLIE.replace(
+    # the Loco positioning deck in place of the Flow deck
+    optical_flow=None,
+    range_finder=None,
+    uwb_range=UwbRangeParams(phase=None),
+    noisy=_noise(0.05, 0.05, 0.02, 0.0061),
+)
+"""A small vehicle indoors that measures its ranges to four anchors by ultra-wideband radio."""
+
 MOCAP = SensorSuite(
     imu=INDOOR.imu.replace(
         # noise and biases that explain a flight of a Crazyflie 2.1 (S. I. Ullah and J. Baca,
@@ -332,6 +343,7 @@ FIELD = _changed(
 _ALL = {
     **{"standard": STANDARD, "lab": SensorSuite(), "rtk": RTK, "consumer": CONSUMER},
     **{"indoor": INDOOR, "one_wall": ONE_WALL, "stale": STALE, "crazyflie": CRAZYFLIE},
+    "uwb": UWB,
     "mocap": MOCAP,
     "field": FIELD,
 }

@@ -1,7 +1,7 @@
-"""The memory of flights: a table of fields for each record, sizes and enumerations. Imports NumPy.
+"""The memory of flights: a table of fields for each record, sizes and enumerations.
 
 A record holds the complete state of a flight, so that snapshot, restore, pickling and copying are
-array copies.
+array copies. The package imports NumPy and, for their names and sizes, the table of aiding sensors.
 """
 
 from quad_gym.records.call import *

@@ -2,6 +2,8 @@
 
 from enum import IntEnum, IntFlag
 
+from quad_gym.params.aid_table import AID_SHAPES
+
 
 class FilterStatus(IntFlag):
     """Flags of a filter's numerical failures since its start; 0: none."""
@@ -70,10 +72,10 @@ class Sensor(IntEnum):
 
     GNSS = 0
     CAMERA = 1
-    BAROMETER = 2
-    MAGNETOMETER = 3
-    OPTICAL_FLOW = 4
-    RANGE_FINDER = 5
+
+    _ignore_ = "number word"
+    for number, word in enumerate(AID_SHAPES, 2):
+        vars()[word.upper()] = number
 
 
 class Block(IntEnum):
@@ -93,21 +95,23 @@ BLOCK_FREEDOMS = (3, 2, 3, 2)
 
 
 class Aid(IntEnum):
-    """Sensors with parameters in the fields `aid_...`: the last members of `Sensor`, in this order.
+    """Sensors of `params/aid_table.py`: the last members of `Sensor`, in this order.
 
     The name in lower case is the field of `SensorSuite`. The fault that silences a sensor
-    (`FaultKind`), its stage, its block of the measurement and its part of a raw observation are
+    (`FaultKind`), its stage, its blocks of the measurement and its part of a raw observation are
     derived from it.
     """
 
-    BAROMETER = 0
-    MAGNETOMETER = 1
-    OPTICAL_FLOW = 2
-    RANGE_FINDER = 3
+    _ignore_ = "number word"
+    for number, word in enumerate(AID_SHAPES):
+        vars()[word.upper()] = number
 
 
-AID_FREEDOMS = (1, 3, 2, 1)
-"""Numbers in a measurement of each aiding sensor, in the order of `Aid`."""
+_SHAPES = AID_SHAPES.values()
+AID_FREEDOMS = tuple(shape.length for shape in _SHAPES)
+"""Numbers in a block of each aiding sensor, in the order of `Aid`."""
+AID_MOST = tuple(shape.most_blocks for shape in _SHAPES)  #: largest numbers of their blocks
+AID_TRIPLES = tuple(shape.rows for shape in _SHAPES)  #: triples of their further parameters
 
 
 class Observes(IntFlag):
@@ -122,10 +126,12 @@ class Observes(IntFlag):
 _FIX = int(Observes.POSITION | Observes.HEIGHT | Observes.VELOCITY)
 GROUP_OBSERVES = (
     *(_FIX, int(Observes.HEADING), int(Observes.VELOCITY), int(_FIX | Observes.HEADING)),
-    *map(int, (Observes.HEIGHT, Observes.HEADING, Observes.VELOCITY, Observes.HEIGHT)),
+    *(sum(int(Observes[word.upper()]) for word in shape.observes) for shape in _SHAPES),
 )
 """The same of each group, in the order of `Block` and `Aid`, as numbers."""
 QUANTITIES = len(Observes)  #: number of the bits of `Observes`
+OWN_ERRORS = tuple(shape.own_error for shape in _SHAPES)
+"""True for aiding sensors with an error of their own among the states of a filter."""
 
 
 class Act(IntEnum):

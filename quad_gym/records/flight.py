@@ -204,7 +204,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
     )),
     ("aids", (
         # sensors other than GNSS and camera, in the order of Aid
-        Field("aid_measurement", (AIDS, 3), "m; T; rad/s", "altitude, then zeros; magnetic field in B; flow, then zero; distance, then zeros"),
+        Field("aid_measurement", (AID_ROWS, 3), "mixed", "measurements, a row for each block; beyond a sensor's own numbers zeros"),
         Field("aid_vector", (AIDS, 3), "T", "true slow error of three numbers in B: hard iron"),
         Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination minus the assumed one"),
         Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),

@@ -1,6 +1,7 @@
 """Parameters of a vehicle, its sensors and its world, either the true or the assumed ones."""
 
 from quad_gym.records.draws import COLUMNS, DRAWABLES
+from quad_gym.records.enums import AID_TRIPLES
 from quad_gym.records.sizes import AIDS, MAX_FEATURES, MAX_SLOW, Field
 
 PARAMETERS_DRAWN = COLUMNS["action_delay"].stop
@@ -89,7 +90,7 @@ PARAMS_FIELDS = (
     Field("aid_matrix_sigma", (AIDS,), "-", "standard deviation of each error of scale and alignment"),
     Field("aid_scale", (AIDS,), "m; T", "unit in observations"),
     Field("aid_gate", (AIDS,), "-", "largest accepted NIS"),
-    Field("aid_numbers", (AIDS, 3), "mixed", "further ones; of the magnetometer: the field in I [T]; of optical flow and range finder: their limits"),
+    Field("aid_numbers", (sum(AID_TRIPLES), 3), "mixed", "further ones of each sensor: `numbers` of its parameters"),
     # slow errors among the filter's states
     Field("slow_sigma", (MAX_SLOW,), "mixed", "standard deviation of each slow error at the start"),
     Field("slow_decay", (MAX_SLOW,), "-", "decay of each slow error over a tick"),

@@ -2,7 +2,17 @@
 
 from typing import NamedTuple
 
-from quad_gym.records.enums import AID_FREEDOMS, BLOCK_FREEDOMS, Aid, Block, FaultKind, Sensor
+from quad_gym.records.enums import (
+    AID_FREEDOMS,
+    AID_MOST,
+    AID_TRIPLES,
+    BLOCK_FREEDOMS,
+    OWN_ERRORS,
+    Aid,
+    Block,
+    FaultKind,
+    Sensor,
+)
 from quad_gym.records.width import REGISTER as REGISTER
 from quad_gym.records.width import WARP as WARP
 from quad_gym.records.width import WIDTH as WIDTH
@@ -30,17 +40,27 @@ POSITION_BLOCK = int(Block.POSITION)
 BASELINE_BLOCK = int(Block.BASELINE)
 VELOCITY_BLOCK = int(Block.VELOCITY)
 FEATURE_BLOCKS = int(Block.FEATURES)  #: indices of the blocks in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i
-AID_BLOCKS = FEATURE_BLOCKS + MAX_FEATURES  #: first block of the other sensors; the block of aid i is AID_BLOCKS + i
-MAX_BLOCKS = AID_BLOCKS + AIDS  #: number of blocks: antenna position, baseline, velocity, features, other sensors
-FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_BLOCKS, MAX_BLOCKS))  #: first block of each sensor
+AID_BLOCKS = FEATURE_BLOCKS + MAX_FEATURES  #: first block of the other sensors
+AID_ROW = tuple(sum(AID_MOST[:aid]) for aid in Aid)  #: first row of each aiding sensor in `aid_measurement`
+AID_ROWS = sum(AID_MOST)  #: number of these rows
+MAX_BLOCKS = AID_BLOCKS + AID_ROWS  #: number of blocks: antenna position, baseline, velocity, features, other sensors
+AID_BLOCK = tuple(AID_BLOCKS + row for row in AID_ROW)  #: first block of each aiding sensor
+FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *AID_BLOCK)  #: first block of each sensor
+AID_NUMBERS = tuple(sum(AID_TRIPLES[:aid]) for aid in Aid)  #: first row of each aiding sensor in `aid_numbers`
 FEATURE_SLICE = slice(FEATURE_BLOCKS, AID_BLOCKS)  #: blocks of the features
-MAX_MEASUREMENTS = 3 * MAX_BLOCKS  #: largest length of the stacked measurement; a direction has three numbers
+MAX_TOGETHER = AID_BLOCKS + 4  #: largest number of blocks of an instant: those of GNSS and camera, and four more
+MAX_MEASUREMENTS = 3 * MAX_TOGETHER  #: largest length of the stacked measurement; a direction has three numbers
 AID_GROUPS = len(Block)  #: first group of the other sensors
 SENSOR_GROUPS = AID_GROUPS + AIDS  #: number of groups of the gate: positions, baselines, velocities, images, other sensors
 FIRST_GROUP = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_GROUPS, SENSOR_GROUPS))  #: first group of each sensor
 GROUP_COUNT = (FEATURE_BLOCKS, *[1] * (SENSORS - 1))  #: number of groups of each sensor
+SEVERAL = (FEATURE_BLOCKS, *(AID_GROUPS + aid for aid in Aid if AID_MOST[aid] > 1))
+"""Groups of several blocks, which support each other: images, for example."""
+WITH_OWN_ERROR = tuple(AID_GROUPS + aid for aid in Aid if OWN_ERRORS[aid])
+"""Groups of sensors with an error of their own among the states."""
 BLOCK_NUMBERS = (3, 3, *AID_FREEDOMS)  #: length of a block of each sensor: a direction is a unit vector
-FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1), *AID_FREEDOMS)
+FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1),
+            *(freedoms for freedoms, most in zip(AID_FREEDOMS, AID_MOST, strict=True) for _ in range(most)))
 """Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 512  #: largest length of an observation
 WARM_DRAWS = 21  #: standard normals for the errors of a warm start: 15 for the states, 6 for the true biases
@@ -65,7 +85,3 @@ class Field(NamedTuple):
     unit: str
     meaning: str
     kind: str = "f8"
-
-
-for _aid in Aid:
-    assert Sensor[_aid.name] == FIRST_AID + _aid

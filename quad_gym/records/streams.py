@@ -7,6 +7,7 @@ the instant and n. Each quantity has a range of indices. A draw yields two rando
 from typing import NamedTuple
 
 from quad_gym.records.draws import DRAWN_SIZE
+from quad_gym.records.enums import AID_MOST, Aid
 from quad_gym.records.sizes import *
 
 DRAWS_OF_FAULT = 8
@@ -33,6 +34,33 @@ def _claim(quantity: str, first: int, count: int) -> int:
     return first
 
 
+_SHARING = 4
+"""Number of aiding sensors, the first ones, that share ranges of draws. Further ones have ranges of
+their own, so that a new sensor changes no draw of another."""
+_FIRST_OWN, _OWN = 4096, 64
+
+
+def _claim_aids(
+    quantity: str, first: int, draws: int, place: int, each_block: bool = False
+) -> tuple[int, ...]:
+    """Reserve draws of a quantity of all aiding sensors; return the first of each.
+
+    Args:
+        quantity: The quantity.
+        first: First draw of the range that the first sensors share.
+        draws: Number of draws of a sensor, or of each of its blocks.
+        place: Place of the quantity in the range that a further sensor has for itself.
+        each_block: True: draws of each block.
+    """
+    _claim(quantity, first, draws * _SHARING)
+    found = [first + draws * aid for aid in range(_SHARING)]
+    for aid in list(Aid)[_SHARING:]:
+        own = _FIRST_OWN + _OWN * (aid - _SHARING) + place
+        count = draws * AID_MOST[aid] if each_block else draws
+        found.append(_claim(f"{quantity}: {aid.name}", own, count))
+    return tuple(found)
+
+
 # at every instant
 DRAW_BIAS = _claim("driving noise of the IMU biases", 0, 3)
 DRAW_IMU = _claim("white noise of the IMU", 3, 3)
@@ -46,9 +74,9 @@ DRAW_FAULTS = _claim("faults", 1024, DRAWS_OF_FAULT * FAULT_KINDS)
 DRAW_HIDDEN = _claim("features that an occlusion hides", 2048, MAX_FEATURES)
 DRAW_VIBRATION = _claim("vibration of the IMU", 576, 3)
 DRAW_BLUR = _claim("places in blurred images", 592, MAX_FEATURES)
-DRAW_AID = _claim("white noise of aiding sensors", 720, 2 * AIDS)
-DRAW_AID_DRIFT = _claim("slow errors of aiding sensors", 736, AIDS)
-DRAW_AID_VECTOR = _claim("slow errors of aiding sensors, of three numbers", 740, 3 * AIDS)
+DRAW_AID = _claim_aids("white noise of aiding sensors", 720, 2, 0, each_block=True)
+DRAW_AID_DRIFT = _claim_aids("slow errors of aiding sensors", 736, 1, 16)
+DRAW_AID_VECTOR = _claim_aids("slow errors of aiding sensors, of three numbers", 740, 3, 24)
 # at an episode's first instant
 DRAW_COURSE = _claim("phase, radius, period and sense of the reference", 64, 2)
 DRAW_START = _claim("start", 66, 5)
@@ -65,7 +93,7 @@ DRAW_WARM = _claim("errors of a warm start", 544, 8)
 DRAW_IMU_ERRORS = _claim("errors of scale and alignment of the IMU", 640, 9)
 DRAW_HEADING = _claim("constant error of the baseline", 649, 1)
 DRAW_SLOW = _claim("slow errors of aiding sensors at the start", 656, MAX_SLOW)
-DRAW_AID_MATRIX = _claim("errors of scale and alignment of aiding sensors", 672, 5 * AIDS)
-DRAW_AID_PHASE = _claim("phases of aiding sensors", 704, AIDS)
+DRAW_AID_MATRIX = _claim_aids("errors of scale and alignment of aiding sensors", 672, 5, 32)
+DRAW_AID_PHASE = _claim_aids("phases of aiding sensors", 704, 1, 56)
 DRAW_OBSTACLES = _claim("shifts of obstacles", 768, 2 * MAX_OBSTACLES)
 DRAW_WARM_DRIFT = _claim("slow error of GNSS positions at a warm start", 552, 3)

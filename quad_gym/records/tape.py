@@ -5,7 +5,7 @@ from enum import IntEnum, auto
 import numpy as np
 
 from quad_gym.records.layout import block_dtype
-from quad_gym.records.sizes import AIDS, MAX_BLOCKS, MAX_FEATURES, MAX_SLOW, Field
+from quad_gym.records.sizes import AID_ROWS, AIDS, MAX_BLOCKS, MAX_FEATURES, MAX_SLOW, Field
 
 SAMPLE = np.dtype([("gyro", "f8", 3), ("accel", "f8", 3), ("dt", "f8"), ("gyro_before", "f8", 3)])
 """An IMU sample that propagates the estimate; see `quad_gym.estimation.samples.Sample`."""
@@ -24,7 +24,7 @@ MEASUREMENT = np.dtype(
         ("valid", "f8", MAX_BLOCKS),  # 1 where a block is measured
         *((name, "f8", 3) for name in ("gnss_position", "gnss_baseline", "gnss_velocity")),
         ("pixels", "f8", (MAX_FEATURES, 2)),
-        ("aid_measurement", "f8", (AIDS, 3)),
+        ("aid_measurement", "f8", (AID_ROWS, 3)),
         # noise; NaN: as in the parameters
         ("position_sigma_I", "f8", 3),
         *((name, "f8") for name in NOISE_FIELDS[1:]),

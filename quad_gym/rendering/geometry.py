@@ -125,6 +125,7 @@ def fixed_view(flight: Flight, width: float, height: float) -> Perspective:
     scene, start = flight.scene, flight["position"][0]
     times = np.linspace(0.0, scene.reference_period or 1.0, max(64, scene.pieces // 4))
     around = [scene.reference(times), start[np.newaxis], scene.gates_I, scene.features_I]
+    around.append(scene.anchors_I)
     around += [np.concatenate(around[:3]) * (1.0, 1.0, 0.0)]  # points on the ground below
     points = np.concatenate(around)
     if len(scene.obstacles):  # all within the geofence, or else those nearby

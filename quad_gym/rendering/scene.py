@@ -1,5 +1,7 @@
 """Scene in perspective: ground, reference, vehicle, estimate, fixes and features."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -90,6 +92,7 @@ class Scene:
         self._shadow()
         self._trails()
         self._camera()
+        self._boxes(self._scene.anchors_I, [colors.PURPLE] * len(self._scene.anchors_I))
         self._fixes()
         self._estimate()
         self._body(np.array(self._now["position"]), self._R_BI, ghost=False)
@@ -224,13 +227,15 @@ class Scene:
         self._features(seen)
 
     def _features(self, seen: NDArray[np.bool_]) -> None:
-        canvas = self._canvas
-        places = self._view.project(self._scene.features_I)[0]
-        for at, visible in zip(places, seen, strict=True):
+        self._boxes(self._scene.features_I, [colors.INK if one else colors.WHITE for one in seen])
+
+    def _boxes(self, places_I: Floats, fills: Sequence[Color]) -> None:
+        """Draw places as small boxes."""
+        for at, fill in zip(self._view.project(places_I)[0], fills, strict=True):
             if np.isfinite(at).all():
                 x, y = at
-                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, colors.INK if visible else colors.WHITE)
-                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, colors.INK, 1.2)
+                self._canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, fill)
+                self._canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, colors.INK, 1.2)
 
     def _fixes(self) -> None:
         rows = self._flight.rows[-max(1, round(FIX_SECONDS * self._scene.control_rate)) :]

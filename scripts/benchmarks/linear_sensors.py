@@ -15,7 +15,7 @@ from quad_gym.analysis.consistency import PARTS
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
     BASELINE_BLOCK,
     FEATURE_SLICE,
     POSITION_BLOCK,
@@ -43,13 +43,12 @@ class SuiteModel:
     """Linear models of a suite, with the errors of its sensors as states.
 
     Raises:
-        ValueError: If the suite has optical flow or a range finder, which are not modeled.
+        ValueError: If the suite has sensors such as optical flow, which are not modeled.
     """
 
     def __init__(self, sensors: SensorSuite) -> None:
-        for name in ("optical_flow", "range_finder"):
-            if getattr(sensors, name) is not None:
-                raise ValueError(f"sensors must be a suite without {name} for the bound")
+        for aid in set(sensors.aids) - {Aid["BAROMETER"], Aid["MAGNETOMETER"]}:
+            raise ValueError(f"sensors must be a suite without {aid.name.lower()} for the bound")
         self.sensors, imu, gnss = sensors, sensors.imu, sensors.gnss
         barometer, magnetometer = sensors.barometer, sensors.magnetometer
         scale, misalignment = imu.accel_scale_sigma, imu.accel_misalignment_sigma
@@ -140,14 +139,14 @@ class SuiteModel:
             H = jacobian(rows, 3, e=-R_IB @ cross(b), heading=heading)
             yield rows, H, [gnss.baseline_sigma**2] * 3, Sensor.GNSS
         barometer, magnetometer = self.sensors.barometer, self.sensors.magnetometer
-        if barometer is not None and (rows := seen(AID_BLOCKS + Aid.BAROMETER)).size:
+        if barometer is not None and (rows := seen(AID_BLOCK[Aid["BAROMETER"]])).size:
             H = jacobian(rows, 1, r=EYE[2:], barometer=1.0)
-            yield rows, H, [barometer.noise_sigma**2], Sensor.BAROMETER
-        if magnetometer is not None and (rows := seen(AID_BLOCKS + Aid.MAGNETOMETER)).size:
-            R_BI, m_I = at(Sensor.MAGNETOMETER).R_BI[rows], np.array(magnetometer.field_I)
+            yield rows, H, [barometer.noise_sigma**2], Sensor["BAROMETER"]
+        if magnetometer is not None and (rows := seen(AID_BLOCK[Aid["MAGNETOMETER"]])).size:
+            R_BI, m_I = at(Sensor["MAGNETOMETER"]).R_BI[rows], np.array(magnetometer.field_I)
             turned = (R_BI @ np.cross([0.0, 0.0, 1.0], m_I))[..., np.newaxis]
             H = jacobian(rows, 3, e=cross(R_BI @ m_I), iron=EYE, declination=turned)
-            yield rows, H, [magnetometer.noise_sigma**2] * 3, Sensor.MAGNETOMETER
+            yield rows, H, [magnetometer.noise_sigma**2] * 3, Sensor["MAGNETOMETER"]
         new = valid[:, FEATURE_SLICE]
         if camera is not None and (rows := np.flatnonzero(new.any(axis=1))).size:
             truth, X_I = at(Sensor.CAMERA), features[rows]

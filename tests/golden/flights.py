@@ -96,6 +96,7 @@ def cases():
         suite = "indoor" if "camera" in fault else "rtk"
         suite = AIDED if "meter" in fault else suite
         suite = "crazyflie" if fault in ("optical_flow_loss", "range_finder_loss") else suite
+        suite = "uwb" if fault == "uwb_range_loss" else suite
         found[f"fault {fault}"] = {"sensors": suite, "faults": _early(fault), "start": "hover"}
     for task in ("LookAround", "StaleRace", "OutageDash"):
         found[task] = {"id": task}
@@ -123,6 +124,13 @@ def cases():
             "sensors": quad_gym.sensor_suite("crazyflie").replace(
                 optical_flow=quad_gym.OpticalFlowParams(latency=0.01),
                 range_finder=quad_gym.RangeFinderParams(latency=0.04),
+            ),
+            **{"estimator": "ekf", "filter_start": "warm", "observation": "measurements"},
+        },
+        "uwb": {"sensors": "uwb", "vehicle": "crazyflie", "innovations": True},
+        "uwb, late, ekf, warm, raw": {
+            "sensors": quad_gym.sensor_suite("uwb").replace(
+                uwb_range=quad_gym.UwbRangeParams(tag_B=(0.02, 0.0, 0.01), latency=0.04)
             ),
             **{"estimator": "ekf", "filter_start": "warm", "observation": "measurements"},
         },

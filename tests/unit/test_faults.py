@@ -24,6 +24,7 @@ from quad_gym.faults import (
 )
 from quad_gym.faults.presets import ALL, PRESETS, faults_of
 from quad_gym.frames import ecef_to_enu
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_SLICE,
@@ -335,8 +336,7 @@ def test_fault_presets_are_found_by_name():
     named = faults_of("rotor_loss+gnss_outage", LAB)
     assert [type(fault) for fault in named] == [GnssOutage, RotorLoss]
     assert named == faults_of(["rotor_loss", PRESETS["gnss_outage"][0]], LAB)
-    flow = quad_gym.sensor_suite("crazyflie")
-    every = AIDED.replace(optical_flow=flow.optical_flow, range_finder=flow.range_finder)
+    every = AIDED.replace(**{name: kind() for name, kind in AID_PARAMS.items()})
     assert len(faults_of(ALL, every)) == len(kinds)
     assert len(faults_of(ALL, RTK)) == len(kinds) - len(Aid)
     for suite in ("consumer", "indoor"):

@@ -101,7 +101,7 @@ def require_equal(run, log, suite, start):
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["rtk", "consumer", slow("standard"), "indoor"])
+@pytest.mark.parametrize("name", ["rtk", "consumer", slow("standard"), "indoor", slow("uwb")])
 def test_example_prints_estimates_of_replay(name):
     suite, program = quad_gym.sensor_suite(name), example(name, "x86-64")
     start = REST if suite.gnss is None else {}
@@ -408,6 +408,28 @@ def test_calls_give_the_estimates_of_the_python_filter():
         np.testing.assert_array_equal(found, values)
     np.testing.assert_allclose(parts[6] ** 2, np.diag(ukf.covariance), rtol=1e-12)
     np.testing.assert_allclose(c.covariance(), ukf.covariance, rtol=1e-9, atol=1e-18)
+
+
+@needs_compiler
+def test_missing_and_late_ranges_give_the_estimates_of_the_python_filter():
+    ukf, c = started("uwb")
+    anchors, rng = np.array(ukf.sensors.uwb_range.anchors_I), np.random.default_rng(1)
+    for _ in range(300):
+        if rng.random() < 0.2:
+            time = max(ukf.oldest_time, ukf.time - rng.uniform(0.0, 0.4) * rng.integers(2))
+            ranges = np.linalg.norm(anchors - (1.0, -2.0, 0.8), axis=1) + rng.normal(0.0, 0.1, 4)
+            ranges[rng.random(4) < 0.3] = np.nan
+            ukf.update(uwb_range=ranges, time=time)
+            assert c.call("update_uwb_range", ranges, time) == OK
+        else:
+            gyro, accel = rng.normal(0.0, 0.2, 3), rng.normal([0.0, 0.0, 9.8], 0.3)
+            ukf.predict(gyro, accel, dt=0.005)
+            assert c.call("predict", gyro, accel, 0.005) == OK
+    parts = np.split(c.estimate(), np.cumsum([3, 3, 9, 4, 3, 3]))
+    wanted = (ukf.position, ukf.velocity, ukf.R_BI.ravel(), ukf.accel_bias, ukf.gyro_bias)
+    for found, values in zip((*parts[:3], *parts[4:6]), wanted, strict=True):
+        np.testing.assert_array_equal(found, values)
+    assert ukf.status == 0
 
 
 @needs_compiler

@@ -40,7 +40,9 @@ def test_measurements_have_the_closed_form_and_their_noise():
         rows = zip(*states, R_BI, strict=True)
         truth = np.array([expected(r, v, R, w)[:3] for r, v, w, R in rows])
         measured = batch.record("aid_measurement")
-        valid = batch.record("block_valid")[:, AID_BLOCKS + FLOW :].all(axis=1)  # flow in range
+        valid = batch.record("block_valid")[:, AID_BLOCKS + FLOW : AID_BLOCKS + RANGE + 1].all(
+            axis=1
+        )  # flow in range
         error = np.column_stack([measured[:, FLOW, :2], measured[:, RANGE, :1]]) - truth
         noise.append(error[valid])
     sigma = np.sqrt(np.mean(np.concatenate(noise) ** 2, axis=0))
@@ -126,7 +128,7 @@ def test_wrong_measurements_are_rejected(kind):
     before = kf.position
     kf.update(optical_flow=(6.0, 0.0), range_finder=3.0)
     np.testing.assert_array_equal(kf.position, before)
-    gates = kf._engine.read("gate")[0, AID_BLOCKS + FLOW :]
+    gates = kf._engine.read("gate")[0, AID_BLOCKS + FLOW : AID_BLOCKS + RANGE + 1]
     np.testing.assert_array_equal(gates, GateDecision.REJECTED)
 
 

@@ -35,7 +35,7 @@ def test_flights_and_views_use_the_names_of_the_table():
 
 
 def test_every_quantity_has_the_shape_of_the_table():
-    room = {"features": 4, "gates": 5, "obstacles": 1}
+    room = {"features": 4, "gates": 5, "obstacles": 1, "blocks": 8}  # of ranges
     wall = quad_gym.Wall(center_I=(9.0, 0.0, 1.0))
     batch = flown("waypoints", sensors=AIDED, world=quad_gym.WorldParams(obstacles=(wall,)))
     room["features"] = len(AIDED.camera.features_I)

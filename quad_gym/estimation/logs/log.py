@@ -7,7 +7,7 @@ delayed.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, make_dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from quad_gym.frames import geodetic_to_ecef
 from quad_gym.params import checks as check
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.rotations import euler_to_dcm
 
@@ -38,6 +39,15 @@ def _enu(name: str) -> tuple[str, ...]:
     return tuple(f"{name}_{axis}" for axis in ("east", "north", "up"))
 
 
+def _of_aid(name: str) -> LogColumn:
+    """Return the columns of an aiding sensor: of its blocks by number, of vectors by axis."""
+    kind = AID_PARAMS[name]
+    names = [f"{name}_{k}" for k in range(kind.most_blocks)] if kind.most_blocks > 1 else [name]
+    if kind.length > 1:
+        names = [axis for each in names for axis in _xyz(each)[: kind.length]]
+    return LogColumn(tuple(names), kind.unit, kind.frame, kind.meaning)
+
+
 _MOTORS, _COMMANDS = (tuple(f"{word}_{k}" for k in range(4)) for word in ("motor", "command"))
 
 # fmt: off
@@ -55,10 +65,7 @@ LOG_COLUMNS = {
     "gnss_velocity_sigma": LogColumn(("gnss_velocity_sigma",), "m/s", "-", "reported sigma"),
     "gnss_baseline": LogColumn(_xyz("gnss_baseline"), "m", "ECEF", "primary to secondary antenna"),
     "gnss_baseline_enu": LogColumn(_enu("gnss_baseline"), "m", "I", "between the antennas"),
-    "barometer": LogColumn(("barometer",), "m", "I", "height by static pressure"),
-    "magnetometer": LogColumn(_xyz("magnetometer"), "T", "B", "magnetic field"),
-    "optical_flow": LogColumn(_xyz("optical_flow")[:2], "rad/s", "B", "motion of the ground"),
-    "range_finder": LogColumn(("range_finder",), "m", "B", "distance to the ground"),
+    **{name: _of_aid(name) for name in AID_PARAMS},
     "heading": LogColumn(("heading",), "rad", "I", "of the body x axis, from east toward north"),
     "attitude": LogColumn(tuple(f"attitude_{a}" for a in "wxyz"), "-", "B to I", "quaternion"),
     "motors": LogColumn(_MOTORS, "V", "-", "voltages of the motors, up to the next row with them"),
@@ -90,16 +97,24 @@ class Stream:
         return Stream(self.time[chosen], self.received[chosen], values)
 
 
-MEASURED = (
-    *("imu", "gnss", "camera", "barometer", "magnetometer", "optical_flow", "range_finder"),
-    "attitude",
-)
+MEASURED = ("imu", "gnss", "camera", *AID_PARAMS, "attitude")
 """Sensors of a log, in the order in which measurements that arrive together are processed."""
 
 
+_AidStreams: Any = make_dataclass(
+    "_AidStreams",
+    [(name, Stream | None, field(default=None, kw_only=True)) for name in AID_PARAMS],
+    frozen=True,
+    eq=False,
+)
+
+
 @dataclass(frozen=True, eq=False)
-class Log:
+class Log(_AidStreams):
     """Measurements of the sensors in a flight, each sensor at its own times.
+
+    Each sensor of `quad_gym.params.aid_table` has a field with its name: a stream of (n, ...)
+    measurements under this name, or None.
 
     Frames are the package's: B with x forward, y left, z up; I with east, north, up.
     """
@@ -111,12 +126,6 @@ class Log:
     deviations position_sigma_I (n, 3) [m], infinite along an axis that was not measured, and
     velocity_sigma (n,) [m/s]"""
     camera: Stream | None = None  #: images: pixels (n, features, 2) from the image's center
-    barometer: Stream | None = None  #: heights: barometer (n,) in I [m]
-    magnetometer: Stream | None = None  #: magnetic fields: magnetometer (n, 3) in B [T]
-    optical_flow: Stream | None = None
-    """rates of the ground: optical_flow (n, 2) as `OpticalFlowParams` describes them [rad/s]"""
-    range_finder: Stream | None = None
-    """distances to the ground along the body's -z: range_finder (n,) [m]"""
     attitude: Stream | None = None
     """attitudes by motion capture: quaternion (n, 4), body to inertial; or heading (n,) [rad]"""
     motors: Stream | None = None

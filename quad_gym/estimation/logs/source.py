@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats, Stream
+from quad_gym.params.aid_table import AID_PARAMS
 
 SENSORS = (
-    *("imu", "gyro", "accel", "gnss", "gnss_velocity", "barometer", "magnetometer"),
-    *("optical_flow", "range_finder", "attitude", "camera", "motors", "battery"),
+    *("imu", "gyro", "accel", "gnss", "gnss_velocity", *AID_PARAMS),
+    *("attitude", "camera", "motors", "battery"),
 )
 """Sensors that a source may have; `gyro` and `accel` are the halves of an IMU, `gnss_velocity` has
 velocities apart from positions."""

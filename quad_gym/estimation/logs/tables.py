@@ -12,6 +12,7 @@ import numpy as np
 from quad_gym.estimation.logs.log import LOG_COLUMNS, Floats, ecef_of
 from quad_gym.estimation.logs.source import LogSource, RawLog
 from quad_gym.params import checks as check
+from quad_gym.params.aid_table import AID_PARAMS
 
 _FORMS = {
     "gnss": ("", "_lla", "_enu"),
@@ -133,6 +134,11 @@ def _together(columns: Columns, key: str) -> Floats | None:
     have = [name in columns for name in names]
     if not any(have):
         return None
+    if key in AID_PARAMS and AID_PARAMS[key].most_blocks > 1:  # as many as there are, in order
+        names = names[
+            : AID_PARAMS[key].length * -(-(1 + max(np.flatnonzero(have))) // AID_PARAMS[key].length)
+        ]
+        have = have[: len(names)]
     if not all(have):
         missing = names[have.index(False)]
         raise ValueError(f"a log must have a column {missing} with {names[have.index(True)]}")
@@ -163,7 +169,8 @@ def sources_of(columns: Columns, body: str) -> Iterator[LogSource]:
                 values={name: v[rows] for name, v in given.items()},
             )
 
-    turned = {key: _together(columns, key) for key in ("gyro", "accel", "magnetometer")}
+    vectors = [name for name, kind in AID_PARAMS.items() if (kind.length, kind.frame) == (3, "B")]
+    turned = {key: _together(columns, key) for key in ("gyro", "accel", *vectors)}
     turned = {key: None if v is None else v * axes for key, v in turned.items()}
     halves = {name: turned[name] for name in ("gyro", "accel") if turned[name] is not None}
     if len(halves) == 2:
@@ -184,9 +191,8 @@ def sources_of(columns: Columns, body: str) -> Iterator[LogSource]:
             gnss[f"{quantity}_G"] = ecef_of(*places.T)
     yield from source("gnss", **gnss)
     yield from source("camera", pixels=_image(columns))
-    yield from source("magnetometer", magnetometer=turned["magnetometer"])
-    for name in ("barometer", "optical_flow", "range_finder", "battery"):
-        yield from source(name, **{name: _together(columns, name)})
+    for name in (*AID_PARAMS, "battery"):
+        yield from source(name, **{name: turned.get(name, _together(columns, name))})
     yield from source("attitude", quaternion=_together(columns, "attitude"))
     yield from source("attitude", heading=_together(columns, "heading"))
     yield from source("motors", motors=_together(columns, "motors"))

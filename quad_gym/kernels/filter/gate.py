@@ -19,7 +19,12 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.measurements import call_measured
-from quad_gym.kernels.filter.monitoring import follow_mean, follow_ratio, forget_corrections
+from quad_gym.kernels.filter.monitoring import (
+    LARGEST,
+    follow_mean,
+    follow_ratio,
+    forget_corrections,
+)
 from quad_gym.kernels.filter.recovery import (
     OUTLIER,
     accept_group,
@@ -34,7 +39,15 @@ from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_o
 from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_outers_of_rows
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
-from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, Act, FilterForm, GateDecision
+from quad_gym.records import (
+    AID_BLOCKS,
+    AID_ROWS,
+    FEATURE_BLOCKS,
+    SEVERAL,
+    Act,
+    FilterForm,
+    GateDecision,
+)
 
 _GAIN = 0.05  #: change of a factor on the noise by one measurement
 _ADAPTED = 1.3  #: mean NIS over the degrees of freedom above which the noise is adapted
@@ -132,7 +145,7 @@ def _weigh(flight, p, settings, group, s, valid, nis, limit, again):
     """Lanes in which block s is rejected, and lanes in which its noise is increased.
 
     An innovation beyond the gate is an error of the sensor, or else of the IMU; then it has a
-    bounded weight. A feature is wrong where the others of its image agree with the estimate.
+    bounded weight. A block of several is wrong where most others agree with the estimate.
     """
     rejected, weakened = no_lane(nis), no_lane(nis)
     if (settings.form & FilterForm.GATE.value) != 0:
@@ -140,7 +153,7 @@ def _weigh(flight, p, settings, group, s, valid, nis, limit, again):
         if any_of(beyond):
             hard = supported(flight, p, settings, group)
             hard = hard | glitches(flight, p, settings, group, nis, limit)
-            if group == FEATURE_BLOCKS:  # most features of the last image agreed
+            if group in SEVERAL:  # most blocks of the last measurement agreed
                 hard = hard | (flight.rejected_in_row[group] < 1.0)
             rejected = beyond & hard
             weakened = beyond & logical_not(hard)
@@ -166,13 +179,15 @@ def add_nis(work, counted, nis, freedoms):
 
 
 @kernel
-def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers):
-    """Store the innovation of block s, at row k, and mask it where its NIS exceeds `limit`.
+def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
+    """Store the innovation of block s, at row k, and decide on it.
 
-    Its stored standard deviations and NIS are those with the suite's noise.
+    Its stored standard deviations and NIS are those with the suite's noise. A block with fewer
+    `numbers` than three has masked rows behind them, which add nothing to its NIS.
 
-    A block with fewer `numbers` than three has masked rows behind them, which add nothing to its
-    NIS. Rejections do not count against a filter that other sensors support.
+    Returns:
+        Lanes in which it is valid; lanes in which it is beyond the gate; its NIS; half the NIS of
+        its difference from the last one; its innovation in standard deviations.
     """
     again = work.again > 0.0
     valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
@@ -192,10 +207,84 @@ def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers):
         scaled = (scaled[0], zero_like(nis), zero_like(nis))
     first = valid & logical_not(again)
     _store_innovation(flight, s, first, nu, sigma, nis_suite, rejected, nis < nis, weakened)
-    beyond = rejected | weakened
+    return valid, rejected | weakened, nis, scatter, scaled
+
+
+@kernel
+def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers):
+    """Store the innovation of block s, at row k, and mask it where its NIS exceeds `limit`.
+
+    Rejections do not count against a filter that other sensors support.
+    """
+    valid, beyond, nis, scatter, scaled = _gate_block(
+        flight, p, work, settings, k, s, group, limit, numbers
+    )
+    first = valid & logical_not(work.again > 0.0)
     judge(flight, p, work, settings, group, first, beyond, nis, scatter, numbers, limit)
     follow_mean(flight, group, first & logical_not(beyond), scaled)
     mask_rejected(flight, work, settings, k, s, valid, numbers)
+
+
+@kernel
+def no_blocks(flight):
+    """Statistics of a measurement of several blocks before the first one, see `add_block`."""
+    zero = zero_like(flight.tick)
+    return zero, zero, zero, zero, zero, (zero, zero, zero)
+
+
+@kernel
+def add_block(statistics, counted, beyond, nis, scatter, scaled):
+    """Add a block to the statistics of its measurement, in the lanes `counted`.
+
+    These are the counts of blocks and of those beyond the gate, the sum of NIS of all and of the
+    others, the sum of the scatter, and the sum of the others' innovations.
+    """
+    count, refused, total, kept, scattered, mean = statistics
+    used = counted & logical_not(beyond)
+    x, y, z = scaled
+    return (
+        count + select(counted, 1.0, 0.0),
+        refused + select(counted & beyond, 1.0, 0.0),
+        total + select(counted, nis, 0.0),
+        kept + select(used, nis, 0.0),
+        scattered + select(counted, scatter, 0.0),
+        (
+            mean[0] + select(used, clip(x, -LARGEST, LARGEST), 0.0),
+            mean[1] + select(used, clip(y, -LARGEST, LARGEST), 0.0),
+            mean[2] + select(used, clip(z, -LARGEST, LARGEST), 0.0),
+        ),
+    )
+
+
+@kernel
+def judge_several(flight, p, work, settings, group, statistics, freedoms, limit):
+    """Take account of a measurement of several blocks.
+
+    It counts as rejected if half of its blocks are; otherwise rejected ones do not count.
+    """
+    count, refused, total, kept, scatter, (x, y, z) = statistics
+    first, most = count > 0.0, refused >= 0.5 * count
+    several, few = maximum(count, 1.0), maximum(count - refused, 1.0)
+    nis = select(most, total / several, kept / few)
+    scatter, root = scatter / several, math.sqrt(few)
+    judge(flight, p, work, settings, group, first, first & most, nis, scatter, freedoms, limit)
+    follow_mean(flight, group, first & logical_not(most), (x / root, y / root, z / root))
+
+
+@kernel
+def gate_several(flight, p, work, settings, k, first, count, group, limit, numbers):
+    """Do the same as `gate_numbers` for a measurement of blocks that are accepted one by one."""
+    statistics = no_blocks(flight)
+    for s in range(first, first + count):
+        if any_of(flight.block_valid[s] > 0.0):
+            valid, beyond, nis, scatter, scaled = _gate_block(
+                flight, p, work, settings, k, s, group, limit, numbers
+            )
+            counted = valid & logical_not(work.again > 0.0)
+            statistics = add_block(statistics, counted, beyond, nis, scatter, scaled)
+            mask_rejected(flight, work, settings, k, s, valid, numbers)
+            k += 3
+    judge_several(flight, p, work, settings, group, statistics, numbers, limit)
 
 
 @kernel
@@ -311,7 +400,7 @@ def gate_innovations(flight, p, work, settings, stages, mask, again):
 def forget_innovations(flight, feature_count, mask):
     """Reset the innovations at the start of an episode, in the lanes `mask`."""
     blocks, none = FEATURE_BLOCKS + feature_count, (np.nan, np.nan, np.nan)
-    for k in range(blocks + AIDS):
+    for k in range(blocks + AID_ROWS):
         s = k if k < blocks else k - blocks + AID_BLOCKS
         flight.block_nis[s] = select(mask, np.nan, flight.block_nis[s])
         flight.gate[s] = select(mask, 0.0, flight.gate[s])

@@ -48,7 +48,6 @@ from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.records import (
     AID_GROUPS,
-    FEATURE_BLOCKS,
     FIRST_GROUP,
     GROUP_COUNT,
     GROUP_OBSERVES,
@@ -56,16 +55,17 @@ from quad_gym.records import (
     QUANTITIES,
     SENSOR_GROUPS,
     SENSORS,
+    SEVERAL,
     VELOCITY_BLOCK,
+    WITH_OWN_ERROR,
     Act,
     Aid,
     Observes,
 )
 
-_BAROMETER = AID_GROUPS + int(Aid.BAROMETER)
-_WITH_OWN_ERROR = (_BAROMETER, AID_GROUPS + int(Aid.MAGNETOMETER))
-"""Groups of sensors with an error state of their own."""
-_NO_GLITCH = (*_WITH_OWN_ERROR, FEATURE_BLOCKS)
+_BAROMETER = AID_GROUPS + int(Aid["BAROMETER"])
+_MAGNETOMETER = int(Aid["MAGNETOMETER"])
+_NO_GLITCH = (*WITH_OWN_ERROR, *SEVERAL)
 """Groups whose steps do not lengthen the time limit: an image of several features is redundant."""
 VELOCITY_BIT = int(Observes.VELOCITY).bit_length() - 1
 OUTLIER = 4.0
@@ -135,9 +135,9 @@ def _confirmed(flight, p, settings, refused, bit):
 def supported(flight, p, settings, refused):
     """Lanes in which other sensors confirm all that the group `refused` measures.
 
-    An image of several features supports itself, so nothing overrules it.
+    Several blocks, as of an image, support themselves, so nothing overrules them.
     """
-    if refused == FEATURE_BLOCKS:
+    if refused in SEVERAL:
         return no_lane(flight.tick)
     found = logical_not(no_lane(flight.tick))
     for bit in range(QUANTITIES):
@@ -175,12 +175,12 @@ def glitches(flight, p, settings, group, nis, limit):
     since = (flight.tick - flight.accepted_tick[group]) * p.dt
     step = (nis > OUTLIER * maximum(flight.nis_ratio, 1.0) * limit) & (since < RECENT)
     found = ((row < 1.0) & step) | ((row > 0.0) & (flight.stepped[group] > 0.0))
-    if group == FEATURE_BLOCKS:  # most features of an image have no error in common
+    if group in SEVERAL:  # most features of an image, for example, have no error in common
         found = no_lane(flight.tick)
     if group in (POSITION_BLOCK, VELOCITY_BLOCK):  # of one receiver
         other = POSITION_BLOCK + VELOCITY_BLOCK - group
         found = found | ((flight.stepped[other] > 0.0) & (flight.rejected_in_row[other] > 0.0))
-    if group in _WITH_OWN_ERROR:
+    if group in WITH_OWN_ERROR:
         found = logical_not(no_lane(flight.tick))  # their error state would take up the error
     if group == POSITION_BLOCK:
         found = found | _dead_reckons(flight, p, settings)
@@ -343,7 +343,7 @@ def _choose(flight, p, work, settings, mask):
     for group in range(SENSOR_GROUPS):
         alone, refused = work.alone[group] > 0.0, mask & (flight.rejected_in_row[group] >= 2.0)
         chosen = refused & late & alone
-        if group in _WITH_OWN_ERROR:
+        if group in WITH_OWN_ERROR:
             chosen = chosen | (work.reset[group] > 0.0)
         work.reset[group] = select(chosen, 1.0, 0.0)
         alarmed = alarmed | chosen
@@ -374,7 +374,7 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
     drifted = work.drifted > 0.0
     _reset_motion(flight, p, slow, P, drifted, jumped, corrected_a, corrected_g)
     if slow is not None:
-        iron = slow.aid_vector[Aid.MAGNETOMETER]
+        iron = slow.aid_vector[_MAGNETOMETER]
         if iron >= 0:  # it was estimated with the attitude
             own = p.slow_sigma[iron] * p.slow_sigma[iron]
             reset_variances(P, D + iron, states, drifted | jumped, (own, own, own))

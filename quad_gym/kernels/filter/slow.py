@@ -37,7 +37,10 @@ from quad_gym.kernels.maths.matrices import (
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import Aid
+from quad_gym.records import AID_NUMBERS, Aid
+
+_MAGNETOMETER = int(Aid["MAGNETOMETER"])
+_FIELD = AID_NUMBERS[_MAGNETOMETER]
 
 
 @kernel
@@ -157,9 +160,9 @@ def turn_iron(flight, slow, p, L9, T, correction, columns):
     L9 is the factor after the update, last column first; R_hat is the attitude before it, T the
     transformation of the attitude errors by `reset_matrix`.
     """
-    first = slow.aid_vector[Aid.MAGNETOMETER]
+    first = slow.aid_vector[_MAGNETOMETER]
     if first >= 0:
-        m, delta = load3(p.aid_numbers[Aid.MAGNETOMETER]), slow.aid_scalar[Aid.MAGNETOMETER]
+        m, delta = load3(p.aid_numbers[_FIELD]), slow.aid_scalar[_MAGNETOMETER]
         turned = (m[1], -m[0], zero_like(m[2]))
         field_I = flight.slow_hat[delta] * turned + m
         before = load33(flight.R_hat) @ field_I

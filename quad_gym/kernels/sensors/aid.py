@@ -1,14 +1,15 @@
 """Errors, delivery and gate shared by the sensors with parameters in the fields `aid_...`.
 
-A sensor has one block of up to three numbers. It may have Gauss-Markov errors of three numbers and
-of one, and constant errors of scale and alignment.
+A sensor has one block of up to three numbers, or several. It may have Gauss-Markov errors of three
+numbers and of one, and constant errors of scale and alignment.
 """
 
 from typing import Any
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D
-from quad_gym.kernels.filter.gate import gate_numbers
+from quad_gym.kernels.filter.gate import gate_numbers, gate_several
+from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
@@ -20,11 +21,13 @@ from quad_gym.kernels.sensors.latency import (
     stamp,
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
-from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
     AID_FREEDOMS,
     AID_GROUPS,
+    AID_MOST,
+    AID_ROW,
     DRAW_AID_DRIFT,
     DRAW_AID_MATRIX,
     DRAW_AID_PHASE,
@@ -60,7 +63,7 @@ def _begin(flight, p, settings, s, mask):
     if k >= 0:
         _, n = normal_pair(stream, DRAW_SLOW + k)
         flight.aid_scalar[s] = select(mask, p.aid_scalar_sigma[s] * n, flight.aid_scalar[s])
-    share, _ = uniform_pair(stream, DRAW_AID_PHASE + s)
+    share, _ = uniform_pair(stream, DRAW_AID_PHASE[s])
     begin_clock(flight, settings, FIRST_AID + s, share, mask)
 
 
@@ -68,11 +71,11 @@ def _begin(flight, p, settings, s, mask):
 def draw_matrix(flight, p, s, mask):
     """Draw the errors of scale and alignment of sensor s, in the lanes `mask`."""
     stream, z = stream_of(flight), p.aid_matrix_sigma[s]
-    a, b = normal_pair(stream, DRAW_AID_MATRIX + 5 * s)
-    c, d = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 1)
-    e, f = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 2)
-    g, h = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 3)
-    i, _ = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 4)
+    a, b = normal_pair(stream, DRAW_AID_MATRIX[s])
+    c, d = normal_pair(stream, DRAW_AID_MATRIX[s] + 1)
+    e, f = normal_pair(stream, DRAW_AID_MATRIX[s] + 2)
+    g, h = normal_pair(stream, DRAW_AID_MATRIX[s] + 3)
+    i, _ = normal_pair(stream, DRAW_AID_MATRIX[s] + 4)
     keep(flight.aid_matrix[s], mask, z * ((a, b, c), (d, e, f), (g, h, i)))
 
 
@@ -81,12 +84,12 @@ def _due(flight, p, settings, s, mask, starting):
     """Lanes in which sensor s measures now; advances its clock and its Gauss-Markov errors."""
     due = tick_clock(flight, settings, FIRST_AID + s, mask)
     if not starting and any_of(due):
-        n, _ = normal_pair(stream_of(flight), DRAW_AID_DRIFT + s)
+        n, _ = normal_pair(stream_of(flight), DRAW_AID_DRIFT[s])
         error = p.aid_scalar_decay[s] * flight.aid_scalar[s] + p.aid_scalar_drive[s] * n
         flight.aid_scalar[s] = select(due, error, flight.aid_scalar[s])
         if any_of(p.aid_vector_drive[s] > 0.0):
             for i in range(3):
-                n, _ = normal_pair(stream_of(flight), DRAW_AID_VECTOR + 3 * s + i)
+                n, _ = normal_pair(stream_of(flight), DRAW_AID_VECTOR[s] + i)
                 last = flight.aid_vector[s, i]
                 error = p.aid_vector_decay[s] * last + p.aid_vector_drive[s] * n
                 flight.aid_vector[s, i] = select(due, error, last)
@@ -94,22 +97,32 @@ def _due(flight, p, settings, s, mask, starting):
 
 
 @kernel
-def _deliver(flight, work, settings, s, mask, due, values):
+def _begin_sample(flight, work, settings, s, mask):
+    """Invalidate the blocks of the last sample, and keep their numbers if there are delays."""
+    for i in range(settings.sensor_blocks[FIRST_AID + s]):
+        block = AID_BLOCK[s] + i
+        flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
+        if settings.sensor_delay[FIRST_AID + s] > 0:
+            keep_arrived(work, block, flight.aid_measurement[AID_ROW[s] + i], 3)
+
+
+@kernel
+def _deliver(flight, work, settings, s, mask, due):
     """Deliver the measurement of sensor s in the lanes `due`, now or after its latency."""
-    sensor, block, measurement = FIRST_AID + s, AID_BLOCKS + s, flight.aid_measurement[s]
-    if settings.faults:
-        due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
-    arrives = find_arrivals(flight, work, settings, sensor, mask)
-    flight.block_valid[block] = select(mask, select(due, 1.0, 0.0), flight.block_valid[block])
+    sensor, first, count = FIRST_AID + s, AID_BLOCK[s], settings.sensor_blocks[FIRST_AID + s]
     if settings.sensor_delay[sensor] == 0:
-        keep(measurement, due, values)
-        flight.block_fresh[block] = select(due, 1.0, flight.block_fresh[block])
-    elif any_of(due | arrives):
-        keep_arrived(work, block, measurement, 3)
-        keep(measurement, due, values)
+        for block in range(first, first + count):
+            new = due & (flight.block_valid[block] > 0.0)
+            flight.block_fresh[block] = select(new, 1.0, flight.block_fresh[block])
+    elif any_of(due | find_arrivals(flight, work, settings, sensor, mask)):
         taken = stamp(flight, settings, sensor, mask)
-        exchange(flight, work, block, measurement, 3, settings.under_way[sensor], mask, taken)
-        deliver_arrived(work, block, measurement, 3, mask)
+        for i in range(count):
+            measurement, under_way = (
+                flight.aid_measurement[AID_ROW[s] + i],
+                settings.under_way[sensor],
+            )
+            exchange(flight, work, first + i, measurement, 3, under_way, mask, taken)
+            deliver_arrived(work, first + i, measurement, 3, mask)
 
 
 def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> Any:
@@ -117,15 +130,18 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
 
     Args:
         aid: The sensor.
-        measure: `(flight, p) -> numbers, within`: three numbers that it measures now, zero beyond
-            its own, and the lanes in which it can measure.
-        expect: `(flight, p, work, settings, k, valid)`: fill its rows from k on, in these lanes.
+        measure: `(flight, p, i) -> numbers, within`: three numbers that block i measures now, zero
+            beyond its own, and the lanes in which it can measure.
+        expect: `(flight, p, work, settings, i, k, valid)`: fill the rows of block i, from k on, in
+            these lanes.
         reset: `(flight, p, work, settings, states, lanes, alone, nu)`: reset states to the sensor
-            in `lanes`, those of the vehicle where it is `alone`, by the innovation nu.
+            in `lanes`, those of the vehicle where it is `alone`, by the innovation nu; of several
+            blocks, by the largest ones.
         others: `(flight, p, mask)`, draw further constant errors of an episode, and `align` of
             `sensor_stage`; optional.
     """
-    s, block, group = int(aid), AID_BLOCKS + aid, AID_GROUPS + aid
+    s, group, sensor = int(aid), AID_GROUPS + aid, FIRST_AID + int(aid)
+    first, row, several = AID_BLOCK[s], AID_ROW[s], AID_MOST[aid] > 1
     numbers, (draw, *align) = float(AID_FREEDOMS[aid]), others or (_draw_nothing,)
 
     @kernel
@@ -136,30 +152,65 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
     @kernel
     def sample(flight, p, settings, work, stages, mask, starting):  # type: ignore[no-untyped-def]
         due = _due(flight, p, settings, s, mask, starting)
-        values, within = measure(flight, p)
-        if starting and settings.heading_sensor == FIRST_AID + s and settings.warm == 0:
+        if starting and settings.heading_sensor == sensor and settings.warm == 0:
             # it initializes the filter, which uses it only once
-            keep(flight.aid_measurement[s], mask, values)
-            flight.block_fresh[block] = select(mask, 1.0, flight.block_fresh[block])
-        else:
-            _deliver(flight, work, settings, s, mask, due & within, values)
+            values, _ = measure(flight, p, 0)
+            keep(flight.aid_measurement[row], mask, values)
+            flight.block_fresh[first] = select(mask, 1.0, flight.block_fresh[first])
+            return
+        if settings.faults:
+            due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
+        _begin_sample(flight, work, settings, s, mask)
+        if any_of(due):
+            for i in range(settings.sensor_blocks[sensor]):
+                values, within = measure(flight, p, i)
+                taken = due & within
+                keep(flight.aid_measurement[row + i], taken, values)
+                flight.block_valid[first + i] = select(taken, 1.0, flight.block_valid[first + i])
+        _deliver(flight, work, settings, s, mask, due)
 
     @kernel
     def expect_valid(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
-        expect(flight, p, work, settings, k, flight.block_valid[block] > 0.0)
+        for i in range(settings.sensor_blocks[sensor]):
+            valid = flight.block_valid[first + i] > 0.0
+            if any_of(valid):
+                expect(flight, p, work, settings, i, k, valid)
+                k += 3
 
     @kernel
     def gate(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
-        gate_numbers(flight, p, work, settings, k, block, group, p.aid_gate[s], numbers)
+        if several:
+            count, limit = settings.sensor_blocks[sensor], p.aid_gate[s]
+            gate_several(flight, p, work, settings, k, first, count, group, limit, numbers)
+        else:
+            gate_numbers(flight, p, work, settings, k, first, group, p.aid_gate[s], numbers)
 
     @kernel
     def reset_states(flight, p, work, settings):  # type: ignore[no-untyped-def]
-        nu, lanes, alone = load3(flight.innovation[block]), work.reset[group], work.alone[group]
-        states = D + settings.slow_states
+        lanes, alone, states = work.reset[group], work.alone[group], D + settings.slow_states
+        nu = load3(flight.innovation[first])
+        if several:
+            nu = _largest(flight, first, settings.sensor_blocks[sensor])
         reset(flight, p, work, settings, states, lanes > 0.0, alone > 0.0, nu)
 
     kernels = (begin, sample, expect_valid, gate, reset_states, *align)
     return sensor_stage(Sensor[aid.name], *kernels)
+
+
+@kernel
+def _largest(flight, first, count):
+    """Magnitudes of the largest innovations among the valid blocks of a sensor."""
+    zero = zero_like(flight.tick)
+    largest = (zero, zero, zero)
+    for block in range(first, first + count):
+        nu, valid = load3(flight.innovation[block]), flight.block_valid[block] > 0.0
+        size = (abs(nu[0]), abs(nu[1]), abs(nu[2]))
+        largest = (
+            maximum(largest[0], select(valid, size[0], zero)),
+            maximum(largest[1], select(valid, size[1], zero)),
+            maximum(largest[2], select(valid, size[2], zero)),
+        )
+    return largest
 
 
 @kernel

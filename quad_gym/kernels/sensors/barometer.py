@@ -14,25 +14,26 @@ from quad_gym.kernels.maths.linalg import diagonal, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.simd.lanes import logical_not, no_lane, select, zero_like
-from quad_gym.records import DRAW_AID, Aid
+from quad_gym.records import AID_ROW, DRAW_AID, Aid
 
-_S = Aid.BAROMETER
+_S = int(Aid["BAROMETER"])
+_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
 
 
 @kernel
-def _measure(flight, p):
-    n, _ = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
+def _measure(flight, p, i):
+    n, _ = normal_pair(stream_of(flight), _DRAW)
     altitude = flight.r[2] + flight.aid_scalar[_S] + p.aid_sigma[_S] * n
     return (altitude, zero_like(altitude), zero_like(altitude)), logical_not(no_lane(flight.tick))
 
 
 @kernel
-def _expect(flight, p, work, settings, k, valid):
+def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2: the altitude, and two masked ones."""
     first, sigma, last = settings.aid_scalar[_S], p.aid_sigma[_S], columns_of(settings) - 1
     altitude, zero = flight.r_hat[2] + flight.slow_hat[first], zero_like(sigma)
     noise = diagonal((sigma * sigma, zero + 1.0, zero + 1.0))
-    z = load3(flight.aid_measurement[_S])
+    z = load3(flight.aid_measurement[_ROW])
     put_block(work, settings, k, valid, z, (altitude, zero, zero), noise)
     for j in range(last + 1):
         value = flight.L_slow[first, j]
@@ -52,4 +53,4 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
     reset_variance(work.P, R + 2, states, lanes & alone, nu[0] * nu[0] + own * own)
 
 
-barometer_stage = aid_stage(_S, _measure, _expect, _reset)
+barometer_stage = aid_stage(Aid(_S), _measure, _expect, _reset)

@@ -17,11 +17,16 @@ import math
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.error_state import D, E, R, V
-from quad_gym.kernels.filter.gate import gate_direction, judge, mask_rejected
-from quad_gym.kernels.filter.monitoring import LARGEST, follow_mean
+from quad_gym.kernels.filter.gate import (
+    add_block,
+    gate_direction,
+    judge_several,
+    mask_rejected,
+    no_blocks,
+)
 from quad_gym.kernels.filter.recovery import MAX_ANGLE, reset_variances, time_of
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
-from quad_gym.kernels.maths.elementary import clip, maximum, minimum
+from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
@@ -182,38 +187,21 @@ def _gate(flight, p, work, settings, k):
 
     A feature whose predicted direction is too uncertain for a linear model is masked, too: the
     error of a direction is bounded, so it would pass any gate, and its update would be wrong and
-    overconfident. An image counts as rejected if half of its features are; otherwise rejected ones
-    do not count.
+    overconfident.
     """
-    again, zero = work.again > 0.0, zero_like(p.sigma_beta)
-    seen, refused, total, kept, scatter, side, up = zero, zero, zero, zero, zero, zero, zero
+    statistics, zero = no_blocks(flight), zero_like(flight.tick)
     for i in range(settings.feature_count):
         block = FEATURE_BLOCKS + i
         if any_of(flight.block_valid[block] > 0.0):
             valid = (work.taking > 0.0) & (flight.block_valid[block] > 0.0)
-            beyond, unsure, nis, change, scaled = gate_direction(
+            beyond, unsure, nis, scatter, (side, up) = gate_direction(
                 flight, p, work, settings, k, block, FEATURE_BLOCKS, valid, p.gate_uncertainty
             )
-            counted = valid & logical_not(unsure | again)
-            used = counted & logical_not(beyond)
-            seen = seen + select(counted, 1.0, 0.0)
-            refused = refused + select(counted & beyond, 1.0, 0.0)
-            total, kept = total + select(counted, nis, 0.0), kept + select(used, nis, 0.0)
-            scatter = scatter + select(counted, change, 0.0)
-            side = side + select(used, clip(scaled[0], -LARGEST, LARGEST), 0.0)
-            up = up + select(used, clip(scaled[1], -LARGEST, LARGEST), 0.0)
+            counted = valid & logical_not(unsure | (work.again > 0.0))
+            statistics = add_block(statistics, counted, beyond, nis, scatter, (side, up, zero))
             mask_rejected(flight, work, settings, k, block, valid, 3.0)
             k += 3
-    first, most = seen > 0.0, refused >= 0.5 * seen
-    count, few, s = maximum(seen, 1.0), maximum(seen - refused, 1.0), FEATURE_BLOCKS
-    mean, scatter, limit = (
-        select(most, total / count, kept / few),
-        scatter / count,
-        p.gate_direction,
-    )
-    judge(flight, p, work, settings, s, first, first & most, mean, scatter, 2.0, limit)
-    root = math.sqrt(few)
-    follow_mean(flight, s, first & logical_not(most), (side / root, up / root, zero))
+    judge_several(flight, p, work, settings, FEATURE_BLOCKS, statistics, 2.0, p.gate_direction)
 
 
 @kernel

@@ -48,9 +48,11 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
 from quad_gym.kernels.simd.lanes import logical_not, no_lane, select, zero_like
-from quad_gym.records import DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
 
-_S = Aid.MAGNETOMETER
+_S = int(Aid["MAGNETOMETER"])
+_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
+_N = AID_NUMBERS[_S]
 
 
 @kernel
@@ -59,12 +61,12 @@ def _draw(flight, p, mask):
 
 
 @kernel
-def _measure(flight, p):
+def _measure(flight, p, i):
     """The field in B, with all errors."""
     stream = stream_of(flight)
-    a, b = normal_pair(stream, DRAW_AID + 2 * _S)
-    c, _ = normal_pair(stream, DRAW_AID + 2 * _S + 1)
-    m, (s, t) = load3(p.aid_numbers[_S]), sin_cos(flight.aid_scalar[_S])
+    a, b = normal_pair(stream, _DRAW)
+    c, _ = normal_pair(stream, _DRAW + 1)
+    m, (s, t) = load3(p.aid_numbers[_N]), sin_cos(flight.aid_scalar[_S])
     field_I = (t * m[0] + s * m[1], t * m[1] - s * m[0], m[2])
     field_B = quaternion_to_dcm(load4(flight.q)) @ field_I
     field_B = field_B + load33(flight.aid_matrix[_S]) @ field_B + load3(flight.aid_vector[_S])
@@ -75,7 +77,7 @@ def _measure(flight, p):
 def _align(flight, p, work, settings, mask):
     """Initialize the heading with the direction of the field, and the covariance to match."""
     P, L, R_BI = work.P, flight.L, load33(flight.R_hat)
-    m, z = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S])
+    m, z = load3(p.aid_numbers[_N]), load3(flight.aid_measurement[_ROW])
     R_BI = R_BI @ level_attitude(R_BI.T @ z, m)
     put_covariance(P, L, 1.0)
     for i in range(settings.slow_states):
@@ -147,18 +149,18 @@ def _full(P):
 @kernel
 def _expected_field(flight, p, settings):
     """R_BI (m_I + delta m_I x e3) and R_BI (m_I x e3)."""
-    m, R_BI = load3(p.aid_numbers[_S]), load33(flight.R_hat)
+    m, R_BI = load3(p.aid_numbers[_N]), load33(flight.R_hat)
     g = (m[1], -m[0], zero_like(m[2]))
     return R_BI @ (flight.slow_hat[settings.aid_scalar[_S]] * g + m), R_BI @ g
 
 
 @kernel
-def _expect(flight, p, work, settings, k, valid):
+def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2."""
     L, M, inverse_c, last = flight.L, flight.L_slow, work.inverse_spread, columns_of(settings) - 1
     first, delta = settings.aid_vector[_S], settings.aid_scalar[_S]
     f_B, g_B = _expected_field(flight, p, settings)
-    z, variance = load3(flight.aid_measurement[_S]), p.aid_sigma[_S] * p.aid_sigma[_S]
+    z, variance = load3(flight.aid_measurement[_ROW]), p.aid_sigma[_S] * p.aid_sigma[_S]
     z_hat = f_B + load3(flight.slow_hat[first : first + 3])
     put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
     for j in range(last + 1):
@@ -178,7 +180,7 @@ def _expect(flight, p, work, settings, k, valid):
 @kernel
 def _reset(flight, p, work, settings, states, lanes, alone, nu):
     """Reset hard iron; where no other sensor measures the heading, the heading, too."""
-    first, m, square = settings.aid_vector[_S], load3(p.aid_numbers[_S]), dot(nu, nu)
+    first, m, square = settings.aid_vector[_S], load3(p.aid_numbers[_N]), dot(nu, nu)
     own = p.slow_sigma[first] * p.slow_sigma[first]
     iron = select(alone, own, maximum(own, square))
     reset_variances(work.P, D + first, states, lanes, (iron, iron, iron))
@@ -186,4 +188,4 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
     reset_heading(work.P, load33(flight.R_hat), states, lanes & alone, variance)
 
 
-magnetometer_stage = aid_stage(_S, _measure, _expect, _reset, _draw, _align)
+magnetometer_stage = aid_stage(Aid(_S), _measure, _expect, _reset, _draw, _align)

@@ -30,21 +30,23 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.sensors.range_finder import MIN_COSINE, ground_range
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
 
-_S = Aid.OPTICAL_FLOW
+_S = int(Aid["OPTICAL_FLOW"])
+_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
+_N = AID_NUMBERS[_S]
 
 
 @kernel
-def _measure(flight, p):
+def _measure(flight, p, i):
     """Two rates, within the limits of height, tilt and rate."""
-    n_x, n_y = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
+    n_x, n_y = normal_pair(stream_of(flight), _DRAW)
     R_BI, w = quaternion_to_dcm(load4(flight.q)), load3(flight.w)
     h, u = ground_range(p, flight.r, R_BI)
-    within = (h >= p.aid_numbers[_S, 0]) & (u >= MIN_COSINE)
+    within = (h >= p.aid_numbers[_N, 0]) & (u >= MIN_COSINE)
     g, v_B = u / select(within, h, 1.0), R_BI @ load3(flight.v)
     x, y = g * v_B[0] - w[1], g * v_B[1] + w[0]
-    most, sigma = p.aid_numbers[_S, 1], p.aid_sigma[_S]
+    most, sigma = p.aid_numbers[_N, 1], p.aid_sigma[_S]
     within = within & (abs(x) <= most) & (abs(y) <= most)
     return (x + sigma * n_x, y + sigma * n_y, zero_like(x)), within
 
@@ -62,15 +64,15 @@ def _put_center(flight, p, work, settings, k, valid, G, W):
     z_hat = vector(-w[1], w[0], zero) + _flow(G, W)
     variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
     noise = diagonal((variance, variance, zero + 1.0))
-    put_block(work, settings, k, valid, load3(flight.aid_measurement[_S]), z_hat, noise)
+    put_block(work, settings, k, valid, load3(flight.aid_measurement[_ROW]), z_hat, noise)
 
 
 @kernel
-def _expect(flight, p, work, settings, k, valid):
+def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2: two rates, and a masked row."""
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
-    h, W = maximum(h, 0.5 * p.aid_numbers[_S, 0]), R_BI @ load3(flight.v_hat)
+    h, W = maximum(h, 0.5 * p.aid_numbers[_N, 0]), R_BI @ load3(flight.v_hat)
     G, z_B, zero = u / h, R_BI.T[2], zero_like(h)
     _put_center(flight, p, work, settings, k, valid, G, W)
     for j in range(9):
@@ -102,4 +104,4 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
     reset_variances(work.P, V, states, lanes & alone, (square, square, square))
 
 
-optical_flow_stage = aid_stage(_S, _measure, _expect, _reset)
+optical_flow_stage = aid_stage(Aid(_S), _measure, _expect, _reset)

@@ -20,9 +20,11 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
 
-_S = Aid.RANGE_FINDER
+_S = int(Aid["RANGE_FINDER"])
+_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
+_N = AID_NUMBERS[_S]
 MIN_COSINE = 0.5  #: cosine of the tilt below which it does not measure: 60 degrees
 
 
@@ -33,25 +35,25 @@ def ground_range(p, r, R_BI):
 
 
 @kernel
-def _measure(flight, p):
+def _measure(flight, p, i):
     """The distance, within range."""
-    n, _ = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
+    n, _ = normal_pair(stream_of(flight), _DRAW)
     h, u = ground_range(p, flight.r, quaternion_to_dcm(load4(flight.q)))
     steep = u < MIN_COSINE
     distance = h / select(steep, 1.0, u)
-    within = (distance >= p.aid_numbers[_S, 0]) & (distance <= p.aid_numbers[_S, 1])
+    within = (distance >= p.aid_numbers[_N, 0]) & (distance <= p.aid_numbers[_N, 1])
     zero = zero_like(distance)
     return (distance + p.aid_sigma[_S] * n, zero, zero), within & (u >= MIN_COSINE)
 
 
 @kernel
-def _expect(flight, p, work, settings, k, valid):
+def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2: the distance, and two masked ones."""
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
     zero, sigma = zero_like(u), p.aid_sigma[_S]
     u = maximum(u, MIN_COSINE)
-    z, noise = load3(flight.aid_measurement[_S]), (sigma * sigma, zero + 1.0, zero + 1.0)
+    z, noise = load3(flight.aid_measurement[_ROW]), (sigma * sigma, zero + 1.0, zero + 1.0)
     put_block(work, settings, k, valid, z, (h / u, zero, zero), diagonal(noise))
     z_B = R_BI.T[2]
     for j in range(9):
@@ -75,4 +77,4 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
     reset_variance(work.P, R + 2, states, lanes & alone, nu[0] * nu[0])
 
 
-range_finder_stage = aid_stage(_S, _measure, _expect, _reset)
+range_finder_stage = aid_stage(Aid(_S), _measure, _expect, _reset)

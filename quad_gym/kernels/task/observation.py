@@ -8,8 +8,9 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
     AID_FREEDOMS,
+    AID_ROW,
     AIDS,
     BASELINE_BLOCK,
     DRAWN_SIZE,
@@ -104,11 +105,11 @@ def _put_absolute(flight, p, settings, row):
 def _put_aids(flight, p, settings, row, k):
     """Write measurements of aiding sensors since the last step, or zeros if there are none."""
     for s in range(AIDS):
-        if settings.sensor_blocks[FIRST_AID + s] > 0:
-            fresh = flight.block_fresh[AID_BLOCKS + s]
+        for block in range(settings.sensor_blocks[FIRST_AID + s]):
+            fresh = flight.block_fresh[AID_BLOCK[s] + block]
             scaled = fresh / p.aid_scale[s]
             for i in range(AID_FREEDOMS[s]):
-                row[k + i] = scaled * flight.aid_measurement[s, i]
+                row[k + i] = scaled * flight.aid_measurement[AID_ROW[s] + block, i]
             row[k + AID_FREEDOMS[s]] = fresh
             k += AID_FREEDOMS[s] + 1
     return k

@@ -1,0 +1,62 @@
+"""The table of aiding sensors: a sensor other than IMU, GNSS and camera has one row here.
+
+A row is the name of the sensor, which is also the name of its kernels' file, and the class of its
+parameters. All else follows from the class: the sensor's draws, records, stage, group of the gate,
+fault, quantity, reading, columns of logs, figures, and its interface in an exported filter.
+"""
+
+import dataclasses
+from typing import NamedTuple, get_args
+
+from quad_gym.params.aids import AidParams
+from quad_gym.params.barometer import BarometerParams
+from quad_gym.params.checked import Checked
+from quad_gym.params.magnetometer import MagnetometerParams
+from quad_gym.params.optical_flow import OpticalFlowParams
+from quad_gym.params.range_finder import RangeFinderParams
+from quad_gym.params.uwb_range import UwbRangeParams
+
+
+class AidTable(Checked):
+    """Aiding sensors of a suite, in the order in which a filter processes them; new ones last."""
+
+    barometer: BarometerParams | None = None
+    """barometer; None: no barometer"""
+    magnetometer: MagnetometerParams | None = None
+    """magnetometer; None: no magnetometer"""
+    optical_flow: OpticalFlowParams | None = None
+    """optical flow of the ground below; None: not measured"""
+    range_finder: RangeFinderParams | None = None
+    """range finder that looks down; None: no range finder"""
+    uwb_range: UwbRangeParams | None = None
+    """ranges to anchors of a known place, by ultra-wideband radio; None: no ranges"""
+
+
+AID_PARAMS: dict[str, type[AidParams]] = {
+    field.name: get_args(field.type)[0] for field in dataclasses.fields(AidTable)
+}
+"""Classes of parameters by the names of the sensors."""
+
+
+class AidShape(NamedTuple):
+    """Numbers of a sensor for which records and kernels are made."""
+
+    length: int  #: as in `AidParams`
+    most_blocks: int
+    rows: int
+    observes: tuple[str, ...]
+    own_error: bool  #: True if an error of the sensor is among the states of a filter
+
+
+def _shape_of(kind: type[AidParams]) -> AidShape:
+    own_error = (kind.slow_vector, kind.slow_scalar) != (
+        AidParams.slow_vector,
+        AidParams.slow_scalar,
+    )
+    return AidShape(kind.length, kind.most_blocks, kind.rows, kind.observes, own_error)
+
+
+AID_SHAPES = {name: _shape_of(kind) for name, kind in AID_PARAMS.items()}
+"""Shapes by the names of the sensors. Compiled code depends on these, not on other parameters."""
+
+__all__ = [params.__name__ for params in AID_PARAMS.values()]  # what `quad_gym` exports
