@@ -48,7 +48,7 @@ AID_BLOCK = tuple(AID_BLOCKS + row for row in AID_ROW)  #: first block of each a
 FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *AID_BLOCK)  #: first block of each sensor
 AID_NUMBERS = tuple(sum(AID_TRIPLES[:aid]) for aid in Aid)  #: first row of each aiding sensor in `aid_numbers`
 FEATURE_SLICE = slice(FEATURE_BLOCKS, AID_BLOCKS)  #: blocks of the features
-MAX_TOGETHER = AID_BLOCKS + 4  #: largest number of blocks of an instant: those of GNSS and camera, and four more
+MAX_TOGETHER = AID_BLOCKS + 4  #: largest number of blocks of an instant: all of GNSS and camera, and four more
 MAX_MEASUREMENTS = 3 * MAX_TOGETHER  #: largest length of the stacked measurement; a direction has three numbers
 AID_GROUPS = len(Block)  #: first group of the other sensors
 SENSOR_GROUPS = AID_GROUPS + AIDS  #: number of groups of the gate: positions, baselines, velocities, images, other sensors
@@ -57,7 +57,7 @@ GROUP_COUNT = (FEATURE_BLOCKS, *[1] * (SENSORS - 1))  #: number of groups of eac
 SEVERAL = (FEATURE_BLOCKS, *(AID_GROUPS + aid for aid in Aid if AID_MOST[aid] > 1))
 """Groups of several blocks, which support each other: images, for example."""
 WITH_OWN_ERROR = tuple(AID_GROUPS + aid for aid in Aid if OWN_ERRORS[aid])
-"""Groups of sensors with an error of their own among the states."""
+"""Groups of sensors whose own error is among the states."""
 BLOCK_NUMBERS = (3, 3, *AID_FREEDOMS)  #: length of a block of each sensor: a direction is a unit vector
 FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1),
             *(freedoms for freedoms, most in zip(AID_FREEDOMS, AID_MOST, strict=True) for _ in range(most)))

@@ -35,8 +35,8 @@ def _claim(quantity: str, first: int, count: int) -> int:
 
 
 _SHARING = 4
-"""Number of aiding sensors, the first ones, that share ranges of draws. Further ones have ranges of
-their own, so that a new sensor changes no draw of another."""
+"""Number of aiding sensors, the first ones, that share ranges of draws. Each further one has a separate
+range, so that a new sensor changes no draw of another."""
 _FIRST_OWN, _OWN = 4096, 64
 
 
