@@ -4,6 +4,7 @@ The build of a wheel runs this file by itself.
 """
 
 import hashlib
+import re
 from pathlib import Path
 
 MARK = b"quad_gym kernels "  #: beginning of the text with the digest in a library
@@ -16,11 +17,15 @@ def sources_digest(package: Path) -> str:
         package: Folder of `quad_gym`.
     """
     digest = hashlib.sha256()
-    for folder in ("kernels", "records", "params"):
-        for file in sorted((package / folder).rglob("*.py")):
-            content = file.read_bytes()
-            name = file.relative_to(package).as_posix()
-            digest.update(f"{name} {len(content)}\n".encode() + content)
+    files = [file for folder in ("kernels", "records") for file in (package / folder).rglob("*.py")]
+    table = package / "params" / "aid_table.py"  # of sensors, from whose classes records follow
+    if table.is_file():
+        names = re.findall(r"^from quad_gym\.params\.(\w+) import", table.read_text(), re.MULTILINE)
+        files += [table, *(table.with_name(f"{name}.py") for name in names)]
+    for file in sorted(files):
+        content = file.read_bytes()
+        name = file.relative_to(package).as_posix()
+        digest.update(f"{name} {len(content)}\n".encode() + content)
     return digest.hexdigest()
 
 
