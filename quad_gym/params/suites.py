@@ -279,7 +279,7 @@ UWB = CRAZYFLIE.replace(
     optical_flow=None,
     range_finder=None,
     uwb_range=UwbRangeParams(phase=None),
-    noisy=_noise(0.05, 0.05, 0.02, 0.0061),
+    noisy=_noise(0.040, 0.038, 0.0133, 0.0062),
 )
 """A small vehicle indoors that measures its ranges to four anchors by ultra-wideband radio."""
 

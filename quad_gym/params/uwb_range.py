@@ -26,13 +26,13 @@ class UwbRangeParams(AidParams):
     them, one after the other, a few more; engineering judgment"""
     noise_sigma: check.Positive = 0.1
     """standard deviation of the white noise [m]; Decawave DWM1000 data sheet: 10 cm. The Crazyflie
-    firmware assumes 0.25 m for two-way ranges (lpsTwrTag.c), errors of the anchors included"""
+    firmware assumes 0.25 m for two-way ranges (lpsTwrTag.c)"""
     anchors_I: Annotated[check.Matrix, _anchors] = (
-        *((-2.5, -2.5, 0.2), (2.5, -2.5, 2.5)),
-        *((2.5, 2.5, 0.2), (-2.5, 2.5, 2.5)),
+        *((-5.0, -5.0, 0.2), (5.0, -5.0, 3.0)),
+        *((5.0, 5.0, 0.2), (-5.0, 5.0, 3.0)),
     )
     """(n, 3) places of the anchors in I [m], at most eight, as in the Crazyflie firmware; corners
-    of a room of 5 m, low and high in turn"""
+    of a hall of 10 m, low and high in turn"""
     tag_B: check.Place = (0.0, 0.0, 0.0)
     """(3,) place of the radio's antenna in B [m]; near the center of mass of a small vehicle"""
     max_range: check.Positive = 60.0

@@ -49,7 +49,7 @@ def test_anchors_beyond_the_longest_range_are_not_measured():
     suite = suite_with(max_range=3.0, outlier_probability=0.0)
     batch = fly(suite, 1, task="hover", start="hover")
     snapshot = batch.snapshot()
-    snapshot["r"][0, :, 0], snapshot["wait"] = (-2.0, -2.0, 1.0), 0.0
+    snapshot["r"][0, :, 0], snapshot["wait"] = (-4.5, -4.5, 1.0), 0.0
     batch.restore(snapshot)
     batch.step()
     valid = batch.record("block_valid")[0, FIRST : FIRST + 8]
