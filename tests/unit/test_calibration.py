@@ -22,6 +22,7 @@ from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.numbers import MAX_SPREAD, NUMBERS
 from quad_gym.estimation.search import NumberSearch, widening
 from quad_gym.estimation.validation import validate
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import euler_to_dcm
@@ -188,7 +189,8 @@ def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
     assert asked == [(Path("flight.csv"), "consumer", False)]
     summary = json.loads((tmp_path / "mine/calibration.json").read_text())
     without = ("camera", "log_delays.camera", "gnss.baseline", "gnss.primary_antenna")
-    without += ("log_compass_rotation", "barometer", "log_delays.barometer")
+    without += ("log_compass_rotation", "log_delays.barometer")
+    without += tuple(name for name in AID_PARAMS if name != "magnetometer")
     assert set(summary["numbers"]) == {n.name for n in NUMBERS if not n.name.startswith(without)}
     assert summary["after"]["measurements"]["gnss_velocity"]["mean_nis"] > 0.0
     assert (tmp_path / "mine/report.html").stat().st_size > 10_000
