@@ -24,7 +24,7 @@ from quad_gym.kernels.library import core_symbol
 
 _OPTIONS = {"nopython": True, "boundscheck": None, "error_model": "numpy", "nogil": True}
 _KEPT = 8  #: number of cached files of a kind for a function
-_FORM = 3  #: version of the emission; after a change, no older object is found
+_FORM = 4  #: version of the emission; after a change, no older object is found
 _PAUSES = {
     "x86_64": ("declare void @llvm.x86.sse2.pause()", "call void @llvm.x86.sse2.pause()"),
     "aarch64": ("declare void @llvm.aarch64.hint(i32)", "call void @llvm.aarch64.hint(i32 1)"),
@@ -223,13 +223,13 @@ def loaded_size(made: bytes) -> int:
 
 
 def _without_calls(text: str) -> str:
-    """Return IR without calls of Numba's run time, as kernels allocate no memory, and of `sqrt`."""
+    """Return IR without calls of Numba's run time, as kernels allocate no memory, and of libm."""
     text = re.sub(r"(?m)^ *(tail )?call void @NRT_(inc|dec)ref\(.*$", "", text)
     text = re.sub(r"\buwtable\b(\(sync\))?", "", text)
-    if "@sqrt(" in text:  # which an instruction computes
-        root = "declare double @llvm.sqrt.f64(double"
-        text = re.sub(r"(?m)^declare double @sqrt\(.*$", "", text).replace(
-            "@sqrt(", "@llvm.sqrt.f64("
-        )
-        text += "" if root in text else f"\n{root})\n"
+    for name in ("sqrt", "floor"):  # which an instruction computes, also of a GPU
+        if f"@{name}(" in text:
+            ours = f"declare double @llvm.{name}.f64(double"
+            text = re.sub(rf"(?m)^declare double @{name}\(.*$", "", text)
+            text = text.replace(f"@{name}(", f"@llvm.{name}.f64(")
+            text += "" if ours in text else f"\n{ours})\n"
     return text.replace("= common ", "= internal ")
