@@ -266,6 +266,7 @@ class FlightBatch(FlightMemory):
             Call.GROUP: self._group,
             Call.WORD_COUNT: len(self._words),
             Call.WRITTEN_COUNT: self._written,
+            Call.AUTORESET: int(self.configuration.compiled_autoreset),
             Call.SIZE: self._low.size,
             Call.RESULT_PITCH: self._results.strides[0],
             Call.RESETS: self._resets,

@@ -53,6 +53,7 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
         high=batch._high,
         work=WORK_BLOCK.itemsize // line,
         results=RESULTS,
+        autoreset=int(c.compiled_autoreset),
     )
 
 

@@ -73,6 +73,7 @@ class DeviceBatch:
         words[Call.BLOCKS] -= 8 * WARP * plan.skipped
         words[Call.PITCH] = 8 * WARP * len(plan.flight)
         words[Call.COUNT], words[Call.SIZE] = count, size
+        words[Call.AUTORESET] = plan.autoreset
         words[Call.RESULT_PITCH] = 8 * self._results.shape[1]
         self._calls = []
         for seen in self._seen:  # in turn

@@ -25,14 +25,12 @@ class CudaLauncher:
     Args:
         ptx: The module.
         device: GPU with the memory of the flights.
-        per_processor: Warps of a multiprocessor: more hide more latency, and their workspaces
-            leave the caches.
 
     Raises:
         ImportError: If cuda-core is not installed.
     """
 
-    def __init__(self, ptx: bytes, device: torch.device, per_processor: int = 4) -> None:
+    def __init__(self, ptx: bytes, device: torch.device) -> None:
         try:
             from cuda import core
         except ImportError as error:
@@ -47,7 +45,7 @@ class CudaLauncher:
         self._core: Any = core
         self._torch_device = torch.device("cuda", number)
         processors = torch.cuda.get_device_properties(number).multi_processor_count
-        self.warps = per_processor * processors
+        self.warps = RESIDENT * processors
 
     def __call__(self, call: int, blocks: int, command: int) -> None:
         """Fly blocks: each warp its share."""

@@ -35,3 +35,4 @@ class DevicePlan(NamedTuple):
     high: NDArray[np.float64]
     work: int  #: words of the workspace of a flight
     results: tuple[str, ...]  #: names of the results of a step
+    autoreset: int  #: an `Autoreset`

@@ -225,9 +225,9 @@ def _fly_tick(call, first, last, left, world, model, settings, work, stages):
 
 
 @kernel
-def _judge_step(flight, world, model, settings, work, stages):
+def _judge_step(call, flight, world, model, settings, work, stages):
     """Set reward and endings of a step; return masks of lanes that begin and end an episode."""
-    resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
+    resetting = (flight.needs_reset > 0.0) & (call[Call.AUTORESET] == Autoreset.NEXT_STEP)
     # a step that only begins an episode uses no earlier draws
     before = flight.instant + np.uint64(-settings.ticks_per_step)
     flight.instant = select(resetting, before, flight.instant)
@@ -238,7 +238,7 @@ def _judge_step(flight, world, model, settings, work, stages):
     run(Stage.JUDGE_CONTACTS, here)
     done = (flight.terminated + flight.truncated) > 0.0
     flight.needs_reset = select(done, 1.0, flight.needs_reset)
-    same_step = settings.autoreset == Autoreset.SAME_STEP
+    same_step = call[Call.AUTORESET] == Autoreset.SAME_STEP
     return resetting | (done & (same_step | (flight.idle > 0.0))), done
 
 
@@ -269,8 +269,8 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
         if command == Command.FINISH:
             _take_estimate(call, index, flight)
             look(flight, true, believed, settings, work, stages, 0)
-        begins, done = _judge_step(flight, true, believed, settings, work, stages)
-        if settings.autoreset == Autoreset.SAME_STEP and any_of(begins):
+        begins, done = _judge_step(call, flight, true, believed, settings, work, stages)
+        if call[Call.AUTORESET] == Autoreset.SAME_STEP and any_of(begins):
             _write_results(call, flight, work, index)  # of the episodes that end
             written = True
         if observing and any_of(begins & done):

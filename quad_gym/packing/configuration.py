@@ -221,6 +221,11 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
         """
         return self.innovations and self.autoreset is Autoreset.SAME_STEP
 
+    @property
+    def compiled_autoreset(self) -> Autoreset:
+        """The mode of the kernels."""
+        return Autoreset.DISABLED if self.begins_after_step else self.autoreset
+
     @cached_property
     def draws(self) -> DrawingTable:
         """Distributions of the parameters that episodes draw."""

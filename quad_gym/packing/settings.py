@@ -18,7 +18,6 @@ from quad_gym.records import (
     FOLLOWED,
     MAX_HARMONICS,
     SETTINGS,
-    Autoreset,
     RewardTerm,
     Sensor,
     Start,
@@ -42,7 +41,6 @@ def settings_record(c: FlightConfiguration) -> NDArray[Any]:
     s["substeps"], s["ticks_per_step"] = c.clocks.substeps, c.clocks.ticks_per_step
     s["source"], s["control"], s["layout"] = c.source, c.control, c.layout
     s["include_std"], s["privileged"] = c.include_std, c.privileged
-    s["autoreset"] = Autoreset.DISABLED if c.begins_after_step else c.autoreset
     s["run_filter"], s["reuse_first_fix"] = c.filters, assumed.estimator.reuse_first_fix
     s["own_estimator"] = c.estimator is not None
     draws_lever = {"lever_arm_B", "center_of_mass_B"} & set(c.randomization.names)

@@ -28,6 +28,7 @@ class Call(IntEnum):
     WRITTEN_COUNT = auto()  #: number of leading WORDS that are copied back
     STAGES = auto()  #: STAGE_TABLE with the stages that the settings need
     ACTIONS = auto()  #: (blocks WIDTH, 4) float64; for STEP
+    AUTORESET = auto()  #: an `Autoreset`
     SIZE = auto()  #: length of an observation; 0: no observations
     LOW = auto()  #: (SIZE,) float64: lower bounds of the observation space
     HIGH = auto()  #: (SIZE,) float64: upper bounds of the observation space

@@ -39,7 +39,6 @@ SETTINGS_FIELDS = (
     Field("include_std", (), "0 or 1", "1 if the observation holds standard deviations", "i8"),
     Field("privileged", (), "0 or 1", "1 if the observation ends with the truth", "i8"),
     Field("shown", (), "0 or 1", "1 if a user's task reads the flights", "i8"),
-    Field("autoreset", (), "-", "see Autoreset", "i8"),
     Field("start", (), "-", "start of episodes, see Start", "i8"),
     Field("pad", (), "0 or 1", "1 if a launch pad carries vehicles that start on the ground", "i8"),
     Field("reward_scale", (), "-", "factor on a reward per second"),

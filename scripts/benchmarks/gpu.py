@@ -33,16 +33,16 @@ CASES = (
 )
 """Golden cases, in the order in which they are flown."""
 TIMED = CASES[:2]
-SIZES = tuple((count, warps) for warps in (4, 2, 8) for count in (4_096, 65_536, 1_048_576))
-"""Numbers of flights, and of warps for each multiprocessor."""
+SIZES = tuple((count, share) for share in (32, 16, 8) for count in (4_096, 65_536, 1_048_576))
+"""Numbers of flights, and of those that a warp flies."""
 DURATION = 2.0  #: of a measurement of steps/s [s]
 TICKS, FLIGHTS, STEPS, SEED = 30, 8, 300, 2026
 TRAINING = {"num_envs": 8192, "num_minibatches": 32, "total_timesteps": 20_000_000}
 """Options of `docs/examples/torch_ppo.py`; they are multiples of the defaults."""
 TRAINED: dict[str, Any] = {"autoreset_mode": "SameStep", "start": "mixed"}
 """Keywords of the flights of the training."""
-Make = Callable[[bytes, int], Any]
-"""Make the launcher of a module of PTX, with a number of warps for each multiprocessor."""
+Make = Callable[..., Any]
+"""Make the launcher of a module of PTX, with a number of flights for each warp."""
 
 
 def prepare(folder: Path, cases: tuple[str, ...] = CASES) -> None:
@@ -97,9 +97,9 @@ def run(
     todo: dict[str, Callable[[], Any]] = {}
     for name, content in cases.items():
         todo[f"golden: {name}"] = functools.partial(_differences, content, make, device)
-        for count, warps in sizes if name in TIMED else ():
-            what = f"{name}, {count} flights, {warps} warps"
-            todo[what] = functools.partial(_speed, content, make, device, count, warps)
+        for count, share in sizes if name in TIMED else ():
+            what = f"{name}, {count} flights, {share} a warp"
+            todo[what] = functools.partial(_speed, content, make, device, count, share)
     training = pickle.loads(zlib.decompress((folder / "training").read_bytes()))
     todo["training: Circle, standard"] = functools.partial(_training, training, make, device)
     for what, measure in todo.items():
@@ -120,7 +120,7 @@ def _differences(content: dict[str, Any], make: Make, device: str) -> dict[str, 
 
     from quad_gym.device.flights import DeviceBatch
 
-    batch = DeviceBatch(content["plan"], FLIGHTS, make(content["ptx"], 4), device)
+    batch = DeviceBatch(content["plan"], FLIGHTS, make(content["ptx"]), device)
     batch.reset(content["keys"])
 
     def step(actions: Any) -> list[Any]:
@@ -140,7 +140,7 @@ def _differences(content: dict[str, Any], make: Make, device: str) -> dict[str, 
     return {"numbers": count, "differing": {name: n for name, n in wrong.items() if n}}
 
 
-def _speed(content: dict[str, Any], make: Make, device: str, count: int, warps: int) -> Any:
+def _speed(content: dict[str, Any], make: Make, device: str, count: int, share: int) -> Any:
     """Return steps/s with random actions, and the memory of a flight [bytes]."""
     import torch
 
@@ -149,7 +149,7 @@ def _speed(content: dict[str, Any], make: Make, device: str, count: int, warps: 
 
     on_gpu = device != "cpu"
     before = torch.cuda.memory_allocated() if on_gpu else 0
-    batch = DeviceBatch(content["plan"], count, make(content["ptx"], warps), device)
+    batch = DeviceBatch(content["plan"], count, make(content["ptx"], share), device)
     after = torch.cuda.memory_allocated() if on_gpu else 0
     batch.reset(keys_of(np.arange(count, dtype=np.uint64)))
     actions = [0.2 * torch.randn(count, 4, device=device) for _ in range(8)]
@@ -194,7 +194,7 @@ def _training(content: dict[str, Any], make: Make, device: str) -> Any:
     sys.path.insert(0, str(ROOT / "docs" / "examples"))
     script = importlib.import_module("torch_ppo")
     args = script.Args(device=device, **TRAINING)
-    batch = DeviceBatch(content["plan"], args.num_envs, make(content["ptx"], 4), device)
+    batch = DeviceBatch(content["plan"], args.num_envs, make(content["ptx"]), device)
     begin, env = time.perf_counter(), _Flights(batch)
     agent = script.train(env, content["plan"].low.size, 4, args)
     seconds, seen = time.perf_counter() - begin, env.reset(0)[0]
@@ -205,13 +205,13 @@ def _training(content: dict[str, Any], make: Make, device: str) -> Any:
     return {"seconds": seconds, "steps/s": args.total_timesteps / seconds, "error": error}
 
 
-def _on_cuda(ptx: bytes, warps: int) -> Any:
+def _on_cuda(ptx: bytes, share: int = 32) -> Any:
     """Return the launcher on the GPU."""
     import torch
 
     from quad_gym.device.launching import CudaLauncher
 
-    return CudaLauncher(ptx, torch.device("cuda"), warps)
+    return CudaLauncher(ptx, torch.device("cuda"), share)
 
 
 def _without_gymnasium() -> None:
