@@ -122,6 +122,7 @@ define check-dist
 endef
 
 wheel: kernels $(VENV)/.builder  ## build sdist and a wheel with the libraries into dist, and check what they hold; needs gcc and cmake
+	$(BIN)/quad-gym compile --ptx
 	rm -rf dist
 	$(BIN)/python -m build --installer pip --sdist
 	QUAD_GYM_WHEEL=$$(uname -m) $(BIN)/python -m build --installer pip --wheel

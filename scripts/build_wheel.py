@@ -45,7 +45,7 @@ def absolute_links(text: str, pages: str, pictures: str) -> str:
 
 
 class KernelsHook(BuildHookInterface[Any]):
-    """Wheels with the libraries for one family of processors."""
+    """Wheels with the libraries for one family of processors, and the modules for GPUs."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Set files and tag of a wheel.
@@ -58,16 +58,20 @@ class KernelsHook(BuildHookInterface[Any]):
             return
         package = Path(self.root, "quad_gym")
         functions = runpy.run_path(str(package / "kernels" / "sources.py"))
-        libraries = sorted((package / "kernels" / "libraries").glob(f"kernels_linux_{family}_*.so"))
+        folder = package / "kernels" / "libraries"
+        libraries = sorted(folder.glob(f"kernels_linux_{family}_*.so"))
+        modules = sorted(folder.glob("*.ptx.z"))  # for GPUs
         digest = functions["sources_digest"](package)
         stale = [f.name for f in libraries if functions["digest_in"](f.read_bytes()) != digest]
+        stale += [f.name for f in modules if not f.name.startswith(digest[:12])]
         if stale or not libraries:
             raise RuntimeError(
-                f"quad-gym compile --library must come before: {', '.join(stale) or 'no library'}"
+                "quad-gym compile --library, and --ptx if there are modules for GPUs, must come "
+                f"before: {', '.join(stale) or 'no library'}"
                 f"{' belongs to other sources' if stale else ''}"
             )
         build_data["force_include"] |= {
-            str(file): f"quad_gym/kernels/libraries/{file.name}" for file in libraries
+            str(file): f"quad_gym/kernels/libraries/{file.name}" for file in (*libraries, *modules)
         }
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-manylinux_{LOWEST_GLIBC}_{family}"

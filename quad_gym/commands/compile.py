@@ -16,7 +16,8 @@ processor, versions of Python and Numba, and sources; otherwise it is compiled a
 `--library` instead builds the libraries of compiled kernels, with which nothing is compiled and
 Numba is not even imported, for each number of lanes that processors like this one have, or those of
 another `--family`. It takes minutes, and a C compiler. Libraries belong to the sources; after an
-edit, Numba compiles again.
+edit, Numba compiles again. `--ptx` emits the modules for NVIDIA GPUs of the tasks with default
+options, which wheels hold, too.
 
 `--stage sensors.barometer:barometer` compiles one stage, while you write it, and says in a few
 lines which kernel and line is wrong, and why.
@@ -24,9 +25,10 @@ lines which kernel and line is wrong, and why.
 The exit code is 1 if code cannot be written to the cache, or the stage does not compile.
 """
 
+import itertools
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -51,6 +53,8 @@ class CompileArgs:
     """number of processes that compile; defaults to one per core"""
     library: bool = False
     """build the libraries of compiled kernels"""
+    ptx: bool = False
+    """emit modules for NVIDIA GPUs"""
     lanes: tuple[int, ...] = ()
     """numbers of lanes of the libraries; defaults to all of the family of processors"""
     family: Literal["x86_64", "aarch64"] | None = None
@@ -100,12 +104,12 @@ def main(args: CompileArgs) -> int:
     with usage_errors((ValueError, RuntimeError, ImportError)):
         if args.stage is not None:
             return _compile_one(args.stage)
-        found = None if args.library else library()
+        found = None if args.library or args.ptx else library()
         if found is not None:
             print(f"nothing to compile: {found.file.name} has all functions")
             return 0
         check.package("numba", "compiling", "compile")
-        if args.library:
+        if args.library or args.ptx:
             return _build(args)
     from quad_gym.kernels.compiling.cache import where_cached
     from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
@@ -142,12 +146,27 @@ def _compile_one(name: str) -> int:
 
 
 def _build(args: CompileArgs) -> int:
-    """Build the libraries, and list them with their sizes."""
+    """Build the libraries or the modules for GPUs, and list them with their sizes."""
+    from quad_gym.device.emission import pack
     from quad_gym.kernels.compiling.building import build
 
-    for file in build(args.lanes, args.jobs, args.family):
+    libraries = build(args.lanes, args.jobs, args.family) if args.library else ()
+    modules = pack(_default_plans()) if args.ptx else ()
+    for file in itertools.chain(libraries, modules):
         print(f"{file.stat().st_size / 1e6:.1f} MB  {file}")
     return 0
+
+
+def _default_plans() -> Iterator[Any]:
+    """Yield the plans of the tasks with default options, on the truth and on the estimate."""
+    from quad_gym.device.emission import plan_of
+    from quad_gym.envs.flights import TASK_DEFAULTS, Flights
+    from quad_gym.records import Autoreset
+
+    for task in TASK_DEFAULTS:
+        for observation in ("truth", "estimate"):
+            flights = Flights(task, 1, Autoreset.NEXT_STEP, observation=observation)
+            yield plan_of(flights.batch)
 
 
 def _is_kept(dispatcher: Any) -> bool:

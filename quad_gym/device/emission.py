@@ -1,9 +1,13 @@
 """The plan of a batch for a GPU, and the PTX of its kernel."""
 
+import hashlib
 import os
 import pickle
 import subprocess
 import sys
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +15,8 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.device.plan import DevicePlan, FieldPlace, Words
+from quad_gym.kernels.library import FOLDER
+from quad_gym.kernels.sources import sources_digest
 from quad_gym.params import checks as check
 from quad_gym.records import RESULTS, WARP, WIDTH, WORK_BLOCK, offset_of
 
@@ -62,14 +68,41 @@ def _first_lane(block: NDArray[Any]) -> Words:
 
 
 def ptx_of(plan: DevicePlan) -> bytes:
-    """Return the PTX of a plan's kernel, cached by sources and settings.
+    """Return the PTX of a plan's kernel: from a wheel, or cached by sources and settings.
 
-    Blocks have another size there than here, so another process emits it.
+    Raises:
+        ImportError: If Numba is needed and not installed.
+        RuntimeError: If the kernel cannot be emitted.
+    """
+    file = _packed(plan)
+    return zlib.decompress(file.read_bytes()) if file.is_file() else _emitted(plan)
+
+
+def pack(plans: Iterable[DevicePlan]) -> Iterator[Path]:
+    """Write the PTX of plans for a wheel, in place of all that is there; yield the files.
 
     Raises:
         ImportError: If Numba is not installed.
-        RuntimeError: If the kernel cannot be emitted.
+        RuntimeError: If a kernel cannot be emitted.
     """
+    for old in FOLDER.glob("*.ptx.z"):
+        old.unlink()
+    FOLDER.mkdir(exist_ok=True)
+    for plan in plans:
+        file = _packed(plan)
+        file.write_bytes(zlib.compress(_emitted(plan), 9))
+        yield file
+
+
+def _packed(plan: DevicePlan) -> Path:
+    """Return the file of a wheel with the PTX of a plan, which need not exist."""
+    key = repr((plan.settings, sorted(plan.stages.items())))
+    sources = sources_digest(Path(__file__).parents[1])
+    return FOLDER / f"{sources[:12]}_{hashlib.sha256(key.encode()).hexdigest()[:12]}.ptx.z"
+
+
+def _emitted(plan: DevicePlan) -> bytes:
+    """Return the PTX of a plan, which another process emits, as blocks have another size there."""
     check.package("numba", "flying on a GPU", "compile")
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
     done = subprocess.run(

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from quad_gym.kernels.library import DEVICE_KERNEL
-from quad_gym.records.width import WARP
+from quad_gym.records.width import RESIDENT, WARP
 
 
 class _Stream:

@@ -4,6 +4,7 @@ import os
 
 WIDTHS = (1, 2, 4, 8)  #: supported numbers of lanes; 1 is for filters on other processors
 WARP = 32  #: number of flights in a block on a GPU, whose threads fly one each
+RESIDENT = 8  #: blocks that a multiprocessor of a GPU flies at once, with 255 registers a thread
 _NEEDED = {
     8: {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"},
     4: {"avx2"},

@@ -1,78 +1,98 @@
-"""Compare golden flights on a GPU number by number; measure steps/s, memory and a training.
-
-It has never been run on a GPU.
+"""Compare golden flights on a GPU number by number; measure steps/s, memory and trainings.
 
     python -m scripts.benchmarks.gpu prepare FOLDER     # on any machine, in a clone with all extras
     python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine
 
-The second part needs the clone and FOLDER, and of packages NumPy, torch and cuda-core. It writes
-FOLDER/results.json after every measurement and skips those that are there: where it was interrupted
-or ran out of time, run it again.
+The first part emits a module for each golden case that a GPU can fly, which takes half an hour on
+two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and cuda-core.
+Both skip what is in FOLDER: where one was interrupted or ran out of time, run it again. Results are
+in FOLDER/results.json.
 """
 
 import argparse
 import functools
 import importlib
 import json
+import multiprocessing
+import os
 import pickle
 import sys
 import time
 import types
 import zlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 ROOT = Path(__file__).parents[2]
-SECONDS = 400.0  #: time after which no measurement begins; the driver compiles a module in 20 s
-CASES = (
-    *("observation truth", "Circle, standard", "trajectories", "obstacles", "ground"),
-    *("many options", "features drawn", "crazyflie, late, ekf, warm, raw", "Waypoints, rtk"),
-)
-"""Golden cases, in the order in which they are flown."""
-TIMED = CASES[:2]
-SIZES = tuple((count, share) for share in (32, 16, 8) for count in (4_096, 65_536, 1_048_576))
-"""Numbers of flights, and of those that a warp flies."""
+SECONDS = 400.0  #: time after which no measurement begins
+TIMED = ("observation truth", "Circle, standard")
+"""Golden cases with which steps/s are measured."""
+SIZES = (1_024, 4_096, 16_384, 65_536, 1_048_576)
+"""Numbers of flights."""
 DURATION = 2.0  #: of a measurement of steps/s [s]
+WARM_UP = 60  #: steps before it
 TICKS, FLIGHTS, STEPS, SEED = 30, 8, 300, 2026
 TRAINING = {"num_envs": 8192, "num_minibatches": 32, "total_timesteps": 20_000_000}
 """Options of `docs/examples/torch_ppo.py`; they are multiples of the defaults."""
+TRAININGS = {"training": {}, "training with memory": {"memory": True}}
+"""More options of the trainings on Circle, by name."""
 TRAINED: dict[str, Any] = {"autoreset_mode": "SameStep", "start": "mixed"}
 """Keywords of the flights of the training."""
-Make = Callable[..., Any]
-"""Make the launcher of a module of PTX, with a number of flights for each warp."""
+Make = Callable[[bytes], Any]
+"""Make the launcher of a module of PTX."""
 
 
-def prepare(folder: Path, cases: tuple[str, ...] = CASES) -> None:
-    """Write a file for each case: its plan, its PTX, and the numbers of its flights here."""
+def prepare(folder: Path, cases: tuple[str, ...] = (), workers: int = 2) -> None:
+    """Write a file for each case: its plan, its PTX, and the numbers of its flights here.
+
+    Args:
+        folder: Folder of the files.
+        cases: Names of golden cases; none: all.
+        workers: Number of processes.
+    """
+    golden: Any = importlib.import_module("tests.golden.flights")
+    folder.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        for said in pool.map(_prepare, [folder] * 99, (*TRAININGS, *(cases or golden.cases()))):
+            print(said, flush=True)
+
+
+def _prepare(folder: Path, name: str) -> str:
+    """Write the file of a case or of a training; return what was written."""
     import quad_gym
     from quad_gym.device.emission import plan_of, ptx_of
 
     golden: Any = importlib.import_module("tests.golden.flights")
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in cases:
+    file = folder / f"{name}.case"
+    if file.is_file():
+        return f"{name}: is there"
+    if name in TRAININGS:
+        env: Any = quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 1, **TRAINED)
+        plan = plan_of(env.flights.batch)
+        content: dict[str, Any] = {"plan": plan, "ptx": ptx_of(plan)}
+    else:
         env = golden.made(golden.cases()[name], FLIGHTS)
         flights = env.unwrapped.flights
-        plan = plan_of(flights.batch)
+        try:
+            plan = plan_of(flights.batch)
+        except ValueError as error:
+            return f"{name}: {error}"
         env.reset(seed=SEED)
         content = {"plan": plan, "ptx": ptx_of(plan), "keys": flights.batch.record("key")}
         names = [state for state in golden.STATES if state in plan.fields]
 
-        def step(actions: Any, env: Any = env) -> list[Any]:
+        def step(actions: Any) -> list[Any]:
             seen, rewards, *_ = env.step(actions)
             parts = list(seen.values()) if isinstance(seen, dict) else [seen]
             return [np.concatenate(parts, axis=1), rewards]
 
         content |= {"names": names, "flown": list(_flown(step, flights.batch.record, names))}
-        file = folder / f"{CASES.index(name)}.case"
-        file.write_bytes(zlib.compress(pickle.dumps((name, content))))
-        print(f"{name}: PTX of {len(content['ptx']) / 1e3:.0f} kB", flush=True)
-    env = quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 1, **TRAINED)
-    plan = plan_of(env.flights.batch)
-    content = {"plan": plan, "ptx": ptx_of(plan)}
-    (folder / "training").write_bytes(zlib.compress(pickle.dumps(content)))
+    file.write_bytes(zlib.compress(pickle.dumps(content)))
+    return f"{name}: PTX of {len(content['ptx']) / 1e3:.0f} kB"
 
 
 def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
@@ -84,24 +104,20 @@ def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
             yield [*results, *(record(name) for name in names)]
 
 
-def run(
-    folder: Path, make: Make, device: str, sizes: tuple[tuple[int, int], ...] = SIZES
-) -> dict[str, Any]:
+def run(folder: Path, make: Make, device: str, sizes: tuple[int, ...] = SIZES) -> dict[str, Any]:
     """Measure what is missing in FOLDER/results.json while there is time; return its content."""
     begin, file = time.monotonic(), folder / "results.json"
     found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
-    cases = {}
-    for path in sorted(folder.glob("*.case")):
-        name, content = pickle.loads(zlib.decompress(path.read_bytes()))
-        cases[name] = content
     todo: dict[str, Callable[[], Any]] = {}
-    for name, content in cases.items():
+    for path in sorted(folder.glob("*.case"), key=lambda path: path.stem not in TIMED):
+        name, content = path.stem, pickle.loads(zlib.decompress(path.read_bytes()))
+        if name in TRAININGS:
+            todo[name] = functools.partial(_training, content, make, device, TRAININGS[name])
+            continue
         todo[f"golden: {name}"] = functools.partial(_differences, content, make, device)
-        for count, share in sizes if name in TIMED else ():
-            what = f"{name}, {count} flights, {share} a warp"
-            todo[what] = functools.partial(_speed, content, make, device, count, share)
-    training = pickle.loads(zlib.decompress((folder / "training").read_bytes()))
-    todo["training: Circle, standard"] = functools.partial(_training, training, make, device)
+        for count in sizes if name in TIMED else ():
+            what = f"{name}, {count} flights"
+            todo[what] = functools.partial(_speed, content, make, device, count)
     for what, measure in todo.items():
         done = what in found and "failed" not in found[what]
         if not done and time.monotonic() - begin < SECONDS:
@@ -140,7 +156,7 @@ def _differences(content: dict[str, Any], make: Make, device: str) -> dict[str, 
     return {"numbers": count, "differing": {name: n for name, n in wrong.items() if n}}
 
 
-def _speed(content: dict[str, Any], make: Make, device: str, count: int, share: int) -> Any:
+def _speed(content: dict[str, Any], make: Make, device: str, count: int) -> Any:
     """Return steps/s with random actions, and the memory of a flight [bytes]."""
     import torch
 
@@ -149,7 +165,7 @@ def _speed(content: dict[str, Any], make: Make, device: str, count: int, share: 
 
     on_gpu = device != "cpu"
     before = torch.cuda.memory_allocated() if on_gpu else 0
-    batch = DeviceBatch(content["plan"], count, make(content["ptx"], share), device)
+    batch = DeviceBatch(content["plan"], count, make(content["ptx"]), device)
     after = torch.cuda.memory_allocated() if on_gpu else 0
     batch.reset(keys_of(np.arange(count, dtype=np.uint64)))
     actions = [0.2 * torch.randn(count, 4, device=device) for _ in range(8)]
@@ -161,8 +177,7 @@ def _speed(content: dict[str, Any], make: Make, device: str, count: int, share: 
         batch.result("reward").sum().item()  # waits
         return time.perf_counter() - begin
 
-    flown(2)
-    once = flown(4) / 4
+    once = flown(WARM_UP) / WARM_UP  # until episodes end at every step
     steps = max(8, min(1000, int(DURATION / once)))
     return {"steps/s": count * steps / flown(steps), "bytes": (after - before) / count}
 
@@ -185,7 +200,7 @@ class _Flights:
         return seen, result("reward").float(), *over, final
 
 
-def _training(content: dict[str, Any], make: Make, device: str) -> Any:
+def _training(content: dict[str, Any], make: Make, device: str, options: dict[str, Any]) -> Any:
     """Train on Circle; return seconds, steps/s, and the mean position error afterwards [m]."""
     import torch
 
@@ -193,29 +208,39 @@ def _training(content: dict[str, Any], make: Make, device: str) -> Any:
 
     sys.path.insert(0, str(ROOT / "docs" / "examples"))
     script = importlib.import_module("torch_ppo")
-    args = script.Args(device=device, **TRAINING)
+    args = script.Args(device=device, **TRAINING, **options)
     batch = DeviceBatch(content["plan"], args.num_envs, make(content["ptx"]), device)
     begin, env = time.perf_counter(), _Flights(batch)
     agent = script.train(env, content["plan"].low.size, 4, args)
     seconds, seen = time.perf_counter() - begin, env.reset(0)[0]
+    begins, state = seen[:, 0] == seen[:, 0], agent.begin(args.num_envs)
     with torch.no_grad():
         for _ in range(STEPS):
-            seen = env.step(agent.actor(seen))[0]
+            features, state = agent.features(seen[None], begins[None], state)
+            seen, _, terminated, truncated, _ = env.step(agent.actor(features[0]))
+            begins = terminated | truncated
     error = float(batch.result("position_error").mean())
     return {"seconds": seconds, "steps/s": args.total_timesteps / seconds, "error": error}
 
 
-def _on_cuda(ptx: bytes, share: int = 32) -> Any:
+def _driver_compiles(path: Path) -> None:
+    """Load a module in this process, so that the driver's cache keeps its code for others."""
+    _without_gymnasium()
+    _on_cuda(pickle.loads(zlib.decompress(path.read_bytes()))["ptx"])
+
+
+def _on_cuda(ptx: bytes) -> Any:
     """Return the launcher on the GPU."""
     import torch
 
     from quad_gym.device.launching import CudaLauncher
 
-    return CudaLauncher(ptx, torch.device("cuda"), share)
+    return CudaLauncher(ptx, torch.device("cuda"))
 
 
 def _without_gymnasium() -> None:
     """Import `quad_gym` without the packages of its environments."""
+    sys.path.insert(0, str(ROOT))
     package = types.ModuleType("quad_gym")
     package.__path__ = [str(ROOT / "quad_gym")]
     sys.modules["quad_gym"] = package
@@ -233,11 +258,13 @@ def main() -> None:
     if args.part == "prepare":
         prepare(folder)
         return
-    sys.path[0] = str(ROOT)
     _without_gymnasium()
     import torch
 
     print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}", flush=True)
+    workers = min(16, os.cpu_count() or 1)
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        list(pool.map(_driver_compiles, folder.glob("*.case")))
     run(folder, _on_cuda, "cuda")
 
 

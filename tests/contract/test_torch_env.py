@@ -20,18 +20,18 @@ def assert_flights_equal(envs, others, steps=12, last=False):
     seen, expected, episodes = envs.reset(seed=4)[0], others.reset(seed=4)[0], 0
     rng = np.random.default_rng(0)
     for _ in range(steps):
-        assert np.array_equal(seen.numpy(), expected)
+        assert np.array_equal(seen.cpu().numpy(), expected)
         actions = rng.uniform(-1.2, 1.2, (len(expected), 4)).astype(np.float32)
-        seen, rewards, *over, infos = envs.step(torch.from_numpy(actions))
+        seen, rewards, *over, infos = envs.step(torch.from_numpy(actions).to(envs.device))
         expected, wanted, *ended, known = others.step(actions)
-        assert np.array_equal(rewards.numpy(), wanted.astype(np.float32))
+        assert np.array_equal(rewards.cpu().numpy(), wanted.astype(np.float32))
         for flags, truths in zip(over, ended, strict=True):
-            assert np.array_equal(flags.numpy(), truths)
+            assert np.array_equal(flags.cpu().numpy(), truths)
         errors = known["position_error"].copy()
         for i in np.flatnonzero(known.get("_final_obs", [])):
-            assert np.array_equal(infos["final_obs"][i].numpy(), known["final_obs"][i])
+            assert np.array_equal(infos["final_obs"][i].cpu().numpy(), known["final_obs"][i])
             errors[i] = known["final_info"]["position_error"][i] if last else errors[i]
-        assert np.array_equal(infos["position_error"].numpy(), errors)
+        assert np.array_equal(infos["position_error"].cpu().numpy(), errors)
         episodes += np.logical_or(*ended).sum()
     return episodes
 

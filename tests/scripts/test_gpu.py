@@ -20,24 +20,29 @@ def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monke
     monkeypatch.setattr(gpu, "TRAINING", sizes)
     monkeypatch.setattr(gpu, "TRAINED", {**gpu.TRAINED, "observation": "truth"})
     monkeypatch.setattr(gpu, "STEPS", 60)
-    gpu.prepare(tmp_path, gpu.CASES[:1])
+    monkeypatch.setattr(gpu, "WARM_UP", 2)
+    monkeypatch.setattr(gpu, "TRAININGS", {"training": {}})
+    said = [
+        gpu._prepare(tmp_path, name) for name in ("observation truth", "training", "LookAround")
+    ]
+    assert (
+        said[2]
+        == "LookAround: flights on a GPU need compiled steps, and a task in Python runs in Python"
+    )
     launchers, compiled = [], functools.cache(lambda text: PtxLauncher(text.decode()))
 
-    def make(text, warps):
-        launchers.append(warps)
+    def make(text):
+        launchers.append(text)
         return compiled(text)
 
-    found = gpu.run(tmp_path, make, "cpu", ((40, 2),))
-    golden, speed = (
-        found["golden: observation truth"],
-        found["observation truth, 40 flights, 2 warps"],
-    )
+    found = gpu.run(tmp_path, make, "cpu", (40,))
+    golden, speed = found["golden: observation truth"], found["observation truth, 40 flights"]
     assert golden["differing"] == {}
     assert golden["numbers"] > 800
     assert speed["steps/s"] > 0
-    assert 0.0 < found["training: Circle, standard"]["error"] < 10.0
-    assert launchers == [4, 2, 4]
+    assert 0.0 < found["training"]["error"] < 10.0
+    assert len(launchers) == 3
     capsys.readouterr()
-    assert gpu.run(tmp_path, make, "cpu", ((40, 2),)) == found
-    assert (launchers, capsys.readouterr().out) == ([4, 2, 4], "")
+    assert gpu.run(tmp_path, make, "cpu", (40,)) == found
+    assert (len(launchers), capsys.readouterr().out) == (3, "")
     assert json.loads((tmp_path / "results.json").read_text()) == found

@@ -59,6 +59,14 @@ def test_flights_of_ptx_equal_those_of_the_batch():
     assert episodes_of("circle", "NextStep", launcher_of_ptx, **TRUTH) > COUNT
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_flights_on_a_gpu_equal_those_of_the_batch(mode):
+    made = {"autoreset_mode": mode, "max_tilt": 0.6}
+    envs = quad_gym.make_torch_vec_env("QuadGym/Circle-v0", COUNT, device="cuda", **made)
+    assert assert_flights_equal(envs, vec_env("circle", COUNT, **made), steps=60, last=True) > 0
+
+
 @pytest.mark.slow  # compiles the filter
 @pytest.mark.parametrize("keywords", [{}, {"sensors": "rtk", "faults": "gnss_outage"}])
 def test_filtered_flights_of_device_code_equal_those_of_the_batch(keywords):

@@ -29,13 +29,12 @@ from quad_gym.kernels.device import SETTINGS_SYMBOL
 from quad_gym.kernels.digest import digest_of
 from quad_gym.kernels.library import DEVICE_KERNEL, core_symbol, say
 from quad_gym.kernels.stages import Stage
-from quad_gym.records import WARP
+from quad_gym.records.width import RESIDENT, WARP
 
 ENTRY = "quad_gym.kernels.device:fly_one"
 GPU = Processor("nvptx64-nvidia-cuda", "sm_80", level=3)
 _RECORDS = ("flight", "world", "model", "settings", "work", "stages")
 _STAGE = r"@qg_core_\w+_stage\("
-_RESIDENT = 8  #: blocks of a warp for which a multiprocessor has 255 registers for each thread
 
 _KERNEL = """
 declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()
@@ -116,7 +115,7 @@ def module_of(settings: bytes, stages: Mapping[Stage, str], processor: Processor
     texts = [linked(ENTRY), *map(linked, names), dispatcher(settings, stages)]
     if processor is GPU:
         texts.append(
-            _KERNEL.format(core=public, kernel=DEVICE_KERNEL, warp=WARP, resident=_RESIDENT)
+            _KERNEL.format(core=public, kernel=DEVICE_KERNEL, warp=WARP, resident=RESIDENT)
         )
         public = DEVICE_KERNEL
     module = llvm.parse_assembly(_plain(texts[0]))
