@@ -6,7 +6,6 @@
 
 With `--memory`, a GRU precedes the policy and the value, and learns through whole rollouts. On a
 GPU nothing waits for the host within an iteration, and updates are replayed as a CUDA graph.
-This script has never been run on a GPU.
 """
 
 import copy

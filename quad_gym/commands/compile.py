@@ -153,7 +153,7 @@ def _build(args: CompileArgs) -> int:
     libraries = build(args.lanes, args.jobs, args.family) if args.library else ()
     modules = pack(_default_plans()) if args.ptx else ()
     for file in itertools.chain(libraries, modules):
-        print(f"{file.stat().st_size / 1e6:.1f} MB  {file}")
+        print(f"{file.stat().st_size / 1e3:,.0f} kB  {file}")
     return 0
 
 

@@ -1,12 +1,17 @@
 """Flights on a GPU: device code on this processor flies as the batch does."""
 
+import importlib.util
+import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.device import emission
 from quad_gym.device.emission import plan_of, ptx_of
 from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.kernels.compiling.building import PROCESSORS
@@ -71,6 +76,42 @@ def test_flights_on_a_gpu_equal_those_of_the_batch(mode):
 @pytest.mark.parametrize("keywords", [{}, {"sensors": "rtk", "faults": "gnss_outage"}])
 def test_filtered_flights_of_device_code_equal_those_of_the_batch(keywords):
     assert episodes_of("circle", "NextStep", max_tilt=0.6, **keywords) > 0
+
+
+def test_module_in_a_wheel_is_taken_for_its_sources_and_settings_alone(tmp_path, monkeypatch):
+    plan, other = (plan_of(vec_env(task, 1, **TRUTH).flights.batch) for task in ("hover", "circle"))
+    (tmp_path / "older.ptx.z").touch()
+    monkeypatch.setattr(emission, "FOLDER", tmp_path)
+    monkeypatch.setattr(emission, "_emitted", lambda plan: b"of the wheel")
+    assert list(emission.pack([plan])) == list(tmp_path.iterdir())
+    monkeypatch.setattr(emission, "_emitted", lambda plan: b"emitted")
+    assert (ptx_of(plan), ptx_of(other)) == (b"of the wheel", b"emitted")
+    monkeypatch.setattr(emission, "sources_digest", lambda package: "0" * 64)
+    assert ptx_of(plan) == b"emitted"
+
+
+def ptxas():
+    """Return the assembler of PTX, or None."""
+    package = importlib.util.find_spec("nvidia")  # of the package nvidia-cuda-nvcc
+    folders = [] if package is None else package.submodule_search_locations
+    found = [file for folder in folders for file in Path(folder).glob("*/bin/ptxas")]
+    return shutil.which("ptxas") or (found[0] if found else None)
+
+
+@pytest.mark.skipif(ptxas() is None, reason="no ptxas")
+@pytest.mark.parametrize(
+    ("keywords", "spills", "size"),
+    [(TRUTH, 200, 250e3), pytest.param({}, 500, 900e3, marks=pytest.mark.slow)],
+)
+def test_machine_code_of_a_gpu_keeps_its_budgets(keywords, spills, size, tmp_path):
+    source, file = tmp_path / "flights.ptx", tmp_path / "flights.cubin"
+    source.write_bytes(ptx_of(plan_of(vec_env("circle", 1, **keywords).flights.batch)))
+    command = [ptxas(), "-arch=sm_90", "-v", "-o", file, source]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stderr
+    assert int(re.search(r"Used (\d+) registers", said)[1]) <= 255
+    spilled = re.search(r"properties for qg_fly\n.*?(\d+) bytes spill stores", said)
+    assert int(spilled[1]) <= spills
+    assert file.stat().st_size <= size
 
 
 @pytest.fixture(scope="module")
