@@ -5,7 +5,7 @@
 
 The first part emits a module for each golden case that a GPU can fly, which takes half an hour on
 two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and cuda-core.
-Both skip what is in FOLDER: where one was interrupted or ran out of time, run it again. Results are
+Both skip the parts in FOLDER: if one was interrupted or ran out of time, run it again. Results are
 in FOLDER/results.json.
 """
 
@@ -62,7 +62,7 @@ def prepare(folder: Path, cases: tuple[str, ...] = (), workers: int = 2) -> None
 
 
 def _prepare(folder: Path, name: str) -> str:
-    """Write the file of a case or of a training; return what was written."""
+    """Write the file of a case or of a training; return a line about it."""
     import quad_gym
     from quad_gym.device.emission import plan_of, ptx_of
 
@@ -105,7 +105,7 @@ def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
 
 
 def run(folder: Path, make: Make, device: str, sizes: tuple[int, ...] = SIZES) -> dict[str, Any]:
-    """Measure what is missing in FOLDER/results.json while there is time; return its content."""
+    """Make the missing measurements of FOLDER/results.json while there is time; return its content."""
     begin, file = time.monotonic(), folder / "results.json"
     found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
     todo: dict[str, Callable[[], Any]] = {}
