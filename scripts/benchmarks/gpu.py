@@ -105,7 +105,7 @@ def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
 
 
 def run(folder: Path, make: Make, device: str, sizes: tuple[int, ...] = SIZES) -> dict[str, Any]:
-    """Make the missing measurements of FOLDER/results.json while there is time; return its content."""
+    """Make missing measurements of FOLDER/results.json while there is time; return all."""
     begin, file = time.monotonic(), folder / "results.json"
     found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
     todo: dict[str, Callable[[], Any]] = {}
