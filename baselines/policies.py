@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 
+from baselines.crazyflie_pid import SLOW, CrazyfliePID
 from baselines.mlp import MlpPolicy
 from baselines.pd import REACH_OF_GAPS, PDPolicy
 from quad_gym import IDS, PDGains
@@ -29,9 +30,9 @@ _PD: dict[str, dict[str, Any]] = {
 }
 """Arguments of `PDPolicy` by name, see `load_policy`."""
 
-_INCLUDED = "pretrained"
+_INCLUDED, _CRAZYFLIE = "pretrained", "crazyflie_pid"
 
-NAMES = (*_PD, _INCLUDED, f"{_INCLUDED}:truth")  #: names of policies, see `load_policy`
+NAMES = (*_PD, _CRAZYFLIE, _INCLUDED, f"{_INCLUDED}:truth")  #: names of policies, see `load_policy`
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",
@@ -63,11 +64,11 @@ def load_policy(name: str, env: Any) -> Policy:
         name: "pd" (tuned gains), "pd:lab" (gains of the report), "pd:features" and
             "pd:features_when_uncertain" (tuned gains, facing the features), "pd:slow" and
             "pd:waiting" (for courses with gaps: half the speed, or waiting when uncertain),
-            "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
-            the task of the environment), "pretrained:truth" (the included one that was trained on
-            the true state, for Circle and LookAround), or a file: `.npz` with plain arrays, or
-            `.zip` written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted
-            files.
+            "pd:FILE.json" (gains found by `quad-gym tune`), "crazyflie_pid" (the Crazyflie's
+            cascade of PID loops), "pretrained" (the included policy for the task of the
+            environment), "pretrained:truth" (the included one that was trained on the true state,
+            for Circle and LookAround), or a file: `.npz` with plain arrays, or `.zip` written by
+            Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
         env: Environment of this package: single, vector or Stable-Baselines3.
 
     Raises:
@@ -79,6 +80,8 @@ def load_policy(name: str, env: Any) -> Policy:
     """
     if name in _PD:
         return PDPolicy(env, **_PD[name])
+    if name == _CRAZYFLIE:
+        return CrazyfliePID(env)
     if name.startswith("pd:"):
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env), name) if is_included(name) else Path(name)
@@ -107,6 +110,8 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
     """
     if name in ("pd:features_when_uncertain", "pd:waiting"):
         return {"include_std": True}
+    if name == _CRAZYFLIE:
+        return {"action": "motor", "layout": "absolute", "control_rate": SLOW}
     if not is_included(name):
         return {}
     trained = MlpPolicy.load(pretrained_file(env_id, name)).record["plan"]["environment"]

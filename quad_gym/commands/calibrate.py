@@ -4,7 +4,7 @@
     quad-gym calibrate one.csv two.csv three.csv --sensors consumer --output results/mine
     quad-gym calibrate flight.ulg --sensors consumer --output results/mine
     quad-gym train --sensors results/mine/suite.toml
-    quad-gym calibrate flight.csv --vehicle mine-vehicle.toml
+    quad-gym calibrate flight.csv --vehicle mine.toml --vehicle-from crazyflie
 
 The search uses the first part of the log, or the first of several logs, and the rest validates its
 result. The written suite is then fitted to all of several logs. It has the rates, delays and noise
@@ -53,8 +53,8 @@ class CalibrateArgs(ReadingArgs):
     course: bool = False
     """use the direction of the first GNSS velocity as heading"""
     vehicle: Path | None = None
-    """write a vehicle (.toml) with thrust, drag and rotor lag from the motor voltages in the log to
-    this file"""
+    """write a vehicle (.toml) with thrust and rotor lag from the motor voltages in the logs to this
+    file, and a world with its linear drag beside it (VEHICLE-world.toml)"""
     vehicle_from: str | None = None
     """vehicle that provides mass, inertia and arms: lab, crazyflie or a .toml file; defaults to
     lab"""
@@ -180,25 +180,36 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     return report.write()
 
 
-def fit_body(args: CalibrateArgs, suite: "SensorSuite", start: dict[str, Any]) -> str:
-    """Write the file of the vehicle; return a sentence about it."""
+def fit_body(args: CalibrateArgs, suite: "SensorSuite", starts: list[dict[str, Any]]) -> str:
+    """Write the files of vehicle and world; return sentences about them."""
     from quad_gym.estimation import fit_vehicle, read_log
 
     assert args.vehicle is not None
-    log = read_log(args.logs[0], **args.reading())
-    if log.motors is None:
-        return (
-            f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
-        )
+    logs = [read_log(log, **args.reading()) for log in args.logs]
+    if any(log.motors is None for log in logs):
+        return f"Wrote no {args.vehicle}: a log has no motor voltages (columns motor_0 to motor_3)."
     with usage_errors():
         begin = args.vehicle_from or "lab"
-        fitted = fit_vehicle(log, sensors=suite, start=start, vehicle=begin)
+        fitted = fit_vehicle(logs, sensors=suite, start=starts, vehicle=begin)
         file = fitted.vehicle.save(args.vehicle)
-    lag, hover = fitted.motor_time_constant, fitted.hover_voltage
+        world = fitted.world.save(world_of(args.vehicle))
+    lag, hover, (along, across) = (
+        fitted.motor_time_constant,
+        fitted.hover_voltage,
+        fitted.linear_drag_over_mass,
+    )
     return (
         f"Wrote {file}: rotor lag {lag.value:.3f} s [{lag.low:.3f}, {lag.high:.3f}], hover voltage "
-        f"{hover.value:.2f} V [{hover.low:.2f}, {hover.high:.2f}]."
+        f"{hover.value:.2f} V [{hover.low:.2f}, {hover.high:.2f}].\n"
+        f"Wrote {world}: linear drag over the mass {along.value:.2f} 1/s [{along.low:.2f}, "
+        f"{along.high:.2f}] along x, {across.value:.2f} 1/s [{across.low:.2f}, {across.high:.2f}] "
+        "along y."
     )
+
+
+def world_of(vehicle: Path) -> Path:
+    """Return the file of the world that belongs to the file of a vehicle."""
+    return vehicle.with_name(f"{vehicle.stem}-world.toml")
 
 
 def next_command(args: CalibrateArgs, folder: Path) -> list[str]:
@@ -243,7 +254,8 @@ def main(args: CalibrateArgs) -> None:
         if args.vehicle is not None:
             if args.vehicle.suffix != ".toml":
                 raise ValueError(f"--vehicle must end with .toml, got {args.vehicle}")
-            refuse_overwriting(args.vehicle, args.overwrite)
+            for file in (args.vehicle, world_of(args.vehicle)):
+                refuse_overwriting(file, args.overwrite)
             require_writable("--vehicle", args.vehicle.parent)
         require_writable("--output", folder)
         starts = starts_of(args)
@@ -272,7 +284,7 @@ def main(args: CalibrateArgs) -> None:
     files.append(write_json(folder / RESULT, contents))
     print(f"\nWrote {len(files)} files to {folder}; open {folder / 'report.html'}.")
     if args.vehicle is not None:
-        print(fit_body(args, found.suite, starts[0]))
+        print(fit_body(args, found.suite, starts))
     print(f"{found.verdict[0].upper()}{found.verdict[1:]}.")
     if found.after.problems:
         raise SystemExit(MISFIT)

@@ -48,9 +48,10 @@ class EvaluateArgs:
     env_id: options.EnvId = "QuadGym/Circle-v0"
     policy: tuple[str, ...] | None = None
     """policies: pd (tuned gains), pd:lab (gains of the report), pd:FILE.json (gains of quad-gym
-    tune), pretrained (the included policy for the task), pretrained:truth (for Circle and
-    LookAround: the included one that was trained on the true state), or files of quad-gym train
-    (.zip or .npz); defaults to pd, and pretrained if it fits"""
+    tune), crazyflie_pid (the cascade of a Crazyflie), pretrained (the included policy for the
+    task), pretrained:truth (for Circle and LookAround: the included one that was trained on the
+    true state), or files of quad-gym train (.zip or .npz); defaults to pd, and pretrained if it
+    fits"""
     observation: tuple[str, ...] = ("truth", "estimate")
     """observations of the policies: truth, estimate, noisy, or measurements (for policies
     trained on raw measurements)"""

@@ -173,7 +173,8 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
             sets a longer limit.
         true_vehicle: True parameters of the vehicle; the controller assumes `vehicle`.
         true_sensors: True parameters of the sensors; the filter assumes `sensors`.
-        world: "calm", "breeze", "fresh_breeze", "slalom" (of `OutageDash`), or `WorldParams`.
+        world: "calm", "breeze", "fresh_breeze", "slalom" (of `OutageDash`), a file (.toml), or
+            `WorldParams`.
         randomization: Parameters drawn in every episode: distributions by name, or `Randomization`.
         faults: Faults of sensors and rotors, see `quad_gym.faults`: names of presets, such as
             "gnss_outage" or "gnss_outliers+rotor_loss", or instances.

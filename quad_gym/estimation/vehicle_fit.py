@@ -3,12 +3,16 @@
 The smoothed trajectory of the log gives attitude, velocity and accelerometer bias. The specific
 force of the model is, in B,
 
-    f_B = a sum_i u_i^2 e3 - c |z_I . v| R_BI v,  du_i/dt = ((1 - s t) e_i - u_i) / tau_m,
+    f_B = a sum_i u_i^2 e3 - (c |z_I . v| + diag(d, 0)) R_BI v,
+    du_i/dt = ((1 - s t) e_i - u_i) / tau_m,
 
-with the voltages e_i, a = kF cm^2 / m, c = Cd Ad rho / (2 m), the time constant tau_m of the rotors
-and the relative sag s of the battery. Least squares of the accelerometer's samples minus f_B find
-a, tau_m, c and s. Residuals that are correlated in time widen the intervals by the square root of
-their autocorrelation time.
+with the voltages e_i, a = kF cm^2 / m, c = Cd Ad rho / (2 m), the linear drag d (2) over the mass,
+the time constant tau_m of the rotors and the relative sag s of the battery. Least squares of the
+accelerometer's samples minus f_B find a, tau_m, c, s and d, near a wide prior. Errors of successive
+samples are correlated, so that each is compared with what the one before it predicts (P. Cochrane,
+G. H. Orcutt, 1949). What correlation remains widens the intervals by the square root of its time.
+Several logs are fitted one by one; the result is their mean, whose weights and interval include the
+variance between flights (R. DerSimonian, N. Laird, 1986).
 """
 
 import math
@@ -18,7 +22,7 @@ from typing import Any, NamedTuple, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_gym.estimation.fits import correlation_time
+from quad_gym.estimation.fits import correlation_time, correlations
 from quad_gym.estimation.logs import Floats, Log, Reading, read_log
 from quad_gym.estimation.logs.parts import longest_part
 from quad_gym.estimation.replaying import prepared
@@ -26,14 +30,15 @@ from quad_gym.estimation.smoothing import smooth
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import LogDelays, SensorSuite
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
+from quad_gym.params.world import WorldParams
 from quad_gym.rotations import quaternion_to_dcm
 
 _SETTLING = 1.0  #: time after the start whose samples do not count [s]
 _FIRST_LAG, _FIRST_DRAG = 0.05, 0.01
 """Values at which the search begins: time constant of the rotors [s], drag over mass [1/m]."""
-
-
-_SINGULAR = 1e-9  #: relative size of a pivot below which a number is not determined
+_PRIOR = np.array([1.0, 1.0, 0.1, 0.01, 1.0, 1.0])
+"""Standard deviations of the coordinates about these values, for logs that do not show them."""
+_PASSES = 3  #: searches, after each of which the errors' correlation is found again
 
 
 class FittedNumber(NamedTuple):
@@ -55,6 +60,10 @@ class FittedVehicle(NamedTuple):
     sag: FittedNumber  #: relative decrease of the voltage at the motors [1/s]
     hover_voltage: FittedNumber
     """voltage at which the rotors carry the weight, with a full battery [V]"""
+    linear_drag_over_mass: tuple[FittedNumber, FittedNumber]
+    """linear drag along x and y of B, over the mass [1/s]"""
+    world: WorldParams
+    """a calm world with this linear drag, where its interval is above zero"""
 
 
 def fit_vehicle(
@@ -63,35 +72,66 @@ def fit_vehicle(
     sensors: SensorSuite | str,
     motors: Mapping[str, ArrayLike] | None = None,
     vehicle: VehicleParams | str = "lab",
-    start: Mapping[str, Any] | None = None,
+    start: Any = None,
     **reading: Unpack[Reading],
 ) -> FittedVehicle:
-    """Find thrust, rotor lag, drag and battery sag of a vehicle from a log.
+    """Find thrust, rotor lag, drag and battery sag of a vehicle from a log, or from several.
 
     Accelerations show forces over the mass: the mass stays as in `vehicle`, and the steady rotor
     speed per volt as well.
 
     Args:
-        log: A table or a file, see `read_log`.
+        log: A table or a file, see `read_log`; or a list of them.
         sensors: The suite that the smoother assumes, or its name.
         motors: Commands of the motors: `time` (n,) [s] from which on they hold, and `voltages`
             (n, 4) [V]; None: the columns `motors` of the log.
         vehicle: The vehicle to begin with, or its name.
-        start: Keywords of `initialize`, such as `{"heading": 0.5}`.
+        start: Keywords of `initialize`, such as `{"heading": 0.5}`; of several logs, a list.
         **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
-        ValueError: If the log or an argument is invalid, the commands are not during the flight, or
-            do not determine the numbers.
+        ValueError: If a log or an argument is invalid, or the commands are not during the flight.
     """
-    from scipy.linalg import solve_triangular
-    from scipy.optimize import least_squares
-
     known = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
     check.instance("vehicle", known, VehicleParams)
     given = None if motors is None else _commands(motors)
-    whole = longest_part(read_log(log, **reading))
-    times, voltages = given or _commands(_in_log(whole))
+    several = isinstance(log, (list, tuple))
+    logs, starts = (log, start or [None] * len(log)) if several else ([log], [start])
+    if not logs or len(starts) != len(logs):
+        raise ValueError(f"start must be one for each of {len(logs)} logs, at least one")
+    if given is not None and len(logs) > 1:
+        raise ValueError("motors must not be given for several logs: they have columns of motors")
+    pairs = [
+        _fit(read_log(one, **reading), sensors, given, known, begin)
+        for one, begin in zip(logs, starts, strict=True)
+    ]
+    return _result(known, *_mean(*(np.array(part) for part in zip(*pairs, strict=True))))
+
+
+def _mean(values: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """Return the mean (k,) of values (n, k) with standard deviations, and its own."""
+    weights = sigma**-2
+    mean = (weights * values).sum(axis=0) / weights.sum(axis=0)
+    excess = (weights * (values - mean) ** 2).sum(axis=0) - (len(values) - 1)
+    free = weights.sum(axis=0) - (weights**2).sum(axis=0) / weights.sum(axis=0)
+    between = np.maximum(excess, 0.0) / np.where(free > 0.0, free, 1.0)
+    weights = 1.0 / (sigma**2 + between)
+    return (weights * values).sum(axis=0) / weights.sum(axis=0), weights.sum(axis=0) ** -0.5
+
+
+def _fit(
+    log: Log,
+    sensors: SensorSuite | str,
+    motors: tuple[Floats, Floats] | None,
+    known: VehicleParams,
+    start: Mapping[str, Any] | None,
+) -> tuple[Floats, Floats]:
+    """Return the coordinates log a, log tau_m, c, s, d of a log, and their standard deviations."""
+    from scipy.linalg import solve_triangular
+    from scipy.optimize import least_squares
+
+    whole = longest_part(log)
+    times, voltages = motors or _commands(_in_log(whole))
     whole, suite = prepared(whole, sensors, {})
     names = ("log_rotation", "log_compass_rotation", "log_accel_bias", "log_gyro_bias")
     suite = suite.replace(log_delays=LogDelays(), **dict.fromkeys(names, (0.0,) * 3))  # corrected
@@ -106,30 +146,31 @@ def fit_vehicle(
         )
     R_BI, v, bias = _motion(smoothed, 0.5 * (ends[rows] + ends[rows - 1]))
     measured = whole.imu.values["accel"][rows] - bias
-    drag_B = -(np.abs((R_BI[:, 2] * v).sum(axis=1)) * np.einsum("nij,nj->in", R_BI, v)).T
+    v_B = np.einsum("nij,nj->ni", R_BI, v)
+    drag_B = np.abs((R_BI[:, 2] * v).sum(axis=1))[:, np.newaxis] * v_B
     spans = (ends[rows - 1], ends[rows])
-
-    def residuals(x: Floats) -> Floats:
-        thrust = math.exp(x[0]) * _mean_squares(times, voltages, spans, math.exp(x[1]), x[3])
-        model = x[2] * drag_B
-        model[:, 2] += thrust
-        return (measured - model).ravel()
-
     squares = known.gravity / (4.0 * known.hover_voltage**2)
-    begin = [math.log(squares), math.log(_FIRST_LAG), _FIRST_DRAG, 0.0]
-    found = least_squares(residuals, begin, x_scale=(0.1, 0.3, 0.02, 1e-3))
-    errors = found.fun.reshape(-1, 3)
-    tau = max(correlation_time(column) for column in errors.T)
-    variance = tau * float((errors**2).sum()) / (errors.size - len(begin))
+    begin = np.array([math.log(squares), math.log(_FIRST_LAG), _FIRST_DRAG, 0.0, 0.0, 0.0])
+
+    def errors_of(x: Floats) -> Floats:
+        thrust = math.exp(x[0]) * _mean_squares(times, voltages, spans, math.exp(x[1]), x[3])
+        model = -x[2] * drag_B - np.append(x[4:], 0.0) * v_B
+        model[:, 2] += thrust
+        return np.asarray(measured - model)
+
+    def residuals(x: Floats, keep: Floats, sigma: float) -> Floats:
+        errors = errors_of(x)
+        return np.append(errors[1:] - keep * errors[:-1], sigma * (x - begin) / _PRIOR)
+
+    x, keep, sigma = begin, np.zeros(3), float(errors_of(begin).std())
+    for _ in range(_PASSES):
+        found = least_squares(residuals, x, x_scale=_PRIOR, args=(keep, sigma))
+        x, new = found.x, found.fun[: -len(begin)].reshape(-1, 3)
+        sigma, keep = float(new.std()), correlations(errors_of(x))
+    variance = max(correlation_time(column) for column in new.T) * sigma**2
     factor = np.linalg.qr(found.jac, mode="r")  # (J^T J)^-1 = R^-1 R^-T
-    if abs(np.diag(factor)).min() <= _SINGULAR * np.linalg.norm(factor, axis=0).max():
-        raise ValueError(
-            "a log must determine thrust, rotor lag, drag and sag: its motor commands must change, "
-            "and the vehicle must move"
-        )
     rows_of_inverse = solve_triangular(factor, np.eye(len(begin)))
-    spread = math.sqrt(variance) * np.linalg.norm(rows_of_inverse, axis=1)
-    return _result(known, found.x, 1.96 * spread)
+    return x, math.sqrt(variance) * np.linalg.norm(rows_of_inverse, axis=1)
 
 
 def _commands(motors: Mapping[str, ArrayLike]) -> tuple[Floats, Floats]:
@@ -162,11 +203,14 @@ def _in_log(log: Log) -> dict[str, ArrayLike]:
     return {"time": times, "voltages": values["commands"] * full[:, np.newaxis]}
 
 
-def _result(known: VehicleParams, x: Floats, reach: Floats) -> FittedVehicle:
-    """Return the result for the coordinates log a, log tau_m, c, s, with half their intervals."""
-    ends = (x, x - reach, x + reach)
+def _result(known: VehicleParams, x: Floats, sigma: Floats) -> FittedVehicle:
+    """Return the result for the coordinates log a, log tau_m, c, s, d, and their deviations."""
+    ends = (x, x - 1.96 * sigma, x + 1.96 * sigma)
     squares, lag = (FittedNumber(*(math.exp(end[k]) for end in ends)) for k in (0, 1))
-    drag, sag = (FittedNumber(*(float(end[k]) for end in ends)) for k in (2, 3))
+    drag, sag, along, across = (
+        FittedNumber(*(float(end[k]) for end in ends)) for k in (2, 3, 4, 5)
+    )
+    linear = [known.mass * d.value if d.low > 0.0 else 0.0 for d in (along, across)]
     per_speed = known.motor_speed_per_volt**2
     full_drag = 0.5 * known.disc_area * known.air_density / known.mass
     changes = {
@@ -179,7 +223,16 @@ def _result(known: VehicleParams, x: Floats, reach: Floats) -> FittedVehicle:
         math.sqrt(known.gravity / (4.0 * a)) for a in (squares.value, squares.high, squares.low)
     ]
     per_mass = FittedNumber(*(a / per_speed for a in squares))
-    return FittedVehicle(known.replace(**changes), per_mass, lag, drag, sag, FittedNumber(*hover))
+    return FittedVehicle(
+        vehicle=known.replace(**changes),
+        thrust_over_mass=per_mass,
+        motor_time_constant=lag,
+        drag_over_mass=drag,
+        sag=sag,
+        hover_voltage=FittedNumber(*hover),
+        linear_drag_over_mass=(along, across),
+        world=WorldParams(linear_drag_B=(*linear, 0.0)),
+    )
 
 
 def _motion(smoothed: Any, times: Floats) -> tuple[Floats, Floats, Floats]:

@@ -1,4 +1,4 @@
-"""Sensor suites and vehicles as TOML files.
+"""Sensor suites, vehicles and worlds as TOML files.
 
 In a file of a suite, a table for each sensor has the fields of its parameters by name::
 
@@ -9,8 +9,8 @@ In a file of a suite, a table for each sensor has the fields of its parameters b
     primary_antenna_B = [0.0, 0.0, 0.12]
 
 Units are SI, angles in rad. Without `base` all tables are required; fields that a table leaves out
-have the defaults of its class, which are the laboratory's. A file of a vehicle has the fields of
-`VehicleParams`, all of them without `base`.
+have the defaults of its class, which are the laboratory's. Files of a vehicle and of a world have
+the fields of `VehicleParams` and `WorldParams`, all of them without `base`.
 """
 
 import dataclasses
@@ -27,11 +27,11 @@ from quad_gym.params import checks as check
 SUFFIX = ".toml"  #: ending of the names of such files
 
 _NONE = "none"
-_HEADS = {"SensorSuite": "Sensor suite", "VehicleParams": "Vehicle"}
+_HEADS = {"SensorSuite": "Sensor suite", "VehicleParams": "Vehicle", "WorldParams": "World"}
 
 
 def is_params_file(name: Any) -> bool:
-    """True for the name of a file of a suite or vehicle."""
+    """True for the name of a file of a suite, vehicle or world."""
     return isinstance(name, str | Path) and Path(name).suffix == SUFFIX
 
 
@@ -48,12 +48,14 @@ class Saved:
             The path.
 
         Raises:
-            ValueError: If the path ends otherwise.
+            ValueError: If the path ends otherwise, or the parameters have obstacles.
             OSError: If it cannot be written.
         """
         path = Path(file)
         if path.suffix != SUFFIX:
             raise ValueError(f"file must end with {SUFFIX}, got {str(file)!r}")
+        if getattr(self, "obstacles", ()):
+            raise ValueError("a world with obstacles cannot be saved: make it in Python")
         head = f"# {_HEADS[type(self).__name__]} of quad_gym; units are SI, angles in rad.\n\n"
         path.write_text(head + text_of(self), encoding="utf-8")
         return path
@@ -71,11 +73,11 @@ def text_of(suite: Any) -> str:
 
 
 def read_params(file: Path, kind: type, base_of: Callable[[Any], Any]) -> Any:
-    """The suite or vehicle in a file.
+    """The suite, vehicle or world in a file.
 
     Args:
         file: A path.
-        kind: `SensorSuite` or `VehicleParams`.
+        kind: `SensorSuite`, `VehicleParams` or `WorldParams`.
         base_of: From the value of `base` to an instance.
 
     Raises:
@@ -107,8 +109,8 @@ def _built(kind: Any, given: Mapping[str, Any], base: Any, where: str) -> Any:
             meant = check.did_you_mean(name, names) or f"; it has {', '.join(names)}"
             raise ValueError(f"{where}{name} is not a field of {kind.__name__}{meant}")
         inner = hints[name]
-        if isinstance(inner, types.UnionType):  # with None
-            (inner,) = (part for part in inner.__args__ if part is not types.NoneType)
+        if types.NoneType in typing.get_args(inner):
+            (inner,) = (part for part in typing.get_args(inner) if part is not types.NoneType)
         if inner is not hints[name] and value == _NONE:
             changes[name] = None
         elif dataclasses.is_dataclass(inner):

@@ -6,7 +6,8 @@ laboratory's model.
 """
 
 from functools import partial
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Matrix
 from quad_gym.params.ground import GROUND_HEIGHT, GroundParams
 from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
+from quad_gym.params.suite_files import Saved, is_params_file, read_params
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import MAX_OBSTACLES
 
@@ -48,7 +50,7 @@ class BatteryParams(Checked):
     motors"""
 
 
-class WorldParams(Checked):
+class WorldParams(Checked, Saved):
     """Wind, drag, ground, battery and obstacles.
 
     Drag of the disc and of the rotors depends on the velocity of the vehicle relative to the air.
@@ -148,8 +150,8 @@ _WORLDS = {
 }
 
 
-def world_params(name: str, vehicle: VehicleParams | None = None) -> WorldParams:
-    """Return a world by its name, for a vehicle.
+def world_params(name: str | Path, vehicle: VehicleParams | None = None) -> WorldParams:
+    """Return a world by its name, for a vehicle, or the world in a file.
 
     Except in "calm", the vehicle determines its drag, battery and size:
 
@@ -163,12 +165,20 @@ def world_params(name: str, vehicle: VehicleParams | None = None) -> WorldParams
       Crazyflie's propellers have a radius of 23 mm and reach 69 mm, here 20 mm and 65 mm.
 
     Args:
-        name: "calm" as in the report, "breeze", "fresh_breeze", or "slalom" with walls.
+        name: "calm" as in the report, "breeze", "fresh_breeze", or "slalom" with walls; or a file
+            that ends with ".toml", as `WorldParams.save` writes it.
         vehicle: The true vehicle; None: the laboratory's. Environments pass theirs.
 
     Raises:
-        ValueError: If there is no such world.
+        ValueError: If there is no such world, or a name or value in the file is invalid.
+        OSError: If the file cannot be read.
     """
+    if is_params_file(name):
+        return read_params(Path(name), WorldParams, lambda base: _base(base, vehicle))
+    return _base(name, vehicle)
+
+
+def _base(name: Any, vehicle: VehicleParams | None) -> WorldParams:
     world = _WORLDS[check.choice("world", name, tuple(_WORLDS))]
     if name == "calm":
         return world

@@ -17,6 +17,7 @@ from quad_gym import SensorSuite, Uniform, VehicleParams, WorldParams, sensor_su
 from quad_gym.estimation.logs.tables import csv_columns
 from quad_gym.params.gravity import GRAVITY
 from quad_gym.rotations import quaternion_to_dcm
+from scripts.studies.onboard_filter import OnboardFilter
 
 Floats = NDArray[np.float64]
 
@@ -36,8 +37,9 @@ COLUMNS = {
 }
 """Columns of NanoBench (arXiv:2603.09908): yaw in degrees, specific force in g, motors in the order
 of this package."""
-IMU = sensor_suite("crazyflie").imu
-"""The IMU of the vehicle in the loop: a suite from logs has model errors in its noise as well."""
+IMU = sensor_suite("crazyflie").imu.replace(gyro_bias_sigma=1e-4)
+"""The IMU of the vehicle in the loop: a suite from logs has model errors in its noise as well. The
+firmware subtracts the mean of the gyro at rest."""
 CRASH = 10.0  #: specific force that no flight of a small quadrotor has [g]
 SPAN, LATEST = 25, 0.2
 """Rows over which accelerations are averaged, and largest difference of clocks [s]."""
@@ -127,7 +129,7 @@ def _late(time: Floats, position: Floats, accel: Floats) -> float:
 
 
 class Body(NamedTuple):
-    """A vehicle by its logs, and the spread of its thrust from flight to flight."""
+    """A vehicle by its logs, and the spread of its rotors from flight to flight."""
 
     vehicle: VehicleParams
     world: WorldParams
@@ -135,24 +137,29 @@ class Body(NamedTuple):
 
 
 def fit_body(logs: Sequence[LoggedFlight], known: VehicleParams) -> Body:
-    """Fit thrust and drag to flights, each by itself; all else stays as in `known`."""
-    found = []
+    """Fit thrust of each rotor and drag to flights, each by itself; all else stays as in `known`.
+
+    The rotors have equal forces in the mean, as their torques balance.
+    """
+    rotors, drags = [], []
     for log in logs:
         rows = log.judged
         battery = uniform_filter1d(log.battery, 20)[:, np.newaxis]
-        squares = ((log.commands * battery) ** 2)[rows].sum(axis=1).mean()
+        squares = ((log.commands * battery) ** 2)[rows].mean(axis=0)
         speed, accel = log.velocity_B[rows], log.accel[rows]
-        drag = (-np.polyfit(speed[:, k], accel[:, k], 1)[0] for k in (0, 1))
-        found.append([math.log(accel[:, 2].mean() / squares), *drag])
-    table = np.array(found)
-    thrust, *drags = table.mean(axis=0)
-    spread = float(table[:, 0].std(ddof=1)) * math.sqrt(1.0 + 1.0 / len(logs))
-    coefficient = math.exp(thrust) * known.mass / known.motor_speed_per_volt**2
-    reach = math.sqrt(3.0) * spread  # of a uniform distribution
+        rotors.append(accel[:, 2].mean() / (4.0 * squares))
+        drags.append([-np.polyfit(speed[:, k], accel[:, k], 1)[0] for k in (0, 1)])
+    thrust = np.array(rotors)
+    mean, drag = thrust.mean(), np.mean(drags, axis=0)
+    spread = thrust.std(axis=0, ddof=1) * math.sqrt(1.0 + 1.0 / len(logs)) / mean
+    middle, reach = thrust.mean(axis=0) / mean, math.sqrt(3.0) * spread  # of a uniform distribution
     return Body(
-        known.replace(thrust_coefficient=coefficient, drag_coefficient=0.0),
-        WorldParams(linear_drag_B=(*(known.mass * drag for drag in drags), 0.0)),
-        {"thrust_coefficient": Uniform(1.0 - reach, 1.0 + reach, relative=True)},
+        known.replace(
+            thrust_coefficient=mean * known.mass / known.motor_speed_per_volt**2,
+            drag_coefficient=0.0,
+        ),
+        WorldParams(linear_drag_B=(*(known.mass * drag), 0.0)),
+        {"rotor_efficiency": [Uniform(m - r, m + r) for m, r in zip(middle, reach, strict=True)]},
     )
 
 
@@ -172,15 +179,18 @@ def fly(
     randomization: Any = None,
     draws: int = 16,
     seed: int = 0,
+    onboard: bool = True,
 ) -> list[Flown]:
     """Fly the setpoints of logs with the Crazyflie's PID, from the ground, on the estimate.
 
-    The controller knows the voltage of the battery as it was logged.
+    The controller knows the voltage of the battery as it was logged. The estimate is that of the
+    Crazyflie's filter, or else the suite's.
     """
     seconds = max(float(log.time[-1]) for log in logs)
     keywords: dict[str, Any] = {
         **{"vehicle": vehicle, "world": world, "randomization": randomization},
-        **{"sensors": suite.replace(imu=suite.imu.replace(rate=RATE)), "filter_start": "warm"},
+        **({"estimator": OnboardFilter()} if onboard else {"filter_start": "warm"}),
+        "sensors": suite.replace(imu=suite.imu.replace(rate=RATE)),
         "true_sensors": suite.replace(imu=IMU.replace(rate=RATE)),
         **{"action": "motor", "layout": "absolute", "control_rate": RATE},
         **{"start": "ground", "radius": 1e-6, "out_of_bounds": 100.0, "duration": seconds + 1.0},

@@ -1,27 +1,23 @@
 """Predict logged flights of a Crazyflie in closed loop, and compare with the logs.
 
     python -m scripts.studies.real_flights LOGS... --sensors mine.toml --fitted 5
-    python -m scripts.studies.real_flights LOGS... --fitted 5 --policy results/policy/best.npz
 
 Logs are tables of NanoBench (arXiv:2603.09908). Thrust and drag are fitted to the first ones. A
-simulated vehicle with the Crazyflie's PID then flies the logged setpoints of all of them, with the
-logged voltage of the battery, sensors and filter of the suite, and thrusts as they vary between the
-fitted flights. Prints a table, and writes it with a figure. With a policy, both controllers also
-fly the same random trajectories in this environment.
+simulated vehicle with the Crazyflie's PID and filter then flies the logged setpoints of all of
+them, with the logged voltage of the battery, the sensors of the suite, and thrusts of each rotor as
+they vary between the fitted flights. Prints a table, and writes it with a figure. Intervals hold 90
+% of the draws, widened by the errors of prediction in the fitted flights.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import spearmanr, t
 from tyro.conf import Positional
 
-from baselines.crazyflie_pid import CrazyfliePID
-from baselines.policies import load_policy
-from quad_gym import SensorSuite, sensor_suite, vehicle_params
+from quad_gym import sensor_suite, vehicle_params
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import (
     columns_of,
@@ -31,21 +27,9 @@ from quad_gym.analysis.reports import (
     write_json,
 )
 from quad_gym.commands import options
-from quad_gym.evaluation import roll_out
-from scripts.studies.closed_loop import (
-    IMU,
-    RATE,
-    Body,
-    Flown,
-    LoggedFlight,
-    fit_body,
-    fly,
-    read_flight,
-    rms,
-)
+from scripts.studies.closed_loop import Flown, LoggedFlight, fit_body, fly, read_flight, rms
 
 FACTOR = 1.3  #: ratio of predicted and logged errors that counts as right
-TASK = "QuadGym/RandomTrajectory-v0"
 
 
 @dataclass(frozen=True)
@@ -62,10 +46,8 @@ class RealFlightsArgs:
     """simulated flights of each log"""
     seed: int = 0
     """seed of the first simulated flight"""
-    policy: str | None = None
-    """file of a policy (.npz) to compare with the PID in simulation"""
-    episodes: int = 100
-    """random trajectories of this comparison"""
+    onboard: bool = True
+    """fly on the estimate of the Crazyflie's own filter; otherwise on that of the suite's"""
     output: Path = Path("results/real_flights")
     """folder"""
 
@@ -92,6 +74,15 @@ def row_of(log: LoggedFlight, flown: Flown, fitted: bool) -> dict[str, Any]:
             np.nanmedian(rms((flown.estimate - flown.position)[:, rows]))
         ),
     }
+
+
+def widen(table: list[dict[str, Any]]) -> None:
+    """Widen the intervals by the errors of the fitted flights, as 90 % of Student's t."""
+    fitted = [row for row in table if row["fitted"]]
+    errors = [np.log(row["predicted"] / row["logged"]) for row in fitted]
+    factor = np.exp(t.ppf(0.95, len(fitted)) * np.sqrt(np.mean(np.square(errors))))
+    for row in table:
+        row["low"], row["high"] = row["low"] / factor, row["high"] * factor
 
 
 def summary_of(table: list[dict[str, Any]]) -> dict[str, float]:
@@ -143,49 +134,21 @@ def prediction_figure(table: list[dict[str, Any]]) -> Any:
     return figure
 
 
-def compare_policies(args: RealFlightsArgs, suite: SensorSuite, body: Body) -> dict[str, Any]:
-    """Fly random trajectories with the PID and with a policy; return their results."""
-    fast = suite.replace(imu=suite.imu.replace(rate=RATE))
-    common: dict[str, Any] = {
-        **{"vehicle": body.vehicle, "world": body.world, "randomization": body.randomization},
-        **{"start": "hover", "filter_start": "warm", "max_speed": 1.0, "max_acceleration": 2.0},
-        **{"sensors": fast, "true_sensors": fast.replace(imu=IMU.replace(rate=RATE))},
-    }
-    envs: dict[str, dict[str, Any]] = {
-        "pid": {"action": "motor", "layout": "absolute", "control_rate": RATE},
-        str(args.policy): {},
-    }
-    found = {}
-    for name, own in envs.items():
-        env = gymnasium.make_vec(TASK, args.episodes, **common, **own)
-        policy = CrazyfliePID(env) if name == "pid" else load_policy(name, env)
-        flown = roll_out(policy, env, seed=args.seed)
-        found[name] = {
-            "error": float(flown.mean_error.mean()),
-            "late_error": float(np.nanmean(flown.late_error)),
-            "crashed": float(flown.crashed.mean()),
-        }
-    return found
-
-
 def main(args: RealFlightsArgs) -> None:
     """Fit, fly, compare."""
     with options.usage_errors():
         plots.require_matplotlib()
-        options.require_at_least(args, fitted=1, draws=1, seed=0, episodes=1)
+        options.require_at_least(args, fitted=2, draws=1, seed=0)
         require_writable("--output", args.output)
         logs, suite = [read_flight(file) for file in args.logs], sensor_suite(args.sensors)
         body = fit_body(logs[: args.fitted], vehicle_params("crazyflie"))
     print(f"Thrust carries the weight at {body.vehicle.hover_voltage:.3f} V.")
-    body.vehicle.save(args.output / "body.toml")
     results: dict[str, Any] = {}
-    if args.policy is not None:
-        results["policies"] = compare_policies(args, suite, body)
-        for name, values in results["policies"].items():
-            print(name, *(f"{key} {value:.3f}" for key, value in values.items()), sep="; ")
-    flown = fly(logs, suite, *body, draws=args.draws, seed=args.seed)
+    common = {"draws": args.draws, "seed": args.seed, "onboard": args.onboard}
+    flown = fly(logs, suite, *body, **common)
     pairs = enumerate(zip(logs, flown, strict=True))
     table = [row_of(log, one, k < args.fitted) for k, (log, one) in pairs]
+    widen(table)
     for name, some in (("all", table), ("others", table[args.fitted :])):
         if len(some) > 2:
             results[name] = summary_of(some)

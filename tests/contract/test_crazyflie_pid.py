@@ -8,6 +8,8 @@ from scipy.signal import StateSpace, lsim
 
 import quad_gym
 from baselines.crazyflie_pid import CrazyfliePID
+from baselines.policies import keywords_of_policy, load_policy
+from quad_gym.evaluation import roll_out
 
 RATE = 500.0
 
@@ -98,6 +100,16 @@ def test_new_episode_forgets_the_one_before():
     again, _ = policy.predict(second, state._replace(step=0), episode_start=[True])
     np.testing.assert_array_equal(again, expected)
     assert not np.array_equal(kept, expected)
+
+
+def test_pid_flies_trajectories_by_its_name():
+    task = "QuadGym/RandomTrajectory-v0"
+    given = {"vehicle": "crazyflie", "sensors": "mocap", "start": "hover", "max_speed": 0.5}
+    env = gymnasium.make_vec(task, 20, **given, **keywords_of_policy("crazyflie_pid", task))
+    flown = roll_out(load_policy("crazyflie_pid", env), env, seed=0)
+    assert not flown.crashed.any()
+    # at most 0.5 m/s, it is late by the reciprocal of its gain, 0.5 s
+    assert 0.02 < np.nanmean(flown.late_error) < 0.25
 
 
 @pytest.mark.parametrize("keywords", [{"layout": "relative"}, {"control_rate": 50}])

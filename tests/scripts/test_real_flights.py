@@ -2,12 +2,16 @@
 
 import csv
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from quad_gym import sensor_suite, vehicle_params
+from quad_gym.records.state import State
+from quad_gym.rotations import euler_to_dcm
 from scripts.studies.closed_loop import COLUMNS, FULL, fit_body, fly, read_flight, rms
+from scripts.studies.onboard_filter import OnboardFilter
 from scripts.studies.real_flights import RealFlightsArgs, main
 
 THRUST, DRAG, LATE, WAIT = 0.29, 0.4, 0.05, 1.0
@@ -90,9 +94,38 @@ def test_simulated_vehicle_reaches_the_setpoints(tmp_path):
     assert (np.nanmax(np.abs((flown.position - log.setpoint)[:, late]), axis=1) < 0.35).all()
 
 
+def test_onboard_filter_mistakes_drag_for_velocity_as_its_linear_model_does():
+    """A vehicle that drag holds at 1 m/s tilts by drag over gravity, and feels no acceleration."""
+    tilt, dt, fixes = DRAG / 9.8, 0.01, 30
+    found = OnboardFilter()
+    found.state = State(1, found.state)
+    found.state.lock(False)
+    found.state.v, found.state.R = [[1.0, 0.0, 0.0]], euler_to_dcm(np.array([[0.0, tilt, 0.0]]))
+    # position, velocity and tilt; the latter accelerates it by 9.8 m/s^2 per rad
+    x, P = np.array([0.0, 1.0, tilt]), 1e-4 * np.eye(3)
+    F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 9.8 * dt], [0.0, 0.0, 1.0]])
+    Q, H = 1e-3 * dt * np.diag([0.0, 0.5**2, 0.1**2]), np.array([1.0, 0.0, 0.0])
+    gnss = SimpleNamespace(primary_antenna_B=(0.0, 0.0, 0.0))
+    common = {
+        **{"dt": dt, "gyro": np.zeros((1, 3)), "accel": np.array([[0.0, 0.0, 9.8]])},
+        "sensors": SimpleNamespace(gnss=gnss),
+        "vehicle": SimpleNamespace(gravity=9.8),
+    }
+    for k in range(1, fixes + 1):
+        fix = SimpleNamespace(new=np.array([True]), value=np.array([[k * dt, 0.0, 0.0]]))
+        estimate = found.update(SimpleNamespace(gnss_position=fix, **common))
+        x, P = F @ x, F @ P @ F.T + Q
+        K = P @ H / (H @ P @ H + 0.01**2)
+        x, P = x + K * (k * dt - H @ x), P - np.outer(K, H @ P)
+    np.testing.assert_allclose(estimate["velocity"][0, 0], x[1], atol=5e-3)
+    np.testing.assert_allclose(-estimate["R_BI"][0, 0, 2], x[2], atol=1e-3)
+    assert x[1] > 1.02  # faster than it is
+    assert x[2] < 0.9 * tilt  # and more level
+
+
 def test_study_writes_table_and_figure(tmp_path, capsys):
     files = [write_flight(tmp_path / f"{k}.csv", seconds=3.0 + 0.3 * k) for k in range(3)]
     main(RealFlightsArgs(tuple(files), fitted=2, draws=2, output=tmp_path / "out"))
     assert "rank_correlation" in capsys.readouterr().out
     written = {file.name for file in (tmp_path / "out").iterdir()}
-    assert written >= {"flights.csv", "results.json", "prediction.png", "body.toml"}
+    assert written >= {"flights.csv", "results.json", "prediction.png"}

@@ -28,6 +28,21 @@ def test_a_suite_is_the_same_after_saving_and_reading(name, tmp_path):
     assert quad_gym.sensor_suite(str(file)) == suite
 
 
+def test_a_world_is_the_same_after_saving_and_reading(tmp_path):
+    breeze = quad_gym.world_params("fresh_breeze")
+    box = ((-5.0, -5.0, 0.0), (5.0, 5.0, 3.0))
+    for world in (quad_gym.WorldParams(geofence=box, ground=quad_gym.GroundParams()), breeze):
+        file = world.save(tmp_path / "mine.toml")
+        assert quad_gym.world_params(str(file)) == world
+        assert quad_gym.QuadEnv("hover", world=str(file)).flights.batch.world == world
+    (tmp_path / "mine.toml").write_text('base = "breeze"\nground_effect = false\n')
+    crazyflie = quad_gym.vehicle_params("crazyflie")
+    near = quad_gym.world_params("breeze", crazyflie).replace(ground_effect=False)
+    assert quad_gym.world_params(tmp_path / "mine.toml", crazyflie) == near
+    with pytest.raises(ValueError, match="a world with obstacles cannot be saved"):
+        quad_gym.world_params("slalom").save(tmp_path / "slalom.toml")
+
+
 def test_numbers_that_are_hard_to_write_are_the_same_after_reading(tmp_path):
     suite = quad_gym.sensor_suite("rtk")
     rng = np.random.default_rng(0)

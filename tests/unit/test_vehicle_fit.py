@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import VehicleParams, vehicle_params
+from quad_gym import VehicleParams, WorldParams, vehicle_params, world_params
 from quad_gym.commands.calibrate import CalibrateArgs, fit_body
 from quad_gym.estimation import fit_vehicle
 from quad_gym.estimation.vehicle_fit import _mean_squares
@@ -14,12 +14,14 @@ LAB = VehicleParams()
 TRUE = LAB.replace(
     thrust_coefficient=1.2 * LAB.thrust_coefficient, motor_time_constant=0.08, drag_coefficient=3.0
 )
+DRAG = (0.5, 0.3)  #: linear drag over the mass [1/s]
 
 
 @pytest.fixture(scope="module")
 def table():
     """Return a log with a row for each change of the motor voltages."""
-    flight = flown(RTK, 12.0, task="lemniscate", vehicle=TRUE)
+    world = WorldParams(linear_drag_B=(*(TRUE.mass * d for d in DRAG), 0.0))
+    flight = flown(RTK, 12.0, task="lemniscate", vehicle=TRUE, world=world)
     table = Recorded(flight, lost=0.0, jitter=0.0).table()
     times, voltages = flight["time"][:-1], flight.about["voltages"][1:]
     empty = np.full(len(times), np.nan)
@@ -53,6 +55,14 @@ def test_fitted_interval_is_narrow_and_contains_true_value(found, name, true, wi
     assert number.high - number.low < width * true
 
 
+def test_fitted_linear_drag_is_that_of_the_world(found):
+    for true, number in zip(DRAG, found.linear_drag_over_mass, strict=True):
+        assert number.value == pytest.approx(true, rel=0.03)
+        assert number.high - number.low < 0.1 * true
+    found_drag = [number.value * LAB.mass for number in found.linear_drag_over_mass]
+    assert found.world == WorldParams(linear_drag_B=(*found_drag, 0.0))
+
+
 def test_fitted_interval_of_battery_sag_contains_zero(found):
     assert found.sag.low < 0.0 < found.sag.high
 
@@ -72,11 +82,14 @@ def test_command_writes_the_vehicle_of_a_log_in_a_file(table, found, tmp_path):
     (tmp_path / "flight.csv").write_text("\n".join([",".join(names), *lines]))
     mine = LAB.replace(mass=0.9, thrust_coefficient=LAB.thrust_coefficient * 0.9 / LAB.mass)
     args = CalibrateArgs(
-        logs=(tmp_path / "flight.csv",),
+        logs=(tmp_path / "flight.csv", tmp_path / "flight.csv"),
         vehicle=tmp_path / "body.toml",
         vehicle_from=str(mine.save(tmp_path / "mine.toml")),
     )
-    assert "rotor lag 0.08" in fit_body(args, RTK, {})
+    assert "rotor lag 0.08" in fit_body(args, RTK, [{}, {}])
+    world = world_params(tmp_path / "body-world.toml")
+    ratios = np.divide(world.linear_drag_B[:2], found.world.linear_drag_B[:2])
+    np.testing.assert_allclose(ratios, 0.9 / LAB.mass, rtol=1e-6)
     written = vehicle_params(tmp_path / "body.toml")
     assert (written.mass, written.inertia) == (0.9, LAB.inertia)
     found_ratio = found.vehicle.thrust_coefficient / found.vehicle.mass
