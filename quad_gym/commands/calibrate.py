@@ -187,7 +187,9 @@ def fit_body(args: CalibrateArgs, suite: "SensorSuite", starts: list[dict[str, A
     assert args.vehicle is not None
     logs = [read_log(log, **args.reading()) for log in args.logs]
     if any(log.motors is None for log in logs):
-        return f"Wrote no {args.vehicle}: a log has no motor voltages (columns motor_0 to motor_3)."
+        return (
+            f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
+        )
     with usage_errors():
         begin = args.vehicle_from or "lab"
         fitted = fit_vehicle(logs, sensors=suite, start=starts, vehicle=begin)

@@ -123,14 +123,14 @@ def prediction_figure(table: list[dict[str, Any]]) -> Any:
         if row["crashed"]:
             place = row["logged"], row["predicted"]
             axes.annotate("crashes", place, (5, -10), textcoords="offset points")
-    axes.set(xscale="log", yscale="log", xlim=ends, ylim=(0.1, 1.4))
+    axes.set(xscale="log", yscale="log", xlim=ends, ylim=(0.2, 1.5))
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_ticks([0.1, 0.2, 0.3, 0.5, 1.0])
+        axis.set_ticks([0.2, 0.3, 0.5, 1.0])
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
     axes.set_xlim(ends)
     axes.set(xlabel="logged tracking error [m]", ylabel="predicted tracking error [m]")
-    axes.legend(loc="upper left")
+    axes.legend(loc="lower right")
     return figure
 
 
