@@ -6,7 +6,7 @@ it takes the thrust for the only force besides weight, so that drag looks like a
 velocity and attitude. No code is copied.
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ _EYE = np.eye(3)
 class OnboardFilter(quad_gym.Estimator):
     """Kalman filter of position, velocity and attitude by gyro, vertical force and positions."""
 
-    state: ClassVar = {
+    state: Any = {  # noqa: RUF012
         "r": np.zeros(3),
         "v": np.zeros(3),
         "R": _EYE,

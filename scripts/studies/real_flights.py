@@ -144,7 +144,7 @@ def main(args: RealFlightsArgs) -> None:
         body = fit_body(logs[: args.fitted], vehicle_params("crazyflie"))
     print(f"Thrust carries the weight at {body.vehicle.hover_voltage:.3f} V.")
     results: dict[str, Any] = {}
-    common = {"draws": args.draws, "seed": args.seed, "onboard": args.onboard}
+    common: dict[str, Any] = {"draws": args.draws, "seed": args.seed, "onboard": args.onboard}
     flown = fly(logs, suite, *body, **common)
     pairs = enumerate(zip(logs, flown, strict=True))
     table = [row_of(log, one, k < args.fitted) for k, (log, one) in pairs]
