@@ -2,7 +2,7 @@
 
 Structure and noise are the defaults of Bitcraze's firmware (crazyflie-firmware, 2025:
 `estimator_kalman.c`, `kalman_core.c`; M. W. Mueller, M. Hamer, R. D'Andrea, ICRA 2015). In flight,
-it takes the thrust for the only force besides weight, so that drag looks like an error of
+thrust is the only force that it assumes besides weight, so that drag looks like an error of
 velocity and attitude. No code is copied.
 """
 

@@ -47,7 +47,7 @@ class RealFlightsArgs:
     seed: int = 0
     """seed of the first simulated flight"""
     onboard: bool = True
-    """fly on the estimate of the Crazyflie's own filter; otherwise on that of the suite's"""
+    """fly on the estimate of the Crazyflie's own filter; otherwise of the suite's filter"""
     output: Path = Path("results/real_flights")
     """folder"""
 
