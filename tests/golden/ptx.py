@@ -85,9 +85,9 @@ class PtxLauncher:
 
 def c_of(text):
     """Return the C source of a module of PTX."""
-    constants = re.findall(r"\.global [^;\n]*?\.b8 (\w+)\[(\d+)\](?: = \{([^}]*)\})?;", text)
+    constants = re.findall(r"\.global [^;\n]*?\.b8 ([\w$]+)\[(\d+)\](?: = \{([^}]*)\})?;", text)
     words = re.findall(
-        r"\.global [^;\n]*?\.u64 (\w+)\[(\d+)\]", text
+        r"\.global [^;\n]*?\.u64 ([\w$]+)\[(\d+)\]", text
     )  # of exceptions, never raised
     places = {name for name, *_ in (*constants, *words)}
     lines = [HEAD]

@@ -73,6 +73,11 @@ def test_flights_on_a_gpu_equal_those_of_the_batch(mode):
 
 
 @pytest.mark.slow  # compiles the filter
+def test_filtered_flights_of_ptx_equal_those_of_the_batch():
+    assert episodes_of("circle", "NextStep", launcher_of_ptx, max_tilt=0.6) > 0
+
+
+@pytest.mark.slow  # compiles the filter
 @pytest.mark.parametrize("keywords", [{}, {"sensors": "rtk", "faults": "gnss_outage"}])
 def test_filtered_flights_of_device_code_equal_those_of_the_batch(keywords):
     assert episodes_of("circle", "NextStep", max_tilt=0.6, **keywords) > 0
