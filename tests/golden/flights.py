@@ -15,7 +15,8 @@ import numpy as np
 import quad_gym
 from quad_gym import Uniform
 from quad_gym.faults.presets import PRESETS
-from quad_gym.params.suites import SUITES
+from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.suites import ALL_SUITES, SUITES
 from quad_gym.records import COLUMNS
 
 DIGESTS = Path(__file__).with_name("flights.json")
@@ -95,8 +96,11 @@ def cases():
     for fault in PRESETS:
         suite = "indoor" if "camera" in fault else "rtk"
         suite = AIDED if "meter" in fault else suite
-        suite = "crazyflie" if fault in ("optical_flow_loss", "range_finder_loss") else suite
-        suite = "uwb" if fault == "uwb_range_loss" else suite
+        sensor = fault.removesuffix("_loss")
+        if sensor in AID_PARAMS and suite == "rtk":
+            having = [name for name in ALL_SUITES if getattr(quad_gym.sensor_suite(name), sensor)]
+            own = quad_gym.sensor_suite("uwb").replace(**{sensor: AID_PARAMS[sensor]()})
+            suite = having[0] if having else own
         found[f"fault {fault}"] = {"sensors": suite, "faults": _early(fault), "start": "hover"}
     for task in ("LookAround", "StaleRace", "OutageDash"):
         found[task] = {"id": task}

@@ -14,6 +14,7 @@ import numpy as np
 
 from quad_gym.estimation import read_log, replay
 from quad_gym.estimation.dead_reckoning import changes
+from quad_gym.params.sensors import SENSOR_PARAMS
 from quad_gym.params.suites import ALL_SUITES, sensor_suite
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.many_logs import logs_of
@@ -21,7 +22,7 @@ from tests.statistical.verdicts import position_errors, rows, start_of
 from tests.unit.test_resets import drifting_receiver
 
 SETTLED, EVERY = 5.0, 0.25  #: first evaluation, and time between two [s]
-SENSORS = ("gnss", "camera", "barometer", "magnetometer", "optical_flow", "range_finder")
+SENSORS = tuple(SENSOR_PARAMS)
 NOISE = ("position_sigma_I", "baseline_sigma", "velocity_sigma", "pixel_sigma", "noise_sigma")
 IMU_NOISE = ("accel_noise_density", "gyro_noise_density", "accel_vibration", "gyro_vibration")
 

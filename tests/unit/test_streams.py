@@ -141,7 +141,8 @@ def test_every_range_is_drawn_from():
     for quantity, first, count in DRAW_RANGES:
         taken = drawn & set(range(first, first + count))
         assert first in taken, quantity
-        assert len(taken) >= 0.6 * count, quantity  # most faults do not use all draws
+        least = 0.5 if ":" in quantity else 0.6  # a sensor of one number uses half of a pair
+        assert len(taken) >= least * count, quantity  # most faults do not use all draws
 
 
 def quantities_of(batch):
