@@ -8,7 +8,9 @@ from quad_gym.envs.flights import TASK_DEFAULTS
 from quad_gym.records import AID_BLOCKS, Control
 
 
-def fly(sensors, count=200, *, task="random_trajectory", seed=0, start=None, **keywords):
+def fly(
+    sensors, count=200, *, task="random_trajectory", seed=0, start=None, trajectory=None, **keywords
+):
     """A batch under PD control on its estimate, with episodes that do not end."""
     params = TASK_DEFAULTS[task].replace(
         duration=0.0,
@@ -16,6 +18,7 @@ def fly(sensors, count=200, *, task="random_trajectory", seed=0, start=None, **k
         max_tilt=np.pi,
         min_height=-1e6,
         start=start or TASK_DEFAULTS[task].start,
+        trajectory=trajectory,
     )
     batch = FlightBatch(
         count,

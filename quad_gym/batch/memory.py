@@ -24,6 +24,7 @@ from quad_gym.records import (
     Room,
     Sensor,
     aligned_zeros,
+    covariance_of,
     field_of_flights,
 )
 
@@ -147,8 +148,7 @@ class FlightMemory:
 
     def covariance(self) -> NDArray[np.float64]:
         """Return the covariances (count, 15, 15) of the filters, in the order r, v, e, b_a, b_g."""
-        factor = self.record("L")
-        return factor @ factor.transpose(0, 2, 1)
+        return covariance_of(self.record("L"), self.record("arc"))
 
     # ---- keeping ------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from quad_gym.estimation.headings import Moments, moments
 from quad_gym.estimation.samples import Measurement
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import FilterStatus
+from quad_gym.records import FilterStatus, covariance_of
 
 
 class Innovations(NamedTuple):
@@ -71,8 +71,7 @@ class FilterEstimate:
         mixed = self._mixed()
         if mixed is not None:
             return mixed.covariance[:15, :15].copy()
-        L = self._read("L")
-        return L @ L.T
+        return covariance_of(self._read("L"), self._read("arc"))
 
     @property
     def heading_known(self) -> bool:

@@ -208,8 +208,8 @@ def _fill(rows: NDArray[Any], batch: FlightBatch, scene: FlightScene) -> None:
         for name in WITH_FILTER:
             rows[name] = np.nan
         return
-    L, gate = batch.record("L"), batch.record("gate")
-    rows["covariance"] = L @ np.swapaxes(L, 1, 2)
+    gate = batch.record("gate")
+    rows["covariance"] = batch.covariance()
     rows["nees"] = _nees(rows, batch.record("R_hat"), rotation_vector=batch.sensors.flow_alone)
     for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):
         measured = ~np.isnan(rows[name]).all(axis=1)

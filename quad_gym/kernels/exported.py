@@ -10,6 +10,7 @@ from numba import types
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling import entry, kernel
+from quad_gym.kernels.filter.error_state import E
 from quad_gym.kernels.filter.still import set_heading, start_still, turned
 from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.linalg import load3, store
@@ -365,12 +366,15 @@ def state(flight, window, address, e):
 @entry(signature=types.none(_FLIGHT, types.int64))
 def covariance(flight, address):
     """Write the covariance, row by row."""
-    L = lanes_of(flight).L
+    lanes = lanes_of(flight)
+    L, arc = lanes.L, lanes.arc
     for i in range(15):
         for j in range(15):
             total = L[i, 0] * L[j, 0]
             for k in range(1, min(i, j) + 1):
                 total = total + L[i, k] * L[j, k]
+            if max(i, j) < E:
+                total = total + arc[i] * arc[j]
             store_lanes(address + 8 * (15 * i + j), total)
 
 

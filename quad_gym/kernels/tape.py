@@ -8,6 +8,7 @@ import math
 from quad_gym.kernels import entries
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.signatures import signature_of
+from quad_gym.kernels.filter.error_state import variance_of
 from quad_gym.kernels.maths.elementary import exp
 from quad_gym.kernels.simd.addresses import store_lanes
 from quad_gym.kernels.simd.blocks import lanes_of
@@ -186,10 +187,7 @@ def keep_estimate(flight, address):
     place = _store3(address, place, flight.b_a_hat)
     place = _store3(address, place, flight.b_g_hat)
     for i in range(15):
-        variance = flight.L[i, 0] * flight.L[i, 0]
-        for j in range(1, i + 1):
-            variance = variance + flight.L[i, j] * flight.L[i, j]
-        store_lanes(address + (place + i) * _LANES, variance)
+        store_lanes(address + (place + i) * _LANES, variance_of(flight, i))
     store_lanes(address + (place + 15) * _LANES, flight.diverged + 0.0)
 
 

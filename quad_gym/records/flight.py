@@ -148,6 +148,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("b_a_hat", (3,), "m/s^2", "estimated accelerometer bias"),
         Field("b_g_hat", (3,), "rad/s", "estimated gyro bias"),
         Field("v_corrected", (3,), "m/s", "change of v_hat by updates since the prediction, with FIRST_ESTIMATES"),
+        Field("arc", (6,), "m, m/s", "deviations of r and v of second order in the heading's error, all of one random number, with FIRST_ESTIMATES"),
         Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
         Field("update_failures", (), "-", "updates that failed since the filter's start"),
         Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),

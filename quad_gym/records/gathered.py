@@ -14,6 +14,7 @@ _OF_CORE = {"tick", "filter_status", "diverged"}
 _PARTS = {"filter", "watch", "late", "slow", "aids"}
 _NOT_READ = {
     *("prediction_failures", "waiting", "waiting_valid", "aid_vector", "aid_scalar", "aid_matrix"),
+    *("arc",),  # set by predictions alone
     *("stamps",),  # only the stamps of arriving measurements are gathered
 }
 _NOT_WRITTEN = {

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
+from quad_gym.records import covariance_of
 from quad_gym.tasks.fields import Group, GroupField, field, quantity, record, shown
 from quad_gym.tasks.memory import ReadableBatch
 
@@ -22,7 +23,11 @@ def _block(first: int, unit: str, frame: str, of: str) -> tuple[GroupField[Float
     @field("(n, 3, 3)", squared, frame, f"covariance of the {of}")
     def covariance(self: "EstimateView") -> Floats:
         rows = np.ascontiguousarray(self.factor[:, first : first + 3, : first + 3])
-        return rows @ rows.transpose(0, 2, 1)
+        P = rows @ rows.transpose(0, 2, 1)
+        if first < 6:
+            arc = self._flights.rows("arc")[:, first : first + 3]
+            P += arc[:, :, np.newaxis] * arc[:, np.newaxis]
+        return P
 
     @field("(n, 3)", unit, frame, f"standard deviations of the {of}")
     def sigma(self: "EstimateView") -> Floats:
@@ -50,13 +55,15 @@ class EstimateView(Group):
 
     @field("(n, 15, 15)", "mixed", "mixed", "covariance of position and velocity in I, attitude, accelerometer and gyro bias in B")
     def covariance(self) -> Floats:
-        return self.factor @ self.factor.transpose(0, 2, 1)
+        return covariance_of(self.factor, self._flights.rows("arc"))
 
-    factor = record("L", "(n, 15, 15)", "mixed", "mixed", "lower Cholesky factor of the covariance")
+    factor = record("L", "(n, 15, 15)", "mixed", "mixed", "lower Cholesky factor of the covariance, without the second order of a heading's error")
 
     @field("(n, 15)", "mixed", "mixed", "standard deviations, square roots of the diagonal of the covariance")
     def sigma(self) -> Floats:
-        return np.sqrt((self.factor * self.factor).sum(axis=2))
+        variances = (self.factor * self.factor).sum(axis=2)
+        variances[:, :6] += self._flights.rows("arc") ** 2
+        return np.sqrt(variances)
 
     position_covariance, position_sigma = _block(0, "m", "I", "position")
     velocity_covariance, velocity_sigma = _block(3, "m/s", "I", "velocity")

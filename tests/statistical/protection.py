@@ -12,6 +12,7 @@ from dataclasses import fields
 
 import numpy as np
 
+from quad_gym import Trajectory
 from quad_gym.estimation import read_log, replay
 from quad_gym.estimation.dead_reckoning import changes
 from quad_gym.params.sensors import SENSOR_PARAMS
@@ -110,15 +111,35 @@ def drifts():
         )
 
 
-def long_flights(name, count):
-    """Print the mean NEES of each minute."""
-    vehicle = {"vehicle": "crazyflie"} if name == "crazyflie" else {}
-    batch, means = fly(sensor_suite(name), count, **vehicle), []
+def consistent_flights():
+    """Yield names, suites and keywords of `fly`: all suites, and what makes some consistent."""
+    for name in ALL_SUITES:
+        yield name, sensor_suite(name), {"vehicle": "crazyflie"} if name == "crazyflie" else {}
+    lab, stale = sensor_suite("lab"), sensor_suite("stale")
+    predicted = lab.estimator.replace(bearing_noise_at="predicted")
+    yield "lab, noise at the predicted direction", lab.replace(estimator=predicted), {}
+    prompt = {name: getattr(stale, name).replace(latency=0.0) for name in ("gnss", "camera")}
+    yield "stale, prompt sensors", stale, {"true_sensors": stale.replace(**prompt)}
+    points = [(2.0, 0.0, 1.5), (0.0, 2.0, 2.0), (-2.0, 0.0, 1.2), (0.0, -2.0, 1.8)]
+    facing = Trajectory.through(
+        points, max_speed=2.0, max_acceleration=2.5, closed=True, look_at=(-8.0, 0.0)
+    )
+    keywords = {"task": "trajectory", "trajectory": facing}
+    yield "one_wall, facing it", sensor_suite("one_wall"), keywords
+
+
+def long_flights(name, suite, count, **keywords):
+    """Print the mean NEES of each minute, and the median."""
+    batch, found = fly(suite, count, **keywords), []
     for _ in range(200):
         steps(batch, 3.0)
-        means.append(nees(batch).mean())
-    minutes = np.reshape(means, (10, 20)).mean(axis=1)
-    print(f"{name}: NEES {np.mean(means):.2f}; by minute", minutes.round(1), flush=True)
+        found.append(nees(batch))
+    minutes = np.mean(found, axis=1).reshape(10, 20).mean(axis=1)
+    print(
+        f"{name}: NEES {np.mean(found):.2f}, median {np.median(found):.1f}; by minute",
+        minutes.round(1),
+        flush=True,
+    )
 
 
 def main():
@@ -127,6 +148,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("tables", nargs="*", default=tables, choices=(*tables, tables))
     parser.add_argument("--flights", type=int, default=20)
+    parser.add_argument("--only", default="", help="part of the name of long flights")
     parser.add_argument("--seconds", type=float, default=20.0)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -135,8 +157,9 @@ def main():
         for name in gated:
             harm(name, args.flights, args.seconds)
     if "long" in args.tables:
-        for name in gated:
-            long_flights(name, args.flights)
+        for name, suite, keywords in consistent_flights():
+            if args.only in name:
+                long_flights(name, suite, args.flights, **keywords)
     if "drift" in args.tables:
         drifts()
 

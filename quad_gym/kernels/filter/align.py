@@ -94,7 +94,7 @@ def initialize(flight, p, mask, x_I, v_I=_NOTHING, v_variance=_NOTHING, tilt_var
     keep(flight.v_hat, mask, v_I)
     flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
     reset(flight, mask, 0.0, "b_a_hat b_g_hat prediction_failures update_failures")
-    reset(flight, mask, 0.0, "nis nis_dimension v_corrected")
+    reset(flight, mask, 0.0, "nis nis_dimension v_corrected arc")
     begin_recovery(flight, mask)
 
     L = flight.L

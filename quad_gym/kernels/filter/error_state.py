@@ -13,7 +13,10 @@ With FIRST_ESTIMATES (optical flow, neither GNSS nor camera) the heading is unob
 e is then a rotation vector, R_BI = exp(-[e x]) R_hat, and keeps its direction in I when an update
 corrects the attitude; a correction dv of the velocity adds R_hat^T e x dv to the velocity's error
 in the next prediction. So an update gives no information about a rotation about the vertical
-(docs/filter-equations.md, "Unobservable heading").
+(docs/filter-equations.md, "Unobservable heading"). As only motions in B are measured,
+a heading error psi moves position and velocity in I along arcs: across them to first order, which P
+contains, and along their radii in proportion to psi^2, which no update may change. `arc` has the
+standard deviations of the second part, by which covariances in I are larger than P.
 
 Sources: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for the reset in general; M.
 Li and A. I. Mourikis, Int. J. Robotics Research 32(6), 2013, for first estimates.
@@ -23,7 +26,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import cross
+from quad_gym.kernels.maths.linalg import cross, keep, load33
 from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
@@ -55,6 +58,31 @@ def reset_matrix(m):
 def velocity_error(v, e, R_BI, change):
     """Velocity error v with error angles e when an update has changed v_hat."""
     return v + cross(R_BI.T @ e, change)
+
+
+@kernel
+def keep_arc(flight, ok):
+    """Keep the deviations of r and v of second order in the heading's error psi, where `ok`.
+
+    With the covariance c of a state with psi, its deviation across the arc is c psi / sigma^2, and
+    that along the radius c (psi^2 - sigma^2) / (2 sigma^2), turned by a right angle. The factor of
+    c in the second has the standard deviation 1 / sqrt(2).
+    """
+    z_B, half = load33(flight.R_hat).T[2], math.sqrt(0.5)
+    for i in range(0, E, 3):
+        c = sum_of_outers(flight.L, i, flight.L, E, i + 3) @ z_B
+        keep(flight.arc[i:], ok, (-half * c[1], half * c[0], zero_like(c[2])))
+
+
+@kernel
+def variance_of(flight, row):
+    """Variance of a state in I or B, from its row of the factor and its arc."""
+    variance = flight.L[row, 0] * flight.L[row, 0]
+    for j in range(1, row + 1):
+        variance = variance + flight.L[row, j] * flight.L[row, j]
+    if row < E:
+        variance = variance + flight.arc[row] * flight.arc[row]
+    return variance
 
 
 @kernel

@@ -16,7 +16,7 @@ variances follows from the whiteness of innovations.
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BA, D, R
+from quad_gym.kernels.filter.error_state import BA, D, R, variance_of
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, select, zero_like
@@ -104,16 +104,6 @@ def add_correction(sums, variances, i, ok, kept, shift, variance):
     """Add a correction and its variance to sums of which a share is `kept`, where `ok`."""
     sums[i] = select(ok, kept * sums[i] + shift, sums[i])
     variances[i] = select(ok, kept * kept * variances[i] + variance, variances[i])
-
-
-@kernel
-def variance_of(flight, row):
-    """Variance of a state, from its row of the factor."""
-    variance = zero_like(flight.tick)
-    for j in range(15):
-        if j <= row:
-            variance = variance + flight.L[row, j] * flight.L[row, j]
-    return variance
 
 
 @kernel

@@ -33,6 +33,7 @@ from quad_gym.kernels.filter.error_state import (
     E,
     R,
     V,
+    keep_arc,
     reset_matrix,
     turn_covariance,
     velocity_error,
@@ -319,6 +320,8 @@ def predict(flight, p, work, form, slow):
     keep(flight.b_a_hat, ok, p.accel_bias_decay * load3(flight.b_a_hat))
     keep(flight.b_g_hat, ok, p.gyro_bias_decay * load3(flight.b_g_hat))
     keep_factor(flight, slow, work, ok)
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        keep_arc(flight, ok)
     if slow is not None:
         decay_slow(flight, slow, p, ok)
     status, failure = flight.filter_status, np.uint64(FilterStatus.PREDICTION_FAILED.value)

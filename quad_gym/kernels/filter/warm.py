@@ -113,7 +113,7 @@ def _start_warm(flight, settings, work, slow):
     n_d = _draw_errors(settings, stream_of(flight), work, slow, T)
     keep(flight.r_hat, mask, load3(flight.r) - T @ load3(d[R : R + 3]))
     keep(flight.v_hat, mask, load3(flight.v) - T @ load3(d[V : V + 3]))
-    reset(flight, mask, 0.0, "v_corrected")
+    reset(flight, mask, 0.0, "v_corrected arc")
     keep(flight.R_hat, mask, euler_to_dcm(load3(d[E : E + 3])).T @ R_BI)
     keep(flight.b_a_hat, mask, load3(flight.b_a) - load3(d[BA : BA + 3]))
     keep(flight.b_g_hat, mask, load3(flight.b_g) - load3(d[BG : BG + 3]))

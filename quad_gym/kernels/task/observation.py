@@ -3,6 +3,7 @@
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.error_state import variance_of
 from quad_gym.kernels.maths.linalg import load3, load4, load33
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.lanes import select, zero_like
@@ -198,10 +199,7 @@ def observe_stage(flight, world, model, settings, work, stages, flag):
     k += 4
     if settings.include_std:
         for i in range(15):
-            variance = flight.L[i, 0] * flight.L[i, 0]
-            for j in range(1, i + 1):
-                variance = variance + flight.L[i, j] * flight.L[i, j]
-            row[k + i] = math.sqrt(variance)
+            row[k + i] = math.sqrt(variance_of(flight, i))
         k += 15
     if settings.privileged:
         k = _put_privileged(flight, p, settings, row, k)
