@@ -22,12 +22,7 @@ PAUSE = 0.1  #: time between looks at the processes [s]
 
 REFRESH = 1.0  #: time between updates of the progress bar [s]
 
-RESTARTS = 2  #: times that a training begins again whose process died
-
 INTERRUPTED = 130  #: exit code of an experiment that was stopped
-
-
-_DIED = "died:"
 
 
 @dataclass
@@ -57,13 +52,11 @@ def train_all(
 ) -> Completion:
     """Complete the unfinished trainings, `jobs` at a time, and show the progress.
 
-    A training that fails does not affect the others, and one whose process dies begins again, up to
-    `RESTARTS` times. SIGINT or SIGTERM stops all of them after their present step, and a second
-    signal immediately. The output of each is in the folder `logs`. The bar is hidden by default
-    (None) if stderr is no terminal.
+    A training that fails or dies does not affect the others. SIGINT or SIGTERM stops all of them
+    after their present step, and a second signal immediately. The output of each is in the folder
+    `logs`. The bar is hidden by default (None) if stderr is no terminal.
     """
     waiting = [training for training in trainings if not training.record()]
-    left = dict.fromkeys(waiting, RESTARTS)
     running: dict[Training, _Job] = {}
     outcome, signals, forwarded, shown = Completion(), list[int](), 0, 0.0
     steps = {training: training.plan.recipe.steps for training in trainings}
@@ -79,11 +72,6 @@ def train_all(
             for training in [t for t, job in running.items() if job.process.exitcode is not None]:
                 problem = running.pop(training).ending()
                 if problem and outcome.stopped:
-                    continue
-                if problem.startswith(_DIED) and left[training]:
-                    left[training] -= 1
-                    waiting.append(training)
-                    bar.write(f"{training.name} {problem}; it begins again")
                     continue
                 if problem:
                     outcome.failed[training] = problem
@@ -129,7 +117,7 @@ class _Job:
         with suppress(EOFError, OSError):
             return str(self._answer.recv())
         code = self.process.exitcode or 0
-        return f"{_DIED} signal {-code}" if code < 0 else f"{_DIED} exit code {code}"
+        return f"died: signal {-code}" if code < 0 else f"died: exit code {code}"
 
 
 def _work(plan: Plan, folder: Path, sender: Any, log: Path) -> None:
