@@ -1,9 +1,10 @@
-"""Evaluations of a run and the files of its policies, for both engines; on Ctrl-C, too."""
+"""Evaluations, checkpoints and lock of a run, for both engines; on Ctrl-C, too."""
 
 import csv
 import io
 import os
 import signal
+import socket
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+from filelock import FileLock, Timeout
 from tqdm.auto import tqdm
 
 from baselines.plans import Plan
@@ -20,6 +22,8 @@ from baselines.seeds import first_seed
 from quad_gym.evaluation import Policy, roll_out
 
 EVALUATIONS = "evaluations.csv"
+STATE = "training_state.pickle"
+"""Name of the state within the file of the last policy; loading the policy ignores it."""
 _COLUMNS = (
     *("steps", "training_seconds", "mean_error", "late_error", "crash_rate", "return"),
     *("gates_passed", "training_return"),
@@ -32,13 +36,19 @@ class RunError(ValueError):
 
 
 def last_file(plan: Plan, folder: Path) -> Path:
-    """File of the policy of the last evaluation."""
+    """File of the policy of the last checkpoint, with the state for resuming."""
     return folder / f"last{SUFFIXES[plan.engine]}"
 
 
 def best_file(plan: Plan, folder: Path) -> Path:
     """File of the policy of the best evaluation."""
     return folder / f"best{SUFFIXES[plan.engine]}"
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """True if a run can be resumed from the folder."""
+    kept = any((folder / f"last{suffix}").exists() for suffix in SUFFIXES.values())
+    return kept and (folder / "training.json").exists()
 
 
 def score(summary: dict[str, float], duration: float) -> float:
@@ -57,8 +67,8 @@ def score(summary: dict[str, float], duration: float) -> float:
 class RunKeeper(ABC):
     """Evaluations of the policy during a run by an environment, `judge`, and files of the run.
 
-    Evaluations are made between two rollouts. A file is written under another name and then
-    renamed, so that the previous one survives an interruption at any time.
+    Evaluations and checkpoints are made between two rollouts. A checkpoint is written under another
+    name and then renamed, so that the previous one survives an interruption at any time.
     """
 
     def __init__(
@@ -89,15 +99,18 @@ class RunKeeper(ABC):
 
     @abstractmethod
     def _save(self, model: Any, *, best: bool) -> None:
-        """Write the last policy, and the best one, if this is the best."""
+        """Write the best policy, if this is the best, and then the last checkpoint.
+
+        The order matters: a run that is killed in between finds the same best policy again.
+        """
 
     # ---- between rollouts -----------------------------------------------------------------------
 
-    def begin(self) -> None:
-        """Start the clock and the progress bar, after compilation."""
+    def begin(self, steps: int) -> None:
+        """Start the clock and the progress bar at a number of steps, after compilation."""
         look: dict[str, Any] = {"unit": " steps", "unit_scale": True, "disable": self._quiet}
-        self._bar = tqdm(total=self._plan.recipe.steps, **look)
-        self._since = time.perf_counter()
+        self._bar = tqdm(total=self._plan.recipe.steps, initial=steps, **look)
+        self.steps, self._since = steps, time.perf_counter()
 
     def watch(self, model: Policy, steps: int) -> None:
         """Evaluate and store the policy if this is due; to be called before every rollout."""
@@ -106,8 +119,9 @@ class RunKeeper(ABC):
         self.steps = steps
         if due or not self.rows:
             self._keep(model)
-        elif self._stop:
+        elif self._stop:  # without an evaluation, which could change the best policy
             self._count_seconds()
+            self._save(model, best=False)
 
     @property
     def stopping(self) -> bool:
@@ -139,8 +153,10 @@ class RunKeeper(ABC):
             self.steps = steps
             self._keep(model)
 
+    # ---- checkpoints ----------------------------------------------------------------------------
+
     def _keep(self, model: Policy) -> None:
-        """Evaluate, and write the policy."""
+        """Evaluate, and write a checkpoint."""
         self._count_seconds()
         episodes = roll_out(model, self._judge, seed=self._first_seed)
         known = episodes.summary() | {
@@ -170,9 +186,19 @@ class RunKeeper(ABC):
         self._since = time.perf_counter()
 
     def _count_seconds(self) -> None:
-        """Add the time since the last evaluation to the time of the training."""
+        """Add the time since the last checkpoint to the time of the training."""
         now = time.perf_counter()
         self.seconds += now - (now if self._since is None else self._since)
+
+    def state(self) -> dict[str, Any]:
+        """State from which the next process resumes."""
+        return {name: getattr(self, name) for name in ("rows", "best", "last", "seconds")}
+
+    def restore(self, state: dict[str, Any], steps: int) -> None:
+        """Restore a `state` that was taken after `steps` steps."""
+        for name, value in state.items():
+            setattr(self, name, value)
+        self.steps = steps
 
 
 @contextmanager
@@ -202,3 +228,53 @@ def replace_file(file: Path, content: bytes) -> None:
             return
         time.sleep(wait)
     part.replace(file)
+
+
+# ---- locks ---------------------------------------------------------------------------------------
+# The operating system releases a lock when the process ends for any reason. Locks also work between
+# machines on a shared file system that supports them (NFS, or Lustre mounted with `flock`).
+
+LOCK = "training.lock"  #: name of the lock file in the folder
+
+HOLDER = "training.process"  #: name of the file with the process that has or had the lock
+
+PATIENCE = 0.5  #: time to wait for a lock [s]; checking for a lock takes it briefly
+
+
+class BusyError(RunError):
+    """Error raised when another process trains in the folder."""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock the existing folder of a run, or raise a `BusyError` if another process has the lock."""
+    lock = FileLock(folder / LOCK, timeout=PATIENCE)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise BusyError(f"folder {folder} is in use by {holder(folder)}") from None
+    try:
+        with suppress(OSError):  # a full disk
+            (folder / HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+        yield
+    finally:
+        lock.release()
+
+
+def is_locked(folder: Path) -> bool:
+    """True if a process trains in the folder now."""
+    if not (folder / LOCK).exists():  # never begun
+        return False
+    try:
+        with FileLock(folder / LOCK, timeout=0.0):
+            return False
+    except Timeout:
+        return True
+
+
+def holder(folder: Path) -> str:
+    """Process that has the lock of a folder, or had it last."""
+    try:
+        return (folder / HOLDER).read_text(encoding="utf-8").strip() or "another process"
+    except OSError:
+        return "another process"

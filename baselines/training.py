@@ -3,20 +3,25 @@
 The folder contains
 
 - `last.zip` and `best.zip`: the policies of the last and of the best evaluation, in the format of
-  Stable-Baselines3;
+  Stable-Baselines3; `last.zip` also contains the state for resuming: flights, random number
+  generators and counters (and `replay_*.pickle` in addition, for algorithms with a replay buffer);
 - or, from the compiled engine, `last.npz` and `best.npz`, in the format of `MlpPolicy`;
 - `training.json`: plan, versions, seeds, wall time; `evaluations.csv`: errors during training;
+- `training.lock`, and `training.process`: the process that trains in the folder, or did last;
 - files for TensorBoard.
+
+A resumed run continues exactly from its last checkpoint.
 """
 
 import importlib.util
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines.keeping import RunError, RunKeeper, best_file
+from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint, locked
 from baselines.mlp import MlpPolicy, mlp_of
 from baselines.plans import Plan, description
 from baselines.policies import interface_of
@@ -43,14 +48,17 @@ class TrainingResult:
 
 
 def train(
-    plan: Plan, folder: Path, *, tensorboard: bool = True, quiet: bool = False
+    plan: Plan, folder: Path, *, resume: bool = False, tensorboard: bool = True, quiet: bool = False
 ) -> TrainingResult:
-    """Train a policy. Ctrl-C or SIGTERM stops the run at the next step.
+    """Train a policy, or resume a training that was stopped.
+
+    Ctrl-C or SIGTERM stops the run at the next step, from which it can be resumed. The folder is
+    locked during the run (`baselines.keeping`).
 
     Args:
         plan: Plan of the training.
-        folder: Folder of the run, created if it is missing; the files of a run of this plan that
-            was stopped are replaced.
+        folder: Folder of the run, created if it is missing.
+        resume: True to continue from the folder's last checkpoint, if it has one.
         tensorboard: True to write files for TensorBoard, if it is installed.
         quiet: True to hide the progress bar.
 
@@ -58,38 +66,14 @@ def train(
         Results of the training.
 
     Raises:
-        ValueError: If the plan is invalid, or the folder contains a finished run, or one of another
-            plan.
+        ValueError: If the plan is invalid, the folder contains a run and `resume` is not set, it
+            contains the run of another plan, or another process trains in it.
         OSError: If the folder is not writable.
     """
-    if finished_run(folder, plan) is not None:
-        raise RunError(f"folder {folder} already contains a run: choose another one (--output)")
     tensorboard = tensorboard and importlib.util.find_spec("tensorboard") is not None
     folder.mkdir(parents=True, exist_ok=True)
-    judge, described = plan.make_judge(), description(plan)
-    begun = {"plan": described, "interface": interface_of(judge), "finished": False}
-    _write_record(folder, begun)
-    if plan.engine == "compiled":
-        from baselines.compiled_ppo.run import run as run_compiled
-
-        keeper: RunKeeper = run_compiled(plan, folder, judge, tensorboard=tensorboard, quiet=quiet)
-    else:
-        from baselines.sb3_run import run
-
-        keeper = run(plan, folder, judge, tensorboard=tensorboard, quiet=quiet)
-    names = ("finished", "steps", "best", "last")
-    record = begun | {
-        **{name: getattr(keeper, name) for name in names},
-        "training_seconds": keeper.seconds,
-        "steps_per_second": keeper.steps / max(keeper.seconds, 1e-9),
-        "threads": resolve_threads(plan.threads),
-        "ended": time.strftime("%Y-%m-%d %H:%M:%S"),
-        "versions": versions("numpy", "numba", "torch", "stable_baselines3", "sb3_contrib"),
-    }
-    _write_record(folder, record)
-    judge.close()
-    values = {name: getattr(keeper, name) for name in ("steps", "seconds", "finished", "best")}
-    return TrainingResult(folder, best_policy=best_file(plan, folder), **values)
+    with locked(folder):
+        return _train(plan, folder, resume, {"tensorboard": tensorboard, "quiet": quiet})
 
 
 def require_model(plan: Plan) -> None:
@@ -107,21 +91,65 @@ def require_model(plan: Plan) -> None:
     make_model(plan, plan.make_flights())
 
 
-def finished_run(folder: Path, plan: Plan) -> dict[str, Any] | None:
-    """Record of the finished run in a folder; None: it has none, or one that was stopped.
+def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
+    """Record of the run in a folder that is resumed; None: a new run begins.
 
-    Raises a `RunError` if the folder contains the run of another plan.
+    Raises a `RunError` if the folder contains a run and `resume` is not set, or contains the run of
+    another plan.
     """
-    if not (folder / "training.json").exists():
+    if not has_checkpoint(folder):
         return None
-    found: dict[str, Any] = json.loads((folder / "training.json").read_text(encoding="utf-8"))
+    if not resume:
+        raise RunError(
+            f"folder {folder} already contains a run: resume it (--resume), or choose "
+            "another folder (--output)"
+        )
+    before: dict[str, Any] = json.loads((folder / "training.json").read_text(encoding="utf-8"))
     described = description(plan)
-    if found["plan"] != described:
-        differing = [k for k in described if found["plan"].get(k) != described[k]]
+    if before["plan"] != described:
+        differing = [k for k in described if before["plan"].get(k) != described[k]]
         raise RunError(
             f"folder {folder} contains a run of another plan (different: {', '.join(differing)})"
         )
-    return found if found["finished"] else None
+    return before
+
+
+def _train(plan: Plan, folder: Path, resume: bool, options: Mapping[str, bool]) -> TrainingResult:
+    described = description(plan)
+    before = run_in(folder, plan, resume=resume)
+    if before is not None and before["finished"]:
+        return _result(plan, folder, before)
+    judge = plan.make_judge()
+    if before is None:
+        begun = {"plan": described, "interface": interface_of(judge), "finished": False}
+        _write_record(folder, begun)
+    if plan.engine == "compiled":
+        from baselines.compiled_ppo.run import run as run_compiled
+
+        keeper: RunKeeper = run_compiled(plan, folder, judge, **options)
+    else:
+        from baselines.checkpoints import run
+
+        keeper = run(plan, folder, judge, **options)
+    record = {
+        "plan": described,
+        "interface": interface_of(judge),
+        **{name: getattr(keeper, name) for name in ("finished", "steps", "best", "last")},
+        "training_seconds": keeper.seconds,
+        "steps_per_second": keeper.steps / max(keeper.seconds, 1e-9),
+        "threads": resolve_threads(plan.threads),
+        "ended": time.strftime("%Y-%m-%d %H:%M:%S"),
+        "versions": versions("numpy", "numba", "torch", "stable_baselines3", "sb3_contrib"),
+    }
+    _write_record(folder, record)
+    judge.close()
+    return _result(plan, folder, record)
+
+
+def _result(plan: Plan, folder: Path, record: Mapping[str, Any]) -> TrainingResult:
+    values = {name: record[name] for name in ("steps", "finished", "best")}
+    best = best_file(plan, folder)
+    return TrainingResult(folder, seconds=record["training_seconds"], best_policy=best, **values)
 
 
 def _write_record(folder: Path, record: Any) -> None:

@@ -1,5 +1,6 @@
 """`CompiledPPO`: proximal policy optimization without torch, for vector environments."""
 
+import pickle
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -142,6 +143,18 @@ class CompiledPPO:
         """Mean return of the latest episodes, not scaled; NaN before the first."""
         return float(np.mean(self._finished)) if self._finished else float("nan")
 
+    def state(self) -> bytes:
+        """Serialize the state of the training and the environment, to resume exactly."""
+        kept = {name: getattr(self, name) for name in _STATE}
+        arrays = (self.networks.params, self.learner.moments, self.learner.steps)
+        return pickle.dumps((kept, arrays))
+
+    def restore(self, state: bytes) -> None:
+        """Restore a `state` with the same recipe; unpickling can run code, so trust its source."""
+        kept, (params, moments, self.learner.steps) = pickle.loads(state)
+        self.networks.params[:], self.learner.moments[:] = params, moments
+        self.__dict__.update(kept)
+
     # ---- a rollout ------------------------------------------------------------------------------
 
     def _roll_out(self) -> None:
@@ -177,6 +190,10 @@ class CompiledPPO:
         rollout = (self._rewards, self._values, self._ended, ahead)
         self._advantages[:] = advantages(*rollout, *discounts)
         self._targets[:] = self._advantages + self._values
+
+
+_STATE = ("env", "num_timesteps", "losses", "_rng", "_seen", "_returns", "_finished")
+"""Attributes of the state of a training, in addition to the networks."""
 
 
 def advantages(

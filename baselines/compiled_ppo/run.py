@@ -1,7 +1,9 @@
 """Training of a plan with the compiled PPO."""
 
 import io
+import pickle
 import time
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 import gymnasium
 
 from baselines.compiled_ppo.ppo import CompiledPPO
-from baselines.keeping import RunKeeper, best_file, last_file, replace_file
+from baselines.keeping import STATE, RunError, RunKeeper, best_file, last_file, replace_file
 from baselines.plans import Plan, description
 from baselines.policies import interface_of
 from baselines.seeds import first_seed
@@ -56,9 +58,11 @@ class CompiledKeeper(RunKeeper):
             losses = {f"train/{name}": value for name, value in model.losses.items()}
             self.events.add(model.num_timesteps, row | losses)
         model.policy(record).save(content)
-        replace_file(last_file(self._plan, self._folder), content.getvalue())
         if best:
             replace_file(best_file(self._plan, self._folder), content.getvalue())
+        with zipfile.ZipFile(content, "a") as archive:
+            archive.writestr(STATE, pickle.dumps((self.state(), model.state())))
+        replace_file(last_file(self._plan, self._folder), content.getvalue())
 
 
 def make_compiled(plan: Plan) -> CompiledPPO:
@@ -92,8 +96,17 @@ def run(
     tensorboard: bool,
     quiet: bool,
 ) -> CompiledKeeper:
-    """Train with the compiled PPO; see `baselines.training.train`."""
+    """Train, or resume from the folder's checkpoint; see `baselines.training.train`."""
     model, keeper = make_compiled(plan), CompiledKeeper(plan, folder, judge, quiet=quiet)
+    if (file := last_file(plan, folder)).exists():
+        try:
+            with zipfile.ZipFile(file) as archive:
+                kept, state = pickle.loads(archive.read(STATE))
+        except (zipfile.BadZipFile, KeyError, pickle.UnpicklingError, EOFError) as error:
+            raise RunError(f"the checkpoint in {folder} is damaged: {error}") from None
+        model.restore(state)
+        keeper.restore(kept, model.num_timesteps)
+
     if tensorboard:
         keeper.events = Events(folder / "tensorboard" / "run")
 
@@ -103,7 +116,7 @@ def run(
 
     with keeper.running():
         model.prepare()
-        keeper.begin()
+        keeper.begin(model.num_timesteps)
         model.learn(plan.recipe.steps, watch, quiet=True)  # the keeper has a progress bar
         keeper.finish(model, model.num_timesteps)
     if keeper.events is not None:

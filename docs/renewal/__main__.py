@@ -5,8 +5,8 @@
     python -m docs.renewal --only circle compare
     python -m docs.renewal --only speed_suites --again   # even if it is up to date
 
-Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables continue
-after an interruption.
+Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables resume where
+an interrupted run stopped.
 """
 
 import argparse

@@ -11,8 +11,7 @@ episodes on the truth and on the estimate, and so does PD control with tuned gai
 matrix of tracking errors and crash rates with 95 % intervals, and conclusions, and writes figures,
 numbers and a report (report.html) that opens without a network.
 
-An interrupted comparison continues with the trainings that are not finished when it is started
-again.
+An interrupted comparison continues where it stopped when it is started again.
 """
 
 import time
@@ -112,7 +111,8 @@ def main(args: CompareArgs) -> int:
         f"into {comparison.folder}."
     )
     jobs = args.jobs or resolve_threads(None)
-    if code := train_all(comparison.trainings, comparison.folder, jobs).exit_code():
+    driver = train_all(comparison.trainings, comparison.folder, jobs)
+    if code := driver.exit_code():
         return code
     matrix = compare.ComparisonResults(comparison, comparison.fly())
     for suite in comparison.suites:

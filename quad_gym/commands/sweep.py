@@ -6,9 +6,10 @@
     quad-gym sweep sweep.toml --dry-run
 
 Several values are separated by commas in key=value, and are lists in the file. Each training has a
-folder with the files of quad-gym train. Trainings run as processes of this machine. A sweep that
-was stopped or killed continues with the trainings that are not finished when it is started again.
-The tables, trainings.csv, groups.csv and table.txt, are made from the folders only.
+folder with the files of quad-gym train. Trainings run as processes of this machine. A training that
+dies restarts from its checkpoint; a sweep that was stopped or killed continues when it is started
+again; sweeps in one folder, also on several machines, share the work. The tables, trainings.csv,
+groups.csv and table.txt, are made from the folders only.
 """
 
 from dataclasses import dataclass, field
@@ -28,7 +29,7 @@ from quad_gym.commands.options import (
     usage_errors,
     value_of,
 )
-from quad_gym.experiments.driver import train_all
+from quad_gym.experiments.driver import RETRIES, train_all
 from quad_gym.experiments.experiment import Training, check_trainings
 from quad_gym.experiments.sweep_plan import DEFAULTS, TABLES, expand, read
 from quad_gym.experiments.sweep_table import FILES, row_of, table_text, write_tables
@@ -62,7 +63,7 @@ class SweepArgs:
     seeds: int | None = None
     """number of training seeds; defaults to 1"""
     evaluations: int | None = None
-    """number of evaluations of each training; defaults to 20"""
+    """number of evaluations and checkpoints of each training; defaults to 20"""
     episodes: int | None = None
     """number of episodes in each evaluation; defaults to 100"""
 
@@ -72,6 +73,8 @@ class SweepArgs:
     """number of parallel trainings; defaults to one per core"""
     threads: int = 1
     """number of threads of each training; it does not affect results"""
+    retries: int = RETRIES
+    """number of restarts of a training that died"""
     dry_run: bool = False
     """print all trainings, and which are finished, without training"""
     progress: bool = True
@@ -80,7 +83,7 @@ class SweepArgs:
 
 def configure(args: SweepArgs) -> tuple[list[Training], Path]:
     """Check all options, and expand them to trainings."""
-    require_at_least(args, seeds=1, evaluations=1, episodes=1, jobs=1, threads=1)
+    require_at_least(args, seeds=1, evaluations=1, episodes=1, jobs=1, threads=1, retries=0)
     given = _given(args, {} if args.file is None else read(args.file))
     leave(given["env"], "threads")
     given["env_ids"] = [known_id("env_ids", name) for name in given.get("env_ids", ["circle"])]
@@ -122,7 +125,7 @@ def main(args: SweepArgs) -> int:
     steps = sum(training.plan.recipe.steps for training in trainings)
     if args.dry_run:
         for training in trainings:
-            print(f"{training.folder}{'   finished' if training.record() else ''}")
+            print(f"{training.folder}{'   finished' if training.finished else ''}")
         print(f"{len(trainings)} trainings, {steps:,} steps.")
         return 0
     with usage_errors():
@@ -130,10 +133,10 @@ def main(args: SweepArgs) -> int:
     jobs = args.jobs or max(1, resolve_threads(None) // args.threads)
     print(f"{len(trainings)} trainings, {steps:,} steps; into {folder}.", flush=True)
     hidden = None if args.progress else True
-    outcome = train_all(trainings, folder, jobs, hidden=hidden)
+    driver = train_all(trainings, folder, jobs, retries=args.retries, hidden=hidden)
     rows = [row_of(training) for training in trainings]
     print(f"\n{table_text(rows)}", flush=True)
     with usage_errors((OSError,)):
         write_tables(rows, folder)
     print(f"Wrote {', '.join(FILES)} to {folder}.")
-    return outcome.exit_code()
+    return driver.exit_code()

@@ -3,12 +3,13 @@
     quad-gym train QuadGym/Circle-v0
     quad-gym train QuadGym/Hover-v0 --algorithm sac --seed 3 --env observation=truth
     quad-gym train circle --engine compiled
+    quad-gym train circle --resume
 
 Hyperparameters for the task and the algorithm come from baselines/recipes.py. During training, the
 policy is evaluated on the task by its true position error and saved: last.zip and best.zip (.npz
 with --engine compiled), which quad-gym evaluate can fly. The folder also contains training.json
-(everything needed to repeat the run), evaluations.csv, and files for TensorBoard. Ctrl-C stops a
-run after the present step; its best policy so far remains.
+(everything needed to repeat the run), evaluations.csv, and files for TensorBoard. An interrupted
+run continues exactly from its last checkpoint with --resume.
 """
 
 import sys
@@ -45,8 +46,10 @@ class TrainArgs:
     output: Path | None = None
     """folder of the run; defaults to results/train/TASK/ALGORITHM_seed_SEED; ALGORITHM begins
     with compiled_ for the compiled engine"""
+    resume: bool = False
+    """resume the run in this folder, or start a new one"""
     evaluations: int = 20
-    """number of evaluations during the run"""
+    """number of evaluations and checkpoints during the run"""
     episodes: int = 100
     """number of episodes in each evaluation"""
     threads: options.Threads = None
@@ -62,7 +65,7 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     """Check all options before training."""
     from baselines.plans import Plan
     from baselines.recipes import recipe
-    from baselines.training import finished_run, require_model
+    from baselines.training import require_model, run_in
     from quad_gym.analysis.reports import require_writable
 
     args = options.with_full_id(args)
@@ -88,8 +91,7 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     task = IDS[args.env_id]
     name = f"compiled_{args.algorithm}" if args.engine == "compiled" else args.algorithm
     folder = args.output or Path("results/train") / task / f"{name}_seed_{args.seed}"
-    if finished_run(folder, plan) is not None:
-        raise ValueError(f"folder {folder} already contains a run: choose another --output")
+    run_in(folder, plan, resume=args.resume)
     plan.make_judge().close()
     require_model(plan)
     require_writable("--output", folder)
@@ -101,15 +103,19 @@ def main(args: TrainArgs) -> None:
     from_start = time.perf_counter()
     with options.usage_errors():
         plan, folder = configure(args)
-    from baselines.keeping import RunError
+    from baselines.keeping import RunError, has_checkpoint
     from baselines.training import export, train
 
+    if args.resume and not has_checkpoint(folder):
+        print(f"There is no run to resume in {folder}: starting a new one.")
     print(
         f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
         f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
     )
     with options.usage_errors((RunError,)):
-        done = train(plan, folder, tensorboard=args.tensorboard, quiet=not args.progress)
+        done = train(
+            plan, folder, resume=args.resume, tensorboard=args.tensorboard, quiet=not args.progress
+        )
     total = time.perf_counter() - from_start
     print(
         f"{done.steps:,} steps in {done.seconds:.0f} s of training, "
@@ -118,7 +124,7 @@ def main(args: TrainArgs) -> None:
         f"{done.best['mean_error']:.4f} m, {done.best['crash_rate']:.1%} crashed."
     )
     if not done.finished:
-        print("Stopped. The same command begins again.", file=sys.stderr)
+        print("Stopped. Run the same command with --resume to continue.", file=sys.stderr)
         raise SystemExit(130)
     if args.export is not None:
         export(done, args.export)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from baselines.keeping import EVALUATIONS, best_file
 from baselines.plans import Plan
-from baselines.training import finished_run, require_model
+from baselines.training import require_model, run_in
 from quad_gym.experiments.flown import Flown, Trial
 
 Floats = NDArray[np.float64]
@@ -35,8 +35,13 @@ class Training:
         return f"{self.case}/seed_{self.plan.seed}"
 
     def record(self) -> dict[str, Any]:
-        """Contents of `training.json`; empty before the training is finished."""
-        return finished_run(self.folder, self.plan) or {}
+        """Contents of `training.json`; empty before the first checkpoint."""
+        return run_in(self.folder, self.plan, resume=True) or {}
+
+    @property
+    def finished(self) -> bool:
+        """True if all steps are completed."""
+        return bool(self.record().get("finished"))
 
     @property
     def best(self) -> str:
@@ -72,7 +77,7 @@ def make_trainings(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path
 
 def check_trainings(trainings: Iterable[Training]) -> None:
     """Check all folders, and make model and environment of each unfinished case once."""
-    for training in {each.case: each for each in trainings if not each.record()}.values():
+    for training in {each.case: each for each in trainings if not each.finished}.values():
         try:
             require_model(training.plan)
             training.plan.make_judge().close()

@@ -1,8 +1,9 @@
 """Tables of a sweep, made from its folders only, without times and paths.
 
-A training that is not finished has no scores.
+An unfinished training has only its steps.
 """
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,13 @@ FILES = ("trainings.csv", "groups.csv", "table.txt")
 def row_of(training: Training) -> dict[str, Any]:
     """Row of a training, from its folder."""
     record = training.record()
-    best = record.get("best", {})
+    finished = bool(record.get("finished"))
+    best = record["best"] if finished else {}
     return {
         "group": training.case,
         "seed": training.plan.seed,
-        "finished": bool(record),
-        "steps": record.get("steps"),
+        "finished": finished,
+        "steps": record["steps"] if finished else training.steps_done(),
         "best_steps": best.get("steps"),
         "episodes": training.plan.episodes,
         **{name: best.get(name) for name in SCORES},
@@ -80,7 +82,7 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
     for row in rows:
         finished = "yes" if row["finished"] else "no"
         name = f"{row['group']}/seed_{row['seed']}"
-        single.append([name, finished, cell(row, "steps", ","), *cells(row)])
+        single.append([name, finished, f"{row['steps']:,}", *cells(row)])
     mean = "best evaluation: mean over finished seeds [95 % interval, Student's t]"
     first = text_table({"": ("group", "finished"), mean: headings}, groups)
     heads = {"": ("training", "finished", "steps"), "best evaluation": headings}
@@ -88,7 +90,10 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def write_tables(rows: Sequence[dict[str, Any]], folder: Path) -> None:
-    """Write `FILES`."""
-    for name, table in zip(FILES, (rows, groups_of(rows)), strict=False):
-        write_csv(folder / name, columns_of(table))
-    (folder / FILES[-1]).write_text(table_text(rows), encoding="utf-8")
+    """Write `FILES` atomically."""
+    parts = [folder / f"{name}.{os.getpid()}.part" for name in FILES]  # of this sweep alone
+    for part, table in zip(parts, (rows, groups_of(rows)), strict=False):
+        write_csv(part, columns_of(table))
+    parts[-1].write_text(table_text(rows), encoding="utf-8")
+    for part, name in zip(parts, FILES, strict=True):
+        part.replace(folder / name)

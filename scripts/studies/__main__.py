@@ -10,7 +10,7 @@ Arms of scripts/studies/arms.py (or of a file like it) are trained with the comp
 with another algorithm of Stable-Baselines3 that they name, and every policy
 flies the same test episodes on the estimate. Prints a table with means over the seeds and 95 %
 intervals over seeds and episodes, and conclusions, and writes figures, numbers and a report. Each
-training is a folder: an interrupted study continues with those that are not finished.
+training is a folder: an interrupted study continues where it stopped.
 """
 
 import time
@@ -121,9 +121,8 @@ def _recipe(args: StudyArgs, algorithm: str) -> Recipe:
 def complete(study: Study) -> None:
     """Complete the trainings one after the other."""
     for number, training in enumerate(study.trainings, 1):
-        if training.record():
-            continue
-        if not train(training.plan, training.folder, tensorboard=False, quiet=True).finished:
+        done = train(training.plan, training.folder, resume=True, tensorboard=False, quiet=True)
+        if not done.finished:
             raise SystemExit(stopped())
         print(progress(number, study.trainings, training), flush=True)
 

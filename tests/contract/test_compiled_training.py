@@ -1,6 +1,8 @@
-"""Trainings with the compiled engine are repeatable, stop on a signal, and need no torch."""
+"""Trainings with the compiled engine are repeatable, resume after a kill, and need no torch."""
 
+import json
 import signal
+import zipfile
 from pathlib import Path
 
 import gymnasium
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 from baselines.compiled_ppo import CompiledPPO
+from baselines.keeping import STATE
 from baselines.mlp import MlpPolicy
 from baselines.plans import Plan
 from baselines.policies import PRETRAINED, load_policy
@@ -39,7 +42,45 @@ def run(plan, folder, **options):
     return train(plan, folder, quiet=True, **options)
 
 
-def test_run_stopped_between_evaluations_begins_again(tmp_path, monkeypatch):
+def assert_same_policy(first, second):
+    first, second = (MlpPolicy.load(f / "last.npz") for f in (first, second))
+    for a, b in zip(first.weights + first.biases, second.weights + second.biases, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def die_after(rollouts, plan, folder, monkeypatch):
+    """Train until a rollout fails."""
+    calls = iter(range(10_000))
+    roll_out = CompiledPPO._roll_out
+
+    def die(self):
+        if next(calls) == rollouts:
+            raise RuntimeError("died")
+        roll_out(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CompiledPPO, "_roll_out", die)
+        with pytest.raises(RuntimeError, match="died"):
+            run(plan, folder)
+
+
+@pytest.mark.parametrize("rollouts", [3, 8])
+def test_resumed_run_equals_uninterrupted_run(tmp_path, monkeypatch, rollouts):
+    plan = small_plan()
+    run(plan, tmp_path / "whole")
+    die_after(rollouts, plan, tmp_path / "cut", monkeypatch)
+    assert run(plan, tmp_path / "cut", resume=True).finished
+    assert_same_policy(tmp_path / "whole", tmp_path / "cut")
+    assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "cut")
+
+
+def evaluations(folder):
+    """Return rows of the evaluations, without their times."""
+    lines = (folder / "evaluations.csv").read_text().split()
+    return [line.split(",")[:1] + line.split(",")[2:] for line in lines]
+
+
+def test_run_stopped_between_evaluations_has_no_further_evaluation(tmp_path, monkeypatch):
     plan = small_plan()  # an evaluation every two rollouts
     run(plan, tmp_path / "whole")
     roll_out = CompiledPPO._roll_out
@@ -55,17 +96,9 @@ def test_run_stopped_between_evaluations_begins_again(tmp_path, monkeypatch):
         stopped = run(plan, tmp_path / "cut")
     assert (stopped.finished, stopped.steps) == (False, 768)
     assert len(evaluations(tmp_path / "cut")) == 1 + 2  # a header, and steps 0 and 512
-    assert run(plan, tmp_path / "cut").finished
-    first, second = (MlpPolicy.load(tmp_path / f / "last.npz") for f in ("whole", "cut"))
-    for a, b in zip(first.weights + first.biases, second.weights + second.biases, strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert run(plan, tmp_path / "cut", resume=True).finished
+    assert_same_policy(tmp_path / "whole", tmp_path / "cut")
     assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "cut")
-
-
-def evaluations(folder):
-    """Return rows of the evaluations, without their times."""
-    lines = (folder / "evaluations.csv").read_text().split()
-    return [line.split(",")[:1] + line.split(",")[2:] for line in lines]
 
 
 def asymmetric_plan(critic_only=15, **changes):
@@ -187,6 +220,19 @@ def test_training_with_the_same_draws_equals_stable_baselines(activation, normal
     assert len(ours._finished) > 30
     episodes = [record["r"] for record in theirs.ep_info_buffer]
     assert ours.training_return == pytest.approx(np.mean(episodes), rel=1e-3)
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path):
+    run(small_plan(), tmp_path)
+    record = json.loads((tmp_path / "training.json").read_text())
+    (tmp_path / "training.json").write_text(json.dumps(record | {"finished": False}))
+    with zipfile.ZipFile(tmp_path / "last.npz") as archive:
+        assert STATE in archive.namelist()
+    (tmp_path / "last.npz").write_bytes(b"PK nonsense")
+    with pytest.raises(ValueError, match="damaged"):
+        run(small_plan(), tmp_path, resume=True)
+    with pytest.raises(ValueError, match=r"another plan \(different: engine\)"):
+        run(small_plan(engine="sb3"), tmp_path, resume=True)
 
 
 def command(tmp_path, *more):

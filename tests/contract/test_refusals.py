@@ -114,7 +114,7 @@ NAMED = {
         *("--seed -1 --output it.npz", "--speed 0 --output it.npz", "--duration 0 --output it.npz"),
         "--fault-time 2 3 --output it.npz",
     ),
-    "sweep": ("--jobs 0 --engine compiled",),
+    "sweep": ("--jobs 0 --engine compiled", "--retries -1 --engine compiled"),
     "train": ("--steps abc", "--output"),
     "tune": ("--candidates 0", "--output /dev/null/x"),
 }

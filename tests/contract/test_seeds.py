@@ -68,10 +68,10 @@ def test_refuses_seeds_out_of_their_block(purpose, seed, count, message):
 def test_trainings_are_evaluated_on_seeds_of_validation_block():
     """The algorithm also seeds its environment, which must not change the flights."""
     pytest.importorskip("stable_baselines3")
+    from baselines.checkpoints import Keeper
     from baselines.models import make_model
     from baselines.plans import Plan
     from baselines.recipes import recipe
-    from baselines.sb3_run import Keeper
 
     flown = []
     for seed in (0, 4):

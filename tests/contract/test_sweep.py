@@ -88,10 +88,12 @@ def test_invalid_file_is_rejected_with_one_line(tmp_path, text, message):
 def pretend(training, error):
     """Write the files of a training, finished if an error is given."""
     training.folder.mkdir(parents=True)
+    (training.folder / "last.npz").touch()
     best = {"steps": 96.0, "mean_error": error, "crash_rate": 0.25, "return": 7.0}
     record = {"plan": description(training.plan), "finished": error is not None}
     record |= {} if error is None else {"steps": 128, "best": best, "training_seconds": time.time()}
     (training.folder / "training.json").write_text(json.dumps(record))
+    (training.folder / "evaluations.csv").write_text("steps,mean_error\n0,1\n64,0.5\n")
 
 
 def test_tables_contain_records_of_folders(tmp_path):
@@ -100,7 +102,7 @@ def test_tables_contain_records_of_folders(tmp_path):
         pretend(training, error)
     rows = [row_of(training) for training in trainings]
     assert [row["finished"] for row in rows] == [True, True, True, False, False]
-    assert [row["steps"] for row in rows] == [128, 128, 128, None, None]
+    assert [row["steps"] for row in rows] == [128, 128, 128, 64, 0]
     assert [row["mean_error"] for row in rows] == [0.1, 0.2, 0.6, None, None]
     (group,) = groups_of(rows)
     assert (group["trainings"], group["finished"]) == (5, 3)

@@ -1,4 +1,4 @@
-"""Trainings are repeatable, stop on a signal, and refuse invalid plans at the start."""
+"""Trainings are repeatable, resume after a kill, and refuse invalid plans at the start."""
 
 import json
 import os
@@ -95,36 +95,107 @@ def test_td3_explores_with_action_noise():
     assert 0.09 < drawn.std() < 0.11
 
 
-@pytest.mark.slow  # a process
-def test_interrupted_command_keeps_its_last_policy_and_begins_again(tmp_path):
-    folder = tmp_path / "run"
+@pytest.mark.parametrize(
+    ("algorithm", "steps"),
+    [
+        *(("ppo", 70), ("sac", 75)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("ppo", 20), ("td3", 75))),
+    ],
+)
+def test_resumed_run_equals_uninterrupted_run(tmp_path, monkeypatch, algorithm, steps):
+    plan = small_plan(algorithm)
+    train(plan, tmp_path / "whole", **QUIET)
+    from baselines.checkpoints import Keeper
+
+    calls = iter(range(10_000))
+
+    def die(self):
+        if next(calls) == steps:
+            raise RuntimeError("died")
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Keeper, "_on_step", die)
+        with pytest.raises(RuntimeError, match="died"):
+            train(plan, tmp_path / "cut", **QUIET)
+    done = train(plan, tmp_path / "cut", resume=True, **QUIET)
+    assert done.finished
+    assert_same(weights(tmp_path / "whole", algorithm), weights(tmp_path / "cut", algorithm))
+
+
+def options(folder, *more):
     few = ["--no-progress", "--no-tensorboard", "--threads", "1", "--episodes", "4"]
     few += ["--env", "duration=1.0", "--n-envs", "16", "--set", "n_steps=16", "batch_size=128"]
-    line = console_commands.line("train", CIRCLE, "--output", folder, *few, "--steps", 500_000)
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen(line, cwd=tmp_path, text=True, **pipes)
-    end = time.monotonic() + 600.0
-    while not (folder / "evaluations.csv").exists():
+    return [CIRCLE, "--output", str(folder), *few, *more]
+
+
+def script(folder, *more):
+    return console_commands.line("train", *options(folder, *more))
+
+
+def rows(folder):
+    file = folder / "evaluations.csv"
+    return len(file.read_text().splitlines()) - 1 if file.exists() else 0
+
+
+def wait_for(condition, process, seconds=1200.0):
+    end = time.monotonic() + seconds
+    while not condition():
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < end
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
+
+
+CALM = [pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGINT, signal.SIGTERM)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, *CALM])
+def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
+    folder = tmp_path / "run"
+    line = script(folder, "--steps", "500000", "--evaluations", "400")
+    process = subprocess.Popen(
+        line, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    wait_for(lambda: rows(folder) >= 3, process)
+    process.send_signal(number)
     _, err = process.communicate(timeout=120)
-    assert process.returncode == 130, err
-    assert "The same command begins again" in err
-    assert not json.loads((folder / "training.json").read_text())["finished"]
-    assert algorithm_class("ppo").load(folder / "last.zip", device="cpu").num_timesteps == 0
-    more = ["--output", folder, *few, "--steps", 400, "--evaluations", 2]
-    again = console_commands.run("train", CIRCLE, *more, where=tmp_path)
-    assert again.returncode == 2  # a different number of steps is a different plan
-    assert "different: recipe" in again.stderr
+    calm = number != signal.SIGKILL
+    assert process.returncode == (130 if calm else -signal.SIGKILL), err
+    if calm:
+        assert "--resume" in err
+    kept = rows(folder)
+    model = algorithm_class("ppo").load(folder / "last.zip", device="cpu")
+    # the first row is of step 0, and the last may be written shortly before its checkpoint
+    assert model.num_timesteps >= (kept - 1) * 1250 - 1250 - 256
+    steps = str(int(model.num_timesteps) + 1024)
+    finished = train_again(folder, steps, tmp_path)
+    assert "goes on" not in finished.stderr
+    assert finished.returncode == 2  # a different number of steps is a different plan
+    assert "different: recipe" in finished.stderr
+
+
+def train_again(folder, steps, where):
+    more = ("--steps", steps, "--evaluations", "400", "--resume")
+    return console_commands.run("train", *options(folder, *more), where=where)
+
+
+def test_resume_without_run_starts_new_run_with_message(tmp_path):
+    few = ("--steps", 400, "--evaluations", 2, "--no-tensorboard", "--resume")
+    done = console_commands.run("train", *options(tmp_path / "run", *few), where=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout.startswith(
+        f"There is no run to resume in {tmp_path / 'run'}: starting a new one.\n"
+    )
+    again = console_commands.run("train", *options(tmp_path / "run", *few), where=tmp_path)
+    assert again.returncode == 0
+    assert "no run to resume" not in again.stdout
 
 
 def test_a_folder_with_a_run_is_not_overwritten(trained):
     with pytest.raises(ValueError, match="already contains a run"):
         train(small_plan(), trained, **QUIET)
     with pytest.raises(ValueError, match=r"another plan \(different: seed, first_flights\)"):
-        train(small_plan(seed=3), trained, **QUIET)
+        train(small_plan(seed=3), trained, resume=True, **QUIET)
     record = json.loads((trained / "training.json").read_text())
     assert record["finished"]
     assert record["plan"]["recipe"]["flights"] == {"start": "mixed", "randomize_reference": True}

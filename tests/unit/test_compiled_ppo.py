@@ -1,4 +1,4 @@
-"""The compiled PPO: gradients, first weights, repeatability and learning."""
+"""The compiled PPO: gradients, first weights, repeatability, saved states and learning."""
 
 import gymnasium
 import numpy as np
@@ -70,6 +70,24 @@ def test_same_seed_same_bits_with_any_number_of_threads(critic_only):
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0], found[2])
     assert not np.array_equal(found[0], found[3])
+
+
+@pytest.mark.parametrize("critic_only", [0, 1])
+def test_training_continues_bit_for_bit_from_restored_state(critic_only):
+    states, recipe = [], small_recipe(parameters={"critic_only": critic_only})
+
+    def watch(model):
+        states.append(model.state())
+        return True
+
+    model = CompiledPPO(sliders(), recipe, seed=0)
+    model.learn(1000, watch)
+    for state in states[1::3]:
+        other = CompiledPPO(sliders(), recipe, seed=9)
+        other.restore(state)
+        other.learn(1000)
+        np.testing.assert_array_equal(other.networks.params, model.networks.params)
+        assert other.training_return == model.training_return
 
 
 def test_training_improves_return_in_foreign_environment():
