@@ -94,7 +94,8 @@ class FlightBatch(FlightMemory):
         if c.filters and c.filter_start == "warm":
             pack_warm_start(self._settings[0], FlightBatch, c)
         self._stages = needed_stages(self._settings[0])
-        digest = configuration_digest(self._settings, model, true, *self._paths)
+        mode = np.array((c.compiled_autoreset,), [("autoreset", np.int64)])
+        digest = configuration_digest(self._settings, mode, model, true, *self._paths)
         used = used_parts(self._settings[0])
         self._allocate(room_of(used), c.draws.low, digest)
         self._words, self._written = words_of_update(self._settings[0], used)

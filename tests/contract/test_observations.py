@@ -7,13 +7,7 @@ import quad_gym
 from quad_gym.envs.spaces import layout_bounds
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params.sensors import AID_PARAMS
-from quad_gym.records import (
-    COLUMNS,
-    FEATURE_BLOCKS,
-    FEATURE_SLICE,
-    MAX_OBSERVATION,
-    MAX_TOGETHER,
-)
+from quad_gym.records import COLUMNS, FEATURE_SLICE, MAX_FEATURES, MAX_OBSERVATION
 from tests.builders import actions_of, vec_env
 from tests.contract.test_tasks import SECONDS, UNBOUNDED, body_axes, level, unit
 from tests.reference_ukf import east_north_up
@@ -301,9 +295,8 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
 
 def test_observation_with_all_parts_fits_in_maximum_length():
     suite = quad_gym.sensor_suite("rtk")
-    aids = {name: kind() for name, kind in AID_PARAMS.items()}
-    count = MAX_TOGETHER - FEATURE_BLOCKS - sum(params.blocks for params in aids.values())
-    camera = suite.camera.replace(features_I=((1.0, 0.0, 0.0),) * count)
+    aids = {name: kind() for name, kind in AID_PARAMS.items() if kind.most_blocks == 1}
+    camera = suite.camera.replace(features_I=((1.0, 0.0, 0.0),) * MAX_FEATURES)
     suite = suite.replace(camera=camera, **aids)
     shown = {"include_std": True, "privileged": True, "sensors": suite, "drawn": tuple(COLUMNS)}
     table = quad_gym.observation_layout("measurements", **shown)

@@ -107,12 +107,13 @@ def _without_place(text: str) -> str:
     callee, unknown = _CALLEE.search(text), re.search(r"name '(\w+)' is not defined", text)
     name = callee.group(1) if callee else "the stage"
     for module in list(sys.modules.values()):
-        file = getattr(module, "__file__", None) if hasattr(module, name) else None
-        lines = Path(file).read_text(encoding="utf-8").splitlines() if unknown and file else []
-        for number, line in enumerate(lines, 1):
-            used = unknown and re.search(rf"\b{unknown.group(1)}\b", line)
-            if used and _at(Path(str(file)), number)[0] == name:
-                return f"{name}, {_short(str(file))}:{number}: {line.strip()}"
+        if unknown is None or name not in getattr(module, "__dict__", {}):
+            continue
+        file = inspect.getfile(module)
+        for number, line in enumerate(Path(file).read_text(encoding="utf-8").splitlines(), 1):
+            used = re.search(rf"\b{unknown.group(1)}\b", line)
+            if used and _at(Path(file), number)[0] == name:
+                return f"{name}, {_short(file)}:{number}: {line.strip()}"
     return name
 
 
