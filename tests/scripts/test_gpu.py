@@ -13,6 +13,7 @@ pytest.importorskip("torch")
 from scripts.benchmarks import gpu
 
 
+@pytest.mark.slow  # compiles PTX in C
 @pytest.mark.skipif(machine() not in PROCESSORS, reason="no code for this processor")
 def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gpu, "DURATION", 0.0)
