@@ -22,6 +22,7 @@ from quad_gym.packing.configuration import MAX_FLIGHTS
 from quad_gym.params import checks as check
 
 _ON_PROCESSOR = ("threads", "render_mode", "render_flights")
+_WRONG = ("faults",)  #: keywords with which NVIDIA's assembler emits wrong code, see docs/gpu.md
 
 
 class QuadDeviceVecEnv(QuadTorchVecEnv):
@@ -44,7 +45,8 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
     Raises:
         TypeError: If a keyword is unknown; the exception is also a ValueError.
         ValueError: If there is no GPU, the value of a keyword is invalid, or the configuration
-            needs Python during a step: tasks and estimators in Python, and rendering.
+            has faults, or needs Python during a step: tasks and estimators in Python, and
+            rendering.
         ImportError: If cuda-core or Numba is not installed.
     """
 
@@ -60,7 +62,7 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
         **keywords: Unpack[VectorKeywords],
     ) -> None:
         given: dict[str, Any] = dict(keywords)
-        for name in _ON_PROCESSOR:
+        for name in (*_ON_PROCESSOR, *(_WRONG if launcher is None else ())):
             if given.pop(name, None) is not None:
                 raise ValueError(f"{name} is of flights on the processor, and must not be given")
         check.whole("num_envs", num_envs, most=MAX_FLIGHTS)

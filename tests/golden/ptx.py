@@ -154,6 +154,10 @@ def _statement(line, targets, places):
     if name.startswith("st."):
         size = re.sub(r"\D", "", name.rpartition(".")[2])
         return f"st{size}({_address(a[0], places)}, {_operand(a[1], places)});"
+    if name.startswith("ld.") and a[0].startswith("{"):
+        bits, address = name.rpartition(".b")[2], _address(a[1], places)
+        parts = enumerate(_operand(x, places) for x in a[0].strip("{}").split(","))
+        return " ".join(f"{x} = ld{bits}({address} + {k} * {bits} / 8);" for k, x in parts)
     if a[0].startswith("{"):
         low, high = a[0].strip("{}").split(",")
         value, by = _operand(a[1], places), int(name[5:]) // 2

@@ -172,6 +172,11 @@ def test_flights_that_need_python_are_refused_on_a_gpu(keywords, message):
         device_env(**{"base": "circle", "count": 2} | keywords)
 
 
+def test_faults_are_refused_on_a_gpu():
+    with pytest.raises(ValueError, match="faults is of flights on the processor"):
+        quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 2, device="cuda", faults="gnss_outage")
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_missing_gpu_is_named():
     with pytest.raises(ValueError, match="needs an NVIDIA GPU and a torch with CUDA"):
