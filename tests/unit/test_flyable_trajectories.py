@@ -96,19 +96,13 @@ def test_infeasible_trajectory_error_names_value_time_and_segment():
 
 def test_trajectory_that_needs_negative_thrust_raises_value_error():
     """A fall faster than gravity needs rotors that pull, unless the vehicle is upside down."""
-    times = np.linspace(0.0, 1.0, 5)
-
-    def fall(acceleration):
-        heights = 9.0 - 0.5 * acceleration * times**2
-        points = [(0.0, 0.0, height) for height in heights]
-        return Trajectory.through(points, times, at_rest=False)
-
-    path = fall(11.0)
+    path = Trajectory.of(lambda t: (0.0, 0.0, 9.0 - 5.5 * t * t), 1.0)
     path.check(VEHICLE, max_tilt=math.pi)  # upside down, thrust downward
     with pytest.raises(ValueError, match="a tilt of 180 degrees"):
         path.check(VEHICLE, max_tilt=math.radians(100.0))
+    free_fall = Trajectory.of(lambda t: (0.0, 0.0, 9.0 - 0.5 * VEHICLE.gravity * t * t), 1.0)
     with pytest.raises(ValueError, match="is infeasible for this vehicle"):
-        fall(VEHICLE.gravity).check(VEHICLE)
+        free_fall.check(VEHICLE)
 
 
 def test_jumps_are_refused():

@@ -187,16 +187,16 @@ def eight_acceleration(t):
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_trajectory_through_a_sampled_function_matches_it_and_its_derivatives(closed):
-    times = np.linspace(0.0, 2.0 * np.pi, 129)
-    points = np.transpose(eight(times))[: 128 if closed else 129]
-    path = Trajectory.through(points, times, closed=closed, at_rest=False)
+def test_trajectory_of_function_matches_function_and_its_derivatives(closed):
+    path = Trajectory.of(eight, 2.0 * np.pi, closed=closed, yaw=lambda t: t)
     t = np.linspace(0.0, path.duration, 1003)[:-1]
-    t = t if closed else t[100:-100]  # derivatives from the fourth on are zero at open ends
     for k, (function, miss) in enumerate(
         ((eight, 2e-6), (eight_velocity, 2e-4), (eight_acceleration, 1e-2))
     ):
         np.testing.assert_allclose(path(t, k), np.transpose(function(t)), rtol=0.0, atol=miss)
+    np.testing.assert_allclose(path.yaw(t), t, rtol=0.0, atol=1e-6)
+    finer = Trajectory.of(eight, 2.0 * np.pi, closed=closed, tolerance=1e-9)
+    np.testing.assert_allclose(finer(t), np.transpose(eight(t)), rtol=0.0, atol=2e-9)
 
 
 def test_trajectory_from_csv_passes_points_at_given_times(tmp_path):
@@ -260,7 +260,6 @@ def test_bad_tables_are_refused(tmp_path, text, message):
         ((FIVE,), {"yaw": "north"}, "yaw must be one of along"),
         ((FIVE,), {"yaw": 90}, r"yaw must be in rad, .*, got 90; did you mean 1\.571\?"),
         ((FIVE,), {"yaw": [0.0, 1.0]}, r"yaw must have shape|yaw must"),
-        ((FIVE,), {"yaw": lambda t: t}, "yaw must be a number"),
         ((FIVE,), {"yaw": 0.0, "look_at": (0, 0)}, "yaw must not be given with look_at"),
         ((FIVE,), {"look_at": (0.0,)}, "look_at must have shape"),
         ((FIVE,), {"closed": 1}, "closed must be True or False"),
@@ -269,6 +268,23 @@ def test_bad_tables_are_refused(tmp_path, text, message):
 def test_hostile_points_are_refused(arguments, options, message):
     with pytest.raises(ValueError, match=message):
         Trajectory.through(*arguments, **options)
+
+
+@pytest.mark.parametrize(
+    ("function", "options", "message"),
+    [
+        (None, {}, "function must be a function"),
+        (lambda t: (t, t), {}, r"function\(0\) must have shape \(3\)"),
+        (lambda t: (t, t, np.nan), {}, r"function\(0\) must be finite"),
+        (lambda t: (abs(t - 1.0), 0, 1), {}, "function must be smooth"),
+        (lambda t: (t, 0, 1), {"closed": True}, "must return to its start"),
+        (eight, {"duration": 0.0}, "duration must be"),
+        (eight, {"yaw": [0.0, 1.0]}, "got an array"),
+    ],
+)
+def test_hostile_functions_are_refused(function, options, message):
+    with pytest.raises(ValueError, match=message):
+        Trajectory.of(function, **{"duration": 2.0, **options})
 
 
 def test_bad_coefficients_are_refused():

@@ -70,7 +70,9 @@ def through(
     check.flag("closed", closed)
     check.flag("at_rest", at_rest)
     places = _places(points, 2 if at_rest or closed else order)
-    rule, point, angles = _heading_choice(yaw, look_at)
+    rule, point, angles = heading_choice(yaw, look_at)
+    if callable(angles):
+        raise ValueError("yaw must be angles at the points, not a function; see Trajectory.of")
     if np.ndim(angles) > 0:
         angles = check.array("yaw", angles, (len(places),))
     if closed:
@@ -102,10 +104,11 @@ def through(
     return Pieces(when, terms, closed, rule, point)
 
 
-def _heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, float], Any]:
+def heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, float], Any]:
     """Return the rule that a heading follows, `Trajectory.heading`, and its point (2,).
 
-    The third value is the source of the angles: a number, or `yaw` itself if it is an array.
+    The third value is the source of the angles: a number, or `yaw` itself if it is a function or an
+    array.
     """
     if look_at is not None:
         if yaw is not None:
@@ -118,7 +121,7 @@ def _heading_choice(yaw: Any, look_at: Any) -> tuple[HeadingRule, tuple[float, f
         return "along", (0.0, 0.0), 0.0
     if yaw is None:
         return "given", (0.0, 0.0), 0.0
-    if np.ndim(yaw) > 0:
+    if callable(yaw) or np.ndim(yaw) > 0:
         return "given", (0.0, 0.0), yaw
     return "given", (0.0, 0.0), check.angle("yaw", yaw)
 
@@ -182,7 +185,7 @@ def coefficients(
     else:
         ends = [(k, np.zeros(values.shape[1])) for k in known]
         spline = make_interp_spline(times, values, k=degree, bc_type=(ends, ends))
-    terms = _polynomials(spline, times, degree)
+    terms = polynomials(spline, times, degree)
     terms[7] = values[:-1]  # what they are, without the rounding of the solution
     if not closed:
         for k in known:
@@ -190,7 +193,7 @@ def coefficients(
     return terms
 
 
-def _polynomials(spline: Any, times: Floats, degree: int) -> Floats:
+def polynomials(spline: Any, times: Floats, degree: int) -> Floats:
     """Return the coefficients (8, m, n) of a spline in the segments between times (m + 1,)."""
     values = np.array([spline(times[:-1], k) for k in range(degree + 1)])
     terms = np.zeros((8, *values.shape[1:]))

@@ -14,6 +14,7 @@ from quad_gym.params.checked import Checked
 from quad_gym.params.checks import Vector
 from quad_gym.params.shown import show
 from quad_gym.params.trajectories.feasibility import check_trajectory
+from quad_gym.params.trajectories.fitting import fit
 from quad_gym.params.trajectories.pieces import Floats, HeadingRule, Pieces
 from quad_gym.params.trajectories.reading import from_csv
 from quad_gym.params.trajectories.splines import through
@@ -47,7 +48,7 @@ class Trajectory(Checked, eq=False):
     """Desired position and heading over time: piecewise polynomials, exact in the kernels, too.
 
     In the segment that begins at t_j, `r*(t) = sum_k c_k (t - t_j)^(7 - k)`, and the yaw has the
-    same form. Make trajectories with `through` or `from_csv` rather than from coefficients. A
+    same form. Make trajectories with `through`, `from_csv` or `of` rather than from coefficients. A
     closed trajectory repeats; an open one stands still at its first point before time 0, and at its
     last point after its end.
 
@@ -80,6 +81,7 @@ class Trajectory(Checked, eq=False):
 
     through = _making(through)
     from_csv = _making(from_csv)
+    of = _making(fit)
     check = check_trajectory
 
     @property
