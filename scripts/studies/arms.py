@@ -97,6 +97,12 @@ ARMS = (
         policy="pd:features_when_uncertain",
         environment={"include_std": True},
     ),
+    Arm(
+        "pd_planning",
+        "PD that plans by covariances",
+        policy="planning",
+        environment={"include_std": True},
+    ),
     Arm("truth", "truth", training={"observation": "truth"}),
     Arm("noisy", "truth + independent noise", training={"observation": "noisy"}),
     Arm(
@@ -173,6 +179,7 @@ OUTAGE_DASH = (
     Arm("pd", "PD at 4.7 m/s", policy="pd"),
     Arm("pd_slow", "PD at 2.4 m/s", policy="pd:slow"),
     Arm("pd_waiting", "PD that waits when uncertain", policy="pd:waiting", environment=_STD),
+    Arm("pd_planning", "PD that plans by covariances", policy="planning", environment=_STD),
     Arm("truth", "truth", environment=_SCALED, training=_TRUTH, learning=_CONSTANT_CRASH_COST),
     Arm("estimate", "estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
     Arm(

@@ -14,9 +14,11 @@ from baselines.recipes import Recipe
 from quad_gym.analysis.intervals import Estimated, rate_over_trainings
 from quad_gym.analysis.reports import as_json
 from quad_gym.envs.effects import with_effect
+from quad_gym.evaluation import Policy
 from quad_gym.experiments.experiment import Experiment, Floats
 from quad_gym.experiments.flown import Flown, Trial
 from scripts.studies.arms import Arm
+from scripts.studies.planning import PlanningPolicy
 from scripts.studies.scores import Score, mean_over_trainings, probability_of_improvement
 from scripts.studies.tasks import StudiedTask
 from scripts.studies.traces import ViewRecorder
@@ -24,7 +26,7 @@ from scripts.studies.traces import ViewRecorder
 
 @dataclass(frozen=True, kw_only=True)
 class StudyTrial(Trial):
-    """Test episodes with traces of the first ones."""
+    """Test episodes that also the policy "planning" flies, with traces of the first ones."""
 
     traced: tuple[str, ...]
     """Names from `TRACES`"""
@@ -32,6 +34,10 @@ class StudyTrial(Trial):
     def recorder(self) -> ViewRecorder:
         """Make the recorder of the episodes."""
         return ViewRecorder(self.traced)
+
+    def load(self, policy: str) -> Policy:
+        """Load a policy by name or file."""
+        return PlanningPolicy(self.env) if policy == "planning" else super().load(policy)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
