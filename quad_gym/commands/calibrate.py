@@ -186,9 +186,11 @@ def fit_body(args: CalibrateArgs, suite: "SensorSuite", starts: list[dict[str, A
 
     assert args.vehicle is not None
     logs = [read_log(log, **args.reading()) for log in args.logs]
-    if any(log.motors is None for log in logs):
+    lacking = [path for path, log in zip(args.logs, logs, strict=True) if log.motors is None]
+    if lacking:
+        which = "the log" if len(logs) == 1 else lacking[0]
         return (
-            f"Wrote no {args.vehicle}: the log has no motor voltages (columns motor_0 to motor_3)."
+            f"Wrote no {args.vehicle}: {which} has no motor voltages (columns motor_0 to motor_3)."
         )
     with usage_errors():
         begin = args.vehicle_from or "lab"

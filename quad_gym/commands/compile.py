@@ -66,8 +66,8 @@ class CompileArgs:
         if not self.stages:
             raise ValueError("--stages must have at least one value, got none")
         require_at_least(self, jobs=1)
-        if self.stage is not None and self.library:
-            raise ValueError("--stage must not come with --library")
+        if self.stage is not None and (self.library or self.ptx):
+            raise ValueError(f"--stage must not come with --{'library' if self.library else 'ptx'}")
         if (self.lanes or self.family) and not self.library:
             name = "lanes" if self.lanes else "family"
             raise ValueError(f"--{name} must come with --library")

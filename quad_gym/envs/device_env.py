@@ -22,7 +22,6 @@ from quad_gym.packing.configuration import MAX_FLIGHTS
 from quad_gym.params import checks as check
 
 _ON_PROCESSOR = ("threads", "render_mode", "render_flights")
-_WRONG = ("faults",)  #: keywords with which NVIDIA's assembler emits wrong code, see docs/gpu.md
 
 
 class QuadDeviceVecEnv(QuadTorchVecEnv):
@@ -62,9 +61,14 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
         **keywords: Unpack[VectorKeywords],
     ) -> None:
         given: dict[str, Any] = dict(keywords)
-        for name in (*_ON_PROCESSOR, *(_WRONG if launcher is None else ())):
+        for name in _ON_PROCESSOR:
             if given.pop(name, None) is not None:
                 raise ValueError(f"{name} is of flights on the processor, and must not be given")
+        if launcher is None and given.get("faults") is not None:
+            raise ValueError(
+                "faults must not be given for a GPU, because NVIDIA's assembler emits wrong code "
+                "for them (docs/gpu.md)"
+            )
         check.whole("num_envs", num_envs, most=MAX_FLIGHTS)
         on_gpu = checked_device(device)
         if launcher is None and not torch.cuda.is_available():

@@ -3,10 +3,10 @@
     python -m scripts.benchmarks.gpu prepare FOLDER     # on any machine, in a clone with all extras
     python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine
 
-The first part emits a module for each golden case that a GPU can fly, which takes half an hour on
-two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and cuda-core.
-Both skip the parts in FOLDER: if one was interrupted or ran out of time, run it again. Results are
-in FOLDER/results.json.
+The first part emits a module for each golden case that a GPU can fly, which takes a quarter of an
+hour on two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and
+cuda-core. Both skip the parts in FOLDER: if one was interrupted or ran out of time, run it again.
+Results are in FOLDER/results.json.
 """
 
 import argparse
@@ -57,7 +57,9 @@ def prepare(folder: Path, cases: tuple[str, ...] = (), workers: int = 2) -> None
     golden: Any = importlib.import_module("tests.golden.flights")
     folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for said in pool.map(_prepare, [folder] * 99, (*TRAININGS, *(cases or golden.cases()))):
+        for said in pool.map(
+            functools.partial(_prepare, folder), (*TRAININGS, *(cases or golden.cases()))
+        ):
             print(said, flush=True)
 
 
@@ -104,30 +106,50 @@ def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
             yield [*results, *(record(name) for name in names)]
 
 
-def run(folder: Path, make: Make, device: str, sizes: tuple[int, ...] = SIZES) -> dict[str, Any]:
-    """Make missing measurements of FOLDER/results.json while there is time; return all."""
+def run(
+    folder: Path, make: Make, device: str, sizes: tuple[int, ...] = SIZES, mapped: Any = map
+) -> dict[str, Any]:
+    """Fly the golden cases, then measure while there is time; return FOLDER/results.json.
+
+    Args:
+        folder: Folder of the files; results that are there are kept, but for failed ones.
+        make: Makes launchers.
+        device: Device of the flights.
+        sizes: Numbers of flights.
+        mapped: Function like `map` for the golden cases, of which any may end a GPU's context.
+    """
     begin, file = time.monotonic(), folder / "results.json"
     found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
-    todo: dict[str, Callable[[], Any]] = {}
-    for path in sorted(folder.glob("*.case"), key=lambda path: path.stem not in TIMED):
-        name, content = path.stem, pickle.loads(zlib.decompress(path.read_bytes()))
-        if name in TRAININGS:
-            todo[name] = functools.partial(_training, content, make, device, TRAININGS[name])
-            continue
-        todo[f"golden: {name}"] = functools.partial(_differences, content, make, device)
-        for count in sizes if name in TIMED else ():
-            what = f"{name}, {count} flights"
-            todo[what] = functools.partial(_speed, content, make, device, count)
-    for what, measure in todo.items():
-        done = what in found and ("failed" not in found[what] or what.startswith("golden"))
-        if not done and time.monotonic() - begin < SECONDS:
-            try:
-                found[what] = measure()
-            except Exception as error:  # the others may work
-                found[what] = {"failed": f"{type(error).__name__}: {error}"}
-            print(f"{time.monotonic() - begin:.0f} s, {what}: {found[what]}", flush=True)
-            file.write_text(json.dumps(found, indent=1) + "\n")
+
+    def is_missing(what: str) -> bool:
+        return what not in found or "failed" in found[what]
+
+    def keep(what: str, result: Any) -> None:
+        found[what] = result
+        print(f"{time.monotonic() - begin:.0f} s, {what}: {result}", flush=True)
+        file.write_text(json.dumps(found, indent=1) + "\n")
+
+    paths = {path.stem: path for path in sorted(folder.glob("*.case"))}
+    golden = [name for name in paths if name not in TRAININGS and is_missing(f"golden: {name}")]
+    compare = functools.partial(_attempted, _differences, make, device)
+    for name, result in zip(golden, mapped(compare, map(paths.get, golden)), strict=True):
+        keep(f"golden: {name}", result)
+    todo: list[tuple[str, Any, str, Any]] = [
+        (f"{name}, {n} flights", _speed, name, n) for name in TIMED for n in sizes
+    ]
+    todo += [(name, _training, name, options) for name, options in TRAININGS.items()]
+    for what, measure, name, more in todo:
+        if name in paths and is_missing(what) and time.monotonic() - begin < SECONDS:
+            keep(what, _attempted(measure, make, device, paths[name], more))
     return found
+
+
+def _attempted(measure: Any, make: Make, device: str, path: Path, *more: Any) -> Any:
+    """Return the measurement of a file, or why it failed."""
+    try:
+        return measure(pickle.loads(zlib.decompress(path.read_bytes())), make, device, *more)
+    except Exception as error:  # the others may work
+        return {"failed": f"{type(error).__name__}: {error}"}
 
 
 def _differences(content: dict[str, Any], make: Make, device: str) -> dict[str, Any]:
@@ -213,7 +235,7 @@ def _training(content: dict[str, Any], make: Make, device: str, options: dict[st
     begin, env = time.perf_counter(), _Flights(batch)
     agent = script.train(env, content["plan"].low.size, 4, args)
     seconds, seen = time.perf_counter() - begin, env.reset(0)[0]
-    begins, state = seen[:, 0] == seen[:, 0], agent.begin(args.num_envs)
+    begins, state = torch.ones(len(seen), dtype=torch.bool, device=device), agent.begin(len(seen))
     with torch.no_grad():
         for _ in range(STEPS):
             features, state = agent.features(seen[None], begins[None], state)
@@ -221,16 +243,6 @@ def _training(content: dict[str, Any], make: Make, device: str, options: dict[st
             begins = terminated | truncated
     error = float(batch.result("position_error").mean())
     return {"seconds": seconds, "steps/s": args.total_timesteps / seconds, "error": error}
-
-
-def _compared(path: Path) -> tuple[str, dict[str, Any]]:
-    """Return the name of a golden case, and how its flights on the GPU differ."""
-    _without_gymnasium()
-    try:
-        content = pickle.loads(zlib.decompress(path.read_bytes()))
-        return f"golden: {path.stem}", _differences(content, _on_cuda, "cuda")
-    except Exception as error:
-        return f"golden: {path.stem}", {"failed": f"{type(error).__name__}: {error}"}
 
 
 def _on_cuda(ptx: bytes) -> Any:
@@ -266,20 +278,11 @@ def main() -> None:
     import torch
 
     print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}", flush=True)
-    file = folder / "results.json"
-    found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
-    todo = [
-        path
-        for path in sorted(folder.glob("*.case"))
-        if path.stem not in TRAININGS and "numbers" not in found.get(f"golden: {path.stem}", {})
-    ]
     workers, spawn = min(16, os.cpu_count() or 1), multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, spawn, max_tasks_per_child=1) as pool:
-        for what, result in pool.map(_compared, todo):  # an error on a GPU ends the process's work
-            found[what] = result
-            print(f"{what}: {result}", flush=True)
-            file.write_text(json.dumps(found, indent=1) + "\n")
-    run(folder, _on_cuda, "cuda")
+    with ProcessPoolExecutor(
+        workers, spawn, initializer=_without_gymnasium, max_tasks_per_child=1
+    ) as pool:
+        run(folder, _on_cuda, "cuda", mapped=pool.map)
 
 
 if __name__ == "__main__":

@@ -173,7 +173,7 @@ def test_flights_that_need_python_are_refused_on_a_gpu(keywords, message):
 
 
 def test_faults_are_refused_on_a_gpu():
-    with pytest.raises(ValueError, match="faults is of flights on the processor"):
+    with pytest.raises(ValueError, match="faults must not be given for a GPU, because"):
         quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 2, device="cuda", faults="gnss_outage")
 
 

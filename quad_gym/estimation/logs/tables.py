@@ -134,10 +134,10 @@ def _together(columns: Columns, key: str) -> Floats | None:
     have = [name in columns for name in names]
     if not any(have):
         return None
-    if key in AID_PARAMS and AID_PARAMS[key].most_blocks > 1:  # as many as there are, in order
-        names = names[
-            : AID_PARAMS[key].length * -(-(1 + max(np.flatnonzero(have))) // AID_PARAMS[key].length)
-        ]
+    kind = AID_PARAMS.get(key)
+    if kind is not None and kind.most_blocks > 1:  # as many as there are, in order
+        blocks = 1 + max(np.flatnonzero(have)) // kind.length
+        names = names[: kind.length * blocks]
         have = have[: len(names)]
     if not all(have):
         missing = names[have.index(False)]
