@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from baselines.recipes import recipe
 from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
@@ -55,6 +54,11 @@ class CompareArgs:
     engine: options.Engine = "sb3"
     steps: int | None = None
     """number of environment steps of each training; defaults to the recipe's"""
+    n_envs: int | None = None
+    """number of parallel flights; defaults to the recipe's"""
+    set: options.Parameters = field(default_factory=dict)
+    evaluations: int = 20
+    """number of evaluations and checkpoints of each training"""
     env: options.Keywords = field(default_factory=dict)
     """keywords of the environment, such as control_rate=100"""
     jobs: int | None = None
@@ -72,15 +76,14 @@ def configure(args: CompareArgs) -> compare.Comparison:
     """Check all options before training."""
     plots.require_matplotlib()
     args = options.with_full_id(args, options.TRACKING)
-    options.require_at_least(args, seeds=1, episodes=2, seed=0, jobs=1)
+    least = {"steps": 1, "n_envs": 1, "evaluations": 1, "seeds": 1, "episodes": 2, "jobs": 1}
+    options.require_at_least(args, seed=0, **least)
     for source in args.train_on:
         check.choice("--train-on", source, SOURCES)
     labels = [suite_label(suite) for suite in args.sensors]
     if len(set(labels)) < len(labels):
         raise ValueError(f"--sensors must have different names, got {' '.join(labels)}")
     options.leave(args.env, "sensors", observation="--train-on", threads="--jobs")
-    chosen = recipe(args.env_id, args.algorithm)
-    chosen = chosen if args.steps is None else chosen.replace(steps=args.steps)
     seeds, episodes = (QUICK_SEEDS, QUICK_EPISODES) if args.quick else (args.seeds, args.episodes)
     name = IDS[args.env_id] + ("_quick" if args.quick else "")
     comparison = compare.Comparison(
@@ -91,7 +94,8 @@ def configure(args: CompareArgs) -> compare.Comparison:
         episodes=episodes,
         first_episode=first_seed("test", args.seed, episodes),
         environment=dict(args.env),
-        recipe=chosen,
+        recipe=options.recipe_of(args),
+        evaluations=args.evaluations,
         engine=args.engine,
         folder=args.output or Path("results/compare") / name,
     )

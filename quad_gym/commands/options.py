@@ -31,6 +31,7 @@ from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
 if TYPE_CHECKING:
+    from baselines.recipes import Recipe
     from quad_gym.estimation import Reading
 
 _Args = TypeVar("_Args")
@@ -148,6 +149,18 @@ def require_at_least(args: Any, **least: int) -> None:
         value = getattr(args, name)
         if value is not None and value < limit:
             raise ValueError(f"{option_name(name)} must be at least {limit}, got {value}")
+
+
+def recipe_of(args: Any) -> "Recipe":
+    """Recipe of a training: the default one, overridden by the options steps, n_envs and set."""
+    from baselines.recipes import recipe
+
+    chosen = recipe(args.env_id, args.algorithm)
+    return chosen.replace(
+        steps=args.steps or chosen.steps,
+        n_envs=args.n_envs or chosen.n_envs,
+        parameters={**chosen.parameters, **args.set},
+    )
 
 
 @contextmanager

@@ -64,7 +64,6 @@ class TrainArgs:
 def configure(args: TrainArgs) -> tuple[Any, Path]:
     """Check all options before training."""
     from baselines.plans import Plan
-    from baselines.recipes import recipe
     from baselines.training import require_model, run_in
     from quad_gym.analysis.reports import require_writable
 
@@ -75,15 +74,9 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
             raise ValueError("--sensors must not be given with --env sensors=...")
         environment["sensors"] = args.sensors
     options.require_at_least(args, steps=1, n_envs=1, evaluations=1, episodes=1, threads=1, seed=0)
-    chosen = recipe(args.env_id, args.algorithm)
-    chosen = chosen.replace(
-        steps=args.steps or chosen.steps,
-        n_envs=args.n_envs or chosen.n_envs,
-        parameters={**chosen.parameters, **args.set},
-    )
     same = ("env_id", "seed", "threads", "engine", "evaluations", "episodes")
     values = {name: getattr(args, name) for name in same}
-    plan = Plan(environment=environment, recipe=chosen, **values)
+    plan = Plan(environment=environment, recipe=options.recipe_of(args), **values)
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
     if args.export is not None and args.algorithm == "recurrent_ppo":

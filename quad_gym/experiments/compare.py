@@ -48,6 +48,8 @@ class Comparison(Experiment):
     sources: tuple[str, ...]
     """Observations in training"""
     recipe: Recipe
+    evaluations: int
+    """Number of evaluations of each training"""
     engine: str
 
     @property
@@ -57,13 +59,12 @@ class Comparison(Experiment):
 
     def cases(self) -> dict[str, Plan]:
         """Plans by `case_of`."""
-        fixed: dict[str, Any] = {"env_id": self.env_id, "recipe": self.recipe, "threads": 1}
+        names = ("env_id", "recipe", "evaluations", "engine")
+        fixed: dict[str, Any] = {"threads": 1, **{name: getattr(self, name) for name in names}}
         plans = {}
         for suite, source in product(self.suites, self.sources):
             keywords = {**self.environment, "observation": source, "sensors": suite}
-            plans[case_of(suite, source)] = Plan(
-                environment=with_effect(keywords), engine=self.engine, **fixed
-            )
+            plans[case_of(suite, source)] = Plan(environment=with_effect(keywords), **fixed)
         return plans
 
     def trials(self) -> dict[str, Trial]:

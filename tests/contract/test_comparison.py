@@ -80,7 +80,8 @@ def test_evaluate_without_included_policy_flies_pd(tmp_path, capsys):
 
 def compare(where, *more):
     line = ["--quick", "--engine", "compiled", "--steps", 4096, "--output", where / "out"]
-    line += ["--env", "duration=0.4", "--train-on", "estimate"]
+    line += ["--env", "duration=0.4", "--train-on", "estimate", "--evaluations", 2]
+    line += ["--n-envs", 32, "--set", "n_epochs=3", "batch_size=512"]
     return run("compare", *line, *more, where=where)
 
 
@@ -95,6 +96,10 @@ def test_compare_writes_report_and_continues(tmp_path):
     assert page.count("data:image/png;base64,") == 4
     assert "http" not in page
     kept = tmp_path / "out/runs/standard/estimate/seed_0/best.npz"
+    plan = json.loads((kept.parent / "training.json").read_text())["plan"]
+    assert plan["evaluations"] == 2
+    assert plan["recipe"]["n_envs"] == 32
+    assert plan["recipe"]["parameters"]["n_epochs"] == 3
     before = kept.stat().st_mtime_ns
     again = compare(tmp_path)
     assert again.returncode == 0, again.stderr

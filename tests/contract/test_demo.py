@@ -38,8 +38,10 @@ def commands(lines):
 def test_demo_shows_the_difference_first_and_then_the_control(demo):
     called = list(commands(line.removeprefix("called ") for line in demo))[:2]
     assert [args.env_id for args in called] == ["QuadGym/LookAround-v0", "QuadGym/Circle-v0"]
-    for args in called:
-        assert args.policy == ("pd", "pretrained:truth", "pretrained")
+    difference, control = called
+    assert difference.policy == ("pd", "pretrained:truth", "pretrained")
+    assert control.train_on == ("truth", "estimate")
+    assert control.seeds > 1  # so that its conclusion has an interval
     text = " ".join(demo)
     assert text.index("LookAround") < text.index("control experiment")
     assert "expected to make no difference" in " ".join(text.split())
@@ -52,7 +54,7 @@ def test_demo_ends_with_files_to_open_and_three_commands(demo):
     shown = [Path(line.split()[0]) for line in ending[1 : ending.index("Next:")]]
     folders = {str(args.output) for args in commands(x.removeprefix("called ") for x in demo[:-3])}
     assert {str(path.parent) for path in shown} == folders
-    assert [path.name for path in shown] == ["video.webp", "errors.png", "errors.png"]
+    assert [path.name for path in shown] == ["video.webp", "errors.png", "report.html"]
 
 
 def test_evaluation_of_the_demo_writes_the_files(tmp_path, capsys):
