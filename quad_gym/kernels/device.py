@@ -31,6 +31,8 @@ from quad_gym.records import (
 
 SETTINGS_SYMBOL = "qg_settings"
 """The settings of a configuration, a constant that `compiling/device.py` writes."""
+HELD_IN = "=r,0"
+"""Registers of a held number; those of a GPU are in `compiling/device.py`."""
 _CALL_WORDS = len(Call)
 _WORK_SIZE, _PARAMS_SIZE = WORK_BLOCK.itemsize, PARAMS_BLOCK.itemsize
 _flight_at, _params_at, _work_at = map(lanes_at, (FLIGHT_BLOCK, PARAMS_BLOCK, WORK_BLOCK))
@@ -79,6 +81,17 @@ def _constant_settings(typing_context):  # type: ignore[no-untyped-def]
     return kind(), lower
 
 
+@intrinsic
+def _held(typing_context, number):  # type: ignore[no-untyped-def]
+    """Return a number that is computed here, and not once more in each branch that needs it."""
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        kind = ir.FunctionType(args[0].type, [args[0].type])
+        return builder.asm(kind, "", HELD_IN, args, side_effect=True)
+
+    return types.int64(types.int64), lower
+
+
 @kernel
 def _fly_ticks(call, index, world, model, settings, work, stages):
     """Fly the ticks of a step."""
@@ -108,7 +121,9 @@ def fly_one(call_at, index, lane, worker, command):
         return
     shift = 8 * lane
     call[Call.LANE] = lane
-    call[Call.BLOCKS] += shift
+    # once: of a sum in both branches of the command, ptxas stores one on a wrong condition
+    call[Call.BLOCKS] = _held(block_address(call, index) + shift)
+    call[Call.PITCH] = 0
     call[Call.RESULTS] += shift
     call[Call.SHOWN] += shift
     call[Call.ACTIONS] += 4 * shift

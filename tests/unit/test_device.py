@@ -1,11 +1,9 @@
 """Flights on a GPU: device code on this processor flies as the batch does."""
 
-import importlib.util
 import re
-import shutil
 import subprocess
 import sys
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +16,11 @@ from quad_gym.kernels.compiling.building import PROCESSORS
 from quad_gym.kernels.library import machine
 from quad_gym.params.suites import SUITES
 from tests.builders import vec_env
-from tests.golden import device, ptx
+from tests.golden import device, ptx, sass
 from tests.golden.flights import trajectories
 
 torch = pytest.importorskip("torch")
+from quad_gym.envs import device_env as device_env_module  # noqa: E402
 from quad_gym.envs.device_env import QuadDeviceVecEnv  # noqa: E402
 from tests.contract.test_torch_env import (  # noqa: E402
     assert_flights_equal,
@@ -95,28 +94,55 @@ def test_module_in_a_wheel_is_taken_for_its_sources_and_settings_alone(tmp_path,
     assert ptx_of(plan) == b"emitted"
 
 
-def ptxas():
-    """Return the assembler of PTX, or None."""
-    package = importlib.util.find_spec("nvidia")  # of the package nvidia-cuda-nvcc
-    folders = [] if package is None else package.submodule_search_locations
-    found = [file for folder in folders for file in Path(folder).glob("*/bin/ptxas")]
-    return shutil.which("ptxas") or (found[0] if found else None)
-
-
-@pytest.mark.skipif(ptxas() is None, reason="no ptxas")
+@pytest.mark.skipif(sass.tool("ptxas") is None, reason="no ptxas")
 @pytest.mark.parametrize(
     ("keywords", "spills", "size"),
-    [(TRUTH, 200, 250e3), pytest.param({}, 500, 900e3, marks=pytest.mark.slow)],
+    [
+        (TRUTH, 200, 250e3),
+        pytest.param({}, 500, 900e3, marks=pytest.mark.slow),
+        pytest.param(
+            {"sensors": "rtk", "faults": "gnss_outage"}, 1000, 1400e3, marks=pytest.mark.slow
+        ),
+    ],
 )
-def test_machine_code_of_a_gpu_keeps_its_budgets(keywords, spills, size, tmp_path):
-    source, file = tmp_path / "flights.ptx", tmp_path / "flights.cubin"
-    source.write_bytes(ptx_of(plan_of(vec_env("circle", 1, **keywords).flights.batch)))
-    command = [ptxas(), "-arch=sm_90", "-v", "-o", file, source]
-    said = subprocess.run(command, check=True, capture_output=True, text=True).stderr
+def test_machine_code_of_a_gpu_keeps_its_budgets_and_its_conditions(
+    keywords, spills, size, tmp_path
+):
+    file = tmp_path / "flights.cubin"
+    said = sass.assembled(ptx_of(plan_of(vec_env("circle", 1, **keywords).flights.batch)), file)
     assert int(re.search(r"Used (\d+) registers", said)[1]) <= 255
     spilled = re.search(r"properties for qg_fly\n.*?(\d+) bytes spill stores", said)
     assert int(spilled[1]) <= spills
     assert file.stat().st_size <= size
+    if sass.tool("nvdisasm") is not None:
+        assert sass.overwritten_conditions(sass.disassembled(file)) == []
+
+
+CARRY = "/*0650*/ @P0 IADD3 R3, P0, R11, R6, RZ ;"
+"""Overwrites its condition, as the assembler of CUDA 13.0 did where there were faults."""
+
+
+@pytest.mark.parametrize(
+    ("lines", "count"),
+    [
+        (
+            [
+                CARRY,
+                "/*0660*/ @P3 IMAD.X R2, R9, 0x1, R8, P0 ;",
+                '/*06d0*/ @P0 STL [R1], R3 (*"SpillRefill"*);',
+            ],
+            1,
+        ),
+        ([CARRY, "/*0660*/ @!P0 EXIT ;"], 1),
+        ([CARRY, "/*0660*/ @P3 IMAD.X R2, R9, 0x1, R8, P0 ;"], 0),
+        ([CARRY, "/*0660*/ ISETP.NE.AND P0, PT, R2, R3, PT ;", "/*0670*/ @P0 EXIT ;"], 0),
+        ([CARRY, ".text.next:", "/*0000*/ @P0 EXIT ;"], 0),
+        ([CARRY.replace(" P0,", " P1,"), "/*0660*/ @P0 STL [R1], R3 ;"], 0),
+        (["/*0650*/ @P0 ISETP.NE.AND P0, PT, R2, R3, PT ;", "/*0660*/ @P0 EXIT ;"], 0),
+    ],
+)
+def test_condition_that_a_carry_overwrites_is_found_where_it_is_needed_later(lines, count):
+    assert len(sass.overwritten_conditions("\n".join(lines))) == count
 
 
 @pytest.fixture(scope="module")
@@ -172,9 +198,13 @@ def test_flights_that_need_python_are_refused_on_a_gpu(keywords, message):
         device_env(**{"base": "circle", "count": 2} | keywords)
 
 
-def test_faults_are_refused_on_a_gpu():
-    with pytest.raises(ValueError, match="faults must not be given for a GPU, because"):
-        quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 2, device="cuda", faults="gnss_outage")
+def test_faults_on_a_gpu_are_warned_of(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(device_env_module, "ptx_of", lambda plan: b"")
+    launcher = SimpleNamespace(warps=1)
+    monkeypatch.setattr(device_env_module, "CudaLauncher", lambda ptx, device: launcher)
+    with pytest.warns(UserWarning, match="compare some of yours with those on the processor"):
+        device_env("circle", 2, launcher=None, faults="gnss_outage")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

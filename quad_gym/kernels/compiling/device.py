@@ -25,7 +25,7 @@ from quad_gym.kernels.compiling.foreign import (
 )
 from quad_gym.kernels.compiling.stages import SLOT
 from quad_gym.kernels.compiling.workers import kernels
-from quad_gym.kernels.device import SETTINGS_SYMBOL
+from quad_gym.kernels.device import HELD_IN, SETTINGS_SYMBOL
 from quad_gym.kernels.digest import digest_of
 from quad_gym.kernels.library import DEVICE_KERNEL, core_symbol, say
 from quad_gym.kernels.stages import Stage
@@ -114,6 +114,7 @@ def module_of(settings: bytes, stages: Mapping[Stage, str], processor: Processor
     names, public = sorted(set(stages.values())), core_symbol(ENTRY)
     texts = [linked(ENTRY), *map(linked, names), dispatcher(settings, stages)]
     if processor is GPU:
+        texts[0] = texts[0].replace(f'"{HELD_IN}"', '"=l,0"')
         texts.append(
             _KERNEL.format(core=public, kernel=DEVICE_KERNEL, warp=WARP, resident=RESIDENT)
         )
