@@ -18,6 +18,8 @@ from quad_gym.records import Ending, Source
 from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]
+_NEES_SAMPLES = 20
+"""Number of evenly spaced instants at which NEES is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,6 @@ def record_flights(
     seeds: Sequence[int],
     steps: int,
     *,
-    nees_samples: int = 20,
     progress: Callable[[range], Iterable[int]] = iter,
 ) -> Recording:
     """Fly a batch of `Control.PD` without autoreset, and record `steps + 1` instants.
@@ -79,7 +80,6 @@ def record_flights(
         batch: Flights.
         seeds: Seeds of the flights.
         steps: Number of control periods.
-        nees_samples: Number of evenly spaced instants at which NEES is computed.
         progress: Function that wraps the range of instants, such as `tqdm.tqdm`.
     """
     count = batch.count
@@ -88,7 +88,7 @@ def record_flights(
     flying = np.ones(count, bool)
     ending, ended_at = np.zeros(count, np.int64), np.full(count, np.nan)
     tracer, tracking, estimation = Tracer(), *(RunningSummary(count, steps + 1) for _ in range(2))
-    samples = np.unique(np.linspace(0, steps, nees_samples + 1).round().astype(int)[1:])
+    samples = np.unique(np.linspace(0, steps, _NEES_SAMPLES + 1).round().astype(int)[1:])
     nees_values = np.full((len(samples), count), np.nan)
 
     for step in progress(range(steps + 1)):

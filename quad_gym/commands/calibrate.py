@@ -23,7 +23,9 @@ from quad_gym.commands.options import (
     LogFiles,
     ReadingArgs,
     SuiteName,
+    capital,
     refuse_overwriting,
+    told,
     usage_errors,
 )
 
@@ -162,9 +164,8 @@ def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Pat
     report = Report(folder, title)
     report.add(
         "p",
-        f"{calibration.verdict[0].upper()}{calibration.verdict[1:]}. NIS per degree of freedom, of "
-        "all measurements, is 1, and the correlation of successive innovations 0, for a consistent "
-        "filter.",
+        f"{capital(calibration.verdict)}. NIS per degree of freedom, of all measurements, is 1, "
+        "and the correlation of successive innovations 0, for a consistent filter.",
     )
     headings = [f"{part} {name}" for part, names in VALIDATION_HEADINGS.items() for name in names]
     headings[0] = "validation"
@@ -276,8 +277,8 @@ def main(args: CalibrateArgs) -> None:
         )
     numbers = text_table({"": list(NUMBER_HEADINGS)}, number_rows(found))
     print(f"\n{numbers}\n\n{text_table(VALIDATION_HEADINGS, validation_rows(found))}\n")
-    for sentence in (*found.after.problems, *found.notes):
-        print(f"{sentence[0].upper()}{sentence[1:]}.")
+    if sentences := (*found.after.problems, *found.notes):
+        print(told(sentences))
     found.suite.save(folder / SUITE)
     files = [folder / SUITE, *write_page(folder, found, f"Calibration with {args.logs[0].name}")]
     contents = {
@@ -289,7 +290,7 @@ def main(args: CalibrateArgs) -> None:
     print(f"\nWrote {len(files)} files to {folder}; open {folder / 'report.html'}.")
     if args.vehicle is not None:
         print(fit_body(args, found.suite, starts))
-    print(f"{found.verdict[0].upper()}{found.verdict[1:]}.")
+    print(f"{capital(found.verdict)}.")
     if found.after.problems:
         raise SystemExit(MISFIT)
     print(f"Next: {shlex.join(next_command(args, folder))}")

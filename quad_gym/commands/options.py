@@ -408,4 +408,9 @@ class ReadingArgs:
 
 def told(notes: Sequence[str]) -> str:
     """Format sentences on what was taken of a log and left out, a line each."""
-    return "\n".join(f"{note[0].upper()}{note[1:]}." for note in notes)
+    return "\n".join(f"{capital(note)}." for note in notes)
+
+
+def capital(text: str) -> str:
+    """Return a text with a capital first letter."""
+    return f"{text[0].upper()}{text[1:]}"

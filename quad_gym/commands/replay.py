@@ -24,6 +24,7 @@ from quad_gym.commands.options import (
     LogFile,
     ReadingArgs,
     SuiteName,
+    capital,
     refuse_overwriting,
     told,
     usage_errors,
@@ -130,11 +131,7 @@ def report_of(result: "Replay") -> str:
         lines.append(f"Too late for the window: {result.too_late} measurements.")
     if result.unused:
         lines.append(f"Ignored (sensors not in the suite): {', '.join(result.unused)}.")
-    return "\n".join([table, *lines, "", *map(_capital, by_quantity(result.findings))])
-
-
-def _capital(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}"
+    return "\n".join([table, *lines, "", *map(capital, by_quantity(result.findings))])
 
 
 def innovations_of(result: "Replay") -> dict[str, Any]:
@@ -201,7 +198,7 @@ def main(args: ReplayArgs) -> None:
     }
     files.append(write_json(folder / RESULT, found))
     print(f"\nWrote {len(files)} files to {folder}.")
-    print(f"\n{_capital(result.verdict)}.")
+    print(f"\n{capital(result.verdict)}.")
     if result.problems:
         print(ADVICE)
         raise SystemExit(MISFIT)

@@ -34,7 +34,7 @@ from quad_gym.estimation.first_motion import SPAN
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.logs.parts import running_motors
 from quad_gym.estimation.player import Player
-from quad_gym.estimation.sets import run_sets
+from quad_gym.estimation.sets import innovations_of_sets
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FREEDOMS
@@ -214,7 +214,7 @@ class _LogLosses:
         return np.concatenate([self._losses(few) for few in some], axis=1)
 
     def _losses(self, suites: Sequence[SensorSuite]) -> Floats:
-        found = run_sets(self._player, self._tape, suites).innovations
+        found = innovations_of_sets(self._player, self._tape, suites)
         losses = np.zeros((len(found), len(suites)))
         for row, block in enumerate(blocks_of(self.suite)):
             have, d = self._valid[:, block], FREEDOMS[block]

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,35 +14,26 @@ from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import WIDTH, aligned_zeros
 
 
-class SetRuns(NamedTuple):
-    """Results of several filters on the same log."""
+def innovations_of_sets(player: Player, tape: Tape, suites: Sequence[SensorSuite]) -> Floats:
+    """Run a tape with filters of suites that differ in numbers only.
 
-    estimates: Floats
-    """(n, KEPT, sets) estimates, see `quad_gym.records.KEPT`; n is 0 if they were not asked for"""
-    innovations: Floats  #: (m, blocks, REPORTED, sets) innovations of each update
-
-
-def run_sets(
-    player: Player, tape: Tape, suites: Sequence[SensorSuite], estimates: bool = False
-) -> SetRuns:
-    """Run a tape with filters of suites that differ in numbers only; estimates if asked for."""
+    Returns:
+        (m, blocks, REPORTED, sets) innovations of each update.
+    """
     engines = [player.started(suite)._engine for suite in suites]
-    first = engines[0]
-    if not estimates:
-        tape = tape.without_estimates()
+    first, tape = engines[0], tape.without_estimates()
 
-    def run(k: int) -> tuple[Floats, Floats]:
+    def run(k: int) -> Floats:
         chosen = [engines[min(i, len(engines) - 1)] for i in range(k, k + WIDTH)]
         parts = (
             _side_by_side([getattr(engine, name) for engine in chosen])
             for name in ("blocks", "params", "_ticks", "steps")
         )
-        return first.run_block(tape, first.empty_slots(tape), *parts)
+        return first.run_block(tape, first.empty_slots(tape), *parts)[1]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         found = list(pool.map(run, range(0, len(engines), WIDTH)))
-    columns = zip(*found, strict=True)
-    return SetRuns(*(np.concatenate(rows, axis=-1)[..., : len(engines)] for rows in columns))
+    return np.concatenate(found, axis=-1)[..., : len(engines)]
 
 
 def _side_by_side(blocks: Sequence[Any]) -> Any:
