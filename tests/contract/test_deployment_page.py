@@ -19,13 +19,6 @@ PAGE = (Path(__file__).parents[2] / "docs" / "deployment.md").read_text(encoding
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
-def test_observation_table_of_page_equals_layout():
-    rows = re.findall(r"^\| (\d+):(\d+) \| `(\w+)` \|.*\| (\S+) \| (\S+) \|$", PAGE, re.MULTILINE)
-    layout = quad_gym.observation_layout()
-    want = [(str(f.slice.start), str(f.slice.stop), f.name, f.unit, f.frame) for f in layout]
-    assert rows == want
-
-
 def test_action_numbers_of_page_equal_default_scales():
     fields = controller_of("pretrained", "QuadGym/Circle-v0").action_fields
     assert "thrust 7.644 (1 + a[0]) N" in PAGE
