@@ -11,8 +11,9 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym import FlightRecorder
 from quad_gym.envs.single import QuadEnv
+from quad_gym.estimation.logs.log import LOG_COLUMNS
 from quad_gym.frames import ecef_to_enu, ecef_to_geodetic
-from quad_gym.records import AID_BLOCKS, AID_ROW, Aid
+from quad_gym.records import AID_BLOCKS, AID_ROW
 from quad_gym.rotations import quaternion_to_dcm
 
 RTK = quad_gym.sensor_suite("rtk")
@@ -21,7 +22,6 @@ PX4 = RTK.replace(
 )
 """Sensors in a log of PX4, and two antennas."""
 LOST, JITTER = 0.01, 0.05
-AXES_OF_FIELD = [f"magnetometer_{axis}" for axis in "xyz"]
 
 
 def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
@@ -104,9 +104,8 @@ class Recorded:
             names += [f"{quantity}_{axis}" for axis in ("east", "north", "up")]
         names += [f"pixel_{i}_{axis}" for i in range(features) for axis in "uv"]
         aids = {
-            Aid.BAROMETER: ["barometer"],
-            Aid.MAGNETOMETER: AXES_OF_FIELD,
-            Aid.UWB_RANGE: [f"uwb_range_{k}" for k in range(4)],
+            aid: LOG_COLUMNS[aid.name.lower()].names[: params.blocks * params.length]
+            for aid, params in self.suite.aids.items()
         }
         names += [name for aid in self.suite.aids for name in aids[aid]]
         rows = []

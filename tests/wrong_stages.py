@@ -15,6 +15,11 @@ def _sum(flight):
     return _range(load3(flight.r))  # an argument is missing
 
 
+@kernel
+def _vertical(R_BI):
+    return R_BI.T[2][2]
+
+
 @stage
 def missing_argument_stage(flight, world, model, settings, work, stages, flag):
     """Call a kernel with too few arguments."""
@@ -31,6 +36,12 @@ def missing_field_stage(flight, world, model, settings, work, stages, flag):
 def wrong_type_stage(flight, world, model, settings, work, stages, flag):
     """Pass a number where a vector is expected."""
     work.spread = _range(load3(flight.r), flight.tick)
+
+
+@stage
+def record_stage(flight, world, model, settings, work, stages, flag):
+    """Pass a record where a matrix is expected."""
+    work.spread = _vertical(settings)
 
 
 @stage

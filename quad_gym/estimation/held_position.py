@@ -26,7 +26,7 @@ SENTENCE = (
 
 def lacks_position(log: Log, suite: SensorSuite) -> bool:
     """Return True if no sensor of a filter measures position or velocity in a log."""
-    moving = [name for name, kind in AID_PARAMS.items() if "velocity" in kind.observes]
+    moving = [n for n, kind in AID_PARAMS.items() if {"position", "velocity"} & {*kind.observes}]
     return not any(
         getattr(suite, name) is not None and name in log.streams
         for name in ("gnss", "camera", *moving)

@@ -53,12 +53,12 @@ NAMES = {
 """Sensors in sentences."""
 
 
-def _observing(quantity: str) -> tuple[str, ...]:
-    return tuple(name for name, kind in AID_PARAMS.items() if quantity in kind.observes)
+def _observing(*states: str) -> tuple[str, ...]:
+    return tuple(name for name, kind in AID_PARAMS.items() if {*states} & {*kind.observes})
 
 
 MEASURED_BY = {
-    "position": ("gnss_position", "gnss_velocity", "features", *_observing("velocity")),
+    "position": ("gnss_position", "gnss_velocity", "features", *_observing("position", "velocity")),
     "height": ("gnss_position", "gnss_velocity", "features", *_observing("height")),
     "heading": ("gnss_baseline", "features", *_observing("heading")),
 }

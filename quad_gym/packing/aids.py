@@ -59,6 +59,11 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
             scalars[aid] = len(errors)
             errors.append(params.slow_scalar)
     count = len(errors)
+    if count > MAX_SLOW:
+        raise ValueError(
+            f"sensors must have at most {MAX_SLOW} time-correlated errors for the filter to "
+            f"estimate, got {count}"
+        )
     errors += [SlowError(1.0)] * (-count % 3)
     return SlowStates(tuple(errors), count, sensors.drifts, tuple(vectors), tuple(scalars))
 
@@ -100,6 +105,11 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
                 decay, drive = decay_and_drive(slow, 1.0 / params.rate)
                 p[f"aid_{name}_sigma"][aid] = slow.sigma
                 p[f"aid_{name}_decay"][aid], p[f"aid_{name}_drive"][aid] = decay, drive
+        if len(params.numbers) > params.rows:
+            raise ValueError(
+                f"{type(params).__name__}.numbers must have at most {params.rows} triples, its "
+                f"rows, got {len(params.numbers)}"
+            )
         for row, numbers in enumerate(params.numbers, AID_NUMBERS[aid]):
             p["aid_numbers"][row] = numbers
 
@@ -107,7 +117,6 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
 def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
     """Write the sensors that a filter assumes into a SETTINGS record, with their slow errors."""
     states = slow_states(sensors)
-    assert len(states.errors) <= MAX_SLOW
     settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated
     settings["estimates_drift"] = states.drifts
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars

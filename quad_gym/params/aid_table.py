@@ -8,7 +8,8 @@ fault, quantity, reading, columns of logs, figures, and its interface in an expo
 import dataclasses
 from typing import NamedTuple, get_args
 
-from quad_gym.params.aids import AidParams
+from quad_gym.params import checks as check
+from quad_gym.params.aids import OBSERVED, AidParams
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.checked import Checked
 from quad_gym.params.magnetometer import MagnetometerParams
@@ -49,6 +50,13 @@ class AidShape(NamedTuple):
 
 
 def _shape_of(kind: type[AidParams]) -> AidShape:
+    """Return the shape of a class of parameters, and refuse a class that is incomplete."""
+    for word in ("observes", "unit", "frame", "meaning", "raw"):
+        if not hasattr(kind, word):
+            raise ValueError(f"{kind.__name__} must have {word}, as in AidParams")
+    check.whole(f"{kind.__name__}.length", kind.length, most=3)
+    for word in kind.observes:
+        check.choice(f"{kind.__name__}.observes", word, OBSERVED)
     own_error = (kind.slow_vector, kind.slow_scalar) != (
         AidParams.slow_vector,
         AidParams.slow_scalar,

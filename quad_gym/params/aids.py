@@ -7,6 +7,9 @@ from typing import Any, ClassVar, NamedTuple, Self
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
+OBSERVED = ("position", "height", "velocity", "heading")
+"""States that a sensor can observe: the horizontal position, and with it often the velocity."""
+
 
 class SlowError(NamedTuple):
     """A time-correlated or constant error, which the filter estimates in augmented states."""
@@ -56,10 +59,12 @@ class AidParams(SensorBase):
 
     _white_noise = ("noise_sigma",)
     _ideal: ClassVar = {"latency": 0.0}
-    length: ClassVar[int] = 1  #: numbers in a block of the measurement
+    length: ClassVar[int] = 1  #: numbers in a block of the measurement, at most three
     most_blocks: ClassVar[int] = 1  #: largest number of blocks
     rows: ClassVar[int] = 1  #: triples in `numbers`
-    observes: ClassVar[tuple[str, ...]]  #: observed states: "position", "height" and so on
+    observes: ClassVar[tuple[str, ...]]
+    """OBSERVED states. Where other sensors in use observe all of them, the gate attributes an
+    implausible measurement to this sensor; a replay assumes that it corrects them."""
     unit: ClassVar[str]  #: of the measurement
     frame: ClassVar[str]  #: of the measurement
     meaning: ClassVar[str]  #: of the measurement, in a few words

@@ -86,6 +86,7 @@ def test_compile_fails_if_code_cannot_be_written_to_cache(monkeypatch, capsys):
         ("missing_argument", "_sum, .*:15: return _range", "missing a required .* 'anchor_I'"),
         ("missing_field", "missing_field_stage, .*flight.altitude", "attribute 'altitude'"),
         ("wrong_type", r"_range, .*: offset = r_I - anchor_I", r"sub\(vector, number\)"),
+        ("record", r"_vertical, .*: return R_BI\.T\[2\]", "'T'"),
         ("missing_name", "missing_name_stage, .*metres", "name 'metres' is not defined"),
     ],
 )

@@ -10,8 +10,12 @@ import inspect
 import itertools
 import re
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
+
+from numba.core.errors import NumbaError
+from numba.core.ir import Loc
 
 from quad_gym.kernels.compiling import stages
 from quad_gym.params import checks as check
@@ -77,7 +81,7 @@ def _explained(error: Exception) -> str:
     text = re.sub(r"\x1b\[\d*m", "", str(error))
     wrapper = inspect.getfile(stages)
     places = dict[str, tuple[str, int, str]]()  # the first of each kernel
-    for file, line in _PLACE.findall(text):
+    for file, line in _PLACE.findall(text) or _places_of(error):
         kernel, source = _at(Path(file), int(line))
         if file != wrapper and kernel not in places:
             places[kernel] = (file, int(line), source)
@@ -85,8 +89,16 @@ def _explained(error: Exception) -> str:
     for kernel, (file, line, source) in itertools.islice(places.items(), 1 + _CALLERS):
         word = "called by" if lines else "kernel"
         lines.append(f"  {word}: {kernel}, {_short(file)}:{line}: {source}")
-    lines.insert(1, f"  reason: {_reason(text)}")
+    own = isinstance(error, NumbaError)
+    lines.insert(1, f"  reason: {_reason(text if own else f'{type(error).__name__}: {error}')}")
     return "\n".join(lines)
+
+
+def _places_of(error: Exception) -> list[tuple[str, int]]:
+    """Return the places at which Numba was, the innermost first: some errors name none."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    found = [getattr(frame.f_locals.get("self"), "loc", None) for frame in reversed(frames)]
+    return [(loc.filename, loc.line) for loc in found if isinstance(loc, Loc)]
 
 
 def _reason(text: str) -> str:

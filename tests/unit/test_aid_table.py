@@ -1,0 +1,54 @@
+"""Rows of the table of aiding sensors: incomplete or inconsistent classes are refused."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation.held_position import lacks_position
+from quad_gym.packing.aids import pack_aids, slow_states
+from quad_gym.params.aid_table import _shape_of
+from quad_gym.params.aids import AidParams, SlowError
+from quad_gym.records import PARAMS
+
+UWB = quad_gym.sensor_suite("uwb")
+COMPLETE = {"observes": ("height",), "unit": "m", "frame": "-", "meaning": "depth"}
+COMPLETE |= {"raw": ("m", "-", 10.0)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"observes": ("hight",)}, "observes must be one of position, .* did you mean height"),
+        ({"length": 4}, "length must be at most 3, got 4"),
+        ({"raw": None}, "Depth must have raw"),
+    ],
+)
+def test_class_of_a_sensor_that_is_wrong_is_refused_by_its_member(change, message):
+    members = {name: value for name, value in (COMPLETE | change).items() if value is not None}
+    with pytest.raises(ValueError, match=message):
+        _shape_of(type("Depth", (AidParams,), members))
+    assert _shape_of(type("Depth", (AidParams,), COMPLETE)).length == 1
+
+
+def test_numbers_beyond_the_rows_of_a_sensor_are_refused(monkeypatch):
+    record = np.zeros(1, PARAMS)[0]
+    pack_aids(record, UWB)
+    monkeypatch.setattr(quad_gym.UwbRangeParams, "rows", 5)
+    with pytest.raises(ValueError, match=r"UwbRangeParams.numbers must have at most 5 .* got 6"):
+        pack_aids(record, UWB)
+
+
+def test_more_slow_errors_than_a_filter_has_states_for_are_refused(monkeypatch):
+    suite = quad_gym.sensor_suite("consumer").replace(uwb_range=UWB.uwb_range)
+    assert slow_states(suite).estimated == 8
+    monkeypatch.setattr(quad_gym.UwbRangeParams, "assumed_vector", SlowError(0.1))
+    with pytest.raises(ValueError, match=r"at most 9 time-correlated errors .* got 11"):
+        slow_states(suite)
+
+
+def test_sensor_of_positions_replaces_a_fictitious_position(monkeypatch):
+    assert lacks_position(SimpleNamespace(streams={"barometer"}), UWB)
+    monkeypatch.setattr(quad_gym.UwbRangeParams, "observes", ("position", "height"))
+    assert not lacks_position(SimpleNamespace(streams={"uwb_range"}), UWB)
