@@ -3,10 +3,10 @@
     quad-gym benchmark
     quad-gym benchmark --only interfaces --n-envs 256
 
-A time is the best of several repeats, because other load on the machine can only increase it;
-"spread" is the excess of the median. The suites take a minute. Progress goes to stderr, tables go
-to stdout, and everything goes to benchmark.json with the configuration, the versions and the
-processor. Run it on an idle machine.
+A time is the best of several repeats, because other load on the machine can only increase it. The
+column "spread" is the excess of the median. The suites take a minute. Progress goes to stderr,
+tables go to stdout, and everything goes to benchmark.json with the configuration, the versions and
+the processor. Run it on an idle machine.
 """
 
 import dataclasses

@@ -12,8 +12,8 @@ The flights follow random trajectories (or another task) by PD control. The norm
 error squared (NEES) is computed for the 15 states and for each part of three, over time, and the
 normalized innovation squared (NIS) for each sensor. For a consistent filter, means over 1,000
 flights are inside known bands at 95 % of the instants, and innovations are white. Prints tables and
-a verdict, and writes figures (PNG and SVG) and all numbers with the configuration and the seeds
-(consistency.json).
+a verdict, and writes figures (PNG and SVG) and consistency.json, which has all numbers with the
+configuration and the seeds.
 """
 
 from dataclasses import dataclass

@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import io
 import itertools
+import re
 import shlex
 import shutil
 import sys
@@ -85,7 +86,10 @@ def with_plain_help(kind: Any) -> Any:
 
 @contextmanager
 def _wrapped_help(words: Sequence[str]) -> Iterator[None]:
-    """Wrap the description of a command, of which tyro makes one line per paragraph."""
+    """Wrap the description of a command, of which tyro makes one line per paragraph.
+
+    The list of subcommands, which has a box, is left out of the usage, which would break in words.
+    """
     if not {"-h", "--help"} & set(words):
         yield
         return
@@ -97,7 +101,8 @@ def _wrapped_help(words: Sequence[str]) -> Iterator[None]:
     finally:
         shown.seek(0)
         width = shutil.get_terminal_size().columns
-        for line in shown.read().splitlines():
+        text = re.sub(r"(usage: [^{\n]*)\{[^}]*\}", r"\1COMMAND ...", shown.read(), count=1)
+        for line in text.splitlines():
             indented = line[:1] in "\x1b ╭│╰"  # examples and boxes
             print(line if indented else textwrap.fill(line, width, break_on_hyphens=False))
 

@@ -7,8 +7,8 @@
 
 Hyperparameters for the task and the algorithm come from baselines/recipes.py. During training, the
 policy is evaluated on the task by its true position error and saved: last.zip and best.zip (.npz
-with --engine compiled), which quad-gym evaluate can fly. The folder also contains training.json
-(everything needed to repeat the run), evaluations.csv, and files for TensorBoard. An interrupted
+with --engine compiled), which quad-gym evaluate can fly. The folder also contains evaluations.csv,
+training.json, with everything needed to repeat the run, and files for TensorBoard. An interrupted
 run continues exactly from its last checkpoint with --resume.
 """
 

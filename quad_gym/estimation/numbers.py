@@ -35,7 +35,7 @@ class Number:
         return self.field in (_MOUNTING, _COMPASS) or self.sensor == _DELAYS
 
     def ends(self, prior: float) -> tuple[float, float]:
-        """Return bounds of the coordinate: a sensor in flight is hardly better than at rest."""
+        """Return bounds of the coordinate; at rest, a sensor is at most about as noisy."""
         if self.positive:
             bounded = self.noise and self.field != "drift_sigma_I"
             return _MIN_SPREAD / self.spread if bounded else -MAX_SPREAD, MAX_SPREAD

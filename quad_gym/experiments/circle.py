@@ -135,8 +135,8 @@ def _sentence(what: str, found: PairedDifference) -> str:
     if not found.significant:
         change = "makes no significant difference to"
     return (
-        f"{what} {change} the mean tracking error ({found.spread.count:,} pairs of flights; 95 % "
-        f"interval {low:+.2f} to {high:+.2f} mm, median {1e3 * found.spread.median:+.2f} mm)."
+        f"{what} {change} the mean tracking error ({found.spread.count:,} pairs, both completed; "
+        f"95 % interval {low:+.2f} to {high:+.2f} mm, median {1e3 * found.spread.median:+.2f} mm)."
     )
 
 

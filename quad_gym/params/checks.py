@@ -156,7 +156,7 @@ def flag(name: str, value: Any) -> bool:
 
 
 def angle(name: str, value: Any) -> float:
-    """`value` as an angle of at most a turn either way [rad]; larger ones are in degrees."""
+    """`value` as an angle within ± one turn [rad]; larger ones are in degrees."""
     result = number(name, value)
     if abs(result) > 2.0 * math.pi:
         meant = f"; did you mean {math.radians(result):.4g}?" if abs(result) <= 360.0 else ""

@@ -165,7 +165,7 @@ def _check_inertia(table: Ranges) -> None:
     """Refuse a range of moments of inertia all of which no body has.
 
     A range in which some draws break the rule that each moment is at most the sum of the other two
-    is accepted: components are drawn independently, so 20 % either way of a flat vehicle includes
+    is accepted: components are drawn independently, so ±20 % of a flat vehicle includes
     such draws, and they fly as well as any. See `params.check_moments`.
     """
     columns = COLUMNS["inertia"]

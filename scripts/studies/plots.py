@@ -1,7 +1,8 @@
 """Figures of a study: the same episode, flown by several policies.
 
-An episode is a mapping of its "time" [s] and of traces from `scripts.studies.traces.TRACES`,
-(t,) each, which are NaN after its end. Figures take episodes by the label of the policy.
+An episode is a mapping of its "time" [s], of its "ending" in words, and of traces from
+`scripts.studies.traces.TRACES`, (t,) each, which are NaN after its end. Figures take episodes by
+the label of the policy.
 """
 
 import math
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from quad_gym.analysis import plots
 
 Floats = NDArray[np.float64]
-Episode = Mapping[str, Floats]
+Episode = Mapping[str, Any]
 
 
 @plots.house_style()
@@ -28,9 +29,9 @@ def glance_figure(episodes: Mapping[str, Episode], half_view: float) -> Any:
         time, error = episode["time"], episode["position_error"]
         _draw_angles(above, episode, math.degrees(half_view))
         _draw_uncertainty(below, episode)
-        below.plot(time, error, color=plots.VERMILLION, label="error of the position")
-        _mark_end(below, time, error, "crash")
-    grid[0, 0].set_ylabel("body x, from the direction\nof the features [deg]")
+        below.plot(time, error, color=plots.VERMILLION, label="tracking error")
+        _mark_end(below, time, error, episode["ending"])
+    grid[0, 0].set_ylabel("body x axis, from the\ndirection of the markers [deg]")
     _finish(grid, episodes, "position_error")
     return figure
 
@@ -48,7 +49,7 @@ def pace_figure(episodes: Mapping[str, Episode]) -> Any:
             for axes, label in ((above, "no GNSS"), (below, "_")):
                 style: dict[str, Any] = {"color": plots.GREY, "alpha": 0.2, "linewidth": 0}
                 axes.axvspan(failed[0], failed[-1], label=label, **style)
-        _mark_end(below, time, episode["speed"], "end")
+        _mark_end(below, time, episode["speed"], episode["ending"])
     grid[0, 0].set_ylabel("speed [m/s]")
     grid[0, 0].set_ylim(bottom=0.0)
     _finish(grid, episodes, "speed")
@@ -82,8 +83,8 @@ def _draw_angles(axes: Any, episode: Episode, half_view: float) -> None:
     axes.axhspan(-half_view, half_view, label="markers in view", **view)
     time, off = episode["time"], np.degrees(episode["off_wall"])
     rewarded = _unbroken(off - np.degrees(episode["off_reward"]))
-    axes.plot(time, rewarded, color=plots.GREY, linestyle=(0, (4, 3)), label="rewarded")
-    axes.plot(time, _unbroken(off), color=plots.BLUE, label="body x")
+    axes.plot(time, rewarded, color=plots.GREY, linestyle=(0, (4, 3)), label="rewarded heading")
+    axes.plot(time, _unbroken(off), color=plots.BLUE, label="body x axis")
     axes.set_ylim(-180.0, 180.0)
     axes.set_yticks([-180, -90, 0, 90, 180])
 
@@ -94,7 +95,7 @@ def _draw_uncertainty(axes: Any, episode: Episode) -> None:
     axes.plot(time, bound, color=plots.PALE, label="_")
     area: dict[str, Any] = {"color": plots.GREEN, "alpha": 0.2, "linewidth": 0}
     axes.fill_between(time, 1e-3, bound, label="filter: 3 sigma", **area)
-    axes.plot(time, episode["estimation_error"], color=plots.GREEN, label="error of the estimate")
+    axes.plot(time, episode["estimation_error"], color=plots.GREEN, label="estimation error")
     axes.set_yscale("log")
     axes.set_ylim(3e-3, 10.0)
     axes.set_xlabel("time [s]")

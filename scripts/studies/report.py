@@ -127,7 +127,7 @@ def _table(results: StudyResults) -> tuple[tuple[str, ...], list[list[str]]]:
 def table_text(results: StudyResults) -> str:
     """Table for the screen."""
     heads, rows = _table(results)
-    flown = "flown on the estimate unless the arm says otherwise"
+    flown = "evaluated on the estimate unless the arm says otherwise"
     return text_table({"": heads[:1], flown: heads[1:]}, rows)
 
 
@@ -159,7 +159,7 @@ def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
     ]
     report.add(
         "p",
-        f"{flown} episodes with each policy, flown on the "
+        f"{flown} episodes with each policy, evaluated on the "
         "estimate unless the arm says otherwise. A crashed episode counts with the position error "
         "out_of_bounds of the task from its crash on. Means over seeds; in brackets 95 % "
         "intervals over seeds and episodes (quad_gym.analysis.intervals). Success: "
@@ -222,7 +222,10 @@ def _add_figures(report: Report, results: StudyResults) -> None:
         recorded = results.flown[name][k].recorded
         traces = {trace: recorded[trace][:, pair.episode] for trace in study.about.traced}
         label = label_of(results, name).replace(", ", ",\n")
-        episodes[label] = {"time": recorded["time"], **traces}
+        flown = results.flown[name][k].episodes
+        ending = str(flown.ending[pair.episode]).replace("_", " ")
+        ending = f"crash: {ending}" if flown.crashed[pair.episode] else "finish"
+        episodes[label] = {"time": recorded["time"], "ending": ending, **traces}
     if kind == "glance":
         camera = sensor_suite(BENCHMARKS[IDS[study.env_id]].keywords["sensors"]).camera
         assert camera is not None
@@ -233,6 +236,6 @@ def _add_figures(report: Report, results: StudyResults) -> None:
     report.add_figure(
         kind,
         figure,
-        f"The same episode, flown on the estimate. Above, {above}; below, "
+        f"The same episode, evaluated on the estimate. Above, {above}; below, "
         f"standard deviation of the filter, and errors. {CHOICES[kind]}",
     )

@@ -83,7 +83,9 @@ def _gates(heading: str) -> dict[str, StudyColumn]:
     """Columns of a course."""
     return {
         "gates": StudyColumn(heading, lambda run: run.episodes.gates_passed, digits=2),
-        "speed": StudyColumn("mean speed [m/s]", lambda run: run.recorded["mean_speed"], digits=2),
+        "speed": StudyColumn(
+            "mean speed up to the end [m/s]", lambda run: run.recorded["mean_speed"], digits=2
+        ),
     }
 
 
@@ -95,8 +97,7 @@ STUDIED: Mapping[str, StudiedTask] = {
             *("truth", "std_certainty"),
         ),
         success=stays,
-        meaning="flown to the end, with a mean position error below "
-        f"{WITHIN:g} m in the second half",
+        meaning=f"completed, with a mean position error below {WITHIN:g} m in the second half",
         columns={
             "error": StudyColumn(
                 "position error [m]", lambda run: run.episodes.mean_error, digits=3

@@ -64,7 +64,6 @@ def test_study_of_each_task_flies_all_arms(task, arms, tmp_path, capsys):
     summary = json.loads((folder / "summary.json").read_text())
     assert set(summary["rows"]) == set(arms)
     assert set(summary["rows"]["truth"]) >= {"success", "crashed", "gates", "speed"}
-    assert sorted(f.name for f in (folder / "flights").iterdir()) == sorted(arms)
     assert not (folder / "runs/truth_on_truth").exists()
     text = (folder / "table.md").read_text()
     assert "passed" in text.partition("Success: ")[2].partition(".")[0]

@@ -15,6 +15,7 @@ import numpy as np
 
 from baselines.policies import load_policy
 from docs.examples.betaflight import BehindBetaflight, flights_behind
+from quad_gym.analysis.plots import house_style
 from quad_gym.analysis.reports import text_table
 from quad_gym.evaluation import roll_out
 
@@ -52,6 +53,7 @@ def step_response(axis, firmware):
     return np.arange(len(rates)) / RATE - BEFORE, np.array(rates)
 
 
+@house_style()
 def draw(file):
     """Draw the step responses of both loops."""
     figure, panels = plt.subplots(1, 3, figsize=(9.0, 2.8), sharex=True, layout="constrained")
