@@ -18,16 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quad_gym.commands.options import (
-    MISFIT,
-    LogFiles,
-    ReadingArgs,
-    SuiteName,
-    capital,
-    refuse_overwriting,
-    told,
-    usage_errors,
-)
+from quad_gym.commands.log_options import MISFIT, LogFiles, ReadingArgs, capital, told
+from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
 
 if TYPE_CHECKING:
     from quad_gym.estimation.calibration import Calibration

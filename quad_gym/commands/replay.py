@@ -19,16 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quad_gym.commands.options import (
-    MISFIT,
-    LogFile,
-    ReadingArgs,
-    SuiteName,
-    capital,
-    refuse_overwriting,
-    told,
-    usage_errors,
-)
+from quad_gym.commands.log_options import MISFIT, LogFile, ReadingArgs, capital, told
+from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
 
 if TYPE_CHECKING:
     from quad_gym.estimation import Replay
