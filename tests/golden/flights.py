@@ -78,6 +78,11 @@ def trajectories():
 
 def cases():
     """Return the keywords of the environments, by name of the case."""
+    return _families() | _single_cases()
+
+
+def _families():
+    """Return a case for each task, suite, observation, action and fault."""
     found = {}
     for task in ("Hover", "Circle", "Lemniscate", "RandomTrajectory", "Waypoints"):
         for suite in SUITES:
@@ -105,8 +110,12 @@ def cases():
     for task in ("LookAround", "StaleRace", "OutageDash"):
         found[task] = {"id": task}
         found[f"{task}, truth"] = {"id": task, "observation": "truth"}
+    return found
+
+
+def _single_cases():
     rtk = {"sensors": "rtk", "start": "hover"}
-    return found | {
+    return {
         "late": {"sensors": _late("rtk"), "start": "hover"},
         "late, not gated": {"sensors": _late("lab", 0.005, 0.005)},
         "barometer and magnetometer": {"sensors": AIDED, "innovations": True},
