@@ -8,7 +8,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import Log
 from quad_gym.params.aid_table import AID_PARAMS
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.sensors import LogDelays, SensorSuite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,7 @@ NUMBERS = (
         Number(
             sensor=_DELAYS, field=name, spread=0.3, positive=False, unit="s", step=1 / 30, limit=1.8
         )
-        for name in ("gnss", "camera", "magnetometer", "barometer")
+        for name in vars(LogDelays())
     ),
     *(
         Number(sensor="", field=_MOUNTING, axes=(k,), spread=0.1, positive=False, unit="rad")

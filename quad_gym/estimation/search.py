@@ -49,7 +49,8 @@ _WIDEST = math.log(2.0)
 """Largest logarithm of the factor by which a standard deviation exceeds the best fit. The factor is
 exp(2 s^2), where s is the standard deviation of its logarithm if the other numbers are known. Its
 square is then the root mean square of the variance: noise that is too small costs more than noise
-that is too large."""
+that is too large. The best fit to several logs is between their noise already, so that its own
+standard deviation counts, not the spread of the logs."""
 _MIN_COUNT = 30  #: number of innovations that describes their tails and correlations
 _COARSE = np.arange(-1.0, 1.01, 0.1)  #: first grid of a delay [s]
 _MARGIN = 0.2  #: time at the end of the log that changes of delays may reach [s]
@@ -330,7 +331,7 @@ class NumberSearch:
         reach = float(t.ppf(0.975, len(sums) - 1))
         found, priors = [], self.values.tolist()
         for k, (number, prior) in enumerate(zip(self.numbers, priors, strict=True)):
-            square = float(alone[k]) ** 2 + float(between[k])
+            square = float(alone[k]) ** 2 + float(between[k]) / len(self._sizes)
             wide = 2.0 * number.spread * square if number.noise else 0.0
             moves = (min(wide, _WIDEST / number.spread), -reach * sigmas[k], reach * sigmas[k])
             value, low, high = (number.value(prior, float(self.x[k] + move)) for move in moves)

@@ -79,6 +79,12 @@ class LogDelays(Checked):
     """of the magnetometer [s]"""
     barometer: Delay = 0.0
     """of the barometer [s]"""
+    optical_flow: Delay = 0.0
+    """of optical flow [s]"""
+    range_finder: Delay = 0.0
+    """of the range finder [s]"""
+    uwb_range: Delay = 0.0
+    """of ranges by radio [s]"""
 
 
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:

@@ -1,9 +1,10 @@
 """Calibrations on part of a real flight, or on another flight, validated on the rest.
 
     python -m tests.statistical.real_flights --ardupilot FOLDER --rtk FOLDER FOLDER FOLDER
+    python -m tests.statistical.real_flights --suite nano/suite.toml --crazyflie FILE ...
 
 The script prints the tables of docs/calibration.md, in about five minutes. The folders are as
-published, see docs/examples/real_flights.py.
+published, see docs/examples/real_flights.py. The files are tables of NanoBench (arXiv:2603.09908).
 """
 
 import argparse
@@ -13,15 +14,18 @@ from pathlib import Path
 import numpy as np
 
 import quad_gym
-from quad_gym.estimation import calibrate, read_log
+from quad_gym.estimation import calibrate, read_log, replay
+from quad_gym.estimation.logs.tables import csv_columns
 from quad_gym.estimation.validation import validate
-from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
 sys.path.append(str(Path(__file__).parents[2] / "docs" / "examples"))
 import real_flights
 
+MAP = Path(real_flights.__file__).with_name("nanobench.toml")
 SETTLED = 60.0  #: time from which the attitude is compared [s]
 MOVING = 10.0  #: time from which fixes are left out, as the filter starts in motion [s]
+START, LOW = 5.0, 0.3  #: time after the start [s] and height [m] from which errors count
 
 
 def attitude_errors(result, folder):
@@ -95,15 +99,64 @@ def survey_vehicle(folders):
             print(f"{source} -> {name}", *fit_texts(seen), sep="; ")
 
 
+def laboratory_vehicle(suite, files):
+    """Print errors of replays against motion capture, before and after the descent."""
+    squares = {"in the air": [], "until the motors stop": []}
+    for file in files:
+        table = csv_columns(file)
+        result = replay(file, sensors=suite, columns=MAP, reported_noise=False)
+        true, own, velocity = (
+            np.column_stack([np.interp(result.time + late, table["t"], table[n]) for n in names])
+            for late, names in (
+                (suite.log_delays.gnss, ("px", "py", "pz")),
+                (0.0, [f"est_stateEstimate_{axis}" for axis in "xyz"]),
+                (suite.log_delays.gnss, ("vx", "vy", "vz")),
+            )
+        )
+        rows = np.searchsorted(table["t"], result.time + suite.log_delays.gnss)
+        q = np.column_stack([table[f"q{axis}"] for axis in "wxyz"])[np.minimum(rows, len(rows) - 1)]
+        R_BI = quaternion_to_dcm(result.quaternion)
+        angles = np.degrees(dcm_to_euler(R_BI)[:, :2] - dcm_to_euler(quaternion_to_dcm(q))[:, :2])
+        antenna = result.position + np.array(suite.gnss.primary_antenna_B) @ R_BI
+        errors = np.column_stack([antenna - true, own - true])
+        scaled = ((result.velocity - velocity) / result.sigma[:, 3:6]) ** 2
+        running = np.column_stack([table[f"motor_motor_m{k}"] for k in range(1, 5)]).all(axis=1)
+        ends = result.time[np.flatnonzero(true[:, 2] > LOW)[-1]], table["t"][running][-1]
+        fixes = result.measured["gnss_position"]
+        texts = []
+        for name, end in zip(squares, ends, strict=True):
+            some = (result.time > result.time[0] + START) & (result.time <= end)
+            known = (fixes.time > fixes.time[0] + START) & (fixes.time <= end)
+            if not result.problems:
+                squares[name].append(scaled[some].mean(axis=0))
+            position, onboard = (
+                100.0 * np.sqrt((errors[some, k : k + 3] ** 2).sum(axis=1).mean()) for k in (0, 3)
+            )
+            tilt = np.sqrt((angles[some] ** 2).mean(axis=0)).round(1)
+            texts.append(
+                f"{name} NIS / 3 {np.nanmean(fixes.nis[known]) / 3.0:.2f}, {position:.1f} cm, "
+                f"velocity {scaled[some].mean(axis=0).round(1)}, roll, pitch {tilt} deg, onboard "
+                f"{onboard:.1f} cm"
+            )
+        share = 100.0 * fixes.rejected.mean()
+        print(file.name, *texts, f"rejected {share:.1f} %", result.verdict, sep="; ")
+    for name, some in squares.items():
+        print(f"{name}, velocity, mean of {len(some)}: {np.mean(some, axis=0).round(2)}")
+
+
 def main():
     """Print the tables of the given folders."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ardupilot", type=Path)
     parser.add_argument("--rtk", type=Path, nargs="*", default=())
+    parser.add_argument("--crazyflie", type=Path, nargs="*", default=())
+    parser.add_argument("--suite", default="mocap")
     args = parser.parse_args()
     if args.ardupilot is not None:
         hobby_vehicle(args.ardupilot)
     survey_vehicle(args.rtk)
+    if args.crazyflie:
+        laboratory_vehicle(quad_gym.sensor_suite(args.suite), args.crazyflie)
 
 
 if __name__ == "__main__":

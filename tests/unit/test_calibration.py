@@ -24,8 +24,9 @@ from quad_gym.estimation.search import NumberSearch, widening
 from quad_gym.estimation.validation import validate
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.range_finder import RangeFinderParams
+from quad_gym.params.sensors import SENSOR_PARAMS
 from quad_gym.params.suites import CONSUMER
-from quad_gym.rotations import euler_to_dcm
+from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.console_commands import run
 from tests.logged_flights import Recorded, flown
 from tests.many_logs import logs_of
@@ -188,9 +189,9 @@ def test_command_writes_suite_page_and_summary(found, tmp_path, monkeypatch):
     )
     assert asked == [(Path("flight.csv"), "consumer", False)]
     summary = json.loads((tmp_path / "mine/calibration.json").read_text())
-    without = ("camera", "log_delays.camera", "gnss.baseline", "gnss.primary_antenna")
-    without += ("log_compass_rotation", "log_delays.barometer")
-    without += tuple(name for name in AID_PARAMS if name != "magnetometer")
+    absent = ("camera", *(name for name in AID_PARAMS if name != "magnetometer"))
+    without = ("gnss.baseline", "gnss.primary_antenna", "log_compass_rotation", *absent)
+    without += tuple(f"log_delays.{name}" for name in absent)
     assert set(summary["numbers"]) == {n.name for n in NUMBERS if not n.name.startswith(without)}
     assert summary["after"]["measurements"]["gnss_velocity"]["mean_nis"] > 0.0
     assert (tmp_path / "mine/report.html").stat().st_size > 10_000
@@ -444,6 +445,32 @@ def test_search_in_all_logs_begins_where_the_search_in_some_has_ended(table, fou
     some.x = np.array([n.number.coordinate(n.prior, n.value) for n in found.numbers])
     every.take(some)
     assert every.suite(every.x) == some.suite(some.x)
+
+
+@pytest.mark.parametrize(("name", "sensor"), [("crazyflie", "range_finder"), ("uwb", "uwb_range")])
+def test_delay_of_an_aiding_sensor_has_its_best_likelihood_at_the_true_delay(name, sensor):
+    """Of a grid with steps of 50 ms, with all other numbers as simulated."""
+    suite = quad_gym.sensor_suite(name).with_rates(imu=100.0)
+    flight = flown(suite, 12.0, task="random_trajectory")
+    columns = Recorded(flight, suite, lost=0.0, jitter=0.0, max_ticks=1).table()
+    log = read_log(columns)
+    late = getattr(log, sensor)
+    received = np.maximum(late.received, late.time + 0.1)
+    log = replace(log, **{sensor: Stream(late.time + 0.1, received, late.values)})
+    x_I = quaternion_to_dcm(flight["quaternion"][0])[0]
+    start = {"position": flight["position"][0], "heading": math.atan2(x_I[1], x_I[0])}
+    search = NumberSearch([log], suite, [start], delays=True, rotation=False)
+    (k,) = (k for k, n in enumerate(search.numbers) if n.name == f"log_delays.{sensor}")
+    delays = np.arange(-0.1, 0.31, 0.05)
+    x = np.array([n.coordinate(v, v) for n, v in zip(search.numbers, search.values, strict=True)])
+    spread = search.numbers[k].spread
+    points = [np.where(np.arange(len(x)) == k, delay / spread, x) for delay in delays]
+    assert delays[np.argmin(search.total(points))] == pytest.approx(0.1)
+
+
+def test_every_sensor_has_a_delay_that_a_calibration_finds():
+    found = {number.field for number in NUMBERS if number.sensor == "log_delays"}
+    assert found == set(vars(quad_gym.LogDelays())) == set(SENSOR_PARAMS)
 
 
 @pytest.mark.slow

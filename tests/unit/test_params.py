@@ -8,6 +8,7 @@ import pytest
 import quad_gym
 from quad_gym.packing.flight import params_record
 from quad_gym.params.clocks import Clocks
+from quad_gym.params.sensors import SENSOR_PARAMS
 from quad_gym.records import MAX_FEATURES, MAX_GATES
 
 NO_NUMBERS = ["fast", "3", b"3", True, np.True_, 3j, np.array([3.0]), 10**400]
@@ -99,7 +100,7 @@ BAD_VALUES = {
     },
     "InitialPoseParams": {"position_sigma heading_sigma": NOT_POSITIVE},
     "NoisyObservationParams": {"position velocity attitude body_rates": BELOW_ZERO},
-    "LogDelays": {"gnss camera magnetometer barometer": [-2.1, 2.1, *NO_NUMBERS]},
+    "LogDelays": {" ".join(SENSOR_PARAMS): [-2.1, 2.1, *NO_NUMBERS]},
     "PDGains": {
         "position velocity": BELOW_ZERO,
         "attitude body_rates": [*NO_VECTORS, (1.0, 1.0, -1.0)],
