@@ -312,9 +312,8 @@ def _like_the_log(suite: SensorSuite, log: Log) -> SensorSuite:
             continue
         measured = 1.0 / float(np.median(np.diff(stream.time)))
         ticks = max(1, round(rate / measured))
-        late = float(np.median(stream.received - stream.time)) + vars(suite.log_delays).get(
-            name, 0.0
-        )
+        late = float(np.median(stream.received - stream.time))
+        late += vars(suite.log_delays).get(name, 0.0)
         latency = min(max(0.0, round(late * rate) / rate), 2.0 * ticks / rate)
         changes[name] = params.replace(rate=rate / ticks, latency=latency)
     return suite.replace(**changes)
