@@ -47,8 +47,8 @@ demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as t
 	@echo "   estimate is expected to make no difference. Three seeds are trained on each for a few seconds,"
 	@echo "   so PD control with tuned gains is expected to be better than both:"
 	@$(BIN)/quad-gym compare circle --engine compiled --train-on truth estimate --seeds 3 \
-		--steps 250000 --n-envs 64 --set batch_size=128 n_epochs=3 --evaluations 4 \
-		--episodes 100 --output results/demo/control
+		--steps 250000 --n-envs 64 --set batch_size=128 n_epochs=3 --evaluations 2 \
+		--episodes 50 --output results/demo/control
 	@echo
 	@echo "Open:"
 	@echo "  results/demo/look_around/video.webp   one episode; the policy on the right looks at the markers"

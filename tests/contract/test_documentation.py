@@ -176,6 +176,14 @@ def test_links_lead_to_files_and_headings_of_the_repository(page):
         assert not anchor or anchor in anchors(file), f"{page.name}: {target}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_no_line_begins_with_a_mark_and_goes_on(page):
+    """Such a line is a block of HTML, in which Markdown is shown as it is written."""
+    assert not re.findall(
+        r"^ {0,3}<!--.*-->.*\S.*$", page.read_text(encoding="utf-8"), re.MULTILINE
+    )
+
+
 def test_functions_named_on_equation_pages_exist():
     pages = ("filter-equations", "recovery")
     text = " ".join((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in pages)
