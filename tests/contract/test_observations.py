@@ -7,7 +7,14 @@ import quad_gym
 from quad_gym.envs.spaces import layout_bounds
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params.sensors import AID_PARAMS
-from quad_gym.records import COLUMNS, FEATURE_SLICE, MAX_FEATURES, MAX_OBSERVATION
+from quad_gym.records import (
+    COLUMNS,
+    FEATURE_BLOCKS,
+    FEATURE_SLICE,
+    MAX_FEATURES,
+    MAX_OBSERVATION,
+    MAX_TOGETHER,
+)
 from tests.builders import actions_of, vec_env
 from tests.contract.test_tasks import SECONDS, UNBOUNDED, body_axes, level, unit
 from tests.reference_ukf import east_north_up
@@ -296,7 +303,8 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
 def test_observation_with_all_parts_fits_in_maximum_length():
     suite = quad_gym.sensor_suite("rtk")
     aids = {name: kind() for name, kind in AID_PARAMS.items() if kind.most_blocks == 1}
-    camera = suite.camera.replace(features_I=((1.0, 0.0, 0.0),) * MAX_FEATURES)
+    most = min(MAX_FEATURES, MAX_TOGETHER - FEATURE_BLOCKS - len(aids))
+    camera = suite.camera.replace(features_I=((1.0, 0.0, 0.0),) * most)
     suite = suite.replace(camera=camera, **aids)
     shown = {"include_std": True, "privileged": True, "sensors": suite, "drawn": tuple(COLUMNS)}
     table = quad_gym.observation_layout("measurements", **shown)
