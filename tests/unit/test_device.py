@@ -101,7 +101,7 @@ def test_module_in_a_wheel_is_taken_for_its_sources_and_settings_alone(tmp_path,
         (TRUTH, 200, 250e3),
         pytest.param({}, 500, 900e3, marks=pytest.mark.slow),
         pytest.param(
-            {"sensors": "rtk", "faults": "gnss_outage"}, 1000, 1400e3, marks=pytest.mark.slow
+            {"sensors": "rtk", "faults": "gnss_outage"}, 500, 1400e3, marks=pytest.mark.slow
         ),
     ],
 )
