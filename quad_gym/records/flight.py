@@ -156,11 +156,9 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("rejected_in_row", (SENSOR_GROUPS,), "-", "positions, baselines, velocities, images wholly rejected, other sensors, since the last accepted one"),
         Field("resets", (SENSOR_GROUPS,), "-", "times that states were reset to each of these in this episode"),
         Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "time of the last accepted measurement of each group"),
-        Field("refused_tick", (SENSOR_GROUPS,), "ticks", "time of the first rejection since then, or of a step that reduced the innovation"),
-        Field("refused_nis", (SENSOR_GROUPS,), "-", "NIS of the last rejected measurement of each group"),
-        Field("innovation_mean", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each group, in standard deviations"),
-        Field("corrected", (6,), "m/s^2, rad/s", "sum of the last corrections of the biases"),
-        Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "variance of this sum in a consistent filter"),
+        Field("refused_tick", (SENSOR_GROUPS,), "ticks", "time of the first rejection since then"),
+        Field("corrected", (9,), "m/s^2, rad/s, m", "sum of the last corrections of the biases, and of the drift of GNSS positions where that is estimated"),
+        Field("corrected_variance", (9,), "m^2/s^4, rad^2/s^2, m^2", "variance of this sum in a consistent filter"),
         Field("corrected_tick", (), "ticks", "time of the last correction"),
         Field("stepped", (SENSOR_GROUPS,), "0 or 1", "1 if the first rejected measurement was a step of the sensor"),
         Field("noise_factor", (SENSOR_GROUPS,), "-", "factor on the noise variance of each group that explains its innovations"),
@@ -181,8 +179,6 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
         Field("gate", (MAX_BLOCKS,), "-", "decision of the gate, see GateDecision"),
         Field("rejections", (MAX_BLOCKS,), "-", "number of rejections since the start of the episode"),
-        Field("corrected_long", (6,), "m/s^2, rad/s", "as corrected, over a longer time"),
-        Field("corrected_long_variance", (6,), "m^2/s^4, rad^2/s^2", "variance of this sum in a consistent filter"),
     )),
     ("late", (
         # sums of the IMU's samples since the start of the episode, biases and gravity included
@@ -199,8 +195,6 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
     ("slow", (
         # slow errors of sensors, where the filter estimates them
         Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
-        Field("drift_corrected", (3,), "m", "sum of the last corrections of the drift of GNSS positions, where that is estimated"),
-        Field("drift_corrected_variance", (3,), "m^2", "variance of this sum in a consistent filter"),
         Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
     )),
     ("aids", (

@@ -23,7 +23,7 @@ from quad_gym.kernels.filter.measurements import (
     restore_valid,
     store_valid,
 )
-from quad_gym.kernels.filter.monitoring import forget_corrections, forget_drift_corrections
+from quad_gym.kernels.filter.monitoring import forget_corrections
 from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_columns, take_mean
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
@@ -192,8 +192,6 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     failed = arrived & old
     if (settings.form & MONITORED) != 0 and any_of(failed):
         forget_corrections(flight, failed)
-        if slow is not None:
-            forget_drift_corrections(flight, failed)
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     failures = select(failed, work.kept_failures + 1.0, flight.update_failures)

@@ -19,12 +19,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.measurements import call_measured
-from quad_gym.kernels.filter.monitoring import (
-    LARGEST,
-    follow_mean,
-    follow_ratio,
-    forget_corrections,
-)
+from quad_gym.kernels.filter.monitoring import follow_ratio, forget_corrections
 from quad_gym.kernels.filter.recovery import (
     OUTLIER,
     accept_group,
@@ -35,13 +30,14 @@ from quad_gym.kernels.filter.recovery import (
 )
 from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or
+from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or, vector
 from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_outers_of_rows
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.records import (
     AID_BLOCKS,
     AID_ROWS,
+    BASELINE_BLOCK,
     FEATURE_BLOCKS,
     SEVERAL,
     Act,
@@ -66,52 +62,52 @@ def _covariance(p, work, settings, k):
 
 
 @kernel
-def _nis_of_triple(P_zz, nu):
-    """The NIS nu^T P_zz^-1 nu, by the Cholesky factor of P_zz."""
-    l00 = math.sqrt(P_zz[0][0])
-    l10, l20 = P_zz[1][0] / l00, P_zz[2][0] / l00
-    l11 = math.sqrt(P_zz[1][1] - l10 * l10)
-    l21 = (P_zz[2][1] - l20 * l10) / l11
-    l22 = math.sqrt(P_zz[2][2] - l20 * l20 - l21 * l21)
+def _nis(P_zz, nu, numbers):
+    """The NIS nu^T P_zz^-1 nu of the first `numbers` numbers, by the Cholesky factor of P_zz."""
+    l00, total = math.sqrt(P_zz[0][0]), zero_like(nu[0])
     y0 = nu[0] / l00
-    y1 = (nu[1] - l10 * y0) / l11
-    y2 = (nu[2] - l20 * y0 - l21 * y1) / l22
-    return y0 * y0 + y1 * y1 + y2 * y2
+    if numbers > 1.0:
+        l10 = P_zz[1][0] / l00
+        l11 = math.sqrt(P_zz[1][1] - l10 * l10)
+        y1 = (nu[1] - l10 * y0) / l11
+        total = y0 * y0 + y1 * y1
+        if numbers > 2.0:
+            l20 = P_zz[2][0] / l00
+            l21 = (P_zz[2][1] - l20 * l10) / l11
+            l22 = math.sqrt(P_zz[2][2] - l20 * l20 - l21 * l21)
+            y2 = (nu[2] - l20 * y0 - l21 * y1) / l22
+            total = total + y2 * y2
+    else:
+        total = y0 * y0
+    return total
 
 
 @kernel
-def _across(u, P_zz, nu):
-    """Innovation and covariance of a direction, across u: (side, up), (P_ss, P_us, P_uu)."""
-    side = unit_or((-u[1], u[0], zero_like(u[0])), (1.0, 0.0, 0.0))  # vertical x u
-    up = cross(u, side)
-    P_side, P_up = P_zz @ side, P_zz @ up
-    return (dot(side, nu), dot(up, nu)), (dot(side, P_side), dot(up, P_side), dot(up, P_up))
+def _across(side, up, P_zz):
+    """Covariance of a direction's innovation across it: to the side, up, and none along it."""
+    P_side, P_up, zero = P_zz @ side, P_zz @ up, zero_like(side[0])
+    upward = dot(up, P_side)
+    row = (dot(side, P_side), upward, zero)
+    return (row, (upward, dot(up, P_up), zero), (zero, zero, zero))
 
 
 @kernel
-def _nis_of_direction(P_zz, nu):
-    """The NIS of two numbers."""
-    l00 = math.sqrt(P_zz[0])
-    l10 = P_zz[1] / l00
-    y0 = nu[0] / l00
-    y1 = (nu[1] - l10 * y0) / math.sqrt(P_zz[2] - l10 * l10)
-    return y0 * y0 + y1 * y1
-
-
-@kernel
-def _minus(nu, last, numbers):
-    """Difference of an innovation and the last one; zero behind its `numbers`."""
+def _store_innovation(flight, s, first, nu, P_zz, numbers, nis):
+    """Store the first `numbers` of the innovation of block s, in the lanes `first`."""
+    none = np.nan + zero_like(nis)
+    sigma = (math.sqrt(P_zz[0][0]), math.sqrt(P_zz[1][1]), math.sqrt(P_zz[2][2]))
     if numbers < 3.0:
-        return (nu[0] - last[0], zero_like(nu[0]), zero_like(nu[0]))
-    return (nu[0] - last[0], nu[1] - last[1], nu[2] - last[2])
-
-
-@kernel
-def _store_innovation(flight, s, first, nu, sigma, nis, rejected, unsure, weakened):
-    """Store the innovation of block s and the decision on it, in the lanes `first`."""
+        nu, sigma = (nu[0], nu[1], none), (sigma[0], sigma[1], none)
+    if numbers < 2.0:
+        nu, sigma = (nu[0], none, none), (sigma[0], none, none)
     keep(flight.innovation[s], first, nu)
     keep(flight.innovation_sigma[s], first, sigma)
     flight.block_nis[s] = select(first, nis, flight.block_nis[s])
+
+
+@kernel
+def _store_decision(flight, s, first, rejected, unsure, weakened):
+    """Store the decision on block s, in the lanes `first`."""
     decision = select(rejected, GateDecision.REJECTED, GateDecision.ACCEPTED)
     decision = select(weakened, GateDecision.WEAKENED, decision)
     decision = select(unsure, GateDecision.UNSURE, decision)
@@ -135,234 +131,109 @@ def mask_block(work, settings, k, rejected):
 
 
 @kernel
-def _decide(flight, s, valid, wanted, again, decision):
-    """Lanes in which a block gets `decision`: as `wanted`, in a later step as in the first."""
-    return valid & ((wanted & logical_not(again)) | (again & (flight.gate[s] == decision)))
+def _weigh(flight, p, settings, group, beyond, nis, limit):
+    """Lanes in which a block `beyond` the gate is rejected, as its sensor is wrong.
 
-
-@kernel
-def _weigh(flight, p, settings, group, s, valid, nis, limit, again):
-    """Lanes in which block s is rejected, and lanes in which its noise is increased.
-
-    An innovation beyond the gate is an error of the sensor, or else of the IMU; then it has a
-    bounded weight. A block of several is wrong where most others agree with the estimate.
+    Elsewhere the IMU is wrong, and the block has a bounded weight. A block of several is wrong
+    where most others agree with the estimate.
     """
-    rejected, weakened = no_lane(nis), no_lane(nis)
-    if (settings.form & FilterForm.GATE.value) != 0:
-        beyond = valid & (nis > limit_of(flight, group, limit))
-        if any_of(beyond):
-            hard = supported(flight, p, settings, group)
-            hard = hard | glitches(flight, p, settings, group, nis, limit)
-            if group in SEVERAL:  # most blocks of the last measurement agreed
-                hard = hard | (flight.rejected_in_row[group] < 1.0)
-            rejected = beyond & hard
-            weakened = beyond & logical_not(hard)
-    rejected = _decide(flight, s, valid, rejected, again, GateDecision.REJECTED)
-    weakened = _decide(flight, s, valid, weakened, again, GateDecision.WEAKENED)
-    return rejected, weakened
-
-
-@kernel
-def weaken(work, k, weakened, share, P_zz):
-    """Add a share of P_zz to the noise of the block at row k, in the lanes `weakened`."""
-    if any_of(weakened):
-        share = select(weakened, maximum(share, 0.0), 0.0)  # a later step may be within the gate
-        more = load_block(work.Rz, k, k) + share * P_zz
-        store_block(work.Rz, k, k, more)
-
-
-@kernel
-def add_nis(work, counted, nis, freedoms):
-    """Add a block to the statistics of the whole measurement, in the lanes `counted`."""
-    work.judged_nis = work.judged_nis + select(counted, nis, 0.0)
-    work.judged_freedoms = work.judged_freedoms + select(counted, freedoms, 0.0)
+    rejected = no_lane(nis)
+    if any_of(beyond):
+        rejected = supported(flight, p, settings, group)
+        rejected = rejected | glitches(flight, p, group, nis, limit)
+        if group in SEVERAL:  # most blocks of the last measurement agreed
+            rejected = rejected | (flight.rejected_in_row[group] < 1.0)
+    return beyond & rejected
 
 
 @kernel
 def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
-    """Store the innovation of block s, at row k, and decide on it.
+    """Decide on block s of `numbers` numbers, at row k, and mask it where it is left out.
 
-    Its stored standard deviations and NIS are those with the suite's noise. A block with fewer
-    `numbers` than three has masked rows behind them, which add nothing to its NIS.
+    A later step decides as the first one. The stored standard deviations and NIS are those with the
+    suite's noise. A direction is left out where the sum of its predicted variances is too large.
 
     Returns:
-        Lanes in which it is valid; lanes in which it is beyond the gate; its NIS; half the NIS of
-        its difference from the last one; its innovation in standard deviations.
+        Lanes in which it is counted; lanes in which it is beyond the gate; its NIS; half the NIS of
+        its difference from the last one.
     """
-    again = work.again > 0.0
+    gating, none = (settings.form & FilterForm.GATE.value) != 0, no_lane(work.again)
     valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
+    first, R = valid & (work.again <= 0.0), load_block(work.Rz, k, k)
     P_suite, nu = _covariance(p, work, settings, k), load3(work.nu[k : k + 3])
-    P_zz = P_suite + scale_noise(flight, work, settings, k, group)
-    nis, last = _nis_of_triple(P_zz, nu), flight.innovation[s]
-    scatter = 0.5 * _nis_of_triple(P_zz, _minus(nu, last, numbers))
-    rejected, weakened = _weigh(flight, p, settings, group, s, valid, nis, limit, again)
-    weaken(work, k, weakened, nis / limit - 1.0, P_zz)
-    sigma = (math.sqrt(P_zz[0][0]), math.sqrt(P_zz[1][1]), math.sqrt(P_zz[2][2]))
-    scaled = (nu[0] / sigma[0], nu[1] / sigma[1], nu[2] / sigma[2])
-    sigma = (math.sqrt(P_suite[0][0]), math.sqrt(P_suite[1][1]), math.sqrt(P_suite[2][2]))
-    nis_suite = _nis_of_triple(P_suite, nu)
-    if numbers < 3.0:
-        none = np.nan + zero_like(nis)
-        nu, sigma = (nu[0], none, none), (sigma[0], none, none)
-        scaled = (scaled[0], zero_like(nis), zero_like(nis))
-    first = valid & logical_not(again)
-    _store_innovation(flight, s, first, nu, sigma, nis_suite, rejected, nis < nis, weakened)
-    return valid, rejected | weakened, nis, scatter, scaled
-
-
-@kernel
-def gate_numbers(flight, p, work, settings, k, s, group, limit, numbers):
-    """Store the innovation of block s, at row k, and mask it where its NIS exceeds `limit`.
-
-    Rejections do not count against a filter that other sensors support.
-    """
-    valid, beyond, nis, scatter, scaled = _gate_block(
-        flight, p, work, settings, k, s, group, limit, numbers
-    )
-    first = valid & logical_not(work.again > 0.0)
-    judge(flight, p, work, settings, group, first, beyond, nis, scatter, numbers, limit)
-    follow_mean(flight, group, first & logical_not(beyond), scaled)
-    mask_rejected(flight, work, settings, k, s, valid, numbers)
-
-
-@kernel
-def no_blocks(flight):
-    """Statistics of a measurement of several blocks before the first one, see `add_block`."""
-    zero = zero_like(flight.tick)
-    return zero, zero, zero, zero, zero, (zero, zero, zero)
-
-
-@kernel
-def add_block(statistics, counted, beyond, nis, scatter, scaled):
-    """Add a block to the statistics of its measurement, in the lanes `counted`.
-
-    These are the counts of blocks and of those beyond the gate, the sum of NIS of all and of the
-    others, the sum of the scatter, and the sum of the others' innovations.
-    """
-    count, refused, total, kept, scattered, mean = statistics
-    used = counted & logical_not(beyond)
-    x, y, z = scaled
-    return (
-        count + select(counted, 1.0, 0.0),
-        refused + select(counted & beyond, 1.0, 0.0),
-        total + select(counted, nis, 0.0),
-        kept + select(used, nis, 0.0),
-        scattered + select(counted, scatter, 0.0),
-        (
-            mean[0] + select(used, clip(x, -LARGEST, LARGEST), 0.0),
-            mean[1] + select(used, clip(y, -LARGEST, LARGEST), 0.0),
-            mean[2] + select(used, clip(z, -LARGEST, LARGEST), 0.0),
-        ),
-    )
-
-
-@kernel
-def judge_several(flight, p, work, settings, group, statistics, freedoms, limit):
-    """Take account of a measurement of several blocks.
-
-    It counts as rejected if half of its blocks are; otherwise rejected ones do not count.
-    """
-    count, refused, total, kept, scatter, (x, y, z) = statistics
-    first, most = count > 0.0, refused >= 0.5 * count
-    several, few = maximum(count, 1.0), maximum(count - refused, 1.0)
-    nis = select(most, total / several, kept / few)
-    scatter, root = scatter / several, math.sqrt(few)
-    judge(flight, p, work, settings, group, first, first & most, nis, scatter, freedoms, limit)
-    follow_mean(flight, group, first & logical_not(most), (x / root, y / root, z / root))
-
-
-@kernel
-def gate_several(flight, p, work, settings, k, first, count, group, limit, numbers):
-    """Do the same as `gate_numbers` for a measurement of blocks that are accepted one by one."""
-    statistics = no_blocks(flight)
-    for s in range(first, first + count):
-        if any_of(flight.block_valid[s] > 0.0):
-            valid, beyond, nis, scatter, scaled = _gate_block(
-                flight, p, work, settings, k, s, group, limit, numbers
-            )
-            counted = valid & logical_not(work.again > 0.0)
-            statistics = add_block(statistics, counted, beyond, nis, scatter, scaled)
-            mask_rejected(flight, work, settings, k, s, valid, numbers)
-            k += 3
-    judge_several(flight, p, work, settings, group, statistics, numbers, limit)
-
-
-@kernel
-def gate_direction(flight, p, work, settings, k, s, group, valid, limit):
-    """Store the innovation of a direction, block s, in the lanes `valid`.
-
-    Returns:
-        Lanes in which it is beyond the gate; lanes in which it is too uncertain, where the sum of
-        its predicted variances exceeds `limit`; its NIS; half the NIS of its difference from the
-        last one; its innovation in standard deviations.
-    """
-    gating, again = (settings.form & FilterForm.GATE.value) != 0, work.again > 0.0
-    u, nu = load3(work.z_hat[k : k + 3]), load3(work.nu[k : k + 3])
-    whole = _covariance(p, work, settings, k)
-    nu_3 = nu
-    nu, P_suite = _across(u, whole, nu_3)
-    whole = whole + scale_noise(flight, work, settings, k, group)
-    _, P_zz = _across(u, whole, nu_3)
-    nis, last = _nis_of_direction(P_zz, nu), flight.innovation[s]
-    scatter = 0.5 * _nis_of_direction(P_zz, (nu[0] - last[0], nu[1] - last[1]))
-    vague = (P_zz[0] + P_zz[2] > limit) & gating
-    unsure = _decide(flight, s, valid, vague, again, GateDecision.UNSURE)
-    sure, most = valid & logical_not(unsure), p.gate_direction
-    rejected, weakened = _weigh(flight, p, settings, group, s, sure, nis, most, again)
-    weaken(work, k, weakened, nis / most - 1.0, whole)
-    none = np.nan + zero_like(nis)
-    scaled = (nu[0] / math.sqrt(P_zz[0]), nu[1] / math.sqrt(P_zz[2]))
-    sigma = (math.sqrt(P_suite[0]), math.sqrt(P_suite[2]), none)
-    nis_suite = _nis_of_direction(P_suite, nu)
-    first = valid & logical_not(again)
-    _store_innovation(
-        flight, s, first, (nu[0], nu[1], none), sigma, nis_suite, rejected, unsure, weakened
-    )
-    return rejected | weakened, unsure, nis, scatter, scaled
-
-
-@kernel
-def mask_rejected(flight, work, settings, k, s, valid, numbers):
-    """Mask block s at row k in the lanes in which it is left out."""
-    if (settings.form & FilterForm.GATE.value) != 0:
-        gate = flight.gate[s]
-        rejected = valid & ((gate == GateDecision.REJECTED) | (gate == GateDecision.UNSURE))
-        mask_block(work, settings, k, rejected)
-        work.left_out = work.left_out + select(rejected, numbers, 0.0)
-
-
-@kernel
-def scale_noise(flight, work, settings, k, group):
-    """Multiply the noise of the block at row k by the factor of its group; return the increase."""
-    R = load_block(work.Rz, k, k)
     more = zero_like(R)
-    if (settings.form & FilterForm.GATE.value) != 0:
+    if gating:
         more = (flight.noise_factor[group] - 1.0) * R
         store_block(work.Rz, k, k, R + more)
-    return more
+    whole = P_suite + more
+    P_zz, unsure, masked = whole, none, numbers
+    if group in (BASELINE_BLOCK, FEATURE_BLOCKS):
+        u, masked = load3(work.z_hat[k : k + 3]), 3.0
+        side = unit_or((-u[1], u[0], zero_like(u[0])), (1.0, 0.0, 0.0))  # vertical x u
+        up = cross(u, side)
+        P_suite, P_zz = _across(side, up, P_suite), _across(side, up, whole)
+        nu = vector(dot(side, nu), dot(up, nu), zero_like(u[0]))
+    if gating and group == FEATURE_BLOCKS:
+        unsure = P_zz[0][0] + P_zz[1][1] > p.gate_uncertainty
+    nis, change = _nis(P_zz, nu, numbers), nu - load3(flight.innovation[s])
+    scatter = 0.5 * _nis(P_zz, change, numbers)
+    _store_innovation(flight, s, first, nu, P_suite, numbers, _nis(P_suite, nu, numbers))
+    beyond, rejected = none, none
+    if gating:
+        beyond = first & logical_not(unsure) & (nis > limit_of(flight, group, limit))
+        rejected = _weigh(flight, p, settings, group, beyond, nis, limit)
+    weakened = beyond & logical_not(rejected)
+    _store_decision(flight, s, first, rejected, unsure, weakened)
+    if gating:
+        gate = flight.gate[s]
+        weakened = valid & (gate == GateDecision.WEAKENED)
+        if any_of(weakened):
+            share = select(weakened, maximum(nis / limit - 1.0, 0.0), 0.0)
+            store_block(work.Rz, k, k, R + more + share * whole)
+        out = valid & ((gate == GateDecision.REJECTED) | (gate == GateDecision.UNSURE))
+        mask_block(work, settings, k, out)
+        work.left_out = work.left_out + select(out, masked, 0.0)
+    return first & logical_not(unsure), beyond, nis, scatter
 
 
 @kernel
-def judge(flight, p, work, settings, group, first, beyond, nis, scatter, freedoms, limit):
-    """Take account of the NIS of a group in the lanes `first`, `beyond` the gate in some.
+def gate_blocks(flight, p, work, settings, k, first, count, group, limit, numbers):
+    """Decide on the blocks of a group from `first` on, at row k, and mask those left out.
 
+    The group counts as rejected if half of its blocks are; otherwise rejected ones do not count.
     Rejections do not count against a filter that other sensors support.
     """
+    zero = zero_like(flight.tick)
+    counted, refused, total, kept, scattered = zero, zero, zero, zero, zero
+    for s in range(first, first + count):
+        if any_of(flight.block_valid[s] > 0.0):
+            valid, beyond, nis, scatter = _gate_block(
+                flight, p, work, settings, k, s, group, limit, numbers
+            )
+            counted, refused = counted + select(valid, 1.0, 0.0), refused + select(beyond, 1.0, 0.0)
+            total = total + select(valid, nis, 0.0)
+            kept = kept + select(valid & logical_not(beyond), nis, 0.0)
+            scattered = scattered + select(valid, scatter, 0.0)
+            k += 3
+    measured, most = counted > 0.0, (counted > 0.0) & (refused >= 0.5 * counted)
+    several, few = maximum(counted, 1.0), maximum(counted - refused, 1.0)
+    nis, excused = select(most, total / several, kept / few), no_lane(zero)
     if (settings.form & FilterForm.GATE.value) != 0:
-        glitch, excused = beyond, beyond
-        if any_of(beyond):
-            excused = beyond & supported(flight, p, settings, group)
-            glitch = beyond & glitches(flight, p, settings, group, nis, limit)
-        add_nis(work, first & logical_not(excused), nis, freedoms)
-        adapt_noise(flight, group, first, scatter, freedoms, limit)
-        count_rejections(flight, group, first, beyond, glitch, nis)
+        glitch = most
+        if any_of(most):
+            excused = most & supported(flight, p, settings, group)
+            glitch = most & glitches(flight, p, group, nis, limit)
+        _adapt_noise(flight, group, measured, scattered / several, numbers, limit)
+        count_rejections(flight, group, measured, most, glitch)
     else:
-        add_nis(work, first, nis, freedoms)
-        accept_group(flight, group, first)
+        accept_group(flight, group, measured)
+    judged = measured & logical_not(excused)
+    work.judged_nis = work.judged_nis + select(judged, nis, 0.0)
+    work.judged_freedoms = work.judged_freedoms + select(judged, numbers, 0.0)
 
 
 @kernel
-def adapt_noise(flight, group, first, scatter, freedoms, limit):
+def _adapt_noise(flight, group, first, scatter, freedoms, limit):
     """Match the factor on a group's noise to the scatter of its innovations, where `first`.
 
     The scatter is half the NIS of the difference of two successive innovations. Its mean is the

@@ -1,43 +1,31 @@
 """Tests of a filter's consistency, and the flag of a diverged one.
 
 Innovations of a consistent filter are white, and so are the corrections of its states, each with
-the variance that its update removes, P- minus P+. Four tests show that the covariance does not
+the variance that its update removes, P- minus P+. Two tests show that the covariance does not
 explain the measurements:
 
 * the mean of NIS over its degrees of freedom;
-* the mean of the last innovations of a sensor, in standard deviations;
-* sums of the corrections of the IMU biases over some seconds, which show a bias that has changed
-  long before innovations do, as attitude and position may compensate each other;
-* the sum of the corrections of the drift of GNSS positions, which shows a jump that the drift has
-  absorbed.
+* sums of the corrections of the IMU biases and of the drift of GNSS positions over some seconds,
+  whose normalized squares are chi-square. They show a bias that has changed long before innovations
+  do, as attitude and position may compensate each other, and a jump that the drift has absorbed.
 
 Source: R. K. Mehra and J. Peschon, Automatica 7, 1971. That corrections are white with these
 variances follows from the whiteness of innovations.
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BA, D, R, variance_of
-from quad_gym.kernels.maths.elementary import clip, maximum, minimum
+from quad_gym.kernels.filter.error_state import BA, BG, D, variance_of
+from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.maths.linalg import load3
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, select, zero_like
-from quad_gym.records import SENSOR_GROUPS
 
 RECENT = 1.0  #: time within which a measurement still counts [s]
-LARGEST = 3.0  #: limit on each innovation in the mean, in standard deviations, because of outliers
-_MEMORY, _BIASED = 0.02, 0.55
-"""Weight of the latest innovation in their mean, of standard deviation sqrt(0.02 / 1.98) = 0.1, and
-the mean beyond which they are not white: once in a million times by chance."""
-CORRECTION_TIME, _ONE_WAY = 3.0, 5.0
-"""Time over which corrections of the biases are summed [s], and the standard deviations of their
-sum above which they go one way."""
-_LONG_TIME, _ONE_WAY_LONG = 12.0, 24.0
-"""The same for errors that are small compared with the noise; the normalized square of three sums,
-chi-square, exceeds the limit with a probability of 2e-5."""
-_HARMLESS = 1.0 / _ONE_WAY**2
-"""Share of the bias's variance in the test: the sum must also exceed its standard deviation."""
-_JUMP_TIME, _SUDDEN, _LIKELY = 1.5, 24.0, 12.0
-"""Time over which corrections of the drift are summed [s], and the limits on the normalized square
-of their sum, the second where the filter is already flagged as diverged."""
+CORRECTION_TIME, _JUMP_TIME = 6.0, 1.5
+"""Times over which corrections of the biases and of the drift are summed [s]."""
+SHIFTED, LIKELY = 24.0, 12.0
+"""Limits on the normalized square of three sums, chi-square: the first is exceeded with a
+probability of 2e-5, the second is for filters that are already flagged as diverged."""
 DIVERGED_RATIO, CONVERGED_RATIO = 2.1, 1.5
 """Mean NIS over degrees of freedom at which a filter is flagged as diverged, and no longer is."""
 _RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
@@ -45,23 +33,6 @@ ALARM_TIME = 1.0  #: shortest time for which a filter is flagged as diverged aft
 _LONGEST_MEMORY = 60.0
 """Longest such time where no state is reset [s]: by then the effect of a bias that is barely
 observable shows again."""
-
-
-@kernel
-def follow_mean(flight, group, valid, nu):
-    """Average the accepted innovations of a group, in standard deviations, where `valid`."""
-    for i in range(3):
-        value, mean = clip(nu[i], -LARGEST, LARGEST), flight.innovation_mean[group, i]
-        mean = mean + _MEMORY * (value - mean)
-        flight.innovation_mean[group, i] = select(valid, mean, flight.innovation_mean[group, i])
-
-
-@kernel
-def biased(flight, p, group):
-    """Lanes in which a group that still measures has innovations that are not white."""
-    mean = flight.innovation_mean[group]
-    largest = maximum(maximum(abs(mean[0]), abs(mean[1])), abs(mean[2]))
-    return (largest > _BIASED) & ((flight.tick - flight.accepted_tick[group]) * p.dt < RECENT)
 
 
 @kernel
@@ -78,96 +49,69 @@ def follow_ratio(flight, p, nis, freedoms, mask):
 
 
 @kernel
-def follow_corrections(flight, p, L, L9, dx, columns, ok):
-    """Add up an update's corrections dx of the biases, and their variances, where `ok`.
+def follow_corrections(flight, p, L9, dx, columns, ok, slow):
+    """Add up an update's corrections dx of the biases and the drift, and their variances.
 
-    L is the factor before the update, L9 has the `columns` that the update has changed.
+    In the lanes `ok`. L9 is the updated factor, last column first; the record still has the factor
+    before.
     """
     passed = (flight.tick - flight.corrected_tick) * p.dt
     kept = maximum(1.0 - passed / CORRECTION_TIME, 0.0)
-    kept_long = maximum(1.0 - passed / _LONG_TIME, 0.0)
     for i in range(6):
-        removed = zero_like(kept)
-        for j in range(columns):
-            if j < 15:
-                removed = removed + L[BA + i, j] * L[BA + i, j]
-            removed = removed - L9[BA + i, j] * L9[BA + i, j]
-        removed, shift = maximum(removed, 0.0), dx[BA + i]
-        add_correction(flight.corrected, flight.corrected_variance, i, ok, kept, shift, removed)
-        sums, variances = flight.corrected_long, flight.corrected_long_variance
-        add_correction(sums, variances, i, ok, kept_long, shift, removed)
+        before, shift = flight.L[BA + i], dx[BA + i]
+        _follow(flight, i, before, L9[BA + i], shift, min(columns, 15), columns, kept, ok)
+    if slow is not None:
+        if slow.estimates_drift:
+            kept = maximum(1.0 - passed / _JUMP_TIME, 0.0)
+            for i in range(3):
+                before, shift = flight.L_slow[i], dx[D + i]
+                _follow(flight, 6 + i, before, L9[D + i], shift, columns, columns, kept, ok)
     flight.corrected_tick = select(ok, flight.tick, flight.corrected_tick)
 
 
 @kernel
-def add_correction(sums, variances, i, ok, kept, shift, variance):
-    """Add a correction and its variance to sums of which a share is `kept`, where `ok`."""
+def _follow(flight, i, before, after, shift, filled, columns, kept, ok):
+    """Add a state's correction and its variance to sums of which a share is `kept`, where `ok`.
+
+    Rows of the factor `before`, of which the first `filled` numbers are not zero, and `after`.
+    """
+    removed, sums, variances = zero_like(kept), flight.corrected, flight.corrected_variance
+    for j in range(columns):
+        if j < filled:
+            removed = removed + before[j] * before[j]
+        removed = removed - after[j] * after[j]
+    variance = kept * kept * variances[i] + maximum(removed, 0.0)
     sums[i] = select(ok, kept * sums[i] + shift, sums[i])
-    variances[i] = select(ok, kept * kept * variances[i] + variance, variances[i])
+    variances[i] = select(ok, variance, variances[i])
 
 
 @kernel
-def one_way(flight, first):
-    """Lanes in which corrections of three biases from `first` on go one way; how far, squared.
+def shifted(flight, first, own, limit):
+    """Lanes in which three sums of corrections, from `first` on, exceed a limit.
 
-    Their sum must exceed the standard deviation of the bias: a smaller one is harmless, and may be
-    a rounding error of corrections by measurements that do not observe biases yet.
+    They must also exceed the standard deviations of the states from row `own` on: smaller ones are
+    harmless, and may be rounding errors while a state is not observed yet.
     """
-    largest, square = -1.0 + zero_like(flight.tick), zero_like(flight.tick)
-    together = square
-    for i in range(first, first + 3):
-        own = _HARMLESS * variance_of(flight, BA + i)
-        total = flight.corrected[i] * flight.corrected[i]
-        variance = own + flight.corrected_variance[i]
-        largest = maximum(largest, total - _ONE_WAY * _ONE_WAY * variance)
-        slow = flight.corrected_long[i] * flight.corrected_long[i]
-        together = together + slow / (own + flight.corrected_long_variance[i])
-        square = maximum(square, maximum(total, slow))
-    return (largest > 0.0) | (together > _ONE_WAY_LONG), square
+    together = zero_like(flight.tick)
+    for i in range(3):
+        total = flight.corrected[first + i] * flight.corrected[first + i]
+        harmless = variance_of(flight, own + i) / limit
+        together = together + total / (harmless + flight.corrected_variance[first + i])
+    return together > limit
+
+
+@kernel
+def largest_square(flight, first):
+    """Square of the largest of three sums of corrections, from `first` on."""
+    x, y, z = load3(flight.corrected[first : first + 3])
+    return maximum(maximum(x * x, y * y), z * z)
 
 
 @kernel
 def forget_corrections(flight, mask):
     """Reset the sums of corrections, in the lanes `mask`."""
-    names = "corrected corrected_variance corrected_long corrected_long_variance"
-    reset(flight, mask, 0.0, names)
+    reset(flight, mask, 0.0, "corrected corrected_variance")
     flight.corrected_tick = select(mask, flight.tick, flight.corrected_tick)
-
-
-@kernel
-def follow_drift_corrections(flight, p, L9, dx, columns, ok):
-    """Add up an update's corrections dx of the drift, and their variances, where `ok`.
-
-    L9 is the updated factor, last column first; the record still has the factor before.
-    """
-    kept = maximum(1.0 - (flight.tick - flight.corrected_tick) * p.dt / _JUMP_TIME, 0.0)
-    sums, variances = flight.drift_corrected, flight.drift_corrected_variance
-    for i in range(3):
-        removed = zero_like(kept)
-        for j in range(columns):
-            before, after = flight.L_slow[i, j], L9[D + i, j]
-            removed = removed + before * before - after * after
-        add_correction(sums, variances, i, ok, kept, dx[D + i], maximum(removed, 0.0))
-
-
-@kernel
-def drifts_suddenly(flight):
-    """Lanes whose corrections exceed the drift and the standard deviation of the position.
-
-    Corrections below that standard deviation are harmless.
-    """
-    square, limit = zero_like(flight.tick), select(flight.diverged > 0.0, _LIKELY, _SUDDEN)
-    for i in range(3):
-        own = variance_of(flight, R + i)
-        total, variance = flight.drift_corrected[i], flight.drift_corrected_variance[i]
-        square = square + total * total / (own / limit + variance)
-    return square > limit
-
-
-@kernel
-def forget_drift_corrections(flight, mask):
-    """Reset the sum of corrections of the drift, in the lanes `mask`."""
-    reset(flight, mask, 0.0, "drift_corrected drift_corrected_variance")
 
 
 @kernel
@@ -180,24 +124,19 @@ def _memory(flight, p, i, drive):
     two: when they no longer show it, up to about seven may remain.
     """
     variance = variance_of(flight, BA + i)
-    taken = flight.corrected_long_variance[i] / (0.5 * _LONG_TIME)
+    taken = flight.corrected_variance[i] / (0.5 * CORRECTION_TIME)
     driven = drive * drive / p.dt
     return minimum(variance / maximum(taken, driven), _LONGEST_MEMORY)
 
 
 @kernel
-def flag_biased(flight, p, mask):
-    """Flag a filter without a gate as diverged while innovations drift, in the lanes `mask`.
+def flag_shifted(flight, p, mask):
+    """Flag a filter without a gate as diverged while its biases drift, in the lanes `mask`.
 
-    The mean of a sensor that no longer measures is outdated and does not count. As nothing is
-    inflated, the flag stays until the biases have been corrected.
+    As no state is reset, the flag stays until the biases have been corrected.
     """
-    drifting = flight.nis_ratio > DIVERGED_RATIO
-    for group in range(SENSOR_GROUPS):
-        drifting = drifting | biased(flight, p, group)
-    accel, _ = one_way(flight, 0)
-    gyro, _ = one_way(flight, 3)
-    drifting = mask & (drifting | accel | gyro)
+    drifting = shifted(flight, 0, BA, SHIFTED) | shifted(flight, 3, BG, SHIFTED)
+    drifting = mask & (drifting | (flight.nis_ratio > DIVERGED_RATIO))
     if any_of(drifting):
         memory = ALARM_TIME + zero_like(p.dt)
         for i in range(3):

@@ -3,21 +3,19 @@
 An innovation that is too large for its gate has one of two causes: the sensor is wrong, or the
 estimate is. Four known rules decide.
 
-* **Support.** Where sensors that have been accepted within `RECENT` observe all that the refused
-  sensor observes, the sensor is wrong and stays out. An error state of its own (the bias of a
-  barometer, hard iron) is reset to it instead. An image of several features supports itself.
+* **Support.** Where sensors accepted within `RECENT` observe all that the refused one observes, it
+  is wrong and stays out. Only its own error state (bias of a barometer, hard iron) is reset to it.
 * **Agreement.** Where two sensors are refused at the same time, the estimate is wrong.
 * **Glitch.** An IMU is right from one measurement to the next, so errors of an estimate grow
   gradually. A first refusal far beyond the gate is thus a step of the sensor, as in the GPS glitch
   protection of ArduPilot; the filter waits `glitch_timeout` for its end.
 * **Time limit.** Otherwise, after `reset_timeout`, the states that the sensor measures are reset
-  to it: their covariances with other states are cut and their variances are the square of the
-  innovation, so that the next measurement determines them. If the error grew gradually, the IMU is
-  to blame: velocity, tilt and biases, too, get no more than the variances of their start. The
-  filter is flagged as diverged.
+  to it: covariances with other states are cut, and variances are the square of the innovation, so
+  that the next measurement determines them. If the error grew gradually, the IMU is to blame:
+  velocity, tilt and biases, too, get the variances of their start.
 
-Where innovations are not white although none is refused, a bias has jumped, or noise is colored.
-The reset is as large as the corrections of the biases explain, so that colored noise does no harm.
+Corrections that are not white show that a bias has jumped, or that noise is colored. The reset is
+as large as they explain, so that colored noise does no harm.
 
 Source: the time limits and resets of PX4 EKF2 and ArduPilot NavEKF3; J. R. Carpenter and C. N.
 D'Souza (editors), Navigation Filter Best Practices, NASA/TP-2018-219822.
@@ -32,12 +30,12 @@ from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covarian
 from quad_gym.kernels.filter.measurements import call_sensors, flag_failure
 from quad_gym.kernels.filter.monitoring import (
     CORRECTION_TIME,
+    LIKELY,
     RECENT,
-    biased,
-    drifts_suddenly,
+    SHIFTED,
     forget_corrections,
-    forget_drift_corrections,
-    one_way,
+    largest_square,
+    shifted,
 )
 from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stationary
 from quad_gym.kernels.maths.elementary import maximum, minimum
@@ -65,15 +63,10 @@ from quad_gym.records import (
 
 _BAROMETER = AID_GROUPS + int(Aid["BAROMETER"])
 _MAGNETOMETER = int(Aid["MAGNETOMETER"])
-_NO_GLITCH = (*WITH_OWN_ERROR, *SEVERAL)
-"""Groups whose steps do not lengthen the time limit: an image of several features is redundant."""
-VELOCITY_BIT = int(Observes.VELOCITY).bit_length() - 1
+_VELOCITY_BIT = int(Observes.VELOCITY).bit_length() - 1
 OUTLIER = 4.0
 """Ratio of NIS and gate beyond which a first refusal is a step of the sensor: an innovation of
 twice the largest one that the gate explains."""
-_STRICT = 0.5
-"""Ratio of the limits for a receiver that is used again and the gate: its false-alarm probability,
-for position and velocity, is about the root of the gate's."""
 _ACCEL_OFFSET, _GYRO_OFFSET = 0.5, 0.09
 """Largest offsets of cheap sensors in data sheets [m/s^2], [rad/s]: TDK ICM-20948."""
 MAX_ANGLE = math.pi / math.sqrt(3.0)
@@ -83,26 +76,19 @@ MAX_ANGLE = math.pi / math.sqrt(3.0)
 @kernel
 def begin_recovery(flight, mask):
     """Reset the monitoring at the start of an episode, in the lanes `mask`."""
-    reset(
-        flight, mask, 0.0, "accepted_tick refused_tick refused_nis stepped innovation_mean diverged"
-    )
+    reset(flight, mask, 0.0, "accepted_tick refused_tick stepped diverged")
     reset(flight, mask, 1.0, "noise_factor nis_ratio")
     flight.alarm_tick = select(mask, -1e9, flight.alarm_tick)
 
 
 @kernel
-def count_rejections(flight, group, first, beyond, glitch, nis):
-    """Count the consecutive innovations of a group beyond its gate, and find steps of its sensor.
-
-    A step back, toward the estimate, begins another time limit.
-    """
-    row, last = flight.rejected_in_row[group], flight.refused_nis[group]
-    new, closer = first & beyond & (row < 1.0), first & beyond & (OUTLIER * nis < last)
-    again = closer & logical_not(new)
-    step = select(glitch & logical_not(again), 1.0, 0.0)
-    flight.stepped[group] = select(first & beyond, step, flight.stepped[group])
-    flight.refused_tick[group] = select(new | again, flight.tick, flight.refused_tick[group])
-    flight.refused_nis[group] = select(first & beyond, nis, last)
+def count_rejections(flight, group, first, beyond, glitch):
+    """Count the consecutive rejections of a group, and find steps of its sensor."""
+    row, refused = flight.rejected_in_row[group], first & beyond
+    began = select(row < 1.0, flight.tick, flight.refused_tick[group])
+    flight.refused_tick[group] = select(refused, began, flight.refused_tick[group])
+    step = select(glitch, 1.0, 0.0)
+    flight.stepped[group] = select(refused, step, flight.stepped[group])
     flight.rejected_in_row[group] = select(first, select(beyond, row + 1.0, 0.0), row)
     accept_group(flight, group, first & logical_not(beyond))
 
@@ -122,10 +108,9 @@ def _confirmed(flight, p, settings, refused, bit):
         if settings.sensor_blocks[sensor] > 0:
             first = FIRST_GROUP[sensor]
             for group in range(first, first + GROUP_COUNT[sensor]):
-                shifted = (
-                    group == POSITION_BLOCK and settings.estimates_drift and bit != VELOCITY_BIT
-                )
-                if group != refused and not shifted and (GROUP_OBSERVES[group] >> bit) & 1:
+                drifting = group == POSITION_BLOCK and settings.estimates_drift
+                drifting = drifting and bit != _VELOCITY_BIT
+                if group != refused and not drifting and (GROUP_OBSERVES[group] >> bit) & 1:
                     since = (flight.tick - flight.accepted_tick[group]) * p.dt
                     found = found | (since < RECENT)
     return found
@@ -147,52 +132,45 @@ def supported(flight, p, settings, refused):
 
 
 @kernel
-def limit_of(flight, group, limit):
-    """Gate of a group, from its usual `limit`; zero if all its measurements are beyond it.
+def _wrong_receiver(flight, group):
+    """Lanes in which a group is of a receiver whose velocities are refused after a step.
 
-    A receiver whose velocity has stepped is wrong, its positions too, which integrate the velocity.
-    It is used again when both pass a stricter test, as the uncertainty of dead reckoning grows.
+    Its positions, which integrate the velocities, are wrong, too.
     """
     if group in (POSITION_BLOCK, VELOCITY_BLOCK):
-        v, strict = VELOCITY_BLOCK, _STRICT * limit
-        wrong = (flight.stepped[v] > 0.0) & (flight.rejected_in_row[v] >= 2.0)
-        if group == POSITION_BLOCK:
-            strict = zero_like(limit)
-        row, nis = flight.rejected_in_row[POSITION_BLOCK], flight.refused_nis[POSITION_BLOCK]
-        bound = select((row > 0.0) & (nis > strict), 0.0, strict)
-        limit = select(wrong, bound, limit)
-    return limit
+        v = VELOCITY_BLOCK
+        return (flight.stepped[v] > 0.0) & (flight.rejected_in_row[v] > 0.0)
+    return no_lane(flight.tick)
 
 
 @kernel
-def glitches(flight, p, settings, group, nis, limit):
+def limit_of(flight, group, limit):
+    """Gate of a group, from its usual `limit`.
+
+    A wrong receiver is used again when the sum of the NIS of position and velocity is below the
+    gate of one of them, as the uncertainty of dead reckoning grows.
+    """
+    other = limit
+    if group == VELOCITY_BLOCK:
+        other = maximum(flight.block_nis[POSITION_BLOCK], 0.0)
+    return select(_wrong_receiver(flight, group), limit - other, limit)
+
+
+@kernel
+def glitches(flight, p, group, nis, limit):
     """Lanes in which an innovation beyond the gate is an error of the sensor, not of the IMU.
 
-    The series of such innovations has begun with a step since the last accepted one, beyond what
-    the last ones explain.
+    The series of such innovations has begun with a step since the last accepted one.
     """
+    if group in WITH_OWN_ERROR:
+        return logical_not(no_lane(flight.tick))  # their error state would take up the error
+    if group in SEVERAL:  # most features of an image, for example, have no error in common
+        return no_lane(flight.tick)
     row = flight.rejected_in_row[group]
     since = (flight.tick - flight.accepted_tick[group]) * p.dt
-    step = (nis > OUTLIER * maximum(flight.nis_ratio, 1.0) * limit) & (since < RECENT)
-    found = ((row < 1.0) & step) | ((row > 0.0) & (flight.stepped[group] > 0.0))
-    if group in SEVERAL:  # most features of an image, for example, have no error in common
-        found = no_lane(flight.tick)
-    if group in (POSITION_BLOCK, VELOCITY_BLOCK):  # of one receiver
-        other = POSITION_BLOCK + VELOCITY_BLOCK - group
-        found = found | ((flight.stepped[other] > 0.0) & (flight.rejected_in_row[other] > 0.0))
-    if group in WITH_OWN_ERROR:
-        found = logical_not(no_lane(flight.tick))  # their error state would take up the error
-    if group == POSITION_BLOCK:
-        found = found | _dead_reckons(flight, p, settings)
-    return found
-
-
-@kernel
-def _dead_reckons(flight, p, settings):
-    """Lanes in which accepted velocities predict positions over `RECENT` better than fixes."""
-    precise = p.velocity_sigma * RECENT < p.position_sigma_I[0]
-    precise = precise & (flight.tick * p.dt >= RECENT)
-    return precise & _confirmed(flight, p, settings, POSITION_BLOCK, VELOCITY_BIT)
+    step = (row < 1.0) & (nis > OUTLIER * limit) & (since < RECENT)
+    found = step | ((row > 0.0) & (flight.stepped[group] > 0.0))
+    return found | _wrong_receiver(flight, group)
 
 
 @kernel
@@ -202,31 +180,20 @@ def time_of(flight, p, group):
 
 
 @kernel
-def reset_rows(P, first, last, states, lanes):
-    """Set the covariances in rows and columns from `first` until `last` to zero, where `lanes`."""
-    for i in range(first, states):
+def reset_variance(P, row, states, lanes, variance):
+    """Cut the covariances of a state, and set its variance, which becomes no smaller."""
+    for i in range(row, states):
         for j in range(i // 3 * 3 + 3):
-            if i != j and ((first <= i and i < last) or (first <= j and j < last)):
+            if i != j and (i == row or j == row):
                 P[i, j] = select(lanes, 0.0, P[i, j])
+    P[row, row] = maximum(P[row, row], select(lanes, variance, 0.0))
 
 
 @kernel
 def reset_variances(P, first, states, lanes, variances):
-    """Cut the covariances of three states from the row `first` on, and set their variances.
-
-    No variance becomes smaller.
-    """
-    reset_rows(P, first, first + 3, states, lanes)
+    """Do the same for three states from the row `first` on."""
     for i in range(3):
-        k = first + i
-        P[k, k] = maximum(P[k, k], select(lanes, variances[i], 0.0))
-
-
-@kernel
-def reset_variance(P, row, states, lanes, variance):
-    """Do the same for one state."""
-    reset_rows(P, row, row + 1, states, lanes)
-    P[row, row] = maximum(P[row, row], select(lanes, variance, 0.0))
+        reset_variance(P, first + i, states, lanes, variances[i])
 
 
 @kernel
@@ -245,19 +212,20 @@ def reset_heading(P, R_BI, states, lanes, variance):
 
 
 @kernel
-def _reset_motion(flight, p, slow, P, drifted, jumped, accel, gyro):
+def _reset_motion(flight, p, work, slow, states, jumped, moved):
     """Reset attitude and biases, and what follows from them: velocity, position and its drift.
 
-    Where the estimate has `drifted` off, attitude and biases get the variances of their start.
-    Where corrections show that a bias has `jumped`, their sum, of the squares `accel` and `gyro`,
-    may be a third of the jump. No sensor has larger offsets than `_ACCEL_OFFSET` and
-    `_GYRO_OFFSET`. The attitude has turned by the jump for the time of the sum, but by no more than
-    at the start.
+    Where the estimate has drifted off, attitude and biases get the variances of their start. Where
+    corrections show that a bias has `jumped`, their sum may be a third of the jump. No sensor has
+    larger offsets than `_ACCEL_OFFSET` and `_GYRO_OFFSET`. The attitude has turned by the jump for
+    the time of the sum, but by no more than at the start. Where the position has `moved`, it and
+    its drift are reset by the sum of the drift's corrections in the same way.
     """
-    k, lanes, P_ee = load33(flight.R_hat).T[2], drifted | jumped, load_block(P, E, E)
-    T, states = select(drifted, p.reset_timeout, CORRECTION_TIME), 15
-    accel = minimum(9.0 * accel, _ACCEL_OFFSET * _ACCEL_OFFSET)
-    gyro = minimum(9.0 * gyro, _GYRO_OFFSET * _GYRO_OFFSET)
+    P, drifted, k = work.P, work.drifted > 0.0, load33(flight.R_hat).T[2]
+    lanes, P_ee = drifted | jumped, load_block(P, E, E)
+    T = select(drifted, p.reset_timeout, 0.5 * CORRECTION_TIME)
+    accel = minimum(9.0 * largest_square(flight, 0), _ACCEL_OFFSET * _ACCEL_OFFSET)
+    gyro = minimum(9.0 * largest_square(flight, 3), _GYRO_OFFSET * _GYRO_OFFSET)
     turned = select(drifted, np.inf, T * T * gyro)
     leaned = accel / (p.gravity * p.gravity) + turned
     tilt = select(p.initial_tilt_sigma > 0.0, p.initial_tilt_sigma, p.first_baseline_sigma)
@@ -267,14 +235,17 @@ def _reset_motion(flight, p, slow, P, drifted, jumped, accel, gyro):
     accel = maximum(accel, select(drifted, p.accel_bias_sigma * p.accel_bias_sigma, 0.0))
     gyro = maximum(gyro, select(drifted, p.gyro_bias_sigma * p.gyro_bias_sigma, 0.0))
     speed = (p.gravity * p.gravity * tilt + accel) * T * T
-    place = 0.25 * T * T * speed
+    place = select(lanes, 0.25 * T * T * speed, 0.0)
     if slow is not None:
-        states = 15 + slow.slow_states
         if slow.estimates_drift:
+            place = maximum(place, select(moved, 9.0 * largest_square(flight, 6), 0.0))
             for i in range(3):
-                drift = minimum(place, stationary(p, i))
-                reset_variance(P, D + i, states, lanes, drift)
-    reset_variances(P, R, states, lanes, (place, place, place))
+                reset_variance(P, D + i, states, lanes | moved, minimum(place, stationary(p, i)))
+        iron = slow.aid_vector[_MAGNETOMETER]
+        if iron >= 0:  # it was estimated with the attitude
+            own = p.slow_sigma[iron] * p.slow_sigma[iron]
+            reset_variances(P, D + iron, states, lanes, (own, own, own))
+    reset_variances(P, R, states, lanes | moved, (place, place, place))
     reset_variances(P, V, states, lanes, (speed, speed, speed))
     reset_variances(P, E, states, lanes, (tilt, tilt, tilt))
     P_ee = load_block(P, E, E)
@@ -285,44 +256,18 @@ def _reset_motion(flight, p, slow, P, drifted, jumped, accel, gyro):
 
 
 @kernel
-def _reset_drift(flight, p, P, states, lanes):
-    """Reset position and drift after a jump, by the square of the drift's corrections."""
-    mean = zero_like(flight.tick)
-    for i in range(3):
-        mean = mean + flight.drift_corrected[i] * flight.drift_corrected[i] / 3.0
-    for i in range(3):
-        total = flight.drift_corrected[i]
-        square = 9.0 * maximum(total * total, mean)
-        reset_variance(P, R + i, states, lanes, square)
-        reset_variance(P, D + i, states, lanes, square)
-
-
-@kernel
-def _colored(flight, p, settings):
-    """Lanes in which innovations of a sensor that no other supports are not white."""
-    found = no_lane(flight.tick)
-    for group in range(SENSOR_GROUPS):
-        colored = biased(flight, p, group)
-        if any_of(colored):
-            found = found | (colored & logical_not(supported(flight, p, settings, group)))
-    return found
-
-
-@kernel
 def _choose(flight, p, work, settings, mask):
-    """Fill work.reset and work.drifted; return the lanes in which states are reset to a sensor."""
-    none = no_lane(flight.tick)
-    sensors, late = zero_like(flight.tick), none
+    """Fill work.reset, alone and drifted; return the lanes in which a sensor resets states."""
+    none, sensors = no_lane(flight.tick), zero_like(flight.tick)
+    late, drifted, alarmed = none, none, none
     for sensor in range(SENSORS):
         first, refused = FIRST_GROUP[sensor], none
         for group in range(first, first + GROUP_COUNT[sensor]):
             refused = refused | (flight.rejected_in_row[group] >= 2.0)
+            work.reset[group], work.alone[group] = zero_like(sensors), zero_like(sensors)
         sensors = sensors + select(refused, 1.0, 0.0)
-    work.drifted, drifted = zero_like(flight.tick), none
+    work.drifted = zero_like(sensors)
     if not any_of(mask & (sensors > 0.0)):
-        for group in range(SENSOR_GROUPS):
-            work.reset[group] = zero_like(flight.tick)
-            work.alone[group] = zero_like(flight.tick)
         return none
     for group in range(SENSOR_GROUPS):
         row, stepped = flight.rejected_in_row[group], flight.stepped[group] > 0.0
@@ -331,57 +276,43 @@ def _choose(flight, p, work, settings, mask):
         long = mask & (row >= 2.0) & (waited >= p.reset_timeout)
         flight.alarm_tick = select(long & alone, flight.tick, flight.alarm_tick)
         due = long & (row >= p.max_rejections)
-        if group not in _NO_GLITCH:
-            glitch = stepped & (sensors < 2.0) & (waited < p.glitch_timeout)
-            due = due & logical_not(glitch)
+        if group not in WITH_OWN_ERROR:
+            due = due & logical_not(stepped & (sensors < 2.0) & (waited < p.glitch_timeout))
         late = late | (due & alone)
         drifted = drifted | (due & alone & logical_not(stepped))
-        work.alone[group] = select(alone, 1.0, 0.0)
-        work.reset[group] = select(due, 1.0, 0.0)
-    work.drifted = select(drifted, 1.0, 0.0)
-    alarmed = drifted
+        work.alone[group], work.reset[group] = select(alone, 1.0, 0.0), select(due, 1.0, 0.0)
     for group in range(SENSOR_GROUPS):
-        alone, refused = work.alone[group] > 0.0, mask & (flight.rejected_in_row[group] >= 2.0)
-        chosen = refused & late & alone
+        refused = mask & (flight.rejected_in_row[group] >= 2.0)
+        chosen = refused & late & (work.alone[group] > 0.0)
         if group in WITH_OWN_ERROR:
             chosen = chosen | (work.reset[group] > 0.0)
         work.reset[group] = select(chosen, 1.0, 0.0)
         alarmed = alarmed | chosen
-    return alarmed
+    work.drifted = select(drifted, 1.0, 0.0)
+    return alarmed | drifted
 
 
 @kernel
 def reset_states(flight, p, work, settings, mask, slow, stages):
     """Reset states to sensors that were refused for too long, in the lanes `mask`."""
-    accel, corrected_a = one_way(flight, 0)
-    gyro, corrected_g = one_way(flight, 3)
-    jumped = mask & (accel | gyro | _colored(flight, p, settings))
-    alarmed = jumped | _choose(flight, p, work, settings, mask)
-    moved = no_lane(flight.tick)
-    if slow is not None:
-        if slow.estimates_drift:
-            altered = (work.reset[_BAROMETER] > 0.0) & (work.alone[_BAROMETER] > 0.0)
-            moved = mask & (drifts_suddenly(flight) | altered)
-            moved = moved & logical_not(supported(flight, p, settings, POSITION_BLOCK))
-            alarmed = alarmed | moved
-    if not any_of(alarmed):
-        return
-    P, states = work.P, 15
-    put_covariance(P, flight.L, 1.0 + zero_like(flight.tick))
+    jumped = mask & (shifted(flight, 0, BA, SHIFTED) | shifted(flight, 3, BG, SHIFTED))
+    alarmed, moved, states = _choose(flight, p, work, settings, mask), no_lane(flight.tick), 15
     if slow is not None:
         states = 15 + slow.slow_states
-        fill_slow(flight, slow, P)
-    drifted = work.drifted > 0.0
-    _reset_motion(flight, p, slow, P, drifted, jumped, corrected_a, corrected_g)
-    if slow is not None:
-        iron = slow.aid_vector[_MAGNETOMETER]
-        if iron >= 0:  # it was estimated with the attitude
-            own = p.slow_sigma[iron] * p.slow_sigma[iron]
-            reset_variances(P, D + iron, states, drifted | jumped, (own, own, own))
         if slow.estimates_drift:
-            _reset_drift(flight, p, P, states, moved)
+            altered = (work.reset[_BAROMETER] > 0.0) & (work.alone[_BAROMETER] > 0.0)
+            limit = select(flight.diverged > 0.0, LIKELY, SHIFTED)
+            moved = mask & (shifted(flight, 6, R, limit) | altered)
+            moved = moved & logical_not(supported(flight, p, settings, POSITION_BLOCK))
+    alarmed = alarmed | jumped | moved
+    if not any_of(alarmed):
+        return
+    put_covariance(work.P, flight.L, 1.0 + zero_like(flight.tick))
+    if slow is not None:
+        fill_slow(flight, slow, work.P)
+    _reset_motion(flight, p, work, slow, states, jumped, moved)
     call_sensors(flight, p, p, settings, work, stages, Act.RESET, 0)
-    ok = alarmed & (cholesky(P, states, work.inverse_diagonal) > 0.0)
+    ok = alarmed & (cholesky(work.P, states, work.inverse_diagonal) > 0.0)
     keep_factor(flight, slow, work, ok)
     failed = alarmed & logical_not(ok)
     flag_failure(flight, failed)
@@ -391,8 +322,4 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
         flight.resets[group] = flight.resets[group] + work.reset[group]
         row = flight.rejected_in_row[group]
         flight.rejected_in_row[group] = select(work.reset[group] > 0.0, 0.0, row)
-    reset(flight, drifted | jumped, 0.0, "innovation_mean")
-    forget_corrections(flight, drifted | jumped)
-    if slow is not None:
-        if slow.estimates_drift:
-            forget_drift_corrections(flight, alarmed)
+    forget_corrections(flight, alarmed)

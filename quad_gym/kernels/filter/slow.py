@@ -25,7 +25,6 @@ fifteen states, as without d, and their prediction does not depend on d. Kernels
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
-from quad_gym.kernels.filter.monitoring import forget_drift_corrections
 from quad_gym.kernels.maths.linalg import add_diagonal, cross, load3, load33
 from quad_gym.kernels.maths.matrices import (
     load_block,
@@ -51,7 +50,6 @@ def begin_slow(flight, p, slow, mask):
         for j in range(D + slow.slow_states):
             value = p.slow_sigma[i] if j == D + i else zero_like(p.slow_sigma[i])
             flight.L_slow[i, j] = select(mask, value, flight.L_slow[i, j])
-    forget_drift_corrections(flight, mask)
 
 
 @kernel

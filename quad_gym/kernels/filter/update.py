@@ -24,9 +24,8 @@ from quad_gym.kernels.filter.measurements import (
     mark_failed,
 )
 from quad_gym.kernels.filter.monitoring import (
-    flag_biased,
+    flag_shifted,
     follow_corrections,
-    follow_drift_corrections,
 )
 from quad_gym.kernels.filter.recovery import reset_states
 from quad_gym.kernels.filter.rows import columns_of
@@ -261,10 +260,7 @@ def _keep(flight, p, work, form, columns, ok, slow):
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
         keep(flight.v_corrected, ok, load3(flight.v_corrected) + load3(dx[V:]))
     if (form & MONITORED) != 0:
-        if slow is not None:
-            if slow.estimates_drift:
-                follow_drift_corrections(flight, p, L9, dx, columns, ok)
-        follow_corrections(flight, p, L, L9, dx, columns, ok)
+        follow_corrections(flight, p, L9, dx, columns, ok, slow)
     turn = euler_to_dcm(load3(dx[E:]))
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
         turn = vector_to_dcm(load3(dx[E:]))
@@ -326,7 +322,7 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     if (form & FilterForm.GATE.value) != 0:
         reset_states(flight, p, work, settings, updated & logical_not(failed), slow, stages)
     elif (form & MONITORED) != 0:
-        flag_biased(flight, p, updated)
+        flag_shifted(flight, p, updated)
 
 
 @stage

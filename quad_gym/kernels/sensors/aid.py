@@ -8,7 +8,7 @@ from typing import Any
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D
-from quad_gym.kernels.filter.gate import gate_numbers, gate_several
+from quad_gym.kernels.filter.gate import gate_blocks
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
@@ -179,11 +179,8 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
 
     @kernel
     def gate(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
-        if several:
-            count, limit = settings.sensor_blocks[sensor], p.aid_gate[s]
-            gate_several(flight, p, work, settings, k, first, count, group, limit, numbers)
-        else:
-            gate_numbers(flight, p, work, settings, k, first, group, p.aid_gate[s], numbers)
+        count, limit = settings.sensor_blocks[sensor], p.aid_gate[s]
+        gate_blocks(flight, p, work, settings, k, first, count, group, limit, numbers)
 
     @kernel
     def reset_states(flight, p, work, settings):  # type: ignore[no-untyped-def]

@@ -17,13 +17,7 @@ import math
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.error_state import D, E, R, V
-from quad_gym.kernels.filter.gate import (
-    add_block,
-    gate_direction,
-    judge_several,
-    mask_rejected,
-    no_blocks,
-)
+from quad_gym.kernels.filter.gate import gate_blocks
 from quad_gym.kernels.filter.recovery import MAX_ANGLE, reset_variances, time_of
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import maximum, minimum
@@ -40,7 +34,7 @@ from quad_gym.kernels.sensors.latency import (
     stamp,
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 from quad_gym.records import (
     DRAW_FEATURE,
     DRAW_PHASE,
@@ -189,19 +183,8 @@ def _gate(flight, p, work, settings, k):
     error of a direction is bounded, so it would pass any gate, and its update would be wrong and
     overconfident.
     """
-    statistics, zero = no_blocks(flight), zero_like(flight.tick)
-    for i in range(settings.feature_count):
-        block = FEATURE_BLOCKS + i
-        if any_of(flight.block_valid[block] > 0.0):
-            valid = (work.taking > 0.0) & (flight.block_valid[block] > 0.0)
-            beyond, unsure, nis, scatter, (side, up) = gate_direction(
-                flight, p, work, settings, k, block, FEATURE_BLOCKS, valid, p.gate_uncertainty
-            )
-            counted = valid & logical_not(unsure | (work.again > 0.0))
-            statistics = add_block(statistics, counted, beyond, nis, scatter, (side, up, zero))
-            mask_rejected(flight, work, settings, k, block, valid, 3.0)
-            k += 3
-    judge_several(flight, p, work, settings, FEATURE_BLOCKS, statistics, 2.0, p.gate_direction)
+    first, limit = FEATURE_BLOCKS, p.gate_direction
+    gate_blocks(flight, p, work, settings, k, first, settings.feature_count, first, limit, 2.0)
 
 
 @kernel

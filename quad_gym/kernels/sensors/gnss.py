@@ -2,7 +2,7 @@
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import D
-from quad_gym.kernels.filter.gate import gate_numbers
+from quad_gym.kernels.filter.gate import gate_blocks
 from quad_gym.kernels.maths.elementary import minimum
 from quad_gym.kernels.maths.linalg import keep, load3, load4
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
@@ -145,10 +145,10 @@ def _gate(flight, p, work, settings, k):
     """Store the innovations in the rows from k on, and mask those beyond the gate."""
     for block in _BLOCKS:
         if any_of(flight.block_valid[block] > 0.0):
+            limit, numbers = p.gate_position, 3.0
             if block == BASELINE_BLOCK:
-                gnss_baseline.gate(flight, p, work, settings, k)
-            else:
-                gate_numbers(flight, p, work, settings, k, block, block, p.gate_position, 3.0)
+                limit, numbers = p.gate_direction, 2.0
+            gate_blocks(flight, p, work, settings, k, block, 1, block, limit, numbers)
             k += 3
 
 

@@ -15,12 +15,8 @@ A sigma above pi says so: it adds this noise along the other two axes.
 
 import math
 
-import numpy as np
-
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.directions import direction_noise
-from quad_gym.kernels.filter.gate import gate_direction, judge, mask_rejected
-from quad_gym.kernels.filter.monitoring import follow_mean
 from quad_gym.kernels.filter.recovery import reset_heading
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
 from quad_gym.kernels.maths.linalg import (
@@ -34,8 +30,7 @@ from quad_gym.kernels.maths.linalg import (
     rounded,
     unit_or,
 )
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
-from quad_gym.records import BASELINE_BLOCK
+from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 
 _COARSE = 0.05
 """Noise up to which this term is left out [rad], as in the laboratory: it makes no difference."""
@@ -82,20 +77,6 @@ def expect(flight, p, work, settings, k, valid):
     for j in range(9):
         a, s = lever_column(flight, work, settings, j, R_BI, u_B)
         put_column(work, settings, k, j, valid, a, s)
-
-
-@kernel
-def gate(flight, p, work, settings, k):
-    """Store the innovation in the rows from k on, and mask it beyond the gate."""
-    s = BASELINE_BLOCK
-    valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
-    beyond, _, nis, scatter, scaled = gate_direction(
-        flight, p, work, settings, k, s, s, valid, np.inf
-    )
-    first = valid & logical_not(work.again > 0.0)
-    judge(flight, p, work, settings, s, first, beyond, nis, scatter, 2.0, p.gate_direction)
-    follow_mean(flight, s, first & logical_not(beyond), (scaled[0], scaled[1], zero_like(nis)))
-    mask_rejected(flight, work, settings, k, s, valid, 3.0)
 
 
 @kernel
