@@ -100,8 +100,8 @@ def _families():
         found[f"action {action}"] = {"action": action}
     for fault in PRESETS:
         suite = "indoor" if "camera" in fault else "rtk"
-        suite = AIDED if "meter" in fault else suite
         sensor = fault.removesuffix("_loss")
+        suite = AIDED if getattr(AIDED, sensor, None) else suite
         if sensor in AID_PARAMS and suite == "rtk":
             having = [name for name in ALL_SUITES if getattr(quad_gym.sensor_suite(name), sensor)]
             own = quad_gym.sensor_suite("uwb").replace(**{sensor: AID_PARAMS[sensor]()})
