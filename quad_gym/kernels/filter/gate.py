@@ -22,7 +22,6 @@ from quad_gym.kernels.filter.measurements import call_measured
 from quad_gym.kernels.filter.monitoring import follow_ratio, forget_corrections
 from quad_gym.kernels.filter.recovery import (
     OUTLIER,
-    accept_group,
     count_rejections,
     glitches,
     limit_of,
@@ -218,15 +217,13 @@ def gate_blocks(flight, p, work, settings, k, first, count, group, limit, number
     measured, most = counted > 0.0, (counted > 0.0) & (refused >= 0.5 * counted)
     several, few = maximum(counted, 1.0), maximum(counted - refused, 1.0)
     nis, excused = select(most, total / several, kept / few), no_lane(zero)
+    glitch = excused
+    if any_of(most):
+        excused = most & supported(flight, p, settings, group)
+        glitch = most & glitches(flight, p, group, nis, limit)
     if (settings.form & FilterForm.GATE.value) != 0:
-        glitch = most
-        if any_of(most):
-            excused = most & supported(flight, p, settings, group)
-            glitch = most & glitches(flight, p, group, nis, limit)
         _adapt_noise(flight, group, measured, scattered / several, numbers, limit)
-        count_rejections(flight, group, measured, most, glitch)
-    else:
-        accept_group(flight, group, measured)
+    count_rejections(flight, group, measured, most, glitch)
     judged = measured & logical_not(excused)
     work.judged_nis = work.judged_nis + select(judged, nis, 0.0)
     work.judged_freedoms = work.judged_freedoms + select(judged, numbers, 0.0)

@@ -21,11 +21,10 @@ Source: the time limits and resets of PX4 EKF2 and ArduPilot NavEKF3; J. R. Carp
 D'Souza (editors), Navigation Filter Best Practices, NASA/TP-2018-219822.
 """
 
-import math
-
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_variance, reset_variances
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covariance
 from quad_gym.kernels.filter.measurements import call_sensors, flag_failure
 from quad_gym.kernels.filter.monitoring import (
@@ -40,7 +39,7 @@ from quad_gym.kernels.filter.monitoring import (
 from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stationary
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import diagonal, dot, load33, outer
+from quad_gym.kernels.maths.linalg import dot, load33, outer
 from quad_gym.kernels.maths.matrices import load_block, store_block
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
@@ -69,8 +68,6 @@ OUTLIER = 4.0
 twice the largest one that the gate explains."""
 _ACCEL_OFFSET, _GYRO_OFFSET = 0.5, 0.09
 """Largest offsets of cheap sensors in data sheets [m/s^2], [rad/s]: TDK ICM-20948."""
-MAX_ANGLE = math.pi / math.sqrt(3.0)
-"""Largest standard deviation of an angle [rad], when it is unknown."""
 
 
 @kernel
@@ -90,13 +87,7 @@ def count_rejections(flight, group, first, beyond, glitch):
     step = select(glitch, 1.0, 0.0)
     flight.stepped[group] = select(refused, step, flight.stepped[group])
     flight.rejected_in_row[group] = select(first, select(beyond, row + 1.0, 0.0), row)
-    accept_group(flight, group, first & logical_not(beyond))
-
-
-@kernel
-def accept_group(flight, group, accepted):
-    """Store the time of a group's last accepted measurement."""
-    before = flight.accepted_tick[group]
+    accepted, before = first & logical_not(beyond), flight.accepted_tick[group]
     flight.accepted_tick[group] = select(accepted, flight.tick, before)
 
 
@@ -177,38 +168,6 @@ def glitches(flight, p, group, nis, limit):
 def time_of(flight, p, group):
     """Seconds since a measurement of a group was last accepted."""
     return maximum(flight.tick - flight.accepted_tick[group], 1.0) * p.dt
-
-
-@kernel
-def reset_variance(P, row, states, lanes, variance):
-    """Cut the covariances of a state, and set its variance, which becomes no smaller."""
-    for i in range(row, states):
-        for j in range(i // 3 * 3 + 3):
-            if i != j and (i == row or j == row):
-                P[i, j] = select(lanes, 0.0, P[i, j])
-    P[row, row] = maximum(P[row, row], select(lanes, variance, 0.0))
-
-
-@kernel
-def reset_variances(P, first, states, lanes, variances):
-    """Do the same for three states from the row `first` on."""
-    for i in range(3):
-        reset_variance(P, first + i, states, lanes, variances[i])
-
-
-@kernel
-def reset_heading(P, R_BI, states, lanes, variance):
-    """Cut the covariances of the heading, the angle about the vertical, and set its variance."""
-    k = R_BI.T[2]
-    cut, P_ee = select(lanes, 1.0, 0.0), load_block(P, E, E)
-    one = zero_like(cut) + 1.0
-    M = diagonal((one, one, one)) + outer(-cut * k, k)
-    for j in range(0, E, 3):
-        store_block(P, E, j, M @ load_block(P, E, j))
-    heading = cut * maximum(minimum(variance, MAX_ANGLE * MAX_ANGLE), dot(k, P_ee @ k))
-    store_block(P, E, E, M @ P_ee @ M + outer(heading * k, k))
-    for i in range(E + 3, states, 3):
-        store_block(P, i, E, load_block(P, i, E) @ M)
 
 
 @kernel

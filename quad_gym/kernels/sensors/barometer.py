@@ -6,8 +6,8 @@ filter (`filter/slow.py`). The model is linear, so sigma points and derivatives 
 """
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_variance
 from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.recovery import reset_variance
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import diagonal, load3

@@ -15,10 +15,11 @@ Each feature is a separate block; an image is one group of the gate.
 import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.covariance_resets import MAX_ANGLE, reset_variances
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.error_state import D, E, R, V
 from quad_gym.kernels.filter.gate import gate_blocks
-from quad_gym.kernels.filter.recovery import MAX_ANGLE, reset_variances, time_of
+from quad_gym.kernels.filter.recovery import time_of
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store

@@ -16,8 +16,8 @@ A sigma above pi says so: it adds this noise along the other two axes.
 import math
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_heading
 from quad_gym.kernels.filter.directions import direction_noise
-from quad_gym.kernels.filter.recovery import reset_heading
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
 from quad_gym.kernels.maths.linalg import (
     cross,

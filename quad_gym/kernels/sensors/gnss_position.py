@@ -12,8 +12,9 @@ and the derivative along an offset is dr + R_hat^T (de x l_p) + dd.
 import math
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_variances
 from quad_gym.kernels.filter.error_state import D, R, V
-from quad_gym.kernels.filter.recovery import reset_variances, time_of
+from quad_gym.kernels.filter.recovery import time_of
 from quad_gym.kernels.filter.rows import columns_of, lever_column, put_block, put_column
 from quad_gym.kernels.filter.slow import stationary
 from quad_gym.kernels.maths.elementary import exp, log

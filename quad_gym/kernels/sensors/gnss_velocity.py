@@ -8,8 +8,8 @@ linear: dz = dv.
 """
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_variances
 from quad_gym.kernels.filter.error_state import V
-from quad_gym.kernels.filter.recovery import reset_variances
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
 from quad_gym.kernels.maths.linalg import cross, diagonal, keep, load3, load4, load33
 from quad_gym.kernels.maths.matrices import load_column3

@@ -25,8 +25,8 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.align import lever_of_attitude
+from quad_gym.kernels.filter.covariance_resets import reset_heading, reset_variances
 from quad_gym.kernels.filter.error_state import BA, D, E, R, V, put_covariance
-from quad_gym.kernels.filter.recovery import reset_heading, reset_variances
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import maximum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky

@@ -19,8 +19,8 @@ and the derivative along an offset is (dV + W x de) G + W (du / h - u dh / h^2).
 """
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_variances
 from quad_gym.kernels.filter.error_state import E, R, V
-from quad_gym.kernels.filter.recovery import reset_variances
 from quad_gym.kernels.filter.rows import put_block, put_column
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33, vector

@@ -10,8 +10,8 @@ U = u + even_u and D = U^2 - odd_u^2; the derivative along an offset is dh / u -
 """
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_variance
 from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.recovery import reset_variance
 from quad_gym.kernels.filter.rows import put_block, put_column
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33

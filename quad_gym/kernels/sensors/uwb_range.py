@@ -14,8 +14,8 @@ A detour of the signal, which the filter does not model, lengthens some ranges.
 """
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.covariance_resets import reset_variances
 from quad_gym.kernels.filter.error_state import R
-from quad_gym.kernels.filter.recovery import reset_variances
 from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import diagonal, dot, load3, load4, load33, norm
