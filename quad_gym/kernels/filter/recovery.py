@@ -151,7 +151,8 @@ def limit_of(flight, group, limit):
 def glitches(flight, p, group, nis, limit):
     """Lanes in which an innovation beyond the gate is an error of the sensor, not of the IMU.
 
-    The series of such innovations has begun with a step since the last accepted one.
+    The series of such innovations has begun with a step since the last accepted one, beyond what
+    the last ones explain.
     """
     if group in WITH_OWN_ERROR:
         return logical_not(no_lane(flight.tick))  # their error state would take up the error
@@ -159,7 +160,8 @@ def glitches(flight, p, group, nis, limit):
         return no_lane(flight.tick)
     row = flight.rejected_in_row[group]
     since = (flight.tick - flight.accepted_tick[group]) * p.dt
-    step = (row < 1.0) & (nis > OUTLIER * limit) & (since < RECENT)
+    least = OUTLIER * maximum(flight.nis_ratio, 1.0) * limit
+    step = (row < 1.0) & (nis > least) & (since < RECENT)
     found = step | ((row > 0.0) & (flight.stepped[group] > 0.0))
     return found | _wrong_receiver(flight, group)
 
