@@ -188,7 +188,7 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
         weakened = valid & (gate == GateDecision.WEAKENED)
         if any_of(weakened):
             share = select(weakened, maximum(nis / limit - 1.0, 0.0), 0.0)
-            store_block(work.Rz, k, k, R + more + share * whole)
+            store_block(work.Rz, k, k, load_block(work.Rz, k, k) + share * whole)
         out = valid & ((gate == GateDecision.REJECTED) | (gate == GateDecision.UNSURE))
         mask_block(work, settings, k, out)
         work.left_out = work.left_out + select(out, masked, 0.0)
