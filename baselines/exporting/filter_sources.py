@@ -13,10 +13,10 @@ import numpy as np
 import quad_gym
 from baselines.exporting.filter_library import HEADER, TARGETS
 from baselines.exporting.source import filled
-from quad_gym.estimation.engine import Engine
-from quad_gym.estimation.filters import LONGEST_STEP
-from quad_gym.estimation.results import COLUMNS
-from quad_gym.estimation.starts import empty_fix, level_start
+from quad_gym.estimation.filtering.engine import Engine
+from quad_gym.estimation.filtering.filters import LONGEST_STEP
+from quad_gym.estimation.filtering.starts import empty_fix, level_start
+from quad_gym.estimation.replaying.results import COLUMNS
 from quad_gym.kernels.entries import FILTER_STAGES
 from quad_gym.kernels.library import core_symbol
 from quad_gym.kernels.stages import Stage, needed_stages

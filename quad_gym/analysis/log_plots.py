@@ -16,8 +16,8 @@ from quad_gym.analysis.plots import (
     house_style,
     panels,
 )
-from quad_gym.estimation.calibration import Calibration
-from quad_gym.estimation.results import Measured, Replay, by_sensor
+from quad_gym.estimation.calibrating.calibration import Calibration
+from quad_gym.estimation.replaying.results import Measured, Replay, by_sensor
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 

@@ -22,8 +22,8 @@ from quad_gym.commands.log_options import MISFIT, LogFiles, ReadingArgs, capital
 from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
 
 if TYPE_CHECKING:
-    from quad_gym.estimation.calibration import Calibration
-    from quad_gym.estimation.validation import Validation
+    from quad_gym.estimation.calibrating.calibration import Calibration
+    from quad_gym.estimation.calibrating.validation import Validation
     from quad_gym.params.sensors import SensorSuite
 
 SUITE, RESULT = "suite.toml", "calibration.json"

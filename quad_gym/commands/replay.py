@@ -103,7 +103,7 @@ def report_of(result: "Replay") -> str:
     """Format a table of measurements, rejections and NIS, and the verdict."""
     from quad_gym.analysis.log_plots import sensors_of
     from quad_gym.analysis.reports import text_table
-    from quad_gym.estimation.findings import by_quantity
+    from quad_gym.estimation.replaying.findings import by_quantity
 
     rows = []
     for name, measured in sensors_of(result).items():
@@ -148,8 +148,8 @@ def main(args: ReplayArgs) -> None:
     """Read, filter, draw and write."""
     from quad_gym.analysis.reports import versions, write_csv, write_json
     from quad_gym.estimation import read_log, replay, smooth
-    from quad_gym.estimation.findings import ADVICE
-    from quad_gym.estimation.plausibility import MisfitError
+    from quad_gym.estimation.replaying.findings import ADVICE
+    from quad_gym.estimation.replaying.plausibility import MisfitError
 
     smoothed = None
     with usage_errors():

@@ -27,13 +27,13 @@ from typing import Any, Unpack
 import numpy as np
 from scipy.linalg import cho_solve
 
-from quad_gym.estimation.filters import KalmanFilter
+from quad_gym.estimation.filtering.filters import KalmanFilter
+from quad_gym.estimation.filtering.running import run_while_unknown
+from quad_gym.estimation.filtering.tape import Tape
 from quad_gym.estimation.logs import Floats, Log, Reading
-from quad_gym.estimation.player import ESTIMATORS, Player
-from quad_gym.estimation.replaying import in_parts, named_start, prepared
-from quad_gym.estimation.results import Smoothed
-from quad_gym.estimation.running import run_while_unknown
-from quad_gym.estimation.tape import Tape
+from quad_gym.estimation.replaying.player import ESTIMATORS, Player
+from quad_gym.estimation.replaying.replay import in_parts, named_start, prepared
+from quad_gym.estimation.replaying.results import Smoothed
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import OPERATION, Operation

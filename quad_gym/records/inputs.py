@@ -141,4 +141,4 @@ FIX = np.dtype(
         ("outcome", "i8"),
     ]
 )
-"""A first fix, and measurements of the attitude; see `quad_gym.estimation.first_fix`."""
+"""A first fix, and measurements of the attitude; see `quad_gym.estimation.filtering.first_fix`."""

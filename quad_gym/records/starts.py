@@ -7,7 +7,7 @@ from quad_gym.records.sizes import MAX_SLOW, MAX_STATES
 START = np.dtype(
     [
         ("x_I", "f8", 3),  # horizontal direction of body x for a steep baseline; zero: unknown
-        # a vehicle of known tilt: see `quad_gym.estimation.starts`
+        # a vehicle of known tilt: see `quad_gym.estimation.filtering.starts`
         ("antenna_I", "f8", 3),
         ("position_root", "f8", (3, 3)),  # of the covariance of the antenna's position
         ("velocity_sigma", "f8", 3),

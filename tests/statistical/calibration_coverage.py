@@ -18,8 +18,8 @@ import numpy as np
 
 import quad_gym
 from quad_gym.estimation import calibrate, read_log
-from quad_gym.estimation.calibration import _prior_of
-from quad_gym.estimation.numbers import numbers_in
+from quad_gym.estimation.calibrating.calibration import _prior_of
+from quad_gym.estimation.calibrating.numbers import numbers_in
 from quad_gym.params.sensors import SENSOR_PARAMS
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.logged_flights import Recorded, flown

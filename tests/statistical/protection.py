@@ -14,7 +14,7 @@ import numpy as np
 
 from quad_gym import Trajectory
 from quad_gym.estimation import read_log, replay
-from quad_gym.estimation.dead_reckoning import changes
+from quad_gym.estimation.replaying.dead_reckoning import changes
 from quad_gym.params.sensors import SENSOR_PARAMS
 from quad_gym.params.suites import ALL_SUITES, sensor_suite
 from tests.field_flights import fly, nees, state_errors, steps

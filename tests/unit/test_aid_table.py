@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.estimation.held_position import lacks_position
+from quad_gym.estimation.replaying.held_position import lacks_position
 from quad_gym.packing.aids import pack_aids, slow_states
 from quad_gym.params.aid_table import _shape_of
 from quad_gym.params.aids import AidParams, SlowError

@@ -12,16 +12,23 @@ import quad_gym
 from quad_gym import estimation
 from quad_gym.commands import calibrate as command
 from quad_gym.estimation import calibrate, read_log, replay
-from quad_gym.estimation import search as search_module
-from quad_gym.estimation.calibration import turn_on_biases
-from quad_gym.estimation.differences import spread_between
-from quad_gym.estimation.findings import Finding, Severity
-from quad_gym.estimation.fits import correlation_time
-from quad_gym.estimation.likelihood import NU, SETTLING, SPACING, Likelihood, in_flight, tails
+from quad_gym.estimation.calibrating import search as search_module
+from quad_gym.estimation.calibrating.calibration import turn_on_biases
+from quad_gym.estimation.calibrating.differences import spread_between
+from quad_gym.estimation.calibrating.likelihood import (
+    NU,
+    SETTLING,
+    SPACING,
+    Likelihood,
+    in_flight,
+    tails,
+)
+from quad_gym.estimation.calibrating.numbers import MAX_SPREAD, NUMBERS
+from quad_gym.estimation.calibrating.search import NumberSearch, widening
+from quad_gym.estimation.calibrating.validation import validate
 from quad_gym.estimation.logs import Log, Stream
-from quad_gym.estimation.numbers import MAX_SPREAD, NUMBERS
-from quad_gym.estimation.search import NumberSearch, widening
-from quad_gym.estimation.validation import validate
+from quad_gym.estimation.replaying.findings import Finding, Severity
+from quad_gym.estimation.replaying.fits import correlation_time
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.sensors import SENSOR_PARAMS

@@ -19,7 +19,7 @@ from baselines.exporting import controller_of, export_filter
 from baselines.exporting.filter_library import LIBRARY, archive
 from quad_gym.commands.main import main
 from quad_gym.estimation import UnscentedKalmanFilter, replay
-from quad_gym.estimation.starts import state_at_rest
+from quad_gym.estimation.filtering.starts import state_at_rest
 from tests.console_commands import refused
 from tests.logged_flights import Recorded, flown
 

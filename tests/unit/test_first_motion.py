@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.estimation.first_motion import with_wide_start
 from quad_gym.estimation.logs import read_log
+from quad_gym.estimation.replaying.first_motion import with_wide_start
 
 RTK = quad_gym.sensor_suite("rtk")
 

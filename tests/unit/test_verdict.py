@@ -9,12 +9,12 @@ import pytest
 from scipy.stats import chi2
 
 from quad_gym.estimation import replay
-from quad_gym.estimation.dead_reckoning import HORIZONS, changes
-from quad_gym.estimation.findings import Finding, Severity, by_quantity
-from quad_gym.estimation.fits import exceeds, fit_of, larger
 from quad_gym.estimation.logs import Log, Stream
-from quad_gym.estimation.results import Measured
-from quad_gym.estimation.verdict import in_one_line
+from quad_gym.estimation.replaying.dead_reckoning import HORIZONS, changes
+from quad_gym.estimation.replaying.findings import Finding, Severity, by_quantity
+from quad_gym.estimation.replaying.fits import exceeds, fit_of, larger
+from quad_gym.estimation.replaying.results import Measured
+from quad_gym.estimation.replaying.verdict import in_one_line
 from quad_gym.records import GateDecision
 from tests import foreign_logs
 from tests.statistical import verdicts

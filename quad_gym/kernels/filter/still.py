@@ -1,6 +1,6 @@
 """First estimate of a vehicle of known tilt, from one fix: scalar code, for one flight.
 
-`quad_gym.estimation.starts` has the equations.
+`quad_gym.estimation.filtering.starts` has the equations.
 """
 
 import math

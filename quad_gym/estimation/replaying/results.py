@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from quad_gym.estimation.findings import Finding, Severity
 from quad_gym.estimation.logs import Floats
+from quad_gym.estimation.replaying.findings import Finding, Severity
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FilterStatus, GateDecision

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.engine import Engine
-from quad_gym.estimation.headings import Moments, moments
-from quad_gym.estimation.samples import Measurement
+from quad_gym.estimation.filtering.engine import Engine
+from quad_gym.estimation.filtering.headings import Moments, moments
+from quad_gym.estimation.filtering.samples import Measurement
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FilterStatus, covariance_of

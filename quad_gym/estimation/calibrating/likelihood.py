@@ -28,13 +28,13 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.collecting import name_of
-from quad_gym.estimation.engine import Floats
-from quad_gym.estimation.first_motion import SPAN
+from quad_gym.estimation.calibrating.sets import innovations_of_sets
+from quad_gym.estimation.filtering.engine import Floats
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.logs.parts import running_motors
-from quad_gym.estimation.player import Player
-from quad_gym.estimation.sets import innovations_of_sets
+from quad_gym.estimation.replaying.collecting import name_of
+from quad_gym.estimation.replaying.first_motion import SPAN
+from quad_gym.estimation.replaying.player import Player
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FREEDOMS

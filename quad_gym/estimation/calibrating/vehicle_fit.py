@@ -22,10 +22,10 @@ from typing import Any, NamedTuple, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_gym.estimation.fits import correlation_time, correlations
 from quad_gym.estimation.logs import Floats, Log, Reading, read_log
 from quad_gym.estimation.logs.parts import longest_part
-from quad_gym.estimation.replaying import prepared
+from quad_gym.estimation.replaying.fits import correlation_time, correlations
+from quad_gym.estimation.replaying.replay import prepared
 from quad_gym.estimation.smoothing import smooth
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import LogDelays, SensorSuite

@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.filtering.samples import HEADING_ALONE, Measurement
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.samples import HEADING_ALONE, Measurement
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records.inputs import SAME_TIME, Outcome

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.engine import Floats
-from quad_gym.estimation.filters import KalmanFilter
-from quad_gym.estimation.samples import Measurement
-from quad_gym.estimation.tape import Tape, TapeWriter
+from quad_gym.estimation.filtering.engine import Floats
+from quad_gym.estimation.filtering.filters import KalmanFilter
+from quad_gym.estimation.filtering.samples import Measurement
+from quad_gym.estimation.filtering.tape import Tape, TapeWriter
 from quad_gym.records import KEPT, WIDTH, Operation
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.estimation.engine import Engine, Floats
-from quad_gym.estimation.headings import COUNT, SPACING, write_starts
-from quad_gym.estimation.samples import checked_baseline, gnss_noise, require_gnss
-from quad_gym.estimation.starts import (
+from quad_gym.estimation.filtering.engine import Engine, Floats
+from quad_gym.estimation.filtering.headings import COUNT, SPACING, write_starts
+from quad_gym.estimation.filtering.samples import checked_baseline, gnss_noise, require_gnss
+from quad_gym.estimation.filtering.starts import (
     FirstEstimate,
     empty_fix,
     head_by_baseline,

@@ -10,8 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.samples import Measurement
-from quad_gym.estimation.tape import BLANK, ONE_PREDICTION, ONE_UPDATE, Tape, write_measurement
+from quad_gym.estimation.filtering.samples import Measurement
+from quad_gym.estimation.filtering.tape import (
+    BLANK,
+    ONE_PREDICTION,
+    ONE_UPDATE,
+    Tape,
+    write_measurement,
+)
 from quad_gym.kernels import entries
 from quad_gym.kernels.linked import linked_table
 from quad_gym.kernels.stages import needed_stages

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.collecting import name_of
+from quad_gym.estimation.filtering.samples import Measurement
 from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.own import Estimator, checked_estimate, factors, own_copy
-from quad_gym.estimation.player import Player
-from quad_gym.estimation.results import Measured, Replay
-from quad_gym.estimation.samples import Measurement
+from quad_gym.estimation.replaying.collecting import name_of
+from quad_gym.estimation.replaying.player import Player
+from quad_gym.estimation.replaying.results import Measured, Replay
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (

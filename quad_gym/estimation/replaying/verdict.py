@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.dead_reckoning import SETTLED, Change, changes
-from quad_gym.estimation.findings import Finding, Severity
-from quad_gym.estimation.fits import MIN_COUNT, Fit, correlations, exceeds, fit_of, larger
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.logs.clocks import PAUSE
 from quad_gym.estimation.logs.parts import running_motors
-from quad_gym.estimation.plausibility import implausible, nothing_in_common
-from quad_gym.estimation.results import Measured, Replay, by_sensor
+from quad_gym.estimation.replaying.dead_reckoning import SETTLED, Change, changes
+from quad_gym.estimation.replaying.findings import Finding, Severity
+from quad_gym.estimation.replaying.fits import MIN_COUNT, Fit, correlations, exceeds, fit_of, larger
+from quad_gym.estimation.replaying.plausibility import implausible, nothing_in_common
+from quad_gym.estimation.replaying.results import Measured, Replay, by_sensor
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.results import Measured
+from quad_gym.estimation.replaying.results import Measured
 
 AT_LIMIT = 0.05
 """Probability with which a test rejects what is at the limit of the test; a consistent filter is

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.estimation.engine import Engine
-from quad_gym.estimation.estimate import FilterEstimate
-from quad_gym.estimation.first_fix import FirstFix, filter_start
-from quad_gym.estimation.headings import RESOLVED, collapse, moments, update_and_weigh
-from quad_gym.estimation.history import InputHistory
-from quad_gym.estimation.samples import Measurement, checked_measurement
+from quad_gym.estimation.filtering.engine import Engine
+from quad_gym.estimation.filtering.estimate import FilterEstimate
+from quad_gym.estimation.filtering.first_fix import FirstFix, filter_start
+from quad_gym.estimation.filtering.headings import RESOLVED, collapse, moments, update_and_weigh
+from quad_gym.estimation.filtering.history import InputHistory
+from quad_gym.estimation.filtering.samples import Measurement, checked_measurement
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.shown import takes

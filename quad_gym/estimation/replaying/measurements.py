@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.filters import LONGEST_STEP
-from quad_gym.estimation.logs import Floats, Log
-from quad_gym.estimation.plausibility import MisfitError
-from quad_gym.estimation.samples import (
+from quad_gym.estimation.filtering.filters import LONGEST_STEP
+from quad_gym.estimation.filtering.samples import (
     HEADING_ALONE,
     Measurement,
     checked_baseline,
     checked_measurement,
 )
-from quad_gym.estimation.starts import level
+from quad_gym.estimation.filtering.starts import level
+from quad_gym.estimation.logs import Floats, Log
+from quad_gym.estimation.replaying.plausibility import MisfitError
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.portable import turned

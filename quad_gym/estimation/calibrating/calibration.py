@@ -13,16 +13,16 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from quad_gym.estimation.likelihood import in_flight
+from quad_gym.estimation.calibrating.likelihood import in_flight
+from quad_gym.estimation.calibrating.numbers import has_heading
+from quad_gym.estimation.calibrating.search import Calibrated, NumberSearch
+from quad_gym.estimation.calibrating.validation import Validation, pooled, validate
 from quad_gym.estimation.logs import Log, Reading, read_log
 from quad_gym.estimation.logs.parts import longest_part, naming
 from quad_gym.estimation.logs.quantities import compared
-from quad_gym.estimation.numbers import has_heading
-from quad_gym.estimation.plausibility import implausible
-from quad_gym.estimation.replaying import origin_of, replay
-from quad_gym.estimation.search import Calibrated, NumberSearch
-from quad_gym.estimation.validation import Validation, pooled, validate
-from quad_gym.estimation.verdict import BEYOND, MAX_BIAS
+from quad_gym.estimation.replaying.plausibility import implausible
+from quad_gym.estimation.replaying.replay import origin_of, replay
+from quad_gym.estimation.replaying.verdict import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SENSOR_PARAMS, SensorSuite
 from quad_gym.params.suites import sensor_suite

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quad_gym.estimation.engine import Floats
+from quad_gym.estimation.filtering.engine import Floats
 
 _RIDGE = 0.1  #: relative increase of the diagonal of squared scores, which are estimates
 

@@ -8,17 +8,17 @@ from typing import Any, TypeVar, Unpack
 
 import numpy as np
 
-from quad_gym.estimation.calls import FilterCalls
-from quad_gym.estimation.earth_field import at_place
-from quad_gym.estimation.filters import UnscentedKalmanFilter
+from quad_gym.estimation.filtering.filters import UnscentedKalmanFilter
 from quad_gym.estimation.logs import Floats, Log, Reading, read_log
 from quad_gym.estimation.logs.parts import naming, parts_of
 from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.own import Estimator
-from quad_gym.estimation.own_player import OwnPlayer
-from quad_gym.estimation.player import ESTIMATORS, Player
-from quad_gym.estimation.results import Estimates, Replay, joined
-from quad_gym.estimation.verdict import with_verdict
+from quad_gym.estimation.replaying.calls import FilterCalls
+from quad_gym.estimation.replaying.earth_field import at_place
+from quad_gym.estimation.replaying.own_player import OwnPlayer
+from quad_gym.estimation.replaying.player import ESTIMATORS, Player
+from quad_gym.estimation.replaying.results import Estimates, Replay, joined
+from quad_gym.estimation.replaying.verdict import with_verdict
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -65,8 +65,8 @@ def replay(
         reported_noise: True: use the accuracy that the receiver reports, if the log has it, in
             place of the suite's. An own estimator does not receive it.
         window: Longest delay of measurements beyond the suite's `log_delays` [s].
-        samples: File to write the calls of the filter to, see `quad_gym.estimation.calls`, which
-            an exported filter repeats.
+        samples: File to write the calls of the filter to, which an exported filter repeats; see
+            `quad_gym.estimation.replaying.calls`.
         **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.filters import LONGEST_STEP, KalmanFilter
-from quad_gym.estimation.measurements import LogMeasurements
-from quad_gym.estimation.starts import state_at_rest
+from quad_gym.estimation.filtering.filters import LONGEST_STEP, KalmanFilter
+from quad_gym.estimation.filtering.starts import state_at_rest
+from quad_gym.estimation.replaying.measurements import LogMeasurements
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.history import InputHistory
-from quad_gym.estimation.samples import Measurement
+from quad_gym.estimation.filtering.history import InputHistory
+from quad_gym.estimation.filtering.samples import Measurement
 from quad_gym.records import (
     AID_BLOCK,
     AID_ROW,

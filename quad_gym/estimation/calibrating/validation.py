@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_gym.estimation.findings import Finding, Severity
-from quad_gym.estimation.fits import Fit, fit_of
-from quad_gym.estimation.likelihood import SETTLING
+from quad_gym.estimation.calibrating.likelihood import SETTLING
 from quad_gym.estimation.logs import Floats, Log
-from quad_gym.estimation.replaying import replay
-from quad_gym.estimation.results import Replay, by_sensor
-from quad_gym.estimation.verdict import in_one_line
+from quad_gym.estimation.replaying.findings import Finding, Severity
+from quad_gym.estimation.replaying.fits import Fit, fit_of
+from quad_gym.estimation.replaying.replay import replay
+from quad_gym.estimation.replaying.results import Replay, by_sensor
+from quad_gym.estimation.replaying.verdict import in_one_line
 from quad_gym.params.sensors import SensorSuite
 
 _PERIOD, _GAP = 5, 1

@@ -12,7 +12,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.logs.clocks import PAUSE
-from quad_gym.estimation.results import Replay
+from quad_gym.estimation.replaying.results import Replay
 from quad_gym.rotations import quaternion_to_dcm
 
 HORIZONS = (0.5, 2.0)

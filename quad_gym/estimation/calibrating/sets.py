@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.engine import Floats
-from quad_gym.estimation.player import Player
-from quad_gym.estimation.tape import Tape
+from quad_gym.estimation.filtering.engine import Floats
+from quad_gym.estimation.filtering.tape import Tape
+from quad_gym.estimation.replaying.player import Player
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import WIDTH, aligned_zeros
 

@@ -8,24 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.estimation.calls import FilterCalls
-from quad_gym.estimation.collecting import collected, name_of
-from quad_gym.estimation.filters import (
+from quad_gym.estimation.filtering.filters import (
     LONGEST_STEP,
     ExtendedKalmanFilter,
     KalmanFilter,
     UnscentedKalmanFilter,
 )
-from quad_gym.estimation.first_motion import with_wide_start
-from quad_gym.estimation.held_position import SENTENCE, held, lacks_position
-from quad_gym.estimation.history import InputHistory
-from quad_gym.estimation.log_start import LogStart
+from quad_gym.estimation.filtering.history import InputHistory
+from quad_gym.estimation.filtering.running import run_filter
+from quad_gym.estimation.filtering.tape import TapeWriter
 from quad_gym.estimation.logs import Floats, Log
-from quad_gym.estimation.measurements import LogMeasurements
-from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
-from quad_gym.estimation.results import Replay
-from quad_gym.estimation.running import run_filter
-from quad_gym.estimation.tape import TapeWriter
+from quad_gym.estimation.replaying.calls import FilterCalls
+from quad_gym.estimation.replaying.collecting import collected, name_of
+from quad_gym.estimation.replaying.first_motion import with_wide_start
+from quad_gym.estimation.replaying.held_position import SENTENCE, held, lacks_position
+from quad_gym.estimation.replaying.log_start import LogStart
+from quad_gym.estimation.replaying.measurements import LogMeasurements
+from quad_gym.estimation.replaying.plausibility import MisfitError, nothing_in_common
+from quad_gym.estimation.replaying.results import Replay
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import POSITION_BLOCK

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.filtering.running import Results
 from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.results import Measured
-from quad_gym.estimation.running import Results
+from quad_gym.estimation.replaying.results import Measured
 from quad_gym.records import AID_BLOCK, AID_BLOCKS, AID_MOST, FEATURE_BLOCKS, FREEDOMS, Aid
 from quad_gym.rotations import dcm_to_quaternion
 

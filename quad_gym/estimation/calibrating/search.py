@@ -19,15 +19,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_gym.estimation.differences import curvature, derivatives, lowest, spread_between
-from quad_gym.estimation.engine import Floats
-from quad_gym.estimation.fits import correlation_time
-from quad_gym.estimation.likelihood import PART, SETTLING, Likelihood, in_flight, loss_of, tails
+from quad_gym.estimation.calibrating.differences import (
+    curvature,
+    derivatives,
+    lowest,
+    spread_between,
+)
+from quad_gym.estimation.calibrating.likelihood import (
+    PART,
+    SETTLING,
+    Likelihood,
+    in_flight,
+    loss_of,
+    tails,
+)
+from quad_gym.estimation.calibrating.numbers import Number, numbers_in
+from quad_gym.estimation.calibrating.validation import left_out
+from quad_gym.estimation.filtering.engine import Floats
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.logs.parts import naming
-from quad_gym.estimation.numbers import Number, numbers_in
-from quad_gym.estimation.replaying import replay
-from quad_gym.estimation.validation import left_out
+from quad_gym.estimation.replaying.fits import correlation_time
+from quad_gym.estimation.replaying.replay import replay
 from quad_gym.params.sensors import SensorSuite
 
 _SILENT = 0.8

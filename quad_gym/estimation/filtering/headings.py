@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.estimation.engine import Engine
-from quad_gym.estimation.samples import Measurement
-from quad_gym.estimation.starts import FirstEstimate, lower_factor
+from quad_gym.estimation.filtering.engine import Engine
+from quad_gym.estimation.filtering.samples import Measurement
+from quad_gym.estimation.filtering.starts import FirstEstimate, lower_factor
 from quad_gym.rotations import dcm_to_euler, euler_to_dcm
 
 Floats = NDArray[np.float64]

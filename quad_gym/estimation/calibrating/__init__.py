@@ -1,0 +1,1 @@
+"""The numbers of a sensor suite, and of a vehicle, from logs."""

@@ -1,0 +1,1 @@
+"""A filter for one vehicle: its memory, starts, inputs and estimate."""
