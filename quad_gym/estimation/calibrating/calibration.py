@@ -129,10 +129,9 @@ def calibrate(
     begins = [dict(each or {}) for each in starts]
     report = progress or (lambda _: None)
     if len(logs) == 1:
-        (whole,), used = logs, 1
-        time = whole.imu.time
+        used, time = 1, logs[0].imu.time
         split = float(time[0] + share * (time[-1] - time[0]))
-        flights, judged = [whole.until(split)], {"": 0}
+        flights, judged = [logs[0].until(split)], {"": 0}
     else:
         used, split = max(1, min(len(logs) - 1, round(share * len(logs)))), -math.inf
         flights = logs
