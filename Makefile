@@ -40,7 +40,7 @@ demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as t
 	@echo "1. LookAround: the only markers are on one wall, and there is no GNSS. Three controllers"
 	@echo "   are evaluated on the true state and on the filter's estimate: PD control, a policy"
 	@echo "   trained on the true state, and one trained on the estimate with its standard deviation."
-	@$(BIN)/quad-gym evaluate look_around --policy pd pretrained:truth pretrained --episodes 200 \
+	@$(BIN)/quad-gym evaluate look_around --policy pd pretrained:truth pretrained --episodes 100 \
 		--video webp --overwrite --output results/demo/look_around
 	@echo
 	@echo "2. The control experiment: on the circle, good sensors determine the state, so training on the"
@@ -48,7 +48,7 @@ demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as t
 	@echo "   so PD control with tuned gains is expected to be better than both:"
 	@$(BIN)/quad-gym compare circle --engine compiled --train-on truth estimate --seeds 3 \
 		--steps 250000 --n-envs 64 --set batch_size=128 n_epochs=3 --evaluations 2 \
-		--episodes 50 --output results/demo/control
+		--episodes 50 --jobs 2 --output results/demo/control
 	@echo
 	@echo "Open:"
 	@echo "  results/demo/look_around/video.webp   one episode; the policy on the right looks at the markers"
