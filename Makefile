@@ -36,7 +36,7 @@ $(VENV)/.writer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,render,docs]"
 	touch $@
 
-demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as the control: two minutes
+demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as the control: two to three minutes
 	@echo "1. LookAround: the only markers are on one wall, and there is no GNSS. Three controllers"
 	@echo "   are evaluated on the true state and on the filter's estimate: PD control, a policy"
 	@echo "   trained on the true state, and one trained on the estimate with its standard deviation."
