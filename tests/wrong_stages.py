@@ -2,6 +2,8 @@
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import load3
+from quad_gym.kernels.sensors.aid import aid_stage
+from quad_gym.records import Aid
 
 
 @kernel
@@ -54,3 +56,16 @@ def missing_name_stage(flight, world, model, settings, work, stages, flag):
 def text_stage(flight, world, model, settings, work, stages, flag):
     """Write a text into a number."""
     work.spread = "far"
+
+
+@kernel
+def _measure_two(flight, p, i):
+    return (flight.r[2], flight.r[1]), flight.r[2] > 0.0
+
+
+@kernel
+def _do_nothing(flight, p, work, settings, *others):
+    """Placeholder of the sensor's other kernels."""
+
+
+barometer_stage = aid_stage(Aid(0), _measure_two, _do_nothing, _do_nothing)

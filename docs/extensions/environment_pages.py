@@ -16,7 +16,7 @@ import pkgutil
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,9 +75,9 @@ def _attribute_docs(kind: type) -> dict[str, str]:
     return found
 
 
-def _field_docs(kind: type) -> dict[str, str]:
-    """Docstrings below each field of a dataclass, inherited fields first."""
-    docs: dict[str, str] = {}
+def _field_docs(kind: type, more: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Docstrings below each field of a dataclass, inherited fields first; `more`: of others."""
+    docs = dict(more or {})
     for part in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
         docs |= _attribute_docs(part)
     for field in dataclasses.fields(kind):
@@ -267,7 +267,8 @@ def _suites_page() -> str:
         "log_delays": quad_gym.LogDelays,
     }.items():
         rows = []
-        said = _field_docs(kind)
+        of_aids = dict.fromkeys(AID_PARAMS, "[s]") if kind is quad_gym.LogDelays else {}
+        said = _field_docs(kind, of_aids)
         for name in (field.name for field in dataclasses.fields(kind)):
             of = (getattr(suite, part) for suite in suites.values())
             values = ["-" if p is None else _value(getattr(p, name)) for p in of]

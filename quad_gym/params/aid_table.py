@@ -1,9 +1,9 @@
 """The table of aiding sensors: a sensor other than IMU, GNSS and camera has one row here.
 
 A row is the name of the sensor, which is also the name of its kernels' file, and the class of its
-parameters. All else but its delay in logs (`LogDelays`) follows from the class: the sensor's draws,
-records, stage, group of the gate, fault, quantity, reading, columns of logs, figures, and its
-interface in an exported filter.
+parameters. All else follows from the class: the sensor's draws, records, stage, group of the gate,
+fault, quantity, reading, columns and delay in logs, figures, and its interface in an exported
+filter.
 """
 
 import dataclasses

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+from collections.abc import Mapping
 from functools import partial, wraps
 from types import NoneType, UnionType
 from typing import (
@@ -56,12 +57,24 @@ class Checked:
     _prefix: ClassVar[str]
 
     def __init_subclass__(
-        cls, *, kw_only: bool = True, eq: bool = True, bare: bool = False
+        cls,
+        *,
+        kw_only: bool = True,
+        eq: bool = True,
+        bare: bool = False,
+        more: Mapping[str, tuple[Any, Any]] | None = None,
     ) -> None:
-        """Move the rules out of the types of fields, which then are plain, and make a dataclass."""
+        """Move the rules out of the types of fields, which then are plain, and make a dataclass.
+
+        `more`: types and defaults of further fields, whose names follow from a table.
+        """
         super().__init_subclass__()
         cls._prefix = "" if bare else f"{cls.__name__}."
-        split = {name: _rule_of(hint) for name, hint in inspect.get_annotations(cls).items()}
+        hints = dict(inspect.get_annotations(cls))
+        for name, (hint, default) in (more or {}).items():
+            hints[name] = hint
+            setattr(cls, name, default)
+        split = {name: _rule_of(hint) for name, hint in hints.items()}
         cls.__annotations__ = {name: plain for name, (plain, _) in split.items()}
         bases = reversed(cls.__mro__[1:])
         inherited = {n: rule for base in bases for n, rule in vars(base).get("_rules", {}).items()}

@@ -5,7 +5,7 @@ laboratory's numbers from the Aerial Robotics course (ASE 479W, The University o
 """
 
 from dataclasses import field
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from quad_gym.params import checks as check
 from quad_gym.params.aid_table import AID_PARAMS, AidTable
@@ -64,27 +64,24 @@ class NoisyObservationParams(Checked):
     """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
 
 
-class LogDelays(Checked):
+class LogDelays(Checked, more=dict.fromkeys(AID_PARAMS, (Delay, 0.0))):
     """Times by which the stamps of a vehicle's logs are later than the measurements themselves.
 
     Autopilots often stamp a measurement when they receive it. A replay subtracts these delays; in
-    simulated flights time stamps are exact.
+    simulated flights time stamps are exact. Each other sensor of a suite has a field with its name,
+    such as `barometer` [s].
     """
 
     gnss: Delay = 0.0
     """of GNSS, relative to the IMU [s]"""
     camera: Delay = 0.0
     """of images [s]"""
-    magnetometer: Delay = 0.0
-    """of the magnetometer [s]"""
-    barometer: Delay = 0.0
-    """of the barometer [s]"""
-    optical_flow: Delay = 0.0
-    """of optical flow [s]"""
-    range_finder: Delay = 0.0
-    """of the range finder [s]"""
-    uwb_range: Delay = 0.0
-    """of ranges by radio [s]"""
+
+    if TYPE_CHECKING:  # of the fields that follow from the table
+
+        def __init__(self, *, gnss: float = 0.0, camera: float = 0.0, **aids: float) -> None: ...
+
+        def __getattr__(self, name: str) -> float: ...
 
 
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:

@@ -48,7 +48,9 @@ AID_BLOCK = tuple(AID_BLOCKS + row for row in AID_ROW)  #: first block of each a
 FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *AID_BLOCK)  #: first block of each sensor
 AID_NUMBERS = tuple(sum(AID_TRIPLES[:aid]) for aid in Aid)  #: first row of each aiding sensor in `aid_numbers`
 FEATURE_SLICE = slice(FEATURE_BLOCKS, AID_BLOCKS)  #: blocks of the features
-MAX_TOGETHER = AID_BLOCKS + 4  #: largest number of blocks of an instant: all of GNSS and camera, and four more
+MAX_TOGETHER = max(AID_BLOCKS + 4, FEATURE_BLOCKS + AID_ROWS)
+"""Largest number of blocks of an instant: all of GNSS and camera and four more, or all of the other
+sensors and GNSS."""
 MAX_MEASUREMENTS = 3 * MAX_TOGETHER  #: largest length of the stacked measurement; a direction has three numbers
 AID_GROUPS = len(Block)  #: first group of the other sensors
 SENSOR_GROUPS = AID_GROUPS + AIDS  #: number of groups of the gate: positions, baselines, velocities, images, other sensors

@@ -8,7 +8,7 @@ text is drawn at four times its size, which spaces letters evenly.
 import contextlib
 import io
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from quad_gym.rendering.colors import Color
 
 Floats = NDArray[np.float64]
 Label = tuple[str, Floats, Color]  #: text, its place (2,) [pixels], and its color
+Mark = tuple[Literal["line", "cross", "box"], Color]  #: shape and color of a part in a legend
 
 OVERSAMPLING, TEXT_OVERSAMPLING = 2, 4
 _RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
@@ -183,13 +184,17 @@ class Canvas:
             if np.isfinite(at).all() and at[1] < bottom - self.line_height(size):
                 self.text(words, at[0], at[1], size, color, 0.5)
 
-    def mark(self, color: Color, x: float, y: float, size: int) -> None:
-        """Draw the mark of a line in a legend; purple: of crosses."""
-        if color == colors.PURPLE:
+    def mark(self, mark: Mark, x: float, y: float, size: int) -> None:
+        """Draw the mark of a part in a legend."""
+        (shape, color), step = mark, self.line_height(size) + 2
+        if shape == "cross":
             self.text("x", x + 1, y - 1, size, color)
-        else:
-            step = self.line_height(size) + 2
+        elif shape == "line":
             self.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
+        else:
+            left, top = round(x + 1), round(y + 0.5 * step - 5)
+            self.surface.fill(colors.INK, (left, top, 8, 8))
+            self.surface.fill(color, (left + 1, top + 1, 6, 6))
 
     def width_of(self, words: str, size: int) -> int:
         """Width of a text [pixels]."""

@@ -12,8 +12,7 @@ from quad_gym.flights.record import Flight
 from quad_gym.params import checks as check
 from quad_gym.records import FaultKind, FilterStatus, GateDecision
 from quad_gym.rendering import colors
-from quad_gym.rendering.canvas import Canvas
-from quad_gym.rendering.colors import Color
+from quad_gym.rendering.canvas import Canvas, Mark
 from quad_gym.rendering.geometry import Perspective, chase_view, course_view, fixed_view
 from quad_gym.rendering.inset import Inset, inset_box
 from quad_gym.rendering.scene import Scene, ellipsoid_scale
@@ -111,7 +110,7 @@ class Renderer:
         name = str(flight.about.get("task", flight.scene.task)).replace("_", " ")
         title, clock = f"{name} on {_SEEN[flight.scene.observation]}", f"{flight['time'][-1]:.2f} s"
         policy = flight.about.get("policy")
-        lines: list[tuple[str, Color | None]] = []
+        lines: list[tuple[str, Mark | None]] = []
         lines += [(f"controller: {short_name(str(policy))}", None)] if policy else []
         lines += [*legend_of(flight), (errors_of(flight), None)]
         lines += [(words, None) for words in _warnings(flight)]
@@ -122,30 +121,34 @@ class Renderer:
         canvas.text(title, x, y, large)
         canvas.text(clock, 6 + width - 6, y, large, colors.INK, 1.0)
         y += canvas.line_height(large) + 2
-        for words, color in lines:
-            if color is not None:
-                canvas.mark(color, x, y, small)
-            canvas.text(words, x if color is None else x + 15, y, small)
+        for words, mark in lines:
+            if mark is not None:
+                canvas.mark(mark, x, y, small)
+            canvas.text(words, x if mark is None else x + 15, y, small)
             y += step
 
 
-def legend_of(flight: Flight) -> list[tuple[str, Color]]:
-    """Names and colors of the parts of a picture."""
+def legend_of(flight: Flight) -> list[tuple[str, Mark]]:
+    """Names and marks of the parts of a picture."""
     scene = flight.scene
-    found = [("next gate" if len(scene.gates_I) else "reference", colors.GREEN)]
+    found: list[tuple[str, Mark]] = []
+    found += [("next gate" if len(scene.gates_I) else "reference", ("line", colors.GREEN))]
     if scene.reference_period and not len(scene.gates_I):
-        found = [("reference", colors.GREY), ("its next second", colors.GREEN)]
-    found += [("truth", colors.BLUE)]
+        found = [("reference", ("line", colors.GREY)), ("its next second", ("line", colors.GREEN))]
+    found += [("truth", ("line", colors.BLUE))]
     if flight.estimated:
         scale = ellipsoid_scale(flight)
         size = "3-sigma ellipsoid, true size"
         size = size if scale == 1.0 else f"3-sigma ellipsoid, error, drawn x {scale:g}"
-        found += [("estimate", colors.VERMILLION), (size, colors.VERMILLION)]
+        found += [(words, ("line", colors.VERMILLION)) for words in ("estimate", size)]
         if scene.has_gnss:
             refused = (flight.rows["gnss_decision"][:, 0] == GateDecision.REJECTED).any()
-            found.append(("GNSS fix (gray: rejected)" if refused else "GNSS fix", colors.PURPLE))
+            words = "GNSS fix (gray: rejected)" if refused else "GNSS fix"
+            found.append((words, ("cross", colors.PURPLE)))
+        if len(scene.anchors_I):
+            found.append(("anchor", ("box", colors.PURPLE)))
     elif scene.observation == "noisy":
-        found.append(("observed position", colors.VERMILLION))
+        found.append(("observed position", ("line", colors.VERMILLION)))
     return found
 
 

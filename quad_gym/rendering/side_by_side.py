@@ -107,9 +107,9 @@ class SideBySide:
         canvas.finish()
         x = 12.0 + canvas.text(f"{time:4.1f} s", 12.0, 9.0, _SMALL) + 20.0
         legend = legend_of(flight.until(min(time, self.sides[0].end)))
-        legend += [("marker in view", colors.INK)] if flight.scene.has_camera else []
-        for words, color in legend:
-            canvas.mark(color, x, 9.0, _SMALL)
+        legend += [("marker in view", ("box", colors.INK))] if flight.scene.has_camera else []
+        for words, mark in legend:
+            canvas.mark(mark, x, 9.0, _SMALL)
             x += 34.0 + canvas.text(words, x + 16.0, 9.0, _SMALL)
         return canvas.pixels()
 

@@ -12,13 +12,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.analysis.consistency import PARTS
+from quad_gym.estimation.filtering.engine import Engine
+from quad_gym.kernels.entries import run_stage
+from quad_gym.kernels.stages import Stage
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
     AID_BLOCK,
+    AID_FREEDOMS,
     BASELINE_BLOCK,
     FEATURE_SLICE,
+    MAX_BLOCKS,
+    OWN_ERRORS,
     POSITION_BLOCK,
+    Act,
     Aid,
     Sensor,
 )
@@ -42,13 +49,20 @@ class Truth(NamedTuple):
 class SuiteModel:
     """Linear models of a suite, with the errors of its sensors as states.
 
+    Barometer and magnetometer have models here. Other aiding sensors have the derivatives and the
+    noise of their kernels.
+
     Raises:
-        ValueError: If the suite has sensors such as optical flow, which are not modeled.
+        ValueError: If another sensor has a time-correlated error, which is not modeled.
     """
 
     def __init__(self, sensors: SensorSuite) -> None:
-        for aid in set(sensors.aids) - {Aid["BAROMETER"], Aid["MAGNETOMETER"]}:
-            raise ValueError(f"sensors must be a suite without {aid.name.lower()} for the bound")
+        self._others = tuple(set(sensors.aids) - {Aid["BAROMETER"], Aid["MAGNETOMETER"]})
+        for aid in self._others:
+            if OWN_ERRORS[aid]:
+                name = aid.name.lower()
+                raise ValueError(f"sensors must be a suite without {name} for the bound")
+        self._engine = Engine(sensors, "ekf")
         self.sensors, imu, gnss = sensors, sensors.imu, sensors.gnss
         barometer, magnetometer = sensors.barometer, sensors.magnetometer
         scale, misalignment = imu.accel_scale_sigma, imu.accel_misalignment_sigma
@@ -147,6 +161,15 @@ class SuiteModel:
             turned = (R_BI @ np.cross([0.0, 0.0, 1.0], m_I))[..., np.newaxis]
             H = jacobian(rows, 3, e=cross(R_BI @ m_I), iron=EYE, declination=turned)
             yield rows, H, [magnetometer.noise_sigma**2] * 3, Sensor["MAGNETOMETER"]
+        for aid in self._others:
+            new = valid[:, AID_BLOCK[aid] : AID_BLOCK[aid] + self.sensors.aids[aid].blocks]
+            if (rows := np.flatnonzero(new.any(axis=1))).size:
+                truth = Truth(*(part[rows] for part in at(Sensor[aid.name])))
+                moving, variance = self._derivatives(aid, truth)
+                variance = np.where(new[rows].repeat(AID_FREEDOMS[aid], axis=1), variance, np.inf)
+                H = jacobian(rows, moving.shape[1])
+                H[:, :, :9] = moving
+                yield rows, H, variance, Sensor[aid.name]
         new = valid[:, FEATURE_SLICE]
         if camera is not None and (rows := np.flatnonzero(new.any(axis=1))).size:
             truth, X_I = at(Sensor.CAMERA), features[rows]
@@ -160,6 +183,27 @@ class SuiteModel:
             variance = np.where(new[rows][:, : X_I.shape[1]], variance, np.inf)
             H = jacobian(rows, 2 * X_I.shape[1], r=r, e=e)
             yield rows, H, np.repeat(variance, 2, axis=1), Sensor.CAMERA
+
+    def _derivatives(self, aid: Aid, truth: Truth) -> tuple[Floats, Floats]:
+        """Derivatives (n, m, 9) of all blocks of a sensor, and variances (n, m), of its kernel."""
+        engine, count = self._engine, len(truth.r)
+        engine.allocate(count)
+        for name, values in zip(("r_hat", "v_hat", "R_hat", "w_meas"), truth, strict=True):
+            padded = np.resize(values, (engine.lanes, *values.shape[1:]))
+            engine.write(name, padded)
+        engine.fill("L", np.eye(15))
+        engine.fill("block_valid", np.ones(MAX_BLOCKS))
+        last, blocks = 8 if engine.slow_states == 0 else 14 + engine.slow_states, []
+        used = np.arange(3 * self.sensors.aids[aid].blocks)
+        used = used[used % 3 < AID_FREEDOMS[aid]]
+        work, table = engine._work, engine._table()
+        arguments = (engine.params, engine.params, engine.settings, work, table, int(Act.EXPECT))
+        for block in np.split(engine.blocks, len(engine.blocks)):
+            run_stage(block.ctypes.data, 0, 1, int(Stage[aid.name]), *arguments)
+            columns = work["A"][0, last - np.arange(9)][:, used]
+            blocks.append((columns.T, work["Rz"][0, used, used].T))
+        H, variance = (np.concatenate(parts)[:count] for parts in zip(*blocks, strict=True))
+        return H, variance
 
 
 def projection(camera: CameraParams, X_B: Floats) -> Floats:

@@ -83,11 +83,12 @@ def test_compile_fails_if_code_cannot_be_written_to_cache(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("stage", "kernel", "reason"),
     [
-        ("missing_argument", "_sum, .*:15: return _range", "missing a required .* 'anchor_I'"),
+        ("missing_argument", "_sum, .*:17: return _range", "missing a required .* 'anchor_I'"),
         ("missing_field", "missing_field_stage, .*flight.altitude", "attribute 'altitude'"),
         ("wrong_type", r"_range, .*: offset = r_I - anchor_I", r"sub\(vector, number\)"),
         ("record", r"_vertical, .*: return R_BI\.T\[2\]", "'T'"),
         ("missing_name", "missing_name_stage, .*metres", "name 'metres' is not defined"),
+        ("barometer", r"sample, .*\(x, y, z\), _ = measure", "number of values: expected 3, got 2"),
     ],
 )
 def test_wrong_stage_is_reported_by_kernel_line_and_reason(stage, kernel, reason, capsys):
@@ -111,10 +112,36 @@ def test_single_stage_is_compiled_by_its_name(capsys):
     [
         ("sensors.barometre:barometer", "MODULE:KERNEL of quad_gym.kernels"),
         ("sensors.barometer:barometre", "got barometre_stage; did you mean barometer_stage"),
+        ("sensors.barometer:aid", "must be a stage of .*, got aid_stage"),
+        ("sensors.barometer:", "must be a stage of .*, got _stage"),
+        (".sensors.barometer:barometer", "MODULE:KERNEL of quad_gym.kernels, got '.sensors"),
+        ("", "MODULE:KERNEL of quad_gym.kernels, got ''"),
     ],
 )
 def test_unknown_stage_is_refused(stage, message, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["compile", "--stage", stage])
     assert ended.value.code == 2
-    assert message in capsys.readouterr().err
+    assert re.search(message, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("from quad_gym.records import Aid; Aid['DEPTH']", "KeyError: 'DEPTH'"),
+        ("from quad_gym.records import Depth", "ImportError: cannot import name 'Depth'"),
+        ("import quad_gym.depth", "No module named 'quad_gym.depth'"),
+        ("depth = (1.0", "SyntaxError: '\\(' was never closed"),
+    ],
+)
+def test_module_that_cannot_be_imported_is_reported_by_its_line(
+    line, reason, tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "depth_sensor.py").write_text(f'"Depth."\n{line}\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["compile", "--stage", "depth_sensor:depth"]) == 1
+    said = capsys.readouterr().err
+    assert re.search(f"error: depth_sensor cannot be imported\n(.*\n)?  reason: .*{reason}", said)
+    assert "depth_sensor.py" in said
+    assert "2" in said
+    assert "Traceback" not in said

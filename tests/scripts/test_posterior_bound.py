@@ -38,7 +38,7 @@ def test_delayed_and_equivalent_undelayed_measurements_give_equal_bounds():
     np.testing.assert_allclose(late.P, punctual.P, rtol=1e-9)
 
 
-@pytest.mark.parametrize("sensors", ["rtk", "consumer", "indoor"])
+@pytest.mark.parametrize("sensors", ["rtk", "consumer", "indoor", "crazyflie", "uwb"])
 def test_errors_of_the_built_in_filter_are_near_the_bound(sensors):
     batch = FlightBatch(
         24,

@@ -12,6 +12,7 @@ import re
 import sys
 import traceback
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from numba.core.errors import NumbaError
@@ -28,6 +29,7 @@ _WORDS = (
     (r"UniTuple\(Lanes(?: x|,) (\d)\)", r"vector of \1"),
     (r"LaneRecord\(\w+\)", "record"),
     (r"\bLanes\b", "number"),
+    (r"\('wrong tuple length for [^']*', '(.*)'\)", r"wrong number of values: \1"),
     (r"Function\(<(?:built-in function|intrinsic|function) ([\w.]+)[^>]*>\)", r"\1"),
 )
 """Types and functions in Numba's words, and in plain ones."""
@@ -47,23 +49,16 @@ def compile_one(name: str) -> str:
 
     Raises:
         ValueError: If there is no such stage.
-        StageError: If it does not compile.
+        StageError: If it does not compile, or its module cannot be imported.
     """
     module_name, _, kernel = name.partition(":")
     kernel = kernel.removesuffix("_stage") + "_stage"
-    module: Any = None
-    for full in (f"quad_gym.kernels.{module_name}", module_name):
-        try:
-            module = importlib.import_module(full)
-            break
-        except ModuleNotFoundError as error:
-            if not full.startswith(error.name or " "):  # a module that it imports is missing
-                raise
+    module = _module_of(f"quad_gym.kernels.{module_name}") or _module_of(module_name)
     if module is None:
-        raise ValueError(f"--stage must be MODULE:KERNEL of quad_gym.kernels, got {name}")
+        raise ValueError(f"--stage must be MODULE:KERNEL of quad_gym.kernels, got {name!r}")
     stage: Any = getattr(module, kernel, None)
     if not hasattr(stage, "signature"):
-        known = [other for other in vars(module) if other.endswith("_stage")]
+        known = [other for other, value in vars(module).items() if hasattr(value, "signature")]
         raise ValueError(
             f"--stage must be a stage of {module.__name__}, got {kernel}"
             f"{check.did_you_mean(kernel, known)}"
@@ -74,6 +69,24 @@ def compile_one(name: str) -> str:
         text = f"{module.__name__}:{kernel} does not compile\n{_explained(error)}"
         raise StageError(text) from None
     return f"{module.__name__}:{kernel}"
+
+
+def _module_of(name: str) -> ModuleType | None:
+    """Import a module; None: there is none of this name."""
+    if not all(map(str.isidentifier, name.split("."))):
+        return None
+    try:
+        return importlib.import_module(name)
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and name.startswith(error.name or " "):
+            return None
+        lines = [f"{name} cannot be imported"]
+        frames = traceback.extract_tb(error.__traceback__)
+        ran = [frame for frame in frames if frame.name == "<module>" and frame.line]
+        if ran:
+            lines.append(f"  line: {_short(ran[-1].filename)}:{ran[-1].lineno}: {ran[-1].line}")
+        lines.append(f"  reason: {type(error).__name__}: {error}")
+        raise StageError("\n".join(lines)) from None
 
 
 def _explained(error: Exception) -> str:

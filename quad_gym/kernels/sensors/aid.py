@@ -154,8 +154,8 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
         due = _due(flight, p, settings, s, mask, starting)
         if starting and settings.heading_sensor == sensor and settings.warm == 0:
             # it initializes the filter, which uses it only once
-            values, _ = measure(flight, p, 0)
-            keep(flight.aid_measurement[row], mask, values)
+            (x, y, z), _ = measure(flight, p, 0)
+            keep(flight.aid_measurement[row], mask, (x, y, z))
             flight.block_fresh[first] = select(mask, 1.0, flight.block_fresh[first])
             return
         if settings.faults:
@@ -163,9 +163,9 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
         _begin_sample(flight, work, settings, s, mask)
         if any_of(due):
             for i in range(settings.sensor_blocks[sensor]):
-                values, within = measure(flight, p, i)
+                (x, y, z), within = measure(flight, p, i)
                 taken = due & within
-                keep(flight.aid_measurement[row + i], taken, values)
+                keep(flight.aid_measurement[row + i], taken, (x, y, z))
                 flight.block_valid[first + i] = select(taken, 1.0, flight.block_valid[first + i])
         _deliver(flight, work, settings, s, mask, due)
 
