@@ -101,7 +101,7 @@ class FlightBatch(FlightMemory):
         self._words, self._written = words_of_update(self._settings[0], used)
         self._allocate_for_threads()
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if c.bounds is None else c.bounds
-        padded = len(self._blocks) * WIDTH
+        padded = -(-self.count // WIDTH) * WIDTH
         self._actions = np.zeros((padded, 4))
         self._resets = np.zeros(self.count, np.uint8)
         self._observations = np.zeros((self.count, self._low.size), np.float32)
@@ -158,20 +158,15 @@ class FlightBatch(FlightMemory):
         chosen = checked_mask(self.count, mask)
         given = checked_start(self.count, position, velocity, yaw, self.task, self.world, chosen)
         words = checked_keys(self.count, seeds, keys)
+        begin = np.flatnonzero(chosen)
         if words is not None:
-            for flight in np.flatnonzero(chosen):
-                block, lane = divmod(int(flight), WIDTH)
-                self._blocks["key"][block, :, lane] = words[flight]
-                self._blocks["instant"][block, lane] = 0
-                self._blocks["episode"][block, lane] = 0.0
+            self.write(begin, key=words[begin], instant=0, episode=0.0)
         self._resets[:] = chosen
         if given is None:
             return self._run(Command.RESET)
-        lanes = np.full((len(self._blocks) * WIDTH, 7), np.nan)
-        lanes[: self.count] = given
-        self._blocks["start_given"] = lanes.reshape(-1, WIDTH, 7).transpose(0, 2, 1)
+        self.write(begin, start_given=given[begin])
         observations = self._run(Command.RESET)
-        self._blocks["start_given"] = np.nan
+        self.write(begin, start_given=np.nan)
         return observations
 
     def step(self, actions: NDArray[Any] | None = None) -> NDArray[np.float32]:
@@ -188,7 +183,7 @@ class FlightBatch(FlightMemory):
         """
         if not self._begun:
             self._require_begun()
-        self._actions[: self.count] = self.record("action") if actions is None else actions
+        self._keep_actions(actions)
         observations = self._run(Command.STEP)
         if self.configuration.begins_after_step:
             over = self.result("terminated") + self.result("truncated") > 0.0
@@ -199,6 +194,10 @@ class FlightBatch(FlightMemory):
                 return self._run(Command.RESET)
         return observations
 
+    def _keep_actions(self, actions: NDArray[Any] | None) -> None:
+        """Store the actions of a step; None: the present ones."""
+        self._actions[: self.count] = self.record("action") if actions is None else actions
+
     def _keep_innovations(self) -> None:
         """Keep the innovations of episodes that are over, before others begin in the same step."""
         if self.innovations:
@@ -206,7 +205,7 @@ class FlightBatch(FlightMemory):
 
     def _require_begun(self) -> None:
         """Refuse to step flights that have no state; checked until all flights have one."""
-        waiting = (self._blocks["episode"] == 0.0) & (self._blocks["idle"] == 0.0)
+        waiting = self.record("episode") == 0.0
         if waiting.any():
             raise check.NotResetError(
                 f"call reset() before step(): {int(waiting.sum())} of {self.count} flights have "

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import named_faults
@@ -117,16 +117,30 @@ class FlightMemory:
                 return np.tile(self._undrawn, (count, 1))
             base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
             return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
+        return self._fetched(name, flights)
+
+    def _fetched(self, name: str, flights: NDArray[np.intp] | None) -> NDArray[Any]:
+        """Return a field of the records that this configuration uses, as `record` does."""
         if flights is None:
             return field_of_flights(self._blocks, name, self.count)
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
+
+    def _drawn(self, columns: slice) -> NDArray[np.float64]:
+        """Return columns of the field `drawn`, as a new array (n, columns)."""
+        values = np.moveaxis(self._blocks["drawn"][:, columns], -1, 1)
+        return values.reshape(-1, values.shape[-1])[: self.count].copy()
+
+    def write(self, flights: NDArray[np.intp], **values: ArrayLike) -> None:
+        """Write fields of the records of some flights, (len(flights), ...) each."""
+        block, lane = np.divmod(flights, WIDTH)
+        for name, value in values.items():
+            self._blocks[name][block, ..., lane] = value
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
         """Return the drawn parameters of the present episodes by name: (count,) or (count, n)."""
         found = {}
         for name in self.randomization.names:
-            values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
-            values = values.reshape(-1, values.shape[-1])[: self.count].copy()
+            values = self._drawn(COLUMNS[name])
             if name == "feature_offsets_I" and self.sensors.camera is not None:
                 count = len(self.sensors.camera.features_I)
                 values = values[:, : 3 * count].reshape(-1, count, 3)

@@ -18,7 +18,7 @@ from quad_gym.device.plan import DevicePlan, FieldPlace, Words
 from quad_gym.kernels.library import FOLDER
 from quad_gym.kernels.sources import sources_digest
 from quad_gym.params import checks as check
-from quad_gym.records import RESULTS, WARP, WIDTH, WORK_BLOCK, offset_of
+from quad_gym.records import RESULTS, SHOWN_SIZE, WARP, WIDTH, WORK_BLOCK, offset_of
 
 LANES = {"QUAD_GYM_LANES": str(WARP), "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 """Environment of a process with the blocks of a GPU."""
@@ -28,11 +28,10 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
     """Return the plan of a batch that has never been reset, for any number of flights.
 
     Raises:
-        ValueError: If the batch needs Python during its steps.
+        ValueError: If the batch needs Python during its steps, other than the methods of a task.
     """
     c = batch.configuration
     for python, what in (
-        (type(batch) is not FlightBatch, "a task in Python"),
         (c.estimator is not None, "an own estimator"),
         (c.begins_after_step, 'innovations with autoreset_mode="SameStep"'),
     ):
@@ -60,6 +59,7 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
         work=WORK_BLOCK.itemsize // line,
         results=RESULTS,
         autoreset=int(c.compiled_autoreset),
+        shown=SHOWN_SIZE if batch._settings["shown"][0] else 0,
     )
 
 

@@ -3,6 +3,7 @@
 It needs NumPy and torch, and no compiler: plan and kernel may be made elsewhere.
 """
 
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import numpy as np
@@ -49,6 +50,7 @@ class DeviceBatch:
         self._actions = self._zeros(blocks * WARP, 4)
         self._resets = self._zeros(count, kind=torch.uint8)
         self._results = self._zeros(len(plan.results), blocks * WARP)
+        self._shown = self._zeros(plan.shown, blocks * WARP)
         self._paths = [self._put(array) for array in (plan.paths, plan.pieces)]
         table = np.zeros(1, STAGE_TABLE)
         table["paths"], table["pieces"] = (tensor.data_ptr() for tensor in self._paths)
@@ -66,6 +68,7 @@ class DeviceBatch:
             Call.HIGH: self._put(plan.high),
             Call.FINAL_OBSERVATIONS: self.final_observations,
             Call.RESULTS: self._results,
+            Call.SHOWN: self._shown,
         }
         words = np.zeros(len(Call), np.int64)
         for word, tensor in self._memory.items():
@@ -74,7 +77,7 @@ class DeviceBatch:
         words[Call.PITCH] = 8 * WARP * len(plan.flight)
         words[Call.COUNT], words[Call.SIZE] = count, size
         words[Call.AUTORESET] = plan.autoreset
-        words[Call.RESULT_PITCH] = 8 * self._results.shape[1]
+        words[Call.RESULT_PITCH] = words[Call.SHOWN_PITCH] = 8 * self._results.shape[1]
         self._calls = []
         for seen in self._seen:  # in turn
             words[Call.OBSERVATIONS] = seen.data_ptr()
@@ -106,8 +109,11 @@ class DeviceBatch:
         Args:
             actions: (n, 4); they are clipped to [-1, 1], and not checked for NaN, which would wait.
         """
-        self._actions[: self.count].copy_(actions.detach()).clamp_(-1.0, 1.0)
+        self._keep_actions(actions)
         return self._fly(Command.STEP)
+
+    def _keep_actions(self, actions: torch.Tensor) -> None:
+        self._actions[: self.count].copy_(actions.detach()).clamp_(-1.0, 1.0)
 
     def _fly(self, command: Command) -> torch.Tensor:
         """Launch a command; return the observations, (n, k) float32."""
@@ -119,6 +125,10 @@ class DeviceBatch:
     def result(self, name: str) -> torch.Tensor:
         """Return one of the results of the last step, (n,) float64."""
         return self._results[self.plan.results.index(name), : self.count]
+
+    def reward_terms(self, builtin: Iterable[str]) -> dict[str, torch.Tensor]:
+        """Return terms of the last step's reward by their names, (n,) each."""
+        return {name: self.result(f"reward_{name}") for name in builtin}
 
     def record(self, name: str) -> torch.Tensor:
         """Return a copy of a field of all flights by its name in the kernels, (n, ...)."""

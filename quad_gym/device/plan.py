@@ -36,3 +36,4 @@ class DevicePlan(NamedTuple):
     work: int  #: words of the workspace of a flight
     results: tuple[str, ...]  #: names of the results of a step
     autoreset: int  #: an `Autoreset`
+    shown: int = 0  #: numbers of a flight for the views of a task in Python

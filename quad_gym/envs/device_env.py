@@ -12,9 +12,10 @@ from gymnasium.vector.utils import batch_space
 
 from quad_gym.batch.seeding import Words, keys_of, stream_keys
 from quad_gym.device.emission import plan_of, ptx_of
-from quad_gym.device.flights import DeviceBatch, Launcher
+from quad_gym.device.flights import Launcher
 from quad_gym.device.launching import CudaLauncher
 from quad_gym.device.plan import DevicePlan
+from quad_gym.device.tasks import flights_on
 from quad_gym.envs.flights import named_options
 from quad_gym.envs.keywords import VectorKeywords, shows
 from quad_gym.envs.torch_env import QuadTorchVecEnv, checked_device
@@ -34,7 +35,8 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
 
     A step is one launch of the kernel, without a copy to the host or a wait. The tensors of
     observations and `info` are views of the memory of the flights: the next step overwrites `info`,
-    and the one after it the observations.
+    and the one after it the observations. The methods of a task in Python run on the host, which
+    waits for the numbers that they read.
     `info` has "position_error" and "estimation_error", with `reward_terms=True` also these; with
     `autoreset_mode="SameStep"`, "final_obs" and its mask "_final_obs"; errors are then those at the
     end of the episode that ended. `batch.result` has the other results of a step, and
@@ -50,7 +52,7 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
     Raises:
         TypeError: If a keyword is unknown; the exception is also a ValueError.
         ValueError: If there is no GPU, the value of a keyword is invalid, or the configuration
-            needs Python during a step: tasks and estimators in Python, and rendering.
+            needs other Python than a task during a step: an estimator, or rendering.
         ImportError: If cuda-core or Numba is not installed.
     """
 
@@ -82,16 +84,13 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
             warnings.warn(_UNTRIED, stacklevel=2)
         make = launcher or (lambda plan: CudaLauncher(ptx_of(plan), on_gpu))
         self.device, self.num_envs = on_gpu, num_envs
-        self.batch = DeviceBatch(plan, num_envs, make(plan), on_gpu)
+        task = getattr(self.flights.batch, "made", None)
+        self.batch = flights_on(on_gpu, plan, num_envs, make(plan), task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         errors = ["position_error", "estimation_error"]
         self._infos: dict[str, Any] = {name: self.batch.result(name) for name in errors}
-        if self.flights.reward_terms:
-            names = [name for name in plan.results if name.startswith("reward_")]
-            terms = {name.removeprefix("reward_"): self.batch.result(name) for name in names}
-            kept = self.flights.batch.reward_terms()
-            self._infos["reward_terms"] = {name: terms[name] for name in kept}
+        self._terms = tuple(self.flights.batch.reward_terms())
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -169,6 +168,8 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
         seen, result = self.batch.step(actions), self.batch.result
         terminated, truncated = result("terminated") > 0.0, result("truncated") > 0.0
         infos = dict(self._infos)
+        if self.flights.reward_terms:
+            infos["reward_terms"] = self.batch.reward_terms(self._terms)
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             infos["final_obs"] = self._split(self.batch.final_observations)
             infos["_final_obs"] = terminated | truncated

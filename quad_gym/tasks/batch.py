@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.batch.resets import checked_mask
 from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import checks as check
-from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
+from quad_gym.records import RESULTS, Autoreset, Ending, Result
 from quad_gym.records.state import State
 from quad_gym.tasks import answers
 from quad_gym.tasks.answers import Start
@@ -51,6 +51,7 @@ class TaskBatch(ReadableBatch):
         split: int = 0,
         kept: Sequence[int] | None = None,
     ) -> None:
+        self.made = c, {"own_task": own_task, "parts": parts, "split": split, "kept": kept}
         self._in_kernel = c.autoreset is Autoreset.NEXT_STEP
         mode = Autoreset.NEXT_STEP if self._in_kernel else Autoreset.DISABLED
         super().__init__(replace(c, autoreset=mode), split)
@@ -65,7 +66,6 @@ class TaskBatch(ReadableBatch):
         self._terms: Mapping[str, Floats] = {}
         self._rewarded: Truths = np.zeros(self.count, bool)
         self._all, self._returns = np.arange(self.count), np.zeros(self.count)
-        self._block, self._lane = np.divmod(self._all, WIDTH)
         size = self._joiner.size if self._joiner else self._low.size
         # the kernels do not write it: they begin episodes only at the start of a step
         self.final_observations = np.zeros((self.count, size), np.float32)
@@ -157,11 +157,9 @@ class TaskBatch(ReadableBatch):
 
     def _begin_again(self, chosen: Truths, start: Start) -> Singles:
         """Begin the same episodes, with the same draws, at other start values."""
-        lanes = np.zeros(len(self._blocks) * WIDTH, bool)
-        lanes[: self.count] = chosen
-        again = lanes.reshape(-1, WIDTH)
-        self._blocks["instant"][again] -= np.uint64(1)
-        self._blocks["episode"][again] -= 1.0
+        again = np.flatnonzero(chosen)
+        instants, episodes = self.record("instant", again), self.record("episode", again)
+        self.write(again, instant=instants - np.uint64(1), episode=episodes - 1.0)
         builtin = super().reset(mask=chosen, **start)
         self._begun_again = True
         self.view.forget()
@@ -186,7 +184,7 @@ class TaskBatch(ReadableBatch):
         self._terms, self._rewarded = terms, sound & ~self.began
         reward = np.where(self._rewarded, self.reward_scale * rewards, 0.0)
         self._returns += reward
-        self._write(slice(None), reward=reward, episode_return=self._returns)
+        self._write(self._all, reward=reward, episode_return=self._returns)
 
     def reward_terms(self) -> dict[str, Floats]:
         """Return the terms of the last step's reward, (count,) each; their sum is the reward.
@@ -226,10 +224,10 @@ class TaskBatch(ReadableBatch):
             )
         return over
 
-    def _write(self, flights: NDArray[np.intp] | slice, **values: NDArray[Any]) -> None:
+    def _write(self, flights: NDArray[np.intp], **values: NDArray[Any]) -> None:
         """Write values of some flights to records, and to results that have their names."""
+        self.write(flights, **values)
         for name, value in values.items():
-            self._blocks[name][self._block[flights], self._lane[flights]] = value
             if name in RESULTS:
                 self._results[RESULTS.index(name), : self.count][flights] = value
 
@@ -238,7 +236,7 @@ class TaskBatch(ReadableBatch):
         if "gates_passed" in self._state.names:
             passed = np.where(self.began, 0.0, self._state.gates_passed)
             self._results[Result.GATES_PASSED, : self.count] = passed
-            self._write(slice(None), gate_next=passed)
+            self.write(self._all, gate_next=passed)
         if self._begun_again:
             for name in ("position_error", "estimation_error", "filter_status"):
                 row = self._results[Result[name.upper()], : self.count]

@@ -9,7 +9,7 @@ from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.stages import needed_stages
 from quad_gym.packing.configuration import FlightConfiguration
-from quad_gym.records import SHOWN, SHOWN_SHAPES, SHOWN_SIZE, WIDTH, Command, Result
+from quad_gym.records import SHOWN, SHOWN_SHAPES, SHOWN_SIZE, Command, Result
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -27,7 +27,7 @@ class ReadableBatch(FlightBatch):
         self._settings["shown"] = True
         self._stages = needed_stages(self._settings[0])
         # rows at distances of a power of two would compete for a few cache lines
-        self._shown = np.zeros((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
+        self._shown = np.zeros((SHOWN_SIZE, len(self._actions) + _GAP))
         self.period = 1.0 / self.clocks.control_rate
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         self.began: Truths = np.zeros(self.count, bool)

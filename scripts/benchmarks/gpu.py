@@ -6,7 +6,8 @@
 The first part emits a module for each golden case that a GPU can fly, which takes a quarter of an
 hour on two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and
 cuda-core. Both skip the parts in FOLDER: if one was interrupted or ran out of time, run it again.
-Results are in FOLDER/results.json.
+With `--only TEXT`, they take the cases and measurements alone whose names contain it. Results are
+in FOLDER/results.json.
 """
 
 import argparse
@@ -20,72 +21,92 @@ import sys
 import time
 import types
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 ROOT = Path(__file__).parents[2]
-SECONDS = 400.0  #: time after which no measurement begins
-TIMED = ("observation truth", "Circle, standard")
-"""Golden cases with which steps/s are measured."""
+SECONDS = 370.0  #: time after which no measurement begins
+LONGEST = 100.0  #: about the longest training [s]
+TIMED = {"observation truth": 1 << 20, "Circle, standard": 1 << 20, "LookAround": 16_384}
+"""Golden cases with which steps/s are measured, and the largest number of flights."""
 SIZES = (1_024, 4_096, 16_384, 65_536, 1_048_576)
 """Numbers of flights."""
 DURATION = 2.0  #: of a measurement of steps/s [s]
 WARM_UP = 60  #: steps before it
 TICKS, FLIGHTS, STEPS, SEED = 30, 8, 300, 2026
-TRAINING = {"num_envs": 8192, "num_minibatches": 32, "total_timesteps": 20_000_000}
-"""Options of `docs/examples/torch_ppo.py`; they are multiples of the defaults."""
-TRAININGS = {"training": {}, "training with memory": {"memory": True}}
-"""More options of the trainings on Circle, by name."""
-TRAINED: dict[str, Any] = {"autoreset_mode": "SameStep", "start": "mixed"}
-"""Keywords of the flights of the training."""
+EVALUATED = 1000  #: most steps of an evaluation, more than an episode has
+
+
+class Training(NamedTuple):
+    """Flights and options of a training by `docs/examples/torch_ppo.py`."""
+
+    env_id: str
+    keywords: Mapping[str, Any]  #: of the flights
+    options: Mapping[str, Any]
+
+
+_CIRCLE = {"num_envs": 8192, "num_minibatches": 32, "total_timesteps": 20_000_000}
+"""Multiples of the script's defaults."""
+_MIXED = {"start": "mixed"}
+TRAININGS = {
+    "training": Training("QuadGym/Circle-v0", _MIXED, _CIRCLE),
+    "training on LookAround": Training(
+        "QuadGym/LookAround-v0",
+        {"include_std": True},
+        {
+            **{"num_envs": 4096, "num_minibatches": 16, "total_timesteps": 40_000_000},
+            "gamma": 0.995,
+        },
+    ),
+    "training with memory": Training("QuadGym/Circle-v0", _MIXED, {**_CIRCLE, "memory": True}),
+}
+"""The trainings by name, in the order of importance."""
 Make = Callable[[bytes], Any]
 """Make the launcher of a module of PTX."""
 
 
-def prepare(folder: Path, cases: tuple[str, ...] = (), workers: int = 2) -> None:
+def prepare(folder: Path, only: str = "", workers: int = 2) -> None:
     """Write a file for each case: its plan, its PTX, and the numbers of its flights here.
 
     Args:
         folder: Folder of the files.
-        cases: Names of golden cases; none: all.
+        only: Part of the names of golden cases and trainings.
         workers: Number of processes.
     """
     golden: Any = importlib.import_module("tests.golden.flights")
     folder.mkdir(parents=True, exist_ok=True)
+    names = [name for name in (*TRAININGS, *golden.cases()) if only in name]
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for said in pool.map(
-            functools.partial(_prepare, folder), (*TRAININGS, *(cases or golden.cases()))
-        ):
+        for said in pool.map(functools.partial(_prepare, folder), names):
             print(said, flush=True)
 
 
 def _prepare(folder: Path, name: str) -> str:
     """Write the file of a case or of a training; return a line about it."""
     import quad_gym
-    from quad_gym.device.emission import plan_of, ptx_of
 
     golden: Any = importlib.import_module("tests.golden.flights")
     file = folder / f"{name}.case"
     if file.is_file():
         return f"{name}: is there"
     if name in TRAININGS:
-        env: Any = quad_gym.make_torch_vec_env("QuadGym/Circle-v0", 1, **TRAINED)
-        plan = plan_of(env.flights.batch)
-        content: dict[str, Any] = {"plan": plan, "ptx": ptx_of(plan)}
+        training = TRAININGS[name]
+        env: Any = quad_gym.make_torch_vec_env(
+            training.env_id, 1, autoreset_mode="SameStep", **training.keywords
+        )
+        flights = env.flights
+        content: dict[str, Any] = _module_of(flights.batch)
     else:
         env = golden.made(golden.cases()[name], FLIGHTS)
         flights = env.unwrapped.flights
-        try:
-            plan = plan_of(flights.batch)
-        except ValueError as error:
-            return f"{name}: {error}"
+        content = _module_of(flights.batch)
         env.reset(seed=SEED)
-        content = {"plan": plan, "ptx": ptx_of(plan), "keys": flights.batch.record("key")}
-        names = [state for state in golden.STATES if state in plan.fields]
+        content["keys"] = flights.batch.record("key")
+        names = [state for state in golden.STATES if state in content["plan"].fields]
 
         def step(actions: Any) -> list[Any]:
             seen, rewards, *_ = env.step(actions)
@@ -95,6 +116,22 @@ def _prepare(folder: Path, name: str) -> str:
         content |= {"names": names, "flown": list(_flown(step, flights.batch.record, names))}
     file.write_bytes(zlib.compress(pickle.dumps(content)))
     return f"{name}: PTX of {len(content['ptx']) / 1e3:.0f} kB"
+
+
+def _module_of(batch: Any) -> dict[str, Any]:
+    """Return what flights need on a GPU: plan, PTX, and the task in Python, if they have one."""
+    from quad_gym.device.emission import plan_of, ptx_of
+
+    plan = plan_of(batch)
+    return {"plan": plan, "ptx": ptx_of(plan), "task": getattr(batch, "made", None)}
+
+
+def _flights(content: dict[str, Any], count: int, make: Make, device: str) -> Any:
+    """Return the flights of a file."""
+    from quad_gym.device.tasks import flights_on
+
+    launcher = make(content["ptx"])
+    return flights_on(device, content["plan"], count, launcher, content.get("task"))
 
 
 def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
@@ -107,7 +144,12 @@ def _flown(step: Any, record: Any, names: list[str]) -> Iterator[list[Any]]:
 
 
 def run(
-    folder: Path, make: Make, device: str, sizes: tuple[int, ...] = SIZES, mapped: Any = map
+    folder: Path,
+    make: Make,
+    device: str,
+    sizes: tuple[int, ...] = SIZES,
+    mapped: Any = map,
+    only: str = "",
 ) -> dict[str, Any]:
     """Fly the golden cases, then measure while there is time; return FOLDER/results.json.
 
@@ -117,12 +159,13 @@ def run(
         device: Device of the flights.
         sizes: Numbers of flights.
         mapped: Function like `map` for the golden cases, of which any may end a GPU's context.
+        only: Part of the names of measurements.
     """
     begin, file = time.monotonic(), folder / "results.json"
     found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
 
     def is_missing(what: str) -> bool:
-        return what not in found or "failed" in found[what]
+        return only in what and (what not in found or "failed" in found[what])
 
     def keep(what: str, result: Any) -> None:
         found[what] = result
@@ -135,9 +178,12 @@ def run(
     for name, result in zip(golden, mapped(compare, map(paths.get, golden)), strict=True):
         keep(f"golden: {name}", result)
     todo: list[tuple[str, Any, str, Any]] = [
-        (f"{name}, {n} flights", _speed, name, n) for name in TIMED for n in sizes
+        (f"{name}, {n} flights", _speed, name, n)
+        for name, most in TIMED.items()
+        for n in sizes
+        if n <= most
     ]
-    todo += [(name, _training, name, options) for name, options in TRAININGS.items()]
+    todo += [(name, _training, name, training.options) for name, training in TRAININGS.items()]
     for what, measure, name, more in todo:
         if name in paths and is_missing(what) and time.monotonic() - begin < SECONDS:
             keep(what, _attempted(measure, make, device, paths[name], more))
@@ -156,9 +202,7 @@ def _differences(content: dict[str, Any], make: Make, device: str) -> dict[str, 
     """Return how many numbers of golden flights differ from those on the processor, by name."""
     import torch
 
-    from quad_gym.device.flights import DeviceBatch
-
-    batch = DeviceBatch(content["plan"], FLIGHTS, make(content["ptx"]), device)
+    batch = _flights(content, FLIGHTS, make, device)
     batch.reset(content["keys"])
 
     def step(actions: Any) -> list[Any]:
@@ -182,26 +226,26 @@ def _speed(content: dict[str, Any], make: Make, device: str, count: int) -> Any:
     """Return steps/s with random actions, and the memory of a flight [bytes]."""
     import torch
 
-    from quad_gym.batch.seeding import keys_of
-    from quad_gym.device.flights import DeviceBatch
-
     on_gpu = device != "cpu"
     before = torch.cuda.memory_allocated() if on_gpu else 0
-    batch = DeviceBatch(content["plan"], count, make(content["ptx"]), device)
+    batch = _flights(content, count, make, device)
     after = torch.cuda.memory_allocated() if on_gpu else 0
-    batch.reset(keys_of(np.arange(count, dtype=np.uint64)))
-    actions = [0.2 * torch.randn(count, 4, device=device) for _ in range(8)]
-
-    def flown(steps: int) -> float:
-        begin = time.perf_counter()
-        for k in range(steps):
-            batch.step(actions[k % 8])
-        batch.result("reward").sum().item()  # waits
-        return time.perf_counter() - begin
-
-    once = flown(WARM_UP) / WARM_UP  # until episodes end at every step
+    _Flights(batch).reset(0)
+    once = _seconds(batch, WARM_UP) / WARM_UP  # until episodes end at every step
     steps = max(8, min(1000, int(DURATION / once)))
-    return {"steps/s": count * steps / flown(steps), "bytes": (after - before) / count}
+    return {"steps/s": count * steps / _seconds(batch, steps), "bytes": (after - before) / count}
+
+
+def _seconds(batch: Any, steps: int) -> float:
+    """Return how long steps with random actions take [s]."""
+    import torch
+
+    actions = [0.2 * torch.randn(batch.count, 4, device=batch.device) for _ in range(8)]
+    begin = time.perf_counter()
+    for k in range(steps):
+        batch.step(actions[k % 8])
+    batch.result("reward").sum().item()  # waits
+    return time.perf_counter() - begin
 
 
 class _Flights:
@@ -223,26 +267,52 @@ class _Flights:
 
 
 def _training(content: dict[str, Any], make: Make, device: str, options: dict[str, Any]) -> Any:
-    """Train on Circle; return seconds, steps/s, and the mean position error afterwards [m]."""
-    import torch
-
-    from quad_gym.device.flights import DeviceBatch
-
+    """Train, and evaluate the policy in an episode of each flight; return the results."""
     sys.path.insert(0, str(ROOT / "docs" / "examples"))
     script = importlib.import_module("torch_ppo")
-    args = script.Args(device=device, **TRAINING, **options)
-    batch = DeviceBatch(content["plan"], args.num_envs, make(content["ptx"]), device)
-    begin, env = time.perf_counter(), _Flights(batch)
-    agent = script.train(env, content["plan"].low.size, 4, args)
-    seconds, seen = time.perf_counter() - begin, env.reset(0)[0]
-    begins, state = torch.ones(len(seen), dtype=torch.bool, device=device), agent.begin(len(seen))
+    args = script.Args(device=device, **options)
+    batch = _flights(content, args.num_envs, make, device)
+    env = _Flights(batch)
+    size = env.reset(0)[0].shape[1]
+    speed = args.num_envs * WARM_UP / _seconds(batch, WARM_UP)
+    # updates of the networks take up to half of the time
+    args.total_timesteps = min(args.total_timesteps, int(0.5 * LONGEST * speed))
+    begin = time.perf_counter()
+    agent = script.train(env, size, 4, args)
+    seconds = time.perf_counter() - begin
+    steps = {"steps": args.total_timesteps, "steps/s": args.total_timesteps / seconds}
+    return {"seconds": seconds, **steps, **_evaluated(env, batch, agent)}
+
+
+def _evaluated(env: _Flights, batch: Any, agent: Any) -> dict[str, float]:
+    """Fly an episode of each flight without exploration.
+
+    Returns:
+        The share of episodes that end in a crash, the mean return, and the mean position error [m].
+    """
+    import torch
+
+    seen, count = env.reset(0)[0], batch.count
+    begins, state = torch.ones(count, dtype=torch.bool, device=batch.device), agent.begin(count)
+    flying, crashed = begins.clone(), torch.zeros_like(begins)
+    returns, errors, flown = (torch.zeros(count, device=batch.device) for _ in range(3))
     with torch.no_grad():
-        for _ in range(STEPS):
+        for _ in range(EVALUATED):
             features, state = agent.features(seen[None], begins[None], state)
-            seen, _, terminated, truncated, _ = env.step(agent.actor(features[0]))
+            seen, reward, terminated, truncated, _ = env.step(agent.actor(features[0]))
             begins = terminated | truncated
-    error = float(batch.result("position_error").mean())
-    return {"seconds": seconds, "steps/s": args.total_timesteps / seconds, "error": error}
+            returns += torch.where(flying, reward, 0.0)
+            errors += torch.where(flying, batch.result("position_error").float(), 0.0)
+            flown += flying
+            crashed |= flying & terminated
+            flying &= ~begins
+            if not flying.any():
+                break
+    return {
+        "crashes": float(crashed.float().mean()),
+        "return": float(returns.mean()),
+        "error": float(errors.sum() / flown.sum()),
+    }
 
 
 def _on_cuda(ptx: bytes) -> Any:
@@ -255,11 +325,12 @@ def _on_cuda(ptx: bytes) -> Any:
 
 
 def _without_gymnasium() -> None:
-    """Import `quad_gym` without the packages of its environments."""
+    """Import modules of `quad_gym` without the packages of its environments and of smoothing."""
     sys.path.insert(0, str(ROOT))
-    package = types.ModuleType("quad_gym")
-    package.__path__ = [str(ROOT / "quad_gym")]
-    sys.modules["quad_gym"] = package
+    for name in ("quad_gym", "quad_gym.estimation"):
+        package = types.ModuleType(name)
+        package.__path__ = [str(ROOT.joinpath(*name.split(".")))]
+        sys.modules[name] = package
 
 
 def main() -> None:
@@ -269,10 +340,11 @@ def main() -> None:
     )
     parser.add_argument("part", choices=("prepare", "run"))
     parser.add_argument("folder", type=Path, help="folder of the cases and of results.json")
+    parser.add_argument("--only", default="", help="part of the names of cases or measurements")
     args = parser.parse_args()
     folder: Path = args.folder
     if args.part == "prepare":
-        prepare(folder)
+        prepare(folder, args.only)
         return
     _without_gymnasium()
     import torch
@@ -282,7 +354,7 @@ def main() -> None:
     with ProcessPoolExecutor(
         workers, spawn, initializer=_without_gymnasium, max_tasks_per_child=1
     ) as pool:
-        run(folder, _on_cuda, "cuda", mapped=pool.map)
+        run(folder, _on_cuda, "cuda", mapped=pool.map, only=args.only)
 
 
 if __name__ == "__main__":

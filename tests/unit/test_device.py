@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -61,6 +62,68 @@ def test_flights_of_device_code_equal_those_of_the_batch(mode):
 
 def test_flights_of_ptx_equal_those_of_the_batch():
     assert episodes_of("circle", "NextStep", launcher_of_ptx, **TRUTH) > COUNT
+
+
+class Drawing(quad_gym.Task):
+    """Draws starts, a target in each step, and ends; observes the target and the step."""
+
+    state: ClassVar = {"target": np.zeros(3), "gates_passed": 0}
+    observes: ClassVar = {"target": quad_gym.ObservationSpec("m", "B", -5.0, 5.0)}
+
+    def reset(self, view, rng):
+        view.state.target = view.position
+        position = view.reference_position + rng.uniform(-0.2, 0.2, (view.count, 3))
+        return {"position": position, "yaw": rng.uniform(-1.0, 1.0)}
+
+    def update(self, view, rng):
+        view.state.target = view.state.target + rng.normal(0.0, 0.1, (view.count, 3))
+        view.state.gates_passed = view.state.gates_passed + rng.integers(2)
+
+    def reward(self, view):
+        gap = np.abs(view.state.target - view.position).sum(axis=1)
+        return {"near": -gap, "progress": view.truth.progress}
+
+    def terminated(self, view):
+        return view.builtin.terminated | (view.state.gates_passed > 12)
+
+    def truncated(self, view):
+        return view.step >= 20
+
+    def observe(self, view):
+        gap = (view.state.target - view.observed.position)[:, :, np.newaxis]
+        return {"target": (view.observed.R_BI @ gap)[:, :, 0], "time": view.time}
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_flights_of_device_code_with_a_task_equal_those_of_the_batch(mode):
+    assert episodes_of("circle", mode, task=Drawing(), **TRUTH) > COUNT
+
+
+@pytest.mark.slow  # compiles the filter
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize(
+    ("base", "keywords"),
+    [
+        ("look_around", {"include_std": True, "max_tilt": 0.6}),
+        ("stale_race", {"max_tilt": 0.6}),
+        ("outage_dash", {"max_episode_steps": 25, "reward_terms": True}),
+    ],
+)
+def test_flights_of_benchmark_tasks_equal_those_of_the_batch(base, keywords, mode):
+    assert episodes_of(base, mode, **keywords) > 0
+
+
+def test_reward_terms_and_endings_of_a_task_on_a_device_are_those_of_the_batch():
+    made = {"task": Drawing(), "reward_terms": True, "reward_per": "second", **TRUTH}
+    envs, others = device_env("circle", 3, **made), vec_env("circle", 3, **made)
+    envs.reset(seed=1), others.reset(seed=1)
+    for _ in range(25):
+        infos, known = envs.step(torch.zeros(3, 4))[-1], others.step(np.zeros((3, 4)))[-1]
+        assert set(infos["reward_terms"]) == {"near", "progress"}
+        for name, term in infos["reward_terms"].items():
+            assert np.array_equal(term.numpy(), known["reward_terms"][name])
+        for name in ("ending", "gates_passed"):
+            assert np.array_equal(envs.batch.result(name).numpy(), known[name])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -184,7 +247,6 @@ def test_device_that_is_no_processor_or_gpu_is_refused(device):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"base": "look_around"}, "a task in Python runs in Python"),
         ({"render_mode": "rgb_array"}, "render_mode is of flights on the processor"),
         ({"threads": 2}, "threads is of flights on the processor"),
         (
