@@ -1,6 +1,6 @@
 """Flights on a GPU with a task in Python, whose methods run in NumPy on the host.
 
-The host reads from the device what the task reads, and nothing else of the records.
+Of the records, the host copies only the fields that the task reads.
 """
 
 import weakref
@@ -40,8 +40,8 @@ def flights_on(
 class DeviceTaskBatch(DeviceBatch):
     """Flights on a device with a task in Python.
 
-    Between the launch of a step and that of the resets after it, the host computes what the task's
-    methods return, for which it waits. Observations are new tensors.
+    Between a step and the resets after it, the host calls the task's methods, and waits for the
+    numbers that they read. Observations are new tensors.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class DeviceTaskBatch(DeviceBatch):
         return self._put(seen)
 
     def reward_terms(self, builtin: Iterable[str]) -> dict[str, torch.Tensor]:
-        """Return the terms of the last step's reward, (n,) each: those of the task, if it has."""
+        """Return the terms of the last step's reward, (n,) each; the task's own have precedence."""
         if "reward" not in self._task.methods:
             return super().reward_terms(builtin)
         return {name: self._put(term) for name, term in self._task.reward_terms().items()}

@@ -6,7 +6,7 @@
 The first part emits a module for each golden case that a GPU can fly, which takes a quarter of an
 hour on two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and
 cuda-core. Both skip the parts in FOLDER: if one was interrupted or ran out of time, run it again.
-With `--only TEXT`, they take the cases and measurements alone whose names contain it. Results are
+With `--only TEXT`, they select cases and measurements by a part of their names. Results are
 in FOLDER/results.json.
 """
 
