@@ -2,10 +2,11 @@
 
     python -m scripts.benchmarks.gpu prepare FOLDER     # on any machine, in a clone with all extras
     python scripts/benchmarks/gpu.py run FOLDER         # on the GPU's machine
+    python -m scripts.benchmarks.gpu evaluate FOLDER    # the trained policies, on the first machine
 
 The first part emits a module for each golden case that a GPU can fly, which takes a quarter of an
 hour on two cores. The second part needs the clone and FOLDER, and of packages NumPy, torch and
-cuda-core. Both skip the parts in FOLDER: if one was interrupted or ran out of time, run it again.
+cuda-core. Both skip the results in FOLDER: if one was interrupted or ran out of time, run it again.
 With `--only TEXT`, they select cases and measurements by a part of their names. Results are
 in FOLDER/results.json.
 """
@@ -38,31 +39,27 @@ SIZES = (1_024, 4_096, 16_384, 65_536, 1_048_576)
 DURATION = 2.0  #: of a measurement of steps/s [s]
 WARM_UP = 60  #: steps before it
 TICKS, FLIGHTS, STEPS, SEED = 30, 8, 300, 2026
-EVALUATED = 1000  #: most steps of an evaluation, more than an episode has
+EPISODES = 1000  #: of an evaluation
 
 
 class Training(NamedTuple):
     """Flights and options of a training by `docs/examples/torch_ppo.py`."""
 
     env_id: str
-    keywords: Mapping[str, Any]  #: of the flights
     options: Mapping[str, Any]
+    keywords: Mapping[str, Any] = {}  #: of the flights
+    learning: Mapping[str, Any] = {}  #: keywords of the flights in training only
 
 
 _CIRCLE = {"num_envs": 8192, "num_minibatches": 32, "total_timesteps": 20_000_000}
 """Multiples of the script's defaults."""
-_MIXED = {"start": "mixed"}
+_LOOK = {"num_envs": 4096, "num_minibatches": 16, "total_timesteps": 40_000_000, "gamma": 0.995}
 TRAININGS = {
-    "training": Training("QuadGym/Circle-v0", _MIXED, _CIRCLE),
+    "training": Training("QuadGym/Circle-v0", _CIRCLE),
     "training on LookAround": Training(
-        "QuadGym/LookAround-v0",
-        {"include_std": True},
-        {
-            **{"num_envs": 4096, "num_minibatches": 16, "total_timesteps": 40_000_000},
-            "gamma": 0.995,
-        },
+        "QuadGym/LookAround-v0", _LOOK, {"include_std": True}, {"out_of_bounds": 3.0}
     ),
-    "training with memory": Training("QuadGym/Circle-v0", _MIXED, {**_CIRCLE, "memory": True}),
+    "training with memory": Training("QuadGym/Circle-v0", {**_CIRCLE, "memory": True}),
 }
 """The trainings by name, in the order of importance."""
 Make = Callable[[bytes], Any]
@@ -96,7 +93,10 @@ def _prepare(folder: Path, name: str) -> str:
     if name in TRAININGS:
         training = TRAININGS[name]
         env: Any = quad_gym.make_torch_vec_env(
-            training.env_id, 1, autoreset_mode="SameStep", **training.keywords
+            training.env_id,
+            1,
+            autoreset_mode="SameStep",
+            **{**training.keywords, **training.learning},
         )
         flights = env.flights
         content: dict[str, Any] = _module_of(flights.batch)
@@ -183,7 +183,10 @@ def run(
         for n in sizes
         if n <= most
     ]
-    todo += [(name, _training, name, training.options) for name, training in TRAININGS.items()]
+    todo += [
+        (name, _training, name, {**training.options, "save": folder / f"{name}.pt"})
+        for name, training in TRAININGS.items()
+    ]
     for what, measure, name, more in todo:
         if name in paths and is_missing(what) and time.monotonic() - begin < SECONDS:
             keep(what, _attempted(measure, make, device, paths[name], more))
@@ -267,9 +270,10 @@ class _Flights:
 
 
 def _training(content: dict[str, Any], make: Make, device: str, options: dict[str, Any]) -> Any:
-    """Train, and evaluate the policy in an episode of each flight; return the results."""
-    sys.path.insert(0, str(ROOT / "docs" / "examples"))
-    script = importlib.import_module("torch_ppo")
+    """Train, keep the weights, and return the steps and the time [s]."""
+    import torch
+
+    script = _ppo()
     args = script.Args(device=device, **options)
     batch = _flights(content, args.num_envs, make, device)
     env = _Flights(batch)
@@ -280,39 +284,36 @@ def _training(content: dict[str, Any], make: Make, device: str, options: dict[st
     begin = time.perf_counter()
     agent = script.train(env, size, 4, args)
     seconds = time.perf_counter() - begin
-    steps = {"steps": args.total_timesteps, "steps/s": args.total_timesteps / seconds}
-    return {"seconds": seconds, **steps, **_evaluated(env, batch, agent)}
+    torch.save((size, agent.state_dict()), args.save)
+    steps = args.total_timesteps
+    return {"seconds": seconds, "steps": steps, "steps/s": steps / seconds}
 
 
-def _evaluated(env: _Flights, batch: Any, agent: Any) -> dict[str, float]:
-    """Fly an episode of each flight without exploration.
-
-    Returns:
-        The share of episodes that end in a crash, the mean return, and the mean position error [m].
-    """
+def evaluate(folder: Path) -> None:
+    """Evaluate the trained policies on the processor; add their summaries to results.json."""
     import torch
 
-    seen, count = env.reset(0)[0], batch.count
-    begins, state = torch.ones(count, dtype=torch.bool, device=batch.device), agent.begin(count)
-    flying, crashed = begins.clone(), torch.zeros_like(begins)
-    returns, errors, flown = (torch.zeros(count, device=batch.device) for _ in range(3))
-    with torch.no_grad():
-        for _ in range(EVALUATED):
-            features, state = agent.features(seen[None], begins[None], state)
-            seen, reward, terminated, truncated, _ = env.step(agent.actor(features[0]))
-            begins = terminated | truncated
-            returns += torch.where(flying, reward, 0.0)
-            errors += torch.where(flying, batch.result("position_error").float(), 0.0)
-            flown += flying
-            crashed |= flying & terminated
-            flying &= ~begins
-            if not flying.any():
-                break
-    return {
-        "crashes": float(crashed.float().mean()),
-        "return": float(returns.mean()),
-        "error": float(errors.sum() / flown.sum()),
-    }
+    from quad_gym import evaluation
+
+    file, script = folder / "results.json", _ppo()
+    for name, training in TRAININGS.items():
+        if not (weights := folder / f"{name}.pt").is_file():
+            continue
+        size, state = torch.load(weights, map_location="cpu")
+        args = script.Args(**training.options)
+        agent = script.Agent(size, 4, args.units, args.memory)
+        agent.load_state_dict(state)
+        made: dict[str, Any] = {"observation": "estimate", **training.keywords}
+        results = evaluation.evaluate(agent, training.env_id, episodes=EPISODES, **made)
+        print(f"{name}: {results.summary()}", flush=True)
+        found = json.loads(file.read_text()) | {f"evaluation: {name}": results.summary()}
+        file.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _ppo() -> Any:
+    """Return the PPO of the examples, a module."""
+    sys.path.insert(0, str(ROOT / "docs" / "examples"))
+    return importlib.import_module("torch_ppo")
 
 
 def _on_cuda(ptx: bytes) -> Any:
@@ -334,17 +335,20 @@ def _without_gymnasium() -> None:
 
 
 def main() -> None:
-    """Prepare or run, as the arguments say."""
+    """Prepare, run or evaluate, as the arguments say."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("part", choices=("prepare", "run"))
+    parser.add_argument("part", choices=("prepare", "run", "evaluate"))
     parser.add_argument("folder", type=Path, help="folder of the cases and of results.json")
     parser.add_argument("--only", default="", help="part of the names of cases or measurements")
     args = parser.parse_args()
     folder: Path = args.folder
     if args.part == "prepare":
         prepare(folder, args.only)
+        return
+    if args.part == "evaluate":
+        evaluate(folder)
         return
     _without_gymnasium()
     import torch

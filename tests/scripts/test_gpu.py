@@ -61,7 +61,7 @@ def test_flights_with_a_task_need_numpy_and_torch_alone():
 def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gpu, "DURATION", 0.0)
     sizes = {"num_envs": 40, "num_minibatches": 2, "total_timesteps": 40 * 32}
-    training = gpu.Training("QuadGym/Circle-v0", {"observation": "truth"}, sizes)
+    training = gpu.Training("QuadGym/Circle-v0", sizes, {"observation": "truth"})
     monkeypatch.setattr(gpu, "STEPS", 60)
     monkeypatch.setattr(gpu, "WARM_UP", 2)
     monkeypatch.setattr(gpu, "LONGEST", 1e6)
@@ -83,10 +83,12 @@ def test_script_for_a_gpu_flies_golden_flights_and_measures_once(tmp_path, monke
     found = gpu.run(tmp_path, make, "cpu", (40,))
     assert found["observation truth, 40 flights"]["steps/s"] > 0
     assert found["training"]["steps"] == 40 * 32
-    assert 0.0 < found["training"]["error"] < 10.0
-    assert 0.0 <= found["training"]["crashes"] <= 1.0
     assert len(launchers) == 4
     capsys.readouterr()
     assert gpu.run(tmp_path, make, "cpu", (40,)) == found
     assert (len(launchers), capsys.readouterr().out) == (4, "")
     assert json.loads((tmp_path / "results.json").read_text()) == found
+    monkeypatch.setattr(gpu, "EPISODES", 4)
+    gpu.evaluate(tmp_path)
+    summary = json.loads((tmp_path / "results.json").read_text())["evaluation: training"]
+    assert summary["episodes"] == 4
