@@ -72,7 +72,8 @@ class DeviceTaskBatch(DeviceBatch):
         self._results[_RESULTS, : self.count] = self._put(self._task.results.T[_RESULTS])
         if self._task._same_step:
             over = np.flatnonzero(self._task.result("ending"))
-            self.final_observations[over] = self._put(self._task.final_observations[over])
+            last = self._put(self._task.final_observations[over])
+            self.final_observations[self._put(over)] = last
         return self._put(seen)
 
     def reward_terms(self, builtin: Iterable[str]) -> dict[str, torch.Tensor]:

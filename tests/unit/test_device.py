@@ -128,10 +128,11 @@ def test_reward_terms_and_endings_of_a_task_on_a_device_are_those_of_the_batch()
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_flights_on_a_gpu_equal_those_of_the_batch(mode):
+@pytest.mark.parametrize(("name", "base"), [("Circle", "circle"), ("LookAround", "look_around")])
+def test_flights_on_a_gpu_equal_those_of_the_batch(name, base, mode):
     made = {"autoreset_mode": mode, "max_tilt": 0.6}
-    envs = quad_gym.make_torch_vec_env("QuadGym/Circle-v0", COUNT, device="cuda", **made)
-    assert assert_flights_equal(envs, vec_env("circle", COUNT, **made), steps=60, last=True) > 0
+    envs = quad_gym.make_torch_vec_env(f"QuadGym/{name}-v0", COUNT, device="cuda", **made)
+    assert assert_flights_equal(envs, vec_env(base, COUNT, **made), steps=60, last=True) > 0
 
 
 @pytest.mark.slow  # compiles the filter
