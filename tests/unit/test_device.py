@@ -23,6 +23,7 @@ from tests.golden.flights import trajectories
 torch = pytest.importorskip("torch")
 from quad_gym.envs import device_env as device_env_module  # noqa: E402
 from quad_gym.envs.device_env import QuadDeviceVecEnv  # noqa: E402
+from tests.contract.test_consistency_script import Held  # noqa: E402
 from tests.contract.test_torch_env import (  # noqa: E402
     assert_flights_equal,
     assert_mask_begins_one_episode,
@@ -225,6 +226,11 @@ def test_reset_mask_of_device_flights_begins_these_episodes_alone(three):
     assert_mask_begins_one_episode(three)
 
 
+def test_reset_mask_of_device_flights_with_a_task_begins_these_episodes_alone():
+    made = {"autoreset_mode": "Disabled", "task": Drawing(), **TRUTH}
+    assert_mask_begins_one_episode(device_env("circle", 3, **made))
+
+
 @pytest.mark.parametrize(
     ("mask", "message"),
     [
@@ -250,6 +256,7 @@ def test_device_that_is_no_processor_or_gpu_is_refused(device):
     [
         ({"render_mode": "rgb_array"}, "render_mode is of flights on the processor"),
         ({"threads": 2}, "threads is of flights on the processor"),
+        ({"estimator": f"{Held.__module__}:Held"}, "an own estimator runs in Python"),
         (
             {"innovations": True, "autoreset_mode": "SameStep"},
             'innovations with autoreset_mode="SameStep" runs in Python',
