@@ -152,9 +152,10 @@ def write_video(
     """Write a video of all policies on the last observation, side by side in one episode."""
     shown = {case: found for case, found in cases.items() if case[1] == args.observation[-1]}
     episode = telling_episode({case: results[case] for case in shown})
+    about = {"env_id": args.env_id}
     sides = [
-        side_of(label_of(name), *found, args.seed, episode, {"env_id": args.env_id})
-        for (name, _), found in shown.items()
+        side_of(label_of(case[0]), *found, results[case].episodes, args.seed, episode, about)
+        for case, found in shown.items()
     ]
     return save_side_by_side(
         sides,

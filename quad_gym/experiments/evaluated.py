@@ -59,10 +59,16 @@ def telling_episode(results: Evaluated) -> int:
 
 
 def side_of(
-    label: str, policy: Policy, env: Any, seed: int, episode: int, about: Mapping[str, Any]
+    label: str,
+    policy: Policy,
+    env: Any,
+    episodes: Episodes,
+    seed: int,
+    episode: int,
+    about: Mapping[str, Any],
 ) -> Side:
-    """Fly the episodes again, and return one of them for a video."""
-    flight, episodes = flight_of_episode(policy, env, seed, episode, about)
+    """Fly one of the episodes again, for a video."""
+    flight = flight_of_episode(policy, env, seed, episode, int(episodes.lengths[episode]), about)
     ending = str(episodes.ending[episode])
     course = ("gates", env.unwrapped.flights.task.gate_count)
     return Side(

@@ -92,21 +92,22 @@ class PathRecorder(Tracer):
 
 
 def flight_of_episode(
-    policy: Policy, env: Any, seed: int, episode: int, about: Mapping[str, Any] | None = None
-) -> tuple[Flight, Episodes]:
-    """Fly the episodes of `fly` once more, and return one of them as a flight, and all results.
+    policy: Policy, env: Any, seed: int, episode: int, steps: int, about: Mapping[str, Any]
+) -> Flight:
+    """Fly the episodes of `fly` once more, for the `steps` steps of one, and return this one.
 
     In a smaller batch, the matrix products of a policy would round differently, and a flight that
     diverges could end elsewhere.
     """
-    recorder = FlightRecorder(env.unwrapped.flights.batch, episode, about=dict(about or {}))
-    flying = True
-
-    def keep(step: int, batch: Any, which: NDArray[np.bool_]) -> None:
-        nonlocal flying
-        if flying:  # including the instant at which it ends
-            recorder.keep()
-        flying = bool(which[episode])
-
-    episodes = roll_out(policy, env, seed=seed, watch=keep)
-    return recorder.flight, episodes
+    recorder = FlightRecorder(env.unwrapped.flights.batch, episode, about=dict(about))
+    observation, _ = env.reset(seed=seed)
+    recorder.keep()
+    state, starts = None, np.ones(env.num_envs, bool)
+    for _ in range(steps):
+        action, state = policy.predict(
+            observation, state=state, episode_start=starts, deterministic=True
+        )
+        observation, *_ = env.step(action)
+        starts = np.zeros(env.num_envs, bool)
+        recorder.keep()
+    return recorder.flight

@@ -9,15 +9,12 @@ very first: where the rewarded heading is near the features, policies see these 
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from baselines.policies import load_policy
-from quad_gym import FlightRecorder
-from quad_gym.evaluation import roll_out
+from quad_gym.experiments.flown import flight_of_episode
 from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
 from quad_gym.rendering.video import checked_video_path
@@ -87,29 +84,13 @@ def write_film(results: StudyResults, kind: str) -> Path:
 
 
 def side_of(results: StudyResults, name: str, k: int, episode: int) -> Side:
-    """One test episode of the training with the k-th seed of an arm.
-
-    It is flown in a batch of all test episodes, as in the test: in a smaller batch, the matrix
-    products of the policy would round differently, and a diverging flight could end elsewhere.
-    """
-    study = results.study
+    """Fly one test episode of the training with the k-th seed of an arm again, for a film."""
+    study, episodes = results.study, results.flown[name][k].episodes
     trial = study.trials()[name]
-    env = trial.env
-    policy = load_policy(study.policies(trial)[k], env)
-    recorder = FlightRecorder(env.unwrapped.flights.batch, episode)
-    flying = True
-
-    def keep(step: int, batch: Any, which: NDArray[np.bool_]) -> None:
-        nonlocal flying
-        if flying:  # including the instant at which it ends
-            recorder.keep()
-        flying = bool(which[episode])
-
-    episodes = roll_out(policy, env, seed=study.first_episode, watch=keep)
-    env.close()
+    policy, steps = trial.load(study.policies(trial)[k]), int(episodes.lengths[episode])
     ending = str(episodes.ending[episode])
     return Side(
-        flight=recorder.flight,
+        flight=flight_of_episode(policy, trial.env, study.first_episode, episode, steps, {}),
         label=label_of(results, name),
         ending="finish" if ending == "task" else ending,
         crashed=bool(episodes.crashed[episode]),
