@@ -21,7 +21,7 @@ $(VENV)/.user: pyproject.toml constraints.txt | $(BIN)/python
 	touch $@
 
 $(VENV)/.viewer: pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) ".[plot,render]"
+	$(INSTALL) ".[plot]" pygame-ce  # draws films; the extra `render` has 165 MB of ffmpeg, too
 	touch $(VENV)/.user $@  # which it holds
 
 $(VENV)/.trainer: $(VENV)/.user

@@ -44,6 +44,18 @@ def _benchmark(section: str) -> str:
     return f"benchmark --only {section}" if package else f"scripts.benchmarks {section}"
 
 
+def _pictures(study: str, task: str, options: str, *names: str) -> Result:
+    """Pictures of the policies that are included, and of one trained on the truth."""
+    return Result(
+        name=f"{study}_pictures",
+        commands=[f"scripts.studies {study} {options} --first-episode 100000 --output OUT"],
+        flights=(task, f"{task}, truth"),
+        texts=lambda _, __: {},
+        figures={f"0/{name}": f"docs/images/{study}_{name}" for name in names},
+    )
+
+
+_FILMED = "--arms truth included --seeds 1 --video webp"
 _DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
 
 CATALOG = {
@@ -141,7 +153,7 @@ CATALOG = {
         Result(
             name="look_around",
             commands=[
-                "scripts.studies look_around --video webp --output OUT --first-episode 100000 "
+                "scripts.studies look_around --output OUT --first-episode 100000 "
                 "--arms pd_reference pd_features pd_features_when_uncertain truth noisy noisier "
                 "certainty std std_certainty std_certainty_privileged"
             ],
@@ -159,8 +171,11 @@ CATALOG = {
                 ),
                 "std_certainty_privileged",
             ),
-            figures=texts.figures_of("look_around", "glance.png"),
+            figures={"0/arms.csv": "docs/data/look_around.csv"},
         ),
+        _pictures("look_around", "LookAround", "--arms included_truth included", "glance.png"),
+        _pictures("stale_race", "StaleRace", _FILMED, "film.webp", "pace.png"),
+        _pictures("outage_dash", "OutageDash", _FILMED, "film.webp", "pace.png"),
         Result(
             name="look_around_included",
             commands=[
@@ -192,7 +207,7 @@ CATALOG = {
         Result(
             name="stale_race",
             commands=[
-                "scripts.studies stale_race --video webp --output OUT --first-episode 100000 "
+                "scripts.studies stale_race --output OUT --first-episode 100000 "
                 "--arms pd truth residual std std_history truth_on_truth truth_delay_compensated "
                 "std_delay_compensated"
             ],
@@ -200,7 +215,7 @@ CATALOG = {
             texts=texts.study(
                 "stale_race", "pd", "truth", "residual", "std", "truth_delay_compensated"
             ),
-            figures=texts.figures_of("stale_race", "film.webp", "pace.png"),
+            figures={"0/arms.csv": "docs/data/stale_race.csv"},
         ),
         Result(
             name="masked",
@@ -214,12 +229,12 @@ CATALOG = {
         Result(
             name="outage_dash",
             commands=[
-                "scripts.studies outage_dash --video webp --output OUT --first-episode 100000 "
+                "scripts.studies outage_dash --output OUT --first-episode 100000 "
                 "--arms pd pd_slow pd_waiting truth std std_privileged truth_on_truth"
             ],
             flights=("OutageDash", "OutageDash, truth"),
             texts=texts.study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),
-            figures=texts.figures_of("outage_dash", "film.webp", "pace.png"),
+            figures={"0/arms.csv": "docs/data/outage_dash.csv"},
         ),
         Result(
             name="sb3_defaults",

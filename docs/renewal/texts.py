@@ -309,11 +309,6 @@ def compiling(folder: Path, printed: Sequence[str]) -> dict[str, str]:
     return {"speed.compile": f"{row['seconds']:.0f} s", **console("speed_compile")(folder, printed)}
 
 
-def figures_of(study: str, *names: str) -> dict[str, str]:
-    pictures = {f"0/{name}": f"docs/images/{study}_{name}" for name in names}
-    return {**pictures, "0/arms.csv": f"docs/data/{study}.csv"}
-
-
 def defaults(_: Path, printed: Sequence[str]) -> dict[str, str]:
     errors = [text.strip().splitlines()[-1].split()[4] for text in printed]
     each = [f"{1e3 * float(error):.0f}" for error in errors]

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+from baselines.policies import is_included
 from baselines.recipes import ALGORITHMS, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
@@ -64,6 +65,11 @@ class Arm(Checked, kw_only=False):
     def trained(self) -> bool:
         """True if the arm is trained."""
         return self.policy is None and self.flies is None
+
+    @property
+    def learned(self) -> bool:
+        """True if the policy is trained by the study or is an included one."""
+        return self.trained or (self.policy is not None and is_included(self.policy))
 
     @property
     def engine(self) -> str:
@@ -132,6 +138,13 @@ ARMS = (
         learning=_task("WithStdCertaintyRewardForCritic", "scripts.studies.arm_critics"),
         parameters={"critic_only": 15},
     ),
+    Arm("included_truth", "truth", policy="pretrained:truth"),
+    Arm(
+        "included",
+        "estimate + standard deviation, reward for certainty",
+        policy="pretrained",
+        environment=_WITH_STD,
+    ),
 )
 """Arms of `QuadGym/LookAround-v0`."""
 
@@ -168,6 +181,7 @@ STALE_RACE = (
         flies="std",
         environment={**_STD, **_COMPENSATED},
     ),
+    Arm("included", "estimate + 15 standard deviations", policy="pretrained", environment=_STD),
 )
 """Arms of `QuadGym/StaleRace-v0`."""
 
@@ -200,6 +214,12 @@ OUTAGE_DASH = (
         "truth, tested on the truth",
         flies="truth",
         environment={**_SCALED, **_TRUTH},
+    ),
+    Arm(
+        "included",
+        "estimate + normalized uncertainty",
+        policy="pretrained",
+        environment=_WITH_UNCERTAINTY,
     ),
 )
 """Arms of `QuadGym/OutageDash-v0`."""

@@ -1,9 +1,10 @@
 """Figure and film of a study: two policies in the same test episode.
 
-The two arms are `truth` and the other trained arm with the largest return; of each arm, the
-training with the best validation is shown, so that test episodes do not affect the choice. The
-episode is the first one of the first `TRACED` that shows a difference, see `CHOICES`, or else the
-very first: where the rewarded heading is near the features, policies see these anyway.
+The two arms are `truth`, or the included policy trained on the truth, and the other learned arm
+with the largest return; of a trained arm, the training with the best validation is shown, so that
+test episodes do not affect the choice. The episode is the first one of the first `TRACED` that
+shows a difference, see `CHOICES`, or else the very first: where the rewarded heading is near the
+features, policies see these anyway.
 """
 
 import math
@@ -22,10 +23,10 @@ from scripts.studies.study import Study, StudyResults
 
 RATE = 10.0  #: pictures per second of a film
 
-_TRAINING = "Of each arm it is the training with the best validation. The episode is the first one "
+_RULE = "Of trained arms, the training with the best validation. The episode is the first one of "
 CHOICES: Mapping[str, str] = {
-    "glance": _TRAINING + "of the test in which the rewarded heading is away from the features.",
-    "pace": _TRAINING + "of the test that the policy trained on the truth ends with a crash.",
+    "glance": _RULE + "the test in which the rewarded heading is away from the features.",
+    "pace": _RULE + "the test that the policy trained on the truth ends with a crash.",
 }
 """Rules of the choice in words, by kind of figure."""
 
@@ -36,16 +37,25 @@ AWAY = math.radians(100.0)
 class Pair(NamedTuple):
     """Two trainings and a test episode."""
 
-    trainings: dict[str, int]  #: index of the seed by name of the arm, `truth` first
+    trainings: dict[str, int]  #: index of the seed by name of the arm, first the truth's
     episode: int  #: index of the test episode
 
 
+def learned_arms(study: Study) -> tuple[str, list[str]] | None:
+    """Names of the arm trained on the truth, and of other learned ones; None if one is missing."""
+    learned = [arm for arm in study.arms if arm.learned]
+    truth = next((arm.name for arm in learned if arm.label == "truth"), None)
+    others = [arm.name for arm in learned if arm.label != "truth"]
+    return None if truth is None or not others else (truth, others)
+
+
 def pair_of(results: StudyResults) -> Pair | None:
-    """Policies and episode to show; None without `truth` and another trained arm."""
-    others = [name for name in results.trained() if name != "truth"]
-    if "truth" not in results.trained() or not others:
+    """Policies and episode to show; None without two arms to show."""
+    found = learned_arms(results.study)
+    if found is None:
         return None
-    trainings = {name: results.best_validated(name) for name in ("truth", results.best(others))}
+    shown = (found[0], results.best(found[1]))
+    trainings = {name: results.best_validated(name) for name in shown}
     truth, other = (results.flown[name][k] for name, k in trainings.items())
     if results.study.about.figure == "glance":
         off = other.recorded["off_wall"] - other.recorded["off_reward"]
@@ -62,10 +72,9 @@ def label_of(results: StudyResults, name: str) -> str:
 
 def require_film(study: Study, kind: str) -> None:
     """Check, before training, that a film of a kind ("webp", "gif" or "mp4") can be made."""
-    trained = [arm.name for arm in study.arms if arm.trained]
-    if "truth" not in trained or len(trained) < 2:
+    if learned_arms(study) is None:
         given = ", ".join(arm.name for arm in study.arms)
-        raise ValueError(f"--video needs the arm truth and another trained one, got {given}")
+        raise ValueError(f"--video needs the arm truth and another learned one, got {given}")
     load_pygame()
     checked_video_path(study.folder / f"film.{kind}")
 

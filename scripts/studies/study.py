@@ -135,7 +135,7 @@ class StudyResults:
 
     def fixed(self) -> list[str]:
         """Names of the fixed rules."""
-        return [arm.name for arm in self.study.arms if arm.policy is not None]
+        return [arm.name for arm in self.study.arms if arm.policy is not None and not arm.learned]
 
     def trained(self) -> list[str]:
         """Names of the trained arms."""
@@ -146,8 +146,9 @@ class StudyResults:
         return max(names, key=lambda name: self.rows[name]["return"].value)
 
     def best_validated(self, name: str) -> int:
-        """Index of the seed of an arm whose evaluations reached the largest return."""
-        return int(np.argmax([returns.max() for _, returns in self.curves[name]]))
+        """Index of the seed of an arm whose evaluations reached the largest return; 0: fixed."""
+        best = [returns.max() for _, returns in self.curves.get(name, ())]
+        return int(np.argmax(best)) if best else 0
 
     def description(self) -> dict[str, Any]:
         """Numbers for JSON."""
