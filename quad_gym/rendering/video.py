@@ -177,7 +177,9 @@ def _write_animation(
     if path.suffix.lower() == ".webp":
         # lossless: quality is the effort, and more than this saves no bytes. Key frames, which only
         # seeking needs, take most of the time and a seventh of the bytes
-        effort = {"quality": 20, "method": 1, "kmax": 0} if lossless else {"quality": 70, "method": 4}
+        effort = (
+            {"quality": 20, "method": 1, "kmax": 0} if lossless else {"quality": 70, "method": 4}
+        )
         options: dict[str, Any] = {**effort, "minimize_size": False, "lossless": lossless}
     else:
         # one palette for all, so that colors do not flicker
