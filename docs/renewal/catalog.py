@@ -55,7 +55,7 @@ def _pictures(study: str, task: str, options: str, *names: str) -> Result:
     )
 
 
-_FILMED = "--arms truth included --seeds 1 --video webp"
+_FILMED = "--arms truth included --seeds 1 --episodes 200 --video webp"
 _DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
 
 CATALOG = {

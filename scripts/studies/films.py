@@ -26,7 +26,7 @@ RATE = 10.0  #: pictures per second of a film
 _RULE = "Of trained arms, the training with the best validation. The episode is the first one of "
 CHOICES: Mapping[str, str] = {
     "glance": _RULE + "the test in which the rewarded heading is away from the features.",
-    "pace": _RULE + "the test that the policy trained on the truth ends with a crash.",
+    "pace": _RULE + "the test that only the policy trained on the truth ends with a crash.",
 }
 """Rules of the choice in words, by kind of figure."""
 
@@ -61,8 +61,9 @@ def pair_of(results: StudyResults) -> Pair | None:
         off = other.recorded["off_wall"] - other.recorded["off_reward"]
         wrapped = np.abs(np.angle(np.exp(1j * off)))
         return Pair(trainings, int(np.argmax(np.nanmean(wrapped, axis=0) > AWAY)))
-    crashed = truth.episodes.crashed[: truth.recorded["speed"].shape[1]]
-    return Pair(trainings, int(np.argmax(crashed)))
+    count = truth.recorded["speed"].shape[1]
+    alone = truth.episodes.crashed[:count] & ~other.episodes.crashed[:count]
+    return Pair(trainings, int(np.argmax(alone)))
 
 
 def label_of(results: StudyResults, name: str) -> str:

@@ -9,7 +9,7 @@ from quad_gym.experiments.flown import Floats
 
 MARKERS = 2  #: number of features that determine position and heading if the vertical is known
 
-TRACED = 12  #: number of episodes whose traces are stored
+TRACED = 50  #: number of episodes whose traces are stored
 
 
 class ViewRecorder:
