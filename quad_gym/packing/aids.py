@@ -12,7 +12,6 @@ from quad_gym.params.gnss import MIN_DRIFT
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
     AID_BLOCK,
-    AID_FREEDOMS,
     AID_NUMBERS,
     AIDS,
     FEATURE_BLOCKS,
@@ -96,9 +95,6 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
     for aid, params in sensors.aids.items():
         p["aid_scale"][aid] = params.scale
         p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.noise_sigma, params.matrix_sigma
-        p["aid_gate"][aid] = gate_limit(
-            AID_FREEDOMS[aid], sensors.estimator.false_alarm_probability
-        )
         for name in ("vector", "scalar"):
             slow = getattr(params, f"slow_{name}")
             if slow is not None:

@@ -19,13 +19,11 @@ from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import (
-    BASELINE_BLOCK,
-    FREEDOMS,
+    GROUP_FREEDOMS,
     PARAMETERS_DRAWN,
     PARAMS,
     PARAMS_BLOCK,
     PARAMS_FIELDS,
-    POSITION_BLOCK,
     FilterForm,
     aligned_zeros,
 )
@@ -157,8 +155,7 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
     p["noise_at_prediction"] = estimator.bearing_noise_at != "measured"
     p["noise_pinhole"] = estimator.bearing_noise_at == "pinhole"
     alarm = estimator.false_alarm_probability
-    p["gate_position"] = gate_limit(FREEDOMS[POSITION_BLOCK], alarm)
-    p["gate_direction"] = gate_limit(FREEDOMS[BASELINE_BLOCK], alarm)
+    p["gate"] = [gate_limit(freedoms, alarm) for freedoms in GROUP_FREEDOMS]
     sigma = math.inf if sensors.gnss is None else estimator.max_direction_sigma
     p["gate_uncertainty"] = sigma * sigma
 

@@ -2,7 +2,7 @@
 
 from quad_gym.records.draws import COLUMNS, DRAWABLES
 from quad_gym.records.enums import AID_TRIPLES
-from quad_gym.records.sizes import AIDS, MAX_FEATURES, MAX_SLOW, Field
+from quad_gym.records.sizes import AIDS, MAX_FEATURES, MAX_SLOW, SENSOR_GROUPS, Field
 
 PARAMETERS_DRAWN = COLUMNS["action_delay"].stop
 """Number of draws with which the parameters begin; the camera's features have the other draws."""
@@ -89,7 +89,6 @@ PARAMS_FIELDS = (
     Field("aid_scalar_drive", (AIDS,), "m; rad", "standard deviation of the driving noise"),
     Field("aid_matrix_sigma", (AIDS,), "-", "standard deviation of each error of scale and alignment"),
     Field("aid_scale", (AIDS,), "m; T", "unit in observations"),
-    Field("aid_gate", (AIDS,), "-", "largest accepted NIS"),
     Field("aid_numbers", (sum(AID_TRIPLES), 3), "mixed", "further ones of each sensor: `numbers` of its parameters"),
     # slow errors among the filter's states
     Field("slow_sigma", (MAX_SLOW,), "mixed", "standard deviation of each slow error at the start"),
@@ -105,8 +104,7 @@ PARAMS_FIELDS = (
     Field("initial_covariance_scale", (), "-", "factor on the first fix's covariance"),
     Field("initial_tilt_sigma", (), "rad", "standard deviation of roll and pitch at a level start; 0: attitude by Wahba's problem"),
     Field("recursive_update_threshold", (), "rad", "standard deviation of a direction above which images are processed in steps"),
-    Field("gate_position", (), "-", "largest accepted NIS of a position"),
-    Field("gate_direction", (), "-", "largest accepted NIS of a direction"),
+    Field("gate", (SENSOR_GROUPS,), "-", "largest accepted NIS of a group of measurements"),
     Field("gate_uncertainty", (), "rad^2", "largest sum of the variances of a feature's predicted direction"),
     Field("max_rejections", (), "-", "rejections in a row before a reset"),
     Field("reset_timeout", (), "s", "duration of rejections before a reset"),

@@ -56,6 +56,7 @@ AID_GROUPS = len(Block)  #: first group of the other sensors
 SENSOR_GROUPS = AID_GROUPS + AIDS  #: number of groups of the gate: positions, baselines, velocities, images, other sensors
 FIRST_GROUP = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_GROUPS, SENSOR_GROUPS))  #: first group of each sensor
 GROUP_COUNT = (FEATURE_BLOCKS, *[1] * (SENSORS - 1))  #: number of groups of each sensor
+GROUP_FREEDOMS = (*BLOCK_FREEDOMS, *AID_FREEDOMS)  #: degrees of freedom of a block of each group
 SEVERAL = (FEATURE_BLOCKS, *(AID_GROUPS + aid for aid in Aid if AID_MOST[aid] > 1))
 """Groups of several blocks, which support each other: images, for example."""
 WITH_OWN_ERROR = tuple(AID_GROUPS + aid for aid in Aid if OWN_ERRORS[aid])

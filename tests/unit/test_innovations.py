@@ -114,9 +114,9 @@ def test_a_rejected_block_is_as_good_as_not_measured(wrong):
 
 def test_gate_threshold_is_the_chi_square_quantile_of_its_false_alarm_probability():
     record = params_record(quad_gym.VehicleParams(), GATED)
-    assert record["gate_position"][0] == pytest.approx(stats.chi2.isf(1e-4, 3), rel=1e-12)
-    assert record["gate_direction"][0] == pytest.approx(stats.chi2.isf(1e-4, 2), rel=1e-12)
-    assert params_record(quad_gym.VehicleParams(), LAB)["gate_position"][0] == np.inf
+    assert record["gate"][0, POSITION_BLOCK] == pytest.approx(stats.chi2.isf(1e-4, 3), rel=1e-12)
+    assert record["gate"][0, BASELINE_BLOCK] == pytest.approx(stats.chi2.isf(1e-4, 2), rel=1e-12)
+    assert (params_record(quad_gym.VehicleParams(), LAB)["gate"] == np.inf).all()
 
 
 def test_a_lane_gates_for_itself():

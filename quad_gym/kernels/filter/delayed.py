@@ -28,37 +28,29 @@ from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_column
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
     carry_slow,
-    keep_slow_factor,
-    restore_slow,
-    set_slow_aside,
+    keep_factor,
     shift_carried_slow,
 )
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import keep, load3, load33, outer, store
 from quad_gym.kernels.maths.matrices import load_column3, store_block, store_column3, sum_of_outers
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.blocks import keep_fields, lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import SENSORS, FilterForm, FilterStatus
 
+_ESTIMATE, _SLOW = "r_hat v_hat v_corrected R_hat b_a_hat b_g_hat L", "slow_hat L_slow"
+"""Fields of an estimate, and those of slow errors."""
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
 @kernel
 def _keep_estimate(flight, work, slow):
     """Copy the estimate, for lanes in which nothing arrives or an update fails."""
-    store(work.kept_r, load3(flight.r_hat))
-    store(work.kept_v, load3(flight.v_hat))
-    store(work.kept_v_corrected, load3(flight.v_corrected))
-    store(work.kept_R, load33(flight.R_hat))
-    store(work.kept_b_a, load3(flight.b_a_hat))
-    store(work.kept_b_g, load3(flight.b_g_hat))
-    store(work.kept_rates, load3(flight.w_meas))
-    work.kept_failures = flight.update_failures
-    for i in range(15):
-        for j in range(i + 1):
-            work.kept_L[i, j] = flight.L[i, j]
+    keep_fields(work, flight, True, _ESTIMATE, "kept_", "")
+    store(work.kept_w_meas, load3(flight.w_meas))
+    work.kept_update_failures = flight.update_failures
     if slow is not None:
-        set_slow_aside(flight, slow, work)
+        keep_fields(work, flight, True, _SLOW, "kept_", "")
 
 
 @kernel
@@ -109,11 +101,7 @@ def _factor_columns(flight, p, work, noise, slow, back):
     if slow is not None:
         states = 15 + slow.slow_states
         carry_slow(flight, slow, p, work, noise, back)
-    pivot = cholesky(P, states, work.inverse_diagonal)
-    for i in range(15):
-        for j in range(i + 1):
-            flight.L[i, j] = P[i, j]
-    return pivot
+    return cholesky(P, states, work.inverse_diagonal)
 
 
 @kernel
@@ -164,9 +152,9 @@ def _carry(flight, p, work, form, back, ticks, slow):
         if back:
             noise = select(good, noise, 0.0)
     work.since_noise = noise
+    keep_factor(flight, slow, work, noise == noise)
     if slow is not None:
         shift_carried_slow(flight, slow, work, back)
-        keep_slow_factor(flight, slow, work, noise == noise)
     return good
 
 
@@ -177,24 +165,16 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     Where it failed, the sums of corrections are reset, as the last correction is undone.
     """
     old = logical_not(arrived & good)
-    keep(flight.r_hat, old, load3(work.kept_r))
-    keep(flight.v_hat, old, load3(work.kept_v))
-    keep(flight.v_corrected, old, load3(work.kept_v_corrected))
-    keep(flight.R_hat, old, load33(work.kept_R))
-    keep(flight.b_a_hat, old, load3(work.kept_b_a))
-    keep(flight.b_g_hat, old, load3(work.kept_b_g))
-    for i in range(15):
-        for j in range(i + 1):
-            flight.L[i, j] = select(old, work.kept_L[i, j], flight.L[i, j])
+    keep_fields(flight, work, old, _ESTIMATE, "", "kept_")
     if slow is not None:
-        restore_slow(flight, slow, work, old)
-    store(flight.w_meas, load3(work.kept_rates))
+        keep_fields(flight, work, old, _SLOW, "", "kept_")
+    store(flight.w_meas, load3(work.kept_w_meas))
     failed = arrived & old
     if (settings.form & MONITORED) != 0 and any_of(failed):
         forget_corrections(flight, failed)
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
-    failures = select(failed, work.kept_failures + 1.0, flight.update_failures)
+    failures = select(failed, work.kept_update_failures + 1.0, flight.update_failures)
     flight.update_failures = failures
 
 
@@ -231,7 +211,7 @@ def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
                 work.mask = select(good, 1.0, 0.0)
                 call_stage(stages, Stage.UPDATE, flight, p, p, settings, work, 0)
         if delayed:
-            good = good & (flight.update_failures == work.kept_failures)
+            good = good & (flight.update_failures == work.kept_update_failures)
             _restore_estimate(flight, work, settings, arrived, good, slow)
     restore_valid(flight, work, settings)
     work.mask = select(mask, 1.0, 0.0)

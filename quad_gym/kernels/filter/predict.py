@@ -18,6 +18,16 @@ as in the augmented filter (27 columns in the prediction, 15 + n_z in the update
   The new factor is L times the factor of that inverse, lower triangular again, and stays accurate
   when a measurement is 10^8 times as good as the prediction.
 
+The extended Kalman filter (EKF) shares everything with the UKF: state, error angles, models, noise,
+and the factor L of the covariance. Where the UKF puts the half-differences of a pair of sigma
+points into a column, the EKF puts the derivative of the model times the column of L; the half-sums
+minus the center, which carry the second order, are zero. With `R(e) = I - [e x] + ...`:
+
+* `a = R_hat^T R(e)^T (f - b_a) - g e3`:  da = R_hat^T (de x f - db_a)
+* `e+ = e + dt S(e) (w - b_g)`:  de+ = de + dt ((de_th w_z, -de_phi w_z, -de_th w_x) - db_g)
+
+The derivatives of measurements are in the files of these, in `kernels/sensors/`.
+
 Sources: report section 3.4; S. J. Julier and J. K. Uhlmann, Proc. IEEE 92(3), 2004.
 """
 
@@ -25,8 +35,7 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
+from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import (
     BA,
     BG,
@@ -40,7 +49,13 @@ from quad_gym.kernels.filter.error_state import (
 )
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.filter.preintegration import accel_variance, gyro_sigma
-from quad_gym.kernels.filter.slow import decay_slow, keep_factor, predict_slow, turn_slow
+from quad_gym.kernels.filter.slow import (
+    decay_slow,
+    keep_factor,
+    predict_slow,
+    stages_of,
+    turn_slow,
+)
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -95,6 +110,20 @@ def _euler_rate_parts(parts, w_B, dg):
 
 
 @kernel
+def _acceleration_column(L, j, R_BI, f_B, df_B):
+    """Derivative of the acceleration in I along column j, whose share of biases in f is df_B."""
+    return R_BI.T @ (cross(load_column3(L, E, j), f_B) - df_B)
+
+
+@kernel
+def _angle_column(L, j, w_B, dt):
+    """Derivative of the Euler step e + dt S(e) (w - b_g) along column j."""
+    d, dg = load_column3(L, E, j), load_column3(L, BG, j)
+    rate = (d[1] * w_B[2] - dg[0], -d[0] * w_B[2] - dg[1], -d[1] * w_B[0] - dg[2])
+    return d + dt * rate
+
+
+@kernel
 def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
     """Offset of the measured force along c times column j of L, in B at the tick's start.
 
@@ -132,8 +161,8 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
     for j in range(9):
         if extended:
             df = _force_offset(L, j, 1.0, f_B, half, half_dt, midpoint)
-            a_odd, a_even = acceleration_column(L, j, R_BI, f_start, df), nothing
-            e_odd, e_even = angle_column(L, j, w_B, dt), nothing
+            a_odd, a_even = _acceleration_column(L, j, R_BI, f_start, df), nothing
+            e_odd, e_even = _angle_column(L, j, w_B, dt), nothing
         else:
             d, dg = c * load_column3(L, E, j), c * load_column3(L, BG, j)
             df = _force_offset(L, j, c, f_B, half, half_dt, midpoint)
@@ -258,7 +287,7 @@ def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
 
 
 @kernel
-def predict(flight, p, work, form, slow):
+def predict(flight, p, work, settings, stages, slow):
     """Predict over one tick with its IMU sample.
 
     In the report's form, the sample is taken at the tick's start:
@@ -271,13 +300,13 @@ def predict(flight, p, work, form, slow):
     force by half the angle by which it rotates the attitude.
 
     With TURN, the covariance is transformed with the reset of e, see `error_state.py`; with EKF,
-    derivatives replace sigma points, see `ekf.py`.
+    derivatives replace sigma points.
 
     A lane whose predicted covariance is not positive definite keeps its state, sets
     PREDICTION_FAILED, and counts the failure. `slow`: the settings if sensors have slow errors
     (`slow.py`), else None.
     """
-    dt = p.dt
+    dt, form = p.dt, settings.form
     midpoint = (form & FilterForm.MIDPOINT.value) != 0
     w_B = load3(flight.gyro) - load3(flight.b_g_hat)
     f_B = load3(flight.accel) - load3(flight.b_a_hat)
@@ -329,13 +358,4 @@ def predict(flight, p, work, form, slow):
     flight.prediction_failures = flight.prediction_failures + select(ok, 0.0, 1.0)
 
 
-@stage
-def predict_stage(flight, world, model, settings, work, stages, flag):
-    """Predict over a tick."""
-    predict(flight, model, work, settings.form, None)
-
-
-@stage
-def predict_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """Predict over a tick with slow errors of sensors in the state."""
-    predict(flight, model, work, settings.form, settings)
+predict_stage, predict_with_slow_stage = stages_of("predict", predict)

@@ -167,9 +167,16 @@ def glitches(flight, p, group, nis, limit):
 
 
 @kernel
-def time_of(flight, p, group):
-    """Seconds since a measurement of a group was last accepted."""
-    return maximum(flight.tick - flight.accepted_tick[group], 1.0) * p.dt
+def reset_drifted_velocity(flight, p, work, states, group, lanes, square):
+    """Reset the velocity where the estimate has drifted off and no other sensor measures it.
+
+    It has changed as the position, by a distance with this square, in the time since the last
+    accepted measurement of the group.
+    """
+    T = maximum(flight.tick - flight.accepted_tick[group], 1.0) * p.dt
+    speed = 4.0 * square / (T * T)
+    drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
+    reset_variances(work.P, V, states, drifted, (speed, speed, speed))
 
 
 @kernel

@@ -23,7 +23,9 @@ fifteen states, as without d, and their prediction does not depend on d. Kernels
 `slow is None`, so that a filter without d has none of this code.
 """
 
-from quad_gym.kernels.compiling import kernel
+from typing import Any
+
+from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
 from quad_gym.kernels.maths.linalg import add_diagonal, cross, load3, load33
 from quad_gym.kernels.maths.matrices import (
@@ -40,6 +42,26 @@ from quad_gym.records import AID_NUMBERS, Aid
 
 _MAGNETOMETER = int(Aid["MAGNETOMETER"])
 _FIELD = AID_NUMBERS[_MAGNETOMETER]
+
+
+def stages_of(name: str, body: Any) -> tuple[Any, Any]:
+    """Make a stage of a filter without slow errors, and one of a filter that estimates them.
+
+    Args:
+        name: Name of the first one, and the beginning of the name of the second.
+        body: `(flight, p, work, settings, stages, slow)`, with the parameters that the filter
+            assumes.
+    """
+
+    def plain(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
+        body(flight, model, work, settings, stages, None)
+
+    def slow(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
+        body(flight, model, work, settings, stages, settings)
+
+    plain.__name__ = plain.__qualname__ = f"{name}_stage"  # for caches and messages
+    slow.__name__ = slow.__qualname__ = f"{name}_with_slow_stage"
+    return stage(plain), stage(slow)
 
 
 @kernel
@@ -77,21 +99,15 @@ def _product(a, b):
 
 
 @kernel
-def keep_slow_factor(flight, slow, work, ok):
-    """Store the rows of d of the factor in work.P, where `ok`."""
-    for i in range(slow.slow_states):
-        for j in range(D + i + 1):
-            flight.L_slow[i, j] = select(ok, work.P[D + i, j], flight.L_slow[i, j])
-
-
-@kernel
 def keep_factor(flight, slow, work, ok):
     """Store the factor in work.P, where `ok`."""
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
     if slow is not None:
-        keep_slow_factor(flight, slow, work, ok)
+        for i in range(slow.slow_states):
+            for j in range(D + i + 1):
+                flight.L_slow[i, j] = select(ok, work.P[D + i, j], flight.L_slow[i, j])
 
 
 @kernel
@@ -257,22 +273,3 @@ def shift_carried_slow(flight, slow, work, back):
     for i in range(slow.slow_states):
         d, decay = flight.slow_hat[i], work.slow_decay[i]
         flight.slow_hat[i] = (1.0 / decay) * d if back else decay * d
-
-
-@kernel
-def set_slow_aside(flight, slow, work):
-    """Save the slow errors, for lanes in which nothing arrives or an update fails."""
-    for i in range(slow.slow_states):
-        work.kept_slow[i] = flight.slow_hat[i]
-        for j in range(D + slow.slow_states):
-            work.kept_L_slow[i, j] = flight.L_slow[i, j]
-
-
-@kernel
-def restore_slow(flight, slow, work, old):
-    """Restore the saved slow errors, where `old`."""
-    for i in range(slow.slow_states):
-        flight.slow_hat[i] = select(old, work.kept_slow[i], flight.slow_hat[i])
-        for j in range(D + slow.slow_states):
-            kept = work.kept_L_slow[i, j]
-            flight.L_slow[i, j] = select(old, kept, flight.L_slow[i, j])

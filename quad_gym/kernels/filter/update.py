@@ -1,20 +1,16 @@
 """The measurement update of the filter, with all blocks of a measurement at once.
 
-See `predict.py` for the form of the unscented transform. Sensors (`kernels/sensors/`) fill three
-rows of the stacked measurement for each block. A block that a lane lacks is masked: its columns and
-innovation are zero and its noise is one, which gives exactly the update without it. Blocks that no
-lane has are left out.
-
-The EKF shares everything with the UKF: where the UKF puts the half-differences of a pair of sigma
-points into a column, the EKF puts the derivative of the model times the column of L; the half-sums
-minus the center, which carry the second order, are zero.
+See `predict.py` for the form of the unscented transform, and for the EKF. Sensors
+(`kernels/sensors/`) fill three rows of the stacked measurement for each block. A block that a lane
+lacks is masked: its columns and innovation are zero and its noise is one, which gives exactly the
+update without it. Blocks that no lane has are left out.
 """
 
 import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.filter.gate import MONITORED, gate_innovations
 from quad_gym.kernels.filter.measurements import (
@@ -23,13 +19,10 @@ from quad_gym.kernels.filter.measurements import (
     flag_failure,
     mark_failed,
 )
-from quad_gym.kernels.filter.monitoring import (
-    flag_shifted,
-    follow_corrections,
-)
+from quad_gym.kernels.filter.monitoring import flag_shifted, follow_corrections
 from quad_gym.kernels.filter.recovery import reset_states
 from quad_gym.kernels.filter.rows import columns_of
-from quad_gym.kernels.filter.slow import load_slow, shift_slow, turn_iron
+from quad_gym.kernels.filter.slow import load_slow, shift_slow, stages_of, turn_iron
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
@@ -325,13 +318,4 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
         flag_shifted(flight, p, updated)
 
 
-@stage
-def update_stage(flight, world, model, settings, work, stages, flag):
-    """Update the estimate with the valid measurements."""
-    update(flight, model, work, settings, stages, None)
-
-
-@stage
-def update_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """Update the estimate of a filter with slow errors of sensors among its states."""
-    update(flight, model, work, settings, stages, settings)
+update_stage, update_with_slow_stage = stages_of("update", update)

@@ -7,9 +7,9 @@ of W multiply the standard normals that the true biases were drawn with. Estimat
 sensors are correlated with the true ones in the same way.
 """
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
-from quad_gym.kernels.filter.slow import keep_factor
+from quad_gym.kernels.filter.slow import keep_factor, stages_of
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import diagonal, keep, load3, load4, store, unit_or
 from quad_gym.kernels.maths.matrices import load_block, store_block
@@ -100,7 +100,7 @@ def _start_aids(flight, slow, T, d, mask):
 
 
 @kernel
-def _start_warm(flight, settings, work, slow):
+def _start_warm(flight, p, work, settings, stages, slow):
     """Start a converged filter, where `work.mask`; `slow`: the settings or None, see `slow.py`.
 
     The settings have the covariance P of a vehicle that faces east, and its root W.
@@ -140,13 +140,4 @@ def _start_warm(flight, settings, work, slow):
         _start_aids(flight, slow, T, d, mask)
 
 
-@stage
-def warm_stage(flight, world, model, settings, work, stages, flag):
-    """Start a converged filter."""
-    _start_warm(flight, settings, work, None)
-
-
-@stage
-def warm_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """Start a converged filter that estimates slow errors of sensors."""
-    _start_warm(flight, settings, work, settings)
+warm_stage, warm_with_slow_stage = stages_of("warm", _start_warm)

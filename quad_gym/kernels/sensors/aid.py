@@ -8,23 +8,14 @@ from typing import Any
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D
-from quad_gym.kernels.filter.gate import gate_blocks
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import keep, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
-from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
-from quad_gym.kernels.sensors.latency import (
-    deliver_arrived,
-    exchange,
-    find_arrivals,
-    keep_arrived,
-    stamp,
-)
+from quad_gym.kernels.sensors.latency import begin_clock, begin_sample, deliver, tick_clock
 from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 from quad_gym.records import (
     AID_BLOCK,
-    AID_FREEDOMS,
     AID_GROUPS,
     AID_MOST,
     AID_ROW,
@@ -96,35 +87,6 @@ def _due(flight, p, settings, s, mask, starting):
     return due
 
 
-@kernel
-def _begin_sample(flight, work, settings, s, mask):
-    """Invalidate the blocks of the last sample, and keep their numbers if there are delays."""
-    for i in range(settings.sensor_blocks[FIRST_AID + s]):
-        block = AID_BLOCK[s] + i
-        flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
-        if settings.sensor_delay[FIRST_AID + s] > 0:
-            keep_arrived(work, block, flight.aid_measurement[AID_ROW[s] + i], 3)
-
-
-@kernel
-def _deliver(flight, work, settings, s, mask, due):
-    """Deliver the measurement of sensor s in the lanes `due`, now or after its latency."""
-    sensor, first, count = FIRST_AID + s, AID_BLOCK[s], settings.sensor_blocks[FIRST_AID + s]
-    if settings.sensor_delay[sensor] == 0:
-        for block in range(first, first + count):
-            new = due & (flight.block_valid[block] > 0.0)
-            flight.block_fresh[block] = select(new, 1.0, flight.block_fresh[block])
-    elif any_of(due | find_arrivals(flight, work, settings, sensor, mask)):
-        taken = stamp(flight, settings, sensor, mask)
-        for i in range(count):
-            measurement, under_way = (
-                flight.aid_measurement[AID_ROW[s] + i],
-                settings.under_way[sensor],
-            )
-            exchange(flight, work, first + i, measurement, 3, under_way, mask, taken)
-            deliver_arrived(work, first + i, measurement, 3, mask)
-
-
 def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> Any:
     """Make the stage of an aiding sensor.
 
@@ -142,7 +104,7 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
     """
     s, group, sensor = int(aid), AID_GROUPS + aid, FIRST_AID + int(aid)
     first, row, several = AID_BLOCK[s], AID_ROW[s], AID_MOST[aid] > 1
-    numbers, (draw, *align) = float(AID_FREEDOMS[aid]), others or (_draw_nothing,)
+    draw, *align = others or (_draw_nothing,)
 
     @kernel
     def begin(flight, p, settings, mask):  # type: ignore[no-untyped-def]
@@ -160,14 +122,15 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
             return
         if settings.faults:
             due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
-        _begin_sample(flight, work, settings, s, mask)
+        values = flight.aid_measurement[row : row + AID_MOST[s]]
+        begin_sample(flight, work, settings, sensor, values, 3, mask)
         if any_of(due):
             for i in range(settings.sensor_blocks[sensor]):
                 (x, y, z), within = measure(flight, p, i)
                 taken = due & within
-                keep(flight.aid_measurement[row + i], taken, (x, y, z))
+                keep(values[i], taken, (x, y, z))
                 flight.block_valid[first + i] = select(taken, 1.0, flight.block_valid[first + i])
-        _deliver(flight, work, settings, s, mask, due)
+        deliver(flight, work, settings, sensor, values, 3, mask, due)
 
     @kernel
     def expect_valid(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
@@ -178,11 +141,6 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
                 k += 3
 
     @kernel
-    def gate(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
-        count, limit = settings.sensor_blocks[sensor], p.aid_gate[s]
-        gate_blocks(flight, p, work, settings, k, first, count, group, limit, numbers)
-
-    @kernel
     def reset_states(flight, p, work, settings):  # type: ignore[no-untyped-def]
         lanes, alone, states = work.reset[group], work.alone[group], D + settings.slow_states
         nu = load3(flight.innovation[first])
@@ -190,8 +148,7 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
             nu = _largest(flight, first, settings.sensor_blocks[sensor])
         reset(flight, p, work, settings, states, lanes > 0.0, alone > 0.0, nu)
 
-    kernels = (begin, sample, expect_valid, gate, reset_states, *align)
-    return sensor_stage(Sensor[aid.name], *kernels)
+    return sensor_stage(Sensor[aid.name], begin, sample, expect_valid, reset_states, *align)
 
 
 @kernel

@@ -13,7 +13,7 @@ from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import diagonal, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.sensors.aid import aid_stage
-from quad_gym.kernels.simd.lanes import logical_not, no_lane, select, zero_like
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["BAROMETER"])
@@ -23,8 +23,7 @@ _ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
 @kernel
 def _measure(flight, p, i):
     n, _ = normal_pair(stream_of(flight), _DRAW)
-    altitude = flight.r[2] + flight.aid_scalar[_S] + p.aid_sigma[_S] * n
-    return (altitude, zero_like(altitude), zero_like(altitude)), logical_not(no_lane(flight.tick))
+    return (flight.r[2] + flight.aid_scalar[_S] + p.aid_sigma[_S] * n, 0.0, 0.0), True
 
 
 @kernel

@@ -9,7 +9,9 @@ R_hat = (I + even +- odd) R_hat, the vector before normalization is odd and even
 X_B = R_hat (X - r_hat), dr_B = R_hat dr; the derivative along an offset of a feature seen at
 distance s along u is (I - u u^T) (X_B x de - dr_B) / s.
 
-Each feature is a separate block; an image is one group of the gate.
+Each feature is a separate block; an image is one group of the gate. A feature whose predicted
+direction is too uncertain for a linear model is masked, too: the error of a direction is bounded,
+so it would pass any gate, and its update would be wrong and overconfident.
 """
 
 import math
@@ -17,30 +19,21 @@ import math
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.covariance_resets import MAX_ANGLE, reset_variances
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
-from quad_gym.kernels.filter.error_state import D, E, R, V
-from quad_gym.kernels.filter.gate import gate_blocks
-from quad_gym.kernels.filter.recovery import time_of
+from quad_gym.kernels.filter.error_state import D, E, R
+from quad_gym.kernels.filter.recovery import reset_drifted_velocity
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm, turn_pair
-from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
-from quad_gym.kernels.sensors.latency import (
-    deliver_arrived,
-    exchange,
-    find_arrivals,
-    keep_arrived,
-    stamp,
-)
+from quad_gym.kernels.sensors.latency import begin_clock, begin_sample, deliver, tick_clock
 from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, select, zero_like
 from quad_gym.records import (
     DRAW_FEATURE,
     DRAW_PHASE,
     FEATURE_BLOCKS,
-    VELOCITY_BLOCK,
     FilterForm,
     Sensor,
 )
@@ -86,32 +79,14 @@ def _begin(flight, p, settings, mask):
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Take an image when due, with limits of range, blur, ground, obstacles, and faults."""
     due = tick_clock(flight, settings, _CAMERA, mask)
-    delayed, count = settings.sensor_delay[_CAMERA] > 0, settings.feature_count
-    arrives = find_arrivals(flight, work, settings, _CAMERA, mask)
-    for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + count):
-        flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
-    if not any_of(due | arrives):
-        return
-    if delayed:
-        for i in range(count):
-            keep_arrived(work, FEATURE_BLOCKS + i, flight.pixels[i], 2)
+    begin_sample(flight, work, settings, _CAMERA, flight.pixels, 2, mask)
     if any_of(due):
-        measure(flight, p, count, due)
+        measure(flight, p, settings.feature_count, due)
         work.mask = select(due, 1.0, 0.0)
         call_stage(stages, Stage.LIMIT_CAMERA, flight, p, p, settings, work, 0)
         call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
         call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
-    if delayed:
-        taken = stamp(flight, settings, _CAMERA, mask)
-        under_way = settings.under_way[_CAMERA]
-        for i in range(count):
-            block, pixels = FEATURE_BLOCKS + i, flight.pixels[i]
-            exchange(flight, work, block, pixels, 2, under_way, mask, taken)
-            deliver_arrived(work, block, pixels, 2, mask)
-    else:
-        for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + count):
-            seen = due & (flight.block_valid[block] > 0.0)
-            flight.block_fresh[block] = select(seen, 1.0, flight.block_fresh[block])
+    deliver(flight, work, settings, _CAMERA, flight.pixels, 2, mask, due)
 
 
 @kernel
@@ -177,18 +152,6 @@ def _expect(flight, p, work, settings, k):
 
 
 @kernel
-def _gate(flight, p, work, settings, k):
-    """Store the innovations in the rows from k on, and mask those beyond the gate.
-
-    A feature whose predicted direction is too uncertain for a linear model is masked, too: the
-    error of a direction is bounded, so it would pass any gate, and its update would be wrong and
-    overconfident.
-    """
-    first, limit = FEATURE_BLOCKS, p.gate_direction
-    gate_blocks(flight, p, work, settings, k, first, settings.feature_count, first, limit, 2.0)
-
-
-@kernel
 def _reset(flight, p, work, settings):
     """Reset attitude and position.
 
@@ -204,13 +167,10 @@ def _reset(flight, p, work, settings):
         distance = minimum(norm(load3(p.features[i]) - load3(flight.r_hat)), p.max_range)
         angle = maximum(angle, square)
         offset = maximum(offset, square * distance * distance)
-    T = time_of(flight, p, FEATURE_BLOCKS)
-    speed = 4.0 * offset / (T * T)
-    drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
-    reset_variances(P, V, states, drifted, (speed, speed, speed))
+    reset_drifted_velocity(flight, p, work, states, FEATURE_BLOCKS, lanes, offset)
     reset_variances(P, R, states, lanes, (offset, offset, offset))
     angle = minimum(angle, MAX_ANGLE * MAX_ANGLE)
     reset_variances(P, E, states, lanes, (angle, angle, angle))
 
 
-camera_stage = sensor_stage(Sensor.CAMERA, _begin, _sample, _expect, _gate, _reset)
+camera_stage = sensor_stage(Sensor.CAMERA, _begin, _sample, _expect, _reset)

@@ -2,20 +2,20 @@
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import D
-from quad_gym.kernels.filter.gate import gate_blocks
 from quad_gym.kernels.maths.elementary import minimum
 from quad_gym.kernels.maths.linalg import keep, load3, load4
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors import gnss_baseline, gnss_position, gnss_velocity
-from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
 from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.kernels.sensors.latency import (
+    begin_clock,
     deliver_arrived,
     exchange,
     find_arrivals,
     keep_arrived,
     stamp,
+    tick_clock,
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
@@ -141,18 +141,6 @@ def _expect(flight, p, work, settings, k):
 
 
 @kernel
-def _gate(flight, p, work, settings, k):
-    """Store the innovations in the rows from k on, and mask those beyond the gate."""
-    for block in _BLOCKS:
-        if any_of(flight.block_valid[block] > 0.0):
-            limit, numbers = p.gate_position, 3.0
-            if block == BASELINE_BLOCK:
-                limit, numbers = p.gate_direction, 2.0
-            gate_blocks(flight, p, work, settings, k, block, 1, block, limit, numbers)
-            k += 3
-
-
-@kernel
 def _reset(flight, p, work, settings):
     states = D + settings.slow_states
     for block in _BLOCKS:
@@ -165,4 +153,4 @@ def _reset(flight, p, work, settings):
             gnss_velocity.reset(work, states, lanes, nu)
 
 
-gnss_stage = sensor_stage(Sensor.GNSS, _begin, _sample, _expect, _gate, _reset)
+gnss_stage = sensor_stage(Sensor.GNSS, _begin, _sample, _expect, _reset)

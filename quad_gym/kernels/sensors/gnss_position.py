@@ -13,8 +13,8 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.covariance_resets import reset_variances
-from quad_gym.kernels.filter.error_state import D, R, V
-from quad_gym.kernels.filter.recovery import time_of
+from quad_gym.kernels.filter.error_state import D, R
+from quad_gym.kernels.filter.recovery import reset_drifted_velocity
 from quad_gym.kernels.filter.rows import columns_of, lever_column, put_block, put_column
 from quad_gym.kernels.filter.slow import stationary
 from quad_gym.kernels.maths.elementary import exp, log
@@ -22,7 +22,7 @@ from quad_gym.kernels.maths.linalg import diagonal, dot, keep, load3, load33, ro
 from quad_gym.kernels.maths.matrices import load_column3
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, VELOCITY_BLOCK
+from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK
 
 
 @kernel
@@ -74,13 +74,11 @@ def expect(flight, p, work, settings, k, valid):
 def reset(flight, p, work, settings, states, lanes, nu):
     """Reset the position, and its slow error to the stationary one.
 
-    Where the estimate has drifted off and no other sensor measures the velocity, it has changed by
-    as much as the position in the time since the last accepted fix.
+    Where the estimate has drifted off, the velocity is reset, too.
     """
-    square, T = dot(nu, nu), time_of(flight, p, POSITION_BLOCK)
-    zero, speed = zero_like(square), 4.0 * square / (T * T)
-    drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
-    reset_variances(work.P, V, states, drifted, (speed, speed, speed))
+    square = dot(nu, nu)
+    reset_drifted_velocity(flight, p, work, states, POSITION_BLOCK, lanes, square)
+    zero = zero_like(square)
     drift = (zero, zero, zero)
     if settings.estimates_drift:
         drift = (stationary(p, 0), stationary(p, 1), stationary(p, 2))

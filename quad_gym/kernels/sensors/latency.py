@@ -1,7 +1,8 @@
-"""Latency of sensors: measurements in transit wait in a flight's record until they arrive.
+"""Clocks of sensors, and their latency: measurements in transit wait in a flight's record.
 
-Each is stored with its time stamp: the sums of the IMU when it was taken, with which
-`filter/delayed.py` retrodicts the estimate to that instant.
+A clock has the ticks of a sensor's first and next measurement. A measurement in transit is stored
+with its time stamp: the sums of the IMU when it was taken, with which `filter/delayed.py`
+retrodicts the estimate to that instant.
 """
 
 import numpy as np
@@ -9,6 +10,42 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.simd.lanes import any_of, no_lane, select, zero_like
 from quad_gym.records import DELAY_SLOTS, FIRST_BLOCK, STAMP
+
+
+@kernel
+def _first_wait(phase, period, share):
+    """Ticks to a sensor's first measurement: its phase, or random within its period."""
+    ticks = zero_like(share)
+    for k in range(1, period):
+        ticks = ticks + select(share * period >= 1.0 * k, 1.0, 0.0)
+    if phase >= 0:
+        ticks = zero_like(share) + phase
+    return ticks
+
+
+@kernel
+def begin_clock(flight, settings, sensor, share, mask):
+    """Begin an episode of a sensor, in the lanes `mask`: nothing is measured yet.
+
+    A random phase is a `share` of the period.
+    """
+    wait = _first_wait(settings.sensor_phase[sensor], settings.sensor_ticks[sensor], share)
+    flight.wait[sensor] = select(mask, wait, flight.wait[sensor])
+    first = FIRST_BLOCK[sensor]
+    for block in range(first, first + settings.sensor_blocks[sensor]):
+        flight.block_fresh[block] = select(mask, 0.0, flight.block_fresh[block])
+        flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
+    if settings.sensor_delay[sensor] > 0:
+        forget_stamps(flight.stamps[sensor], mask)
+
+
+@kernel
+def tick_clock(flight, settings, sensor, mask):
+    """Advance a sensor's clock by a tick; return the lanes in which it measures now."""
+    wait, period = flight.wait[sensor], settings.sensor_ticks[sensor]
+    due = mask & (wait <= 0.0) & (period > 0)
+    flight.wait[sensor] = select(mask, select(due, 1.0 * period, wait) - 1.0, wait)
+    return due
 
 
 @kernel
@@ -107,3 +144,31 @@ def deliver_arrived(work, block, values, numbers, mask):
     """Replace the numbers that have just been measured by those that arrived last."""
     for i in range(numbers):
         values[i] = select(mask, work.arrived[block, i], values[i])
+
+
+@kernel
+def begin_sample(flight, work, settings, sensor, values, numbers, mask):
+    """Invalidate the blocks of the last sample, and keep their numbers if there are delays.
+
+    `values` (blocks, numbers): those of the sensor in the record.
+    """
+    first = FIRST_BLOCK[sensor]
+    for i in range(settings.sensor_blocks[sensor]):
+        flight.block_valid[first + i] = select(mask, 0.0, flight.block_valid[first + i])
+        if settings.sensor_delay[sensor] > 0:
+            keep_arrived(work, first + i, values[i], numbers)
+
+
+@kernel
+def deliver(flight, work, settings, sensor, values, numbers, mask, due):
+    """Deliver the measurement of a sensor in the lanes `due`, now or after its latency."""
+    first, count = FIRST_BLOCK[sensor], settings.sensor_blocks[sensor]
+    if settings.sensor_delay[sensor] == 0:
+        for block in range(first, first + count):
+            new = due & (flight.block_valid[block] > 0.0)
+            flight.block_fresh[block] = select(new, 1.0, flight.block_fresh[block])
+    elif any_of(due | find_arrivals(flight, work, settings, sensor, mask)):
+        taken, under_way = stamp(flight, settings, sensor, mask), settings.under_way[sensor]
+        for i in range(count):
+            exchange(flight, work, first + i, values[i], numbers, under_way, mask, taken)
+            deliver_arrived(work, first + i, values[i], numbers, mask)

@@ -28,6 +28,7 @@ from quad_gym.kernels.filter.align import lever_of_attitude
 from quad_gym.kernels.filter.covariance_resets import reset_heading, reset_variances
 from quad_gym.kernels.filter.error_state import BA, D, E, R, V, put_covariance
 from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
+from quad_gym.kernels.filter.slow import keep_factor
 from quad_gym.kernels.maths.elementary import maximum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -47,7 +48,7 @@ from quad_gym.kernels.maths.matrices import load_block, load_column3, store_bloc
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
-from quad_gym.kernels.simd.lanes import logical_not, no_lane, select, zero_like
+from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
 
 _S = int(Aid["MAGNETOMETER"])
@@ -70,16 +71,16 @@ def _measure(flight, p, i):
     field_I = (t * m[0] + s * m[1], t * m[1] - s * m[0], m[2])
     field_B = quaternion_to_dcm(load4(flight.q)) @ field_I
     field_B = field_B + load33(flight.aid_matrix[_S]) @ field_B + load3(flight.aid_vector[_S])
-    return p.aid_sigma[_S] * vector(a, b, c) + field_B, logical_not(no_lane(flight.tick))
+    return p.aid_sigma[_S] * vector(a, b, c) + field_B, True
 
 
 @kernel
 def _align(flight, p, work, settings, mask):
     """Initialize the heading with the direction of the field, and the covariance to match."""
-    P, L, R_BI = work.P, flight.L, load33(flight.R_hat)
+    P, R_BI = work.P, load33(flight.R_hat)
     m, z = load3(p.aid_numbers[_N]), load3(flight.aid_measurement[_ROW])
     R_BI = R_BI @ level_attitude(R_BI.T @ z, m)
-    put_covariance(P, L, 1.0)
+    put_covariance(P, flight.L, 1.0)
     for i in range(settings.slow_states):
         for j in range(D + i):
             P[D + i, j] = zero_like(p.dt)
@@ -89,9 +90,7 @@ def _align(flight, p, work, settings, mask):
     _tie_heading(p, P, m, R_BI, iron, delta)
     _tie_position(p, P, R_BI, iron, delta)
     cholesky(P, D + settings.slow_states, work.inverse_diagonal)
-    for i in range(D):
-        for j in range(i + 1):
-            L[i, j] = select(mask, P[i, j], L[i, j])
+    keep_factor(flight, None, work, mask)
     for i in range(settings.slow_states):
         estimated = mask & (p.slow_sigma[i] > 0.0)
         for j in range(D + i + 1):

@@ -42,8 +42,7 @@ def _measure(flight, p, i):
     steep = u < MIN_COSINE
     distance = h / select(steep, 1.0, u)
     within = (distance >= p.aid_numbers[_N, 0]) & (distance <= p.aid_numbers[_N, 1])
-    zero = zero_like(distance)
-    return (distance + p.aid_sigma[_S] * n, zero, zero), within & (u >= MIN_COSINE)
+    return (distance + p.aid_sigma[_S] * n, 0.0, 0.0), within & (u >= MIN_COSINE)
 
 
 @kernel

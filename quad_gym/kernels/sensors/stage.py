@@ -3,9 +3,10 @@
 from typing import Any
 
 from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.gate import gate_blocks
 from quad_gym.kernels.filter.measurements import ACTS
-from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import Act, Sensor
+from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.records import FIRST_BLOCK, FIRST_GROUP, GROUP_COUNT, GROUP_FREEDOMS, Act, Sensor
 
 
 @kernel
@@ -18,7 +19,6 @@ def sensor_stage(
     begin: Any,
     sample: Any,
     expect: Any,
-    gate: Any,
     reset: Any,
     align: Any = _cannot_align,
 ) -> Any:
@@ -30,11 +30,23 @@ def sensor_stage(
         sample: `(flight, world, settings, work, stages, mask, starting)`: measure when due, and
             deliver.
         expect: `(flight, p, work, settings, k)`: fill the sensor's rows, from k on.
-        gate: `(flight, p, work, settings, k)`: store its innovations, and mask those beyond the
-            gate.
         reset: `(flight, p, work, settings)`: reset states where `work.reset`.
         align: `(flight, p, work, settings, mask)`: initialize the heading.
     """
+    first, group, several = FIRST_BLOCK[sensor], FIRST_GROUP[sensor], GROUP_COUNT[sensor] > 1
+    numbers = tuple(map(float, GROUP_FREEDOMS[group : group + GROUP_COUNT[sensor]]))
+
+    @kernel
+    def gate(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
+        if several:  # each group is a block
+            for i in range(len(numbers)):
+                s, g = first + i, group + i
+                if any_of(flight.block_valid[s] > 0.0):
+                    gate_blocks(flight, p, work, settings, k, s, 1, g, p.gate[g], numbers[i])
+                    k += 3
+        else:
+            count, limit = settings.sensor_blocks[sensor], p.gate[group]
+            gate_blocks(flight, p, work, settings, k, first, count, group, limit, numbers[0])
 
     def call(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
         act, argument, mask = flag % ACTS, flag // ACTS, work.mask > 0.0

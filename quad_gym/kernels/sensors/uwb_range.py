@@ -45,8 +45,8 @@ def _measure(flight, p, i):
     n, _ = normal_pair(stream, _DRAW + 2 * i)
     u, w = uniform_pair(stream, _DRAW + 2 * i + 1)
     distance = norm(_to_antenna(p, i, load3(flight.r), quaternion_to_dcm(load4(flight.q))))
-    detour, zero = select(u < share, size * w, 0.0), zero_like(distance)
-    return (distance + p.aid_sigma[_S] * n + detour, zero, zero), distance <= longest
+    detour = select(u < share, size * w, 0.0)
+    return (distance + p.aid_sigma[_S] * n + detour, 0.0, 0.0), distance <= longest
 
 
 @kernel

@@ -189,6 +189,34 @@ def reset(typing_context, block, chosen, value, names):  # type: ignore[no-untyp
     return types.none(block, chosen, types.unliteral(value), names), lower
 
 
+@intrinsic(prefer_literal=True)
+def keep_fields(  # type: ignore[no-untyped-def]
+    typing_context, block, other, chosen, names, prefix, others
+):
+    """Copy fields of another block where `chosen`, all numbers of them; names: "a b c".
+
+    `prefix` and `others` come before these names in the two blocks.
+    """
+    if not isinstance(block, LaneRecord) or not isinstance(names, types.StringLiteral):
+        return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        for name in names.literal_value.split():
+            to, source = prefix.literal_value + name, others.literal_value + name
+            kind = block.field(to)
+            element = kind.dtype if isinstance(kind, types.Array) else kind
+            first = _field_pointer(builder, block, args[0], to, element)
+            copied = _field_pointer(builder, other, args[1], source, element)
+            for k in range(0, block.record.typeof(to).nitems // REGISTER, WIDTH // REGISTER):
+                step = [ir.Constant(ir.IntType(32), k)]
+                pointer, place = builder.gep(first, step), builder.gep(copied, step)
+                numbers = (builder.load(where, align=8) for where in (place, pointer))
+                builder.store(builder.select(args[2], *numbers), pointer, align=8)
+        return context.get_dummy_value()
+
+    return types.none(block, other, types.unliteral(chosen), names, prefix, others), lower
+
+
 def _counted_from_the_start(generic: Any, args: Any, kws: Any) -> Any:
     """The signature of an access to an array of lanes, or by an enum, with unsigned indices.
 
