@@ -4,6 +4,9 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from quad_gym.params import checks as check
 from quad_gym.params.checked import Checked
 
@@ -70,6 +73,12 @@ class AidParams(SensorBase):
     meaning: ClassVar[str]  #: of the measurement, in a few words
     raw: ClassVar[tuple[str, str, float]]
     """unit, frame and bound of the measurement in raw observations"""
+
+    @classmethod
+    def measured(cls, values: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return True for the rows of `values` (n, ...) with a block without a NaN."""
+        blocks = values.reshape(len(values), -1, cls.length)
+        return np.asarray(np.isfinite(blocks).all(axis=2).any(axis=1))
 
     @property
     def blocks(self) -> int:

@@ -37,7 +37,9 @@ def _claim(quantity: str, first: int, count: int) -> int:
 _SHARING = 4
 """Number of aiding sensors, the first ones, that share ranges of draws. Each further one has a separate
 range, so that a new sensor changes no draw of another."""
-_FIRST_OWN, _OWN = 4096, 64
+_FIRST_OWN, _OWN, _OF_BLOCKS = 4096, 64, 16
+"""First of these ranges, their size, and the part for the blocks of a sensor."""
+_FIRST_LARGE, _LARGE = 1 << 16, 1 << 12  #: the same for sensors with more blocks
 
 
 def _claim_aids(
@@ -57,6 +59,8 @@ def _claim_aids(
     for aid in list(Aid)[_SHARING:]:
         own = _FIRST_OWN + _OWN * (aid - _SHARING) + place
         count = draws * AID_MOST[aid] if each_block else draws
+        if each_block and count > _OF_BLOCKS:
+            own = _FIRST_LARGE + _LARGE * (aid - _SHARING)
         found.append(_claim(f"{quantity}: {aid.name}", own, count))
     return tuple(found)
 

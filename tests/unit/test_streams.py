@@ -30,6 +30,7 @@ from quad_gym.records import (
     MAX_OBSTACLES,
     MAX_SLOW,
     FaultKind,
+    streams,
 )
 from quad_gym.records.streams import _claim
 from tests.builders import batch as begun
@@ -38,6 +39,15 @@ from tests.unit.alarms import alarm_score
 COUNT = 10_000
 OUTAGE, JUMP = int(FaultKind.GNSS_OUTAGE), int(FaultKind.GNSS_JUMP)
 KERNELS = Path(quad_gym.kernels.__file__).parent
+
+
+def test_sensor_with_many_blocks_has_draws_for_each(monkeypatch):
+    ranges = list(DRAW_RANGES)
+    monkeypatch.setattr(streams, "DRAW_RANGES", ranges)
+    monkeypatch.setattr(streams, "AID_MOST", (*AID_MOST[:-1], 500))
+    (last,) = streams._claim_aids("a test", 30_000, 2, 0, each_block=True)[-1:]
+    assert ranges[-1] == ("a test: UWB_RANGE", last, 1000)
+    assert all(r.first + r.draws <= last or last + 1000 <= r.first for r in ranges[:-1])
 
 
 def test_no_two_ranges_share_a_draw():

@@ -6,6 +6,8 @@ import pytest
 import quad_gym
 from quad_gym.analysis.consistency import InnovationRecorder
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.estimation.logs import read_log
+from quad_gym.estimation.replaying.measurements import LogMeasurements
 from quad_gym.params.portable import euler_dcm
 from quad_gym.records import AID_BLOCK, Aid, Control, GateDecision
 from quad_gym.rotations import quaternion_to_dcm
@@ -106,6 +108,22 @@ def test_update_agrees_with_a_linear_update_by_numerical_derivatives(kind, missi
     difference = (kf.covariance - P) / np.outer(scale, scale)
     np.testing.assert_allclose(difference[:6, :6], 0.0, atol=tolerance)
     assert abs(dx[:3]).max() > 1e-3  # there was something to correct
+
+
+def test_rows_of_a_log_without_some_of_the_ranges_are_kept():
+    n = 400
+    table = {"time": 0.01 * np.arange(n), "gyro": np.zeros((n, 3)), "accel": np.zeros((n, 3))}
+    table["accel"][:, 2] = 9.8
+    ranges = np.full((4, n), np.nan)
+    ranges[:, 10::10] = np.array([[6.0], [np.nan], [7.0], [8.0]])
+    table |= {f"uwb_range_{anchor}": ranges[anchor] for anchor in range(4)}
+    stream = read_log(table).streams["uwb_range"]
+    np.testing.assert_array_equal(stream.time, table["time"][10::10])
+    assert LogMeasurements(read_log(table), UWB, False).at("uwb_range", 0).blocks == [
+        FIRST,
+        FIRST + 2,
+        FIRST + 3,
+    ]
 
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])

@@ -14,6 +14,7 @@ import numpy as np
 from quad_gym.estimation.logs.log import Floats, Log
 from quad_gym.estimation.logs.source import LogSource, RawLog, positive
 from quad_gym.frames import ecef_to_enu
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
 
 ENOUGH, LONG = 20, 2.0  #: number of rows, and their duration [s], from which a constant is dead
@@ -93,7 +94,7 @@ def _with_valid_numbers(source: LogSource) -> LogSource:
 
 
 def _finite(source: LogSource) -> Any:
-    """Return True for the rows in which all of a vector, or one of several, was measured."""
+    """Return True for the rows in which all of a vector, or of one of several, was measured."""
     if not len(source):
         return np.ones(0, bool)
     rows = [
@@ -103,6 +104,8 @@ def _finite(source: LogSource) -> Any:
     ]
     if source.sensor == "camera":
         return rows[0].any(axis=1)
+    if source.sensor in source.values and source.sensor in AID_PARAMS:
+        return AID_PARAMS[source.sensor].measured(source.values[source.sensor])
     whole = [row.all(axis=1) for row in rows]
     return np.any(whole, axis=0) if source.sensor == "gnss" else np.all(whole, axis=0)
 

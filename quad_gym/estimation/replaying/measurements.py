@@ -88,11 +88,11 @@ class LogMeasurements:
         if name == "gnss":
             quantities = ("position", "baseline", "velocity")[: 3 if self.takes_velocity else 2]
             wanted = [f"{quantity}_{frame}" for quantity in quantities for frame in "GI"]
-        several = name in AID_PARAMS and AID_PARAMS[name].most_blocks > 1
         for key in wanted:
-            if key in values and not found.all():
-                known = np.isfinite(values[key][rows]).reshape(len(rows), -1)
-                found |= known.any(axis=1) if several else known.all(axis=1)
+            if key in AID_PARAMS:
+                found |= AID_PARAMS[key].measured(values[key][rows])
+            elif key in values and not found.all():
+                found |= np.isfinite(values[key][rows]).reshape(len(rows), -1).all(axis=1)
         return found
 
     def at(self, name: str, k: int) -> Measurement | None:
