@@ -45,7 +45,7 @@ def _entry(function):
 def begin_filter(block, params, settings, work, x_I):
     """Start the filters of a block, see `start_filter`."""
     flight, mask = lanes_of(block), lanes_of(work).mask > 0.0
-    forget_innovations(flight, settings.feature_count, mask)
+    forget_innovations(flight, mask)
     initialize(flight, lanes_of(params), mask, x_I)
     begin_slow(flight, lanes_of(params), settings, mask)
 

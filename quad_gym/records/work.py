@@ -77,7 +77,7 @@ WORK_FIELDS = (
     Field("kept_L", (15, 15), "mixed", "L"),
     Field("kept_slow_hat", (MAX_SLOW,), "mixed", "slow_hat"),
     Field("kept_L_slow", (MAX_SLOW, MAX_STATES), "mixed", "L_slow"),
-    Field("kept_valid", (MAX_BLOCKS,), "0 or 1", "measured blocks"),
+    Field("kept_block_valid", (MAX_BLOCKS,), "0 or 1", "measured blocks"),
     Field("kept_w_meas", (3,), "rad/s", "w_meas"),
     Field("kept_update_failures", (), "-", "update_failures"),
     # the instant to which a late update goes back

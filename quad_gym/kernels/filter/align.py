@@ -164,4 +164,4 @@ def align_stage(flight, world, model, settings, work, stages, flag):
 @stage
 def forget_innovations_stage(flight, world, model, settings, work, stages, flag):
     """Forget the innovations of the previous episode."""
-    forget_innovations(flight, settings.feature_count, work.mask > 0.0)
+    forget_innovations(flight, work.mask > 0.0)

@@ -12,16 +12,13 @@ Source: Y. Bar-Shalom, H. Chen and M. Mallick, "One-step solution for the multis
 measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 40(1), 2004.
 """
 
-import numpy as np
-
-from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import E, V, velocity_error
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     choose_valid,
+    count_failure,
     count_measured,
-    restore_valid,
-    store_valid,
 )
 from quad_gym.kernels.filter.monitoring import forget_corrections
 from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_columns, take_mean
@@ -30,17 +27,17 @@ from quad_gym.kernels.filter.slow import (
     carry_slow,
     keep_factor,
     shift_carried_slow,
+    stages_of,
 )
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import keep, load3, load33, outer, store
 from quad_gym.kernels.maths.matrices import load_column3, store_block, store_column3, sum_of_outers
-from quad_gym.kernels.simd.blocks import keep_fields, lanes_of
+from quad_gym.kernels.simd.blocks import keep_fields
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
-from quad_gym.records import SENSORS, FilterForm, FilterStatus
+from quad_gym.records import SENSORS, FilterForm
 
 _ESTIMATE, _SLOW = "r_hat v_hat v_corrected R_hat b_a_hat b_g_hat L", "slow_hat L_slow"
 """Fields of an estimate, and those of slow errors."""
-_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
 @kernel
@@ -68,10 +65,7 @@ def _find_stamp(flight, p, work, sensor, delay, under_way, arrived):
 
     Where a measurement arrives, w_meas becomes the rates at that instant, for lever arms.
     """
-    store(work.since_turn, load33(flight.imu_turn))
-    store(work.since_bias_gain, load33(flight.imu_bias_gain))
-    store(work.since_velocity, load3(flight.imu_velocity))
-    store(work.since_position, load3(flight.imu_position))
+    keep_fields(work, flight, True, "turn bias_gain velocity position", "since_", "imu_")
     stamps = flight.stamps[sensor]
     for slot in range(under_way + 1):
         row, here = stamps[slot], arrived & (stamps[slot, 0] == flight.tick - delay)
@@ -172,15 +166,14 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     failed = arrived & old
     if (settings.form & MONITORED) != 0 and any_of(failed):
         forget_corrections(flight, failed)
-    status = flight.filter_status
-    flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
-    failures = select(failed, work.kept_update_failures + 1.0, flight.update_failures)
+    failures = select(failed, work.kept_update_failures, flight.update_failures)
     flight.update_failures = failures
+    count_failure(flight, failed)
 
 
 @kernel
-def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
-    """Update with each delayed sensor in turn, then with all prompt ones, in the lanes `mask`.
+def update_by_sensor(flight, p, work, settings, stages, slow):
+    """Update with each delayed sensor in turn, then with all prompt ones, where `work.mask`.
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
@@ -188,10 +181,10 @@ def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
         work: Workspace.
         settings: Delays of the sensors.
         stages: Table of stages.
-        mask: Lanes to work on.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
-    store_valid(flight, work, settings)
+    mask = work.mask > 0.0
+    keep_fields(work, flight, True, "block_valid", "kept_", "")
     for sensor in range(SENSORS + 1):
         delayed = sensor != SENSORS
         delay = choose_valid(flight, work, settings, sensor)
@@ -213,24 +206,8 @@ def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
         if delayed:
             good = good & (flight.update_failures == work.kept_update_failures)
             _restore_estimate(flight, work, settings, arrived, good, slow)
-    restore_valid(flight, work, settings)
+    keep_fields(flight, work, True, "block_valid", "", "kept_")
     work.mask = select(mask, 1.0, 0.0)
 
 
-# ---- stages ----------------------------------------------------------------------------------
-
-
-@stage
-def late_update_stage(flight, world, model, settings, work, stages, flag):
-    """Update with delayed and prompt measurements."""
-    scratch = lanes_of(work)
-    mask = scratch.mask > 0.0
-    update_by_sensor(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask)
-
-
-@stage
-def late_update_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """Update a filter with slow errors of sensors among its states."""
-    scratch = lanes_of(work)
-    mask = scratch.mask > 0.0
-    update_by_sensor(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask, settings)
+late_update_stage, late_update_with_slow_stage = stages_of("late_update", update_by_sensor)

@@ -34,8 +34,6 @@ from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_oute
 from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.records import (
-    AID_BLOCKS,
-    AID_ROWS,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     SEVERAL,
@@ -265,15 +263,8 @@ def gate_innovations(flight, p, work, settings, stages, mask, again):
 
 
 @kernel
-def forget_innovations(flight, feature_count, mask):
+def forget_innovations(flight, mask):
     """Reset the innovations at the start of an episode, in the lanes `mask`."""
-    blocks, none = FEATURE_BLOCKS + feature_count, (np.nan, np.nan, np.nan)
-    for k in range(blocks + AID_ROWS):
-        s = k if k < blocks else k - blocks + AID_BLOCKS
-        flight.block_nis[s] = select(mask, np.nan, flight.block_nis[s])
-        flight.gate[s] = select(mask, 0.0, flight.gate[s])
-        flight.rejections[s] = select(mask, 0.0, flight.rejections[s])
-        keep(flight.innovation[s], mask, none)
-        keep(flight.innovation_sigma[s], mask, none)
+    reset(flight, mask, np.nan, "block_nis innovation innovation_sigma")
+    reset(flight, mask, 0.0, "gate rejections rejected_in_row resets")
     forget_corrections(flight, mask)
-    reset(flight, mask, 0.0, "rejected_in_row resets")

@@ -83,13 +83,6 @@ def count_measured(flight, work, settings):
 
 
 @kernel
-def store_valid(flight, work, settings):
-    """Store the validity of all blocks, to update with one delayed sensor after the other."""
-    for block in range(MAX_BLOCKS):
-        work.kept_valid[block] = flight.block_valid[block]
-
-
-@kernel
 def choose_valid(flight, work, settings, turn):
     """Leave only one delayed sensor's blocks valid; if `turn` is SENSORS, all that are not delayed.
 
@@ -104,15 +97,8 @@ def choose_valid(flight, work, settings, turn):
         share = 1.0 if turn == (sensor if latency > 0 else SENSORS) else 0.0
         first = FIRST_BLOCK[sensor]
         for block in range(first, first + settings.sensor_blocks[sensor]):
-            flight.block_valid[block] = share * work.kept_valid[block]
+            flight.block_valid[block] = share * work.kept_block_valid[block]
     return delay
-
-
-@kernel
-def restore_valid(flight, work, settings):
-    """Restore the stored validity of all blocks."""
-    for block in range(MAX_BLOCKS):
-        flight.block_valid[block] = work.kept_valid[block]
 
 
 @kernel
@@ -124,8 +110,9 @@ def mark_failed(flight, failed):
 
 
 @kernel
-def flag_failure(flight, failed):
-    """Flag an update that failed."""
+def count_failure(flight, failed):
+    """Flag and count an update that failed."""
     status = flight.filter_status
     failure = np.uint64(FilterStatus.UPDATE_FAILED.value)
     flight.filter_status = select(failed, status | failure, status)
+    flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)

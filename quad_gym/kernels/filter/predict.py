@@ -181,7 +181,8 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
                 e_odd = inverse_c * (d + dt * rate_odd)
                 e_even = dt * inverse_c * rate_even
         if midpoint:
-            e_odd = _turned_angles(L, j, full, half, dt)
+            # about the new R_hat: R_half (R_half e - dt b_g)
+            e_odd = full @ load_column3(L, E, j) - dt * (half @ load_column3(L, BG, j))
 
         v_j = load_column3(L, V, j)
         if first:
@@ -203,12 +204,6 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
         store_column3(F, E, j, e_odd)
 
     return inverse_c * mean_a, inverse_c * mean_e
-
-
-@kernel
-def _turned_angles(L, j, full, half, dt):
-    """Column j of the error angles about the new R_hat, R_half (R_half e - dt b_g)."""
-    return full @ load_column3(L, E, j) - dt * (half @ load_column3(L, BG, j))
 
 
 @kernel

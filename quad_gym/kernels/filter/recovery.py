@@ -26,7 +26,7 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.covariance_resets import reset_variance, reset_variances
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covariance
-from quad_gym.kernels.filter.measurements import call_sensors, flag_failure
+from quad_gym.kernels.filter.measurements import call_sensors, count_failure
 from quad_gym.kernels.filter.monitoring import (
     CORRECTION_TIME,
     LIKELY,
@@ -283,8 +283,7 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
     ok = alarmed & (cholesky(work.P, states, work.inverse_diagonal) > 0.0)
     keep_factor(flight, slow, work, ok)
     failed = alarmed & logical_not(ok)
-    flag_failure(flight, failed)
-    flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
+    count_failure(flight, failed)
     flight.alarm_tick = select(alarmed, flight.tick, flight.alarm_tick)
     for group in range(SENSOR_GROUPS):
         flight.resets[group] = flight.resets[group] + work.reset[group]

@@ -82,12 +82,6 @@ def stationary(p, i):
 
 
 @kernel
-def _scale_rows(a, m):
-    """Diag(a) M."""
-    return (a[0] * m[0], a[1] * m[1], a[2] * m[2])
-
-
-@kernel
 def _scale_both(a, b, m):
     """Diag(a) M diag(b)."""
     return (_product(a[0] * b, m[0]), _product(a[1] * b, m[1]), _product(a[2] * b, m[2]))
@@ -95,6 +89,7 @@ def _scale_both(a, b, m):
 
 @kernel
 def _product(a, b):
+    """Diag(a) B of a matrix or a vector."""
     return (a[0] * b[0], a[1] * b[1], a[2] * b[2])
 
 
@@ -117,10 +112,10 @@ def predict_slow(flight, slow, p, work):
     for i in range(0, slow.slow_states, 3):
         a, s = load3(p.slow_decay[i : i + 3]), load3(p.slow_drive[i : i + 3])
         for j in range(0, BA, 3):
-            store_block(P, D + i, j, _scale_rows(a, sum_of_outers(M, i, F, j, 15)))
+            store_block(P, D + i, j, _product(a, sum_of_outers(M, i, F, j, 15)))
         with_a, with_g = sum_of_outers(M, i, L, BA, 12), sum_of_outers(M, i, L, BG, 15)
-        store_block(P, D + i, BA, _scale_rows(p.accel_bias_decay * a, with_a))
-        store_block(P, D + i, BG, _scale_rows(p.gyro_bias_decay * a, with_g))
+        store_block(P, D + i, BA, _product(p.accel_bias_decay * a, with_a))
+        store_block(P, D + i, BG, _product(p.gyro_bias_decay * a, with_g))
         for j in range(0, i, 3):
             b = load3(p.slow_decay[j : j + 3])
             other = sum_of_outers(M, i, M, j, D + j + 3)
@@ -255,7 +250,7 @@ def carry_slow(flight, slow, p, work, noise, back):
     for i in range(0, slow.slow_states, 3):
         a, gained = _factors(work, i, back), _gained(p, work, i, noise)
         for j in range(0, D, 3):
-            store_block(P, D + i, j, _scale_rows(a, sum_of_outers(rows, i, M, j, 15)))
+            store_block(P, D + i, j, _product(a, sum_of_outers(rows, i, M, j, 15)))
         for j in range(0, i, 3):
             other = sum_of_outers(rows, i, rows, j, D + j + 3)
             store_block(P, D + i, D + j, _scale_both(a, _factors(work, j, back), other))

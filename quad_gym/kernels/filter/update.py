@@ -15,8 +15,8 @@ from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, t
 from quad_gym.kernels.filter.gate import MONITORED, gate_innovations
 from quad_gym.kernels.filter.measurements import (
     call_measured,
+    count_failure,
     count_measured,
-    flag_failure,
     mark_failed,
 )
 from quad_gym.kernels.filter.monitoring import flag_shifted, follow_corrections
@@ -307,8 +307,7 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     flight.nis = select(ok, nis, flight.nis)
     flight.nis_dimension = select(ok, measured, flight.nis_dimension)
     failed = wanted & logical_not(ok)
-    flag_failure(flight, failed)
-    flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
+    count_failure(flight, failed)
     if (form & MONITORED) != 0 and any_of(failed):
         mark_failed(flight, failed)
     updated = mask & (work.measured > 0.0)

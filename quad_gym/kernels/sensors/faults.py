@@ -14,6 +14,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import clip, log, sin_cos
 from quad_gym.kernels.maths.linalg import dot, keep, load3, load33, load44, store
 from quad_gym.kernels.maths.random import stream_of, uniform_pair
+from quad_gym.kernels.simd.blocks import reset
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import (
     DRAW_FAULTS,
@@ -256,9 +257,7 @@ def begin_faults_stage(flight, world, model, settings, work, stages, flag):
             flight.fault_until[k] = select(never, NEVER, flight.fault_until[k])
             flight.fault_active[k] = select(mask, 0.0, flight.fault_active[k])
             flight.fault_count[k] = select(mask, 0.0, flight.fault_count[k])
-    flight.outlier = select(mask, 0.0, flight.outlier)
-    for i in range(settings.feature_count):
-        flight.feature_mistaken[i] = select(mask, 0.0, flight.feature_mistaken[i])
+    reset(flight, mask, 0.0, "outlier feature_mistaken")
     if settings.randomized:
         _apply_rotor_faults(flight, world, settings)
     _advance_faults(flight, world, settings, mask)

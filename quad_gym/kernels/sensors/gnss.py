@@ -10,10 +10,10 @@ from quad_gym.kernels.sensors import gnss_baseline, gnss_position, gnss_velocity
 from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.kernels.sensors.latency import (
     begin_clock,
+    begin_sample,
     deliver_arrived,
     exchange,
     find_arrivals,
-    keep_arrived,
     stamp,
     tick_clock,
 )
@@ -75,15 +75,11 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     """Measure when due, and at the start for the initialization of the filter."""
     due = tick_clock(flight, settings, _GNSS, mask)
     delayed, period = settings.sensor_delay[_GNSS] > 0, settings.sensor_ticks[_GNSS]
+    values = (flight.gnss_position, flight.gnss_baseline, flight.gnss_velocity)
+    begin_sample(flight, work, settings, _GNSS, values, 3, mask)
     arrives = find_arrivals(flight, work, settings, _GNSS, mask)
     if not starting and not any_of(due | arrives):
-        nothing = zero_like(flight.tick)
-        _flag(flight.block_valid, mask, nothing, nothing, settings)
         return
-    if delayed:
-        keep_arrived(work, POSITION_BLOCK, flight.gnss_position, 3)
-        keep_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3)
-        keep_arrived(work, VELOCITY_BLOCK, flight.gnss_velocity, 3)
     if settings.gnss_drifts > 0 and not starting and any_of(due):
         share = minimum(flight.tick / period, 1.0)
         gnss_position.drift_gnss(flight, p, due, share)
@@ -106,23 +102,11 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     valid = select(due & measured, 1.0, 0.0)
     _flag(flight.block_valid, mask, valid, select(unpaired, 0.0, valid), settings)
     if delayed:
-        _deliver_delayed(flight, work, settings, mask, starting)
-
-
-@kernel
-def _deliver_delayed(flight, work, settings, mask, starting):
-    """Hold back the fix just measured, and deliver the one that arrives.
-
-    At the start of an episode the fix stays in the record, for the initialization of the filter.
-    """
-    taken, n = stamp(flight, settings, _GNSS, mask), settings.under_way[_GNSS]
-    exchange(flight, work, POSITION_BLOCK, flight.gnss_position, 3, n, mask, taken)
-    exchange(flight, work, BASELINE_BLOCK, flight.gnss_baseline, 3, n, mask, taken)
-    exchange(flight, work, VELOCITY_BLOCK, flight.gnss_velocity, 3, n, mask, taken)
-    if not starting:
-        deliver_arrived(work, POSITION_BLOCK, flight.gnss_position, 3, mask)
-        deliver_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3, mask)
-        deliver_arrived(work, VELOCITY_BLOCK, flight.gnss_velocity, 3, mask)
+        taken, n = stamp(flight, settings, _GNSS, mask), settings.under_way[_GNSS]
+        for block in _BLOCKS:
+            exchange(flight, work, block, values[block], 3, n, mask, taken)
+            if not starting:  # there, it stays in the record, for the initialization of the filter
+                deliver_arrived(work, block, values[block], 3, mask)
 
 
 @kernel

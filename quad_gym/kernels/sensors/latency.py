@@ -36,7 +36,9 @@ def begin_clock(flight, settings, sensor, share, mask):
         flight.block_fresh[block] = select(mask, 0.0, flight.block_fresh[block])
         flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
     if settings.sensor_delay[sensor] > 0:
-        forget_stamps(flight.stamps[sensor], mask)
+        for slot in range(DELAY_SLOTS):
+            row = flight.stamps[sensor, slot]
+            row[0] = select(mask, np.nan, row[0])
 
 
 @kernel
@@ -46,13 +48,6 @@ def tick_clock(flight, settings, sensor, mask):
     due = mask & (wait <= 0.0) & (period > 0)
     flight.wait[sensor] = select(mask, select(due, 1.0 * period, wait) - 1.0, wait)
     return due
-
-
-@kernel
-def forget_stamps(stamps, mask):
-    """Begin an episode with nothing in transit, in the lanes `mask`."""
-    for slot in range(DELAY_SLOTS):
-        stamps[slot, 0] = select(mask, np.nan, stamps[slot, 0])
 
 
 @kernel
@@ -71,13 +66,6 @@ def _put_stamp(stamps, flight, under_way, taken):
         row[10 + i] = select(taken, flight.imu_velocity[i], row[10 + i])
         row[13 + i] = select(taken, flight.imu_position[i], row[13 + i])
         row[25 + i] = select(taken, flight.w_meas[i], row[25 + i])
-
-
-@kernel
-def keep_arrived(work, block, values, numbers):
-    """Keep the numbers of a block that have arrived, before new ones are measured."""
-    for i in range(numbers):
-        work.arrived[block, i] = values[i]
 
 
 @kernel
@@ -110,7 +98,7 @@ def exchange(flight, work, block, values, numbers, under_way, mask, taken):
 
     Args:
         flight: Record.
-        work: Workspace; reads the results of `keep_arrived` and `find_arrivals`.
+        work: Workspace; reads the results of `begin_sample` and `find_arrivals`.
         block: Number of the block.
         values: Its numbers in the record.
         numbers: Count of these numbers.
@@ -156,7 +144,8 @@ def begin_sample(flight, work, settings, sensor, values, numbers, mask):
     for i in range(settings.sensor_blocks[sensor]):
         flight.block_valid[first + i] = select(mask, 0.0, flight.block_valid[first + i])
         if settings.sensor_delay[sensor] > 0:
-            keep_arrived(work, first + i, values[i], numbers)
+            for n in range(numbers):
+                work.arrived[first + i, n] = values[i][n]
 
 
 @kernel
