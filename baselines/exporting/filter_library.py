@@ -34,8 +34,9 @@ _BARE = """\
 arm-none-eabi-gcc -std=c99 -O2 -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-d16 \\
     main.c libquad_gym_filter.a -lm  # with the start-up code and linker script of your board"""
 _WASM = """\
+# Debian: clang lld wasi-libc libclang-rt-dev-wasm32
 clang --target=wasm32-wasi --sysroot=/usr -std=c99 -O2 -D_WASI_EMULATED_PROCESS_CLOCKS \\
-    main.c libquad_gym_filter.a -lm -lwasi-emulated-process-clocks -o example.wasm  # wasi-libc"""
+    main.c libquad_gym_filter.a -lm -lwasi-emulated-process-clocks -o example.wasm"""
 TARGETS = {
     "x86-64": Target(
         ("x86_64-unknown-linux-gnu", "x86-64-v3", "pic"),
