@@ -8,6 +8,7 @@ import quad_gym
 from quad_gym import FlightBatch, TaskParams, sensor_suite
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.flights.columns import COLUMNS
+from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.records import Source
 from quad_gym.tasks.view import VIEW_FIELDS
 from tests import builders
@@ -35,11 +36,12 @@ def test_flights_and_views_use_the_names_of_the_table():
 
 
 def test_every_quantity_has_the_shape_of_the_table():
-    room = {"features": 4, "gates": 5, "obstacles": 1, "blocks": 8}  # of ranges
+    room = {"gates": 5, "obstacles": 1, "features": len(AIDED.camera.features_I)}
     wall = quad_gym.Wall(center_I=(9.0, 0.0, 1.0))
     batch = flown("waypoints", sensors=AIDED, world=quad_gym.WorldParams(obstacles=(wall,)))
-    room["features"] = len(AIDED.camera.features_I)
     for name, quantity in QUANTITIES.items():
+        if name in AID_PARAMS:
+            room["blocks"] = AID_PARAMS[name].most_blocks
         shape = tuple(room.get(n, n) for n in quantity.shape)
         values = batch.read(name)
         assert values.shape == (5, *shape), name
