@@ -48,7 +48,7 @@ def _measure(flight, p, i):
     x, y = g * v_B[0] - w[1], g * v_B[1] + w[0]
     most, sigma = p.aid_numbers[_N, 1], p.aid_sigma[_S]
     within = within & (abs(x) <= most) & (abs(y) <= most)
-    return (x + sigma * n_x, y + sigma * n_y, zero_like(x)), within
+    return (x + sigma * n_x, y + sigma * n_y, 0.0), within
 
 
 @kernel
@@ -58,23 +58,16 @@ def _flow(g, v_B):
 
 
 @kernel
-def _put_center(flight, p, work, settings, k, valid, G, W):
-    """Fill the rows of measurement, prediction and noise."""
-    w, zero = load3(flight.w_meas) - load3(flight.b_g_hat), zero_like(G)
-    z_hat = vector(-w[1], w[0], zero) + _flow(G, W)
-    variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
-    noise = diagonal((variance, variance, zero + 1.0))
-    put_block(work, settings, k, valid, load3(flight.aid_measurement[_ROW]), z_hat, noise)
-
-
-@kernel
 def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2: two rates, and a masked row."""
     L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
     h, W = maximum(h, 0.5 * p.aid_numbers[_N, 0]), R_BI @ load3(flight.v_hat)
-    G, z_B, zero = u / h, R_BI.T[2], zero_like(h)
-    _put_center(flight, p, work, settings, k, valid, G, W)
+    G, z_B, zero, w = u / h, R_BI.T[2], zero_like(h), load3(flight.w_meas) - load3(flight.b_g_hat)
+    z_hat = vector(-w[1], w[0], zero) + _flow(G, W)
+    variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
+    noise = diagonal((variance, variance, zero + 1.0))
+    put_block(work, settings, k, valid, load3(flight.aid_measurement[_ROW]), z_hat, noise)
     for j in range(9):
         dV, dh = R_BI @ load_column3(L, V, j), L[R + 2, j] if j <= R + 2 else zero
         if (settings.form & FilterForm.EKF.value) != 0:
