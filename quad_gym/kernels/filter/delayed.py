@@ -13,7 +13,7 @@ measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 4
 """
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.error_state import E, V, velocity_error
+from quad_gym.kernels.filter.error_state import D, E, V, velocity_error
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     choose_valid,
@@ -25,6 +25,7 @@ from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_column
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
     carry_slow,
+    copy_factor,
     keep_factor,
     shift_carried_slow,
     stages_of,
@@ -36,18 +37,19 @@ from quad_gym.kernels.simd.blocks import keep_fields
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
 from quad_gym.records import SENSORS, FilterForm
 
-_ESTIMATE, _SLOW = "r_hat v_hat v_corrected R_hat b_a_hat b_g_hat L", "slow_hat L_slow"
-"""Fields of an estimate, and those of slow errors."""
+_ESTIMATE = "r_hat v_hat v_corrected R_hat b_a_hat b_g_hat"
+_KEPT = f"{_ESTIMATE} w_meas update_failures"
 
 
 @kernel
 def _keep_estimate(flight, work, slow):
     """Copy the estimate, for lanes in which nothing arrives or an update fails."""
-    keep_fields(work, flight, True, _ESTIMATE, "kept_", "")
-    store(work.kept_w_meas, load3(flight.w_meas))
-    work.kept_update_failures = flight.update_failures
+    keep_fields(work, flight, True, _KEPT, "kept_", "")
+    all_lanes = flight.tick == flight.tick
+    copy_factor(work.kept_L, flight.L, 0, D, all_lanes)
     if slow is not None:
-        keep_fields(work, flight, True, _SLOW, "kept_", "")
+        keep_fields(work, flight, True, "slow_hat", "kept_", "")
+        copy_factor(work.kept_L_slow, flight.L_slow, D, slow.slow_states, all_lanes)
 
 
 @kernel
@@ -160,9 +162,11 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     """
     old = logical_not(arrived & good)
     keep_fields(flight, work, old, _ESTIMATE, "", "kept_")
+    keep_fields(flight, work, True, "w_meas", "", "kept_")
+    copy_factor(flight.L, work.kept_L, 0, D, old)
     if slow is not None:
-        keep_fields(flight, work, old, _SLOW, "", "kept_")
-    store(flight.w_meas, load3(work.kept_w_meas))
+        keep_fields(flight, work, old, "slow_hat", "", "kept_")
+        copy_factor(flight.L_slow, work.kept_L_slow, D, slow.slow_states, old)
     failed = arrived & old
     if (settings.form & MONITORED) != 0 and any_of(failed):
         forget_corrections(flight, failed)

@@ -94,15 +94,19 @@ def _product(a, b):
 
 
 @kernel
+def copy_factor(L, source, first, rows, ok):
+    """Copy `rows` of a lower factor, from row `first` of the whole one on, where `ok`."""
+    for i in range(rows):
+        for j in range(first + i + 1):
+            L[i, j] = select(ok, source[i, j], L[i, j])
+
+
+@kernel
 def keep_factor(flight, slow, work, ok):
     """Store the factor in work.P, where `ok`."""
-    for i in range(15):
-        for j in range(i + 1):
-            flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    copy_factor(flight.L, work.P, 0, D, ok)
     if slow is not None:
-        for i in range(slow.slow_states):
-            for j in range(D + i + 1):
-                flight.L_slow[i, j] = select(ok, work.P[D + i, j], flight.L_slow[i, j])
+        copy_factor(flight.L_slow, work.P[D:], D, slow.slow_states, ok)
 
 
 @kernel
