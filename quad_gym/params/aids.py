@@ -77,8 +77,8 @@ class AidParams(SensorBase):
     @classmethod
     def measured(cls, values: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return True for the rows of `values` (n, ...) with a block without a NaN."""
-        blocks = values.reshape(len(values), -1, cls.length)
-        return np.asarray(np.isfinite(blocks).all(axis=2).any(axis=1))
+        known = np.isfinite(values.reshape(len(values), -1, cls.length))
+        return np.asarray(np.any(np.all(known, axis=2), axis=1))
 
     @property
     def blocks(self) -> int:
