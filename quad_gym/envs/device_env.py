@@ -1,6 +1,5 @@
 """`QuadDeviceVecEnv`: many flights on a GPU as a vector environment of torch tensors."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any, Unpack
 
@@ -24,10 +23,6 @@ from quad_gym.packing.configuration import MAX_FLIGHTS
 from quad_gym.params import checks as check
 
 _ON_PROCESSOR = ("threads", "render_mode", "render_flights")
-_UNTRIED = (
-    "no flights with faults have been measured on a GPU in the present form of the kernel; compare "
-    "some of yours with those on the processor, as docs/gpu.md shows"
-)
 
 
 class QuadDeviceVecEnv(QuadTorchVecEnv):
@@ -40,8 +35,7 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
     `info` has "position_error" and "estimation_error", with `reward_terms=True` also these; with
     `autoreset_mode="SameStep"`, "final_obs" and its mask "_final_obs"; errors are then those at the
     end of the episode that ended. `batch.result` has the other results of a step, and
-    `batch.record` the records of the flights. Faults have not been measured on a GPU yet; the class
-    warns of it.
+    `batch.record` the records of the flights.
 
     Args:
         num_envs: Number of flights.
@@ -80,8 +74,6 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
             )
         super().__init__(1, base=base, autoreset_mode=autoreset_mode, threads=1, **given)
         plan = plan_of(self.flights.batch)
-        if launcher is None and given.get("faults") is not None:
-            warnings.warn(_UNTRIED, stacklevel=2)
         make = launcher or (lambda plan: CudaLauncher(ptx_of(plan), on_gpu))
         self.device, self.num_envs = on_gpu, num_envs
         task = getattr(self.flights.batch, "made", None)

@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -21,7 +20,6 @@ from tests.golden import device, ptx, sass
 from tests.golden.flights import trajectories
 
 torch = pytest.importorskip("torch")
-from quad_gym.envs import device_env as device_env_module  # noqa: E402
 from quad_gym.envs.device_env import QuadDeviceVecEnv  # noqa: E402
 from tests.contract.test_consistency_script import Held  # noqa: E402
 from tests.contract.test_torch_env import (  # noqa: E402
@@ -266,15 +264,6 @@ def test_device_that_is_no_processor_or_gpu_is_refused(device):
 def test_flights_that_need_python_are_refused_on_a_gpu(keywords, message):
     with pytest.raises(ValueError, match=message):
         device_env(**{"base": "circle", "count": 2} | keywords)
-
-
-def test_faults_on_a_gpu_are_warned_of(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(device_env_module, "ptx_of", lambda plan: b"")
-    launcher = SimpleNamespace(warps=1)
-    monkeypatch.setattr(device_env_module, "CudaLauncher", lambda ptx, device: launcher)
-    with pytest.warns(UserWarning, match="compare some of yours with those on the processor"):
-        device_env("circle", 2, launcher=None, faults="gnss_outage")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
