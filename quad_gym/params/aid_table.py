@@ -7,6 +7,7 @@ filter.
 """
 
 import dataclasses
+import difflib
 from typing import NamedTuple, get_args
 
 from quad_gym.params import checks as check
@@ -55,6 +56,10 @@ def _shape_of(kind: type[AidParams]) -> AidShape:
     for word in ("observes", "unit", "frame", "meaning", "raw"):
         if not hasattr(kind, word):
             raise ValueError(f"{kind.__name__} must have {word}, as in AidParams")
+    known = {*dir(AidParams), *(field.name for field in dataclasses.fields(kind))}
+    for word in vars(kind).keys() - known:
+        if near := difflib.get_close_matches(word, known, 1, cutoff=0.8):
+            raise ValueError(f"{kind.__name__}.{word} is not read; did you mean {near[0]}?")
     check.whole(f"{kind.__name__}.length", kind.length, most=3)
     for word in kind.observes:
         check.choice(f"{kind.__name__}.observes", word, OBSERVED)

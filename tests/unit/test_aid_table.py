@@ -23,6 +23,7 @@ COMPLETE |= {"raw": ("m", "-", 10.0)}
         ({"observes": ("hight",)}, "observes must be one of position, .* did you mean height"),
         ({"length": 4}, "length must be at most 3, got 4"),
         ({"raw": None}, "Depth must have raw"),
+        ({"slow_skalar": property(lambda self: None)}, "slow_skalar is not read; .* slow_scalar"),
     ],
 )
 def test_class_of_a_sensor_that_is_wrong_is_refused_by_its_member(change, message):
