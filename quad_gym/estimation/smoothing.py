@@ -7,7 +7,7 @@ a prediction from x, P to x-, P- with transition Jacobian Phi,
     G = P Phi^T P-^-1,  x_s <- x + G (x_s - x-),  P_s <- P + G (P_s - P-) G^T,
 
 with the state (r, v, e, b_a, b_g) and the slow errors of sensors. Phi is the analytic Jacobian of
-the EKF (`kernels/filter/ekf.py`) for both filters: sigma points of the UKF are so close that their
+the EKF (`filter/predict.py`) for both filters: sigma points of the UKF are so close that their
 differences equal it, and the second order that the UKF adds to P- counts as process noise. Attitude
 errors are the error Euler angles of the report and compose by multiplication, R_BI = R(e) R_hat;
 the covariance is transformed with each change of R_hat, as in the filter (`error_state.py`).
