@@ -38,11 +38,11 @@ $(VENV)/.writer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,render,docs]"
 	touch $@
 
-demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as the control: two to three minutes
+demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as the control: about two minutes
 	@echo "1. LookAround: the only markers are on one wall, and there is no GNSS. Three controllers"
 	@echo "   are evaluated on the true state and on the filter's estimate: PD control, a policy"
 	@echo "   trained on the true state, and one trained on the estimate with its standard deviation."
-	@$(BIN)/quad-gym evaluate look_around --policy pd pretrained:truth pretrained --episodes 100 \
+	@$(BIN)/quad-gym evaluate look_around --policy pd pretrained:truth pretrained --episodes 60 \
 		--video webp --overwrite --output results/demo/look_around
 	@echo
 	@echo "2. The control experiment: on the circle, good sensors determine the state, so training on the"
@@ -50,7 +50,7 @@ demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as t
 	@echo "   so PD control with tuned gains is expected to be better than both:"
 	@$(BIN)/quad-gym compare circle --engine compiled --train-on truth estimate --seeds 3 \
 		--steps 250000 --n-envs 128 --set n_steps=16 batch_size=64 n_epochs=2 --evaluations 2 \
-		--episodes 50 --jobs 2 --output results/demo/control
+		--episodes 30 --jobs 2 --output results/demo/control
 	@echo
 	@echo "Open:"
 	@echo "  results/demo/look_around/video.webp   one episode; the policy on the right looks at the markers"
