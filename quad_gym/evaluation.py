@@ -1,6 +1,7 @@
 """Evaluation of a policy: one episode in each flight, with results for each episode."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
@@ -100,17 +101,12 @@ def roll_out(
     crashed, flying = np.zeros(count, bool), np.ones(count, bool)
     ending = np.full(count, "none", object)
 
-    observation, _ = env.reset(seed=seed)
-    state, starts = None, np.ones(count, bool)
+    steps = steps_of(policy, env, seed)
+    next(steps)
     if watch is not None:
         watch(0, quads.flights.batch, flying)
-    for step in range(1, limit + 1):
-        action, state = policy.predict(
-            observation, state=state, episode_start=starts, deterministic=True
-        )
-        observation, reward, terminated, truncated, info = env.step(action)
+    for step, (reward, terminated, truncated, info) in enumerate(islice(steps, limit), 1):
         info = _info_of_step(info)
-        starts = np.zeros(count, bool)
         returns[flying] += reward[flying]
         errors[flying] += info["position_error"][flying]
         estimation[flying] += info["estimation_error"][flying]
@@ -135,6 +131,26 @@ def roll_out(
     late_error = np.where(lost | (lengths == limit), late / (limit - half), np.nan)
     estimation /= lengths
     return Episodes(returns, lengths, mean_error, late_error, estimation, crashed, gates, ending)
+
+
+def steps_of(
+    policy: Policy, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int
+) -> Iterator[tuple[Any, ...]]:
+    """Reset an environment, and step it for as long as asked; the policy acts deterministically.
+
+    Yields:
+        Nothing, (), after the reset; rewards, terminated, truncated and `info` after each step.
+    """
+    observation, _ = env.reset(seed=seed)
+    yield ()
+    state, starts = None, np.ones(env.num_envs, bool)
+    while True:
+        action, state = policy.predict(
+            observation, state=state, episode_start=starts, deterministic=True
+        )
+        observation, *results = env.step(action)
+        starts = np.zeros(env.num_envs, bool)
+        yield tuple(results)
 
 
 def _info_of_step(info: dict[str, Any]) -> dict[str, Any]:

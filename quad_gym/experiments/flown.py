@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, Protocol
 
 import gymnasium
@@ -13,7 +14,7 @@ from baselines.policies import load_policy
 from quad_gym import Flight, FlightRecorder
 from quad_gym.analysis.recording import Tracer
 from quad_gym.envs.effects import with_effect
-from quad_gym.evaluation import Episodes, Policy, roll_out
+from quad_gym.evaluation import Episodes, Policy, roll_out, steps_of
 
 Floats = NDArray[np.float64]
 
@@ -100,14 +101,6 @@ def flight_of_episode(
     diverges could end elsewhere.
     """
     recorder = FlightRecorder(env.unwrapped.flights.batch, episode, about=dict(about))
-    observation, _ = env.reset(seed=seed)
-    recorder.keep()
-    state, starts = None, np.ones(env.num_envs, bool)
-    for _ in range(steps):
-        action, state = policy.predict(
-            observation, state=state, episode_start=starts, deterministic=True
-        )
-        observation, *_ = env.step(action)
-        starts = np.zeros(env.num_envs, bool)
+    for _ in islice(steps_of(policy, env, seed), steps + 1):  # the first one is the start
         recorder.keep()
     return recorder.flight
