@@ -55,7 +55,7 @@ def register_task(
     check.choice("base", base, tuple(IDS))
     if env_id in IDS:
         raise ValueError(f"env_id must be a new one, got {env_id!r}")
-    kwargs = {"base": IDS[base], "task": task, **keywords}
+    kwargs = {"base": (IDS[base], task), **keywords}
     register(env_id, **_ENTRY_POINTS, kwargs=kwargs)  # type: ignore[arg-type]
 
 

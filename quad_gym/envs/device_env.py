@@ -15,7 +15,7 @@ from quad_gym.device.flights import Launcher
 from quad_gym.device.launching import CudaLauncher
 from quad_gym.device.plan import DevicePlan
 from quad_gym.device.tasks import flights_on
-from quad_gym.envs.flights import named_options
+from quad_gym.envs.flights import Base, named_options
 from quad_gym.envs.keywords import VectorKeywords, shows
 from quad_gym.envs.torch_env import QuadTorchVecEnv, checked_device
 from quad_gym.envs.vector import seeds_of
@@ -56,7 +56,7 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
         num_envs: int = 1,
         *,
         device: str | torch.device = "cuda",
-        base: str | None = None,
+        base: "Base | None" = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         launcher: Callable[[DevicePlan], Launcher] | None = None,
         **keywords: Unpack[VectorKeywords],

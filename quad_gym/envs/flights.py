@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,16 +62,23 @@ SLOWEST = 1.0  #: least control rate [Hz]: smaller ones are periods
 MAX_STEPS = 10**9  #: longest time limit in steps; a duration of 0 has none
 
 
-def kind_and_task(
-    task: "Task | type[Task] | str | None", base: str | None
-) -> "tuple[str, Task | type[Task] | str | None]":
-    """Return the kind of task that is flown, and the user-defined task laid over it, if any."""
+Own: TypeAlias = "Task | type[Task] | str"
+"""A user-defined task: an instance, its class, or "module:name" of either."""
+Base: TypeAlias = "str | tuple[str, Own]"
+"""Kind of task, or, for an id of `register_task`, that kind and the task laid over it."""
+
+
+def kind_and_tasks(task: "Own | None", base: "Base | None") -> "tuple[str, tuple[Own, ...]]":
+    """Return the kind of task that is flown, and the tasks laid over it, the last one on top."""
     kinds = (*TASK_DEFAULTS, *BENCHMARKS)
+    registered: tuple[Own, ...] = ()
+    if isinstance(base, tuple | list) and len(base) == 2:
+        base, registered = base[0], (base[1],)
     kind = "circle" if base is None else check.choice("base", base, kinds)
     if not isinstance(task, str) or ":" in task:
-        return kind, task
+        return kind, registered if task is None else (*registered, task)
     if base is None and task in kinds:
-        return task, None
+        return task, ()
     if task in kinds:
         raise ValueError(
             f'task must be a quad_gym.Task, or its "module:name", where an id or base names the '
@@ -88,20 +95,20 @@ class Flights:
 
     def __init__(
         self,
-        task: "Task | type[Task] | str | None",
+        task: "Own | None",
         count: int,
         autoreset: Autoreset,
         *,
-        base: str | None = None,
+        base: "Base | None" = None,
         **keywords: Any,
     ) -> None:
         check.whole("num_envs", count, most=MAX_FLIGHTS)
-        name, own_task = kind_and_task(task, base)
+        name, tasks = kind_and_tasks(task, base)
         self.name = name
         defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
-        require_own_task(given, name, defaults.kind, own_reward=bool(own) and own_task is None)
+        require_own_task(given, name, defaults.kind, own_reward=bool(own))
         self.task: TaskParams = defaults.replace(**given)
         if "pad" in given and not self.task.may_start_on_ground:
             raise ValueError(
@@ -112,8 +119,9 @@ class Flights:
             self.task = self.task.replace(duration=longest)
         asked = frozenset(keywords)
         keywords = {**DEFAULTS, **own, **keywords}
-        if own_task is not None:
-            keywords["task"] = own_task
+        if "task" in own:
+            tasks = (own["task"], *tasks)
+        keywords["task"] = tasks
         if "faults" in own and keywords["faults"] is own["faults"] and runs_no_sensor(keywords):
             keywords["faults"] = None  # the task's own, which would have no effect
         steps = keywords.pop("max_episode_steps", None)
@@ -140,7 +148,7 @@ class Flights:
         self.layout, self.reward_terms = keywords["layout"], keywords["reward_terms"]
         self.control_rate = check.positive("control_rate", keywords["control_rate"], least=SLOWEST)
         check_limit(self.task, self.control_rate, "control_rate")
-        raw, own_task = self.observation == "measurements", keywords.get("task")
+        raw, tasks = self.observation == "measurements", keywords["task"]
         flown = {name: value for name, value in keywords.items() if name not in _NOT_OF_BATCH}
         flown["sensors"] = _suite(keywords, "camera" in asked)
         c = FlightConfiguration(
@@ -154,7 +162,7 @@ class Flights:
             autoreset=autoreset,
         )
         drawn = c.randomization.names
-        if c.world.ground is None and own_task is None and "start_position_I" not in drawn:
+        if c.world.ground is None and not tasks and "start_position_I" not in drawn:
             check_pad(self.task)  # a user-defined task may set where vehicles start
         _require_sensors(c.possible_faults, keywords)
         self.table: tuple[ObservationField, ...] = observation_layout(
@@ -166,12 +174,12 @@ class Flights:
             drawn=(drawn if drawn or c.world != WorldParams() else None) if c.privileged else None,
         )
         c = replace(c, bounds=layout_bounds(self.table))
-        if own_task is None:
+        if not tasks:
             self.batch = FlightBatch(c)  # type: ignore[arg-type]
         else:
             from quad_gym.envs.own_task import batch_with_task
 
-            self.batch, self.table = batch_with_task(own_task, c, self.table)
+            self.batch, self.table = batch_with_task(tasks, c, self.table)
         self.space = observation_space(self.table)
         self.policy_size = policy_size(self.table) if c.privileged else None
 

@@ -1,5 +1,6 @@
 """From the keyword `task` to flights with a user-defined task."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -8,19 +9,39 @@ import numpy as np
 from quad_gym.envs.spaces import PRIVILEGED_NAMES, ObservationField, policy_size
 from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.tasks.batch import TaskBatch
+from quad_gym.tasks.laid import LaidTask
 from quad_gym.tasks.observing import Part
-from quad_gym.tasks.task import ObservationSpec, resolve_task
+from quad_gym.tasks.task import ObservationSpec, Task, resolve_task
 
 Table = tuple[ObservationField, ...]
 
 
-def batch_with_task(given: Any, c: FlightConfiguration, table: Table) -> tuple[TaskBatch, Table]:
-    """Make the flights with a user-defined task; return them, and their observation's table.
+def laid_over(tasks: Sequence[Any]) -> Task:
+    """Make one task of several, of which each is laid over the one before it.
 
+    A task that derives from the class of the one before it takes its place.
+    """
+    found = resolve_task(tasks[0])
+    for given in tasks[1:]:
+        over = resolve_task(given)
+        base = type(found.over if isinstance(found, LaidTask) else found)
+        if base is not Task and isinstance(over, base):
+            found = LaidTask(over, found.base) if isinstance(found, LaidTask) else over
+        else:
+            found = LaidTask(over, found)
+    return found
+
+
+def batch_with_task(
+    given: Sequence[Any], c: FlightConfiguration, table: Table
+) -> tuple[TaskBatch, Table]:
+    """Make the flights with user-defined tasks; return them, and their observation's table.
+
+    `given` are tasks, each of which is laid over the one before it.
     The parts that `observe` returns are found by calling it once, with a flight made for the
     purpose. Parts with names of built-in parts are refused.
     """
-    task = resolve_task(given)
+    task = laid_over(given)
     task._require(c.sensors, c.world)
     split = policy_size(table)
     if not task.has("observe"):

@@ -7,7 +7,7 @@ import numpy as np
 
 from quad_gym.batch.seeding import stream_key
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
-from quad_gym.envs.flights import Flights, checked_actions
+from quad_gym.envs.flights import Base, Flights, checked_actions
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
@@ -135,10 +135,13 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     center of its distribution and divided by half of its range (normal: by its standard deviation).
 
     Args:
-        task: Your task, which overrides the id's task (in place of the class of `LookAround`,
-            `StaleRace` or `OutageDash`): a `quad_gym.Task`, its class, or "module:name" of either.
-            Without an id, also the name of a kind of task, such as "hover".
-        base: Kind of task under your own; `gymnasium.make` sets it from the id. None: the circle.
+        task: Your task: a `quad_gym.Task`, its class, or "module:name" of either. It is laid over
+            the id's task (also over the class of `LookAround`, `StaleRace` or `OutageDash`, and
+            over a task of `register_task`), which keeps what yours does not override. A class
+            derived from the id's takes its place. Without an id, also the name of a kind of task,
+            such as "hover".
+        base: Kind of task under your own, or a pair of it and a task; `gymnasium.make` sets it from
+            the id. None: the circle.
         observation: "estimate", "truth", "noisy" (truth plus independent noise, as large as the
             errors of the converged filter), or "measurements".
         action: "ctbr", "motor", "wrench", "attitude" or "velocity"; by default "velocity" on
@@ -204,7 +207,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         self,
         task: "Task | type[Task] | str | None" = None,
         *,
-        base: str | None = None,
+        base: "Base | None" = None,
         render_mode: str | None = None,
         **keywords: Unpack[EnvKeywords],
     ) -> None:

@@ -5,6 +5,7 @@ from typing import Any, Unpack
 import torch
 from gymnasium.vector import AutoresetMode
 
+from quad_gym.envs.flights import Base
 from quad_gym.envs.keywords import VectorKeywords, shows
 from quad_gym.envs.vector import QuadVectorEnv
 
@@ -35,7 +36,7 @@ class QuadTorchVecEnv(QuadVectorEnv):
         num_envs: int = 1,
         *,
         device: str | torch.device = "cpu",
-        base: str | None = None,
+        base: "Base | None" = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **keywords: Unpack[VectorKeywords],
     ) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.seeding import stream_keys
 from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults, start_info
-from quad_gym.envs.flights import Flights, checked_actions, named_options
+from quad_gym.envs.flights import Base, Flights, checked_actions, named_options
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
@@ -56,7 +56,7 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         num_envs: int = 1,
         task: "Task | type[Task] | str | None" = None,
         *,
-        base: str | None = None,
+        base: "Base | None" = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         render_mode: str | None = None,

@@ -3,7 +3,7 @@
 import difflib
 import warnings
 from collections.abc import Callable, Collection, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,9 +39,9 @@ class ObservationSpec(NamedTuple):
 class Task:
     """Your own reward, endings, observation and reset of an environment.
 
-    Methods that you do not override keep the behavior of the environment's built-in task. Each
-    method is called once per control step for all flights, with a `View` whose arrays have one row
-    per flight. `gymnasium.make(id, task=Mine())`, `make_vec` and `make_sb3_vec_env` produce bitwise
+    Methods that you do not override keep the behavior of the environment's task, which may be a
+    class such as `LookAround`. Each method is called once per control step for all flights, with a
+    `View` whose arrays have one row per flight. `gymnasium.make(id, task=Mine())`, `make_vec` and `make_sb3_vec_env` produce bitwise
     identical flights, provided that the methods compute each row independently of the others.
 
     | method | returns |
@@ -86,20 +86,23 @@ class Task:
                     f"{cls.__name__}.{name} is not called; did you mean {near[0]}?", stacklevel=2
                 )
 
-    @staticmethod
+    @classmethod
     def of(
+        cls,
         *,
         state: Mapping[str, ArrayLike] | None = None,
         observes: Mapping[str, ObservationSpec] | None = None,
-        replaces_observation: bool = False,
-        keeps: Collection[str] = (),
-        privileged: bool = False,
+        replaces_observation: bool | None = None,
+        keeps: Collection[str] | None = None,
+        privileged: bool | None = None,
         **methods: Callable[..., Any],
-    ) -> "Task":
+    ) -> Self:
         """Make a task of plain functions, with the arguments of the methods: `Task.of(reward=f)`.
 
         Other arguments are the attributes of the class. `methods` are `reset`, `update`, `reward`,
-        `terminated`, `truncated` and `observe`.
+        `terminated`, `truncated` and `observe`. Called on a subclass, as `LookAround.of(reward=f)`,
+        it makes an instance of that class, which keeps what is not given; variables of `state` are
+        added to those of the class, and so are parts of `observes`, unless `observe` is given.
 
         Raises:
             TypeError: If a name is not a method of `Task`, or a value is not callable.
@@ -109,10 +112,18 @@ class Task:
                 raise TypeError(f"a task has no {name}; it has {', '.join(METHODS)}")
             if not callable(function):
                 raise TypeError(f"{name} must be a function, got {function!r}")
-        task = Task()
-        task.state, task.observes = dict(state or {}), dict(observes or {})
-        task.replaces_observation, task.privileged = replaces_observation, privileged
-        task.keeps = tuple(keeps)
+        task = cls()
+        if state is not None:
+            task.state = {**task.state, **state}
+        if observes is not None or "observe" in methods:
+            kept = {} if "observe" in methods else task.observes
+            task.observes = {**kept, **(observes or {})}
+        if replaces_observation is not None:
+            task.replaces_observation = replaces_observation
+        if keeps is not None:
+            task.keeps = tuple(keeps)
+        if privileged is not None:
+            task.privileged = privileged
         vars(task).update(methods)
         return task
 
@@ -189,4 +200,4 @@ def resolve_task(given: Any) -> Task:
 
 def label(task: Task) -> str:
     """Name of a task in messages."""
-    return type(task).__name__
+    return str(getattr(task, "_label", type(task).__name__))
