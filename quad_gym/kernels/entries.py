@@ -162,7 +162,10 @@ limit_features = Entry("single:limit_features", _FLIGHT, _PARAMS, bool, bool, in
 nearest_obstacles = Entry("single:nearest_obstacles", _MATRIX, _CUBE, _SETTINGS, _VECTOR, _MATRIX)
 hide_points = Entry("single:hide_points", _MATRIX, _CUBE, _CUBE, _SETTINGS, _MASK)
 
-FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
+FILTER_STAGES = (
+    *(Stage.UPDATE, Stage.PREDICT, Stage.GATE, Stage.RECOVER),
+    *(Stage[sensor.name] for sensor in Sensor),
+)
 """Stages that a filter runs, as far as it needs them."""
 FILTER_ENTRIES = (start_filter.name, run_tape.name, take_inputs.name)
 """Names of the entries that a filter calls, the slowest to compile first."""

@@ -76,6 +76,8 @@ class Stage(IntEnum):
     OBSERVE = auto()
     SHOW = auto()
     # called by other stages
+    GATE = auto()
+    RECOVER = auto()
     FEEL_GROUND = auto()
     DISTURB_IMU = auto()
     SATURATE_IMU = auto()
@@ -140,6 +142,12 @@ _grounded, _contacts, _drawn = _with("grounded"), _with("contacts"), _with("rand
 _MONITORED = FilterForm.GATE | FilterForm.INNOVATIONS
 
 
+def _formed(form: FilterForm, *names: str) -> Callable[[Any], bool]:
+    """Make a test of settings: the built-in filter has one of these forms; the names are set."""
+    needed = _built_in(*names)
+    return lambda settings: needed(settings) and bool(int(settings["form"]) & form)
+
+
 def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
     return _filter_and(lambda s: s["sensor_blocks"][sensor])
 
@@ -159,6 +167,9 @@ def _sensor_source(sensor: Sensor) -> Kernel:
 SOURCES = (
     _stage("filter.update:update_with_slow", _built_in("slow_states"), "filter", "slow"),
     _stage("filter.update:update", _built_in(), "filter"),
+    _stage("filter.recovery:recover_with_slow", _formed(FilterForm.GATE, "slow_states"), "watch"),
+    _stage("filter.recovery:recover", _formed(FilterForm.GATE), "watch"),
+    _stage("filter.gate:gate", _formed(_MONITORED), "watch"),
     _stage("filter.predict:predict_with_slow", _built_in("slow_states"), "filter", "slow"),
     _stage("filter.predict:predict", _built_in(), "filter"),
     _stage("filter.delayed:late_update_with_slow", _built_in(*_REWINDS, "slow_states"), "late"),

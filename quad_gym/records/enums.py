@@ -140,9 +140,8 @@ class Act(IntEnum):
     BEGIN = 0  #: begin an episode: draw constant errors, set the clock
     SAMPLE = 1  #: measure when due, queue delayed measurements, and deliver the ones that arrive
     EXPECT = 2  #: predict the measurement: its value at the estimate, its noise and its columns
-    GATE = 3  #: store the innovation, and mask it if it exceeds the gate
-    RESET = 4  #: reset states to the sensor after it was refused for too long
-    ALIGN = 5  #: initialize the heading, if the sensor is the `heading_sensor` of the settings
+    RESET = 3  #: reset states to the sensor after it was refused for too long
+    ALIGN = 4  #: initialize the heading, if the sensor is the `heading_sensor` of the settings
 
 
 class TaskKind(IntEnum):

@@ -17,8 +17,8 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.measurements import call_measured
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.measurements import rows_of, rows_of_blocks
 from quad_gym.kernels.filter.monitoring import follow_ratio, forget_corrections
 from quad_gym.kernels.filter.recovery import (
     OUTLIER,
@@ -36,12 +36,17 @@ from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, ze
 from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
+    FIRST_BLOCK,
+    FIRST_GROUP,
+    GROUP_COUNT,
+    GROUP_FREEDOMS,
+    SENSORS,
     SEVERAL,
-    Act,
     FilterForm,
     GateDecision,
 )
 
+_FREEDOMS = tuple(map(float, GROUP_FREEDOMS))
 _GAIN = 0.05  #: change of a factor on the noise by one measurement
 _ADAPTED = 1.3  #: mean NIS over the degrees of freedom above which the noise is adapted
 _SERIES = 3.0  #: rejections in a row beyond which further ones do not adapt the noise
@@ -228,6 +233,23 @@ def gate_blocks(flight, p, work, settings, k, first, count, group, limit, number
 
 
 @kernel
+def _gate_sensors(flight, p, work, settings):
+    """Decide on the blocks of all groups with a measurement in any lane."""
+    k = 0
+    for sensor in range(SENSORS):
+        if rows_of(flight, settings, sensor) > 0:
+            for i in range(GROUP_COUNT[sensor]):
+                first, group = FIRST_BLOCK[sensor] + i, FIRST_GROUP[sensor] + i
+                # where a sensor has several groups, each is a block
+                count = settings.sensor_blocks[sensor] if GROUP_COUNT[sensor] == 1 else 1
+                rows = rows_of_blocks(flight, first, count)
+                if rows > 0:
+                    limit, numbers = p.gate[group], _FREEDOMS[group]
+                    gate_blocks(flight, p, work, settings, k, first, count, group, limit, numbers)
+                k += rows
+
+
+@kernel
 def _adapt_noise(flight, group, first, scatter, freedoms, limit):
     """Match the factor on a group's noise to the scatter of its innovations, where `first`.
 
@@ -247,19 +269,19 @@ MONITORED = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 """Bits of a `FilterForm` with which innovations are stored, and the filter is monitored."""
 
 
-@kernel
-def gate_innovations(flight, p, work, settings, stages, mask, again):
+@stage
+def gate_stage(flight, world, model, settings, work, stages, flag):
     """Store the innovations of the present measurements and mask those beyond the gate.
 
-    Where measurements are processed in steps, the first step decides for all: `again` are the lanes
-    in a later step. On return, work.left_out counts the masked numbers of each lane.
+    Works in the lanes work.taking. Where measurements are processed in steps, the first step
+    decides for all: work.again are the lanes in a later step. On return, work.left_out counts the
+    masked numbers of each lane.
     """
-    zero = zero_like(p.sigma_beta)
-    work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
-    work.judged_nis, work.judged_freedoms, work.left_out = zero, zero, zero
-    call_measured(flight, p, work, settings, stages, Act.GATE)
-    first = mask & (work.measured > 0.0) & logical_not(again)
-    follow_ratio(flight, p, work.judged_nis, work.judged_freedoms, first)
+    zero = zero_like(model.sigma_beta)
+    work.judged_nis, work.judged_freedoms = zero, zero
+    _gate_sensors(flight, model, work, settings)
+    first = (work.taking > 0.0) & (work.measured > 0.0) & logical_not(work.again > 0.0)
+    follow_ratio(flight, model, work.judged_nis, work.judged_freedoms, first)
 
 
 @kernel

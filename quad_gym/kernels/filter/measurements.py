@@ -51,17 +51,23 @@ def call_measured(flight, p, work, settings, stages, act):
     """Call the sensors with a measurement in any lane, each with its first row."""
     k = 0
     for sensor in range(SENSORS):
-        rows = _rows_of(flight, settings, sensor)
+        rows = rows_of(flight, settings, sensor)
         if rows > 0:
             call_sensor(flight, p, p, settings, work, stages, sensor, act, k)
             k += rows
 
 
 @kernel
-def _rows_of(flight, settings, sensor):
+def rows_of(flight, settings, sensor):
     """Count the rows of a sensor in the stacked measurement."""
-    rows, first = 0, FIRST_BLOCK[sensor]
-    for block in range(first, first + settings.sensor_blocks[sensor]):
+    return rows_of_blocks(flight, FIRST_BLOCK[sensor], settings.sensor_blocks[sensor])
+
+
+@kernel
+def rows_of_blocks(flight, first, count):
+    """Count the rows of blocks from `first` on in the stacked measurement."""
+    rows = 0
+    for block in range(first, first + count):
         if any_of(flight.block_valid[block] > 0.0):
             rows += 3
     return rows

@@ -36,7 +36,7 @@ from quad_gym.kernels.filter.monitoring import (
     largest_square,
     shifted,
 )
-from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stationary
+from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stages_of, stationary
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import dot, load33, outer
@@ -261,8 +261,9 @@ def _choose(flight, p, work, settings, mask):
 
 
 @kernel
-def reset_states(flight, p, work, settings, mask, slow, stages):
-    """Reset states to sensors that were refused for too long, in the lanes `mask`."""
+def reset_states(flight, p, work, settings, stages, slow):
+    """Reset states to sensors that were refused for too long, in the lanes work.taking."""
+    mask = work.taking > 0.0
     jumped = mask & (shifted(flight, 0, BA, SHIFTED) | shifted(flight, 3, BG, SHIFTED))
     alarmed, moved, states = _choose(flight, p, work, settings, mask), no_lane(flight.tick), 15
     if slow is not None:
@@ -290,3 +291,6 @@ def reset_states(flight, p, work, settings, mask, slow, stages):
         row = flight.rejected_in_row[group]
         flight.rejected_in_row[group] = select(work.reset[group] > 0.0, 0.0, row)
     forget_corrections(flight, alarmed)
+
+
+recover_stage, recover_with_slow_stage = stages_of("recover", reset_states)

@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
-from quad_gym.kernels.filter.gate import MONITORED, gate_innovations
+from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     call_measured,
     count_failure,
@@ -20,7 +20,6 @@ from quad_gym.kernels.filter.measurements import (
     mark_failed,
 )
 from quad_gym.kernels.filter.monitoring import flag_shifted, follow_corrections
-from quad_gym.kernels.filter.recovery import reset_states
 from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.filter.slow import load_slow, shift_slow, stages_of, turn_iron
 from quad_gym.kernels.maths.elementary import is_finite
@@ -288,7 +287,10 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     call_measured(flight, p, work, settings, stages, Act.EXPECT)
     _innovate(work, n, c)
     if (form & MONITORED) != 0:
-        gate_innovations(flight, p, work, settings, stages, mask, again)
+        zero = zero_like(c)
+        work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
+        work.left_out = zero
+        call_stage(stages, Stage.GATE, flight, p, p, settings, work, 0)
         measured = measured - work.left_out
     _sum_noise(p, work, n, factor)
     nis, definite = _whiten(work, n, columns)
@@ -312,7 +314,8 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
         mark_failed(flight, failed)
     updated = mask & (work.measured > 0.0)
     if (form & FilterForm.GATE.value) != 0:
-        reset_states(flight, p, work, settings, updated & logical_not(failed), slow, stages)
+        work.taking = select(updated & logical_not(failed), 1.0, 0.0)
+        call_stage(stages, Stage.RECOVER, flight, p, p, settings, work, 0)
     elif (form & MONITORED) != 0:
         flag_shifted(flight, p, updated)
 
