@@ -221,8 +221,8 @@ QUANTITIES = {
     "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "the filter's estimate of `gnss_drift`", filtered=True, builtin=True),
     "filter_status": Quantity("filter_status", (), "bits", "-", "numerical failures of the filter so far, see `FilterStatus`", int),
     "filter_diverged": Quantity("diverged", (), "-", "-", "the filter flags itself as diverged: the covariance does not explain the last innovations (filters with an innovation gate, or with `faults`, `truncate_when_diverged` or `innovations`)", bool),
-    "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update", filtered=True, builtin=True),
-    "nis_dimension": Quantity("nis_dimension", (), "-", "-", "measurements in the last update", int, filtered=True),
+    "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update; NaN: it was done in steps", filtered=True, builtin=True),
+    "nis_dimension": Quantity("nis_dimension", (), "-", "-", "degrees of freedom of the measurements in the last update: a direction has two", int, filtered=True),
     # the state that the controller observes: the truth, the estimate, or the truth with noise
     "observed_position": Quantity("r_seen", (3,), "m", "I", "position from the controller's source"),
     "observed_velocity": Quantity("v_seen", (3,), "m/s", "I", "velocity from the controller's source"),

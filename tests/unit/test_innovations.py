@@ -7,6 +7,7 @@ from scipy import stats
 import quad_gym
 from quad_gym.estimation import UnscentedKalmanFilter
 from quad_gym.packing.flight import params_record
+from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
@@ -19,6 +20,7 @@ from tests.field_flights import fly, measured_now, state_errors, steps
 from tests.filter_states import set_like
 from tests.lane_filter import EIGHT, STATE, LaneFilter
 from tests.reference_ukf import PlainUKF
+from tests.unit.alarms import ALARM
 
 LAB = quad_gym.sensor_suite("lab")
 CONSISTENT = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at="predicted"))
@@ -55,19 +57,24 @@ class InnovatingUKF(PlainUKF):
 
     def update(self, *measurements):
         super().update(*measurements)
-        z, S, self.nis = self.innovation, self.innovation_covariance, []
+        z, S, self.nis, parts = self.innovation, self.innovation_covariance, [], []
         names = ["position", "baseline"] + ["feature"] * (len(z) // 3 - 2)
         for k, name in enumerate(names):
-            nu, block = z[3 * k : 3 * k + 3], S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+            part = np.eye(len(z))[3 * k : 3 * k + 3]
             if name != "position":  # across the predicted direction
                 u = self.prediction[3 * k : 3 * k + 3]
-                across = np.linalg.svd(u[np.newaxis])[2][1:]
-                nu, block = across @ nu, across @ block @ across.T
-            self.nis.append(nu @ np.linalg.solve(block, nu))
+                part = np.linalg.svd(u[np.newaxis])[2][1:] @ part
+            self.nis.append(normalized_square(part, z, S))
+            parts.append(part)
+        self.joint = normalized_square(np.vstack(parts), z, S), len(np.vstack(parts))
+
+
+def normalized_square(part, nu, S):
+    return part @ nu @ np.linalg.solve(part @ S @ part.T, part @ nu)
 
 
 @pytest.mark.parametrize("across", ["measured", "predicted", "pinhole"])
-def test_nis_of_each_block_agrees_with_a_plain_filter(across):
+def test_nis_of_each_block_and_of_all_agrees_with_a_plain_filter(across):
     sensors = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at=across))
     ours, plain = UnscentedKalmanFilter(sensors), InnovatingUKF(sensors)
     for ukf in (ours, plain):
@@ -79,6 +86,9 @@ def test_nis_of_each_block_agrees_with_a_plain_filter(across):
             ukf.update(*fix)
         blocks = [POSITION_BLOCK, BASELINE_BLOCK, *(FEATURE_BLOCKS + seen)]
         np.testing.assert_allclose(ours.block_nis[blocks], plain.nis, rtol=1e-4, atol=1e-4)
+        assert ours.nis[1] == plain.joint[1]
+        if k >= 30 and across != "measured":  # else components along directions are correlated
+            np.testing.assert_allclose(ours.nis[0], plain.joint[0], rtol=0.15)
         assert (ours.gate_decisions[blocks] == GateDecision.ACCEPTED).all()
         for ukf in (ours, plain):
             ukf.predict(RECORDING.gyro[k], RECORDING.accel[k])
@@ -206,3 +216,25 @@ def test_one_wrong_feature_stays_out_while_the_others_agree():
     assert (more[seen, FEATURE_BLOCKS + 1] > 10).all()
     assert more[:, POSITION_BLOCK].max() <= 2
     assert (np.linalg.norm(state_errors(batch)[:, FIX], axis=1) < 0.05).all()
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+@pytest.mark.parametrize("name", sorted(set(ALL_SUITES) - {"lab", "stale"}))
+def test_mean_nis_of_an_update_is_its_dimension_with_each_suite(name, kind):
+    """`lab` is overconfident, and `stale` ignores its delays.
+
+    Constant errors of a flight, which a filter models as noise, change the mean by a few percent.
+    """
+    suite = quad_gym.sensor_suite(name)
+    batch = fly(suite.replace(estimator=suite.estimator.replace(kind=kind)), 48, task="circle")
+    steps(batch, 0.5)
+    nis, dimension = np.zeros(48), np.zeros(48)
+    for _ in range(200):
+        batch.step()
+        whole = np.isfinite(batch.record("nis"))  # not processed in steps
+        nis += np.where(whole, batch.record("nis"), 0.0)
+        dimension += np.where(whole, batch.record("nis_dimension"), 0.0)
+    excess = (nis - dimension) / dimension.mean()
+    deviation = excess.std(ddof=1) / np.sqrt(len(excess))
+    assert abs(excess.mean()) < 0.05 + stats.t.isf(ALARM / 2, 47) * deviation
+    assert deviation < 0.03

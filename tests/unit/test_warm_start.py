@@ -139,7 +139,7 @@ def test_first_fix_is_a_measurement_unless_it_starts_the_filter():
     assert not fly(suite, 3).record("block_valid")[:, POSITION_BLOCK].any()
     warm = fly(suite, 3, filter_start="warm")
     assert warm.record("block_valid")[:, POSITION_BLOCK].all()
-    assert (warm.record("nis_dimension") == 9.0).all()
+    assert (warm.record("nis_dimension") == 8.0).all()
 
 
 def test_invalid_filter_start_and_warm_start_without_filter_are_refused():

@@ -134,7 +134,10 @@ class FilterEstimate:
 
     @property
     def nis(self) -> tuple[float, int]:
-        """Normalized innovation squared of the last update, and its number of measurements.
+        """Normalized innovation squared of the last update, and its degrees of freedom.
+
+        The suite's noise applies, and directions count across themselves, with two numbers. NaN:
+        the update was done in steps.
 
         With delayed measurements, the last update is the one with the latest time stamp.
         """

@@ -179,7 +179,8 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
         unsure = P_zz[0][0] + P_zz[1][1] > p.gate_uncertainty
     nis, change = _nis(P_zz, nu, numbers), nu - load3(flight.innovation[s])
     scatter = 0.5 * _nis(P_zz, change, numbers)
-    _store_innovation(flight, s, first, nu, P_suite, numbers, _nis(P_suite, nu, numbers))
+    suite_nis, used_nis = _nis(P_suite, nu, numbers), nis
+    _store_innovation(flight, s, first, nu, P_suite, numbers, suite_nis)
     beyond, rejected = none, none
     if gating:
         beyond = first & logical_not(unsure) & (nis > limit_of(flight, group, limit))
@@ -192,9 +193,13 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
         if any_of(weakened):
             share = select(weakened, maximum(nis / limit - 1.0, 0.0), 0.0)
             store_block(work.Rz, k, k, load_block(work.Rz, k, k) + share * whole)
+            used_nis = nis / (1.0 + share)
         out = valid & ((gate == GateDecision.REJECTED) | (gate == GateDecision.UNSURE))
         mask_block(work, settings, k, out)
         work.left_out = work.left_out + select(out, masked, 0.0)
+        used = valid & logical_not(out)
+        work.suite_nis = work.suite_nis + select(used, suite_nis, 0.0)
+        work.used_nis = work.used_nis + select(used, used_nis, 0.0)
     return first & logical_not(unsure), beyond, nis, scatter
 
 
@@ -279,6 +284,7 @@ def gate_stage(flight, world, model, settings, work, stages, flag):
     """
     zero = zero_like(model.sigma_beta)
     work.judged_nis, work.judged_freedoms = zero, zero
+    work.suite_nis, work.used_nis = zero, zero
     _gate_sensors(flight, model, work, settings)
     first = (work.taking > 0.0) & (work.measured > 0.0) & logical_not(work.again > 0.0)
     follow_ratio(flight, model, work.judged_nis, work.judged_freedoms, first)

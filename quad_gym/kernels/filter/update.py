@@ -12,6 +12,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
+from quad_gym.kernels.filter.freedoms import find_directions, nis_along
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     call_measured,
@@ -22,7 +23,7 @@ from quad_gym.kernels.filter.measurements import (
 from quad_gym.kernels.filter.monitoring import flag_shifted, follow_corrections
 from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.filter.slow import load_slow, shift_slow, stages_of, turn_iron
-from quad_gym.kernels.maths.elementary import is_finite
+from quad_gym.kernels.maths.elementary import is_finite, maximum
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
     add_to_diagonal,
@@ -293,6 +294,8 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
         call_stage(stages, Stage.GATE, flight, p, p, settings, work, 0)
         measured = measured - work.left_out
     _sum_noise(p, work, n, factor)
+    without = find_directions(flight, p, work, settings)
+    along = nis_along(p, work, n)
     nis, definite = _whiten(work, n, columns)
     total = _correct(flight, work, states, columns, slow)
     if (form & FilterForm.TURN.value) != 0:
@@ -306,8 +309,11 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     wanted = mask & (measured > 0.0)
     ok = wanted & definite & is_finite(total) & is_finite(nis)
     _keep(flight, p, work, form, columns, ok, slow)
+    nis = maximum(nis - along, 0.0)  # a difference of rounding errors where it is zero
+    if (form & FilterForm.GATE.value) != 0:
+        nis = select(work.used_nis > 0.0, nis * work.suite_nis / work.used_nis, nis)
     flight.nis = select(ok, nis, flight.nis)
-    flight.nis_dimension = select(ok, measured, flight.nis_dimension)
+    flight.nis_dimension = select(ok, measured - without, flight.nis_dimension)
     failed = wanted & logical_not(ok)
     count_failure(flight, failed)
     if (form & MONITORED) != 0 and any_of(failed):
