@@ -14,7 +14,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from baselines.normalization import Normalization
+
 FORMAT = "quad_gym policy 1"  #: identifier of the file format
+LARGEST = 2**28  #: largest size of a file, unpacked [bytes]; the included policies have 0.1 MB
+NORMALIZED_FORMAT = "quad_gym policy 2"  #: identifier of a file that has a normalization
 
 _ACTIVATIONS: dict[str, Any] = {
     "relu": lambda x: np.maximum(x, 0.0),
@@ -32,9 +36,10 @@ class MlpPolicy:
         biases: Biases of each layer, (outputs,).
         activations: Activation of each layer: "relu", "tanh", "elu" or "none".
         record: Training record: the plan and its results.
+        normalization: Normalization of observations before the first layer; None: none.
 
     Raises:
-        ValueError: If the shapes of the layers are inconsistent.
+        ValueError: If the shapes of the layers are inconsistent, or a weight is not finite.
     """
 
     def __init__(
@@ -43,8 +48,13 @@ class MlpPolicy:
         biases: Sequence[NDArray[np.float32]],
         activations: Sequence[str],
         record: Mapping[str, Any],
+        normalization: Normalization | None = None,
     ) -> None:
         shapes = [w.shape for w in weights]
+        if not shapes or any(len(shape) != 2 for shape in shapes):
+            raise ValueError(f"weights must be matrices, one per layer, got shapes {shapes}")
+        if not all(np.isfinite(values).all() for values in (*weights, *biases)):
+            raise ValueError("weights and biases must be finite: they contain NaN or infinity")
         chained = all(a[0] == b[1] for a, b in pairwise(shapes))
         fitting = all(b.shape == (w.shape[0],) for w, b in zip(weights, biases, strict=True))
         if not (chained and fitting and len(activations) == len(weights)):
@@ -54,6 +64,12 @@ class MlpPolicy:
             raise ValueError(f"activations must be among {', '.join(_ACTIVATIONS)}, got {unknown}")
         self.weights, self.biases = tuple(weights), tuple(biases)
         self.activations, self.record = tuple(activations), dict(record)
+        if normalization is not None and len(normalization.mean) != self.inputs:
+            raise ValueError(
+                f"normalization must have {self.inputs} numbers, as the observations of the "
+                f"policy, got {len(normalization.mean)}"
+            )
+        self.normalization = normalization
 
     @property
     def inputs(self) -> int:
@@ -71,6 +87,8 @@ class MlpPolicy:
         x = np.asarray(observation, np.float32)
         if x.shape[-1:] != (self.inputs,):
             raise ValueError(f"observation must be (..., {self.inputs}), got shape {x.shape}")
+        if self.normalization is not None:
+            x = self.normalization(x)
         for W, b, activation in zip(self.weights, self.biases, self.activations, strict=True):
             x = _ACTIVATIONS[activation](x @ W.T + b)
         return np.clip(x, -1.0, 1.0).astype(np.float32), None
@@ -79,7 +97,11 @@ class MlpPolicy:
         """Write the policy and its record to one file."""
         layers: dict[str, Any] = {f"W{i}": W for i, W in enumerate(self.weights)}
         layers |= {f"b{i}": b for i, b in enumerate(self.biases)}
-        about = {"format": FORMAT, "activations": self.activations, "record": self.record}
+        about: dict[str, Any] = {"format": FORMAT, "activations": self.activations}
+        about["record"] = self.record
+        if self.normalization is not None:
+            about |= {"format": NORMALIZED_FORMAT, "clip": self.normalization.clip}
+            layers |= {"mean": self.normalization.mean, "deviation": self.normalization.deviation}
         np.savez_compressed(file, about=np.array(json.dumps(about)), **layers)
 
     @classmethod
@@ -89,20 +111,69 @@ class MlpPolicy:
         if not file.exists():
             raise ValueError(f"there is no policy {file}")
         try:
-            with np.load(file, allow_pickle=False) as stored:
-                about: dict[str, Any] = json.loads(str(stored["about"]))
-                count = range(len(about["activations"]))
-                weights, biases = ([stored[f"{name}{i}"] for i in count] for name in "Wb")
-        except (zipfile.BadZipFile, OSError, EOFError, KeyError, ValueError, TypeError):
+            arrays, about = _contents(file)
+            count = range(len(about["activations"]))
+            weights, biases = ([arrays[f"{name}{i}"] for i in count] for name in "Wb")
+        except (
+            zipfile.BadZipFile,
+            OSError,
+            EOFError,
+            KeyError,
+            ValueError,
+            TypeError,
+            MemoryError,
+        ):
             raise ValueError(f"{file} is not a policy, or is damaged") from None
-        if about.get("format") != FORMAT:
+        if about.get("format") not in (FORMAT, NORMALIZED_FORMAT):
             raise ValueError(f"{file} must be a {FORMAT!r}, got {about.get('format')!r}")
-        return cls(weights, biases, about["activations"], about["record"])
+        try:
+            normalization = None
+            if about["format"] == NORMALIZED_FORMAT:
+                statistics = arrays["mean"], arrays["deviation"]
+                normalization = Normalization(*statistics, float(about["clip"]))
+            record = checked_record(about["record"])
+            return cls(weights, biases, about["activations"], record, normalization)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{file} is not a valid policy: {error}") from None
 
 
-def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
+def _contents(file: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Arrays of a file and its description; refuses a file that is larger than policies are."""
+    with zipfile.ZipFile(file) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+    if size > LARGEST:
+        raise ValueError(f"it has {size:,} bytes")
+    with np.load(file, allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    about = json.loads(str(arrays.pop("about")))
+    if not isinstance(about, dict):
+        raise TypeError("its description is not a table")
+    return arrays, about
+
+
+def checked_record(record: Any) -> dict[str, Any]:
+    """A training record, of which the tables that policies are loaded by are tables."""
+    if not isinstance(record, dict):
+        raise ValueError(f"its training record must be a table, got {record!r}")
+    plan = record.get("plan", {})
+    tables = {"plan": plan, "interface": record.get("interface", {})}
+    if isinstance(plan, dict):
+        tables["environment"] = plan.get("environment", {})
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise ValueError(f"{name} of its training record must be a table, got {table!r}")
+    seen = tables["interface"].get("observation", [])
+    if not (isinstance(seen, list | tuple) and all(isinstance(name, str) for name in seen)):
+        raise ValueError(f"observation of its training record must be names, got {seen!r}")
+    return record
+
+
+def mlp_of(
+    model: Any, record: Mapping[str, Any], normalization: Normalization | None = None
+) -> MlpPolicy:
     """Convert the deterministic actor of a Stable-Baselines3 model with an "MlpPolicy".
 
+    `normalization` has the statistics with which its observations were normalized, if they were.
     Raises a ValueError if the actor is not a multilayer perceptron.
     """
     from torch import nn
@@ -129,4 +200,4 @@ def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
             activations[-1] = names[type(module)]
         else:
             raise ValueError(f"model must consist of plain layers, got {type(module).__name__}")
-    return MlpPolicy(weights, biases, activations, record)
+    return MlpPolicy(weights, biases, activations, record, normalization)

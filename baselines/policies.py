@@ -11,7 +11,8 @@ from typing import Any
 import gymnasium
 
 from baselines.crazyflie_pid import SLOW, CrazyfliePID
-from baselines.mlp import MlpPolicy
+from baselines.mlp import MlpPolicy, checked_record
+from baselines.normalization import normalized, require_statistics
 from baselines.pd import REACH_OF_GAPS, PDPolicy
 from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
@@ -57,7 +58,7 @@ def interface_of(env: Any) -> dict[str, Any]:
     }
 
 
-def load_policy(name: str, env: Any) -> Policy:
+def load_policy(name: str, env: Any, normalization: Any = None) -> Policy:
     """Load a policy for an environment.
 
     Args:
@@ -69,15 +70,25 @@ def load_policy(name: str, env: Any) -> Policy:
             environment), "pretrained:truth" (the included one that was trained on the true state,
             for Circle and LookAround), or a file: `.npz` with plain arrays, or `.zip` written by
             Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
-        env: Environment of this package: single, vector or Stable-Baselines3.
+        env: Environment of this package: single, vector or Stable-Baselines3, without wrappers
+            that change observations.
+        normalization: Statistics with which observations were normalized while a policy in a file
+            was trained: a file or a wrapper, see `baselines.normalization.Normalization.of`;
+            "none": it was trained without.
 
     Raises:
-        ValueError: If the policy does not exist, or does not fit the environment.
+        ValueError: If the policy does not exist, does not fit the environment, or lies next to
+            statistics of `VecNormalize` that are not given.
         ImportError: If the file is a `.zip` and Stable-Baselines3 is not installed.
 
     Warns:
         UserWarning: If a `.npz` was trained on another task.
     """
+    of_file = not (name in _PD or name == _CRAZYFLIE or name.startswith("pd:") or is_included(name))
+    if normalization is not None and not of_file:
+        raise ValueError(
+            f"normalization must not be given for {name}, which does not observe normalized values"
+        )
     if name in _PD:
         return PDPolicy(env, **_PD[name])
     if name == _CRAZYFLIE:
@@ -94,13 +105,13 @@ def load_policy(name: str, env: Any) -> Policy:
             warnings.warn(
                 f"{file} was trained on {trained_on}, but flies {task_of(env)}", stacklevel=2
             )
-        return policy  # type: ignore[no-any-return]
+        return normalized(name, policy, normalization)  # type: ignore[no-any-return]
     if file.suffix != ".zip":
         raise ValueError(
             "policy must be pd, pd:lab, pd:FILE.json, pretrained, or a .npz or .zip file, "
             f"got {name!r}{check.did_you_mean(name, NAMES)}"
         )
-    return _stable_baselines_policy(file, env)
+    return _stable_baselines_policy(file, env, normalization)
 
 
 def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
@@ -160,7 +171,7 @@ def _flights_of(env: Any) -> Any:
     return flights
 
 
-def _stable_baselines_policy(file: Path, env: Any) -> Policy:
+def _stable_baselines_policy(file: Path, env: Any, normalization: Any) -> Policy:
     if not file.exists():
         raise ValueError(f"there is no policy {file}")
     try:
@@ -170,9 +181,10 @@ def _stable_baselines_policy(file: Path, env: Any) -> Policy:
         raise ValueError(f"{file} is not a policy of Stable-Baselines3, or is damaged") from None
     if module not in _ALGORITHM_OF_MODULE:
         raise ValueError(f"{file} contains a policy of an unknown algorithm ({module})")
+    require_statistics(file, normalization)
     record = file.parent / "training.json"
     if record.exists():
-        _require_agreement(file, json.loads(record.read_text(encoding="utf-8")), env)
+        _require_agreement(file, record_of(record), env)
     try:
         from baselines.models import algorithm_class
     except ImportError as error:
@@ -183,11 +195,35 @@ def _stable_baselines_policy(file: Path, env: Any) -> Policy:
         model = algorithm_class(_ALGORITHM_OF_MODULE[module]).load(file, device="cpu")
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
         raise ValueError(f"{file} cannot be loaded: {error}") from None
+    policy = normalized(str(file), model, normalization)
     space = getattr(env, "single_observation_space", env.observation_space)
-    if model.observation_space != space:
+    free = policy is not model and model.observation_space.shape == space.shape
+    if model.observation_space != space and not free:
+        if _is_unbounded(model.observation_space, space):
+            raise ValueError(
+                f"{file} expects observations without bounds, as a wrapper of the environment "
+                "makes them: give the statistics of NormalizeObservation as normalization"
+            )
         _require_size(file, gymnasium.spaces.flatdim(model.observation_space), env)
         raise ValueError(f"{file} expects observations {model.observation_space}, not {space}")
-    return model
+    return policy  # type: ignore[no-any-return]
+
+
+def record_of(file: Path) -> dict[str, Any]:
+    """Training record in a file, a ValueError if it is none."""
+    try:
+        return checked_record(json.loads(file.read_text(encoding="utf-8")))
+    except (UnicodeDecodeError, ValueError) as error:
+        raise ValueError(f"{file} is not a valid training record: {error}") from None
+
+
+def _is_unbounded(space: Any, bounded: Any) -> bool:
+    """Return True for a box of the shape of another one, but without its bounds."""
+    return (
+        isinstance(space, gymnasium.spaces.Box)
+        and space.shape == bounded.shape
+        and not space.is_bounded("both")
+    )
 
 
 def _require_size(file: Path, size: int, env: Any) -> None:
@@ -204,7 +240,7 @@ def _require_agreement(file: Path, record: Mapping[str, Any], env: Any) -> None:
     """Reject a policy that was trained with other actions or observations."""
     trained, here = record.get("interface", {}), interface_of(env)
     for name in trained:
-        if trained[name] == here[name]:
+        if name not in here or trained[name] == here[name]:
             continue
         if name == "observation":
             keywords = record.get("plan", {}).get("environment", {})

@@ -1,6 +1,5 @@
 """`Controller`: a trained network with all information for running it elsewhere."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.mlp import MlpPolicy, mlp_of
-from baselines.policies import is_included, load_policy, pretrained_file
+from baselines.normalization import NormalizedPolicy
+from baselines.policies import is_included, load_policy, pretrained_file, record_of
 from quad_gym.envs import keywords_of
 from quad_gym.envs.spaces import ObservationField, layout_bounds
 from quad_gym.packing.flight import params_record
@@ -117,7 +117,10 @@ class Controller:
 
 
 def controller_of(
-    policy: str, env_id: str | None = None, keywords: Mapping[str, Any] | None = None
+    policy: str,
+    env_id: str | None = None,
+    keywords: Mapping[str, Any] | None = None,
+    normalization: Any = None,
 ) -> Controller:
     """Load a trained policy with descriptions of its observations and actions.
 
@@ -126,11 +129,12 @@ def controller_of(
             --export`) or `.zip` of Stable-Baselines3, which can run code while it is loaded.
         env_id: Id of the environment; None: from the training record.
         keywords: Keywords of the environment; None: from the training record.
+        normalization: As in `load_policy`; the exported controller contains it.
 
     Raises:
         ValueError: If the policy does not exist, is no multilayer perceptron, has no training
             record while `env_id` is None, or does not fit the environment; or its record names
-            modules, which are imported only if `env_id` or `keywords` name them.
+            modules or files, which are used only if `env_id` or `keywords` name them.
         ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
     """
     if policy == "pd" or policy.startswith("pd:"):
@@ -149,7 +153,7 @@ def controller_of(
     if file.suffix == ".npz":
         record = MlpPolicy.load(file).record
     elif (stored := file.parent / "training.json").exists():
-        record = json.loads(stored.read_text(encoding="utf-8"))
+        record = record_of(stored)
     plan = record.get("plan", {})
     if env_id is None:
         if "env_id" not in plan:
@@ -158,11 +162,13 @@ def controller_of(
         _require_no_module(file, "ENV_ID", env_id)
     if keywords is None:
         keywords = plan.get("environment", {}) if plan.get("env_id") == env_id else {}
-        for name in ("task", "estimator"):
-            _require_no_module(file, f"--env {name}", keywords.get(name))
+        for name, value in keywords.items():
+            _require_no_module(file, f"--env {name}", value)
+            if name not in ("task", "estimator"):  # which name modules
+                _require_no_file(file, f"--env {name}", value)
     env = gymnasium.make_vec(env_id, num_envs=1, threads=1, **keywords)
     try:
-        found: Any = load_policy(str(file), env)
+        found: Any = load_policy(str(file), env, normalization)
         flights = env.unwrapped.flights  # type: ignore[attr-defined]
         if not isinstance(env.single_observation_space, gymnasium.spaces.Box):
             raise ValueError(
@@ -171,7 +177,7 @@ def controller_of(
         batch = flights.batch
         params = params_record(batch.vehicle, batch.sensors, action_params=batch.action_params)[0]
         controller = Controller(
-            policy=found if isinstance(found, MlpPolicy) else mlp_of(found, record),
+            policy=_network_of(found, record),
             source=policy if is_included(policy) else file.name,
             env_id=env_id,
             keywords=dict(keywords),
@@ -184,6 +190,28 @@ def controller_of(
         env.close()
     _require_same(controller, found, file)
     return controller
+
+
+def _network_of(found: Any, record: Mapping[str, Any]) -> MlpPolicy:
+    """Network of a policy, with its normalization."""
+    statistics = None
+    if isinstance(found, NormalizedPolicy):
+        found, statistics = found.model, found.normalization
+    if not isinstance(found, MlpPolicy):
+        return mlp_of(found, record, statistics)
+    if statistics is None:
+        return found
+    layers = found.weights, found.biases, found.activations
+    return MlpPolicy(*layers, found.record, statistics)
+
+
+def _require_no_file(file: Path, what: str, value: Any) -> None:
+    """Refuse a path in a training record: the error of a reader would show its contents."""
+    for name in value if isinstance(value, list | tuple) else (value,):
+        if isinstance(name, str) and (Path(name).suffix or len(Path(name).parts) > 1):
+            raise ValueError(
+                f"{file} names a file, {name}: if you trust it, specify {what} yourself"
+            )
 
 
 def _require_no_module(file: Path, what: str, name: Any) -> None:

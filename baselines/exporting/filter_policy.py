@@ -40,6 +40,8 @@ def policy_values(controller: Controller) -> dict[str, Any]:
             "policy must have observation='estimate' and layout='relative' to be exported with a "
             f"filter, got an observation of {', '.join(unknown or names)}"
         )
-    network = re.sub(r"\b([Wb]\d+|low|high|dot)\b", r"qgi_\1", c_source(controller, "qg_policy"))
+    network = re.sub(
+        r"\b([Wb]\d+|low|high|mean|deviation|dot)\b", r"qgi_\1", c_source(controller, "qg_policy")
+    )
     fields = "\n    ".join(_FIELDS[name] for name in names)
     return {**descriptions(controller), "POLICY": True, "FIELDS": fields, "NETWORK": network}

@@ -8,6 +8,7 @@ import numpy as np
 
 import quad_gym
 from baselines.exporting.controller import Controller
+from baselines.normalization import Normalization
 from quad_gym.params import checks as check
 
 OPSET = 17  #: version of the operator set, old enough for runtimes on companion computers
@@ -34,6 +35,11 @@ def onnx_model(controller: Controller) -> Any:
         helper.make_node("Max", ["observation", "low"], ["above"]),
         helper.make_node("Min", ["above", "high"], ["x0"]),
     ]
+    if controller.policy.normalization is not None:
+        more, steps = _normalization(controller.policy.normalization)
+        constants |= more
+        nodes[-1] = helper.make_node("Min", ["above", "high"], ["within"])
+        nodes += [helper.make_node(kind, *names, **said) for kind, *names, said in steps]
     sizes_in, sizes_out = {"observation": controller.policy.inputs}, {"action": 4}
     policy = controller.policy
     layers = zip(policy.weights, policy.biases, policy.activations, strict=True)
@@ -65,6 +71,28 @@ def onnx_model(controller: Controller) -> Any:
     helper.set_model_props(model, {k: json.dumps(v) for k, v in _metadata(controller).items()})
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def _normalization(found: Normalization) -> tuple[dict[str, Any], list[Any]]:
+    """Constants and nodes that normalize "within" to "x0", in the type of the statistics."""
+    from onnx import TensorProto
+
+    kind = found.mean.dtype.type
+    wide = TensorProto.DOUBLE if found.mean.dtype == np.float64 else TensorProto.FLOAT
+    constants = {
+        "mean": found.mean,
+        "deviation": found.deviation.astype(kind),
+        "lowest": kind(-found.clip),
+        "highest": kind(found.clip),
+    }
+    return constants, [
+        ("Cast", ["within"], ["wide"], {"to": wide}),
+        ("Sub", ["wide", "mean"], ["centered"], {}),
+        ("Div", ["centered", "deviation"], ["scaled"], {}),
+        ("Max", ["scaled", "lowest"], ["above_lowest"], {}),
+        ("Min", ["above_lowest", "highest"], ["normalized"], {}),
+        ("Cast", ["normalized"], ["x0"], {"to": TensorProto.FLOAT}),
+    ]
 
 
 def save_onnx(controller: Controller, file: Path) -> float:

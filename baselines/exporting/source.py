@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import quad_gym
 from baselines.exporting.controller import Controller
+from baselines.mlp import MlpPolicy
 
 _ACTIVATIONS = {
     "none": "x",
@@ -37,7 +38,7 @@ def c_source(controller: Controller, name: str) -> str:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a C identifier, got {name!r}")
     policy, (low, high) = controller.policy, controller.bounds
-    arrays: dict[str, NDArray[np.float32]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     layers = ""
     for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         arrays |= {f"W{k}": W, f"b{k}": b}
@@ -48,9 +49,13 @@ def c_source(controller: Controller, name: str) -> str:
         if k + 1 < len(policy.weights):
             layers += f"    for (i = 0; i < {outputs}; i++)\n        in[i] = out[i];\n"
     arrays |= {"low": low, "high": high}
+    more = _normalization(policy)
+    if policy.normalization is not None:
+        arrays |= {"mean": policy.normalization.mean, "deviation": policy.normalization.deviation}
     widest = max(len(b) for b in policy.biases)
     values = {
         **descriptions(controller),
+        **more,
         "NAME": name,
         "ARRAYS": "\n".join(_array(name, values) for name, values in arrays.items()),
         "LAYERS": layers,
@@ -58,6 +63,16 @@ def c_source(controller: Controller, name: str) -> str:
         "WIDEST": widest,
     }
     return filled("controller.c", values)
+
+
+def _normalization(policy: MlpPolicy) -> dict[str, Any]:
+    """Values of the template that normalize observations, in the type of the statistics."""
+    found = policy.normalization
+    if found is None:
+        return {"NORMALIZED": False}
+    clip = _number(found.mean.dtype.type(found.clip)) if np.isfinite(found.clip) else ""
+    limited = f"z < -{clip} ? -{clip} : z > {clip} ? {clip} : z" if clip else "z"
+    return {"NORMALIZED": True, "KIND": _kind(found.mean), "LIMITED": limited}
 
 
 def descriptions(controller: Controller) -> dict[str, Any]:
@@ -81,15 +96,21 @@ def descriptions(controller: Controller) -> dict[str, Any]:
     }
 
 
-def _number(value: float) -> str:
-    """Format a float so that C reads the same bits."""
-    text = f"{np.float32(value):.9g}"
-    return text + ("f" if set(text) & set(".e") else ".0f")
+def _kind(values: NDArray[Any]) -> str:
+    """Type of numbers in C."""
+    return "double" if values.dtype == np.float64 else "float"
 
 
-def _array(name: str, values: NDArray[np.float32]) -> str:
+def _number(value: np.floating[Any]) -> str:
+    """Format a number of single or double precision so that C reads the same bits."""
+    wide = value.dtype == np.float64
+    text = f"{value:.17g}" if wide else f"{value:.9g}"
+    return text + ("" if set(text) & set(".e") else ".0") + ("" if wide else "f")
+
+
+def _array(name: str, values: NDArray[Any]) -> str:
     """Define a constant array; matrices are stored row by row."""
-    words = [_number(value) for value in values.ravel().tolist()]
+    words = [_number(value) for value in values.ravel()]
     lines = [", ".join(words[k : k + 6]) for k in range(0, values.size, 6)]
     rows = ",\n    ".join(lines)
-    return f"static const float {name}[{values.size}] = {{\n    {rows}\n}};\n"
+    return f"static const {_kind(values)} {name}[{values.size}] = {{\n    {rows}\n}};\n"

@@ -50,6 +50,8 @@ def _policies(names: set[str]) -> tuple[dict[str, Any], bytes]:
         layers[name] = {}
         for source, file in files.items():
             policy = MlpPolicy.load(file)
+            if policy.normalization is not None:
+                raise ValueError(f"{file} normalizes observations, which the page does not")
             each = zip(policy.weights, policy.biases, policy.activations, strict=True)
             layers[name][source] = []
             for W, b, activation in each:

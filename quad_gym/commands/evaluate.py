@@ -57,6 +57,7 @@ class EvaluateArgs:
     trained on raw measurements)"""
     sensors: options.OwnSuite = None
     estimator: options.EstimatorName = None
+    normalization: options.Normalized = None
     env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
@@ -91,6 +92,9 @@ def configure(args: EvaluateArgs) -> tuple[dict[Pairing, tuple[Policy, Any]], Pa
             "--policy that was trained on measurements"
         )
     first_seed("test", args.seed, args.episodes)  # rejects seeds of trainings
+    files = [name for name in args.policy or () if Path(name).suffix in (".zip", ".npz")]
+    if args.normalization is not None and not files:
+        raise ValueError("--normalization needs a --policy that is a file (.zip or .npz)")
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     if args.output is None and not args.overwrite:
         folder = options.free_folder(folder, "summary.json")
@@ -125,7 +129,8 @@ def policy_and_flights(
 ) -> tuple[Policy, Any]:
     """Load a policy, and make the environment in which it flies."""
     env = make_flights(args, observation, count, policy)
-    return load_policy(policy, env), env
+    of_file = Path(policy).suffix in (".zip", ".npz")
+    return load_policy(policy, env, args.normalization if of_file else None), env
 
 
 def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) -> Any:

@@ -16,7 +16,13 @@ from typing import Literal
 
 import numpy as np
 
-from quad_gym.commands.options import SuiteName, full_id, refuse_overwriting, usage_errors
+from quad_gym.commands.options import (
+    Normalized,
+    SuiteName,
+    full_id,
+    refuse_overwriting,
+    usage_errors,
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,7 @@ class ExportFilterArgs:
     """processor: x86-64 (with AVX2) or aarch64 with Linux, cortex-m7, or WebAssembly"""
     policy: str | None = None
     """also export a policy that acts on the estimate: pretrained, or a file of quad-gym train"""
+    normalization: Normalized = None
     log: Path | None = None
     """log of a flight at the place where the filter will run: the origin of its positions, magnetic
     field and rate of the IMU; defaults to the suite's"""
@@ -55,8 +62,14 @@ def main(args: ExportFilterArgs) -> None:
         require_writable("--output", folder)
         if args.env_id is not None and args.policy is None:
             raise ValueError("--env-id must come with --policy")
+        if args.normalization is not None and args.policy is None:
+            raise ValueError("--normalization must come with --policy")
         env_id = None if args.env_id is None else full_id(args.env_id)
-        policy = None if args.policy is None else controller_of(args.policy, env_id)
+        policy = (
+            None
+            if args.policy is None
+            else controller_of(args.policy, env_id, normalization=args.normalization)
+        )
         rate = 0.0
         if args.log is not None:
             log = read_log(args.log)

@@ -15,7 +15,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from quad_gym.commands.options import Keywords, full_id, refuse_overwriting, usage_errors
+from quad_gym.commands.options import (
+    Keywords,
+    Normalized,
+    full_id,
+    refuse_overwriting,
+    usage_errors,
+)
 
 _SUFFIXES = {"c": ".c", "onnx": ".onnx"}
 
@@ -54,6 +60,7 @@ class ExportPolicyArgs:
     """format of the file"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment; defaults to those of the training record"""
+    normalization: Normalized = None
     output: Path | None = None
     """file to write; defaults to one in results/export; its name is also the function's name"""
     overwrite: bool = False
@@ -88,7 +95,7 @@ def export(args: ExportPolicyArgs, file: Path) -> str:
     from baselines.exporting import c_source, controller_of, save_onnx
 
     env_id = None if args.env_id is None else full_id(args.env_id)
-    controller = controller_of(args.policy, env_id, args.env or None)
+    controller = controller_of(args.policy, env_id, args.env or None, args.normalization)
     if args.to == "onnx":
         error = save_onnx(controller, file)
         return f"Its actions in onnxruntime differ from the policy's by at most {error:.1g}."

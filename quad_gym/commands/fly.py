@@ -55,6 +55,7 @@ class FlyArgs:
     env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as action=motor control_rate=200 world=breeze"""
 
+    normalization: options.Normalized = None
     sensors: options.OwnSuite = None
     estimator: options.EstimatorName = None
     camera: bool = True
@@ -181,7 +182,10 @@ def flights_of(args: FlyArgs) -> Callable[[int], Iterator[Flight]]:
     env = make_env(args)
     if args.output and not env.unwrapped.flights.batch.max_steps:
         raise ValueError("--output needs a flight with a time limit: a --duration above 0")
-    policy, sensors = load_policy(args.policy, env), options.sensors_of(args.env_id, args.sensors)
+    policy, sensors = (
+        load_policy(args.policy, env, args.normalization),
+        options.sensors_of(args.env_id, args.sensors),
+    )
     about: dict[str, Any] = {"task": IDS[args.env_id], "policy": args.policy, "sensors": sensors}
     about["faults"] = args.faults
     return lambda seed: fly(env, policy, seed, about)

@@ -349,6 +349,15 @@ EstimatorName = Annotated[
     ),
 ]
 
+Normalized = Annotated[
+    str | None,
+    arg(
+        metavar="FILE",
+        help="statistics with which a policy's observations were normalized in training: .pkl of "
+        "VecNormalize, or .npz of baselines.normalization; none: it was trained without",
+    ),
+]
+
 SuiteNames = Annotated[
     tuple[str, ...], arg(help=f"sensor suites: {', '.join(SUITES)}, or files of suites (.toml)")
 ]

@@ -4,6 +4,7 @@ import ctypes
 import json
 import shutil
 import subprocess
+import zipfile
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -272,3 +273,63 @@ def test_module_that_a_policy_file_names_is_not_imported(plan, named, tmp_path, 
             controller_of("policy.npz", CIRCLE)
         assert not Path("ran").exists()
     controller_of("policy.npz", CIRCLE, {})  # which the user names
+
+
+def rewritten(file, **entries):
+    """Copy the included policy of the circle, with other entries; None: without the entry."""
+    included = Path(quad_gym.__file__).parents[1] / "baselines" / "pretrained" / "circle.npz"
+    with np.load(included) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    arrays |= {name: value for name, value in entries.items() if not isinstance(value, bytes)}
+    if "record" in arrays:
+        about = json.loads(str(arrays["about"])) | {"record": arrays.pop("record")}
+        arrays["about"] = np.array(json.dumps(about))
+    np.savez_compressed(file, **arrays)
+    for name, content in entries.items():
+        if isinstance(content, bytes):
+            with zipfile.ZipFile(file, "a") as archive:
+                archive.writestr(f"{name}.npy", content)
+    return file
+
+
+def claiming(count):
+    """Return an array in NumPy's format that claims so many numbers, and has none."""
+    header = str({"descr": "<f4", "fortran_order": False, "shape": (count,)}).encode()
+    header += b" " * (118 - len(header) - 1) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+
+
+NANS = np.full((4, 64), np.nan, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"more": claiming(10**12)}, "is not a policy, or is damaged"),
+        ({"more": claiming(10**7)}, "is not a policy, or is damaged"),
+        ({"more": np.zeros(2**26 + 1, np.float32)}, "is not a policy, or is damaged"),
+        ({"W0": np.float32(1.0)}, r"is not a valid policy: weights must be matrices.*\(\)"),
+        ({"W0": np.zeros((0, 0), np.float32)}, "is not a valid policy"),
+        ({"W2": NANS}, "is not a valid policy: weights and biases must be finite"),
+        ({"record": []}, r"its training record must be a table, got \[\]"),
+        ({"record": {"plan": "circle"}}, "plan of its training record must be a table"),
+        ({"record": {"plan": {"environment": ["motor"]}}}, "environment of its training record"),
+        ({"record": {"interface": [1]}}, "interface of its training record must be a table"),
+        ({"record": {"interface": {"observation": 5}}}, "must be names, got 5"),
+    ],
+)
+def test_damaged_or_hostile_policy_is_refused(entries, message, tmp_path):
+    file = rewritten(tmp_path / "policy.npz", **entries)
+    with pytest.raises(ValueError, match=rf"policy\.npz .*{message}"):
+        controller_of(str(file), CIRCLE)
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [{"trajectory": "/etc/passwd"}, {"trajectory": ["a", "b/c.csv"]}, {"world": "mine.toml"}],
+)
+def test_file_that_a_policy_file_names_is_not_opened(keywords, tmp_path):
+    plan = {"env_id": CIRCLE, "environment": keywords}
+    file = rewritten(tmp_path / "policy.npz", record={"plan": plan})
+    with pytest.raises(ValueError, match=f"names a file, .*specify --env {next(iter(keywords))}"):
+        controller_of(str(file))

@@ -46,6 +46,12 @@ int @NAME@(const float observation[@SIZE@], float action[4])
             return 1;
         in[i] = x < low[i] ? low[i] : x > high[i] ? high[i] : x;
     }
+@IF NORMALIZED@
+    for (i = 0; i < @SIZE@; i++) { /* as in training */
+        const @KIND@ z = (in[i] - mean[i]) / deviation[i];
+        in[i] = (float)(@LIMITED@);
+    }
+@END@
 @LAYERS@    for (i = 0; i < 4; i++)
         action[i] = out[i] < -1.0f ? -1.0f : out[i] > 1.0f ? 1.0f : out[i];
     return 0;
