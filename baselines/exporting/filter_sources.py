@@ -16,6 +16,7 @@ from baselines.exporting.source import filled
 from quad_gym.estimation.filtering.engine import Engine
 from quad_gym.estimation.filtering.filters import LONGEST_STEP
 from quad_gym.estimation.filtering.starts import empty_fix, level_start
+from quad_gym.estimation.logs.mounting import mounting_of
 from quad_gym.estimation.replaying.results import COLUMNS
 from quad_gym.kernels.entries import FILTER_STAGES
 from quad_gym.kernels.library import core_symbol
@@ -143,6 +144,7 @@ class Sources:
             "qg_core_settings": engine.settings.tobytes(),
             "qg_core_first": level_start(self.suite).tobytes(),
             "qg_core_fix": empty_fix(self.suite).tobytes(),
+            "qg_core_mounting": mounting_of(self.suite).tobytes(),
             "qg_core_parts": np.array([len(self.copied), *itertools.chain(*self.copied)]).tobytes(),
         }
 
@@ -222,7 +224,9 @@ class Sources:
                 copies * 8 * sum(length for _, length in self.copied),
             )
         )
+        turns = bool(mounting_of(suite)["imu_turns"][0])
         return {
+            "MOUNTING": "the library rotates them" if turns else "B does not differ",
             "TITLE": f"State estimator: {suite.estimator.kind.upper()} of the sensor suite "
             f'"{self.label}", quad_gym {quad_gym.__version__}.',
             "SUITE": self.label,

@@ -40,6 +40,7 @@ from quad_gym.records import (
     STEP_BLOCK,
     VELOCITY_BLOCK,
     WORK_BLOCK,
+    Aid,
     Operation,
 )
 from quad_gym.records.inputs import (
@@ -49,6 +50,7 @@ from quad_gym.records.inputs import (
     FIX,
     INPUT,
     MEMORY,
+    MOUNTING,
     PENDING,
     WINDOW,
     Outcome,
@@ -61,7 +63,11 @@ _FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _MEASUREMENT, _START = map(
         *(MEASUREMENT, START),
     ),
 )
-_WINDOW, _INPUT, _FIX, _MEMORY, _ESTIMATE = map(from_dtype, (WINDOW, INPUT, FIX, MEMORY, ESTIMATE))
+_WINDOW, _INPUT, _FIX, _MEMORY, _ESTIMATE, _MOUNTING = map(
+    from_dtype, (WINDOW, INPUT, FIX, MEMORY, ESTIMATE, MOUNTING)
+)
+_MAGNETOMETER = int(Aid["MAGNETOMETER"])
+_FIELD_ROW = AID_ROW[_MAGNETOMETER]
 _PREDICT, _UPDATE, _, _RESTORE, _ = map(int, Operation)
 _OK, _, _NOT_FINITE, _RANGE, _, _, _, _NO_HEADING, _CONTRADICTION = map(int, Outcome)
 _NOTHING = (0.0, 0.0, 0.0)
@@ -190,13 +196,30 @@ def _run(flight, params, ticks, steps, settings, work, table, window, memory, pa
     window.operations = 0
 
 
-@entry(signature=types.none(*_NUMBERS, _WINDOW, _MEMORY, types.int64, _INPUT, _MEASUREMENT))
-def take(flight, params, ticks, steps, settings, work, table, window, memory, parts, given, m):
-    """Process a sample or the measurement m.
+@kernel
+def _correct(mounting, given, m):
+    """Rotate a sample or the measurement m to B, as `Log.corrected` does."""
+    if given.rank > 0:
+        if mounting.compass_turns:
+            field = m.aid_measurement[_FIELD_ROW]
+            store(field, turned(mounting.R_compass, load3(field)))
+    elif mounting.imu_turns:
+        store(given.gyro, turned(mounting.R_imu, load3(given.gyro) - load3(mounting.gyro_bias)))
+        store(given.accel, turned(mounting.R_imu, load3(given.accel) - load3(mounting.accel_bias)))
+
+
+@entry(
+    signature=types.none(*_NUMBERS, _WINDOW, _MEMORY, types.int64, _MOUNTING, _INPUT, _MEASUREMENT)
+)
+def take(
+    flight, params, ticks, steps, settings, work, table, window, memory, parts, mounting, given, m
+):
+    """Process a sample or the measurement m, in the axes of its sensor.
 
     `parts` is the address of the number of parts of the filter's memory that copies have, and of
     the place and length of each, in words.
     """
+    _correct(mounting, given, m)
     known = math.isfinite(given.time) and math.isfinite(given.dt)
     if not (known and _is_all_finite(given.gyro) and _is_all_finite(given.accel)):
         given.outcome = _NOT_FINITE
@@ -281,9 +304,11 @@ def _prepared(s, fix):
     return outcome
 
 
-@entry(signature=types.none(_START, _FIX))
-def prepare(first, fix):
+@entry(signature=types.none(_START, _FIX, _MOUNTING))
+def prepare(first, fix, mounting):
     """Compute the first estimate that follows from a fix, with the suite's numbers in `first`."""
+    if mounting.compass_turns:
+        store(fix.field_B, turned(mounting.R_compass, load3(fix.field_B)))
     fix.outcome = _prepared(first, fix)
 
 

@@ -99,6 +99,19 @@ MEMORY = np.dtype(
 )
 """Addresses of the arrays of an exported filter; `copy_words` is the length of a copy."""
 
+MOUNTING = np.dtype(
+    [
+        ("imu_turns", "i8"),  # 1: its samples are rotated
+        ("R_imu", "f8", (3, 3)),  # from the axes of the IMU to B
+        ("gyro_bias", "f8", 3),  # mean bias, in the axes of the IMU [rad/s]
+        ("accel_bias", "f8", 3),  # [m/s^2]
+        ("compass_turns", "i8"),
+        ("R_compass", "f8", (3, 3)),
+    ],
+    align=True,
+)
+"""Mounting and mean biases of the sensors of a suite, which an exported filter corrects."""
+
 ESTIMATE = np.dtype(
     [
         ("time", "f8"),

@@ -20,6 +20,9 @@ from baselines.exporting.filter_library import LIBRARY, archive
 from quad_gym.commands.main import main
 from quad_gym.estimation import UnscentedKalmanFilter, replay
 from quad_gym.estimation.filtering.starts import state_at_rest
+from quad_gym.estimation.logs import read_log
+from quad_gym.estimation.replaying.first_motion import wide_start
+from quad_gym.params.suites import ALL_SUITES
 from tests.console_commands import refused
 from tests.logged_flights import Recorded, flown
 
@@ -54,6 +57,8 @@ REST = {"position": (0.0, 0.0, 1.5), "heading": math.radians(20.0)}
 TURNED = quad_gym.sensor_suite("rtk")
 TURNED = TURNED.replace(
     log_rotation=(0.05, 0.02, 0.1),
+    log_accel_bias=(0.05, -0.1, 0.02),
+    log_gyro_bias=(0.002, -0.001, 0.003),
     log_delays=TURNED.log_delays.replace(gnss=0.12, camera=-0.03),
     imu=TURNED.imu.replace(lever_arm_B=(0.05, -0.02, 0.03)),
 )
@@ -109,6 +114,7 @@ def require_equal(run, log, suite, start):
     assert names == list(wanted.columns())
     np.testing.assert_array_equal(rows, np.array(list(wanted.columns().values())).T)
     assert len(rows) > 100
+    return wanted
 
 
 @needs_compiler
@@ -117,6 +123,73 @@ def test_example_prints_estimates_of_replay(name):
     suite, program = quad_gym.sensor_suite(name), example(name, "x86-64")
     start = REST if suite.gnss is None else {}
     require_equal(partial(estimates, program), logged(name), suite, start)
+
+
+def hard_log(suite):
+    """Return a table that begins in motion, and its start.
+
+    The gyro jumps, so that states are reset; each 25th measurement is an outlier; all sensors but
+    the IMU pause for 0.7 s.
+    """
+    flight = flown(suite, 8.0)
+    table = Recorded(flight, suite).table()
+    late = table["received"] > 1.5
+    table = {k: v[late].copy() for k, v in table.items() if np.isfinite(v).any()}
+    time, own = table["time"], ("time", "received", "gyro", "accel", "motor")
+    table["gyro_x"][time > 4.0] += 0.15
+    for name in (name for name in table if not name.startswith(own)):
+        table[name][(time > 5.5) & (time < 6.2)] = np.nan
+        rows = np.flatnonzero(np.isfinite(table[name]))[10::25]
+        if len(rows):
+            table[name][rows] += 30.0 * np.nanstd(table[name])
+    row = round(1.5 * suite.imu.rate)
+    w, x, y, z = flight["quaternion"][row]
+    start = {"heading": math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))}
+    if suite.gnss is None:
+        start["position"] = tuple(flight["position"][row])
+    return table, start
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "name", [name if name in ("rtk", "consumer") else slow(name) for name in ALL_SUITES]
+)
+def test_example_equals_replay_after_resets_outliers_outage_and_start_in_motion(name):
+    suite = quad_gym.sensor_suite(name)
+    table, start = hard_log(suite)
+    result = require_equal(partial(estimates, example(name, "x86-64")), table, suite, start)
+    if name in ("rtk", "consumer"):  # all of that happens there
+        assert wide_start(suite, read_log(table))["tilt_sigma"] == 0.3
+        assert result.measured["gnss_position"].rejected.any()
+        assert np.diff(result.sigma[:, 6]).max() > 0.5 * suite.estimator.initial_tilt_sigma
+
+
+@needs_compiler
+def test_exported_filter_takes_samples_in_the_axes_of_sensors(tmp_path):
+    """Rows of samples are those of the log, and the library rotates them as the replay does."""
+    suite = quad_gym.sensor_suite("consumer").replace(
+        log_rotation=(0.05, 0.02, 0.1),
+        log_compass_rotation=(0.1, -0.1, 0.3),
+        log_accel_bias=(0.1, 0.0, 0.2),
+    )
+    export_filter(suite, "askew", "x86-64", tmp_path)
+    program = tmp_path / "example"
+    files = [tmp_path / "main.c", tmp_path / LIBRARY]
+    subprocess.run(["cc", "-O2", *files, "-lm", "-o", program], check=True)
+    table = read_log(logged("consumer"))
+    result = replay(table, sensors=suite, samples=tmp_path / "samples.csv")
+    rows = [line.split(",") for line in (tmp_path / "samples.csv").read_text().split()]
+    for name, first, values in (
+        ("imu", 1, np.hstack([table.imu.values["gyro"], table.imu.values["accel"]])),
+        ("magnetometer", 2, table.magnetometer.values["magnetometer"]),
+    ):
+        given = {tuple(row) for row in values.tolist()}
+        width = values.shape[1]
+        found = [tuple(map(float, row[first:][:width])) for row in rows if row[0] == name]
+        assert len(found) > 20
+        assert set(found) <= given
+    found = estimates(program, tmp_path / "samples.csv")[1]
+    np.testing.assert_array_equal(found, np.array(list(result.columns().values())).T)
 
 
 @functools.cache
@@ -206,7 +279,7 @@ def test_example_refuses_samples_of_another_origin(tmp_path):
 @pytest.mark.parametrize(
     ("without", "start", "message"),
     [
-        ("motor", {"tilt_sigma": 0.1}, "tilt_sigma"),
+        ("motor", {"gnss_sigma": 0.1, "accel": (0.0, 0.0, 9.8)}, "accel"),
         ("gnss_baseline", {}, "baseline or a magnetic field"),
     ],
 )

@@ -190,7 +190,6 @@ FIX, SPEED = np.zeros(3), np.array([1.0, 0.0, 0.0])
         ({"velocity_sigma": 0.1}, "velocity_sigma must come with"),
         ({"tilt_sigma": -0.1}, "tilt_sigma"),
         ({"time": math.inf}, "time"),
-        ({"gnss_baseline_G": SPEED, "tilt_sigma": 0.1}, "tilt_sigma must not be given with"),
         ({"gnss_baseline_G": SPEED, "magnetometer": SPEED}, "magnetometer must not be given with"),
         ({"gnss_baseline_G": SPEED, "gnss_sigma": np.eye(3)}, "gnss_sigma"),
     ],

@@ -9,14 +9,14 @@ extern "C" {
     extern int name(void *, void *, void *, void *, void *, void *, void *, void *, int64_t)
 
 extern int qg_core_take(void *, void *, void *, void *, const void *, void *, const void *, void *,
-                        void *, void *, const void *, int64_t, void *, void *);
+                        void *, void *, const void *, int64_t, const void *, void *, void *);
 extern int qg_core_state(void *, void *, void *, const void *, int64_t, void *);
 extern int qg_core_covariance(void *, void *, void *, int64_t);
 extern int qg_core_seen(void *, void *, int64_t, int64_t, int64_t, int64_t);
-extern int qg_core_prepare(void *, void *, void *, void *);
+extern int qg_core_prepare(void *, void *, void *, void *, const void *);
 extern int qg_core_start(void *, void *, void *, void *, const void *, void *, void *, void *);
 extern const char qg_core_params[], qg_core_steps[], qg_core_settings[], qg_core_first[],
-    qg_core_fix[], qg_core_parts[];
+    qg_core_fix[], qg_core_parts[], qg_core_mounting[];
 @STAGE_DECLARATIONS@
 
 /* The address of the full record, of which only the used parts are in memory. */
@@ -48,7 +48,7 @@ static int qgi_take(qg_filter *f, qg_input_record *input, qg_measurement_record 
         return QG_NOT_STARTED;
     qg_core_take(&result, &raised, qgi_flight(f), f->params, qg_core_params, f->steps,
                  qg_core_settings, f->work, f->table, &f->window, &memory,
-                 qgi_address(qg_core_parts), input, measured);
+                 qgi_address(qg_core_parts), qg_core_mounting, input, measured);
     return (int)input->outcome;
 }
 
@@ -86,7 +86,7 @@ static int qgi_init(qg_filter *f, qg_fix_record *fix)
     void *result, *raised;
     qg_start_record first;
     memcpy(&first, qg_core_first, sizeof first);
-    qg_core_prepare(&result, &raised, &first, fix);
+    qg_core_prepare(&result, &raised, &first, fix, qg_core_mounting);
     if (fix->outcome)
         return (int)fix->outcome;
     memset(f, 0, sizeof *f);

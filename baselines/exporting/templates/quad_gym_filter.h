@@ -60,7 +60,7 @@ typedef struct {
     const double *gnss_velocity; /* in G [m/s]; NULL: at rest */
     double velocity_sigma;       /* [m/s]; 0: the suite's */
     const double *heading;       /* of body x, from east toward north [rad] */
-    const double *magnetometer;  /* magnetic field in B [T] */
+    const double *magnetometer;  /* magnetic field in the axes of its sensor [T] */
     double magnetometer_sigma;   /* [T]; 0: the suite's */
     int course;                  /* 1: the vehicle flies nose first, along gnss_velocity */
     double tilt_sigma;           /* of roll and pitch [rad]; 0: the suite's */
@@ -82,7 +82,7 @@ void qg_barometer_from_start(qg_filter *filter);
 /* ---- inputs ---- */
 
 /* Propagate the estimate over dt, from 1e-9 s to QG_LONGEST_STEP: angular rate [rad/s] and specific
- * force [m/s^2] in B. */
+ * force [m/s^2] in the axes of the IMU, from which @MOUNTING@. */
 int qg_predict(qg_filter *filter, const double gyro[3], const double accel[3], double dt);
 
 /* Measurements of one instant, for one joint update. NULL: not measured. Standard deviations are

@@ -58,6 +58,9 @@ class FirstFix:
     tilt_sigma: float | None = None
     """standard deviation of roll and pitch of a level start [rad]; None:
     `FilterParams.initial_tilt_sigma`, or else LEVEL_SIGMA"""
+    rest_sigma: float | None = None
+    """standard deviation of a velocity that is not measured, per axis [m/s]; None: by
+    `FilterParams.initial_velocity_variance`"""
     accel: ArrayLike | None = None
     """(3,) specific force at rest in B, preferably the mean of many samples [m/s^2]; None: the
     vehicle is assumed level"""
@@ -90,12 +93,14 @@ class FilterStart:
     """horizontal direction of the body x axis, for a steep baseline; zero: unknown"""
     estimates: list[FirstEstimate] = field(default_factory=list)
     """estimates with a known tilt, one or one for each heading; empty with Wahba's problem"""
+    numbers: dict[str, float] = field(default_factory=dict)
+    """parameters that differ from the suite's, for the start alone"""
 
     def write(self, engine: Engine) -> None:
         """Start the filters in an engine's memory."""
         engine.fill("gnss_position", self.position_G)
         engine.fill("gnss_baseline", self.baseline_G)
-        kept = engine.impose({"position_sigma_I": self.sigmas})
+        kept = engine.impose({"position_sigma_I": self.sigmas, **self.numbers})
         engine.start(self.x_I)
         engine.restore_noise(kept)
         if self.estimates:
@@ -121,12 +126,20 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     if baseline is not None:
         baseline = checked_baseline(sensors, baseline)
     if baseline is not None and fix.accel is None:
-        others = ("heading_sigma", "magnetometer", "magnetometer_sigma", "tilt_sigma")
-        fix.refuse("not be given with gnss_baseline_G", *others, "accel_sigma", "course")
+        others = ("heading_sigma", "magnetometer", "magnetometer_sigma", "accel_sigma", "course")
+        fix.refuse("not be given with gnss_baseline_G", *others)
+        if sensors.estimator.initial_tilt_sigma is None:
+            reason = "not be given with gnss_baseline_G: the suite has no initial_tilt_sigma"
+            fix.refuse(reason, "tilt_sigma")
         x_I = np.zeros(3)
         if fix.heading is not None:
             x_I = level(check.number("heading", fix.heading))[0]
-        return FilterStart(position, sigmas, velocity, speeds, baseline, x_I)
+        numbers = {}
+        if fix.rest_sigma is not None:
+            numbers["initial_velocity_variance"] = speeds[0] * speeds[0]
+        if fix.tilt_sigma is not None:
+            numbers["initial_tilt_sigma"] = check.positive("tilt_sigma", fix.tilt_sigma, most=1.0)
+        return FilterStart(position, sigmas, velocity, speeds, baseline, x_I, numbers=numbers)
     start = _first_tilt(sensors, fix)
     start["antenna_I"] = turned(ecef_to_enu(sensors.gnss.reference_antenna_G), position)
     root = math.sqrt(sensors.estimator.initial_covariance_scale) * np.diag(sigmas)
@@ -153,7 +166,11 @@ def _first_velocity(sensors: SensorSuite, fix: FirstFix) -> tuple[Floats | None,
     assert gnss is not None
     if fix.gnss_velocity_G is None:
         fix.refuse("come with gnss_velocity_G", "velocity_sigma")
-        return None, np.full(3, math.sqrt(sensors.estimator.initial_velocity_variance))
+        still = math.sqrt(sensors.estimator.initial_velocity_variance)
+        if fix.rest_sigma is not None:
+            still = check.positive("rest_sigma", fix.rest_sigma)
+        return None, np.full(3, still)
+    fix.refuse("not be given with gnss_velocity_G", "rest_sigma")
     noise = gnss.velocity_sigma
     if fix.velocity_sigma is not None:
         noise = check.positive("velocity_sigma", fix.velocity_sigma)

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.estimation.logs.mounting import mounting_of, rotated
 from quad_gym.frames import geodetic_to_ecef
 from quad_gym.params import checks as check
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.rotations import euler_to_dcm
 
 Floats = NDArray[np.float64]
 
@@ -141,6 +141,8 @@ class Log(_AidStreams):
     rows by reason; `others`, further sources"""
     notes: tuple[str, ...] = ()  #: sentences on the choice of sources and on dropped rows
     problems: tuple[str, ...] = ()  #: sentences on wrong quantities
+    in_sensor_axes: Mapping[str, Stream] = field(default_factory=dict)
+    """of a corrected log: IMU and magnetometer before their rotation and mean biases"""
 
     def __post_init__(self) -> None:
         if len(self.imu) < 2:
@@ -170,18 +172,28 @@ class Log(_AidStreams):
             for name, stream in self.streams.items()
             if delays.get(name)
         }
-        means = {"accel": suite.log_accel_bias, "gyro": suite.log_gyro_bias}
-        if any((*suite.log_rotation, *means["accel"], *means["gyro"])):
-            R = euler_to_dcm(suite.log_rotation)
-            given = self.imu.values.items()
-            changes["imu"] = replace(
-                self.imu, values={name: (v - means[name]) @ R.T for name, v in given}
-            )
+        mounting, before = mounting_of(suite)[0], dict(self.in_sensor_axes)
+        if mounting["imu_turns"]:
+            values, before["imu"] = self.imu.values, self.imu
+            turned = {
+                name: rotated(mounting["R_imu"], values[name] - mounting[f"{name}_bias"])
+                for name in ("gyro", "accel")
+            }
+            changes["imu"] = replace(self.imu, values=turned)
         compass = changes.get("magnetometer", self.magnetometer)
-        if any(suite.log_compass_rotation) and compass is not None:
-            field_B = compass.values["magnetometer"] @ euler_to_dcm(suite.log_compass_rotation).T
+        if mounting["compass_turns"] and compass is not None:
+            before["magnetometer"] = compass
+            field_B = rotated(mounting["R_compass"], compass.values["magnetometer"])
             changes["magnetometer"] = replace(compass, values={"magnetometer": field_B})
-        return replace(self, **changes) if changes else self
+        return replace(self, **changes, in_sensor_axes=before) if changes else self
+
+    def as_sensed(self, name: str) -> Stream:
+        """Return the IMU or the magnetometer in the axes of the sensor, in the same rows."""
+        stream: Stream = getattr(self, name)
+        if (whole := self.in_sensor_axes.get(name)) is None:
+            return stream
+        order = np.argsort(whole.time, kind="stable")
+        return whole.rows(order[np.searchsorted(whole.time[order], stream.time)])
 
     def between(self, first: float | None, last: float | None) -> "Log":
         """Return the log from a time of arrival [s] to another; None: from its start, to its end.

@@ -133,7 +133,7 @@ def _log_of(
         chosen.pop(half, None)
     names, kept = list(chosen), clocks.on_one_clock(recording, list(chosen.values()))
     chosen = dict(zip(names, kept, strict=True))
-    streams = {name: source.stream() for name, source in chosen.items() if len(source)}
+    streams: dict[str, Any] = {n: source.stream() for n, source in chosen.items() if len(source)}
     if (velocities := streams.pop("gnss_velocity", None)) is not None:
         streams["gnss"] = _stacked(streams.get("gnss"), velocities)
     about = {"file": recording.file} if recording.file else {}

@@ -1,4 +1,9 @@
-"""Logs that begin in motion: level and at rest is then a rough guess, as its spread must show."""
+"""Logs that begin in motion: level and at rest is then a rough guess, as its spread must show.
+
+The spread is the start's alone: a later reset has the suite's own numbers.
+"""
+
+import math
 
 import numpy as np
 
@@ -12,20 +17,20 @@ CERTAIN = 4.0  #: standard deviations of a speed from positions beyond which it 
 TILT = 0.3  #: standard deviation of roll and pitch of a vehicle that maneuvers [rad]
 
 
-def with_wide_start(suite: SensorSuite, log: Log) -> SensorSuite:
-    """Return a suite whose filter starts with large uncertainty, if a log begins in motion.
+def wide_start(suite: SensorSuite, log: Log) -> dict[str, float]:
+    """Return keywords of `initialize` for a large uncertainty, if a log begins in motion.
 
-    A filter that solves Wahba's problem for its start keeps it.
+    A filter that solves Wahba's problem for its start keeps it: there are none.
     """
     speed = _first_speed(log, suite)
     own = suite.estimator
     if speed is None or own.initial_tilt_sigma is None:
-        return suite
-    wide = own.replace(
-        initial_tilt_sigma=max(own.initial_tilt_sigma, TILT),
-        initial_velocity_variance=max(own.initial_velocity_variance, (1.0 + round(speed)) ** 2),
-    )
-    return suite.replace(estimator=wide)
+        return {}
+    at_rest = math.sqrt(own.initial_velocity_variance)
+    return {
+        "tilt_sigma": max(own.initial_tilt_sigma, TILT),
+        "rest_sigma": max(at_rest, 1.0 + round(speed)),
+    }
 
 
 def _first_speed(log: Log, suite: SensorSuite) -> float | None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from quad_gym.estimation.filtering.filters import LONGEST_STEP, KalmanFilter
 from quad_gym.estimation.filtering.starts import state_at_rest
+from quad_gym.estimation.replaying.first_motion import wide_start
 from quad_gym.estimation.replaying.measurements import LogMeasurements
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
@@ -21,28 +22,28 @@ class LogStart:
         measured: Measurements of the log.
         given: Keywords of `initialize` or, with a position, of `set_state`.
         in_order: True if measurements are processed in the order of their time stamps.
-        tilted: True if roll and pitch are too uncertain for a heading by a magnetic field.
     """
 
-    def __init__(
-        self, measured: LogMeasurements, given: dict[str, Any], in_order: bool, tilted: bool
-    ) -> None:
-        self.given, self.tilted = given, tilted
+    def __init__(self, measured: LogMeasurements, given: dict[str, Any], in_order: bool) -> None:
+        self.given = given
         self.at_rest = "position" in given  #: True: the caller gives the state
         self.from_fix: dict[str, Any] = {}  #: keywords of `initialize`, once they are known
         self._measured, self._in_order = measured, in_order
         self._field: int | None = None  # the last magnetic field before the start
+        self.field_row: int | None = None  #: row of the magnetometer that the start uses
         self._first_fix = math.inf
+        # roll and pitch of a wide start are too uncertain for a heading by a magnetic field
+        self.tilted = bool(wide_start(measured.suite, measured.log)) and not in_order
 
     def begin(self, kf: KalmanFilter, suite: SensorSuite) -> None:
-        """Start a filter; `suite` is its suite, without a wide start."""
+        """Start a filter with its suite."""
         if self.at_rest:
             try:
                 kf.set_state(**self._state(suite))
             except TypeError as error:
                 raise ValueError(f"start must be the keywords of set_state: {error}") from None
         else:
-            kf.initialize(**self.from_fix)
+            kf.initialize(**self._widened(self.from_fix, suite))
         if self._measured.log.barometer_from_start:  # relative to the height of the vehicle
             kf._engine.steps["level"] = np.nan
 
@@ -70,14 +71,23 @@ class LogStart:
                 return False
             if self._field is not None:
                 fields = self._measured.streams["magnetometer"].values["magnetometer"]
-                fix["magnetometer"] = fields[self._field]
+                fix["magnetometer"], self.field_row = fields[self._field], self._field
         if self.given.get("course") and "gnss_velocity_G" not in {**fix, **self.given}:
             why = "the first fix of the log has none"
             if not self._measured.takes_velocity:
                 why = "the sensors take none: GnssParams.velocity_sigma is None"
             raise ValueError(f"a start by its course must have a GNSS velocity, but {why}")
-        self.from_fix = {**fix, **self.given, "time": time}
+        self.from_fix = self._widened({**fix, **self.given, "time": time}, self._measured.suite)
         return True
+
+    def _widened(self, fix: dict[str, Any], suite: SensorSuite) -> dict[str, Any]:
+        """Return a first fix with the uncertainty of a start in motion, for a suite."""
+        wide = wide_start(suite, self._measured.log)
+        if "accel" in fix:  # at rest
+            wide.pop("tilt_sigma", None)
+        if "gnss_velocity_G" in fix:
+            wide.pop("rest_sigma", None)
+        return {**fix, **wide, **self.given}
 
     def _knows_heading(self, fix: dict[str, Any]) -> bool:
         """Return True if no magnetic field is necessary, or admitted, for the heading."""

@@ -20,7 +20,6 @@ from quad_gym.estimation.filtering.tape import TapeWriter
 from quad_gym.estimation.logs import Floats, Log
 from quad_gym.estimation.replaying.calls import FilterCalls
 from quad_gym.estimation.replaying.collecting import collected, name_of
-from quad_gym.estimation.replaying.first_motion import with_wide_start
 from quad_gym.estimation.replaying.held_position import SENTENCE, held, lacks_position
 from quad_gym.estimation.replaying.log_start import LogStart
 from quad_gym.estimation.replaying.measurements import LogMeasurements
@@ -63,13 +62,11 @@ class Player:
             log, suite = held(log, suite, place)
         self.log, self.suite, self.estimator = log, suite, estimator
         self.in_order, self.window = window is None, window or 0.0
-        wide = with_wide_start(suite, log)
-        self.filter = ESTIMATORS[estimator](wide, window=self.window)
+        self.filter = ESTIMATORS[estimator](suite, window=self.window)
         self.measured = LogMeasurements(log, suite, reported_noise)
         self.streams, self.unused = self.measured.streams, self.measured.unused
         self.unused = ("gnss", *self.unused) if unused_gnss else self.unused
-        tilted = wide is not suite and not self.in_order
-        self.start = LogStart(self.measured, start, self.in_order, tilted)
+        self.start = LogStart(self.measured, start, self.in_order)
         self.averages = suite.imu.samples == "average"
         self.late: dict[str, list[float]] = {}  # ages of what came too late, by sensor
         self.history = InputHistory(self.window, max(LONGEST_STEP, suite.imu.dt), numbered=True)
@@ -127,7 +124,7 @@ class Player:
 
     def started(self, suite: SensorSuite) -> KalmanFilter:
         """Return a filter for another suite in the state in which the tape begins."""
-        kf = ESTIMATORS[self.estimator](with_wide_start(suite, self.log), window=self.window)
+        kf = ESTIMATORS[self.estimator](suite, window=self.window)
         self.start.begin(kf, suite)
         return kf
 
@@ -143,7 +140,7 @@ class Player:
         self.history.begin(begin)
         if self.calls is not None:
             given = self.start.from_fix or {"time": begin, **self.start.given}
-            self.calls.start(given, self.filter.sensors, self.log.barometer_from_start)
+            self.calls.start(given, self.start.field_row, self.log.barometer_from_start)
         return fix + 1
 
     def _write_inputs(self, names: list[str], kinds: Any, places: Any, first: int) -> None:
@@ -172,7 +169,7 @@ class Player:
             self.writer.write(inputs)
             self._require_samples(inputs)
             times.append(inputs["now"][inputs["keeps"] > 0])
-            self._note(inputs, names, kinds[some], places[some])
+            self._note(inputs, names, kinds[some], places[some], before)
             samples = places[some][kinds[some] == 0]
             before = int(samples[-1]) if len(samples) else before
         self.writer.keep()
@@ -193,12 +190,16 @@ class Player:
         for kind, stream in enumerate(self.streams.values()):
             inputs["time"][kinds == kind] = stream.time[places[kinds == kind]]
         imu, rows = kinds == 0, places[kinds == 0]
-        chosen = rows if self.averages else np.append(before, rows)[:-1]
+        chosen = self._samples(rows, before)
         for name in ("gyro", "accel"):
             values = self.log.imu.values[name][chosen]
             values[chosen < 0] = np.nan  # none holds before the first one
             inputs[name][imu] = values
         return inputs
+
+    def _samples(self, rows: Any, before: int) -> Any:
+        """Return the samples (n,) that hold for the times up to these rows of the IMU."""
+        return rows if self.averages else np.append(before, rows)[:-1]
 
     def _require_samples(self, inputs: Any) -> None:
         """Refuse samples that are too far apart."""
@@ -212,7 +213,7 @@ class Player:
                 f"{far['now'][0]:.3f} s to {far['time'][0]:.3f} s: {cause}"
             )
 
-    def _note(self, inputs: Any, names: list[str], kinds: Any, places: Any) -> None:
+    def _note(self, inputs: Any, names: list[str], kinds: Any, places: Any, before: int) -> None:
         """Note which measurements were taken and which came too late, and the calls."""
         measures, old = inputs["rank"] > 0, inputs["outcome"] == Outcome.TOO_OLD
         took = measures & ~old
@@ -222,6 +223,8 @@ class Player:
             age = float(stream.received[place] - stream.time[place])
             self.late.setdefault(names[kind], []).append(age)
         if self.calls is not None:
-            for given, kind, place in zip(inputs, kinds.tolist(), places.tolist(), strict=True):
-                measurement = self.measured.at(names[kind], place) if kind else None
-                self.calls.take(given, names[kind], measurement)
+            rows = places.copy()
+            rows[kinds == 0] = self._samples(places[kinds == 0], before)
+            for given, kind, row in zip(inputs, kinds.tolist(), rows.tolist(), strict=True):
+                measurement = self.measured.at(names[kind], row) if kind else None
+                self.calls.take(given, names[kind], row, measurement)

@@ -84,7 +84,7 @@ def replay(
     reach = window + max(0.0, *vars(suite.log_delays).values())
 
     def fly(part: Log, begin: dict[str, Any]) -> Replay:
-        calls = None if samples is None else FilterCalls(suite)
+        calls = None if samples is None else FilterCalls(suite, part)
         hold = own is None and calls is None  # the exported filter receives measurements only
         player = Player(part, suite, estimator, begin, reported_noise, reach, calls, hold)
         found = player.play() if own is None else OwnPlayer(player, own).play()
