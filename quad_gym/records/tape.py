@@ -8,7 +8,7 @@ from quad_gym.records.layout import block_dtype
 from quad_gym.records.sizes import AID_ROWS, AIDS, MAX_BLOCKS, MAX_FEATURES, MAX_SLOW, Field
 
 SAMPLE = np.dtype([("gyro", "f8", 3), ("accel", "f8", 3), ("dt", "f8"), ("gyro_before", "f8", 3)])
-"""An IMU sample that propagates the estimate; see `quad_gym.estimation.filtering.samples.Sample`."""
+"""An IMU sample that propagates the estimate; `gyro_before` is the one before, for lever arms."""
 
 NOISE_FIELDS = (
     "position_sigma_I",

@@ -188,10 +188,12 @@ class KalmanFilter(FilterEstimate):
             time: Time stamp of the measurements [s], from `oldest_time` to the filter's `time`;
                 None: the filter's `time`.
             others: Measurements of aiding sensors in the suite: `barometer`, the height in I from
-                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T]. Also
-                standard deviations that replace the suite's, per axis: `gnss_sigma`, a number or
-                three numbers (east, north, up) [m]; `velocity_sigma` [m/s], `baseline_sigma` [rad],
-                `pixel_sigma` [pixels], `barometer_sigma` [m], `magnetometer_sigma` [T].
+                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T];
+                `optical_flow`, (2,) angular rates [rad/s]; `range_finder` [m]; `uwb_range`,
+                (anchors,) ranges [m]. Also standard deviations that replace the suite's, per axis:
+                `gnss_sigma`, a number or three numbers (east, north, up) [m]; `velocity_sigma`
+                [m/s], `baseline_sigma` [rad], `pixel_sigma` [pixels], and for each aiding sensor,
+                such as `barometer_sigma` [m], in its unit.
 
         Raises:
             ValueError: If an argument has another shape or is not finite, the suite lacks the
@@ -348,7 +350,7 @@ class ExtendedKalmanFilter(KalmanFilter):
     """An error-state EKF for one vehicle, with the state, models, noise and interface of the UKF.
 
     Its covariance follows from analytic derivatives of the models at the estimate, which cost less
-    than sigma points and neglect the second order; see `quad_gym.kernels.filter.ekf`.
+    than sigma points and neglect the second order; see `quad_gym.kernels.filter.predict`.
 
     Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for error angles about an
     estimated attitude.
