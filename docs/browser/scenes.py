@@ -7,7 +7,7 @@ import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.envs.spaces import ObservationField, layout_bounds, observation_layout
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.control import pd_gains

@@ -27,9 +27,12 @@ from docs.extensions import policy_cards
 from docs.renewal.pages import TABLES
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
-from quad_gym.envs.flights import TASK_DEFAULTS
-from quad_gym.envs.keywords import TASK_KEYWORDS
+from quad_gym.envs.config import (
+    KEYWORDS_WITHOUT_EFFECT,
+    ONE_TASK_KEYWORDS,
+    TASK_DEFAULTS,
+    TASK_KEYWORDS,
+)
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.estimation.logs.log import LOG_COLUMNS, LogColumn
 from quad_gym.flights.columns import COLUMNS, FEATURES

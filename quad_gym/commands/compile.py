@@ -160,7 +160,8 @@ def _build(args: CompileArgs) -> int:
 def _default_plans() -> Iterator[Any]:
     """Yield the plans of the tasks with default options, on the truth and on the estimate."""
     from quad_gym.device.emission import plan_of
-    from quad_gym.envs.flights import TASK_DEFAULTS, Flights
+    from quad_gym.envs.config import TASK_DEFAULTS
+    from quad_gym.envs.flights import Flights
     from quad_gym.records import Autoreset
 
     for task in TASK_DEFAULTS:

@@ -25,7 +25,7 @@ from quad_gym.analysis.plots import require_matplotlib
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.envs import IDS
-from quad_gym.envs.flights import own_estimator
+from quad_gym.envs.config import own_estimator
 from quad_gym.experiments.consistency import Case, CaseFlights, run_single
 from quad_gym.params import checks as check
 from quad_gym.params.suites import FIELD_FILTER

@@ -21,7 +21,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
-from quad_gym.envs.effects import with_effect
+from quad_gym.envs.config import with_effect
 from quad_gym.evaluation import Policy
 from quad_gym.experiments.evaluated import (
     Evaluated,

@@ -15,7 +15,8 @@ from quad_gym.device.flights import Launcher
 from quad_gym.device.launching import CudaLauncher
 from quad_gym.device.plan import DevicePlan
 from quad_gym.device.tasks import flights_on
-from quad_gym.envs.flights import Base, named_options
+from quad_gym.envs.config import Base
+from quad_gym.envs.flights import named_options
 from quad_gym.envs.keywords import VectorKeywords, shows
 from quad_gym.envs.torch_env import QuadTorchVecEnv, checked_device
 from quad_gym.envs.vector import seeds_of

@@ -5,14 +5,13 @@ interfaces, `inspect.signature` and `help` from the signatures that `shows` make
 explains each keyword.
 """
 
-import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
 
+from quad_gym.envs.config import DEFAULTS, TASK_KEYWORDS
 from quad_gym.faults.presets import FaultsGiven
-from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.params import checks as check
 from quad_gym.params.control import ActionParams
 from quad_gym.params.randomization import Given, Randomization
@@ -90,34 +89,7 @@ class VectorKeywords(EnvKeywords, total=False):
     render_flights: Sequence[int] | None
 
 
-_OWN_DEFAULTS: dict[str, Any] = {
-    "observation": "estimate",
-    "action": "ctbr",
-    "layout": "relative",
-    "reward_terms": False,
-    "camera": True,
-    "estimator": None,
-    "control_rate": 50.0,
-}
-"""Defaults that differ from `FlightBatch`, or that it lacks."""
-
-DEFAULTS: dict[str, Any] = {
-    **{
-        field.name: field.default
-        for field in dataclasses.fields(FlightConfiguration)
-        if field.name in inspect.get_annotations(EnvKeywords)
-    },
-    **_OWN_DEFAULTS,
-}
-"""Defaults of keywords that the id's task does not set; None for all others."""
-
-TASK_KEYWORDS = tuple(inspect.get_annotations(TaskKeywords))
-"""Names of the keywords that are fields of `TaskParams`."""
-
 RENDERING_KEYWORDS = ("render_view", "render_size")  #: names of the keywords that concern pictures
-
-FILTER_KEYWORDS = ("estimator", "filter_start")
-"""Names of the keywords that have an effect only where a filter runs."""
 
 
 def types_of(keywords: type) -> dict[str, Any]:

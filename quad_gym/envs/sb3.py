@@ -10,8 +10,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from quad_gym.batch.seeding import stream_keys
+from quad_gym.envs.config import Base
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
-from quad_gym.envs.flights import Base, Flights, checked_actions, start_options
+from quad_gym.envs.flights import Flights, checked_actions, start_options
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import Rendered, rendering_options
 from quad_gym.envs.spaces import action_space

@@ -6,8 +6,9 @@ import gymnasium
 import numpy as np
 
 from quad_gym.batch.seeding import stream_key
+from quad_gym.envs.config import Base
 from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
-from quad_gym.envs.flights import Base, Flights, checked_actions
+from quad_gym.envs.flights import Flights, checked_actions
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space

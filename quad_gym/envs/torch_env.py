@@ -5,7 +5,7 @@ from typing import Any, Unpack
 import torch
 from gymnasium.vector import AutoresetMode
 
-from quad_gym.envs.flights import Base
+from quad_gym.envs.config import Base
 from quad_gym.envs.keywords import VectorKeywords, shows
 from quad_gym.envs.vector import QuadVectorEnv
 

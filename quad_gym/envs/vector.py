@@ -10,8 +10,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from quad_gym.batch.seeding import stream_keys
+from quad_gym.envs.config import Base
 from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults, start_info
-from quad_gym.envs.flights import Base, Flights, checked_actions, named_options
+from quad_gym.envs.flights import Flights, checked_actions, named_options
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space

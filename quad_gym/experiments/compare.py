@@ -14,7 +14,7 @@ from quad_gym.analysis import comparison_plots
 from quad_gym.analysis.intervals import in_brackets, mean_interval, paired_difference
 from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import columns_of, text_table, versions, write_csv, write_json
-from quad_gym.envs.effects import with_effect
+from quad_gym.envs.config import with_effect
 from quad_gym.experiments.experiment import Experiment, Floats
 from quad_gym.experiments.flown import Flown, Trial
 from quad_gym.experiments.pages import Report

@@ -15,7 +15,7 @@ from quad_gym.analysis.consistency_plots import errors_figure, mean_square_figur
 from quad_gym.analysis.plots import save_figure
 from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.params.sensors import SensorSuite
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from baselines.policies import load_policy
 from quad_gym import Flight, FlightRecorder
 from quad_gym.analysis.recording import Tracer
-from quad_gym.envs.effects import with_effect
+from quad_gym.envs.config import with_effect
 from quad_gym.evaluation import Episodes, Policy, roll_out, steps_of
 
 Floats = NDArray[np.float64]

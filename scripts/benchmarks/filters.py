@@ -21,7 +21,7 @@ from quad_gym.analysis.consistency_flights import ASTRAY, endless
 from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_over_trainings
 from quad_gym.analysis.metrics import nees
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.evaluation import roll_out
 from quad_gym.experiments.benchmark import timing
 from quad_gym.faults.presets import possible

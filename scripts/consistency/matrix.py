@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from quad_gym.analysis.consistency import PARTS, SENSOR_BLOCKS
 from quad_gym.analysis.metrics import chi_square_band
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.experiments.consistency import Case, CaseFlights, fly
 from quad_gym.faults.presets import PRESETS, possible
 from quad_gym.params.distributions import Uniform

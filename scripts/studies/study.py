@@ -13,7 +13,7 @@ from baselines.plans import Plan
 from baselines.recipes import Recipe
 from quad_gym.analysis.intervals import Estimated, rate_over_trainings
 from quad_gym.analysis.reports import as_json
-from quad_gym.envs.effects import with_effect
+from quad_gym.envs.config import with_effect
 from quad_gym.evaluation import Policy
 from quad_gym.experiments.experiment import Experiment, Floats
 from quad_gym.experiments.flown import Flown, Trial

@@ -15,16 +15,9 @@ import baselines
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import evaluate
-from quad_gym.envs.effects import with_effect
+from quad_gym.envs.config import DEFAULTS, TASK_KEYWORDS, with_effect
 from quad_gym.envs.flights import Flights
-from quad_gym.envs.keywords import (
-    DEFAULTS,
-    RENDERING_KEYWORDS,
-    TASK_KEYWORDS,
-    EnvKeywords,
-    TaskKeywords,
-    VectorKeywords,
-)
+from quad_gym.envs.keywords import RENDERING_KEYWORDS, EnvKeywords, TaskKeywords, VectorKeywords
 from quad_gym.records import Autoreset
 
 ROOT = Path(__file__).parents[2]

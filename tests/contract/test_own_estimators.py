@@ -13,7 +13,7 @@ import quad_gym
 from quad_gym.analysis.consistency import flight_errors
 from quad_gym.analysis.metrics import nees
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.records import Control, Source
 from tests import console_commands
 from tests.builders import batch, single_env, vec_env

@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are
 
 from quad_gym.analysis.consistency_flights import endless
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.records import Source
 from scripts.benchmarks.posterior_bound import Recursion, posterior_bound
 

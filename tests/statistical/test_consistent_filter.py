@@ -10,7 +10,7 @@ import quad_gym
 from quad_gym.analysis.consistency import flight_errors
 from quad_gym.analysis.consistency_flights import endless, measure_consistency
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.records import Source
 from tests.builders import batch as flights_of
 from tests.consistent import assert_consistent, start_matched

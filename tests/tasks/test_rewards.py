@@ -9,7 +9,7 @@ import pytest
 import quad_gym
 from baselines import PDPolicy
 from quad_gym import rewards
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.tasks.rewards import BLOCKS, Constant, Term
 from tests.builders import flown
 

@@ -11,7 +11,7 @@ import pytest
 import quad_gym
 from quad_gym.device import emission
 from quad_gym.device.emission import plan_of, ptx_of
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.kernels.compiling.building import PROCESSORS
 from quad_gym.kernels.library import machine
 from quad_gym.params.suites import SUITES

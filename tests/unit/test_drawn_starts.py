@@ -9,7 +9,7 @@ from scipy import stats
 
 import quad_gym
 from quad_gym import LogUniform, Normal, Uniform
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from tests.field_flights import fly, nees, steps
 
 FLIGHTS = 20_000

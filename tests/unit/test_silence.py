@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.estimation import UnscentedKalmanFilter
 from quad_gym.faults import GnssJump, GyroBiasStep, PositionJump

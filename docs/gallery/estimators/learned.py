@@ -22,7 +22,7 @@ import numpy as np
 
 import quad_gym
 from quad_gym.analysis.consistency_flights import endless
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.records import Source
 from quad_gym.rotations import euler_to_dcm
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.flights import TASK_DEFAULTS
+from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import timing
 from quad_gym.records import Source
 
