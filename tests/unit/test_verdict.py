@@ -1,6 +1,7 @@
 """The verdict on a replay, by quantity, on simulated flights with known faults."""
 
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -11,8 +12,8 @@ from scipy.stats import chi2
 from quad_gym.estimation import replay
 from quad_gym.estimation.logs import Log, Stream
 from quad_gym.estimation.replaying.dead_reckoning import HORIZONS, changes
-from quad_gym.estimation.replaying.findings import Finding, Severity, by_quantity
-from quad_gym.estimation.replaying.fits import exceeds, fit_of, larger
+from quad_gym.estimation.replaying.findings import QUANTITIES, Finding, Severity, by_quantity
+from quad_gym.estimation.replaying.fits import exceeds, fit_of, larger, runs_beyond_chance
 from quad_gym.estimation.replaying.results import Measured
 from quad_gym.estimation.replaying.verdict import in_one_line
 from quad_gym.records import GateDecision
@@ -85,6 +86,42 @@ def test_measurements_of_another_clock_are_named_with_the_difference():
     assert any("nothing corrects it for 4" in p for p in result.problems)
 
 
+def test_stamps_that_step_back_are_named_with_their_time():
+    log, _ = flight()
+    late = np.isfinite(log["gnss_enu"][:, 0]) & (log["time"] > 30.0)
+    result = replay(log | {"time": np.where(late, log["time"] - 1.0, log["time"])}, sensors=NAME)
+    (text,) = (f.text for f in of(result, "position") if "step back" in f.text)
+    assert re.search(
+        r"all from 3[01]\.\d s on, by about 1\.\d\d s: the time stamps step back", text
+    )
+
+
+@pytest.mark.parametrize(("begin", "end"), [(44.0, 60.0), (20.0, 27.0)])
+def test_a_receiver_that_is_refused_to_the_end_or_for_a_tenth_of_a_log_is_lost(begin, end):
+    """It is 150 m away from one fix to the next, which the filter refuses in a row."""
+
+    def change(table, rng, suite):
+        wrong = (table["time"] > begin) & (table["time"] < end)
+        table["gnss_enu"][wrong] += (150.0, 0.0, 0.0)
+
+    result = judged(change)
+    assert result.verdict.startswith("not usable, because position: ")
+    assert any("GNSS position refused for" in problem for problem in result.problems)
+
+
+@pytest.mark.parametrize("pause", [False, True])
+def test_a_log_without_a_position_is_not_usable_however_short_its_parts_are(pause):
+    """Seven seconds, or three parts of seven, in which nothing corrects the position."""
+    table = foreign_logs.flight(21.0 if pause else 7.0).table()
+    kept = (table["time"] % 7.0 < 5.0) if pause else np.ones(len(table["time"]), bool)
+    table = {k: v[kept] for k, v in table.items() if not k.startswith("gnss")}
+    start = {"position": (0.0, 0.0, 0.0), "heading": 0.0}
+    result = replay(table, sensors="field", start=start)
+    (text,) = (f.text for f in of(result, "position") if f.severity == Severity.LOST)
+    flown = 15 if pause else 7
+    assert re.fullmatch(rf"nothing corrects it for {flown} s which is the whole log: .*", text)
+
+
 def test_an_outage_of_twelve_seconds_is_dead_reckoning_and_one_of_six_is_not():
     assert any("dead reckoning" in p for p in judged(verdicts.silence).problems)
     assert not judged(verdicts.outage).problems
@@ -129,6 +166,19 @@ def test_a_share_exceeds_its_limit_as_often_as_the_test_says():
     at, above = ([exceeds(rng.random(300) < p, 0.1) for _ in range(400)] for p in (0.1, 0.2))
     assert np.mean(at) < 0.08
     assert np.mean(above) > 0.95
+
+
+def test_runs_of_rejections_are_those_that_independent_outliers_hardly_have():
+    """Of logs with independent outliers, one in a thousand has such a run."""
+    rng = np.random.default_rng(3)
+    for share in (0.03, 0.2):
+        found = [bool(runs_beyond_chance(rng.random(400) < share, 1e-3)) for _ in range(1500)]
+        assert np.mean(found) < 0.005
+    rejected = rng.random(400) < 0.03
+    rejected[348:] = True
+    assert runs_beyond_chance(rejected, 1e-3)[-1] == pytest.approx((348, 399), abs=2)
+    half = np.arange(100) >= 50
+    assert runs_beyond_chance(half, 1e-3) == [(50, 99)]
 
 
 def test_repeated_cases_are_no_further_evidence():
@@ -195,11 +245,15 @@ def test_the_estimate_changes_by_what_is_added_to_it():
 
 def test_a_line_names_the_first_problem_or_the_worst_sensors():
     lost = Finding(quantity="heading", severity=Severity.LOST, text="turned")
+    doubtful = [replace(lost, quantity=q, severity=Severity.UNCERTAIN) for q in QUANTITIES[1::-1]]
     fits = {
         name: fit_of(measured(size * np.ones((5, 1)), np.zeros(5, bool)))
         for name, size in (("gnss_position", 0.5), ("barometer", 1.1))
     }
     assert in_one_line([lost], fits) == "not usable, because heading: turned"
+    assert in_one_line(doubtful, fits).startswith(
+        "usable with reservations: position, height; NIS per degree of freedom 0.25 to 1.2"
+    )
     assert in_one_line([], fits) == (
         "usable: NIS per degree of freedom 0.25 to 1.2, pessimistic in GNSS position by a factor "
         "of 2.0"

@@ -20,9 +20,9 @@ from quad_gym.estimation.calibrating.validation import Validation, pooled, valid
 from quad_gym.estimation.logs import Log, Reading, read_log
 from quad_gym.estimation.logs.parts import longest_part, naming
 from quad_gym.estimation.logs.quantities import compared
+from quad_gym.estimation.replaying.motion_rules import BEYOND, MAX_BIAS
 from quad_gym.estimation.replaying.plausibility import implausible
 from quad_gym.estimation.replaying.replay import origin_of, replay
-from quad_gym.estimation.replaying.verdict import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SENSOR_PARAMS, SensorSuite
 from quad_gym.params.suites import sensor_suite

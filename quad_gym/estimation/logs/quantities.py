@@ -288,7 +288,8 @@ def _motions(time: Floats, places: Floats, stamps: Floats, told: Floats) -> tupl
 def _differs(moved: Floats, mean: Floats) -> float:
     """Return the median difference of horizontal velocities over the median speed [-]."""
     difference = np.linalg.norm((mean - moved)[:, :2], axis=1)
-    return float(np.median(difference) / np.median(np.linalg.norm(moved[:, :2], axis=1)))
+    speed = float(np.median(np.linalg.norm(moved[:, :2], axis=1)))
+    return float(np.median(difference)) / speed if speed > 0.0 else math.inf
 
 
 def _cause(moved: Floats, mean: Floats) -> str:

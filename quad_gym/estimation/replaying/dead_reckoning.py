@@ -58,7 +58,8 @@ def changes(log: Log, result: Replay, settled: float) -> tuple[list[Change], int
     S = np.vstack([np.zeros(3), S])
     W = np.cumsum(np.einsum("kji,kj->ki", R[1:], _small_angles(R[1:], predicted)), axis=0)
     W = np.vstack([np.zeros(3), W])
-    hardest = np.linalg.norm(accel, axis=1) / dt
+    hardest = np.linalg.norm(accel, axis=1)  # parts may follow each other without time between
+    np.divide(hardest, dt, out=hardest, where=dt > 0.0)
     began = np.maximum.accumulate(np.append(-np.inf, np.where(dt > PAUSE, time[1:], -np.inf)))
     found: dict[str, Change] = {}
     count = 0

@@ -98,3 +98,20 @@ def larger(nis: Floats, freedoms: int, ratio: float) -> bool:
     from scipy.stats import chi2
 
     return exceeds(nis > ratio * chi2.median(freedoms), 0.5)
+
+
+def runs_beyond_chance(rejected: Any, probability: float) -> list[tuple[int, int]]:
+    """Return first and last rows of the runs of rejections (n,) that chance does not explain.
+
+    Chance has independent outliers that are as frequent as the rejections outside of the run, and
+    at least 1 %, and explains a run unless its probability is smaller than the given one.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(rejected, int), [0]])))
+    count, total = len(rejected), int(np.sum(rejected))
+    found = []
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        length = end - begin
+        share = max((total - length) / max(count - length, 1), 0.01)
+        if count * share**length < probability:
+            found.append((begin, end - 1))
+    return found
