@@ -213,6 +213,8 @@ def test_the_command_starts_a_log_without_gnss_at_a_position(tmp_path, capsys):
         main(words)
     assert ended.value.code == 2
     assert "--start-position must come with --heading" in capsys.readouterr().err
-    main([*words, "--heading", "90"])
+    with pytest.raises(SystemExit) as ended:  # no sensor measures the position
+        main([*words, "--heading", "90"])
+    assert ended.value.code == 1
     rows = np.genfromtxt(tmp_path / "out/estimates.csv", delimiter=",", names=True)
     assert rows["position_x"][0] == 3.0

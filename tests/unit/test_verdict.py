@@ -119,7 +119,7 @@ def test_a_log_without_a_position_is_not_usable_however_short_its_parts_are(paus
     result = replay(table, sensors="field", start=start)
     (text,) = (f.text for f in of(result, "position") if f.severity == Severity.LOST)
     flown = 15 if pause else 7
-    assert re.fullmatch(rf"nothing corrects it for {flown} s which is the whole log: .*", text)
+    assert re.fullmatch(rf"nothing corrects it for {flown} s, the whole log: .*", text)
 
 
 def test_an_outage_of_twelve_seconds_is_dead_reckoning_and_one_of_six_is_not():

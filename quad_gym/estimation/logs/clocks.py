@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from quad_gym.estimation.logs.log import Floats
-from quad_gym.estimation.logs.source import LogSource, RawLog
+from quad_gym.estimation.logs.repeats import spread
+from quad_gym.estimation.logs.source import COMMANDS, LogSource, RawLog
+from quad_gym.params.aid_table import AID_PARAMS
 
 LATE = (
     1.0  #: largest delay of a measurement behind a later one, beyond which its stamp is wrong [s]
@@ -62,6 +64,9 @@ def cleaned(recording: RawLog, source: LogSource) -> LogSource:
         after = np.minimum.accumulate(np.where(fits, time, np.inf)[::-1])[::-1]
         fits |= (time > before - LATE) & (time < after + LATE)
     source = _without_lone_stamps(source.keep(fits, WRONG))
+    source = _without_doubles(source)
+    if source.sensor in _OF_IMU or source.sensor in AID_PARAMS:
+        source = spread(recording, source, PAUSE)
     return _once(source)
 
 
@@ -86,8 +91,20 @@ def _without_lone_stamps(source: LogSource) -> LogSource:
     return source.keep(sizes[part] > min(_FEW, sizes.max() - 1), WRONG)
 
 
+def _without_doubles(source: LogSource) -> LogSource:
+    """Return a source without rows that equal another one with the same stamp."""
+    if len(source) < 2 or source.sensor in COMMANDS:
+        return source
+    columns = (v.reshape(len(source), -1) for v in source.values.values())
+    table = np.nan_to_num(np.column_stack([source.time, *columns]), nan=np.inf)
+    order = np.argsort(source.time, kind="stable")
+    fresh = np.ones(len(source), bool)
+    fresh[order[1:]] = (table[order[1:]] != table[order[:-1]]).any(axis=1)
+    return source.keep(fresh, DOUBLED)
+
+
 def _once(source: LogSource) -> LogSource:
-    """Return a source without doubled rows, and without copies of the measurement before."""
+    """Return a source with a row for each stamp, and without copies of the measurement before."""
     if len(source) < 2:
         return source
     order = np.argsort(source.time, kind="stable")
@@ -95,7 +112,7 @@ def _once(source: LogSource) -> LogSource:
     fresh[order[1:]] = np.diff(source.time[order]) > 0.0
     if source.sensor != "motors":
         source = source.keep(fresh, DOUBLED)
-    if source.sensor in _OF_IMU or source.sensor in ("motors", "battery"):
+    if source.sensor in _OF_IMU or source.sensor in COMMANDS:
         return source
     table = np.column_stack([v.reshape(len(source), -1) for v in source.values.values()])
     table = np.nan_to_num(table, nan=np.inf)

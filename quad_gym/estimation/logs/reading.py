@@ -9,8 +9,9 @@ import numpy as np
 
 from quad_gym.estimation.logs import clocks, euroc, maps, quantities, tables
 from quad_gym.estimation.logs.log import Log, Stream
+from quad_gym.estimation.logs.repeats import without_repeats
 from quad_gym.estimation.logs.selection import select
-from quad_gym.estimation.logs.source import LogSource, RawLog
+from quad_gym.estimation.logs.source import COMMANDS, LogSource, RawLog
 from quad_gym.params import checks as check
 
 
@@ -124,6 +125,7 @@ def _log_of(
     sources = [
         quantities.measured(recording, clocks.cleaned(recording, s)) for s in recording.sources
     ]
+    sources = [s if s.sensor in COMMANDS else without_repeats(recording, s) for s in sources]
     chosen = select(recording, sources, instance, topic)
     if "imu" not in chosen and {"gyro", "accel"} <= set(chosen):
         chosen["imu"] = _joined(recording, chosen["gyro"], chosen["accel"])

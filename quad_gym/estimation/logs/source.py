@@ -23,6 +23,9 @@ SENSORS = (
 """Sensors that a source may have; `gyro` and `accel` are the halves of an IMU, `gnss_velocity` has
 velocities apart from positions."""
 
+COMMANDS = ("motors", "battery")
+"""Sources that are no measurements of the motion."""
+
 TO_FLU = np.array([1.0, -1.0, -1.0])
 """Vectors of a body with x forward, y right, z down as forward, left, up, and the reverse."""
 

@@ -84,7 +84,7 @@ def checked_columns(given: Mapping[Any, Any]) -> Columns:
                 for j, axis in enumerate("uv"):
                     found[f"pixel_{i}_{axis}"] = array_[:, i, j].astype(np.float64)
         elif array_.ndim == 2 and name in LOG_COLUMNS:
-            names = LOG_COLUMNS[name].names
+            names = _names_of(name, array_.shape[1])
             check.array(f"column {name}", array_, (None, len(names)), allow_nan=True)
             found.update({n: array_[:, i].astype(np.float64) for i, n in enumerate(names)})
         else:
@@ -101,6 +101,14 @@ def checked_columns(given: Mapping[Any, Any]) -> Columns:
         if name not in found:
             raise ValueError(f"a log must have a column {name}, got {', '.join(found) or 'none'}")
     return found
+
+
+def _names_of(key: str, width: int) -> tuple[str, ...]:
+    """Return the columns of a quantity with a width; of several blocks, as many as are given."""
+    names, kind = LOG_COLUMNS[key].names, AID_PARAMS.get(key)
+    if kind is None or kind.most_blocks == 1 or width % kind.length:
+        return names
+    return names[:width]
 
 
 def _pixel_of(name: str) -> tuple[int, int] | None:

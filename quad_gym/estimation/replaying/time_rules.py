@@ -81,8 +81,8 @@ def gaps(case: Case) -> Iterator[Finding]:
         during = (result.time >= since) & (result.time <= until)
         sigma = float(np.linalg.norm(result.sigma[during, axes], axis=1).max())
         known = "" if math.isnan(sigma) else f", standard deviation up to {sigma:.3g} m"
-        where = f"from {since:.1f} s on" if len(times) else "which is the whole log"
-        yield lost(quantity, f"{text} {where}: dead reckoning{known}")
+        where = f" from {since:.1f} s on" if len(times) else ", the whole log"
+        yield lost(quantity, f"{text}{where}: dead reckoning{known}")
         if quantity == "position":
             return  # which the height shares
 
