@@ -14,6 +14,7 @@ import importlib.util
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -27,6 +28,11 @@ _NO_CODE = {
     *(f"{__package__}.{name}" for name in ("cores", "digest", "library", "linked", "sources")),
 }
 """Modules that determine when code is compiled, but do not change the code."""
+_BEGAN = time.time()  #: when this process began to import kernels [s]
+_IMPORTED: dict[str, tuple[int, float]] = {}
+"""Modules with kernels: the identity of their names, and when the first kernel was made [s]."""
+_FILES: dict[str, Path] = {}
+"""Files of the modules of which there are digests."""
 _TABLE = f"{PACKAGE}.params.aid_table"
 """Module of parameters of which code depends on the values `AID_SHAPES` only."""
 
@@ -60,7 +66,32 @@ def _read(name: str) -> tuple[str, list[str]]:
         return "", []
     if name == _TABLE:
         return hashlib.sha256(repr(module.AID_SHAPES).encode()).hexdigest(), []
+    _FILES[name] = Path(module.__file__)
     return _parsed(Path(module.__file__).read_bytes(), module.__package__ or "")
+
+
+def edited_source() -> Path | None:
+    """File that may have changed since this process imported it, of those that have digests.
+
+    Digests are of files, and compiled code is of what was imported, so that the latter must not be
+    kept under the former. An edit changes a file's time, or, if it replaces the file or the time is
+    set, the time of its change of status.
+    """
+    for name, file in _FILES.items():
+        with contextlib.suppress(OSError):
+            status = file.stat()
+            _, imported = _IMPORTED.get(name, (0, _BEGAN))
+            if max(status.st_mtime, status.st_ctime) > imported:
+                return file
+    return None
+
+
+def note_import(function: Callable[..., Any]) -> None:
+    """Note when the module of a kernel was imported, at the latest; for `edited_source`."""
+    names = function.__globals__
+    known = _IMPORTED.get(function.__module__)
+    if known is None or known[0] != id(names):
+        _IMPORTED[function.__module__] = id(names), time.time()
 
 
 def _parsed(content: bytes, package: str) -> tuple[str, list[str]]:

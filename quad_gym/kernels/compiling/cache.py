@@ -23,7 +23,7 @@ from numba.core import caching, compiler, config
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
-from quad_gym.kernels.digest import digest_of_function
+from quad_gym.kernels.digest import digest_of_function, edited_source
 from quad_gym.kernels.library import say
 from quad_gym.records import REGISTER, WIDTH
 
@@ -163,6 +163,18 @@ class CodeCache:
                 say(f"quad_gym: compiling {self._function.__name__} ({where})")
             yield
 
+    @staticmethod
+    def is_stale() -> bool:
+        """True if a source has changed since this process imported it; reports it once.
+
+        Code that is compiled here is then that of no file, and must not be kept.
+        """
+        file = edited_source()
+        if file is not None and CodeCache.complaining:
+            CodeCache.complaining = False
+            say(f"quad_gym: compiled code is not cached: {file} has changed since it was imported")
+        return file is not None
+
     # ---- what Numba calls -------------------------------------------------------------------
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -181,7 +193,7 @@ class CodeCache:
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write the compiled code of a signature; if this fails, report it and continue."""
-        if self.folder is None:
+        if self.folder is None or self.is_stale():
             return
         content = dumps((_needed(data.library._final_module), data._reduce()))
         temporary = self.folder / f"{self._stem}.tmp"  # one process at a time writes it

@@ -13,6 +13,7 @@ from numba.core.registry import CPUDispatcher
 
 from quad_gym.kernels.compiling.cache import CodeCache
 from quad_gym.kernels.compiling.linking import EntryCompiler, KernelCompiler, KernelDispatcher
+from quad_gym.kernels.digest import note_import
 
 _OPTIONS: dict[str, Any] = {"nopython": True, "boundscheck": None, "error_model": "numpy"}
 
@@ -28,6 +29,7 @@ def routine(function: Callable[..., Any]) -> Any:
 
 
 def _kernel(function: Callable[..., Any], **options: Any) -> Any:
+    note_import(function)
     return KernelDispatcher(
         py_func=function, targetoptions=_OPTIONS | options, pipeline_class=KernelCompiler
     )
@@ -60,6 +62,7 @@ def entry(function: Callable[..., Any] | None = None, signature: Any = None) -> 
     """
     if function is None:
         return functools.partial(entry, signature=signature)
+    note_import(function)
     options = _OPTIONS | {"nogil": True}
     dispatcher = EntryDispatcher(function, targetoptions=options, pipeline_class=EntryCompiler)
     dispatcher._cache = CodeCache(function)

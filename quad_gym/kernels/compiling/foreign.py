@@ -18,6 +18,7 @@ from numba.core import compiler, typed_passes
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import cpu_target
 
+from quad_gym.kernels.compiling.cache import CodeCache
 from quad_gym.kernels.compiling.linking import EntryLibrary, compiler_with
 from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.kernels.library import core_symbol
@@ -132,7 +133,7 @@ def _read(file: Path | None) -> bytes | None:
 
 def _write(file: Path | None, content: bytes) -> None:
     """Write a cached file, and remove the oldest ones of its function."""
-    if file is None:
+    if file is None or CodeCache.is_stale():
         return
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -157,3 +157,38 @@ def test_full_disk_gives_one_warning_and_no_cached_code(parts):
     assert not parts.files("tmp")
     assert parts.run(processes=1)[0] == RIGHT
     assert len(parts.files("code")) == 3
+
+
+EDITED = """
+import os
+import sys
+import parts_of_test as parts
+from pathlib import Path
+file, kept = Path(parts.__file__), os.stat(parts.__file__)
+text = file.read_text()
+assert text.count("x + x") == 1
+file.with_suffix(".new").write_text(text.replace("x + x", "x * x * 1.0"))
+if sys.argv[1:] == ["old time"]:
+    os.utime(file.with_suffix(".new"), (kept.st_atime, kept.st_mtime))
+file.with_suffix(".new").replace(file)
+from quad_gym.kernels.compiling.workers import prepare
+prepare(parts.NAMES, processes={processes})
+print(parts.results())
+"""
+
+
+@pytest.mark.parametrize("when", ["new time", "old time"])
+def test_code_of_a_source_edited_after_its_import_is_not_kept(parts, when):
+    """The first process compiles 2 x, which it has imported, and the others x^2, of the file."""
+    if when == "old time" and sys.platform == "win32":
+        pytest.skip("Windows does not show when a file was replaced")
+    code = EDITED.replace("sys.argv[1:]", repr([when]))
+    output, said = parts.run(code, processes=1)
+    assert output == RIGHT
+    assert "compiled code is not cached:" in said
+    assert "parts_of_test.py has changed since it was imported" in said
+    assert not parts.files("code")
+    for known in (False, True):
+        output, said = parts.run(processes=1)
+        assert output == "[26.0, 27.0, 28.0]"
+        assert bool(said) != known
