@@ -136,6 +136,10 @@ class QuadDeviceVecEnv(QuadTorchVecEnv):
             return stream_keys(seeds_of(first, self.num_envs))
         return keys_of(np.arange(self.num_envs, dtype=np.uint64) + np.uint64(first))
 
+    def write_steps(self, steps: torch.Tensor) -> None:
+        """Set the number of steps of each flight's episode, as `QuadTorchVecEnv.write_steps`."""
+        self.batch.write("step", steps.to(self.device, torch.float64))
+
     def step(
         self, actions: torch.Tensor
     ) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:

@@ -39,9 +39,35 @@ class RslRlVecEnv(VecEnv):
         self.env, self.device, self.num_envs = env, env.device, env.num_envs
         self.num_actions = int(env.single_action_space.shape[0])  # type: ignore[index]
         self.max_episode_length = batch.max_steps
-        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self._lengths = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.cfg = {"env_id": env.spec.id if env.spec else env.flights.name, "seed": seed}
         self._observations = env.reset(seed=seed)[0]
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Number of steps flown in each flight's episode, (n,) of whole numbers.
+
+        Writing it, or its elements, changes when the flights reach their time limit, as the runner
+        does with `init_at_random_ep_len=True`.
+        """
+        return self._lengths
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, lengths: torch.Tensor) -> None:
+        whole = isinstance(lengths, torch.Tensor) and not (
+            lengths.is_floating_point() or lengths.is_complex() or lengths.dtype == torch.bool
+        )
+        if not whole or lengths.shape != (self.num_envs,):
+            raise ValueError(
+                f"episode_length_buf must be a tensor of {self.num_envs} whole numbers, got "
+                f"{lengths!r}"
+            )
+        if bool(((lengths < 0) | (lengths >= self.max_episode_length)).any()):
+            raise ValueError(
+                f"episode_length_buf must be at least 0 and below {self.max_episode_length}, the "
+                f"time limit, got {int(lengths.min())} to {int(lengths.max())}"
+            )
+        self._lengths = lengths.to(self.device, torch.long, copy=True)
 
     def get_observations(self) -> TensorDict:
         """Return the present observations in the groups "policy" and "critic"."""
@@ -63,10 +89,11 @@ class RslRlVecEnv(VecEnv):
         Returns:
             Observations, rewards (n,), ends of episodes (n,) bool, extras.
         """
+        self.env.write_steps(self._lengths)
         self._observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
-        self.episode_length_buf += 1
-        self.episode_length_buf[ended] = 0
+        self._lengths += 1
+        self._lengths[ended] = 0
         log = {f"/{name}": infos[name] for name in ("position_error", "estimation_error")}
         extras = {"time_outs": truncated & ~terminated, "log": log}
         return self.get_observations(), rewards, ended, extras

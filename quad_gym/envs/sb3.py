@@ -70,6 +70,7 @@ class QuadSB3VecEnv(Rendered, VecEnv):
             "render_modes": ["human", "rgb_array"],
             "render_fps": round(self.flights.control_rate),
         }
+        self._own = frozenset(dir(self))
 
     def reset(self) -> Any:
         """Begin an episode in every flight, with the seeds and options that have been set."""
@@ -179,16 +180,22 @@ class QuadSB3VecEnv(Rendered, VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute; as the flights share it, only for all of them.
+        """Set `metadata`, or an attribute that you have added; it is shared by all flights.
 
         Raises:
-            ValueError: If `indices` leaves out flights, or there is no such attribute.
+            ValueError: If `indices` leaves out flights, there is no such attribute, or it is one of
+                this class: keywords of `make_sb3_vec_env` determine these.
         """
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("indices must be None: the flights share their attributes")
         if not hasattr(self, attr_name):
             raise ValueError(
                 f"attr_name must be an attribute of the environment, got {attr_name!r}"
+            )
+        if attr_name in self._own and attr_name != "metadata":
+            raise ValueError(
+                f"attr_name must be metadata or an attribute that you have added, got {attr_name!r}"
+                ", which is determined by the keywords of make_sb3_vec_env"
             )
         setattr(self, attr_name, value)
 

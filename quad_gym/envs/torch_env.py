@@ -2,6 +2,7 @@
 
 from typing import Any, Unpack
 
+import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 
@@ -91,6 +92,14 @@ class QuadTorchVecEnv(QuadVectorEnv):
             _tensors(infos),
         )
 
+    def write_steps(self, steps: torch.Tensor) -> None:
+        """Set the number of steps of each flight's episode, (n,), from which its time limit counts.
+
+        Reference, sensors and faults keep their time.
+        """
+        every = np.arange(self.num_envs)
+        self.flights.batch.write(every, step=_array(steps).astype(np.float64))
+
 
 def checked_device(device: str | torch.device) -> torch.device:
     """Return the device of the tensors: the processor, or an NVIDIA GPU."""
@@ -108,7 +117,7 @@ def _array(value: Any) -> Any:
     if not isinstance(value, torch.Tensor):
         return value
     value = value.detach().cpu()
-    return value.float().numpy() if value.is_floating_point() else value.numpy()
+    return value.float().numpy() if value.dtype == torch.bfloat16 else value.numpy()
 
 
 def _tensors(values: Any) -> Any:

@@ -66,6 +66,57 @@ def test_time_limits_are_time_outs_and_lengths_begin_again():
         assert set(env.episode_length_buf.tolist()) == {step % 3}
 
 
+def time_outs(env, steps):
+    """Fly zero actions; return the step in which each flight first reaches its time limit."""
+    first = torch.zeros(env.num_envs, dtype=torch.long)
+    for step in range(1, steps + 1):
+        _, _, _, extras = env.step(torch.zeros(env.num_envs, 4))
+        first[extras["time_outs"] & (first == 0)] = step
+    return first
+
+
+def test_written_lengths_of_episodes_move_the_time_limits():
+    env = hovering(0, max_episode_steps=20, out_of_bounds=50.0)
+    lengths = torch.arange(64) % 20
+    env.episode_length_buf = lengths
+    assert torch.equal(time_outs(env, 20), 20 - lengths)
+    env.episode_length_buf[:] = 18  # elements, too
+    assert torch.equal(time_outs(env, 3), torch.full((64,), 2))
+
+
+def test_lengths_that_are_not_written_change_nothing():
+    env, flights = hovering(0), hovering(0).env
+    actions = 0.3 * torch.randn(30, 64, 4, generator=torch.Generator().manual_seed(0))
+    for action in actions:
+        seen, rewards, *_ = env.step(action)
+        expected = flights.step(action)
+        assert torch.equal(seen["policy"], expected[0])
+        assert torch.equal(rewards, expected[1])
+
+
+def test_runner_spreads_the_time_limits_of_its_first_episodes():
+    torch.manual_seed(0)
+    env = hovering(0, max_episode_steps=100, out_of_bounds=50.0)
+    OnPolicyRunner(env, SETTINGS, log_dir=None, device="cpu").learn(1, init_at_random_ep_len=True)
+    assert len(set(env.episode_length_buf.tolist())) > 20  # before, all had 32
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        0,
+        torch.zeros(3, dtype=torch.long),
+        torch.zeros(64),
+        torch.full((64,), 500),
+        torch.full((64,), -1),
+    ],
+)
+def test_wrong_lengths_of_episodes_are_refused(wrong):
+    env = hovering(0)
+    with pytest.raises(ValueError, match="episode_length_buf must be"):
+        env.episode_length_buf = wrong
+
+
 def test_another_autoreset_mode_is_refused():
     flights = quad_gym.make_torch_vec_env("QuadGym/Hover-v0", 2, observation="truth")
     with pytest.raises(ValueError, match="SameStep"):

@@ -139,6 +139,12 @@ def test_attributes_and_methods_are_shared_by_all_flights():
         env.set_attr("metadata", {}, indices=[0])
     with pytest.raises((ValueError, AttributeError)):
         env.set_attr("no_such_attribute", 1)
+    env.note = 1
+    env.set_attr("note", 2)
+    assert env.note == 2
+    for name in ("num_envs", "flights", "action_space", "render_mode", "reset", "step_wait"):
+        with pytest.raises(ValueError, match=f"attr_name must be metadata.*{name}.*keywords"):
+            env.set_attr(name, 1)
     assert env.env_is_wrapped(Monitor) == [True] * 3
     assert env.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=1) == [False]
     env.close()

@@ -12,7 +12,7 @@ ENV_ID = "QuadGym/Hover-v0"
 SHORT = {"observation": "truth", "max_episode_steps": 5}
 
 
-def assert_flights_equal(envs, others, steps=12, last=False):
+def assert_flights_equal(envs, others, steps=12, last=False, kind=np.float32):
     """Fly tensors and arrays with the same actions; return the number of episodes.
 
     `last`: where an episode ends and the next begins in a step, errors are those of the end.
@@ -21,7 +21,7 @@ def assert_flights_equal(envs, others, steps=12, last=False):
     rng = np.random.default_rng(0)
     for _ in range(steps):
         assert np.array_equal(seen.cpu().numpy(), expected)
-        actions = rng.uniform(-1.2, 1.2, (len(expected), 4)).astype(np.float32)
+        actions = rng.uniform(-1.2, 1.2, (len(expected), 4)).astype(kind)
         seen, rewards, *over, infos = envs.step(torch.from_numpy(actions).to(envs.device))
         expected, wanted, *ended, known = others.step(actions)
         assert np.array_equal(rewards.cpu().numpy(), wanted.astype(np.float32))
@@ -37,10 +37,34 @@ def assert_flights_equal(envs, others, steps=12, last=False):
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_flights_of_torch_tensors_equal_those_of_make_vec(mode):
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.float16])
+def test_flights_of_torch_tensors_equal_those_of_make_vec(mode, kind):
     made = {"autoreset_mode": mode, **SHORT}
     envs = quad_gym.make_torch_vec_env(ENV_ID, 9, **made)
-    assert assert_flights_equal(envs, gymnasium.make_vec(ENV_ID, 9, **made)) == 18
+    assert assert_flights_equal(envs, gymnasium.make_vec(ENV_ID, 9, **made), kind=kind) == 18
+
+
+def assert_written_steps_move_the_time_limits(envs):
+    """Flights with a limit of five steps, of which k have been flown, end after 5 - k more."""
+    envs.reset(seed=0)
+    steps = torch.arange(envs.num_envs) % 5
+    envs.write_steps(steps)
+    first = torch.zeros(envs.num_envs, dtype=torch.long)
+    for k in range(1, 6):
+        truncated = envs.step(torch.zeros(envs.num_envs, 4))[3].cpu()
+        first[truncated & (first == 0)] = k
+    assert torch.equal(first, 5 - steps)
+
+
+def test_written_steps_move_the_time_limits():
+    made = {"autoreset_mode": "NextStep", **SHORT}
+    assert_written_steps_move_the_time_limits(quad_gym.make_torch_vec_env(ENV_ID, 7, **made))
+
+
+def test_actions_in_bfloat16_are_flown():
+    envs = quad_gym.make_torch_vec_env(ENV_ID, 2, **SHORT)
+    envs.reset(seed=0)
+    envs.step(torch.zeros(2, 4, dtype=torch.bfloat16))
 
 
 def test_tensors_of_a_step_are_not_overwritten_by_the_next_one():

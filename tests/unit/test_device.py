@@ -25,6 +25,7 @@ from tests.contract.test_consistency_script import Held  # noqa: E402
 from tests.contract.test_torch_env import (  # noqa: E402
     assert_flights_equal,
     assert_mask_begins_one_episode,
+    assert_written_steps_move_the_time_limits,
 )
 
 COUNT = 40  # a block, and a part of one
@@ -222,6 +223,11 @@ def test_observations_of_device_flights_stay_for_one_more_step(three):
 
 def test_reset_mask_of_device_flights_begins_these_episodes_alone(three):
     assert_mask_begins_one_episode(three)
+
+
+def test_written_steps_of_device_flights_move_the_time_limits():
+    made = {"autoreset_mode": "NextStep", **TRUTH, "max_episode_steps": 5}
+    assert_written_steps_move_the_time_limits(device_env("circle", 7, **made))
 
 
 def test_reset_mask_of_device_flights_with_a_task_begins_these_episodes_alone():
