@@ -41,7 +41,7 @@ $(VENV)/.writer: $(VENV)/.user
 demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as the control: about two minutes
 	@echo "1. LookAround: the only markers are on one wall, and there is no GNSS. Three controllers"
 	@echo "   are evaluated on the true state and on the filter's estimate: PD control, a policy"
-	@echo "   trained on the true state, and one trained on the estimate with its standard deviation."
+	@echo "   trained on the true state, and one with estimate + standard deviation, reward for certainty."
 	@$(BIN)/quad-gym evaluate look_around --policy pd pretrained:truth pretrained --episodes 60 \
 		--video webp --overwrite --output results/demo/look_around
 	@echo

@@ -63,6 +63,7 @@ class Page {
     element("gnss").disabled = !info.gnss;
     element("camera").disabled = !info.features;
     element("magnified").value = info.magnified;
+    element("included").textContent = info.included;
     this.readColors();
     this.showLatency();
   }

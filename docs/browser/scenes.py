@@ -31,6 +31,8 @@ class Scene(NamedTuple):
     sensors: str
     trained: str
     """name of its policies"""
+    included: str
+    """training of the included policy, in words"""
     magnified: int
     """factor of the errors of the estimate in pictures"""
 
@@ -42,6 +44,7 @@ SCENES = {
         BENCHMARKS["look_around"].task.replace(**_ENDLESS),
         "one_wall",
         "look_around",
+        "Estimate + standard deviation, reward for certainty",
         1,
     ),
     "circle": Scene(
@@ -49,6 +52,7 @@ SCENES = {
         TASK_DEFAULTS["circle"].replace(**_ENDLESS),
         "rtk",
         "circle",
+        "Trained on the estimate",
         20,
     ),
     "consumer": Scene(
@@ -56,6 +60,7 @@ SCENES = {
         TASK_DEFAULTS["circle"].replace(**_ENDLESS),
         "consumer",
         "circle",
+        "Trained on the estimate",
         1,
     ),
 }
@@ -90,6 +95,7 @@ def described(name: str, batch: FlightBatch) -> dict[str, Any]:
     suite = batch.sensors
     return {
         "title": SCENES[name].title,
+        "included": SCENES[name].included,
         "tick": suite.imu.dt,
         "ticksPerStep": round(suite.imu.rate / CONTROL_RATE),
         "harmonics": int(batch._settings["harmonics"][0]),

@@ -75,7 +75,7 @@ class FlightBatch(FlightMemory):
         self.threads = resolve_threads(c.threads)
         self._own_filter: OwnFilter | None = None
         if c.estimator is not None:
-            given = check.own("estimator", c.estimator, Estimator)
+            given = check.own("estimator", c.estimator, Estimator, ("update",))
             self._own_filter = OwnFilter(given, self.count)
         if c.filters and c.filter_start == "cold":
             check_cold_start(c.sensors, c.draws)

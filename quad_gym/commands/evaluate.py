@@ -159,7 +159,14 @@ def write_video(
     episode = telling_episode({case: results[case] for case in shown})
     about = {"env_id": args.env_id}
     sides = [
-        side_of(label_of(case[0]), *found, results[case].episodes, args.seed, episode, about)
+        side_of(
+            label_of(case[0], IDS[args.env_id]),
+            *found,
+            results[case].episodes,
+            args.seed,
+            episode,
+            about,
+        )
         for case, found in shown.items()
     ]
     return save_side_by_side(

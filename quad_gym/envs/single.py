@@ -99,7 +99,8 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     when the filter has failed numerically (`info["filter_status"]`), or, with
     `truncate_when_diverged=True`, when its consistency monitor flags divergence. A step can do
     both, as with Gymnasium's `TimeLimit`. `info["ending"]` is the reason, the termination if both:
-    the number of a `quad_gym.Ending`.
+    the number of a `quad_gym.Ending`. A `TimeLimit`, which `gymnasium.make(..., max_episode_steps=)`
+    adds, truncates from outside, with an `ending` of 0.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, with the

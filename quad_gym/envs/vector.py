@@ -30,6 +30,14 @@ _MODES = {
 _OTHERS = ("num_envs", "autoreset_mode", "threads", "render_mode", "render_flights")
 
 
+def _mode_of(given: str | AutoresetMode) -> AutoresetMode:
+    """Autoreset mode of a keyword: a mode, or its value or name."""
+    names = [mode.value for mode in _MODES]
+    if not isinstance(given, AutoresetMode):
+        check.choice("autoreset_mode", given, names)
+    return AutoresetMode(given)
+
+
 class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
     """N flights in one compiled call; flight i equals a `QuadEnv` seeded with seed + i.
 
@@ -66,7 +74,7 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
     ) -> None:
         given = checked(keywords, *_OTHERS)
         look = rendering_options(given)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = _mode_of(autoreset_mode)
         mode = _MODES[self.autoreset_mode]
         flights = Flights(task, num_envs, mode, base=base, threads=threads, **given)
         self._open(flights, render_mode, look | {"render_flights": render_flights})

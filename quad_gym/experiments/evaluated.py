@@ -24,15 +24,21 @@ _LABELS = {
 }
 """Names of policies for figures and videos"""
 
+_INCLUDED = {
+    "look_around": "estimate + standard deviation, reward for certainty",
+    "stale_race": "estimate + 15 standard deviations + history",
+    "outage_dash": "estimate + normalized uncertainty",
+}
+"""Names of included policies whose training differs in more than the observation, by task"""
+
 
 def evaluation_table(results: Evaluated, env: Any) -> str:
     """Format a table of errors and endings; `env` is an environment of the same task."""
-    flights = env.unwrapped.flights
-    course = flights.name == "waypoints"
+    course = gates_of(env) > 0
     rows = [
         [
             f"{reports.short_name(policy)} on {observation}",
-            *(_progress(flown.episodes, flights) if course else _errors(flown.episodes)),
+            *(_progress(flown.episodes, env) if course else _errors(flown.episodes)),
             f"{1e3 * flown.episodes.estimation_error.mean():.1f}",
             _rate(flown.episodes.crashed),
             f"{flown.episodes.returns.mean():.2f}",
@@ -41,14 +47,24 @@ def evaluation_table(results: Evaluated, env: Any) -> str:
     ]
     tracking = {"tracking error [mm]": ["whole episode", "second half"]}
     if course:
-        tracking = {"course": ["gates passed", "time if completed"]}
+        tracking = {"course": [f"gates of {gates_of(env)}", "completed", "time if completed"]}
     return reports.text_table(
         {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
     )
 
 
-def label_of(policy: str) -> str:
-    """Name of a policy for figures and videos."""
+def gates_of(env: Any) -> int:
+    """Number of gates of a course, or of gaps between walls; 0 for other tasks."""
+    flights = env.unwrapped.flights
+    if flights.name == "outage_dash":
+        return len(flights.batch.world.obstacles) // 2
+    return int(flights.task.gate_count) if flights.task.kind == "waypoints" else 0
+
+
+def label_of(policy: str, task: str) -> str:
+    """Name of a policy for figures and videos; `task`: name of the environment's task."""
+    if policy == "pretrained" and task in _INCLUDED:
+        return _INCLUDED[task]
     return _LABELS.get(policy, reports.short_name(policy))
 
 
@@ -70,13 +86,12 @@ def side_of(
     """Fly one of the episodes again, for a video."""
     flight = flight_of_episode(policy, env, seed, episode, int(episodes.lengths[episode]), about)
     ending = str(episodes.ending[episode])
-    course = ("gates", env.unwrapped.flights.task.gate_count)
     return Side(
         flight=flight,
         label=label,
         ending="finish" if ending == "task" else ending,
         crashed=bool(episodes.crashed[episode]),
-        course=course if env.unwrapped.flights.name == "waypoints" else None,
+        course=("gates", gates_of(env)) if gates_of(env) else None,
     )
 
 
@@ -87,7 +102,7 @@ def bound_of(env: Any) -> float:
 
 def remark_on_crashes(results: Evaluated, env: Any) -> str:
     """Describe how crashed episodes count in the table; empty without crashes."""
-    if not any(flown.episodes.crashed.any() for flown in results.values()):
+    if gates_of(env) or not any(flown.episodes.crashed.any() for flown in results.values()):
         return ""
     return (
         f"A crashed episode counts with a tracking error of {bound_of(env):g} m, the bound of the "
@@ -95,13 +110,13 @@ def remark_on_crashes(results: Evaluated, env: Any) -> str:
     )
 
 
-def _progress(episodes: Episodes, flights: Any) -> list[str]:
-    """Share of the gates passed, and mean time of complete courses."""
-    done = episodes.ending == "last_gate"
-    passed = f"{episodes.gates_passed.mean() / flights.task.gate_count:.1%}"
+def _progress(episodes: Episodes, env: Any) -> list[str]:
+    """Mean number of gates passed, share of complete courses, and their mean time."""
+    done = episodes.gates_passed >= gates_of(env)
+    passed = [f"{episodes.gates_passed.mean():.2f}", _rate(done)]
     if not any(done):
-        return [passed, "-"]
-    return [passed, f"{episodes.lengths[done].mean() / flights.control_rate:.2f} s"]
+        return [*passed, "-"]
+    return [*passed, f"{episodes.lengths[done].mean() / env.unwrapped.flights.control_rate:.2f} s"]
 
 
 def _errors(episodes: Episodes) -> list[str]:
@@ -150,7 +165,8 @@ def write_figures(results: Evaluated, env: Any, folder: Path) -> list[Path]:
 
     `env` is an environment of the same task.
     """
-    labeled = {f"{label_of(policy)}, on {seen}": f for (policy, seen), f in results.items()}
+    task = env.unwrapped.flights.name
+    labeled = {f"{label_of(policy, task)}, on {seen}": f for (policy, seen), f in results.items()}
     curves = {label: flown.recorded for label, flown in labeled.items()}
     paths = paths_figure({label: flown.recorded["path"] for label, flown in labeled.items()})
     return [

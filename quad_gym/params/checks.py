@@ -184,11 +184,12 @@ def instance(name: str, value: T, kind: type) -> T:
 _Kind = TypeVar("_Kind")
 
 
-def own(name: str, given: Any, kind: type[_Kind]) -> _Kind:
+def own(name: str, given: Any, kind: type[_Kind], needs: Sequence[str] = ()) -> _Kind:
     """Return an object of a class that users extend.
 
     `given` is an instance; a subclass, which is instantiated without arguments; or "module:name" of
-    either. Modules in the working directory are found, too.
+    either. Modules in the working directory are found, too. `needs` are methods of the class that
+    the object must override.
     """
     found = _named(name, given, kind.__name__) if isinstance(given, str) else given
     if isinstance(found, type) and issubclass(found, kind):
@@ -197,6 +198,9 @@ def own(name: str, given: Any, kind: type[_Kind]) -> _Kind:
         raise ValueError(
             f'{name} must be a quad_gym.{kind.__name__} or its "module:name", got {given!r}'
         )
+    for method in needs:
+        if getattr(type(found), method) is getattr(kind, method) and method not in vars(found):
+            raise ValueError(f"{name} must define {method}, got {given!r} without it")
     return found
 
 

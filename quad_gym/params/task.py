@@ -91,6 +91,11 @@ class TaskParams(Checked):
         super().__post_init__()
         self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
         self.reward_params.require_effect(self.kind)
+        lowest, of = (
+            (0.0, "of starts") if self.may_start_on_ground else (self.height, "of the task")
+        )
+        if self.kind != "trajectory" and self.min_height > lowest:
+            self._refuse("min_height", f"be at most {lowest:g} m, the height {of}")
         if not 0.0 < self.max_tilt <= math.pi:
             self._refuse("max_tilt", "be in (0, pi]")
 

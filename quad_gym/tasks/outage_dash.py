@@ -55,6 +55,10 @@ class OutageDash(Task):
     and drifts. The best distance to continue depends on the filter's uncertainty and on the width
     of the next gap.
 
+    The task has a loophole: GNSS fails only once, and early. A controller that waits in the open
+    air in front of the first wall until the outage is over, and then dashes, needs no covariance,
+    and crashes in 1.3 % of the episodes.
+
     At 5 m/s the course takes 27 s of the 45 s, and time that remains is not rewarded: there is
     enough time to wait for the end of every outage, but not to fly the whole course slowly.
 

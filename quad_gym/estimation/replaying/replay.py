@@ -75,7 +75,7 @@ def replay(
     """
     own = None
     if not isinstance(estimator, str) or ":" in estimator:
-        own, estimator = check.own("estimator", estimator, Estimator), "ukf"
+        own, estimator = check.own("estimator", estimator, Estimator, ("update",)), "ukf"
     if own is not None and samples is not None:
         raise ValueError("samples must not be given with an estimator of your own")
     check.choice("estimator", estimator, tuple(ESTIMATORS))
