@@ -1,6 +1,6 @@
 """Find the noise, delays and field of a vehicle's sensors from logs of its flights.
 
-    quad-gym calibrate flight.csv --sensors consumer
+    quad-gym calibrate flight.csv --sensors field
     quad-gym calibrate one.csv two.csv three.csv --sensors consumer --output results/mine
     quad-gym calibrate flight.ulg --sensors consumer --output results/mine
     quad-gym train --sensors results/mine/suite.toml
@@ -34,7 +34,7 @@ class CalibrateArgs(ReadingArgs):
     """Options of the calibration."""
 
     logs: LogFiles
-    sensors: SuiteName = "consumer"
+    sensors: SuiteName = "field"
     share: float = 0.5
     """share of the log that the search uses, from its beginning; or of the logs"""
     delays: bool = True

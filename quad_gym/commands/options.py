@@ -337,6 +337,11 @@ _OR_FILE = f"{', '.join(ALL_SUITES)}, or a file of SensorSuite.save (.toml)"
 
 SuiteName = Annotated[str, arg(help=f"sensor suite: {_OR_FILE}")]
 
+LogSuite = Annotated[
+    str | None,
+    arg(help=f"sensor suite: {_OR_FILE}; defaults to one with the sensors that the log has"),
+]
+
 OwnSuite = Annotated[
     str | None,
     arg(help=f"sensor suite: {_OR_FILE}; defaults to the task's default, standard for most"),

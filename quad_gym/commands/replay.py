@@ -1,12 +1,13 @@
 """Run the filter on the log of a real flight: estimates, innovations, rejected measurements.
 
-    quad-gym replay flight.csv --sensors rtk
+    quad-gym replay flight.csv
     quad-gym replay flight.csv --sensors rtk --smooth
     quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
     quad-gym replay flight.csv --sensors rtk --estimator module:Class
 
 A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
-some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. The last
+some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. Without
+--sensors, the sensors in the log choose a suite. The last
 lines are the verdict. The exit code is 1 if units or axes are implausible, the suite's noise model
 does not fit the log, or the filter was lost.
 """
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quad_gym.commands.log_options import MISFIT, LogFile, ReadingArgs, capital, told
-from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.options import LogSuite, refuse_overwriting, usage_errors
 
 if TYPE_CHECKING:
     from quad_gym.estimation import Replay
@@ -33,12 +34,14 @@ class ReplayArgs(ReadingArgs):
     """Options of the replay."""
 
     log: LogFile
-    sensors: SuiteName = "standard"
+    sensors: LogSuite = None
     estimator: str = "ukf"
     """filter: ukf, ekf, or module:Class of a quad_gym.Estimator"""
     heading: float | None = None
     """heading of the body x axis at the start, from east toward north [deg]; by default from a
     baseline or a magnetometer, or else unknown"""
+    heading_from_north: float | None = None
+    """the same heading as a compass shows it, from north toward east [deg]"""
     start_position: tuple[float, float, float] | None = None
     """initial position east, north and up [m], level and at rest, with --heading; required for logs
     without GNSS"""
@@ -72,10 +75,15 @@ def folder_of(args: ReplayArgs) -> Path:
     from quad_gym.analysis.plots import require_matplotlib
     from quad_gym.analysis.reports import require_writable
 
-    if args.course and args.heading is not None:
-        raise ValueError("--heading must not be given with --course")
-    if args.start_position is not None and args.heading is None:
-        raise ValueError("--start-position must come with --heading")
+    headings = (args.heading, args.heading_from_north)
+    if sum(given is not None for given in headings) + args.course > 1:
+        raise ValueError(
+            "only one of --heading, --heading-from-north and --course must be given, as each is a "
+            "heading: --heading counts from east toward north, --heading-from-north from north "
+            "toward east; --heading must not be given with --course"
+        )
+    if args.start_position is not None and headings == (None, None):
+        raise ValueError("--start-position must come with --heading or --heading-from-north")
     if args.smooth and ":" in args.estimator:
         raise ValueError("--smooth must not be given with an --estimator of your own")
     if args.figure:
@@ -94,6 +102,8 @@ def start_of(args: ReplayArgs) -> dict[str, Any]:
     start: dict[str, Any] = {"course": True} if args.course else {}
     if args.heading is not None:
         start["heading"] = math.radians(args.heading)
+    if args.heading_from_north is not None:
+        start["heading"] = math.radians(90.0 - args.heading_from_north)
     if args.start_position is not None:
         start["position"] = args.start_position
     return start
@@ -148,6 +158,7 @@ def main(args: ReplayArgs) -> None:
     """Read, filter, draw and write."""
     from quad_gym.analysis.reports import versions, write_csv, write_json
     from quad_gym.estimation import read_log, replay, smooth
+    from quad_gym.estimation.replaying.default_suite import suite_for
     from quad_gym.estimation.replaying.findings import ADVICE
     from quad_gym.estimation.replaying.plausibility import MisfitError
 
@@ -155,13 +166,16 @@ def main(args: ReplayArgs) -> None:
     with usage_errors():
         folder = folder_of(args)
         options: dict[str, Any] = {
-            "sensors": args.sensors,
             "estimator": args.estimator,
             "start": start_of(args),
             "reported_noise": args.reported_noise,
         }
         try:
             log = read_log(args.log, **args.reading())
+            suite, reason = (args.sensors, "") if args.sensors else suite_for(log)
+            if reason:
+                print(f"Suite: {suite} (--sensors), as {reason}.")
+            options["sensors"] = suite
             result = replay(log, window=args.window, samples=args.samples, **options)
             if args.smooth:
                 smoothed = smooth(log, **options)
@@ -179,7 +193,7 @@ def main(args: ReplayArgs) -> None:
 
         with house_style():
             name = result.estimator.upper() if ":" not in args.estimator else result.estimator
-            title = f"{args.log.name}, {name}, suite {args.sensors}"
+            title = f"{args.log.name}, {name}, suite {suite}"
             files += save_figure(replay_figure(result, title), folder / "replay")
     found = {
         **result.summary(),

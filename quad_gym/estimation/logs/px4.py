@@ -17,9 +17,10 @@ FLU (x forward, y left, z up) and the world ENU (east, north, up):
 | `actuator_motors`, else `actuator_outputs` | commands of the motors from 0 to 1 |
 | `battery_status` | voltage of the battery |
 
-Compass and barometer of logs before 2017 are in `sensor_combined`. Of several instances, the one is
-taken that the estimator used (`estimator_status`), or that has the highest priority
-(CAL_MAGn_PRIO). Flow about the axes x and y of FRD is positive for right-hand turns of the sensor:
+Compass and barometer of logs before 2017 are in `sensor_combined`. Of several compasses with the
+Earth's field, the one is taken that has the highest priority (CAL_MAGn_PRIO), or that the estimator
+used (`estimator_status`), as of other sensors. Flow about the axes x and y of FRD is positive for
+right-hand turns of the sensor:
 (V_y / h + w_x, V_x / h - w_y) in FLU. A sample's `timestamp_sample` is its time stamp, and
 `timestamp` its time of arrival. For a GNSS receiver without time stamps, the delay is PX4's
 parameter EKF2_GPS_DELAY, or 0.11 s. Where heights above the ellipsoid are not filled, those above
@@ -172,7 +173,8 @@ def _compasses(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[LogSo
         if priority is not None:
             rank, because = float(priority), f"CAL_MAG{number}_PRIO {priority:g}"
         if device in used:
-            rank, because = 1e3, "the estimator used it"
+            rank += 0.5  # of equal priority
+            because = f"{because}, the estimator used it" if because else "the estimator used it"
         values = {"magnetometer": _three(topic, "magnetometer_ga") * _GAUSS * TO_FLU}
         yield _source(
             *("magnetometer", name, topic),

@@ -171,7 +171,7 @@ def compared(log: Log, suite: SensorSuite) -> Log:
         checks.append(_heights_of_gnss)
         checks += [_velocities] if gnss.velocity_sigma is not None else []
     if suite.barometer is not None:
-        checks += [_unit_of_barometer, _level_of_barometer]
+        checks += [_unit_of_barometer]
     problems = list(log.problems)
     for changes, sentence in _unit_of_heading(log):
         log = replace(log, **changes)
@@ -181,6 +181,9 @@ def compared(log: Log, suite: SensorSuite) -> Log:
         for changes, sentence in check(log, *_places(log, origin_G)):
             log = replace(log, **changes)
             problems.append(sentence)
+    if suite.barometer is not None:
+        for changes, sentence in _level_of_barometer(log, *_places(log, origin_G)):
+            log = replace(log, **changes, notes=(*log.notes, sentence))
     if suite.magnetometer is not None:
         for changes, sentence in _unit_of_field(log, suite.magnetometer.strength):
             log = replace(log, **changes)

@@ -23,6 +23,25 @@ _FORMS = {
 
 DISORDER = 0.1  #: share of steps back in time, of the IMU, that no recorder writes
 
+_CONVERTED = {
+    ".bbl": "a blackbox of Betaflight or INAV: convert it with blackbox_decode, and map the "
+    "columns of its .csv (columns=, --columns)",
+    ".bfl": "a blackbox of Betaflight: convert it with blackbox_decode, and map the columns of "
+    "its .csv (columns=, --columns)",
+    ".px4log": "a log of sdlog2 (PX4 before 2016): convert it with sdlog2_dump.py of PX4, and map "
+    "the columns of its .csv (columns=, --columns)",
+    ".txt": "no table that names its columns: records of DJI must first be converted, as with "
+    "DatCon or dji-log-parser, to a .csv whose columns are mapped (columns=, --columns); they lack "
+    "the samples of the IMU unless they come from the aircraft (.DAT)",
+    ".dat": "a record of DJI: convert it with DatCon, and map the columns of its .csv (columns=, "
+    "--columns)",
+    ".tlog": "telemetry of MAVLink, whose IMU is too slow for a filter: use the log of the "
+    "autopilot (.bin, .ulg), or convert it with mavlogdump.py --format csv and map its columns "
+    "(columns=, --columns)",
+    ".log": "a text log of ArduPilot: use the binary log (.bin) of the same flight",
+}
+"""Files of others, by their endings, and how to read them."""
+
 Columns = Mapping[str, Floats]
 
 
@@ -35,6 +54,8 @@ def opened(path: Path) -> TextIO:
 
 def csv_columns(path: Path) -> Columns:
     """Return the columns of a file by their headings; an empty cell is NaN."""
+    if (advice := _CONVERTED.get(path.suffix.lower())) is not None and path.exists():
+        raise ValueError(f"{path.name} is {advice}")
     numbers, count = array("d"), 0
     try:
         with opened(path) as file:
@@ -51,7 +72,9 @@ def csv_columns(path: Path) -> Columns:
                     )
                 numbers.extend(_number(path, cell, count) for cell in row)
     except (UnicodeDecodeError, csv.Error, EOFError, gzip.BadGzipFile):
-        raise ValueError(f"{path.name} must be a table of text (.csv)") from None
+        raise ValueError(
+            f"{path.name} must be a table of text (.csv), a log (.ulg, .bin), a bag or a folder"
+        ) from None
     if len(set(names)) < len(names):
         raise ValueError(f"{path.name} must have distinct column names, got {names}")
     if not count:

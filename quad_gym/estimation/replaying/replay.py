@@ -10,11 +10,11 @@ import numpy as np
 
 from quad_gym.estimation.filtering.filters import UnscentedKalmanFilter
 from quad_gym.estimation.logs import Floats, Log, Reading, read_log
+from quad_gym.estimation.logs.earth_field import at_place
 from quad_gym.estimation.logs.parts import naming, parts_of
 from quad_gym.estimation.logs.quantities import compared
 from quad_gym.estimation.own import Estimator
 from quad_gym.estimation.replaying.calls import FilterCalls
-from quad_gym.estimation.replaying.earth_field import at_place
 from quad_gym.estimation.replaying.own_player import OwnPlayer
 from quad_gym.estimation.replaying.player import ESTIMATORS, Player
 from quad_gym.estimation.replaying.results import Estimates, Replay, joined

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats
+from quad_gym.estimation.logs.log import Floats
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.sensors import SensorSuite
