@@ -204,7 +204,8 @@ FIELDS_OF_PARAMETERS = [
 ]
 
 
-@pytest.mark.parametrize("half", HALVES)
+@pytest.mark.slow  # values far within the limits of tests/unit/test_limits.py, minutes of flights
+@pytest.mark.parametrize("half", [0, 1])
 @pytest.mark.parametrize(("nominal", "use", "name"), FIELDS_OF_PARAMETERS)
 def test_any_value_of_parameter_field_is_refused_by_name_or_flown(nominal, use, name, half):
     controls = {
@@ -254,7 +255,8 @@ FAULTS = [
 """The fields of every kind; those that all have, each with some kinds."""
 
 
-@pytest.mark.parametrize("half", HALVES)
+@pytest.mark.slow  # as above
+@pytest.mark.parametrize("half", [0, 1])
 @pytest.mark.parametrize(("kind", "name"), FAULTS, ids=lambda part: getattr(part, "__name__", part))
 def test_any_value_of_fault_field_is_refused_by_name_or_flown(kind, name, half):
     needed, sensors = {}, RTK
