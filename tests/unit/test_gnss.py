@@ -10,6 +10,7 @@ import quad_gym
 from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels.maths.linalg import load3, store
 from quad_gym.kernels.sensors.gnss_baseline import noisy_baseline
+from quad_gym.packing.flight import params_record
 from quad_gym.sensors import GnssReceiver
 from tests.unit.alarms import assert_normal
 from tests.unit.compiled import Compiled
@@ -123,3 +124,22 @@ def test_bad_input_is_refused_by_name(name, position, R_BI):
         GnssReceiver(LAB, np.random.default_rng(1)).measure(position, R_BI)
     with pytest.raises(ValueError, match=r"^rng must"):
         GnssReceiver(LAB, 1)
+
+
+def test_assumed_noise_of_a_baseline_leaves_its_constant_error_after_a_minute():
+    """Averaged over the baselines of 60 s, the white noise that the filter assumes is the constant
+    error of the heading and the average of the true white noise, as the page says. The kernels
+    have this number."""
+    suite = quad_gym.sensor_suite("rtk")
+    gnss = suite.gnss.replace(rate=10.0, baseline_sigma=0.04, heading_error_sigma=0.01)
+    suite, count = suite.replace(gnss=gnss), 600.0
+    record = params_record(quad_gym.vehicle_params("lab"), suite)[0]
+    averaged = float(record["baseline_noise"]) / np.sqrt(count)
+    np.testing.assert_allclose(averaged, np.hypot(0.01, 0.04 / np.sqrt(count)), rtol=1e-12)
+    np.testing.assert_allclose(float(record["baseline_sigma"]), 0.04, rtol=1e-12)
+    np.testing.assert_allclose(
+        float(record["first_baseline_sigma"]), np.hypot(0.01, 0.04), rtol=1e-12
+    )
+    without = suite.replace(gnss=gnss.replace(heading_error_sigma=0.0))
+    record = params_record(quad_gym.vehicle_params("lab"), without)[0]
+    np.testing.assert_allclose(float(record["baseline_noise"]), 0.04, rtol=1e-12)

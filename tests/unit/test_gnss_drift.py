@@ -85,3 +85,20 @@ def test_lasting_jump_of_the_fixes_is_followed_after_the_time_limit():
     steps(batch, CONSUMER.estimator.glitch_timeout - 7.0)
     assert (batch.record("alarm_tick") > 3.0 * CONSUMER.imu.rate).all()
     assert (batch.record("gate")[:, 0] == 1.0).mean() >= 0.95
+
+
+@pytest.mark.parametrize("phase", [0.25, 0.5])
+def test_drift_grows_over_the_time_from_the_start_to_the_first_measurement(phase):
+    """It starts at zero, and has the variance s^2 (1 - exp(-2 t / tau)) at the first measurement,
+    after a share of the period, and at the second. Standard deviations of 4,000 flights have a
+    sigma of 1.1 %."""
+    gnss = CONSUMER.gnss.replace(
+        rate=2.0, phase=phase, drift_sigma_I=(1.0, 2.0, 3.0), drift_tau=0.5, latency=0.0
+    )
+    batch, measured = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover"), 0.5 * phase
+    np.testing.assert_array_equal(batch.record("gnss_drift"), 0.0)
+    for wait in (measured + 0.02, 0.5):
+        steps(batch, round(50.0 * wait) / 50.0)
+        expected = np.array([1.0, 2.0, 3.0]) * np.sqrt(1.0 - np.exp(-2.0 * measured / 0.5))
+        np.testing.assert_allclose(batch.record("gnss_drift").std(axis=0), expected, rtol=0.06)
+        measured += 0.5

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 import quad_gym.frames
 from quad_gym.estimation import replay
-from quad_gym.records import POSITION_BLOCK, VELOCITY_BLOCK, GateDecision
+from quad_gym.records import AID_GROUPS, POSITION_BLOCK, VELOCITY_BLOCK, Aid, GateDecision
 from tests.field_flights import fly, state_errors, steps
 from tests.filter_states import set_at_rest
 
@@ -274,3 +274,31 @@ def test_receiver_that_drifts_off_in_a_real_flight_is_left_out_until_it_is_right
     during = (result.time >= start) & (result.time < end)
     assert (error[during] < np.maximum(20.0, 3.0 * sigma[during])).all()
     assert error[result.time > end + 5.0].max() < 5.0
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_reset_to_a_barometer_changes_its_error_where_others_confirm_the_height(confirmed):
+    """A barometer that is refused by 20 m has an error of 20 m, if GNSS confirms the height.
+
+    Where no other sensor does, the height is wrong by so much, and the error is a usual one.
+    """
+    barometer, off = quad_gym.BarometerParams(), 20.0
+    ukf = quad_gym.UnscentedKalmanFilter(SUITE.replace(barometer=barometer))
+    set_at_rest(ukf, np.diag(DEVIATIONS**2), R_BI=R_BI)
+    blocks, group = ukf._engine.blocks, AID_GROUPS + int(Aid["BAROMETER"])
+    blocks["tick"] += 2.0 * SUITE.estimator.glitch_timeout * SUITE.imu.rate
+    blocks["corrected_tick"][:] = blocks["tick"]
+    blocks["accepted_tick"][:, :] = 0.0
+    if confirmed:
+        blocks["accepted_tick"][:, POSITION_BLOCK] = blocks["tick"]
+    blocks["rejected_in_row"][:, group] = 20.0
+    before = np.sqrt(np.diag(ukf.covariance))
+    ukf.update(barometer=ukf.position[2] + off)
+    assert ukf._engine.read("resets")[0, group] == 1.0
+    own = np.linalg.norm(ukf._engine.read("L_slow")[0, 0])
+    sigma = np.sqrt(np.diag(ukf.covariance))
+    np.testing.assert_allclose(own, off if confirmed else barometer.bias_sigma, rtol=1e-6)
+    np.testing.assert_allclose(
+        sigma[2], before[2] if confirmed else np.hypot(off, barometer.bias_sigma), rtol=1e-6
+    )
+    np.testing.assert_allclose(sigma[:2], before[:2], rtol=1e-6)

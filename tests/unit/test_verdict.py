@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.stats import chi2
 
 from quad_gym.estimation import replay
 from quad_gym.estimation.logs import Log, Stream
+from quad_gym.estimation.replaying import sensor_rules
 from quad_gym.estimation.replaying.dead_reckoning import HORIZONS, changes
 from quad_gym.estimation.replaying.findings import QUANTITIES, Finding, Severity, by_quantity
 from quad_gym.estimation.replaying.fits import exceeds, fit_of, larger, runs_beyond_chance
@@ -206,6 +208,21 @@ def test_mean_nis_is_per_degree_of_freedom_and_includes_rejected_measurements():
     fit = fit_of(measured(innovation, [False, False, True, False]))
     assert fit.mean_nis == pytest.approx((1.0 + 1.0 + 18.0 + 2.0) / 4.0 / 2.0)
     assert fit.rejected == 0.25
+
+
+@pytest.mark.parametrize(
+    ("times", "severity"),
+    [(1.3, None), (1.55, Severity.UNCERTAIN), (1.85, Severity.UNCERTAIN), (2.2, Severity.LOST)],
+)
+def test_errors_of_twice_the_assumed_ones_make_a_log_unusable(times, severity):
+    """Limits of the standard deviations are 2 (lost) and its root (uncertain). The statistics of
+    2,000 measurements vary by a few percent."""
+    errors = times * np.random.default_rng(5).normal(size=(2000, 3))
+    case = measured(errors, np.zeros(2000, bool))
+    fit = fit_of(case)
+    fits = SimpleNamespace(fits={"gnss_velocity": fit})
+    found = [finding.severity for finding in sensor_rules._size(fits, "gnss_velocity", case, fit)]
+    assert found == ([] if severity is None else [severity])
 
 
 def test_the_estimate_changes_by_what_is_added_to_it():
