@@ -25,7 +25,8 @@ APART = 5.0  #: ratio of the steps between and inside of batches, at least
 BETWEEN = (1.5, 0.6)  #: multiples of both, between which there are hardly any steps
 HARDLY = 0.1  #: share of these
 LONGEST_BATCH = 3.0  #: time of a batch, over that of its samples at the mean rate
-FEW = 20  #: rows that show batches
+FEW = 20  #: rows, and batches, that show that a sensor is read in batches
+ALIKE = 0.8  #: share of the batches whose size is the usual one, up to a factor of two
 
 FROZEN = "repeats the measurement before"
 
@@ -126,6 +127,9 @@ def spread(recording: RawLog, source: LogSource, longest: float) -> LogSource:
     last = np.append(np.flatnonzero(~tiny), len(time) - 1)  # of each batch
     first = np.concatenate([[0], last[:-1] + 1])
     counts = last - first + 1
+    alike = np.abs(np.log2(counts / np.median(counts))) <= 1.0
+    if len(counts) < FEW or alike.mean() < ALIKE:
+        return source  # some pauses
     ends = time[last]
     spans = np.diff(ends, prepend=ends[0] - counts[0] * mean)
     spans = np.where(spans > LONGEST_BATCH * counts * mean, counts * mean, spans)

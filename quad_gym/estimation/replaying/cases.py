@@ -1,7 +1,8 @@
 """What the rules of a verdict look at: a log, its replay, and the innovations of each sensor."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.replaying.findings import Finding, Severity
@@ -50,6 +51,7 @@ class Case:
     result: Replay  #: its rows until the motors stop for good
     sensors: Mapping[str, Measured]  #: innovations, of all blocks of a sensor together
     fits: Mapping[str, Fit]  #: their statistics
+    start: Mapping[str, Any] = field(default_factory=dict)  #: that the caller has given
 
 
 def lost(quantity: str, text: str) -> Finding:

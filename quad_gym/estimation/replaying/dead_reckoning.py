@@ -47,10 +47,10 @@ def changes(log: Log, result: Replay, settled: float) -> tuple[list[Change], int
     time, dt = time[first:], np.diff(time[first:])
     R = quaternion_to_dcm(result.quaternion[first:])
     r, v = result.position[first:], result.velocity[first:]
-    gyro, accel = (_increments(log, result, name)[first:] for name in ("gyro", "accel"))
+    gyro, accel = (increments(log, result, name)[first:] for name in ("gyro", "accel"))
     turns = gyro - result.gyro_bias[first:-1] * dt[:, np.newaxis]
     steps = accel - result.accel_bias[first:-1] * dt[:, np.newaxis]
-    predicted = _rotations(-turns) @ R[:-1]
+    predicted = small_rotations(-turns) @ R[:-1]
     middle = 0.5 * (R[:-1] + predicted)
     gains = np.einsum("kji,kj->ki", middle, steps) - np.outer(dt, [0.0, 0.0, GRAVITY])
     V = np.vstack([np.zeros(3), np.cumsum(gains, axis=0)])
@@ -91,7 +91,7 @@ def changes(log: Log, result: Replay, settled: float) -> tuple[list[Change], int
     return list(found.values()), count
 
 
-def _increments(log: Log, result: Replay, name: str) -> Floats:
+def increments(log: Log, result: Replay, name: str) -> Floats:
     """Return integrals (n - 1, 3) of IMU samples between the rows of a replay."""
     stamps, values = log.imu.time, log.imu.values[name]
     steps = np.diff(stamps)[:, np.newaxis]
@@ -101,7 +101,7 @@ def _increments(log: Log, result: Replay, name: str) -> Floats:
     return np.diff(at, axis=0)
 
 
-def _rotations(turns: Floats) -> Floats:
+def small_rotations(turns: Floats) -> Floats:
     """Return matrices (n, 3, 3) of rotation vectors (n, 3), by Rodrigues' formula."""
     angle = np.linalg.norm(turns, axis=1)[:, np.newaxis, np.newaxis]
     K = np.zeros((len(turns), 3, 3))

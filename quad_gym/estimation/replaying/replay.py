@@ -96,7 +96,7 @@ def replay(
     result = in_parts(whole, named_start(start), fly)
     if samples is not None:
         Path(samples).write_text("".join(rows), encoding="utf-8")
-    return with_verdict(whole, reading.get("body", "flu"), suite, result)
+    return with_verdict(whole, reading.get("body", "flu"), suite, result, dict(start or {}))
 
 
 _Found = TypeVar("_Found", bound=Estimates)

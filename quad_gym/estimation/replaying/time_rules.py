@@ -8,13 +8,23 @@ import numpy as np
 
 from quad_gym.estimation.logs import Floats
 from quad_gym.estimation.logs.clocks import PAUSE
-from quad_gym.estimation.replaying.cases import MEASURED_BY, NAMES, OF_SENSOR, Case, lost, uncertain
+from quad_gym.estimation.replaying.cases import (
+    MEASURED_BY,
+    NAMES,
+    OF_SENSOR,
+    Case,
+    lost,
+    note,
+    uncertain,
+)
 from quad_gym.estimation.replaying.findings import Finding
 from quad_gym.estimation.replaying.fits import exceeds
 from quad_gym.estimation.replaying.results import Measured
 from quad_gym.estimation.replaying.sensor_rules import LONG_RUN, MAX_REJECTED, PATIENCE
 
 LATE = 0.5  #: share of late measurements above which the clocks do not agree [-]
+MANY_LOST = 0.05  #: share of lost samples of the IMU that is worth a note [-]
+SHORT_PAUSE = 0.3  #: time without samples of the IMU in which a vehicle turns by some degrees [s]
 BLOCK = 20  #: measurements in a row that are late together, so that a clock has changed
 
 
@@ -91,6 +101,31 @@ def _refused(sensors: Mapping[str, Measured], name: str, since: float, until: fl
     """Return True if a sensor was refused between two times."""
     m = sensors.get(name)
     return m is not None and bool((m.gated & (m.time > since) & (m.time < until)).any())
+
+
+def lost_samples(case: Case) -> Iterator[Finding]:
+    """Samples of the IMU that the log lacks."""
+    steps = np.diff(case.log.imu.time)
+    steps = steps[steps <= PAUSE]
+    if len(steps) < BLOCK:
+        return
+    usual = float(np.quantile(steps, 0.2))
+    missing = float(np.maximum(np.round(steps / usual) - 1.0, 0.0)[steps > 1.5 * usual].sum())
+    share = missing / (missing + len(steps))
+    most = float(steps.max())
+    count = int((steps > max(SHORT_PAUSE, 10.0 * usual)).sum())
+    if count:
+        yield uncertain(
+            "attitude",
+            f"the IMU has {count} {'pause' if count == 1 else 'pauses'} of up to {most:.2f} s, in "
+            "which the attitude is extrapolated",
+        )
+    elif share > MANY_LOST:
+        yield note(
+            "attitude",
+            f"the log lacks about {100.0 * share:.0f} % of the IMU's samples, for up to "
+            f"{most:.3f} s: of averaged samples nothing is lost, of others motion is",
+        )
 
 
 def flagged(case: Case) -> Iterator[Finding]:

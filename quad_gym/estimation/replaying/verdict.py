@@ -16,7 +16,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import Log
 from quad_gym.estimation.logs.parts import running_motors
-from quad_gym.estimation.replaying import motion_rules, sensor_rules, time_rules
+from quad_gym.estimation.replaying import compass_rules, motion_rules, sensor_rules, time_rules
 from quad_gym.estimation.replaying.cases import NAMES, Case, lost
 from quad_gym.estimation.replaying.findings import QUANTITIES, Finding, Severity
 from quad_gym.estimation.replaying.fits import Fit, fit_of
@@ -59,6 +59,11 @@ RULES = (
         "mean NIS of 25; correlated innovations of GNSS",
         "1.4 times as large; a run of rejections that chance does not explain",
     ),
+    Rule(compass_rules.axes, "axes of magnetometer and IMU differ"),
+    Rule(compass_rules.jumps, "", "the magnetic field jumps by a fifth, as no turn explains"),
+    Rule(compass_rules.strength, "", "the strength of the magnetic field changes by 10 % for 2 s"),
+    Rule(motion_rules.first_heading, "the motion contradicts the heading at the start"),
+    Rule(time_rules.lost_samples, "", "the IMU pauses for 0.3 s"),
     Rule(motion_rules.unexplained, "the estimate changes as no sample of the IMU explains"),
     Rule(time_rules.flagged, "the filter is flagged as diverged at the end"),
     Rule(motion_rules.biases, "biases of the IMU that no sensor has"),
@@ -67,7 +72,9 @@ RULES = (
 """All rules: what makes a quantity unusable, and what makes it uncertain."""
 
 
-def with_verdict(log: Log, body: str, suite: SensorSuite, result: Replay) -> Replay:
+def with_verdict(
+    log: Log, body: str, suite: SensorSuite, result: Replay, start: Mapping[str, Any]
+) -> Replay:
     """Return a replay with its findings, the worst first, and the verdict in a line.
 
     If the log has commands of the motors, it ends for the verdict where they stop for good.
@@ -75,7 +82,7 @@ def with_verdict(log: Log, body: str, suite: SensorSuite, result: Replay) -> Rep
     flown = _until_landing(log, result)
     sensors = by_sensor(flown.measured)
     fits = {name: fit for name, m in sensors.items() if (fit := fit_of(m))}
-    case = Case(log, body, suite, flown, sensors, fits)
+    case = Case(log, body, suite, flown, sensors, fits, start)
     found = [finding for rule in RULES for finding in rule.find(case)]
     found.sort(key=lambda finding: -finding.severity)
     return replace(result, findings=tuple(found), verdict=in_one_line(found, fits))
