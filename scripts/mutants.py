@@ -41,7 +41,7 @@ _OPERATORS: dict[type[ast.AST], str] = {
     **{ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "=="},
     **{ast.BitAnd: "|", ast.BitOr: "&", ast.Is: "is not", ast.IsNot: "is"},
 }
-"""What stands for an operator in a broken line."""
+"""Replacements of operators in broken lines."""
 _TEXT: dict[type[ast.AST], str] = {
     **{ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.And: "and", ast.Or: "or"},
     **{ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="},

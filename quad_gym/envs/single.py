@@ -139,7 +139,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     Args:
         task: Your task: a `quad_gym.Task`, its class, or "module:name" of either. It is laid over
             the id's task (also over the class of `LookAround`, `StaleRace` or `OutageDash`, and
-            over a task of `register_task`), which keeps what yours does not override. A class
+            over a task of `register_task`), whose other methods stay. A class
             derived from the id's takes its place. Without an id, also the name of a kind of task,
             such as "hover".
         base: Kind of task under your own, or a pair of it and a task; `gymnasium.make` sets it from

@@ -55,7 +55,7 @@ class SkrlWrapper(Wrapper):
         return self._observations, *columns, self._infos  # type: ignore[return-value]
 
     def state(self) -> None:
-        """Return None: critics observe what the policy does."""
+        """Return None: critics have the observation of the policy."""
 
     def render(self, *args: Any, **kwargs: Any) -> Any:
         """Return the output of the environment's `render`; None without a `render_mode`."""

@@ -14,7 +14,7 @@ from quad_gym.envs.vector import QuadVectorEnv
 class QuadTorchVecEnv(QuadVectorEnv):
     """N flights for training loops in torch, whose results are tensors.
 
-    Flights, seeds, autoreset and keywords are those of `QuadVectorEnv`, and the flights have the
+    Flights, seeds, autoreset and keywords are as in `QuadVectorEnv`, and the flights have the
     same bits. Observations share the memory that the compiled code wrote, without a copy; every
     step returns new tensors. Rewards are float32, (n,). `info` has tensors (n,) by the same names,
     without the masks `_name`, which are true for all flights after a step. With
