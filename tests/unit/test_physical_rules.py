@@ -99,3 +99,12 @@ def test_heading_from_north_that_is_given_as_from_east_is_named(table):
     assert finding.severity == Severity.LOST
     assert "--heading-from-north" in finding.text
     assert not found(flown, "heading at the start", start={"heading": 0.3})
+
+
+def test_positions_that_drift_for_some_seconds_do_not_cost_the_velocities(table):
+    """They drift by 2 m/s for eight seconds, and the velocities are right all the time."""
+    since = np.clip(table["time"] - 14.0, 0.0, 8.0)[:, np.newaxis]
+    places = table["gnss_enu"] + 2.0 * since * [1.0, 0.0, 0.0]
+    result = replay(table | {"gnss_enu": places}, sensors="field")
+    assert "gnss_velocity" in result.measured
+    assert not any("velocities contradict" in problem for problem in result.problems)

@@ -33,6 +33,8 @@ CERTAIN = 4.0  #: standard deviations of a motion beyond which it is no noise
 OFF = 0.5
 """Difference from 1 of the median ratio of velocities and motion, as complex numbers: of their turn
 and scale [-]. Noise and outliers of positions leave it at 1."""
+UNKNOWN = "wrong direction, unit or axes"  #: cause of velocities that contradict the positions
+CORRELATED = 0.7  #: correlation of velocities and motion that belong together [-]
 SILENT = 0.25  #: ratio of velocities and motion below which a log has no velocities [-]
 SPAN = 1.0  #: time over which velocities are compared with positions [s]
 FARTHEST = 1e6  #: distance from the origin of I [m]
@@ -245,11 +247,13 @@ def _velocities(log: Log, time: Floats, places: Floats) -> _Found:
     rows = _contradiction(moved, mean, max(1.0, CERTAIN * noise / SPAN))
     if rows is None:
         return
-    moved, mean = moved[rows], mean[rows]
+    cause = _cause(moved[rows], mean[rows])
+    if cause == UNKNOWN and _agree_otherwise(moved, mean, max(1.0, CERTAIN * noise / SPAN)):
+        return  # for some time only: the filter judges by the IMU which of both is wrong
     values = {k: v for k, v in gnss.values.items() if k not in (name, "velocity_sigma")}
     yield (
         {"gnss": replace(gnss, values=values)},
-        f"GNSS velocities contradict the positions: {_cause(moved, mean)}; they are left out",
+        f"GNSS velocities contradict the positions: {cause}; they are left out",
     )
 
 
@@ -268,6 +272,25 @@ def _contradiction(moved: Floats, mean: Floats, limit: float) -> Any:
             off = abs(1.0 - ratio) > OFF * abs(ratio) if chosen is told else abs(ratio) < SILENT
             return rows if off else None
     return None
+
+
+def _agree_otherwise(moved: Floats, mean: Floats, limit: float) -> bool:
+    """Return True if velocities agree with the positions where they do not differ by a limit.
+
+    Velocities in another direction or unit are wrong all the time. A receiver that drifts or jumps
+    is wrong for some time.
+    """
+    by_places, told = (v[:, 0] + 1j * v[:, 1] for v in (moved, mean))
+    others = np.abs(by_places - told) < limit
+    apart = np.flatnonzero(~others)
+    if not len(apart) or len(apart) < 0.8 * (apart[-1] - apart[0] + 1):
+        return False  # they differ again and again
+    a, b = told[others], by_places[others]
+    if len(a) < max(ENOUGH, len(told) // 3) or not np.any(a):
+        return False
+    ratio = complex(np.vdot(a, b) / np.vdot(a, a))  # of the positions' velocities to the told ones
+    alike = np.abs(np.vdot(a, b)) / math.sqrt(float(np.vdot(a, a).real * np.vdot(b, b).real))
+    return bool(abs(1.0 - ratio) < OFF and alike > CORRELATED)
 
 
 def _motions(time: Floats, places: Floats, stamps: Floats, told: Floats) -> tuple[Floats, Floats]:
@@ -312,7 +335,7 @@ def _cause(moved: Floats, mean: Floats) -> str:
     best = min(tries, key=lambda cause: _differs(moved, tries[cause]))
     if _differs(moved, tries[best]) < 0.3:
         return best
-    return "wrong direction, unit or axes"
+    return UNKNOWN
 
 
 def _beside(log: Log, time: Floats, places: Floats) -> tuple[Floats, Floats] | None:
