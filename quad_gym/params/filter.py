@@ -50,11 +50,12 @@ class FilterParams(Checked):
     """True: the fix that starts the filter is also its first measurement (laboratory). The fix is
     then counted twice, so suites other than "lab" have False"""
     recursive_update_threshold: check.Positive | None = None
-    """standard deviation of a feature's predicted direction above which an image is processed in
-    several steps, each linearized about the estimate after the step before [rad]; None: always in a
-    single update (report). The linearization error of pixels grows with the square of the direction
-    error, and exceeds a precise camera's noise at an uncertain start or after an outage. With GNSS,
-    features beyond `max_direction_sigma` are then ignored even without a gate"""
+    """ratio of the second order of measurements, in the filter's covariance, to their noise above
+    which they are processed in several steps, each linearized about the estimate after the step
+    before [-]; None: always in a single update (report). The second order grows with the variance
+    of the state, and exceeds the noise of images, ranges or optical flow at an uncertain start or
+    after an outage. With GNSS, features beyond `max_direction_sigma` are then ignored even without
+    a gate"""
     false_alarm_probability: check.NonNegative = 0.0
     """probability that the innovation gate rejects a valid measurement: a position, baseline,
     velocity or feature, or a measurement of an aiding sensor, is left out of the update if its

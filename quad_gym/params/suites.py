@@ -82,7 +82,7 @@ FIELD_FILTER = FilterParams(
     initial_tilt_sigma=0.03,  # of vehicles that stand or hover at the start of an episode
     initial_velocity_variance=0.03**2,  # of the same vehicles
     reuse_first_fix=False,
-    recursive_update_threshold=0.01,  # its square is below what a pixel subtends
+    recursive_update_threshold=0.3,  # its square is a tenth of the noise
     false_alarm_probability=1e-4,
 )
 """The filter of all suites except `lab`: consistent from its start, with an innovation gate."""
@@ -256,7 +256,7 @@ STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
     # the laboratory's pixels are coarse, so that images need be processed in steps after outages
     # alone, and no measurement of it is corrupted, so that none has to be rejected
-    estimator=FIELD_FILTER.replace(recursive_update_threshold=0.1, false_alarm_probability=0.0),
+    estimator=FIELD_FILTER.replace(false_alarm_probability=0.0),
     noisy=_noise(0.0020, 0.0150, 0.0011, 0.0124),
 )
 """The environments' default: the laboratory's sensors with a consistent filter."""

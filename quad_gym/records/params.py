@@ -103,7 +103,7 @@ PARAMS_FIELDS = (
     Field("initial_velocity_variance", (), "m^2/s^2", "variance of the velocity at the filter's start"),
     Field("initial_covariance_scale", (), "-", "factor on the first fix's covariance"),
     Field("initial_tilt_sigma", (), "rad", "standard deviation of roll and pitch at a level start; 0: attitude by Wahba's problem"),
-    Field("recursive_update_threshold", (), "rad", "standard deviation of a direction above which images are processed in steps"),
+    Field("recursive_update_threshold", (), "-", "ratio of second order and noise above which measurements are processed in steps"),
     Field("gate", (SENSOR_GROUPS,), "-", "largest accepted NIS of a group of measurements"),
     Field("gate_uncertainty", (), "rad^2", "largest sum of the variances of a feature's predicted direction"),
     Field("max_rejections", (), "-", "rejections in a row before a reset"),

@@ -43,67 +43,76 @@ def _left_out(flight, settings, block):
 
 
 @kernel
-def find_directions(flight, p, work, settings):
-    """Fill work.along; return how many numbers of the measurement are no degrees of freedom.
+def without_directions(flight, p, work, settings):
+    """The NIS along directions, and how many numbers of the measurement are no degrees of freedom.
 
-    A heading alone is a baseline with noise above pi along two axes, see `gnss_baseline.py`.
+    From work.nu and work.Rz before whitening; uses work.M and work.y. Where the second order of
+    the prior is small, the components along directions are independent. A heading alone is a
+    baseline with noise above pi along two axes, see `gnss_baseline.py`.
     """
     k, numbers = 0, zero_like(work.spread)
+    nis, wide = numbers, no_lane(numbers)
     for sensor in range(SENSORS):
         first = FIRST_BLOCK[sensor]
         for block in range(first, first + settings.sensor_blocks[sensor]):
             valid = flight.block_valid[block] > 0.0
             if any_of(valid):
-                used = no_lane(numbers)
-                if block == BASELINE_BLOCK or FEATURE_BLOCKS <= block < AID_BLOCKS:
+                if is_direction(block):
                     used = valid & logical_not(_left_out(flight, settings, block))
-                store(work.along[k : k + 3], select(used, 1.0, 0.0) * load3(work.z_hat[k : k + 3]))
-                numbers = numbers + select(used, 1.0, 0.0)
-                if block == BASELINE_BLOCK:
-                    alone = used & (p.baseline_sigma > math.pi)
-                    numbers = numbers + select(alone, 1.0, 0.0)
+                    u, nu = load3(work.z_hat[k : k + 3]), load3(work.nu[k : k + 3])
+                    variance, length = dot(u, load_block(work.Rz, k, k) @ u), dot(u, nu)
+                    shift = dot(u, load3(work.mu[k : k + 3]))
+                    wide = wide | (used & (p.sigma_beta * shift * shift > _SMALL * variance))
+                    nis = nis + select(used, length * length / variance, 0.0)
+                    numbers = numbers + select(used, 1.0, 0.0)
+                    if block == BASELINE_BLOCK:
+                        alone = used & (p.baseline_sigma > math.pi)
+                        numbers = numbers + select(alone, 1.0, 0.0)
                 k += 3
-    return numbers
+    if any_of(wide):
+        _find_directions(flight, work, settings)
+        nis = select(wide, _joint_nis(work, k // 3), nis)
+    return nis, numbers
 
 
 @kernel
-def nis_along(p, work, n):
-    """The NIS along the directions in work.along, from work.nu and work.Rz before whitening.
+def is_direction(block):
+    """True if a block is a unit vector: a baseline or a feature."""
+    return block == BASELINE_BLOCK or FEATURE_BLOCKS <= block < AID_BLOCKS
 
-    Uses work.M and work.y. Where the second order of the prior is small, the components are
-    independent.
-    """
-    nis, wide, blocks = zero_like(work.spread), no_lane(work.spread), n // 3
-    for i in range(blocks):
-        u, nu = load3(work.along[3 * i : 3 * i + 3]), load3(work.nu[3 * i : 3 * i + 3])
-        variance = dot(u, load_block(work.Rz, 3 * i, 3 * i) @ u)
-        shift = dot(u, load3(work.mu[3 * i : 3 * i + 3]))
-        wide = wide | (p.sigma_beta * shift * shift > _SMALL * variance)
-        none, length = variance <= 0.0, dot(u, nu)
-        variance = select(none, 1.0, variance)
-        work.M[i, i], work.y[i] = variance, length
-        nis = nis + length * length / variance
-    if any_of(wide):
-        nis = select(wide, _joint_nis(work, blocks), nis)
-    return nis
+
+@kernel
+def _find_directions(flight, work, settings):
+    """Fill work.along."""
+    k = 0
+    for sensor in range(SENSORS):
+        first = FIRST_BLOCK[sensor]
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            valid = flight.block_valid[block] > 0.0
+            if any_of(valid):
+                used = no_lane(work.spread)
+                if is_direction(block):
+                    used = valid & logical_not(_left_out(flight, settings, block))
+                store(work.along[k : k + 3], select(used, 1.0, 0.0) * load3(work.z_hat[k : k + 3]))
+                k += 3
 
 
 @kernel
 def _joint_nis(work, blocks):
-    """The same where the components are not independent."""
+    """The NIS along directions whose components are not independent."""
     M, y, size = work.M, work.y, (blocks + 2) // 3 * 3
     zero = zero_like(work.spread)
     for i in range(size):
-        if i >= blocks:
-            M[i, i], y[i] = zero + 1.0, zero
+        M[i, i], y[i] = zero + 1.0, zero
         for j in range(i):
             M[i, j] = zero
-            if i < blocks:
-                u_i, u_j = (
-                    load3(work.along[3 * i : 3 * i + 3]),
-                    load3(work.along[3 * j : 3 * j + 3]),
-                )
-                M[i, j] = dot(u_i, load_block(work.Rz, 3 * i, 3 * j) @ u_j)
+        if i < blocks:
+            u = load3(work.along[3 * i : 3 * i + 3])
+            y[i] = dot(u, load3(work.nu[3 * i : 3 * i + 3]))
+            for j in range(i + 1):
+                other = load3(work.along[3 * j : 3 * j + 3])
+                M[i, j] = dot(u, load_block(work.Rz, 3 * i, 3 * j) @ other)
+            M[i, i] = select(M[i, i] > 0.0, M[i, i], 1.0)
     cholesky(M, size, work.inverse_diagonal)
     solve_left_vector(M, y, size, work.inverse_diagonal)
     nis = zero

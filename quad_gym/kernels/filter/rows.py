@@ -48,10 +48,25 @@ def put_column(work, settings, k, j, valid, a, s):
 
 
 @kernel
+def by_derivative(settings):
+    """True in an EKF, whose columns are derivatives."""
+    return (settings.form & FilterForm.EKF.value) != 0
+
+
+@kernel
+def with_pairs(settings):
+    """True if pairs of sigma points are needed: in a UKF, and in an EKF for their half-sums."""
+    return not by_derivative(settings) or (settings.form & FilterForm.GRADUAL.value) != 0
+
+
+@kernel
 def lever_column(flight, work, settings, j, R_BI, l_B):
-    """Half-difference and half-sum of R^T l along column j, or derivative and zero in an EKF."""
-    if (settings.form & FilterForm.EKF.value) != 0:
-        a = R_BI.T @ cross(load_column3(flight.L, E, j), l_B)
-        return a, zero_like(a)
+    """Half-difference and half-sum of R^T l along column j; in an EKF derivative and half-sum."""
     odd, even, inverse_c = load33(work.odd[j]), load33(work.even[j]), work.inverse_spread
-    return R_BI.T @ (inverse_c * (odd.T @ l_B)), R_BI.T @ (inverse_c * (even.T @ l_B))
+    a = R_BI.T @ (inverse_c * (odd.T @ l_B))
+    s = R_BI.T @ (inverse_c * (even.T @ l_B))
+    if by_derivative(settings):
+        a = R_BI.T @ cross(load_column3(flight.L, E, j), l_B)
+        if not with_pairs(settings):
+            s = zero_like(a)
+    return a, s

@@ -12,7 +12,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
-from quad_gym.kernels.filter.freedoms import find_directions, nis_along
+from quad_gym.kernels.filter.freedoms import without_directions
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     call_measured,
@@ -21,13 +21,23 @@ from quad_gym.kernels.filter.measurements import (
     mark_failed,
 )
 from quad_gym.kernels.filter.monitoring import flag_shifted, follow_corrections
+from quad_gym.kernels.filter.progressive import (
+    FEW,
+    MOST_STEPS,
+    count_steps,
+    drop_even,
+    factor_of,
+    find_unsure,
+    hide_unsure,
+    share_second_order,
+    show_hidden,
+)
 from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.filter.slow import load_slow, shift_slow, stages_of, turn_iron
 from quad_gym.kernels.maths.elementary import is_finite, maximum
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
     add_to_diagonal,
-    dot,
     keep,
     load3,
     load33,
@@ -45,7 +55,7 @@ from quad_gym.kernels.maths.matrices import (
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation, split_turn, vector_to_dcm
 from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
-from quad_gym.records import FEATURE_BLOCKS, Act, FilterForm, GateDecision
+from quad_gym.records import Act, FilterForm
 
 
 @kernel
@@ -61,15 +71,21 @@ def _split_turns(flight, work, c, form):
 
 
 @kernel
-def _innovate(work, n, c):
-    """Fill work.nu, the innovation: the measurement minus the mean of the sigma points."""
+def _mean_even(work, n, c):
+    """Fill work.mu with the mean of the sigma points minus the center."""
     even, mu = work.E, work.mu
     for k in range(n):
         total = even[0, k]
         for j in range(1, 9):
             total = total + even[j, k]
         mu[k] = total / c
-        work.nu[k] = work.z[k] - work.z_hat[k] - mu[k]
+
+
+@kernel
+def _innovate(work, n):
+    """Fill work.nu, the innovation: the measurement minus the mean of the sigma points."""
+    for k in range(n):
+        work.nu[k] = work.z[k] - work.z_hat[k] - work.mu[k]
 
 
 @kernel
@@ -87,12 +103,12 @@ def _sum_noise(p, work, n, factor):
             store_block(work.Rz, i, j, block)
 
 
-_FACTORS = (1e6, 1e6 / 9.0, 1e5 / 9.0, 1e4 / 9.0, 1e3 / 9.0, 100.0 / 9.0, 10.0 / 9.0)
-"""Factors on the noise of the steps of a measurement; the sum of their inverses is one."""
-_LAST = len(_FACTORS) - 1
-_FEW, _FIRST_OF_FEW = _LAST - 2, 100.0
-"""The first of the last three steps, and its factor where these are enough."""
-_VAGUE = 0.2  #: standard deviation of a direction above which three steps are too few [rad]
+@kernel
+def _put_noise(work, n):
+    """Fill work.Rz where there are no even parts, with the noise of its blocks."""
+    for i in range(0, n, 3):
+        for j in range(0, i, 3):
+            store_block(work.Rz, i, j, zero_like(load_block(work.Rz, i, i)))
 
 
 @kernel
@@ -103,90 +119,41 @@ def update(flight, p, work, settings, stages, slow):
     The gate masks after the spread c of the sigma points was chosen for all measurements; c enters
     the moments in their fourth order only.
 
-    With GRADUAL, lanes whose attitude is uncertain process images in steps: three updates by the
-    same measurements with more noise, or seven where a direction is uncertain by `_VAGUE`, each
-    about the estimate from the one before. The information of the steps adds up to the
-    measurements' own, so a linear model gives the same result as one step; the derivatives of this
-    nonlinear one are taken where they matter. (R. Zanetti, "Recursive Update Filtering for
-    Nonlinear Estimation", IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
+    With GRADUAL, lanes in which a measurement is not linear process it in steps, see
+    `progressive.py`.
     """
-    mask, first, form = work.mask > 0.0, _LAST, settings.form
-    loose = no_lane(p.sigma_spread)
-    hidden, vague = loose, loose
-    if (form & FilterForm.GRADUAL.value) != 0 and settings.feature_count > 0:
-        loose, vague = _are_loose(flight, p, work, settings.feature_count)
-        loose, vague = mask & loose, mask & vague
-        if any_of(loose):
-            first = 0 if any_of(vague) else _FEW
-            if (form & FilterForm.GATE.value) == 0:  # a gate leaves them out by itself
-                hidden = _hide_unsure(flight, work, settings.feature_count, loose)
-    failures = flight.update_failures
-    for part in range(first, _LAST + 1):
-        few = _FIRST_OF_FEW if part == _FEW else _FACTORS[part]
-        factor = select(vague, _FACTORS[part], select(loose, few, 1.0))
-        well = flight.update_failures == failures  # a step that fails is the last
-        taking = mask & well & (vague | (loose & (part >= _FEW)) | (part == _LAST))
-        again = (vague & (part > 0)) | (loose & (part > _FEW))
-        _update_by(flight, p, work, settings, stages, taking, factor, again, slow)
+    mask, form = work.mask > 0.0, settings.form
+    gradual, extended = (form & FilterForm.GRADUAL.value) != 0, (form & FilterForm.EKF.value) != 0
+    curved = True  # the half-sums of sigma pairs count
+    hidden, further = no_lane(p.sigma_spread), zero_like(p.sigma_spread)
+    if gradual and settings.feature_count > 0:
+        find_unsure(flight, p, work, settings.feature_count)
+        if (form & FilterForm.GATE.value) == 0:  # a gate leaves them out by itself
+            hidden = hide_unsure(flight, work, settings.feature_count, mask)
+    failures, step, last = flight.update_failures, 0, 0
+    while step <= last:
+        n = _expect(flight, p, work, settings, stages, slow)
+        if n > 0:
+            if not extended or gradual:
+                _mean_even(work, n, work.spread)
+            if gradual and step == 0:
+                further = count_steps(flight, p, work, settings, mask)
+                for m in range(1, MOST_STEPS + 1):
+                    if any_of(further >= 1.0 * m):
+                        last = m
+            if extended:
+                curved = any_of(further > 0.0)
+                drop_even(work, n, further < 1.0, curved)
+            well = flight.update_failures == failures  # a step that fails is the last
+            taking = mask & well & (further >= 1.0 * step)
+            factor = factor_of(further, step)
+            steps = (step, further, factor, curved)
+            _update_by(flight, p, work, settings, stages, n, taking, steps, slow)
+        step += 1
     if any_of(hidden):
-        _show_hidden(flight, work, settings, hidden)
-    if (form & FilterForm.GRADUAL.value) != 0:
-        flight.nis = select(loose, np.nan, flight.nis)
-
-
-@kernel
-def _are_loose(flight, p, work, feature_count):
-    """Lanes in which a visible feature's direction is uncertain, and lanes where it is by `_VAGUE`.
-
-    A direction is uncertain above `recursive_update_threshold`; features that are left out do not
-    count as vague. Its error comes from attitude and position; the position's share grows as the
-    feature gets nearer. Set work.hidden for features too uncertain for a linear model even in
-    steps.
-    """
-    P_rr, P_ee = sum_of_squares(flight.L, R, 3), sum_of_squares(flight.L, E, 9)
-    position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
-    attitude = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
-    too_much, r = p.recursive_update_threshold * p.recursive_update_threshold, load3(flight.r_hat)
-    loose = no_lane(attitude)
-    vague = loose
-    for i in range(feature_count):
-        offset = load3(p.features[i]) - r
-        square, seen = dot(offset, offset), flight.block_valid[FEATURE_BLOCKS + i] > 0.0
-        loose = loose | (seen & (position > (too_much - attitude) * square))
-        unsure = seen & (position > (p.gate_uncertainty - attitude) * square)
-        work.hidden[i] = select(unsure, 1.0, 0.0)
-        much = seen & (position > (_VAGUE * _VAGUE - attitude) * square)
-        vague = vague | (much & logical_not(unsure))
-    return loose, loose & vague
-
-
-@kernel
-def _hide_unsure(flight, work, feature_count, mask):
-    """Hide features whose directions are too uncertain to use; return the lanes that have any.
-
-    Each step would infer a wrong distance from a wrong direction and make the filter overconfident.
-    """
-    some = no_lane(work.hidden[0])
-    for i in range(feature_count):
-        hidden = mask & (work.hidden[i] > 0.0)
-        some = some | hidden
-        work.hidden[i] = select(hidden, 1.0, 0.0)
-        valid = flight.block_valid[FEATURE_BLOCKS + i]
-        flight.block_valid[FEATURE_BLOCKS + i] = select(hidden, 0.0, valid)
-    return some
-
-
-@kernel
-def _show_hidden(flight, work, settings, mask):
-    """Restore hidden features, and mark them as left out: they have no innovation."""
-    for i in range(settings.feature_count):
-        hidden, block = mask & (work.hidden[i] > 0.0), FEATURE_BLOCKS + i
-        flight.block_valid[block] = select(hidden, 1.0, flight.block_valid[block])
-        if (settings.form & MONITORED) != 0:
-            flight.gate[block] = select(hidden, GateDecision.UNSURE, flight.gate[block])
-            flight.block_nis[block] = select(hidden, np.nan, flight.block_nis[block])
-            keep(flight.innovation[block], hidden, (np.nan, np.nan, np.nan))
-            keep(flight.innovation_sigma[block], hidden, (np.nan, np.nan, np.nan))
+        show_hidden(flight, work, settings, hidden)
+    if gradual:
+        flight.nis = select(further > 0.0, np.nan, flight.nis)
 
 
 @kernel
@@ -268,34 +235,47 @@ def _keep(flight, p, work, form, columns, ok, slow):
 
 
 @kernel
-def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
-    """Update with the measurements, their noise multiplied by `factor`, in the lanes `mask`.
-
-    `again`: lanes that process these measurements in a later step.
-    """
+def _expect(flight, p, work, settings, stages, slow):
+    """Fill the stacked measurement, its prediction, noise and columns; return its length."""
     n, form = count_measured(flight, work, settings), settings.form
-    if n == 0:
-        return
-    columns, states, estimated = 9, 15, 15
+    estimated = 15
+    if slow is not None:
+        estimated = 15 + slow.slow_errors  # the others only fill up a block
+    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + work.measured)
+    work.spread, work.inverse_spread = c, 1.0 / c
+    if n > 0:
+        if (form & FilterForm.EKF.value) == 0 or (form & FilterForm.GRADUAL.value) != 0:
+            _split_turns(flight, work, c, form)
+        call_measured(flight, p, work, settings, stages, Act.EXPECT)
+    return n
+
+
+@kernel
+def _update_by(flight, p, work, settings, stages, n, mask, steps, slow):
+    """Update with the n measurements, in the lanes `mask`.
+
+    `steps`: the number of this step with these measurements, the number of steps that follow the
+    first, the factor on the noise, and True if second-order terms count.
+    """
+    step, further, factor, curved = steps
+    form, columns, states = settings.form, 9, 15
     if slow is not None:
         columns, states = columns_of(slow), 15 + slow.slow_states
-        estimated = 15 + slow.slow_errors  # the others only fill up a block
     measured = work.measured
-    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
-    work.spread, work.inverse_spread = c, 1.0 / c
-    if (form & FilterForm.EKF.value) == 0:
-        _split_turns(flight, work, c, form)
-    call_measured(flight, p, work, settings, stages, Act.EXPECT)
-    _innovate(work, n, c)
+    _innovate(work, n)
     if (form & MONITORED) != 0:
-        zero = zero_like(c)
-        work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
+        zero = zero_like(measured)
+        work.taking, work.again = select(mask, 1.0, 0.0), zero + (1.0 if step > 0 else 0.0)
         work.left_out = zero
         call_stage(stages, Stage.GATE, flight, p, p, settings, work, 0)
         measured = measured - work.left_out
-    _sum_noise(p, work, n, factor)
-    without = find_directions(flight, p, work, settings)
-    along = nis_along(p, work, n)
+    if any_of(further > FEW):
+        share_second_order(work, n, further)
+    if curved:
+        _sum_noise(p, work, n, factor)
+    else:
+        _put_noise(work, n)
+    along, without = without_directions(flight, p, work, settings)
     nis, definite = _whiten(work, n, columns)
     total = _correct(flight, work, states, columns, slow)
     if (form & FilterForm.TURN.value) != 0:

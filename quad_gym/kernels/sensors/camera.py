@@ -21,7 +21,13 @@ from quad_gym.kernels.filter.covariance_resets import MAX_ANGLE, reset_variances
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.error_state import D, E, R
 from quad_gym.kernels.filter.recovery import reset_drifted_velocity
-from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
+from quad_gym.kernels.filter.rows import (
+    by_derivative,
+    columns_of,
+    put_block,
+    put_three,
+    with_pairs,
+)
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
 from quad_gym.kernels.maths.matrices import load_column3
@@ -34,7 +40,6 @@ from quad_gym.records import (
     DRAW_FEATURE,
     DRAW_PHASE,
     FEATURE_BLOCKS,
-    FilterForm,
     Sensor,
 )
 
@@ -116,24 +121,25 @@ def _column(flight, p, work, settings, k, j, A, S, R_BI):
     """Fill the rows of all features in column j, with a derivative or a pair of sigma points."""
     L, c, inverse_c, camera = flight.L, work.spread, work.inverse_spread, load3(p.camera)
     d, dr_B = load_column3(L, E, j), load_column3(L, R, j)
-    by_derivative = (settings.form & FilterForm.EKF.value) != 0
-    dr_B = R_BI @ dr_B if by_derivative else R_BI @ (c * dr_B)
+    dr_B = R_BI @ dr_B if by_derivative(settings) else R_BI @ (c * dr_B)
     odd, even = load33(work.odd[j]), load33(work.even[j])
     for i in range(settings.feature_count):
         valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
         if any_of(valid):
             X_B, per_distance = load3(work.X_B[i]), work.inverse_distance[i]
-            if by_derivative:
+            a, s = zero_like(X_B), zero_like(X_B)
+            if with_pairs(settings):
+                # (I + even +- odd) (X_B -+ dr_B) - l_c
+                shift = c * dr_B if by_derivative(settings) else dr_B
+                v_odd, v_even = turn_pair(even, odd, X_B, shift)
+                a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
+                a, s = inverse_c * a, inverse_c * s
+            if by_derivative(settings):
                 u_B = load3(work.z_hat[k : k + 3])
                 v = per_distance * (cross(X_B, d) - dr_B)
-                put_three(A, k, valid, v + -dot(u_B, v) * u_B)
-                put_three(S, k, valid, zero_like(v))
-            else:
-                # (I + even +- odd) (X_B -+ dr_B) - l_c
-                v_odd, v_even = turn_pair(even, odd, X_B, dr_B)
-                a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
-                put_three(A, k, valid, inverse_c * a)
-                put_three(S, k, valid, inverse_c * s)
+                a = v + -dot(u_B, v) * u_B
+            put_three(A, k, valid, a)
+            put_three(S, k, valid, s)
             k += 3
 
 

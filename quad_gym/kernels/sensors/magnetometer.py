@@ -27,7 +27,13 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.align import lever_of_attitude
 from quad_gym.kernels.filter.covariance_resets import reset_heading, reset_variances
 from quad_gym.kernels.filter.error_state import BA, D, E, R, V, put_covariance
-from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
+from quad_gym.kernels.filter.rows import (
+    by_derivative,
+    columns_of,
+    put_block,
+    put_three,
+    with_pairs,
+)
 from quad_gym.kernels.filter.slow import keep_factor
 from quad_gym.kernels.maths.elementary import maximum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky
@@ -49,7 +55,7 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["MAGNETOMETER"])
 _ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
@@ -166,12 +172,13 @@ def _expect(flight, p, work, settings, i, k, valid):
         db, turned = load_column3(M, first, j), M[delta, j] * g_B
         a, s = turned + db, zero_like(db)
         if j < 9:
-            if (settings.form & FilterForm.EKF.value) != 0:
+            odd, even = load33(work.odd[j]), load33(work.even[j])
+            if with_pairs(settings):
+                s = odd @ turned + inverse_c * (even @ f_B)
+            if by_derivative(settings):
                 a = a + cross(f_B, load_column3(L, E, j))
             else:
-                odd, even = load33(work.odd[j]), load33(work.even[j])
                 a = a + (even @ turned + inverse_c * (odd @ f_B))
-                s = odd @ turned + inverse_c * (even @ f_B)
             put_three(work.E[8 - j], k, valid, s)
         put_three(work.A[last - j], k, valid, a)
 

@@ -21,7 +21,7 @@ and the derivative along an offset is (dV + W x de) G + W (du / h - u dh / h^2).
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.covariance_resets import reset_variances
 from quad_gym.kernels.filter.error_state import E, R, V
-from quad_gym.kernels.filter.rows import put_block, put_column
+from quad_gym.kernels.filter.rows import by_derivative, put_block, put_column, with_pairs
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33, vector
 from quad_gym.kernels.maths.matrices import load_column3
@@ -30,7 +30,7 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.sensors.range_finder import MIN_COSINE, ground_range
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["OPTICAL_FLOW"])
 _ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
@@ -70,12 +70,12 @@ def _expect(flight, p, work, settings, i, k, valid):
     put_block(work, settings, k, valid, load3(flight.aid_measurement[_ROW]), z_hat, noise)
     for j in range(9):
         dV, dh = R_BI @ load_column3(L, V, j), L[R + 2, j] if j <= R + 2 else zero
-        if (settings.form & FilterForm.EKF.value) != 0:
+        a, s = (zero, zero, zero), (zero, zero, zero)
+        if by_derivative(settings):
             e = load_column3(L, E, j)
             du = cross(z_B, e)[2]
             a = _flow(G, dV + cross(W, e)) + _flow((du - G * dh) / h, W)
-            s = (zero, zero, zero)
-        else:
+        if with_pairs(settings):
             odd, even = load33(work.odd[j]), load33(work.even[j])
             dV, dh = c * dV, c * dh
             V_e = even @ W + odd @ dV
@@ -84,7 +84,8 @@ def _expect(flight, p, work, settings, i, k, valid):
             divisor = 1.0 / (h * h - dh * dh)
             g_e = (even_u * h * h - odd_u * dh * h + u * dh * dh) * divisor / h
             g_o = (odd_u * h - (u + even_u) * dh) * divisor
-            a = inverse_c * (_flow(G + g_e, V_o) + _flow(g_o, W + V_e))
+            if not by_derivative(settings):
+                a = inverse_c * (_flow(G + g_e, V_o) + _flow(g_o, W + V_e))
             s = inverse_c * (_flow(G + g_e, V_e) + _flow(g_e, W) + _flow(g_o, V_o))
         put_column(work, settings, k, j, valid, a, s)
 

@@ -12,7 +12,7 @@ U = u + even_u and D = U^2 - odd_u^2; the derivative along an offset is dh / u -
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.covariance_resets import reset_variance
 from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.rows import put_block, put_column
+from quad_gym.kernels.filter.rows import by_derivative, put_block, put_column, with_pairs
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33
 from quad_gym.kernels.maths.matrices import load_column3
@@ -20,7 +20,7 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["RANGE_FINDER"])
 _ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
@@ -57,16 +57,18 @@ def _expect(flight, p, work, settings, i, k, valid):
     z_B = R_BI.T[2]
     for j in range(9):
         dh = L[R + 2, j] if j <= R + 2 else zero
-        if (settings.form & FilterForm.EKF.value) != 0:
+        a, s = zero, zero
+        if by_derivative(settings):
             du = cross(z_B, load_column3(L, E, j))[2]
-            a, s = (dh - h * du / u) / u, zero
-        else:
+            a = (dh - h * du / u) / u
+        if with_pairs(settings):
             dh, odd, even = c * dh, load33(work.odd[j]) @ z_B, load33(work.even[j]) @ z_B
             U = u + even[2]
             divisor = 1.0 / (U * U - odd[2] * odd[2])
-            a = inverse_c * (dh * U - h * odd[2]) * divisor
             s = h * (odd[2] * odd[2] - U * even[2]) - u * dh * odd[2]
             s = inverse_c * s * divisor / u
+            if not by_derivative(settings):
+                a = inverse_c * (dh * U - h * odd[2]) * divisor
         put_column(work, settings, k, j, valid, (a, zero, zero), (s, zero, zero))
 
 

@@ -16,7 +16,13 @@ A detour of the signal, which the filter does not model, lengthens some ranges.
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.covariance_resets import reset_variances
 from quad_gym.kernels.filter.error_state import R
-from quad_gym.kernels.filter.rows import lever_column, put_block, put_column
+from quad_gym.kernels.filter.rows import (
+    by_derivative,
+    lever_column,
+    put_block,
+    put_column,
+    with_pairs,
+)
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import diagonal, dot, load3, load4, load33, norm
 from quad_gym.kernels.maths.matrices import load_column3
@@ -24,7 +30,7 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.aid import aid_stage
 from quad_gym.kernels.simd.lanes import select, zero_like
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["UWB_RANGE"])
 _ROW, _DRAW, _TAG = AID_ROW[_S], DRAW_AID[_S], AID_NUMBERS[_S]
@@ -60,16 +66,17 @@ def _expect(flight, p, work, settings, i, k, valid):
     for j in range(9):
         o, e = lever_column(flight, work, settings, j, R_BI, l_B)
         o = o + load_column3(L, R, j)
-        if (settings.form & FilterForm.EKF.value) != 0:
-            a, s = dot(d, o) / D, zero
-        else:
+        a, s = dot(d, o) / D, zero
+        if with_pairs(settings):
             o, e = c * o, c * e
             center = d + e
             plus, minus = norm(center + o), norm(center - o)
             along, P, M = dot(center, o), plus + D, minus + D
-            a = 2.0 * along / (plus + minus)
-            s = 0.5 * (dot(center + d, e) + dot(o, o)) * (P + M) - 2.0 * a * along
-            a, s = inverse_c * a, inverse_c * s / (P * M)
+            half = 2.0 * along / (plus + minus)
+            s = 0.5 * (dot(center + d, e) + dot(o, o)) * (P + M) - 2.0 * half * along
+            s = inverse_c * s / (P * M)
+            if not by_derivative(settings):
+                a = inverse_c * half
         put_column(work, settings, k, j, valid, (a, zero, zero), (s, zero, zero))
 
 

@@ -1,0 +1,99 @@
+"""Measurements of a wide prior, against iterated Gauss-Newton steps from the same prior."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.faults import SensorLoss
+from tests.field_flights import fly, nees, state_errors, steps
+from tests.filter_states import set_at_rest
+from tests.unit.alarms import ALARM
+
+SUITE = quad_gym.sensor_suite("uwb").simplified()
+ANCHORS, NOISE = np.array(SUITE.uwb_range.anchors_I), SUITE.uwb_range.noise_sigma
+FILTERS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
+PLACE = np.array([0.0, 0.0, 1.5])
+
+
+def in_one_step(suite):
+    return suite.replace(estimator=suite.estimator.replace(recursive_update_threshold=None))
+
+
+def gauss_newton(ranges, sigma):
+    """Most likely position, and its covariance, for a prior about PLACE with deviation sigma."""
+    r = PLACE.copy()
+    for _ in range(15):
+        offset = r - ANCHORS
+        length = np.linalg.norm(offset, axis=1)
+        H = offset / length[:, np.newaxis]
+        information = np.eye(3) / sigma**2 + H.T @ H / NOISE**2
+        gradient = H.T @ (ranges - length) / NOISE**2 + (PLACE - r) / sigma**2
+        r = r + np.linalg.solve(information, gradient)
+    return r, np.linalg.inv(information)
+
+
+def draws(sigma, count):
+    """Positions of the prior, with ranges measured there."""
+    rng = np.random.default_rng(4)
+    positions = PLACE + sigma * rng.normal(size=(count, 3))
+    lengths = np.linalg.norm(positions[:, np.newaxis] - ANCHORS, axis=2)
+    return positions, lengths + NOISE * rng.normal(size=lengths.shape)
+
+
+def squares(errors, covariances):
+    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
+
+
+def estimates(suite, kind, sigma, ranges):
+    """Positions and covariances after one update from the prior, for each set of ranges."""
+    kalman, found = FILTERS[kind](suite), []
+    P = np.diag(np.repeat([sigma, 0.5, 0.01, 0.05, 0.002], 3) ** 2)
+    for values in ranges:
+        set_at_rest(kalman, P, position=PLACE)
+        kalman.update(uwb_range=values)
+        found.append((kalman.position, kalman.covariance[:3, :3]))
+    return (np.array(part) for part in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("kind", FILTERS)
+@pytest.mark.parametrize("sigma", [1.0, 1.5])
+def test_ranges_of_a_wide_prior_agree_with_gauss_newton(kind, sigma):
+    truth, ranges = draws(sigma, 150)
+    positions, covariances = estimates(SUITE, kind, sigma, ranges)
+    best, its = (np.array(x) for x in zip(*(gauss_newton(z, sigma) for z in ranges), strict=True))
+    apart = squares(positions - best, its)
+    assert np.median(apart) < 0.3
+    ratio = np.linalg.det(covariances) / np.linalg.det(its)
+    assert 0.9 < np.median(ratio) < 3.0
+    limits = stats.chi2.ppf([ALARM / 2, 1.0 - ALARM / 2], 3 * 150) / 150
+    assert limits[0] < squares(truth - best, its).mean() < limits[1]
+    assert limits[0] < squares(truth - positions, covariances).mean() < limits[1]
+    plain, believed = estimates(in_one_step(SUITE), kind, sigma, ranges)
+    assert squares(truth - plain, believed).mean() > limits[1]
+
+
+@pytest.mark.parametrize("kind", FILTERS)
+def test_ranges_after_an_outage_leave_a_filter_consistent(kind):
+    suite = SUITE.replace(estimator=SUITE.estimator.replace(kind=kind))
+    loss = SensorLoss(sensor="uwb_range", start=1.0, duration=10.0)
+    batch = fly(suite, 64, vehicle=quad_gym.vehicle_params("crazyflie"), faults=(loss,))
+    steps(batch, 11.5)
+    assert (batch.record("filter_status") == 0).all()
+    limit = stats.chi2(15 * 64).ppf(1.0 - ALARM) / 64
+    assert nees(batch).mean() < limit
+    error = np.sqrt((state_errors(batch)[:, :3] ** 2).mean())
+    assert error < 0.15
+
+
+@pytest.mark.parametrize("kind", FILTERS)
+def test_optical_flow_at_a_vague_height_leaves_a_filter_consistent(kind):
+    suite = quad_gym.sensor_suite("field").simplified()
+    suite = suite.replace(
+        optical_flow=quad_gym.OpticalFlowParams(rate=50.0),
+        estimator=suite.estimator.replace(kind=kind),
+    )
+    batch = fly(suite, 128, task="lemniscate", start="hover")
+    steps(batch, 0.5)
+    assert nees(batch).mean() < stats.chi2(15 * 128).ppf(1.0 - ALARM) / 128
