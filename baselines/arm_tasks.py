@@ -18,8 +18,12 @@ if TYPE_CHECKING:
 TYPICAL = 0.03  #: typical standard deviation of the position while markers are in view [m]
 
 _SCALES = {
-    **{"position_error": (0.0, 6.0), "velocity_error": (0.0, 4.0), "body_rates": (0.0, 2.0)},
-    **{"next_gap": (0.0, 12.0), "gap_width": (4.5, 1.5), "next_width": (4.5, 1.5)},
+    "position_error": (0.0, 6.0),
+    "velocity_error": (0.0, 4.0),
+    "body_rates": (0.0, 2.0),
+    "next_gap": (0.0, 12.0),
+    "gap_width": (4.5, 1.5),
+    "next_width": (4.5, 1.5),
 }
 """Centers and half ranges of parts of the observation of `OutageDash`, in their units; parts that
 contain the truth, `actual_NAME`, have these scales, too."""

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
-from quad_gym.params.checks import Vector, Vector3
+from quad_gym.params.checks import Checked, Vector, Vector3
 
 Array = NDArray[np.float64]
 
@@ -59,8 +58,10 @@ class CrazyflieGains(Checked):
     max_force: check.Positive = 0.12
     """force of a rotor at a thrust of 65,535 [N]"""
     force_curve: Annotated[Vector, partial(check.vector, length=4)] = (
-        *(-0.02476538, 0.06523794),
-        *(-0.02679250, 0.00677679),
+        -0.02476538,
+        0.06523794,
+        -0.02679250,
+        0.00677679,
     )
     """force of a rotor over the voltage of its motor, lowest power first [N/V^k], by which the
     firmware compensates the battery"""

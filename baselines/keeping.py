@@ -17,16 +17,21 @@ import gymnasium
 from filelock import FileLock, Timeout
 from tqdm.auto import tqdm
 
-from baselines.plans import Plan
-from baselines.seeds import first_seed
+from baselines.recipes import Plan, first_seed
 from quad_gym.evaluation import Policy, roll_out
 
 EVALUATIONS = "evaluations.csv"
 STATE = "training_state.pickle"
 """Name of the state within the file of the last policy; loading the policy ignores it."""
 _COLUMNS = (
-    *("steps", "training_seconds", "mean_error", "late_error", "crash_rate", "return"),
-    *("gates_passed", "training_return"),
+    "steps",
+    "training_seconds",
+    "mean_error",
+    "late_error",
+    "crash_rate",
+    "return",
+    "gates_passed",
+    "training_return",
 )
 SUFFIXES = {"sb3": ".zip", "compiled": ".npz"}  #: extensions of policy files, by engine
 

@@ -1,7 +1,10 @@
-"""Untrained models of Stable-Baselines3 for a plan."""
+"""Models of Stable-Baselines3 for a plan, and checkpoints from which a run resumes exactly."""
 
 import inspect
+import io
 import math
+import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +13,18 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from baselines.plans import Linear, Plan
-from baselines.recipes import Recipe
-from baselines.seeds import first_seed
+from baselines.keeping import STATE, RunError, RunKeeper, best_file, replace_file
+from baselines.recipes import Linear, Plan, Recipe, first_seed
 from quad_gym.params import checks as check
+
+# --------------------------------------------------------------------------------------------------
+# Untrained models of Stable-Baselines3 for a plan.
+# --------------------------------------------------------------------------------------------------
 
 _OURS = {"self", "policy", "env", "learning_rate", "policy_kwargs", "action_noise"}
 _OURS |= {"seed", "device", "tensorboard_log", "_init_setup_model"}
@@ -104,3 +112,118 @@ def _checked_parameters(chosen: Recipe) -> dict[str, Any]:
             if share and value > 1.0:
                 raise ValueError(f"{name} must be at most 1, got {value!r}")
     return found
+
+
+# --------------------------------------------------------------------------------------------------
+# Checkpoints of models of Stable-Baselines3, from which a run resumes exactly.
+# --------------------------------------------------------------------------------------------------
+
+LAST = "last.zip"
+
+
+class Keeper(RunKeeper, BaseCallback):
+    """`RunKeeper` for Stable-Baselines3, as a callback."""
+
+    def _on_training_start(self) -> None:
+        self.begin(self.num_timesteps)
+
+    def _on_rollout_start(self) -> None:
+        """Evaluate and save between two rollouts, after the update by the last one."""
+        self.watch(self.model, self.model.num_timesteps)
+
+    def _on_step(self) -> bool:
+        return not self.stopping
+
+    def _training_return(self, model: BaseAlgorithm) -> float:
+        records = model.ep_info_buffer or []
+        return float(np.mean([r["r"] for r in records])) if records else float("nan")
+
+    def _save(self, model: Any, *, best: bool) -> None:
+        for name, value in self.rows[-1].items():
+            model.logger.record(f"evaluation/{name}", value)
+        if best:
+            replace_file(best_file(self._plan, self._folder), _model_bytes(model))
+        save_model(self._folder, model, self)
+
+
+def _model_bytes(model: BaseAlgorithm) -> bytes:
+    buffer = io.BytesIO()
+    model.save(buffer)
+    return buffer.getvalue()
+
+
+def save_model(folder: Path, model: BaseAlgorithm, keeper: Keeper) -> None:
+    """Write `last.zip`: the model, and the states of the flights and random number generators."""
+    env = model.get_env()
+    assert env is not None
+    state = {
+        "flights": env.unwrapped.flights.batch.snapshot(),  # type: ignore[attr-defined]
+        "torch": torch.get_rng_state(),
+        "numpy": np.random.get_state(),  # noqa: NPY002 - Stable-Baselines3 shuffles with it
+        "actions": model.action_space.np_random.bit_generator.state,
+        "keeper": keeper.state(),
+        "replay": None,
+    }
+    if isinstance(model, OffPolicyAlgorithm):
+        replay = folder / f"replay_{model.num_timesteps}.pickle"
+        part = replay.with_name(replay.name + ".part")
+        model.save_replay_buffer(part)
+        part.replace(replay)
+        state["replay"] = replay.name
+    buffer = io.BytesIO(_model_bytes(model))
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.writestr(STATE, pickle.dumps(state))
+    replace_file(folder / LAST, buffer.getvalue())
+    for old in folder.glob("replay_*.pickle"):
+        if old.name != state["replay"]:
+            old.unlink()
+
+
+def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) -> BaseAlgorithm:
+    """Load the model of `last.zip` into an untrained one, and restore flights, keeper and draws."""
+    try:
+        with zipfile.ZipFile(folder / LAST) as archive:
+            state = pickle.loads(archive.read(STATE))
+        found = type(model).load(
+            folder / LAST,
+            env=env,
+            device="cpu",
+            force_reset=False,
+            custom_objects={"tensorboard_log": model.tensorboard_log},
+        )
+    except (zipfile.BadZipFile, KeyError, pickle.UnpicklingError) as error:
+        raise RunError(f"the checkpoint in {folder} is damaged: {error}") from None
+    if state["replay"]:
+        found.load_replay_buffer(folder / state["replay"])  # type: ignore[attr-defined]
+    env.reset()
+    env.unwrapped.flights.batch.restore(state["flights"])  # type: ignore[attr-defined]
+    torch.set_rng_state(state["torch"])
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    found.action_space.np_random.bit_generator.state = state["actions"]
+    keeper.restore(state["keeper"], found.num_timesteps)
+    return found
+
+
+def run(
+    plan: Plan,
+    folder: Path,
+    judge: gymnasium.vector.VectorEnv[Any, Any, Any],
+    *,
+    tensorboard: bool,
+    quiet: bool,
+) -> Keeper:
+    """Train with Stable-Baselines3, or resume from the last checkpoint; see `training.train`."""
+    torch.set_num_threads(1)  # networks of this size do not benefit from more
+    env = plan.make_flights()
+    model = make_model(plan, env, folder / "tensorboard" if tensorboard else None)
+    keeper = Keeper(plan, folder, judge, quiet=quiet)
+    resuming = (folder / LAST).exists()
+    if resuming:
+        model = load_model(folder, model, env, keeper)
+    steps = plan.recipe.steps - model.num_timesteps
+    with keeper.running():
+        if steps > 0:
+            model.learn(steps, callback=keeper, reset_num_timesteps=not resuming, tb_log_name="run")
+        keeper.finish(model, model.num_timesteps)
+    env.close()
+    return keeper

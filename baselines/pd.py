@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from quad_gym.envs.spaces import policy_size
 from quad_gym.params import checks as check
-from quad_gym.params.control import PDGains, pd_gains
+from quad_gym.params.vehicle import PDGains, pd_gains
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,14 @@ class _Seen(NamedTuple):
 
 _RELATIVE_FIELDS = _Seen._fields[:-1]
 _ABSOLUTE_FIELDS = (
-    *("position", "velocity", "R_BI", "body_rates", "reference_position", "reference_velocity"),
-    *("reference_heading", "reference_acceleration"),
+    "position",
+    "velocity",
+    "R_BI",
+    "body_rates",
+    "reference_position",
+    "reference_velocity",
+    "reference_heading",
+    "reference_acceleration",
 )
 
 

@@ -1,4 +1,4 @@
-"""Recipes: all hyperparameters of each algorithm on each task.
+"""Recipes: all hyperparameters of each algorithm on each task; plans and seeds of trainings.
 
 A recipe is data. `quad-gym train` and `quad-gym compare` read it, and their options override it.
 Policies are always evaluated on the task of the environment's id; `flights` defines differences of
@@ -6,14 +6,75 @@ the flights in training, such as a start that is easier to learn from.
 """
 
 from collections.abc import Mapping
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import gymnasium
+
+import quad_gym
 from quad_gym import IDS
+from quad_gym.analysis.reports import as_json
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Checked
+from quad_gym.params.suites import contents_of_suite_files
+
+if TYPE_CHECKING:
+    from baselines.scaled_reward import ScaledReward
+
+
+# --------------------------------------------------------------------------------------------------
+# Disjoint blocks of seeds for flights in training, validation and test.
+#
+# Flight i of an environment seeded with s has the seed s + i, as is Gymnasium's convention.
+# Trainings with seeds 0 and 4 would therefore share most of their flights, and an evaluation with
+# seed 0 would use flights of the first training. Here each purpose has its own seeds:
+#
+# | purpose | seeds of its flights |
+# |---|---|
+# | "test" | `seed + i`, with `seed` as given by the user, below 10^9 |
+# | "training" | `10^9 + 10^6 seed + i`, up to 10^6 flights at a time |
+# | "validation" | `10^12 + 10^6 seed + i`, up to 10^6 flights at a time |
+#
+# Flights for "training" are used to fit parameters, including the search of gains; flights for
+# "validation" to select the best checkpoint of a training; flights for "test" for reported results.
+# --------------------------------------------------------------------------------------------------
+
+PURPOSES = ("training", "validation", "test")  #: purposes of flights
+
+BLOCK = 10**6  #: number of flights in the block of one seed of a training, or of its validation
+
+TEST_END = 10**9  #: upper limit of the seeds of tests
+
+MAX_SEED = 99_999
+"""Largest seed of a training, for which the blocks of training and validation do not overlap."""
+
+_FIRST = {"training": TEST_END, "validation": 10**12}
+
+
+def flight_seeds(purpose: str, seed: int, count: int) -> range:
+    """Seeds (count,) of the flights of one training, validation or test.
+
+    `seed` is the one of the training or, for a test, of its first flight. Raises a ValueError if
+    the seeds are outside the block of the purpose.
+    """
+    check.choice("purpose", purpose, PURPOSES)
+    testing = purpose == "test"  # from TEST_END on, seeds are for training
+    check.whole("count", count, most=TEST_END if testing else BLOCK)
+    check.whole("seed", seed, least=0, most=TEST_END - count if testing else MAX_SEED)
+    first = seed if testing else _FIRST[purpose] + BLOCK * seed
+    return range(first, first + count)
+
+
+def first_seed(purpose: str, seed: int, count: int = 1) -> int:
+    """Seed of the first of `count` flights, to which flight i adds i; see `flight_seeds`."""
+    return flight_seeds(purpose, seed, count)[0]
+
+
+# --------------------------------------------------------------------------------------------------
+# Recipes: all hyperparameters of each algorithm on each task.
+# --------------------------------------------------------------------------------------------------
 
 ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
@@ -84,8 +145,13 @@ def unfreeze(recipe: Any) -> tuple[Any, ...]:
 _PPO = Recipe(
     algorithm="ppo",
     parameters={
-        **{"n_steps": 32, "batch_size": 1024, "n_epochs": 5},
-        **{"gamma": 0.97, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.0},
+        "n_steps": 32,
+        "batch_size": 1024,
+        "n_epochs": 5,
+        "gamma": 0.97,
+        "gae_lambda": 0.95,
+        "clip_range": 0.2,
+        "ent_coef": 0.0,
     },
     policy={"log_std_init": -1.0},
     flights={"start": "mixed", "randomize_reference": True},
@@ -93,8 +159,13 @@ _PPO = Recipe(
 """Result of a search over learning rates, reward scales, activations and batch sizes on Circle."""
 
 _OFF_POLICY = {
-    **{"batch_size": 1024, "buffer_size": 500_000, "learning_starts": 5_000},
-    **{"train_freq": 1, "gradient_steps": 4, "gamma": 0.95, "tau": 0.01},
+    "batch_size": 1024,
+    "buffer_size": 500_000,
+    "learning_starts": 5_000,
+    "train_freq": 1,
+    "gradient_steps": 4,
+    "gamma": 0.95,
+    "tau": 0.01,
 }
 _SAC = Recipe(
     algorithm="sac",
@@ -160,3 +231,93 @@ def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
         memory = {**base.policy, "lstm_hidden_size": 64}
         return base.replace(algorithm=algorithm, policy=memory)
     return _SPECIAL.get((env_id, algorithm), _DEFAULTS[algorithm])
+
+
+# --------------------------------------------------------------------------------------------------
+# Plans of trainings, and the environments that they define.
+# --------------------------------------------------------------------------------------------------
+
+ENGINES = ("sb3", "compiled")  #: training engines: Stable-Baselines3, or `baselines.compiled_ppo`
+
+
+class Plan(Checked):
+    """Plan of a training and its evaluations."""
+
+    env_id: Annotated[str, partial(check.choice, choices=tuple(quad_gym.IDS))] = "QuadGym/Circle-v0"
+    """Id of the environment, from `quad_gym.IDS`"""
+    environment: ReadOnly = field(default_factory=dict)
+    """Keywords of the environment in training and evaluation; they override the recipe's"""
+    learning: ReadOnly = field(default_factory=dict)
+    """Keywords of the environment in training only; they override all others"""
+    recipe: Recipe = field(default_factory=lambda: recipe("QuadGym/Circle-v0"))
+    seed: Annotated[int, partial(check.whole, least=0, most=MAX_SEED)] = 0
+    """Seed of the networks; it also determines the blocks of seeds of the flights in training and
+    validation, see `baselines.recipes`"""
+    threads: int | None = None
+    """Number of threads of the flights; None: one per core. It does not affect results"""
+    engine: Annotated[str, partial(check.choice, choices=ENGINES)] = "sb3"
+    """Training engine, one of `ENGINES`"""
+    evaluations: Annotated[int, check.whole] = 20
+    """Number of evaluations, each with a checkpoint, during the training"""
+    episodes: Annotated[int, check.whole] = 100
+    """Number of episodes in each evaluation"""
+
+    def __reduce__(self) -> Any:
+        """Support pickling, to send plans to other processes."""
+        return unfreeze(self)
+
+    def make_flights(self) -> "ScaledReward":
+        """Make the environment to train in with Stable-Baselines3."""
+        from baselines.scaled_reward import ScaledReward
+
+        env = quad_gym.make_sb3_vec_env(
+            self.env_id,
+            n_envs=self.recipe.n_envs,
+            seed=first_seed("training", self.seed, self.recipe.n_envs),
+            threads=self.threads,
+            **{**self.recipe.flights, **self.environment, **self.learning},
+        )
+        return ScaledReward(env, self.recipe.reward_scale)
+
+    def make_vector_flights(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+        """Make the environment to train in with the compiled engine; it is not seeded."""
+        return gymnasium.make_vec(
+            self.env_id,
+            num_envs=self.recipe.n_envs,
+            threads=self.threads,
+            **{**self.recipe.flights, **self.environment, **self.learning},
+            autoreset_mode="SameStep",
+        )
+
+    def make_judge(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+        """Make the environment for evaluations, defined by the id and the keywords."""
+        return gymnasium.make_vec(
+            self.env_id, num_envs=self.episodes, threads=self.threads, **self.environment
+        )
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Schedule that changes linearly from a first to a last value during training."""
+
+    first: float
+    last: float
+
+    def __call__(self, remaining: float) -> float:
+        """Return the value when a share `remaining` of the training remains."""
+        return self.last + (self.first - self.last) * remaining
+
+
+def description(plan: Plan) -> dict[str, Any]:
+    """Convert a plan to JSON types."""
+    found: dict[str, Any] = as_json(plan)
+    del found["threads"]  # does not affect results
+    if not plan.learning:
+        del found["learning"]
+    given = (plan.environment.get("sensors"), plan.learning.get("sensors"))
+    found |= as_json(contents_of_suite_files(*given))
+    found["first_flights"] = {
+        "training": first_seed("training", plan.seed, plan.recipe.n_envs),
+        "validation": first_seed("validation", plan.seed, plan.episodes),
+    }
+    return found

@@ -23,8 +23,8 @@ from typing import Any
 
 from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint, locked
 from baselines.mlp import MlpPolicy, mlp_of
-from baselines.plans import Plan, description
 from baselines.policies import interface_of
+from baselines.recipes import Plan, description
 from quad_gym.analysis.reports import versions, write_json
 from quad_gym.batch.threads import resolve_threads
 from quad_gym.params import checks as check
@@ -128,7 +128,7 @@ def _train(plan: Plan, folder: Path, resume: bool, options: Mapping[str, bool]) 
 
         keeper: RunKeeper = run_compiled(plan, folder, judge, **options)
     else:
-        from baselines.checkpoints import run
+        from baselines.models import run
 
         keeper = run(plan, folder, judge, **options)
     record = {

@@ -18,37 +18,38 @@ from quad_gym.envs.keywords import EnvKeywords
 from quad_gym.params import aid_table
 from quad_gym.params.aid_table import *  # noqa: F403
 from quad_gym.params.camera import CameraParams
-from quad_gym.params.control import ActionParams, PDGains, pd_gains
-from quad_gym.params.distributions import LogUniform, Normal, Uniform
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
-from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.params.obstacles import Cylinder, Wall
-from quad_gym.params.randomization import Randomization
-from quad_gym.params.reward import RewardParams
-from quad_gym.params.sensors import (
+from quad_gym.params.randomization import LogUniform, Normal, Randomization, Uniform
+from quad_gym.params.suites import (
     InitialPoseParams,
     LogDelays,
     NoisyObservationParams,
     SensorSuite,
+    sensor_suite,
 )
-from quad_gym.params.suites import sensor_suite
-from quad_gym.params.task import TaskParams
+from quad_gym.params.task import RewardParams, TaskParams
 from quad_gym.params.trajectories import Trajectory
-from quad_gym.params.vehicle import VehicleParams, vehicle_params
-from quad_gym.params.world import BatteryParams, WorldParams, world_params
+from quad_gym.params.vehicle import ActionParams, PDGains, VehicleParams, pd_gains, vehicle_params
+from quad_gym.params.world import (
+    BatteryParams,
+    Cylinder,
+    GroundParams,
+    Wall,
+    WorldParams,
+    world_params,
+)
 from quad_gym.records import Ending
 
 if TYPE_CHECKING:  # _LAZY imports them on first use
     from quad_gym.batch.flight_batch import FlightBatch
-    from quad_gym.batch.measurements import Measurements
+    from quad_gym.batch.own_estimator import Estimator, Measurements
     from quad_gym.envs.single import QuadEnv
     from quad_gym.envs.spaces import observation_layout
     from quad_gym.envs.vector import QuadVectorEnv
     from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
-    from quad_gym.estimation.own import Estimator
-    from quad_gym.flights.record import Flight, FlightRecorder
+    from quad_gym.flights import Flight, FlightRecorder
     from quad_gym.tasks import ObservationSpec, Task, TaskError, rewards
     from quad_gym.tasks.view import View
 
@@ -72,12 +73,12 @@ def __dir__() -> list[str]:
 
 
 _LAZY = {
-    "Estimator": "quad_gym.estimation.own",
+    "Estimator": "quad_gym.batch.own_estimator",
     "ExtendedKalmanFilter": "quad_gym.estimation",
-    "Flight": "quad_gym.flights.record",
+    "Flight": "quad_gym.flights",
     "FlightBatch": "quad_gym.batch.flight_batch",
-    "FlightRecorder": "quad_gym.flights.record",
-    "Measurements": "quad_gym.batch.measurements",
+    "FlightRecorder": "quad_gym.flights",
+    "Measurements": "quad_gym.batch.own_estimator",
     "ObservationSpec": "quad_gym.tasks",
     "QuadEnv": "quad_gym.envs.single",
     "QuadVectorEnv": "quad_gym.envs.vector",

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.kernels import entries
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 from quad_gym.params import checks as check
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import FEATURE_SLICE, FLIGHT
 from quad_gym.rotations import dcm_to_quaternion

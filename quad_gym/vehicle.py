@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.kernels import entries
-from quad_gym.packing.flight import params_record
-from quad_gym.packing.world import world_settings
+from quad_gym.packing import params_record, world_settings
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 

@@ -37,15 +37,41 @@ _COPIED = ("quad_gym", "baselines", "scripts", "docs", "tests", "pyproject.toml"
 _LEFT_OUT = {"tests/contract/test_golden.py"}
 _WORD = re.compile(r"[A-Za-z_]{3,}")
 _OPERATORS: dict[type[ast.AST], str] = {
-    **{ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.And: "or", ast.Or: "and"},
-    **{ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "=="},
-    **{ast.BitAnd: "|", ast.BitOr: "&", ast.Is: "is not", ast.IsNot: "is"},
+    ast.Add: "-",
+    ast.Sub: "+",
+    ast.Mult: "/",
+    ast.Div: "*",
+    ast.And: "or",
+    ast.Or: "and",
+    ast.Lt: ">=",
+    ast.LtE: ">",
+    ast.Gt: "<=",
+    ast.GtE: "<",
+    ast.Eq: "!=",
+    ast.NotEq: "==",
+    ast.BitAnd: "|",
+    ast.BitOr: "&",
+    ast.Is: "is not",
+    ast.IsNot: "is",
 }
 """Replacements of operators in broken lines."""
 _TEXT: dict[type[ast.AST], str] = {
-    **{ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.And: "and", ast.Or: "or"},
-    **{ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="},
-    **{ast.BitAnd: "&", ast.BitOr: "|", ast.Is: "is", ast.IsNot: "is not"},
+    ast.Add: "+",
+    ast.Sub: "-",
+    ast.Mult: "*",
+    ast.Div: "/",
+    ast.And: "and",
+    ast.Or: "or",
+    ast.Lt: "<",
+    ast.LtE: "<=",
+    ast.Gt: ">",
+    ast.GtE: ">=",
+    ast.Eq: "==",
+    ast.NotEq: "!=",
+    ast.BitAnd: "&",
+    ast.BitOr: "|",
+    ast.Is: "is",
+    ast.IsNot: "is not",
 }
 
 

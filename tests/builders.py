@@ -13,7 +13,7 @@ import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.flights.record import FlightRecorder
+from quad_gym.flights import FlightRecorder
 
 MAKERS = {
     "make": lambda **keywords: gymnasium.make("QuadGym/Circle-v0", **keywords),

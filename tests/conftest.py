@@ -12,9 +12,8 @@ os.environ.setdefault("QUAD_GYM_KERNELS", "numba")  # even where a library is bu
 from hypothesis import HealthCheck, settings
 
 from quad_gym.kernels.compiling.workers import prepare
-from quad_gym.kernels.cores import available_cores
-from quad_gym.kernels.entries import FILTER_ENTRIES, SENSORS_AND_VEHICLE
-from quad_gym.kernels.linked import names_of
+from quad_gym.kernels.entries import FILTER_ENTRIES, SENSORS_AND_VEHICLE, names_of
+from quad_gym.kernels.library import available_cores
 from quad_gym.kernels.stages import SOURCES
 
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # for this process and its children

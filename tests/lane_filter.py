@@ -2,11 +2,15 @@
 
 import numpy as np
 
-from quad_gym.kernels.entries import FILTER_ENTRIES, FILTER_STAGES, run_stage, start_filter
-from quad_gym.kernels.linked import linked_table
+from quad_gym.kernels.entries import (
+    FILTER_ENTRIES,
+    FILTER_STAGES,
+    linked_table,
+    run_stage,
+    start_filter,
+)
 from quad_gym.kernels.stages import Stage, needed_stages
-from quad_gym.packing.aids import pack_sensors
-from quad_gym.packing.flight import form_of, params_block, params_record
+from quad_gym.packing import form_of, pack_sensors, params_block, params_record
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
     BASELINE_BLOCK,

@@ -11,8 +11,8 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym import FlightRecorder
 from quad_gym.envs.single import QuadEnv
-from quad_gym.estimation.logs.log import LOG_COLUMNS
 from quad_gym.frames import ecef_to_enu, ecef_to_geodetic
+from quad_gym.logs.formats.log import LOG_COLUMNS
 from quad_gym.records import AID_BLOCKS, AID_ROW
 from quad_gym.rotations import quaternion_to_dcm
 

@@ -4,7 +4,7 @@ import math
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.batch.cold_start import (
+from quad_gym.batch.starts import (
     MAX_BASELINE_SIGMA,
     MAX_HEADING_SIGMA,
     MAX_HEADING_SIGMA_INDOORS,

@@ -1,8 +1,8 @@
 """Stages with mistakes, for tests of what `quad-gym compile --stage` says of them."""
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import load3
-from quad_gym.kernels.sensors.aid import aid_stage
+from quad_gym.kernels.numbers.linalg import load3
+from quad_gym.kernels.sensors.common import aid_stage
 from quad_gym.records import Aid
 
 

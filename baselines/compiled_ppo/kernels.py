@@ -11,10 +11,9 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.board import comes, finished, post, take
+from quad_gym.kernels.board import add_shared, comes, finished, post, read_shared, take
 from quad_gym.kernels.compiling import entry, kernel, routine
-from quad_gym.kernels.simd.atomics import add_shared, read_shared
-from quad_gym.records.board import FINISHED, TICKET
+from quad_gym.records.call import FINISHED, TICKET
 
 TILE = 64  #: number of samples in a tile
 

@@ -2,7 +2,8 @@
 
 import pickle
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,215 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from baselines.compiled_ppo.learner import Learner
-from baselines.compiled_ppo.networks import Networks
+from baselines.compiled_ppo import kernels
+from baselines.compiled_ppo.kernels import INPUTS, OUTPUTS, STORED, TILE
 from baselines.mlp import MlpPolicy
-from baselines.recipes import Recipe
-from quad_gym.batch.threads import resolve_threads
+from baselines.recipes import ACTIVATIONS, Recipe
+from quad_gym.batch.threads import (
+    MIN_BLOCKS_PER_THREAD,
+    POSTED_BEFORE,
+    Crew,
+    board_of,
+    resolve_threads,
+)
 from quad_gym.params import checks as check
+
+# --------------------------------------------------------------------------------------------------
+# Actor and critic of PPO: multilayer perceptrons in one vector of parameters.
+# --------------------------------------------------------------------------------------------------
+
+Floats = NDArray[np.float32]
+Table = NDArray[np.int64]
+
+
+class Networks:
+    """Gaussian policy and value function of a recipe, for observations and actions of some lengths.
+
+    `critic_only` inputs, at the end of an observation, are for the critic only. The vector of
+    parameters contains the logarithms of the policy's standard deviations directly after the
+    actor's layers. Initial values of layers are drawn as in Stable-Baselines3.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        recipe: Recipe,
+        rng: np.random.Generator,
+        critic_only: int = 0,
+    ) -> None:
+        self.actor, first = _table_of((inputs - critic_only, *recipe.layers, outputs), 0)
+        self.critic, count = _table_of((inputs, *recipe.critic_layers, 1), first + outputs)
+        self._activation, self.params = recipe.activation, np.zeros(count, np.float32)
+        self.net = (self.params, np.zeros_like(self.params), ACTIVATIONS.index(recipe.activation))
+        self.model = (self.net, self.actor, self.critic)
+        self.log_std = self.params[first : first + outputs]
+        self.log_std[:] = recipe.policy.get("log_std_init", 0.0)
+        for table, last_gain in ((self.actor, 0.01), (self.critic, 1.0)):
+            for W, _ in self.layers(table)[:-1]:
+                W[:] = np.sqrt(2.0) * orthogonal(W.shape, rng)
+            W, _ = self.layers(table)[-1]
+            W[:] = last_gain * orthogonal(W.shape, rng)
+        self._room = tuple(room[0] for room in self.rooms(1)[:2])
+
+    def layers(self, table: Table) -> list[tuple[Any, Any]]:
+        """Weights (outputs, inputs) and biases (outputs,) of each layer, as views."""
+        return [
+            (self.params[w : w + i * o].reshape(o, i), self.params[b : b + o])
+            for i, o, w, b, _ in table.tolist()
+        ]
+
+    def flip(self) -> None:
+        """Update the flipped weights from the parameters."""
+        for table in (self.actor, self.critic):
+            kernels.flip(self.net, table)
+
+    def rooms(self, parts: int) -> tuple[Floats, ...]:
+        """Work memory of `kernels.differentiate`: inputs, outputs, deltas, and a matrix product."""
+        tables = (self.actor, self.critic)
+        sizes = (
+            (2, TILE, int(self.critic[0, INPUTS])),
+            (TILE * max(int(t[-1, STORED] + t[-1, OUTPUTS]) for t in tables),),
+            (2, TILE * max(int(t[:, OUTPUTS].max()) for t in tables)),
+            (max(int((t[:, INPUTS] * t[:, OUTPUTS]).max()) for t in tables),),
+        )
+        return tuple(np.zeros((parts, *size), np.float32) for size in sizes)
+
+    def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
+        """Means of actions (n, a) and values (n,) for observations x (n, o)."""
+        means = np.empty((len(x), len(self.log_std)), np.float32)
+        values = np.empty(len(x), np.float32)
+        kernels.evaluate(x, self.model, *self._room, means, values)
+        return means, values
+
+    def policy(self, record: Mapping[str, Any]) -> MlpPolicy:
+        """Copy the actor to a policy that requires only NumPy."""
+        layers = self.layers(self.actor)
+        activations = [self._activation] * (len(layers) - 1) + ["none"]
+        return MlpPolicy(
+            [W.copy() for W, _ in layers], [b.copy() for _, b in layers], activations, record
+        )
+
+
+def _table_of(sizes: Sequence[int], first: int) -> tuple[Table, int]:
+    """Table of a network whose parameters begin at `first`, and the end of its parameters."""
+    rows, stored = [], 0
+    for inputs, outputs in pairwise(sizes):
+        rows.append((inputs, outputs, first, first + inputs * outputs, stored))
+        first += (inputs + 1) * outputs
+        stored += outputs
+    return np.array(rows, np.int64), first
+
+
+def orthogonal(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[Any]:
+    """Draw a matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014)."""
+    Q, R = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
+    Q *= np.sign(np.diag(R))
+    return Q if shape[0] >= shape[1] else Q.T
+
+
+# --------------------------------------------------------------------------------------------------
+# Update step of PPO: epochs of minibatches, on as many threads as are worthwhile.
+# --------------------------------------------------------------------------------------------------
+
+PARTS = 2 * MIN_BLOCKS_PER_THREAD
+"""Number of parts of a minibatch, enough for two threads: adding more parts would take longer. They
+are added in order, so that the sum does not depend on the number of threads."""
+
+Samples = tuple[NDArray[Any], ...]
+"""Observations (n, o), actions (n, a), their log probabilities (n,) in the rollout, returns (n,)
+as targets of the critic."""
+
+
+class Learner:
+    """Training on samples with advantages (n,), as in `stable_baselines3.PPO.train`.
+
+    Each `learn` reads samples and advantages again; `parameters` are a recipe's complete ones.
+    """
+
+    def __init__(
+        self,
+        networks: Networks,
+        samples: Samples,
+        advantages: NDArray[np.float32],
+        parameters: dict[str, Any],
+        threads: int,
+    ) -> None:
+        self.networks, self.parameters, self._advantages = networks, parameters, advantages
+        self.moments, self.steps = np.zeros((2, networks.params.size), np.float32), 0
+        self.span, self.order = np.zeros(2, np.int64), np.arange(len(advantages))
+        self.normalized = np.zeros(len(advantages), np.float32)
+        self.gradients = np.zeros((PARTS, networks.params.size), np.float32)
+        self.sums = np.zeros((PARTS, len(kernels.SUMS)))
+        minibatch, rooms = (self.span, self.order, self.normalized), networks.rooms(PARTS)
+        recipe = np.array([parameters[name] for name in ("clip_range", "ent_coef", "vf_coef")])
+        fixed = (minibatch, networks.model, samples, recipe, rooms, (self.gradients, self.sums))
+
+        def differentiate(
+            board: NDArray[np.int64], number: int, command: int, serving: bool
+        ) -> bool:
+            return bool(kernels.differentiate(board, number, command, serving, *fixed))
+
+        self._differentiate = differentiate
+        self._crew = Crew(differentiate, PARTS, threads)
+
+    def prepare(self) -> None:
+        """Call every kernel once to compile it, without changing the networks."""
+        self.networks.flip()
+        self._differentiate(board_of(0, 1), 0, POSTED_BEFORE, False)
+        copies = self.networks.params.copy(), self.moments.copy()
+        kernels.descend(self.gradients, *copies, 0.0, 1.0, np.ones(2))
+
+    def learn(self, rate: float, rng: np.random.Generator) -> dict[str, float]:
+        """Train on all samples for `n_epochs` epochs; returns means of `SUMS` over the last one.
+
+        Raises a FloatingPointError if a gradient is not finite because the training has diverged.
+        """
+        count, size = len(self.order), self.parameters["batch_size"]
+        for _ in range(self.parameters["n_epochs"]):
+            sums = np.zeros(len(kernels.SUMS))
+            self.order[:] = rng.permutation(count)
+            self.normalized[:] = self._advantages[self.order]
+            for first in range(0, count, size):
+                if self.parameters["normalize_advantage"]:
+                    _normalize(self.normalized[first : first + size])
+                sums += self.differentiate(first, min(first + size, count))
+                self.descend(rate)
+        return dict(zip(kernels.SUMS, (sums / count).tolist(), strict=True))
+
+    def differentiate(self, first: int, last: int) -> NDArray[np.float64]:
+        """Compute the gradient of a minibatch of this epoch, in parts; returns its `SUMS`."""
+        self.span[:] = first, last
+        self._crew.gather()
+        self._crew.run(0)
+        return self.sums.sum(axis=0)
+
+    def descend(self, rate: float) -> None:
+        """Take a step along the gradient."""
+        self.steps += 1
+        norm = kernels.descend(
+            self.gradients,
+            self.networks.params,
+            self.moments,
+            rate,
+            self.parameters["max_grad_norm"],
+            1.0 - np.power(kernels.BETAS, self.steps),
+        )
+        if not np.isfinite(norm):
+            raise FloatingPointError("the training has diverged: a gradient is not finite")
+        self.networks.flip()
+
+
+def _normalize(advantages: NDArray[np.float32]) -> None:
+    """Normalize advantages to zero mean and unit variance, in place; a single one is unchanged."""
+    if len(advantages) > 1:
+        advantages -= advantages.mean()
+        advantages /= np.sqrt(advantages @ advantages / (len(advantages) - 1)) + 1e-8
+
+
+# --------------------------------------------------------------------------------------------------
+# `CompiledPPO`: proximal policy optimization without torch, for vector environments.
+# --------------------------------------------------------------------------------------------------
 
 PARAMETERS = {
     "n_steps": 2048,

@@ -12,9 +12,8 @@ import gymnasium
 
 from baselines.compiled_ppo.ppo import CompiledPPO
 from baselines.keeping import STATE, RunError, RunKeeper, best_file, last_file, replace_file
-from baselines.plans import Plan, description
 from baselines.policies import interface_of
-from baselines.seeds import first_seed
+from baselines.recipes import Plan, description, first_seed
 
 
 class Events:

@@ -1,5 +1,7 @@
-"""`Controller`: a trained network with all information for running it elsewhere."""
+"""`Controller`: a trained network with all information for running it as C99 or ONNX."""
 
+import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +11,18 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+import quad_gym
 from baselines.mlp import MlpPolicy, mlp_of
-from baselines.normalization import NormalizedPolicy
+from baselines.normalization import Normalization, NormalizedPolicy
 from baselines.policies import is_included, load_policy, pretrained_file, record_of
 from quad_gym.envs import keywords_of
 from quad_gym.envs.spaces import ObservationField, layout_bounds
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 from quad_gym.params import checks as check
+
+# --------------------------------------------------------------------------------------------------
+# `Controller`: a trained network with all information for running it elsewhere.
+# --------------------------------------------------------------------------------------------------
 
 _OUR_PACKAGES = ("quad_gym", "baselines")  #: packages that are imported already
 _AGREEMENT = 1e-4
@@ -228,3 +235,242 @@ def _require_same(controller: Controller, model: Any, file: Path) -> None:
     error = np.abs(controller.policy.predict(seen)[0] - model.predict(seen, deterministic=True)[0])
     if not error.max() <= _AGREEMENT:
         raise ValueError(f"{file} is not a plain network: its layers alone act differently")
+
+
+# --------------------------------------------------------------------------------------------------
+# Controllers as one C99 file: weights, bounds and one function, for any compiler.
+# --------------------------------------------------------------------------------------------------
+
+_ACTIVATIONS_IN_C = {
+    "none": "x",
+    "relu": "x > 0.0f ? x : 0.0f",
+    "tanh": "tanhf(x)",
+    "elu": "x > 0.0f ? x : expm1f(x)",
+}
+
+
+def filled(name: str, values: Mapping[str, Any]) -> str:
+    """Template with the values of its @NAMES@; @IF NAME@ to @END@ is left out for a false value."""
+    text = (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
+    text = re.sub(
+        r"@IF (\w+)@\n(.*?)@END@\n", lambda m: m[2] if values[m[1]] else "", text, flags=re.DOTALL
+    )
+    return re.sub(r"@([A-Z_]+)@", lambda m: str(values[m[1]]), text)
+
+
+def c_source(controller: Controller, name: str) -> str:
+    """Generate C99 code of a controller that requires only the math library.
+
+    It has no static state and allocates no memory; arithmetic is single precision, as on processors
+    of autopilots. `name` of the function must be a C identifier.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise ValueError(f"name must be a C identifier, got {name!r}")
+    policy, (low, high) = controller.policy, controller.bounds
+    arrays: dict[str, NDArray[Any]] = {}
+    layers = ""
+    for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        arrays |= {f"W{k}": W, f"b{k}": b}
+        outputs, inputs = W.shape
+        layers += f"    for (i = 0; i < {outputs}; i++) {{\n"
+        layers += f"        const float x = b{k}[i] + dot(W{k} + {inputs} * i, in, {inputs});\n"
+        layers += f"        out[i] = {_ACTIVATIONS_IN_C[policy.activations[k]]};\n    }}\n"
+        if k + 1 < len(policy.weights):
+            layers += f"    for (i = 0; i < {outputs}; i++)\n        in[i] = out[i];\n"
+    arrays |= {"low": low, "high": high}
+    more = _normalization_in_c(policy)
+    if policy.normalization is not None:
+        arrays |= {"mean": policy.normalization.mean, "deviation": policy.normalization.deviation}
+    widest = max(len(b) for b in policy.biases)
+    values = {
+        **descriptions(controller),
+        **more,
+        "NAME": name,
+        "ARRAYS": "\n".join(_array(name, values) for name, values in arrays.items()),
+        "LAYERS": layers,
+        "LONGEST": max(widest, policy.inputs),
+        "WIDEST": widest,
+    }
+    return filled("controller.c", values)
+
+
+def _normalization_in_c(policy: MlpPolicy) -> dict[str, Any]:
+    """Values of the template that normalize observations, in the type of the statistics."""
+    found = policy.normalization
+    if found is None:
+        return {"NORMALIZED": False}
+    clip = _number(found.mean.dtype.type(found.clip)) if np.isfinite(found.clip) else ""
+    limited = f"z < -{clip} ? -{clip} : z > {clip} ? {clip} : z" if clip else "z"
+    return {"NORMALIZED": True, "KIND": _kind(found.mean), "LIMITED": limited}
+
+
+def descriptions(controller: Controller) -> dict[str, Any]:
+    """Origin, rate, observation and action of a controller, as values of templates."""
+    keywords = "".join(f" {key}={value}" for key, value in controller.keywords.items())
+    rows = []
+    for field in controller.table:
+        first, last = field.slice.start, field.slice.stop - 1
+        where = f"[{first}..{last}]" if last > first else f"[{last}]"
+        rows.append((where, field.name, field.unit, field.frame))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+    actions = (field.formula(i) for i, field in enumerate(controller.action_fields))
+    return {
+        "ABOUT": f"{controller.source}, {controller.env_id}{keywords}; "
+        f"quad_gym {quad_gym.__version__}",
+        "RATE": f"{controller.control_rate:g}",
+        "SIZE": controller.policy.inputs,
+        "LINES": "\n".join(f" *   {line}" for line in lines),
+        "ACTIONS": "\n".join(f" *   {action}" for action in actions),
+    }
+
+
+def _kind(values: NDArray[Any]) -> str:
+    """Type of numbers in C."""
+    return "double" if values.dtype == np.float64 else "float"
+
+
+def _number(value: np.floating[Any]) -> str:
+    """Format a number of single or double precision so that C reads the same bits."""
+    wide = value.dtype == np.float64
+    text = f"{value:.17g}" if wide else f"{value:.9g}"
+    return text + ("" if set(text) & set(".e") else ".0") + ("" if wide else "f")
+
+
+def _array(name: str, values: NDArray[Any]) -> str:
+    """Define a constant array; matrices are stored row by row."""
+    words = [_number(value) for value in values.ravel()]
+    lines = [", ".join(words[k : k + 6]) for k in range(0, values.size, 6)]
+    rows = ",\n    ".join(lines)
+    return f"static const {_kind(values)} {name}[{values.size}] = {{\n    {rows}\n}};\n"
+
+
+# --------------------------------------------------------------------------------------------------
+# Controllers as ONNX models, checked with onnxruntime against the policy.
+# --------------------------------------------------------------------------------------------------
+
+OPSET = 17  #: version of the operator set, old enough for runtimes on companion computers
+_IR_VERSION = 8  #: corresponding version of the file format
+
+AGREEMENT = 1e-4
+"""Largest difference accepted between actions of the model and of the policy; saturated actions are
+differences of large sums."""
+
+_ACTIVATIONS_IN_ONNX = {"relu": "Relu", "tanh": "Tanh", "elu": "Elu"}
+
+
+def onnx_model(controller: Controller) -> Any:
+    """Convert a controller to an `onnx.ModelProto`, from `observation` (batch, n) to `action`.
+
+    The metadata describe observation and action, as JSON.
+    """
+    onnx = check.package("onnx", "ONNX", "export")
+    from onnx import TensorProto, helper, numpy_helper
+
+    low, high = controller.bounds
+    constants = {"low": low, "high": high, "least": np.float32(-1.0), "most": np.float32(1.0)}
+    nodes = [
+        helper.make_node("Max", ["observation", "low"], ["above"]),
+        helper.make_node("Min", ["above", "high"], ["x0"]),
+    ]
+    if controller.policy.normalization is not None:
+        more, steps = _normalization_in_onnx(controller.policy.normalization)
+        constants |= more
+        nodes[-1] = helper.make_node("Min", ["above", "high"], ["within"])
+        nodes += [helper.make_node(kind, *names, **said) for kind, *names, said in steps]
+    sizes_in, sizes_out = {"observation": controller.policy.inputs}, {"action": 4}
+    policy = controller.policy
+    layers = zip(policy.weights, policy.biases, policy.activations, strict=True)
+    for k, (W, b, activation) in enumerate(layers):
+        constants |= {f"W{k}": W, f"b{k}": b}
+        linear = f"x{k + 1}" if activation == "none" else f"z{k}"
+        nodes.append(helper.make_node("Gemm", [f"x{k}", f"W{k}", f"b{k}"], [linear], transB=1))
+        if activation != "none":
+            nodes.append(
+                helper.make_node(_ACTIVATIONS_IN_ONNX[activation], [linear], [f"x{k + 1}"])
+            )
+    last = f"x{len(policy.weights)}"
+    nodes.append(helper.make_node("Clip", [last, "least", "most"], ["action"]))
+    inputs, outputs = (
+        [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+            for name, size in sizes.items()
+        ]
+        for sizes in (sizes_in, sizes_out)
+    )
+    arrays = {name: np.asarray(value) for name, value in constants.items()}
+    stored = [numpy_helper.from_array(value, name) for name, value in arrays.items()]
+    graph = helper.make_graph(nodes, "controller", inputs, outputs, stored)
+    model = helper.make_model(
+        graph,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="quad_gym",
+        producer_version=quad_gym.__version__,
+    )
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in _metadata(controller).items()})
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _normalization_in_onnx(found: Normalization) -> tuple[dict[str, Any], list[Any]]:
+    """Constants and nodes that normalize "within" to "x0", in the type of the statistics."""
+    from onnx import TensorProto
+
+    kind = found.mean.dtype.type
+    wide = TensorProto.DOUBLE if found.mean.dtype == np.float64 else TensorProto.FLOAT
+    constants = {
+        "mean": found.mean,
+        "deviation": found.deviation.astype(kind),
+        "lowest": kind(-found.clip),
+        "highest": kind(found.clip),
+    }
+    return constants, [
+        ("Cast", ["within"], ["wide"], {"to": wide}),
+        ("Sub", ["wide", "mean"], ["centered"], {}),
+        ("Div", ["centered", "deviation"], ["scaled"], {}),
+        ("Max", ["scaled", "lowest"], ["above_lowest"], {}),
+        ("Min", ["above_lowest", "highest"], ["normalized"], {}),
+        ("Cast", ["normalized"], ["x0"], {"to": TensorProto.FLOAT}),
+    ]
+
+
+def save_onnx(controller: Controller, file: Path) -> float:
+    """Write a controller as ONNX, after a comparison with the policy in onnxruntime.
+
+    Returns:
+        Largest difference of an action over 1,000 observations.
+
+    Raises:
+        RuntimeError: If the actions of model and policy differ.
+    """
+    content = onnx_model(controller).SerializeToString()
+    runtime = check.package("onnxruntime", "ONNX", "export")
+    session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    seen = controller.samples(1000, np.random.default_rng(0))
+    (found,) = session.run(None, {"observation": seen})
+    error = float(np.abs(found - controller.act(seen)).max())
+    if not error <= AGREEMENT:
+        raise RuntimeError(f"the ONNX model's actions differ from the policy's by {error:.1e}")
+    file.write_bytes(content)
+    return error
+
+
+def _metadata(controller: Controller) -> dict[str, Any]:
+    return {
+        "source": controller.source,
+        "env_id": controller.env_id,
+        "control_rate_hz": controller.control_rate,
+        "action_kind": controller.action,
+        "observation": [
+            {
+                "name": f.name,
+                "first": f.slice.start,
+                "size": f.slice.stop - f.slice.start,
+                "unit": f.unit,
+                "frame": f.frame,
+            }
+            for f in controller.table
+        ],
+        "action": [field.formula(i) for i, field in enumerate(controller.action_fields)],
+    }

@@ -1,23 +1,394 @@
-"""The process that writes an exported filter, with one flight in a block."""
+"""The process that writes an exported filter: the C sources, with one flight in a block."""
 
 import concurrent.futures
+import itertools
+import math
 import multiprocessing
 import os
 import pickle
 import sys
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
-from baselines.exporting.filter_library import LIBRARY, TARGETS, archive
-from baselines.exporting.filter_sources import Sources
-from quad_gym.kernels.compiling.foreign import (
+import numpy as np
+
+import quad_gym
+from baselines.exporting.controller import filled
+from baselines.exporting.filter_library import HEADER, LIBRARY, TARGETS, archive
+from quad_gym.estimation.engine import Engine
+from quad_gym.estimation.filters import LONGEST_STEP
+from quad_gym.estimation.starts import empty_fix, level_start
+from quad_gym.kernels.compiling.building import (
     Processor,
     emitted,
     is_cached,
     loaded_size,
     object_of,
 )
+from quad_gym.kernels.entries import FILTER_STAGES
 from quad_gym.kernels.library import core_symbol, say
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.kernels.stages import Stage, needed_stages
+from quad_gym.logs.formats.log import mounting_of
+from quad_gym.logs.replaying.results import COLUMNS
+from quad_gym.params.suites import SensorSuite
+from quad_gym.records import (
+    AID_BLOCK,
+    AID_ROW,
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
+    FLIGHT_BLOCK,
+    KEPT,
+    MEASUREMENT,
+    OPERATION,
+    PARAMS_BLOCK,
+    PARTS,
+    POSITION_BLOCK,
+    SAMPLE,
+    START,
+    STEP_BLOCK,
+    VELOCITY_BLOCK,
+    WORK_BLOCK,
+    offset_of,
+    room_of,
+)
+from quad_gym.records.inputs import EVENT, FIX, INPUT, MEMORY, PENDING, WINDOW, Kept, Outcome
+
+# --------------------------------------------------------------------------------------------------
+# The C sources of an exported filter: numbers of its records and suite, in the templates.
+#
+# Records must have one lane, see `filter_process`.
+# --------------------------------------------------------------------------------------------------
+
+_ENTRIES = tuple(
+    f"quad_gym.kernels.exported:{name}"
+    for name in ("take", "prepare", "start", "state", "covariance", "seen")
+)
+_RECORDS = {
+    "sample": SAMPLE,
+    "measurement": MEASUREMENT,
+    "start": START,
+    "fix": FIX,
+    "input": INPUT,
+    "operation": OPERATION,
+    "event": EVENT,
+    "pending": PENDING,
+    "window": WINDOW,
+    "memory": MEMORY,
+}
+"""Records in the memory of an exported filter, by their names there."""
+_OUTCOMES = {
+    Outcome.OK: "done",
+    Outcome.NOT_STARTED: "call an init function first",
+    Outcome.NOT_FINITE: "an argument is infinite or not a number",
+    Outcome.OUT_OF_RANGE: "an argument is out of the range that its comment states",
+    Outcome.TOO_OLD: "older than the memory of the filter, which export --log or QG_EVENTS extends",
+    Outcome.TOO_NEW: "the time stamp is more than QG_LONGEST_STEP later than the filter",
+    Outcome.FULL: "too many measurements wait for later samples, more than QG_WAITING",
+    Outcome.NO_HEADING: "a start needs one of: baseline, heading, magnetometer, course",
+    Outcome.CONTRADICTION: "arguments that exclude each other, or that the suite lacks",
+}
+
+
+class _Port(NamedTuple):
+    """A measurement of one sensor, as an exported filter takes it."""
+
+    name: str
+    numbers: int  #: of the measurement
+    block: int  #: block of innovations
+    place: str  #: field of MEASUREMENT
+    note: str  #: what it is, for a comment
+    sigma: str  #: name of its standard deviation
+    sigma_place: str  #: field of MEASUREMENT
+    sigma_note: str  #: unit, for a comment
+    blocks: int = 1  #: number of blocks
+
+
+_GNSS_PORTS = (
+    _Port(
+        "gnss_position",
+        3,
+        POSITION_BLOCK,
+        "gnss_position",
+        "primary antenna minus reference antenna, in G [m]",
+        "gnss_sigma",
+        "position_sigma_I",
+        "3 standard deviations of it: east, north, up [m]",
+    ),
+    _Port(
+        "gnss_baseline",
+        3,
+        BASELINE_BLOCK,
+        "gnss_baseline",
+        "primary to secondary antenna, in G [m]",
+        "baseline_sigma",
+        "baseline_sigma",
+        "of its direction [rad]",
+    ),
+    _Port(
+        "gnss_velocity",
+        3,
+        VELOCITY_BLOCK,
+        "gnss_velocity",
+        "of the primary antenna, in G [m/s]",
+        "velocity_sigma",
+        "velocity_sigma",
+        "[m/s]",
+    ),
+)
+_WINDOW = 0.5  #: longest delay of measurements beyond the suite's `log_delays` [s], as in a replay
+
+
+class Sources:
+    """Contents of the files of an exported filter of a suite, for one of TARGETS.
+
+    `policy` are the values of a policy for the templates (`policy_values`), or none. The memory for
+    late measurements suffices for the suite's IMU rate, or `imu_rate` [Hz] if that is higher.
+    """
+
+    def __init__(
+        self,
+        suite: SensorSuite,
+        label: str,
+        target: str,
+        policy: dict[str, Any],
+        imu_rate: float = 0.0,
+    ) -> None:
+        self.suite, self.label, self.target, self.policy = suite, label, target, policy
+        self.imu_rate = imu_rate
+        self.engine = Engine(suite, suite.estimator.kind)
+        needed = needed_stages(self.engine.settings[0])
+        self.stages = {stage: needed[stage] for stage in FILTER_STAGES if stage in needed}
+        used = {"core", "filter", "watch"}
+        if self.engine.slow_states:
+            used.add("slow")
+        if suite.aids:
+            used.add("aids")
+        self.room = room_of(frozenset(used))
+        self.copied = self._copied(used)
+
+    @property
+    def functions(self) -> tuple[str, ...]:
+        """Names of the compiled functions in the library."""
+        return (*self.stages.values(), *_ENTRIES)
+
+    @property
+    def constants(self) -> dict[str, bytes]:
+        """Records that do not change, by their symbols in the library."""
+        engine = self.engine
+        return {
+            "qg_core_params": engine.params.tobytes(),
+            "qg_core_steps": engine.steps.tobytes(),
+            "qg_core_settings": engine.settings.tobytes(),
+            "qg_core_first": level_start(self.suite).tobytes(),
+            "qg_core_fix": empty_fix(self.suite).tobytes(),
+            "qg_core_mounting": mounting_of(self.suite).tobytes(),
+            "qg_core_parts": np.array([len(self.copied), *itertools.chain(*self.copied)]).tobytes(),
+        }
+
+    def texts(self, flash: int) -> dict[str, bytes]:
+        """Return header, example, CMake file and README by name, for a library's size [bytes]."""
+        values = {**self._suite_values(), **self._record_values(), **self._sensor_values()}
+        values |= {"POLICY": False, **self.policy, "FLASH": f"{flash:,}"}
+        values["IMPLEMENTATION"] = filled("implementation.c", values)
+        files = {HEADER: "quad_gym_filter.h"} | {
+            name: name for name in ("main.c", "CMakeLists.txt", "README.md")
+        }
+        return {name: filled(source, values).encode() for name, source in files.items()}
+
+    # ---- numbers ------------------------------------------------------------------------------
+
+    def _copied(self, used: set[str]) -> list[tuple[int, int]]:
+        """Return places and lengths of the used parts in memory, in doubles."""
+        found: list[tuple[int, int]] = []
+        for name, fields in PARTS:
+            if name not in used:
+                continue
+            place = (offset_of(FLIGHT_BLOCK, fields[0].name) - self.room.skipped) // 8
+            length = sum(math.prod(field.shape) for field in fields)
+            if found and sum(found[-1]) == place:
+                found[-1] = (found[-1][0], found[-1][1] + length)
+            else:
+                found.append((place, length))
+        return found
+
+    def _record_values(self) -> dict[str, Any]:
+        values: dict[str, Any] = {
+            "FLIGHT_WORDS": self.room.dtype.itemsize // 8,
+            "PARAMS_WORDS": PARAMS_BLOCK.itemsize // 8,
+            "WORK_WORDS": WORK_BLOCK.itemsize // 8,
+            "STEPS_WORDS": STEP_BLOCK.itemsize // 8,
+            "COPY_WORDS": sum(length for _, length in self.copied),
+            "SKIPPED": self.room.skipped,
+            "STAGES": len(Stage),
+            "KEPT": KEPT,
+            "OF_LEVEL": offset_of(STEP_BLOCK, "level"),
+            "OF_STATUS": offset_of(FLIGHT_BLOCK, "filter_status"),
+        }
+        values["STRUCTS"] = "\n".join(
+            _struct(f"qg_{name}_record", kind) for name, kind in _RECORDS.items()
+        )
+        values["STAGE_DECLARATIONS"] = "\n".join(
+            f"QGI_STAGE({core_symbol(name)});" for name in self.stages.values()
+        )
+        values["FILL_TABLE"] = "\n".join(
+            f"    f->table[{int(s)}] = (uint64_t)(uintptr_t){core_symbol(name)};"
+            for s, name in self.stages.items()
+        )
+        values["OUTCOMES"] = "".join(
+            f"    QG_{outcome.name} = {int(outcome)}, /* {words} */\n"
+            for outcome, words in _OUTCOMES.items()
+        )
+        values["WORDS"] = ", ".join(f'"{words}"' for words in _OUTCOMES.values())
+        values["COLUMNS"] = ",".join((*COLUMNS, "diverged"))
+        values |= {f"A_{kind.name}": int(kind) for kind in Kept}
+        return values
+
+    def _suite_values(self) -> dict[str, Any]:
+        suite = self.suite
+        sensors = [s for s in (suite.gnss, suite.camera, *suite.aids.values()) if s is not None]
+        window = _WINDOW + max(0.0, *vars(suite.log_delays).values())
+        rate = sum(sensor.rate for sensor in sensors)
+        events = math.ceil(1.25 * window * (max(suite.imu.rate, self.imu_rate) + rate)) + 24
+        measurements = math.ceil(1.25 * window * rate) + 16
+        copies = events // 8 + 2
+        words = sum(
+            (
+                self.room.dtype.itemsize + PARAMS_BLOCK.itemsize + WORK_BLOCK.itemsize,
+                STEP_BLOCK.itemsize + 8 * len(Stage) + WINDOW.itemsize + 24,
+                (events + copies + 72) * OPERATION.itemsize + 16 * PENDING.itemsize,
+                events * EVENT.itemsize + (events + 36) * SAMPLE.itemsize,
+                (measurements + 16) * MEASUREMENT.itemsize,
+                copies * 8 * sum(length for _, length in self.copied),
+            )
+        )
+        turns = bool(mounting_of(suite)["imu_turns"][0])
+        return {
+            "MOUNTING": "the library rotates them" if turns else "B does not differ",
+            "TITLE": f"State estimator: {suite.estimator.kind.upper()} of the sensor suite "
+            f'"{self.label}", quad_gym {quad_gym.__version__}.',
+            "SUITE": self.label,
+            "ESTIMATOR": suite.estimator.kind,
+            "TARGET": TARGETS[self.target].words,
+            "BUILD": TARGETS[self.target].build,
+            "TICK": repr(suite.imu.dt),
+            "AVERAGES": int(suite.imu.samples == "average"),
+            "LONGEST": repr(max(LONGEST_STEP, suite.imu.dt)),
+            "WINDOW": repr(window),
+            "EVENTS": events,
+            "MEASUREMENTS": measurements,
+            "RAM": f"{words:,}",
+            "REFERENCE": _numbers(suite.gnss.reference_antenna_G if suite.gnss else (0, 0, 0)),
+        }
+
+    @property
+    def _ports(self) -> Iterator[_Port]:
+        """Measurements of the suite."""
+        suite, gnss = self.suite, self.suite.gnss
+        for aid, params in suite.aids.items():
+            name, unit = aid.name.lower(), f"[{params.unit}]"
+            place, sigma = f"aid_measurement[{AID_ROW[aid]}]", f"aid_sigma[{int(aid)}]"
+            missing = "; NAN: not measured" if params.most_blocks > 1 else ""
+            rest = f"{params.meaning} {unit}{missing}", f"{name}_sigma", sigma, unit
+            port = _Port(name, params.length * params.blocks, AID_BLOCK[aid], place, *rest)
+            yield port._replace(blocks=params.blocks)
+        if gnss is not None:
+            has = (True, gnss.has_baseline, gnss.velocity_sigma is not None)
+            yield from itertools.compress(_GNSS_PORTS, has)
+
+    def _sensor_values(self) -> dict[str, Any]:
+        suite, ports = self.suite, list(self._ports)
+        texts = dict.fromkeys(("MACROS", "FIELDS_OF_MEASUREMENTS", "TAKE", "API", "SOURCE"), "")
+        rows = {aid.name.lower(): f"m.{aid.name.lower()} = x + 1" for aid in suite.aids}
+        names = {aid.name.lower(): [aid.name.lower()] for aid in suite.aids}
+        for port in ports:
+            name, several = port.name, port.sigma == "gnss_sigma"
+            value = f"const double {name}[{port.numbers}]" if port.numbers > 1 else f"double {name}"
+            sigma = f"const double *{port.sigma}" if several else f"double {port.sigma}"
+            given = f", {sigma}" if name in ("gnss_position", "gnss_velocity") else ""
+            call = f"int qg_update_{name}(qg_filter *f, {value}{given}, double time)"
+            texts["MACROS"] += f"#define QG_{name.upper()} 1\n"
+            texts["FIELDS_OF_MEASUREMENTS"] += (
+                f"    const double *{name}; /* {port.numbers}: {port.note} */\n"
+                f"    {sigma}; /* {port.sigma_note} */\n"
+            )
+            texts["API"] += f"{call}; /* {port.note} */\n"
+            length = port.numbers // port.blocks
+            texts["TAKE"] += (
+                f"    r.valid[{port.block}] = qgi_put(r.{port.place}, m->{name}, {length});\n"
+            )
+            if port.blocks > 1:
+                one = f"(&r.{port.place})[i], m->{name} + {length} * i, {length}"
+                texts["TAKE"] += (
+                    f"    for (int i = 1; m->{name} && i < {port.blocks}; i++)\n"
+                    f"        r.valid[{port.block} + i] = qgi_put({one});\n"
+                )
+            texts["TAKE"] += (
+                f"    qgi_put(r.{port.sigma_place}, m->{port.sigma}, 3);\n"
+                if several
+                else f"    r.{port.sigma_place} = m->{port.sigma};\n"
+            )
+            values = {
+                "CALL": call,
+                "NAME": name,
+                "ADDRESS": name if port.numbers > 1 else f"&{name}",
+            }
+            values["SIGMA"] = f"    m.{port.sigma} = {port.sigma};\n" if given else ""
+            texts["SOURCE"] += filled("update.c", values)
+        if suite.camera is not None:
+            call = "int qg_update_pixels(qg_filter *f, const double *pixels, double time)"
+            values = {"CALL": call, "NAME": "pixels", "ADDRESS": "pixels", "SIGMA": ""}
+            texts["MACROS"] += f"#define QG_FEATURES {len(suite.camera.features_I)}\n"
+            texts["API"] += f"{call}; /* see qg_measurements */\n"
+            texts["SOURCE"] += filled("update.c", values)
+            rows["camera"], names["camera"] = "m.pixels = x + 1", ["pixels"]
+        gnss = [port.name for port in ports if port.name.startswith("gnss")]
+        if gnss:
+            names["gnss"] = gnss
+            parts = {"gnss_position": 1, "gnss_sigma": 4, "gnss_baseline": 7, "gnss_velocity": 10}
+            columns = [
+                f"m.{name} = given({k})"
+                for name, k in parts.items()
+                if name in (*gnss, "gnss_sigma")
+            ]
+            columns += ["m.velocity_sigma = number(13)"] if "gnss_velocity" in gnss else []
+            rows["gnss"] = ", ".join(columns)
+        ranks = (
+            f"{' || '.join(f'm->{name}' for name in names[stream])} ? {rank} : "
+            for rank, stream in enumerate(sorted(names), 1)
+        )
+        return {
+            **texts,
+            "RANK": f"{''.join(ranks)}{len(names) + 1}",
+            "ROWS": "".join(
+                f'    if (!strcmp(name, "{name}"))\n        {statement};\n    else\n'
+                for name, statement in rows.items()
+            ),
+            "CAMERA": suite.camera is not None,
+            "GNSS": suite.gnss is not None,
+            "BAROMETER": suite.barometer is not None,
+            "FEATURE_BLOCKS": FEATURE_BLOCKS,
+        }
+
+
+def _numbers(values: Any) -> str:
+    """Format numbers so that C reads the same bits."""
+    return ", ".join(repr(float(value)) for value in values)
+
+
+def _struct(name: str, dtype: np.dtype) -> str:
+    """Return the C type of a record whose fields are all eight bytes long."""
+    assert dtype.fields is not None
+    lines = []
+    for field, (kind, *_) in dtype.fields.items():
+        base, shape = kind.subdtype or (kind, ())
+        word = "double" if base.kind == "f" else "int64_t"
+        lines.append(f"    {word} {field}{''.join(f'[{n}]' for n in shape)};")
+    return "\n".join(["typedef struct {", *lines, f"}} {name};", ""])
+
+
+# --------------------------------------------------------------------------------------------------
+# The process that writes an exported filter, with one flight in a block.
+# --------------------------------------------------------------------------------------------------
 
 
 def write() -> None:

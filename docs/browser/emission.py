@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from quad_gym.kernels.compiling.foreign import Processor, is_cached, object_of
+from quad_gym.kernels.compiling.building import Processor, is_cached, object_of
 from quad_gym.kernels.entries import fly
 from quad_gym.kernels.library import core_symbol, say
 

@@ -6,14 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.envs.config import TASK_DEFAULTS
+from quad_gym.envs.config import BENCHMARKS, TASK_DEFAULTS
 from quad_gym.envs.spaces import ObservationField, layout_bounds, observation_layout
 from quad_gym.faults import GyroBiasStep
-from quad_gym.params.control import pd_gains
-from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import sensor_suite
+from quad_gym.params.suites import SensorSuite, sensor_suite
 from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import pd_gains
 from quad_gym.records import Control, Source
 
 CONTROLLERS = 3

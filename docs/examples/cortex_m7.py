@@ -19,13 +19,29 @@ from quad_gym.analysis.reports import text_table
 
 SOURCE = Path(__file__).with_suffix(".c")
 FLAGS = (
-    *("-std=gnu99", "-O2", "-mcpu=cortex-m7", "-mfloat-abi=hard", "-mfpu=fpv5-d16"),
-    *("-nostartfiles", "--specs=nosys.specs", "-Wl,-e,start"),
-    *("-Wl,--section-start=.vectors=0", "-Wl,-Ttext=0x400", "-Wl,-Tdata=0x20000000"),
+    "-std=gnu99",
+    "-O2",
+    "-mcpu=cortex-m7",
+    "-mfloat-abi=hard",
+    "-mfpu=fpv5-d16",
+    "-nostartfiles",
+    "--specs=nosys.specs",
+    "-Wl,-e,start",
+    "-Wl,--section-start=.vectors=0",
+    "-Wl,-Ttext=0x400",
+    "-Wl,-Tdata=0x20000000",
 )
 BOARD = (
-    *("-M", "mps2-an500", "-icount", "shift=0", "-semihosting"),
-    *("-nographic", "-monitor", "none", "-serial", "none"),
+    "-M",
+    "mps2-an500",
+    "-icount",
+    "shift=0",
+    "-semihosting",
+    "-nographic",
+    "-monitor",
+    "none",
+    "-serial",
+    "none",
 )
 CYCLES, CLOCK = 2.0, 480e6  # cycles per instruction (assumed), and Hz
 

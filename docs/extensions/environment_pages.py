@@ -26,16 +26,16 @@ import quad_gym
 from docs.extensions import policy_cards
 from docs.renewal.pages import TABLES
 from quad_gym.batch.quantities import QUANTITIES
-from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.config import (
+    BENCHMARKS,
     KEYWORDS_WITHOUT_EFFECT,
     ONE_TASK_KEYWORDS,
     TASK_DEFAULTS,
     TASK_KEYWORDS,
 )
 from quad_gym.envs.spaces import ObservationField
-from quad_gym.estimation.logs.log import LOG_COLUMNS, LogColumn
-from quad_gym.flights.columns import COLUMNS, FEATURES
+from quad_gym.flights import COLUMNS, FEATURES
+from quad_gym.logs.formats.log import LOG_COLUMNS, LogColumn
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES

@@ -12,8 +12,7 @@ import numpy as np
 
 import quad_gym
 from baselines import PDPolicy
-from quad_gym.analysis.consistency_flights import endless, measure_consistency
-from quad_gym.analysis.consistency_plots import draw_mean_square
+from quad_gym.analysis.consistency import draw_mean_square, endless, measure_consistency
 from quad_gym.evaluation import roll_out
 
 # %%

@@ -9,7 +9,7 @@ from typing import Any
 
 from docs.renewal.pages import console as block
 from docs.renewal.pages import table
-from quad_gym.analysis.intervals import Estimated, rate_interval
+from quad_gym.analysis.metrics import Estimated, rate_interval
 from scripts.studies.report import number, share
 
 Texts = Callable[[Path, Sequence[str]], dict[str, str]]

@@ -1,4 +1,4 @@
-"""Filter consistency: statistics over many flights, compared with those of a consistent filter.
+"""Filter consistency: flights that test it, statistics, findings and figures.
 
 If the covariance P is correct, the normalized estimation error squared (NEES) e^T P^-1 e has a
 chi-square distribution with as many degrees of freedom as coordinates, so that its mean over n
@@ -14,15 +14,31 @@ Source: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Applications to
 Navigation, 2001, section 5.4.
 """
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym import records
-from quad_gym.analysis.metrics import STATE_DIMENSION, mean_band, nees, state_error
+from quad_gym.analysis import plots
+from quad_gym.analysis.metrics import (
+    STATE_DIMENSION,
+    RunningSummary,
+    TrackingSummary,
+    mean_band,
+    nees,
+    state_error,
+)
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.params.task import TaskParams
 from quad_gym.rotations import quaternion_to_dcm
+
+# --------------------------------------------------------------------------------------------------
+# Filter consistency: statistics over many flights, compared with those of a consistent filter.
+# --------------------------------------------------------------------------------------------------
 
 PARTS = {
     "state": slice(0, STATE_DIMENSION),
@@ -289,3 +305,240 @@ class InnovationRecorder:
                 correlation = self._products[name] / pairs * number / total
                 found[name] = Whiteness(name, correlation, 1.96 / np.sqrt(pairs))
         return found
+
+
+# --------------------------------------------------------------------------------------------------
+# Flights that test a filter's consistency, with findings as numbers and as sentences.
+# --------------------------------------------------------------------------------------------------
+
+
+def endless(task: TaskParams) -> TaskParams:
+    """Remove all endings from a task, so that all flights have the same length."""
+    return task.replace(  # type: ignore[no-any-return]
+        duration=0.0, out_of_bounds=1e9, min_height=-1e9, max_tilt=math.pi
+    )
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Findings about the consistency of a filter."""
+
+    nees: dict[str, MeanSquare]
+    """Mean NEES over time, by the names of `quad_gym.analysis.consistency.PARTS`"""
+    nis: dict[str, MeanSquare]
+    """Mean NIS over time, by sensor"""
+    whiteness: dict[str, Whiteness]
+    """Autocorrelation of the innovations, by sensor"""
+    time: Floats
+    """Times of the errors since the start, (t,) [s]"""
+    errors: Floats
+    """Root mean square errors over flights, (t, 15)"""
+    claimed: Floats
+    """Root mean square of the filters' standard deviations over flights, (t, 15)"""
+    tracking: TrackingSummary
+    """Distance of the true position from the reference, (flights,) [m]"""
+    astray: NDArray[np.bool_]
+    """True for flights that were ever farther than `ASTRAY` from their reference, (flights,)"""
+    failed: int
+    """Number of filters with a numerical failure"""
+    counted_as_noise: frozenset[str] = frozenset()
+    """Sensors with a constant error that the filter models as white noise: their innovations are
+    smaller than the filter expects, and correlated over time, although the state is consistent"""
+
+    def since(self, start: float) -> "Findings":
+        """Select mean squares from `start` on [s], to leave out the first instants."""
+        nees = {name: part.since(start) for name, part in self.nees.items()}
+        nis = {name: part.since(start) for name, part in self.nis.items()}
+        return replace(self, nees=nees, nis=nis)
+
+    @property
+    def consistent(self) -> bool:
+        """True if NEES, NIS, whiteness and status are those expected of a consistent filter.
+
+        Where a constant error is modeled as noise, innovations only must not be too large.
+        """
+        apart = self.counted_as_noise
+        squares = [*self.nees.values(), *(p for name, p in self.nis.items() if name not in apart)]
+        small = all(part.overall <= part.dimension for n, part in self.nis.items() if n in apart)
+        white = all(part.white for name, part in self.whiteness.items() if name not in apart)
+        return self.failed == 0 and white and small and all(part.consistent for part in squares)
+
+    def sentences(self) -> dict[str, str]:
+        """Verdicts in plain English, by quantity."""
+        why = " Expected: the filter models a constant error as noise."
+        known = dict.fromkeys(self.counted_as_noise, why)
+        said = {f"nees_{name}": f"NEES of the {verdict(part)}" for name, part in self.nees.items()}
+        for name, part in self.nis.items():
+            said[f"nis_{name}"] = f"NIS of the {verdict(part)}{known.get(name, '')}"
+        for name, white in self.whiteness.items():
+            found = f"largest autocorrelation {white.largest:+.3f}: {'' if white.white else 'not '}"
+            said[f"innovations_{name}"] = f"Innovations of the {name}: {found}white."
+            said[f"innovations_{name}"] += known.get(name, "")
+        return said
+
+
+ASTRAY = 5.0  #: distance from the reference beyond which a flight counts as lost [m]
+
+
+def measure_consistency(
+    batch: FlightBatch,
+    *,
+    seeds: Sequence[int],
+    duration: float,
+    every: float = 0.05,
+    settle: float = 0.0,
+    progress: Callable[[float], Any] = lambda time: None,
+) -> Findings:
+    """Fly, and compare errors and innovations with the covariances of the filters.
+
+    Args:
+        batch: Flights of a task without endings, see `endless`, with `innovations=True` or a user's
+            estimator, whose innovations are unknown.
+        seeds: Seeds of the flights.
+        duration: Length of the flights [s].
+        every: Evaluation interval of the errors [s].
+        settle: Time before which innovations are left out of the autocorrelation [s].
+        progress: Function called repeatedly with the time flown so far [s].
+
+    Raises:
+        ValueError: If `duration` or `every` is not positive, or the control rate of the batch is
+            not its IMU rate.
+    """
+    if not (duration > 0.0 and every > 0.0):
+        raise ValueError(f"duration and every must be above 0, got {duration} and {every}")
+    if batch.clocks.ticks_per_step != 1:
+        raise ValueError("batch must be controlled at its IMU rate, so that no sample is missed")
+    dt = batch.sensors.imu.dt
+    steps, stride = round(duration / dt), max(1, round(every / dt))
+    squares = NeesRecorder()
+    bins = dt * stride * np.arange(steps // stride + 1)
+    innovations = InnovationRecorder(batch, bins, settle) if batch.innovations else None
+    tracking = RunningSummary(batch.count, steps)
+    astray = np.zeros(batch.count, bool)
+    batch.reset(seeds=seeds)
+    squares.add(batch, 0.0)
+    for step in range(1, steps + 1):
+        batch.step()
+        if innovations is not None:
+            innovations.add(batch, step * dt)
+        distance = batch.result("position_error")
+        tracking.add(distance)
+        astray |= ~(distance < ASTRAY)
+        if step % stride == 0:
+            squares.add(batch, step * dt)
+            progress(step * dt)
+    errors, claimed = squares.errors()
+    gnss = batch.sensors.gnss
+    return Findings(
+        nees=squares.nees(),
+        nis={} if innovations is None else innovations.nis(),
+        whiteness={} if innovations is None else innovations.whiteness(),
+        time=squares.time(),
+        errors=errors,
+        claimed=claimed,
+        tracking=tracking.result(),
+        astray=astray,
+        failed=int((batch.record("filter_status") != 0).sum()),
+        counted_as_noise=frozenset({"baseline"} if gnss and gnss.heading_errs else ()),
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Figures of filter consistency: NEES and NIS, errors and standard deviations, autocorrelation.
+# --------------------------------------------------------------------------------------------------
+
+_UNITS = {
+    "position": ("mm", 1e3),
+    "velocity": ("mm/s", 1e3),
+    "attitude": ("mrad", 1e3),
+    "accel_bias": ("mm/s²", 1e3),
+    "gyro_bias": ("deg/h", np.degrees(3600.0)),
+}
+_TOLERANCE = f"tolerance (gray): 95 % band of a mean over at most {BAND_FLIGHTS:,} flights"
+
+
+def _grid(count: int, title: str, label: str = "time [s]") -> tuple[Any, Any]:
+    """Make a figure with `count` axes, three in a row; four are two by two."""
+    columns = 2 if count == 4 else 3
+    rows = -(-count // columns)
+    figure, grid = plots.panels(rows, columns, (10.0, 0.6 + 2.1 * rows), title)
+    for spare in grid.ravel()[count:]:
+        spare.set_visible(False)
+    for axes in grid.ravel()[max(0, count - columns) : count]:
+        axes.set_xlabel(label)
+    return figure, grid.ravel()[:count]
+
+
+def _title(name: str) -> str:
+    return "whole state" if name == "state" else name.replace("_", " ")
+
+
+def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
+    """Draw a mean square over time with its band; the title states the share of instants inside.
+
+    Instants before `settle` [s] are left out of the numbers in the title.
+    """
+    axes.fill_between(part.time, part.low, part.high, color=plots.PALE, linewidth=0.0)
+    axes.axhline(part.dimension, color=plots.GREY, linewidth=0.8)
+    axes.plot(part.time, part.mean, color=plots.BLUE, linewidth=1.2)
+    if settle > 0.0:
+        axes.axvline(settle, color=plots.VERMILLION, linewidth=0.8, linestyle=":")
+    counted = part.since(settle)
+    inside = f"{100 * counted.share_inside:.0f} % within ±{100 * counted.tolerance:.2g} %"
+    axes.set_title(f"{_title(part.name)}: {counted.overall:.2f}, {inside}")
+    reach = 3.0 * (part.high - part.low).max()
+    gaps = np.abs(counted.mean - part.dimension)
+    limit = max(reach, 1.15 * float(np.percentile(gaps, 98.0)))  # regardless of outliers
+    axes.set_ylim(max(0.0, part.dimension - limit), part.dimension + limit)
+    axes.set_xlim(0.0, part.time[-1])
+
+
+@plots.house_style()
+def mean_square_figure(
+    quantity: str, parts: dict[str, MeanSquare], title: str, settle: float = 0.0
+) -> Any:
+    """Figure of the means of "NEES" of the state's parts, or "NIS" of the sensors, over time."""
+    text = f"{title}\nMean {quantity} over flights (blue), and {_TOLERANCE}"
+    figure, axes = _grid(len(parts), text)
+    for axis, part in zip(axes, parts.values(), strict=True):
+        draw_mean_square(axis, part, settle)
+    return figure
+
+
+@plots.house_style()
+def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
+    """Figure of root mean square errors and standard deviations of the filter, (t, 15) each."""
+    what = "Error (blue), standard deviation of the filter (dashed)"
+    text = f"{title}\n{what}; root mean square over flights"
+    blocks = {name: part for name, part in PARTS.items() if name in _UNITS}
+    figure, axes = _grid(len(blocks), text)
+    for axis, (name, part) in zip(axes, blocks.items(), strict=True):
+        unit, factor = _UNITS[name]
+        for values, color, dashes in ((errors, plots.BLUE, "-"), (sigmas, plots.INK, (0, (4, 3)))):
+            size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
+            axis.plot(time, size, color=color, linestyle=dashes, linewidth=1.3)
+        axis.set_title(f"{_title(name)} [{unit}]")
+        plots.logarithmic(axis, subs=(2.0, 5.0))
+        axis.yaxis.set_minor_formatter("{x:g}")
+        axis.tick_params(axis="y", which="minor", labelsize=7.0)
+        axis.set_xlim(0.0, time[-1])
+    return figure
+
+
+@plots.house_style()
+def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
+    """Figure of the autocorrelation of each sensor's innovations, with the band of white noise."""
+    text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white noise (gray)"
+    figure, axes = _grid(len(found), text, "lag [measurements]")
+    for axis, part in zip(axes, found.values(), strict=True):
+        lags = np.arange(1, part.correlation.size + 1)
+        axis.fill_between(lags, -part.band, part.band, color=plots.PALE, linewidth=0.0)
+        axis.axhline(0.0, color=plots.GREY, linewidth=0.8)
+        axis.vlines(lags, 0.0, part.correlation, color=plots.BLUE, linewidth=1.6)
+        axis.plot(
+            lags, part.correlation, color=plots.BLUE, marker="o", markersize=3.0, linestyle="none"
+        )
+        limit = 1.2 * max(2.5 * NEGLIGIBLE_CORRELATION, np.abs(part.correlation).max())
+        axis.set_ylim(-limit, limit)
+        axis.set_title(f"{_title(part.name)}: largest {part.largest:+.3f}")
+    return figure

@@ -8,24 +8,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.calls import Calls, Word, address_of
-from quad_gym.batch.cold_start import check_cold_start
-from quad_gym.batch.memory import FlightMemory, configuration_digest
-from quad_gym.batch.own_estimator import OwnFilter
+from quad_gym.batch.memory import Calls, FlightMemory, Word, address_of, configuration_digest
+from quad_gym.batch.own_estimator import Estimator, OwnFilter
 from quad_gym.batch.quantities import innovations_of, read
-from quad_gym.batch.references import check_reference, check_standing
-from quad_gym.batch.resets import checked_keys, checked_mask, checked_start
+from quad_gym.batch.starts import (
+    check_cold_start,
+    check_reference,
+    check_standing,
+    checked_keys,
+    checked_mask,
+    checked_start,
+    pack_warm_start,
+)
 from quad_gym.batch.threads import Crew, resolve_threads
-from quad_gym.batch.warm_start import pack_warm_start
-from quad_gym.estimation.own import Estimator
-from quad_gym.kernels.linked import linked_table
+from quad_gym.configuration import FlightConfiguration
+from quad_gym.kernels.entries import linked_table
 from quad_gym.kernels.stages import needed_stages, used_parts
-from quad_gym.packing.configuration import FlightConfiguration
-from quad_gym.packing.flight import params_block, params_record
-from quad_gym.packing.paths import pack_paths
-from quad_gym.packing.settings import settings_record
+from quad_gym.packing import pack_paths, params_block, params_record, settings_record
 from quad_gym.params import checks as check
-from quad_gym.params.shown import takes
+from quad_gym.params.checks import takes
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.world import WorldParams
 from quad_gym.records import (
@@ -42,7 +43,7 @@ from quad_gym.records import (
 )
 
 _GROUP_MEMORY = 1 << 23
-"""Memory of the blocks that a thread flies side by side [bytes], see `kernels/gathering.py`: less
+"""Memory of the blocks that a thread flies side by side [bytes], see `kernels/flight.py`: less
 leaves gathered blocks half empty, more leaves the caches. A batch up to twice as large is one
 group."""
 _NO_BOUNDS = np.zeros(0)
@@ -56,7 +57,7 @@ class FlightBatch(FlightMemory):
     flight depends only on its seed and its actions, not on the size of the batch, its order or the
     number of threads.
 
-    It takes a `quad_gym.packing.configuration.FlightConfiguration`, or its fields as arguments.
+    It takes a `quad_gym.configuration.FlightConfiguration`, or its fields as arguments.
 
     Raises:
         ValueError: If an argument is invalid; nothing is allocated then.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.memory import FlightMemory
-from quad_gym.packing.aids import blocks_of
+from quad_gym.packing import blocks_of
 from quad_gym.params import checks as check
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.records import (
@@ -278,6 +278,10 @@ def innovations_of(batch: FlightMemory) -> dict[str, NDArray[Any]]:
     fields = ("block_fresh", "innovation", "innovation_sigma", "block_nis", "gate", "rejections")
     fresh, innovation, sigma, nis, gate, rejections = (batch.record(f)[:, blocks] for f in fields)
     return {
-        **{"measured": fresh > 0.0, "innovation": innovation, "sigma": sigma, "nis": nis},
-        **{"gate": gate.astype(np.int64), "rejections": rejections.astype(np.int64)},
+        "measured": fresh > 0.0,
+        "innovation": innovation,
+        "sigma": sigma,
+        "nis": nis,
+        "gate": gate.astype(np.int64),
+        "rejections": rejections.astype(np.int64),
     }

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels.cores import available_cores
+from quad_gym.kernels.library import available_cores
 from quad_gym.params import checks as check
-from quad_gym.records import board
+from quad_gym.records import call
 
 MIN_BLOCKS_PER_THREAD = 4  #: smallest number of blocks that is worth a hand-over to another thread
 
@@ -52,7 +52,7 @@ class Crew:
         self.process = os.getpid()
         self._fly = fly
         self._board = board_of(blocks, parts, group)
-        places = board.RANGES + board.WORDS_OF_RANGE * np.arange(1, parts) + board.PRESENT
+        places = call.RANGES + call.WORDS_OF_RANGE * np.arange(1, parts) + call.PRESENT
         self._alarms = [(int(place), threading.Semaphore(0)) for place in places]
         self._errors: list[BaseException] = []
         self._flying = False
@@ -80,7 +80,7 @@ class Crew:
         if not self._alarms:
             return
         words = self._board
-        if words[board.FINISHED] != words[board.LAST - board.WORDS_OF_RANGE]:
+        if words[call.FINISHED] != words[call.LAST - call.WORDS_OF_RANGE]:
             self._wait()
         for place, alarm in self._alarms:
             if words[place] == 0:
@@ -99,15 +99,15 @@ class Crew:
 
 def board_of(blocks: int, parts: int, group: int = 1) -> NDArray[np.int64]:
     """A board with the blocks cut into ranges and chunks, and nothing posted."""
-    words = np.zeros(board.RANGES + parts * board.WORDS_OF_RANGE, np.int64)
-    ranges = words[board.RANGES :].reshape(parts, board.WORDS_OF_RANGE)
+    words = np.zeros(call.RANGES + parts * call.WORDS_OF_RANGE, np.int64)
+    ranges = words[call.RANGES :].reshape(parts, call.WORDS_OF_RANGE)
     cuts = [blocks * part // parts for part in range(parts + 1)]
-    ranges[:, board.FIRST], ranges[:, board.LAST] = cuts[:-1], cuts[1:]
-    ranges[:, board.NEXT] = cuts[1:]
-    words[board.FINISHED] = blocks
+    ranges[:, call.FIRST], ranges[:, call.LAST] = cuts[:-1], cuts[1:]
+    ranges[:, call.NEXT] = cuts[1:]
+    words[call.FINISHED] = blocks
     # gathering lanes from half of a range makes up for the wait of a thread for the other's half
     chunk = max(1 + blocks // (CHUNKS_OF_RANGE * parts), min(group, blocks // (2 * parts)))
-    words[board.CHUNK] = chunk if parts > 1 else blocks
+    words[call.CHUNK] = chunk if parts > 1 else blocks
     return words
 
 
@@ -122,7 +122,7 @@ def _help(
     """Run a helper thread: sleep until it is woken, then serve the board."""
     while True:
         alarm.acquire()
-        if words[board.STOP]:
+        if words[call.STOP]:
             return
         words[place] = 1
         try:
@@ -134,6 +134,6 @@ def _help(
 
 def _dismiss(words: NDArray[np.int64], alarms: list[tuple[int, threading.Semaphore]]) -> None:
     """End the helpers of a crew that is no longer needed."""
-    words[board.STOP] = 1
+    words[call.STOP] = 1
     for _, alarm in alarms:
         alarm.release()

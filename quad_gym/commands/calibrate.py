@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quad_gym.commands.log_options import MISFIT, LogFiles, ReadingArgs, capital, told
 from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+from quad_gym.commands.replay import MISFIT, LogFiles, ReadingArgs, capital, told
 
 if TYPE_CHECKING:
-    from quad_gym.estimation.calibrating.calibration import Calibration
-    from quad_gym.estimation.calibrating.validation import Validation
-    from quad_gym.params.sensors import SensorSuite
+    from quad_gym.logs.calibrating.calibration import Calibration
+    from quad_gym.logs.calibrating.likelihood import Validation
+    from quad_gym.params.suites import SensorSuite
 
 SUITE, RESULT = "suite.toml", "calibration.json"
 
@@ -149,9 +149,9 @@ def summary_of(calibration: "Calibration") -> dict[str, Any]:
 
 def write_page(folder: Path, calibration: "Calibration", title: str) -> list[Path]:
     """Write figures and page."""
-    from quad_gym.analysis.log_plots import innovations_figure, numbers_figure
     from quad_gym.analysis.plots import house_style
-    from quad_gym.experiments.pages import Report
+    from quad_gym.analysis.reports import Report
+    from quad_gym.logs.plots import innovations_figure, numbers_figure
 
     report = Report(folder, title)
     report.add(

@@ -76,8 +76,12 @@ class CompileArgs:
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     """Names of the compiled functions of some kinds, slowest to compile first."""
     from quad_gym.envs.flights import Flights
-    from quad_gym.kernels.entries import FILTER_ENTRIES, FILTER_STAGES, SENSORS_AND_VEHICLE
-    from quad_gym.kernels.linked import names_of
+    from quad_gym.kernels.entries import (
+        FILTER_ENTRIES,
+        FILTER_STAGES,
+        SENSORS_AND_VEHICLE,
+        names_of,
+    )
     from quad_gym.kernels.stages import SOURCES, needed_stages
     from quad_gym.records import Autoreset
 
@@ -147,7 +151,7 @@ def _compile_one(name: str) -> int:
 
 def _build(args: CompileArgs) -> int:
     """Build the libraries or the modules for GPUs, and list them with their sizes."""
-    from quad_gym.device.emission import pack
+    from quad_gym.device import pack
     from quad_gym.kernels.compiling.building import build
 
     libraries = build(args.lanes, args.jobs, args.family) if args.library else ()
@@ -159,7 +163,7 @@ def _build(args: CompileArgs) -> int:
 
 def _default_plans() -> Iterator[Any]:
     """Yield the plans of the tasks with default options, on the truth and on the estimate."""
-    from quad_gym.device.emission import plan_of
+    from quad_gym.device import plan_of
     from quad_gym.envs.config import TASK_DEFAULTS
     from quad_gym.envs.flights import Flights
     from quad_gym.records import Autoreset

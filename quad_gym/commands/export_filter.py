@@ -52,7 +52,7 @@ def main(args: ExportFilterArgs) -> None:
     from baselines.exporting.filter_library import LIBRARY, export_filter
     from quad_gym.analysis.reports import require_writable
     from quad_gym.estimation import read_log
-    from quad_gym.estimation.replaying.replay import origin_of
+    from quad_gym.logs.replaying.replay import origin_of
     from quad_gym.params.suites import sensor_suite, suite_label
 
     with usage_errors((ValueError, OSError, ImportError, RuntimeError)):

@@ -28,10 +28,10 @@ from quad_gym import IDS, Flight, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
 from quad_gym.evaluation import Policy
-from quad_gym.faults.presets import PRESETS, faults_of
+from quad_gym.faults import PRESETS, faults_of
 from quad_gym.params import checks as check
 from quad_gym.rendering import Renderer, save_video
-from quad_gym.rendering.live import WINDOW_RATE, Window
+from quad_gym.rendering.renderer import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path, fly_steps
 
 FAULTS = tuple(name for name in PRESETS if name != "none")

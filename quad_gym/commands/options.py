@@ -26,8 +26,7 @@ from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from quad_gym.envs import IDS
-from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.envs.config import TASK_DEFAULTS
+from quad_gym.envs.config import BENCHMARKS, TASK_DEFAULTS
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 

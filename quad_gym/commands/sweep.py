@@ -12,14 +12,21 @@ again; sweeps in one folder, also on several machines, share the work. The table
 groups.csv and table.txt, are made from the folders only.
 """
 
-from dataclasses import dataclass, field
+import itertools
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
+from baselines.recipes import Plan, Recipe, recipe
 from quad_gym import IDS
-from quad_gym.analysis.reports import require_writable
+from quad_gym.analysis.metrics import in_brackets, mean_interval, rate_over_trainings
+from quad_gym.analysis.reports import columns_of, require_writable, text_table, write_csv
 from quad_gym.batch.threads import resolve_threads
 from quad_gym.commands.options import (
     Keywords,
@@ -29,10 +36,214 @@ from quad_gym.commands.options import (
     usage_errors,
     value_of,
 )
-from quad_gym.experiments.driver import RETRIES, train_all
-from quad_gym.experiments.experiment import Training, check_trainings
-from quad_gym.experiments.sweep_plan import DEFAULTS, TABLES, expand, read
-from quad_gym.experiments.sweep_table import FILES, row_of, table_text, write_tables
+from quad_gym.experiments import RETRIES, Training, check_trainings, make_trainings, train_all
+from quad_gym.params import checks as check
+
+# --------------------------------------------------------------------------------------------------
+# Trainings of a sweep: a file or options, expanded to all combinations of values.
+# --------------------------------------------------------------------------------------------------
+
+DEFAULTS: Mapping[str, Any] = {
+    "env_ids": ["QuadGym/Circle-v0"],
+    "algorithm": "ppo",
+    "steps": None,
+    "n_envs": None,
+    "engine": "sb3",
+    "seeds": 1,
+    "evaluations": 20,
+    "episodes": 100,
+    "env": {},
+    "set": {},
+    "recipe": {},
+}
+"""Keys of a sweep, see `docs/sweeps.md`; None: as in the recipe."""
+
+TABLES = ("env", "set", "recipe")
+_SINGLE = ("algorithm", "steps", "n_envs")  #: fields of a recipe that are separate keys
+_ELSEWHERE = {**{name: name for name in _SINGLE}, "parameters": "set"}
+"""Keys to use instead of fields of the recipe."""
+_RECIPE = tuple(f.name for f in fields(Recipe) if f.name not in (*_ELSEWHERE, "flights", "policy"))
+
+Axis = tuple[str, str]  #: table (empty for a separate key) and key of a value
+
+
+def read(file: Path) -> dict[str, Any]:
+    """Read a sweep file."""
+    try:
+        found = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} is not valid TOML: {error}") from None
+    for name, value in found.items():
+        check.choice(f"a key of {file}", name, tuple(DEFAULTS))
+        if name in TABLES and not isinstance(value, dict):
+            raise ValueError(f"{name} in {file} must be a table, got {value!r}")
+        names = isinstance(value, list) and all(isinstance(each, str) for each in value)
+        if name == "env_ids" and not names:
+            raise ValueError(f"{name} must be a list of names, got {value!r}")
+    return found
+
+
+def expand(given: Mapping[str, Any], folder: Path, *, threads: int = 1) -> list[Training]:
+    """All trainings of a sweep, with keys of `DEFAULTS`; the first seed of each is first."""
+    spec = {**DEFAULTS, **given}
+    axes: dict[Axis, Any] = {(table, k): v for table in TABLES for k, v in spec[table].items()}
+    axes |= {("", key): spec[key] for key in _SINGLE if spec[key] is not None}
+    tried = [value if isinstance(value, list) else [value] for value in axes.values()]
+    if [] in tried:
+        empty = ".".join(filter(None, list(axes)[tried.index([])]))
+        raise ValueError(f"{empty} must have at least one value")
+    cases: dict[str, Plan] = {}
+    for env_id, values in itertools.product(spec["env_ids"], itertools.product(*tried)):
+        chosen = dict(zip(axes, values, strict=True))
+        engine = "compiled_" if spec["engine"] == "compiled" else ""
+        words = [IDS[env_id], f"{engine}{chosen['', 'algorithm']}"]
+        words += [  # values from lists, so that further values do not change it
+            f"{axis[1]}={_word(value)}"
+            for axis, value in chosen.items()
+            if isinstance(axes[axis], list) and axis[1] != "algorithm"
+        ]
+        name = ",".join(words)
+        if name in cases:
+            raise ValueError(f"every value of a sweep must be given once, got {name} twice")
+        cases[name] = _plan(spec, env_id, chosen, threads)
+    return make_trainings(cases, _seeds(spec["seeds"]), folder)
+
+
+def _seeds(given: Any) -> Sequence[int]:
+    if not isinstance(given, list):
+        return range(check.whole("seeds", given))
+    if not given or len(set(given)) < len(given):
+        raise ValueError(f"seeds must be different numbers, at least one, got {given}")
+    return [check.whole("seeds", seed, least=0) for seed in given]
+
+
+def _plan(spec: Mapping[str, Any], env_id: str, chosen: Mapping[Axis, Any], threads: int) -> Plan:
+    tables = {t: {k: _frozen(v) for (u, k), v in chosen.items() if u == t} for t in (*TABLES, "")}
+    for name in tables["recipe"]:
+        if name in _ELSEWHERE:
+            raise ValueError(f"recipe must not hold {name}: use {_ELSEWHERE[name]} instead")
+        check.choice("recipe", name, _RECIPE)
+    base = recipe(env_id, tables[""].pop("algorithm"))
+    return Plan(
+        env_id=env_id,
+        environment=tables["env"],
+        recipe=base.replace(
+            **tables[""],
+            **tables["recipe"],
+            parameters={**base.parameters, **tables["set"]},
+        ),
+        threads=threads,
+        **{name: spec[name] for name in ("engine", "evaluations", "episodes")},
+    )
+
+
+def _frozen(value: Any) -> Any:
+    """Convert lists to tuples, as keywords and recipes require."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
+def _word(value: Any) -> str:
+    """Value in the name of a folder."""
+    if isinstance(value, list | tuple):
+        return "x".join(map(_word, value))
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return "".join(c if c.isalnum() or c in "._-+" else "-" for c in text)
+
+
+# --------------------------------------------------------------------------------------------------
+# Tables of a sweep, made from its folders only, without times and paths.
+#
+# An unfinished training has only its steps.
+# --------------------------------------------------------------------------------------------------
+
+SCORES = ("mean_error", "late_error", "crash_rate", "return", "gates_passed")
+"""Scores of the best evaluation of a training."""
+
+FILES = ("trainings.csv", "groups.csv", "table.txt")
+
+
+def row_of(training: Training) -> dict[str, Any]:
+    """Row of a training, from its folder."""
+    record = training.record()
+    finished = bool(record.get("finished"))
+    best = record["best"] if finished else {}
+    return {
+        "group": training.case,
+        "seed": training.plan.seed,
+        "finished": finished,
+        "steps": record["steps"] if finished else training.steps_done(),
+        "best_steps": best.get("steps"),
+        "episodes": training.plan.episodes,
+        **{name: best.get(name) for name in SCORES},
+    }
+
+
+def groups_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean of each score over the finished seeds of each group, with its 95 % interval.
+
+    Intervals are Student's t; for crash rates, `rate_over_trainings`.
+    """
+    found = []
+    for group in dict.fromkeys(row["group"] for row in rows):
+        those = [row for row in rows if row["group"] == group]
+        finished = sum(row["finished"] for row in those)
+        summary = {"group": group, "trainings": len(those), "finished": finished}
+        for name in SCORES:
+            values = np.array([row[name] for row in those if row[name] is not None])
+            low = high = None
+            if values.size > 1:
+                low, high = mean_interval(values)
+                if name == "crash_rate":
+                    _, low, high = rate_over_trainings(values, those[0]["episodes"])
+            summary[name] = float(values.mean()) if values.size else None
+            summary[f"{name}_low"], summary[f"{name}_high"] = low, high
+        found.append(summary)
+    return found
+
+
+def table_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Tables for the screen: groups, then trainings."""
+
+    def cell(row: dict[str, Any], name: str, form: str) -> str:
+        if row[name] is None:
+            return "-"
+        low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+        interval = None if low is None or high is None else (low, high)
+        return in_brackets(row[name], interval, form)
+
+    def cells(row: dict[str, Any]) -> list[str]:
+        shown = (("mean_error", ".4f"), ("crash_rate", ".1%"), ("return", ".1f"))
+        return [cell(row, name, form) for name, form in shown]
+
+    headings = ("error [m]", "crashed", "return")
+    groups = [
+        [row["group"], f"{row['finished']}/{row['trainings']}", *cells(row)]
+        for row in groups_of(rows)
+    ]
+    single = []
+    for row in rows:
+        finished = "yes" if row["finished"] else "no"
+        name = f"{row['group']}/seed_{row['seed']}"
+        single.append([name, finished, f"{row['steps']:,}", *cells(row)])
+    mean = "best evaluation: mean over finished seeds [95 % interval, Student's t]"
+    first = text_table({"": ("group", "finished"), mean: headings}, groups)
+    heads = {"": ("training", "finished", "steps"), "best evaluation": headings}
+    return f"{first}\n\n{text_table(heads, single)}\n"
+
+
+def write_tables(rows: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Write `FILES` atomically."""
+    parts = [folder / f"{name}.{os.getpid()}.part" for name in FILES]  # of this sweep alone
+    for part, table in zip(parts, (rows, groups_of(rows)), strict=False):
+        write_csv(part, columns_of(table))
+    parts[-1].write_text(table_text(rows), encoding="utf-8")
+    for part, name in zip(parts, FILES, strict=True):
+        part.replace(folder / name)
+
+
+# --------------------------------------------------------------------------------------------------
+# Train all combinations of environments, keywords, parameters and seeds.
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

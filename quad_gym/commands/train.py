@@ -63,7 +63,7 @@ class TrainArgs:
 
 def configure(args: TrainArgs) -> tuple[Any, Path]:
     """Check all options before training."""
-    from baselines.plans import Plan
+    from baselines.recipes import Plan
     from baselines.training import require_model, run_in
     from quad_gym.analysis.reports import require_writable
 

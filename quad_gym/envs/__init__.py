@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from gymnasium.envs.registration import register, registry
 
-from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.envs.config import BENCHMARKS
 from quad_gym.envs.keywords import EnvKeywords, VectorKeywords, checked, shows
 from quad_gym.params import checks as check
 from quad_gym.params.task import TASKS

@@ -8,21 +8,87 @@ effect with the others are refused here, and nowhere else in `envs`.
 from collections.abc import Collection, Mapping
 from dataclasses import fields
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, TypeAlias, TypeVar
 
-from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.configuration import FlightConfiguration
 from quad_gym.envs.spaces import ACTIONS, LAYOUTS, OBSERVATIONS
-from quad_gym.faults.presets import felt_without_sensors, needs_sensors
-from quad_gym.packing.configuration import FlightConfiguration
+from quad_gym.faults import GnssOutage, felt_without_sensors, needs_sensors
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
-from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import given_suite, sensor_suite
+from quad_gym.params.checks import Checked
+from quad_gym.params.suites import SensorSuite, given_suite, sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.records import Autoreset, Layout
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
+
+
+# --------------------------------------------------------------------------------------------------
+# Benchmark tasks: each is a built-in reference with its own sensors and `Task`.
+# --------------------------------------------------------------------------------------------------
+
+
+class Benchmark(NamedTuple):
+    """Definition of a benchmark task; keywords override it."""
+
+    task: TaskParams  #: reference and bounds of the task
+    keywords: Mapping[str, Any]  #: keywords of the environment
+
+
+BENCHMARKS = {
+    "look_around": Benchmark(
+        TaskParams(
+            kind="random_trajectory",
+            start="hover",
+            radius=2.5,
+            height=2.0,
+            period=12.0,
+            randomize_reference=True,
+            duration=15.0,  # the estimate of a vehicle that never looks has diverged by then
+            out_of_bounds=8.0,  # room for errors of the estimate, and for recovery
+            min_height=-5.0,
+        ),
+        {"sensors": "one_wall", "task": "quad_gym.tasks.look_around:LookAround"},
+    ),
+    "stale_race": Benchmark(
+        TaskParams(
+            kind="waypoints",
+            start="hover",
+            radius=3.5,
+            height=1.5,
+            duration=20.0,
+            out_of_bounds=12.0,
+            gate_count=8,
+            gate_radius=0.6,  # several times the delay error of the measurements at racing speed
+        ),
+        {"sensors": "stale", "task": "quad_gym.tasks.stale_race:StaleRace"},
+    ),
+    "outage_dash": Benchmark(
+        TaskParams(
+            kind="hover",
+            start="hover",
+            radius=60.0,  # the start of the course, which leads through the origin
+            height=4.0,
+            duration=45.0,  # 27 s at the rewarded speed, and 15 s for the longest outage
+            out_of_bounds=300.0,
+            min_height=0.0,
+        ),
+        {
+            "sensors": "consumer",
+            "action": "velocity",  # the decision is how far to go on, not how to stay upright
+            "control_rate": 10.0,
+            "world": "slalom",
+            "faults": (GnssOutage(start=(2.0, 8.0), duration=(5.0, 15.0)),),
+            "task": "quad_gym.tasks.outage_dash:OutageDash",
+        },
+    ),
+}
+"""Benchmark tasks by name."""
+
+
+# --------------------------------------------------------------------------------------------------
+# `EnvConfig`: all that the keywords of an environment say, checked, nested by subject.
+# --------------------------------------------------------------------------------------------------
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
     # with bounds of 3 m, SAC overestimates the value of places that it no longer visits, and drifts

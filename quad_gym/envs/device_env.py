@@ -9,18 +9,14 @@ import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from quad_gym.batch.seeding import Words, keys_of, stream_keys
-from quad_gym.device.emission import plan_of, ptx_of
-from quad_gym.device.flights import Launcher
-from quad_gym.device.launching import CudaLauncher
-from quad_gym.device.plan import DevicePlan
-from quad_gym.device.tasks import flights_on
+from quad_gym.batch.starts import Words, keys_of, stream_keys
+from quad_gym.configuration import MAX_FLIGHTS
+from quad_gym.device import CudaLauncher, DevicePlan, Launcher, flights_on, plan_of, ptx_of
 from quad_gym.envs.config import Base
 from quad_gym.envs.flights import named_options
 from quad_gym.envs.keywords import VectorKeywords, shows
 from quad_gym.envs.torch_env import QuadTorchVecEnv, checked_device
 from quad_gym.envs.vector import seeds_of
-from quad_gym.packing.configuration import MAX_FLIGHTS
 from quad_gym.params import checks as check
 
 _ON_PROCESSOR = ("threads", "render_mode", "render_flights")

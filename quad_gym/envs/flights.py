@@ -1,16 +1,21 @@
 """From the keywords of an environment to its flights: the same for all three interfaces."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.batch.references import check_in_bounds, check_pad
-from quad_gym.batch.resets import checked_start
+from quad_gym.batch.quantities import innovations_of
+from quad_gym.batch.starts import check_in_bounds, check_pad, checked_start
+from quad_gym.configuration import MAX_FLIGHTS
 from quad_gym.envs.config import Base, EnvConfig, Own
+from quad_gym.envs.keywords import RENDERING_KEYWORDS
 from quad_gym.envs.spaces import (
     ObservationField,
     layout_bounds,
@@ -18,10 +23,13 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
-from quad_gym.packing.configuration import MAX_FLIGHTS
+from quad_gym.faults import named_faults
 from quad_gym.params import checks as check
 from quad_gym.params.world import WorldParams
 from quad_gym.records import Autoreset, Layout
+
+if TYPE_CHECKING:
+    from quad_gym.rendering.renderer import Rendering
 
 
 class Flights:
@@ -130,3 +138,138 @@ def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"options may contain {', '.join(known)}, got {unknown[0]!r}")
     return chosen
+
+
+# --------------------------------------------------------------------------------------------------
+# Faults and innovations in `info`.
+# --------------------------------------------------------------------------------------------------
+
+Parts = dict[str, dict[str, NDArray[Any]]]
+
+
+def start_info(batch: FlightBatch) -> dict[str, Any]:
+    """Return `info` of all flights at the start of episodes: arrays, and dictionaries of arrays."""
+    return {
+        "position_error": batch.record("position_error"),
+        "estimation_error": batch.record("estimation_error"),
+        "ending": np.zeros(batch.count, np.int64),
+        "filter_status": batch.record("filter_status").astype(np.int64),
+        "filter_diverged": batch.record("diverged") > 0.0,
+        "gates_passed": np.zeros(batch.count, np.int64),
+        **drawn_info(batch.drawn()),
+        **flight_info(batch, batch.record("faults")),
+    }
+
+
+def drawn_info(drawn: dict[str, NDArray[np.float64]]) -> Parts:
+    """Return the entry "drawn" of `info` for all flights; empty without draws."""
+    return {"drawn": drawn} if drawn else {}
+
+
+def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
+    """Return the entries "faults", from their bits (n,), and "innovations" of `info`, if any."""
+    found: Parts = {}
+    if batch.faults:
+        found["faults"] = named_faults(batch.faults, bits)
+    if batch.innovations:
+        found["innovations"] = innovations_of(batch)
+    return found
+
+
+def info_of_flight(infos: Mapping[str, Any], flight: int) -> dict[str, Any]:
+    """Return the entries of one flight, with Python's booleans and numbers for arrays of one."""
+    found: dict[str, Any] = {}
+    for name, values in infos.items():
+        if isinstance(values, dict):
+            found[name] = info_of_flight(values, flight)
+        elif values.ndim > 1 or values.dtype == object:
+            found[name] = values[flight]
+        else:
+            found[name] = values[flight].item()
+    return found
+
+
+def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[np.intp]) -> None:
+    """Describe the present instant of some flights instead, if `info` has faults."""
+    if batch.faults:
+        now = named_faults(batch.faults, batch.record("faults", flights))
+        for name, values in now.items():
+            infos["faults"][name][flights] = values
+
+
+def final_parts(infos: dict[str, Any], batch: FlightBatch, over: NDArray[np.bool_]) -> Parts:
+    """Return the faults and innovations of episodes that are over, (n,)."""
+    found: Parts = {}
+    if "faults" in infos:
+        faults = infos["faults"].items()
+        found["faults"] = {name: values & over for name, values in faults}
+    if batch.innovations:
+        found["innovations"] = batch.final_innovations
+    return found
+
+
+# --------------------------------------------------------------------------------------------------
+# Rendering, the same for all interfaces of an environment; imports nothing until it is used.
+#
+# Pygame is imported with the first picture: environments with a render mode can be made without it.
+# --------------------------------------------------------------------------------------------------
+
+RENDERING_METADATA: dict[str, Any] = {
+    "render_modes": ["human", "rgb_array", "rgb_array_list"],
+    "render_fps": 50,
+}
+"""Gymnasium's metadata; an environment's own has its control rate as the frame rate."""
+
+
+def rendering_options(keywords: dict[str, Any]) -> dict[str, Any]:
+    """Remove the rendering keywords from the keywords of an environment, and return them."""
+    return {name: keywords.pop(name) for name in RENDERING_KEYWORDS if name in keywords}
+
+
+class Rendered:
+    """Flights with a renderer and Gymnasium's description, as the interfaces have them."""
+
+    flights: Flights
+    render_mode: str | None
+    rendering: "Rendering | None"
+    _spec: EnvSpec | None = None
+    _seeded = False
+
+    def _open(self, flights: Flights, mode: str | None, keywords: Mapping[str, Any]) -> None:
+        """Set flights, and a renderer if there is a `render_mode`, which other keywords need."""
+        self.flights, self.render_mode, self.rendering = flights, mode, None
+        given = {name: value for name, value in keywords.items() if value is not None}
+        if mode is None and given:
+            raise ValueError(f"{next(iter(given))} needs a render_mode, got None")
+        if mode is not None:
+            from quad_gym.rendering.renderer import Rendering
+
+            options = {name.removeprefix("render_"): value for name, value in given.items()}
+            self.rendering = Rendering(flights.batch, mode, **options)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's description of the environment, with the time limit in steps."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        """Store a description with the time limit of the environment, not of a wrapper."""
+        self._spec = copy.copy(value)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.flights.batch.max_steps or None
+
+    def _open_rendering(self, make: str) -> "Rendering | None":
+        """Return the renderer of flights that have begun, or warn if it is missing."""
+        if self.rendering is None:
+            gymnasium.logger.warn(
+                f"render() needs a render_mode: {make}(..., render_mode='rgb_array')"
+            )
+        elif not self._seeded:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        return self.rendering
+
+    def close(self) -> None:
+        """Close the window, if there is one; closing twice is fine."""
+        if self.rendering is not None:
+            self.rendering.close()

@@ -11,19 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
 
 from quad_gym.envs.config import DEFAULTS, TASK_KEYWORDS
-from quad_gym.faults.presets import FaultsGiven
+from quad_gym.faults import FaultsGiven
 from quad_gym.params import checks as check
-from quad_gym.params.control import ActionParams
+from quad_gym.params.checks import show
 from quad_gym.params.randomization import Given, Randomization
-from quad_gym.params.reward import RewardParams
-from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.shown import show
+from quad_gym.params.suites import SensorSuite
+from quad_gym.params.task import RewardParams
 from quad_gym.params.trajectories import Trajectory
-from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.vehicle import ActionParams, VehicleParams
 from quad_gym.params.world import WorldParams
 
 if TYPE_CHECKING:
-    from quad_gym.estimation.own import Estimator
+    from quad_gym.batch.own_estimator import Estimator
     from quad_gym.tasks import Task
 
 

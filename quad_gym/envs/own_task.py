@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from quad_gym.configuration import FlightConfiguration
 from quad_gym.envs.spaces import PRIVILEGED_NAMES, ObservationField, policy_size
-from quad_gym.packing.configuration import FlightConfiguration
-from quad_gym.tasks.batch import TaskBatch
-from quad_gym.tasks.laid import LaidTask
-from quad_gym.tasks.observing import Part
+from quad_gym.tasks.batch import LaidTask, Part, TaskBatch
 from quad_gym.tasks.task import ObservationSpec, Task, resolve_task
 
 Table = tuple[ObservationField, ...]

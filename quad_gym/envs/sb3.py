@@ -9,12 +9,20 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from quad_gym.batch.seeding import stream_keys
+from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.config import Base
-from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
-from quad_gym.envs.flights import Flights, checked_actions, start_options
+from quad_gym.envs.flights import (
+    Flights,
+    Rendered,
+    checked_actions,
+    drawn_info,
+    flight_info,
+    info_of_flight,
+    rendering_options,
+    start_info,
+    start_options,
+)
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
-from quad_gym.envs.rendered import Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result

@@ -5,12 +5,20 @@ from typing import TYPE_CHECKING, Any, Unpack
 import gymnasium
 import numpy as np
 
-from quad_gym.batch.seeding import stream_key
+from quad_gym.batch.starts import stream_key
 from quad_gym.envs.config import Base
-from quad_gym.envs.flight_info import drawn_info, flight_info, info_of_flight, start_info
-from quad_gym.envs.flights import Flights, checked_actions
+from quad_gym.envs.flights import (
+    RENDERING_METADATA,
+    Flights,
+    Rendered,
+    checked_actions,
+    drawn_info,
+    flight_info,
+    info_of_flight,
+    rendering_options,
+    start_info,
+)
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
-from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result
@@ -121,7 +129,7 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
     `truncate_when_diverged` or `innovations`; `gates_passed`. With `randomization` also `drawn`,
     the parameters of the episode by name. With `faults` also `faults`, True for each that is active
     at present, by name. With `innovations=True` also `innovations`: the filter's last innovations,
-    their NIS and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`. With
+    their NIS and the decisions of its gate, see `quad_gym.envs.flights.innovations_of`. With
     `reward_terms=True` also `reward_terms` in every step: the weighted terms of the reward by name,
     whose sum is the reward (of your own task, what its `reward` returns by name).
 

@@ -12,8 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import given_suite
+from quad_gym.params.suites import SensorSuite, given_suite
 from quad_gym.records import COLUMNS, MAX_OBSERVATION, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}

@@ -9,12 +9,21 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from quad_gym.batch.seeding import stream_keys
+from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.config import Base
-from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults, start_info
-from quad_gym.envs.flights import Flights, checked_actions, named_options
+from quad_gym.envs.flights import (
+    RENDERING_METADATA,
+    Flights,
+    Rendered,
+    checked_actions,
+    final_parts,
+    flight_info,
+    named_options,
+    rendering_options,
+    replace_faults,
+    start_info,
+)
 from quad_gym.envs.keywords import EnvKeywords, checked, shows
-from quad_gym.envs.rendered import RENDERING_METADATA, Rendered, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result

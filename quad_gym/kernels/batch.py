@@ -3,12 +3,20 @@
 import numpy as np
 
 from quad_gym.kernels import entries
-from quad_gym.kernels.board import comes, finished, post, take
+from quad_gym.kernels.board import add_shared, comes, finished, post, read_shared, take
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.signatures import signature_of
-from quad_gym.kernels.flight import begin_episode, look, move_and_measure, run, update
-from quad_gym.kernels.gathering import block_address, update_soon, update_waiting
-from quad_gym.kernels.simd.addresses import (
+from quad_gym.kernels.flight import (
+    begin_episode,
+    block_address,
+    look,
+    move_and_measure,
+    run,
+    update,
+    update_soon,
+    update_waiting,
+)
+from quad_gym.kernels.numbers.blocks import (
     array_at,
     lanes_at,
     prefetch,
@@ -16,8 +24,7 @@ from quad_gym.kernels.simd.addresses import (
     store_lanes,
     store_tile,
 )
-from quad_gym.kernels.simd.atomics import add_shared, read_shared
-from quad_gym.kernels.simd.lanes import all_of, any_of, logical_not, no_lane, select
+from quad_gym.kernels.numbers.lanes import all_of, any_of, logical_not, no_lane, select
 from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.records import (
     EXCHANGE_BLOCK,
@@ -38,7 +45,7 @@ from quad_gym.records import (
     RewardTerm,
     offset_of,
 )
-from quad_gym.records.board import COMMAND, FINISHED, TICKET
+from quad_gym.records.call import COMMAND, FINISHED, TICKET
 
 _TERMS, _FIRST_TERM, _EXCHANGE_PITCH = len(RewardTerm), len(Result), EXCHANGE_BLOCK.itemsize
 _CALL_WORDS = len(Call)

@@ -15,9 +15,8 @@ from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.batch import _begin_step, _end_block
 from quad_gym.kernels.compiling import Stage, entry, kernel
-from quad_gym.kernels.flight import look, move_and_measure, run, update
-from quad_gym.kernels.gathering import block_address
-from quad_gym.kernels.simd.addresses import array_at, lanes_at, record_at
+from quad_gym.kernels.flight import block_address, look, move_and_measure, run, update
+from quad_gym.kernels.numbers.blocks import array_at, lanes_at, record_at
 from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.records import (
     FLIGHT_BLOCK,
@@ -30,9 +29,9 @@ from quad_gym.records import (
 )
 
 SETTINGS_SYMBOL = "qg_settings"
-"""The settings of a configuration, a constant that `compiling/device.py` writes."""
+"""The settings of a configuration, a constant that `compiling/building.py` writes."""
 HELD_IN = "=r,0"
-"""Registers of a held number; those of a GPU are in `compiling/device.py`."""
+"""Registers of a held number; those of a GPU are in `compiling/building.py`."""
 _CALL_WORDS = len(Call)
 _WORK_SIZE, _PARAMS_SIZE = WORK_BLOCK.itemsize, PARAMS_BLOCK.itemsize
 _flight_at, _params_at, _work_at = map(lanes_at, (FLIGHT_BLOCK, PARAMS_BLOCK, WORK_BLOCK))

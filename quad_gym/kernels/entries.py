@@ -6,14 +6,15 @@ and with the data type of the catalog; a call writes results into arrays of the 
 """
 
 import functools
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.kernels.library import library
-from quad_gym.kernels.stages import STAGE_TABLE, Stage
+from quad_gym.kernels.stages import SOURCES, STAGE_TABLE, Stage
 from quad_gym.records import (
     FLIGHT,
     FLIGHT_BLOCK,
@@ -121,26 +122,45 @@ _WORDS, _SLOTS = Rows(np.dtype(np.uint64)), Rows(np.dtype(np.uint64), 2)
 fly = Entry("batch:fly", int, int, int, int, int, bool, returns=bool)
 run_tape = Entry(
     "tape:run_tape",
-    *(_BLOCK, _BLOCK_PARAMS, _BLOCK_PARAMS, _STEPS, _SETTINGS, _BLOCK_WORK, _TABLE),
+    _BLOCK,
+    _BLOCK_PARAMS,
+    _BLOCK_PARAMS,
+    _STEPS,
+    _SETTINGS,
+    _BLOCK_WORK,
+    _TABLE,
     *_TAPE,
-    *(_INDICES, _WORDS, _SLOTS),
-    *(int, int),
+    _INDICES,
+    _WORDS,
+    _SLOTS,
+    int,
+    int,
 )
 take_inputs = Entry(
-    "window:take_inputs", *map(Rows, (WINDOW, EVENT, SAMPLE, PENDING, OPERATION, INPUT))
+    "tape:take_inputs", *map(Rows, (WINDOW, EVENT, SAMPLE, PENDING, OPERATION, INPUT))
 )
 start_filter = Entry("single:start_filter", _BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
 run_stage = Entry(
     "single:run_stage",
     *[int] * 4,
-    *(_BLOCK_PARAMS, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _TABLE),
+    _BLOCK_PARAMS,
+    _BLOCK_PARAMS,
+    _SETTINGS,
+    _BLOCK_WORK,
+    _TABLE,
     int,
 )
 sense_features = Entry("single:sense_features", _FLIGHT, _PARAMS, int)
 sense_gnss = Entry("single:sense_gnss", _FLIGHT, _PARAMS, bool)
 body_accelerations_in_air = Entry(
     "single:body_accelerations_in_air",
-    *(_VECTOR, _MATRIX, *[_VECTOR] * 4, _PARAMS, _SETTINGS, _VECTOR, _VECTOR),
+    _VECTOR,
+    _MATRIX,
+    *[_VECTOR] * 4,
+    _PARAMS,
+    _SETTINGS,
+    _VECTOR,
+    _VECTOR,
 )
 integrate_flight = Entry("single:integrate_flight", _FLIGHT, _PARAMS, int)
 sense_imu_average = Entry("single:sense_imu_average", _FLIGHT, _PARAMS, _FLIGHT)
@@ -163,20 +183,88 @@ nearest_obstacles = Entry("single:nearest_obstacles", _MATRIX, _CUBE, _SETTINGS,
 hide_points = Entry("single:hide_points", _MATRIX, _CUBE, _CUBE, _SETTINGS, _MASK)
 
 FILTER_STAGES = (
-    *(Stage.UPDATE, Stage.PREDICT, Stage.GATE, Stage.RECOVER),
+    Stage.UPDATE,
+    Stage.PREDICT,
+    Stage.GATE,
+    Stage.RECOVER,
     *(Stage[sensor.name] for sensor in Sensor),
 )
 """Stages that a filter runs, as far as it needs them."""
 FILTER_ENTRIES = (start_filter.name, run_tape.name, take_inputs.name)
 """Names of the entries that a filter calls, the slowest to compile first."""
 _SENSORS_AND_VEHICLE = (
-    *(sense_features, sense_gnss, body_accelerations_in_air, integrate_flight),
-    *(sense_imu_average, sense_imu, body_accelerations, start_level, first_heading),
-    *(wahba_of_vectors, step_biases, step_gnss_drift, draw_sensor_errors),
-    *(disturb_imu, turn_gnss_baseline, limit_features, nearest_obstacles, hide_points),
+    sense_features,
+    sense_gnss,
+    body_accelerations_in_air,
+    integrate_flight,
+    sense_imu_average,
+    sense_imu,
+    body_accelerations,
+    start_level,
+    first_heading,
+    wahba_of_vectors,
+    step_biases,
+    step_gnss_drift,
+    draw_sensor_errors,
+    disturb_imu,
+    turn_gnss_baseline,
+    limit_features,
+    nearest_obstacles,
+    hide_points,
 )
 SENSORS_AND_VEHICLE = tuple(entry.name for entry in _SENSORS_AND_VEHICLE)
 """Names of the entries for sensors and vehicles, the slowest to compile first."""
 _ENTRIES = (fly, run_tape, start_filter, take_inputs, run_stage, *_SENSORS_AND_VEHICLE)
 ENTRIES = {entry.name: entry for entry in _ENTRIES}
 """All entries by their names."""
+
+
+# --------------------------------------------------------------------------------------------------
+# The stages of this process, and a table of those that a batch needs.
+#
+# They are in the library of compiled kernels, or Numba compiles or loads them on demand.
+# --------------------------------------------------------------------------------------------------
+
+_addresses: dict[str, int] = {}
+_lock = threading.Lock()
+
+
+def names_of(needed: Collection[str], entries: Sequence[str] = (fly.name,)) -> list[str]:
+    """The compiled functions of stages and of the entries that call them, the longest first."""
+    ordered = [name for name in dict.fromkeys(s.name for s in SOURCES) if name in needed]
+    return [*ordered[:2], *entries[:1], *ordered[2:], *entries[1:]]
+
+
+def linked_table(needed: Mapping[Stage, str], entries: Sequence[str] = (fly.name,)) -> NDArray[Any]:
+    """Table of addresses, (1,) STAGE_TABLE, of only the stages that are needed.
+
+    A batch has memory only for the parts that these stages use, see `used_parts`: other slots stay
+    empty, even if another batch has linked their stages. The entries that call them are compiled
+    with them.
+    """
+    with _lock:
+        missing = set(needed.values()) - _addresses.keys()
+        if missing:
+            found = library()
+            if found is None:
+                from quad_gym.kernels.compiling.workers import prepare  # importing it takes 1 s
+
+                prepare(names_of(set(needed.values()), entries))
+            address = _compiled if found is None else found.address_of
+            _addresses.update((name, address(name)) for name in missing)
+    table = np.zeros(1, STAGE_TABLE)
+    for stage, name in needed.items():
+        table["address"][0, stage] = _addresses[name]
+    return table
+
+
+def _compiled(name: str) -> int:
+    """Address of the machine code of a stage."""
+    from quad_gym.kernels.compiling.decorators import SIGNATURE
+    from quad_gym.kernels.compiling.workers import dispatcher_of
+
+    compiled = dispatcher_of(name).overloads[tuple(SIGNATURE.args)]
+    address = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
+    if not address:
+        raise RuntimeError(f"{name} has no machine code")
+    return int(address)

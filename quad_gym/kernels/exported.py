@@ -11,15 +11,13 @@ from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling import entry, kernel
 from quad_gym.kernels.filter.error_state import E
-from quad_gym.kernels.filter.still import set_heading, start_still, turned
-from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import load3, store
-from quad_gym.kernels.simd.addresses import array_at, store_lanes
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.filter.starts import set_heading, start_still, turned
+from quad_gym.kernels.numbers.blocks import array_at, lanes_of, store_lanes
+from quad_gym.kernels.numbers.elementary import sin_cos
+from quad_gym.kernels.numbers.linalg import load3, store
 from quad_gym.kernels.single import begin_filter
 from quad_gym.kernels.stages import STAGE_TABLE
-from quad_gym.kernels.tape import keep_estimate, predict_sample, update_with
-from quad_gym.kernels.window import take_input
+from quad_gym.kernels.tape import keep_estimate, predict_sample, take_input, update_with
 from quad_gym.records import (
     AID_BLOCK,
     AID_MOST,
@@ -59,8 +57,14 @@ from quad_gym.records.inputs import (
 _FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _MEASUREMENT, _START = map(
     from_dtype,
     (
-        *(FLIGHT_BLOCK, PARAMS_BLOCK, STEP_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE),
-        *(MEASUREMENT, START),
+        FLIGHT_BLOCK,
+        PARAMS_BLOCK,
+        STEP_BLOCK,
+        SETTINGS,
+        WORK_BLOCK,
+        STAGE_TABLE,
+        MEASUREMENT,
+        START,
     ),
 )
 _WINDOW, _INPUT, _FIX, _MEMORY, _ESTIMATE, _MOUNTING = map(

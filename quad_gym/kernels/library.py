@@ -1,4 +1,4 @@
-"""The library of compiled kernels for this machine, without Numba.
+"""The library of compiled kernels for this machine, without Numba, and its cores.
 
 `quad-gym compile --library` makes one for each number of lanes, which wheels hold. It belongs to
 sources, whose digest it holds: with other sources it is not used. Without one, Numba compiles.
@@ -15,7 +15,38 @@ from pathlib import Path
 from typing import Any
 
 from quad_gym.kernels.sources import digest_in, sources_digest
-from quad_gym.records.width import WIDTH, runs_lanes
+from quad_gym.records.sizes import WIDTH, runs_lanes
+
+# --------------------------------------------------------------------------------------------------
+# Number of cores that this process may use.
+# --------------------------------------------------------------------------------------------------
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use, by its affinity, quota and NUMBA_NUM_THREADS."""
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    quota = _cgroup_cores()
+    if quota is not None:
+        cores = min(cores, quota)
+    limit = os.environ.get("NUMBA_NUM_THREADS", "")
+    return max(1, min(cores, int(limit))) if limit.isdigit() and int(limit) > 0 else cores
+
+
+def _cgroup_cores() -> int | None:
+    """Number of whole cores that a container's quota allows, if there is one."""
+    try:
+        with open("/sys/fs/cgroup/cpu.max", encoding="ascii") as file:
+            quota, period = file.read().split()
+        return None if quota == "max" else max(1, int(quota) // int(period))
+    except (OSError, ValueError):
+        return None
+
+
+# --------------------------------------------------------------------------------------------------
+# The library of compiled kernels for this machine, without Numba.
+# --------------------------------------------------------------------------------------------------
 
 FOLDER = Path(__file__).with_name("libraries")
 DEVICE_KERNEL = "qg_fly"  #: kernel of a module for a GPU: call (address), blocks, command

@@ -9,16 +9,14 @@ Python calls them through `entries.py`, which has their arguments.
 from quad_gym.kernels import entries
 from quad_gym.kernels.compiling import call_stage, entry, kernel
 from quad_gym.kernels.compiling.signatures import signature_of
-from quad_gym.kernels.filter.align import initialize
 from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
-from quad_gym.kernels.filter.still import set_heading, start_still
-from quad_gym.kernels.filter.wahba import wahba
-from quad_gym.kernels.maths.linalg import diagonal, load3, load4, load33, outer, store
-from quad_gym.kernels.obstacles.shapes import crosses, distance_from
+from quad_gym.kernels.filter.starts import initialize, set_heading, start_still, wahba
+from quad_gym.kernels.numbers.blocks import lanes_at, lanes_of
+from quad_gym.kernels.numbers.linalg import diagonal, load3, load4, load33, outer, store
+from quad_gym.kernels.obstacles import crosses, distance_from
 from quad_gym.kernels.sensors import camera
-from quad_gym.kernels.sensors.gnss import measure_gnss
-from quad_gym.kernels.sensors.gnss_position import drift_gnss
+from quad_gym.kernels.sensors.gnss import drift_gnss, measure_gnss
 from quad_gym.kernels.sensors.imperfect import (
     draw_heading_error,
     draw_imu_errors,
@@ -28,8 +26,6 @@ from quad_gym.kernels.sensors.imperfect import (
     vibrate_imu,
 )
 from quad_gym.kernels.sensors.imu import drift_biases, measure_imu, measure_imu_average
-from quad_gym.kernels.simd.addresses import lanes_at
-from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.air import accelerations_in_air
 from quad_gym.kernels.vehicle.dynamics import accelerations, integrate, load_state
 from quad_gym.records import FLIGHT_BLOCK

@@ -13,7 +13,7 @@ from typing import NamedTuple, get_args
 from quad_gym.params import checks as check
 from quad_gym.params.aids import OBSERVED, AidParams
 from quad_gym.params.barometer import BarometerParams
-from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Checked
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Checked
 
 OBSERVED = ("position", "height", "velocity", "heading")
 """States that a sensor can observe: the horizontal position, and with it often the velocity."""

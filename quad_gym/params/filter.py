@@ -5,9 +5,9 @@ from functools import partial
 from typing import Annotated, Literal
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
-from quad_gym.params.gravity import GRAVITY
-from quad_gym.params.ground import GROUND_HEIGHT
+from quad_gym.params.checks import Checked
+from quad_gym.params.vehicle import GRAVITY
+from quad_gym.params.world import GROUND_HEIGHT
 
 
 class FilterParams(Checked):

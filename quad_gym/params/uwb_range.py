@@ -28,8 +28,10 @@ class UwbRangeParams(AidParams):
     """standard deviation of the white noise [m]; Decawave DWM1000 data sheet: 10 cm. The Crazyflie
     firmware assumes 0.25 m for two-way ranges (lpsTwrTag.c)"""
     anchors_I: Annotated[check.Matrix, _anchors] = (
-        *((-5.0, -5.0, 0.2), (5.0, -5.0, 3.0)),
-        *((5.0, 5.0, 0.2), (-5.0, 5.0, 3.0)),
+        (-5.0, -5.0, 0.2),
+        (5.0, -5.0, 3.0),
+        (5.0, 5.0, 0.2),
+        (-5.0, 5.0, 3.0),
     )
     """(n, 3) places of the anchors in I [m], at most eight, as in the Crazyflie firmware; corners
     of a hall of 10 m, low and high in turn"""

@@ -5,20 +5,175 @@ still, the ground far away and the battery always full, and there are no obstacl
 laboratory's model.
 """
 
+import math
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
-from quad_gym.params.checks import Matrix
-from quad_gym.params.ground import GROUND_HEIGHT, GroundParams
-from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
-from quad_gym.params.suite_files import Saved, is_params_file, read_params
+from quad_gym.params import portable
+from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.files import Saved, is_params_file, read_params
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import MAX_OBSTACLES
+from quad_gym.records import MAX_OBSTACLES, Shape
+
+# --------------------------------------------------------------------------------------------------
+# The ground that supports vehicles: feet, friction, and limits of a safe touchdown.
+# --------------------------------------------------------------------------------------------------
+
+FARTHEST_FOOT = 10.0  #: largest distance of a foot from the center of mass [m]
+GROUND_HEIGHT = -0.1
+"""Height of the ground in I [m]: a vehicle that stands on the laboratory's legs is at height 0."""
+
+
+class GroundParams(Checked):
+    """A level plane at `WorldParams.ground_height` that supports a vehicle anywhere.
+
+    Four feet and the four rotor hubs can touch it. Contact is a constraint on velocities that is
+    solved once per tick: the plane stops points that would move below it and pushes but never
+    pulls; impacts are inelastic, and friction is Coulomb friction. After the tick of an impact,
+    points of a tumbling vehicle may be 15 mm below the plane, and with a friction of 5, 5 cm. The
+    contact has no stiffness, so every step size is stable (J. J. Moreau, "Unilateral contact
+    and dry friction in finite freedom dynamics", 1988; D. E. Stewart, J. C. Trinkle, "An implicit
+    time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb friction",
+    Int. J. Numerical Methods in Engineering 39, 1996).
+    """
+
+    feet_B: check.Matrix43 = (
+        (0.15, -0.15, -0.1),
+        (0.15, 0.15, -0.1),
+        (-0.15, 0.15, -0.1),
+        (-0.15, -0.15, -0.1),
+    )
+    """(4, 3) positions of the soles of the feet relative to the center of mass, in B [m], in a
+    level plane below all rotor hubs; default: legs of 0.1 m under the laboratory vehicle's arms"""
+    friction: Annotated[float, check.between(0.0, 100.0)] = 0.6
+    """Coulomb friction coefficient, for sticking and sliding; rubber on concrete has 0.6 to 0.85;
+    0: no friction"""
+    max_touchdown_speed: Annotated[float, partial(check.positive, least=0.2)] = 1.5
+    """speed of the center of mass toward the ground above which a touchdown is a crash [m/s]; a
+    free fall from 0.11 m ends at the default"""
+    max_touchdown_tilt: Annotated[float, partial(check.positive, most=math.pi)] = math.radians(30.0)
+    """angle between the body z axis and the vertical above which touching the ground is a crash
+    [rad]; touching it with a rotor always is"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        feet = np.array(self.feet_B)
+        if np.abs(feet).max() > FARTHEST_FOOT:
+            self._refuse("feet_B", f"be within {FARTHEST_FOOT:g} m")
+        if np.linalg.svd(feet[:, :2] - feet[:, :2].mean(axis=0))[1][1] < 1e-3 or not (
+            np.ptp(feet[:, 2]) <= 1e-9 and feet[0, 2] < 0.0
+        ):
+            must = "be four points of a level plane below the center of mass, not all on one line"
+            self._refuse("feet_B", must)
+
+
+# --------------------------------------------------------------------------------------------------
+# Obstacles of a world: walls and cylinders.
+#
+# They are upright, at places in the inertial frame I (east, north, up). A vehicle that comes closer
+# to one than its radius collides with it, and the camera cannot see features behind one.
+# --------------------------------------------------------------------------------------------------
+
+FARTHEST_OBSTACLE = 1e4
+"""Largest size of an obstacle, distance of its center from the origin, and shift [m]."""
+MIN_SIZE = 1e-3  #: smallest length, thickness, height or radius [m]
+
+Size = Annotated[float, partial(check.positive, least=MIN_SIZE, most=FARTHEST_OBSTACLE)]
+
+
+class Obstacle(Checked):
+    """Base of all obstacles: a place, which can be shifted at random in each episode."""
+
+    center_I: check.Vector3 = (0.0, 0.0, 0.0)
+    """(3,) center of the obstacle in I [m]"""
+    shift_I: check.NonNegative3 = (0.0, 0.0, 0.0)
+    """(3,) largest shift along each axis of I, in either direction [m]; each episode draws a shift
+    uniformly"""
+    follows: Annotated[int, partial(check.whole, least=0)] | None = None
+    """index of an earlier obstacle in `WorldParams.obstacles` whose shift is added to this
+    obstacle's own shift, as for the two sides of a gap; None: its own shift only"""
+
+    shape: ClassVar[Shape]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in ("center_I", "shift_I"):
+            farthest = max(abs(x) for x in getattr(self, field))
+            check.number(f"{type(self).__name__}.{field}", farthest, most=FARTHEST_OBSTACLE)
+
+    @property
+    def half_size(self) -> Vector:
+        """Half sizes (3,): length, thickness, height; of a cylinder radius, radius, height [m]."""
+        raise NotImplementedError
+
+    @property
+    def axis(self) -> Vector:
+        """Horizontal direction (2,) of the length, east and north [-]."""
+        return (1.0, 0.0)
+
+
+class Wall(Obstacle):
+    """An upright box: a wall, a pillar, a house."""
+
+    size: check.Vector3 = (4.0, 0.2, 3.0)
+    """(3,) length, thickness and height [m]"""
+    yaw: Annotated[float, check.between(-FARTHEST_OBSTACLE, FARTHEST_OBSTACLE)] = 0.0
+    """direction of the length, from east toward north [rad]"""
+
+    shape = Shape.WALL
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for length in self.size:
+            check.positive("Wall.size", length, least=MIN_SIZE, most=FARTHEST_OBSTACLE)
+
+    @property
+    def half_size(self) -> Vector:
+        """Half length, half thickness and half height (3,) [m]."""
+        length, thickness, height = self.size
+        return (0.5 * length, 0.5 * thickness, 0.5 * height)
+
+    @property
+    def axis(self) -> Vector:
+        """Horizontal direction (2,) of the length, east and north [-]."""
+        return (portable.cos(self.yaw), portable.sin(self.yaw))
+
+
+class Cylinder(Obstacle):
+    """An upright cylinder: a pillar, a tree, a mast."""
+
+    radius: Size = 0.2
+    """radius of the cylinder [m]"""
+    height: Size = 3.0
+    """height of the cylinder [m]"""
+
+    shape = Shape.CYLINDER
+
+    @property
+    def half_size(self) -> Vector:
+        """Radius, radius and half height (3,) [m]."""
+        return (self.radius, self.radius, 0.5 * self.height)
+
+
+def check_obstacles(name: str, obstacles: tuple[Obstacle, ...]) -> None:
+    """Refuse anything that is not an obstacle, and obstacles that follow a later one."""
+    for k, obstacle in enumerate(obstacles):
+        if not isinstance(obstacle, Wall | Cylinder):
+            raise ValueError(f"{name} must contain Wall and Cylinder, got {obstacle!r}")
+        if obstacle.follows is not None and obstacle.follows >= k:
+            raise ValueError(
+                f"{name}[{k}].follows must be the index of an earlier obstacle, less than {k}, got "
+                f"{obstacle.follows}"
+            )
+
+
+# --------------------------------------------------------------------------------------------------
+# The world around a vehicle: air, ground, battery and obstacles.
+# --------------------------------------------------------------------------------------------------
 
 MAX_WIND = 200.0  #: largest wind speed [m/s]; the strongest tornadoes reach some 135 m/s
 

@@ -5,17 +5,10 @@ array copies. The package imports NumPy and, for their names and sizes, the tabl
 """
 
 from quad_gym.records.call import *
-from quad_gym.records.draws import *
 from quad_gym.records.enums import *
 from quad_gym.records.flight import *
-from quad_gym.records.gathered import *
+from quad_gym.records.inputs import *
 from quad_gym.records.layout import *
 from quad_gym.records.params import *
-from quad_gym.records.path import *
-from quad_gym.records.results import *
-from quad_gym.records.settings import *
 from quad_gym.records.sizes import *
-from quad_gym.records.starts import *
 from quad_gym.records.streams import *
-from quad_gym.records.tape import *
-from quad_gym.records.work import *

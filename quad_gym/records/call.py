@@ -1,6 +1,10 @@
-"""Arguments of a call of the compiled batch kernel: words, most of them addresses."""
+"""Arguments of a call of the compiled batch kernel, and the board on which threads share it."""
 
 from enum import IntEnum, auto
+
+# --------------------------------------------------------------------------------------------------
+# Arguments of a call of the compiled batch kernel: words, most of them addresses.
+# --------------------------------------------------------------------------------------------------
 
 
 # fmt: off
@@ -21,9 +25,9 @@ class Call(IntEnum):
     flights if each episode has its own."""
     SETTINGS = auto()  #: SETTINGS of the batch
     WORK = auto()  #: WORK_BLOCK of this thread
-    GROUP = auto()  #: number of blocks that a thread steps together, tick by tick; see `kernels/gathering.py`
+    GROUP = auto()  #: number of blocks that a thread steps together, tick by tick; see `kernels/flight.py`
     GATHERED = auto()  #: FLIGHT_BLOCK of this thread: lanes gathered from several blocks
-    WORDS = auto()  #: (WORD_COUNT,) uint64: offsets of the words copied to GATHERED; see `gathered.py`
+    WORDS = auto()  #: (WORD_COUNT,) uint64: offsets of the words copied to GATHERED; see `layout.py`
     WORD_COUNT = auto()  #: number of WORDS
     WRITTEN_COUNT = auto()  #: number of leading WORDS that are copied back
     STAGES = auto()  #: STAGE_TABLE with the stages that the settings need
@@ -41,3 +45,14 @@ class Call(IntEnum):
     SHOWN_PITCH = auto()  #: bytes from one row of SHOWN to the next
     LANE = auto()  #: index in a block of the first flight that this call flies, if it flies only one
 # fmt: on
+
+
+# --------------------------------------------------------------------------------------------------
+# Words of a board, on which threads share the blocks of a batch, see `kernels/board.py`.
+# --------------------------------------------------------------------------------------------------
+
+LINE = 8  #: words in a cache line; words that different threads write are in different lines
+TICKET, FINISHED, COMMAND, STOP, CHUNK = 0, LINE, 2 * LINE, 3 * LINE, 3 * LINE + 1
+RANGES, WORDS_OF_RANGE = 4 * LINE, 2 * LINE
+NEXT, FIRST, LAST, PRESENT = 0, 1, 2, LINE
+"""Words of a range: the next block to take, the first block, the end, and 1 if its thread polls."""

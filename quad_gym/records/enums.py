@@ -125,7 +125,10 @@ class Observes(IntFlag):
 
 _FIX = int(Observes.POSITION | Observes.HEIGHT | Observes.VELOCITY)
 GROUP_OBSERVES = (
-    *(_FIX, int(Observes.HEADING), int(Observes.VELOCITY), int(_FIX | Observes.HEADING)),
+    _FIX,
+    int(Observes.HEADING),
+    int(Observes.VELOCITY),
+    int(_FIX | Observes.HEADING),
     *(sum(int(Observes[word.upper()]) for word in shape.observes) for shape in _SHAPES),
 )
 """The same of each group, in the order of `Block` and `Aid`, as numbers."""

@@ -1,8 +1,25 @@
-"""Records of the inputs of a filter in the order of their arrival; see `kernels/window.py`."""
+"""Records of a filter's start and inputs, in the order of arrival and as tapes."""
 
 from enum import IntEnum, auto
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.records.layout import block_dtype
+from quad_gym.records.sizes import (
+    AID_ROWS,
+    AIDS,
+    MAX_BLOCKS,
+    MAX_FEATURES,
+    MAX_SLOW,
+    MAX_STATES,
+    Field,
+)
+
+# --------------------------------------------------------------------------------------------------
+# Records of the inputs of a filter in the order of their arrival; see `kernels/tape.py`.
+# --------------------------------------------------------------------------------------------------
 
 FARTHEST_FIX = 1e6
 """Largest distance of a fix from the reference antenna [m]; the center of the Earth is farther."""
@@ -116,9 +133,11 @@ ESTIMATE = np.dtype(
     [
         ("time", "f8"),
         *((name, "f8", 3) for name in ("position", "velocity")),
-        *(("R_BI", "f8", (3, 3)), ("quaternion", "f8", 4)),
+        ("R_BI", "f8", (3, 3)),
+        ("quaternion", "f8", 4),
         *((name, "f8", 3) for name in ("accel_bias", "gyro_bias")),
-        *(("sigma", "f8", 15), ("diverged", "i4")),
+        ("sigma", "f8", 15),
+        ("diverged", "i4"),
     ],
     align=True,
 )
@@ -154,4 +173,112 @@ FIX = np.dtype(
         ("outcome", "i8"),
     ]
 )
-"""A first fix, and measurements of the attitude; see `quad_gym.estimation.filtering.first_fix`."""
+"""A first fix, and measurements of the attitude; see `quad_gym.estimation.starts`."""
+
+
+# --------------------------------------------------------------------------------------------------
+# Measurement of a sensor as a user's estimator receives it.
+# --------------------------------------------------------------------------------------------------
+
+
+class SensorReading(NamedTuple):
+    """Measurement of one sensor, of all flights."""
+
+    value: NDArray[Any]  #: one row per flight; NaN where no measurement arrives at this instant
+    new: NDArray[
+        np.bool_
+    ]  #: True where one arrives: (n,), for pixels (n, features), for ranges (n, anchors)
+    age: float
+    """Time since the measurement was taken, its time stamp: the latency of the sensor [s]"""
+
+
+# --------------------------------------------------------------------------------------------------
+# Records of a tape: inputs of a filter, and the operations that process them in order.
+# --------------------------------------------------------------------------------------------------
+
+SAMPLE = np.dtype([("gyro", "f8", 3), ("accel", "f8", 3), ("dt", "f8"), ("gyro_before", "f8", 3)])
+"""An IMU sample that propagates the estimate; `gyro_before` is the one before, for lever arms."""
+
+NOISE_FIELDS = (
+    "position_sigma_I",
+    "baseline_noise",
+    "baseline_sigma",
+    "velocity_sigma",
+    "pixel_sigma",
+)
+"""Parameters that a measurement may replace, in addition to `aid_sigma`."""
+
+MEASUREMENT = np.dtype(
+    [
+        ("valid", "f8", MAX_BLOCKS),  # 1 where a block is measured
+        *((name, "f8", 3) for name in ("gnss_position", "gnss_baseline", "gnss_velocity")),
+        ("pixels", "f8", (MAX_FEATURES, 2)),
+        ("aid_measurement", "f8", (AID_ROWS, 3)),
+        # noise; NaN: as in the parameters
+        ("position_sigma_I", "f8", 3),
+        *((name, "f8") for name in NOISE_FIELDS[1:]),
+        ("aid_sigma", "f8", AIDS),
+    ]
+)
+"""Measurements of one instant; see `quad_gym.estimation.inputs.Measurement`."""
+
+
+class Operation(IntEnum):
+    """Operations of a tape."""
+
+    PREDICT = 0  #: propagate with sample `index`
+    UPDATE = auto()
+    """update with measurement `index`; its innovations go to row `target`, unless negative"""
+    COPY = auto()  #: copy the memory of the filter into slot `target`
+    RESTORE = auto()  #: restore the memory from slot `target`
+    KEEP = auto()  #: store the estimate in row `target`
+
+
+OPERATION = np.dtype([("code", "i8"), ("index", "i8"), ("target", "i8")])
+
+STEP_BLOCK = block_dtype(
+    (
+        Field("rate", (2 + MAX_SLOW,), "1/s", "1/tau of accelerometer and gyro bias, slow errors"),
+        Field("sigma", (2 + MAX_SLOW,), "mixed", "stationary standard deviation of each"),
+        Field("level", (), "m", "zero of the barometer; NaN: the height at its first measurement"),
+    )
+)
+"""Numbers that a tape needs in addition to the parameters."""
+
+KEPT = 3 + 3 + 9 + 3 + 3 + 15 + 1
+"""Length of a row of estimates: r, v, R, b_a, b_g, 15 variances, and 1 if it has diverged."""
+REPORTED = 8
+"""Numbers per block in a row of innovations: innovation, sigma (3 each), NIS, gate decision."""
+
+
+# --------------------------------------------------------------------------------------------------
+# Record of a filter's start from one fix.
+# --------------------------------------------------------------------------------------------------
+
+START = np.dtype(
+    [
+        ("x_I", "f8", 3),  # horizontal direction of body x for a steep baseline; zero: unknown
+        # a vehicle of known tilt: see `quad_gym.estimation.starts`
+        ("antenna_I", "f8", 3),
+        ("position_root", "f8", (3, 3)),  # of the covariance of the antenna's position
+        ("velocity_sigma", "f8", 3),
+        ("T", "f8", (3, 3)),  # from the level frame to B
+        ("tilt_sigma", "f8"),
+        ("tilt_of_bias", "f8"),
+        ("heading", "f8"),
+        ("heading_sigma", "f8"),
+        ("heading_of_tilt", "f8", 2),
+        ("heading_of_slow", "f8", MAX_SLOW),
+        ("lever_B", "f8", 3),  # the antenna
+        ("accel_bias_sigma", "f8"),
+        ("gyro_bias_sigma", "f8"),
+        ("slow_sigma", "f8", MAX_SLOW),
+        ("slow_states", "i8"),
+        # results
+        ("position", "f8", 3),
+        ("R_BI", "f8", (3, 3)),
+        ("factor", "f8", (MAX_STATES, MAX_STATES + 1)),  # lower, in the first columns
+        ("e", "f8", (3, MAX_STATES + 1)),  # error angles by independent errors
+    ]
+)
+"""Inputs and results of a filter's start."""

@@ -1,19 +1,22 @@
-"""Records in memory: of a single flight, and of WIDTH flights as a block.
+"""Records in memory: of a single flight, of WIDTH flights as a block, and parts of them.
 
 In a block of flights (`block_dtype`) every field has a trailing axis of WIDTH. The scalar form
 (`scalar_dtype`) has these fields without that axis. Kernels read both by field name.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.records.flight import FLIGHT_FIELDS, PARTS
-from quad_gym.records.params import PARAMS_FIELDS
-from quad_gym.records.settings import SETTINGS_FIELDS
-from quad_gym.records.sizes import WIDTH, Field
-from quad_gym.records.work import WORK_FIELDS
+from quad_gym.records.flight import FLIGHT_FIELDS, PARTS, WORK_FIELDS
+from quad_gym.records.params import PARAMS_FIELDS, SETTINGS_FIELDS
+from quad_gym.records.sizes import FIRST_BLOCK, MAX_BLOCKS, TERMS, WIDTH, Field
+
+# --------------------------------------------------------------------------------------------------
+# Records in memory: of a single flight, and of WIDTH flights as a block.
+# --------------------------------------------------------------------------------------------------
 
 
 def scalar_dtype(fields: tuple[Field, ...]) -> np.dtype:
@@ -102,3 +105,115 @@ def put_in_flights(blocks: NDArray[Any], name: str, values: NDArray[Any]) -> Non
     if last < len(values):
         rest = values[last:]
         target[whole, ..., : len(rest)] = rest.transpose(*range(1, rest.ndim), 0)
+
+
+# --------------------------------------------------------------------------------------------------
+# The words of a flight's record that an update of its filter reads and writes.
+# --------------------------------------------------------------------------------------------------
+
+_OF_CORE = {"tick", "filter_status", "diverged"}
+_PARTS = {"filter", "watch", "late", "slow", "aids"}
+_NOT_READ = {
+    "prediction_failures",
+    "waiting",
+    "waiting_valid",
+    "aid_vector",
+    "aid_scalar",
+    "aid_matrix",
+    "arc",  # set by predictions alone
+    "stamps",  # only the stamps of arriving measurements are gathered
+}
+_NOT_WRITTEN = {
+    "tick",
+    "w_meas",
+    "w_before",
+    "gyro",
+    "accel",
+    "block_valid",
+    "gnss_position",
+    "gnss_baseline",
+    "gnss_velocity",
+    "pixels",
+    "aid_measurement",
+    "imu_turn",
+    "imu_velocity",
+    "imu_position",
+    "imu_bias_gain",
+}
+
+
+def words_of_update(settings: Any, used: frozenset[str]) -> tuple[NDArray[np.uint64], int]:
+    """Return the words of an update as offsets of their first lane in a block.
+
+    Words that an update writes come first; the second value is their number. `used` names the parts
+    of a flight's record that are in use.
+    """
+    blocks = tuple(map(int, settings["sensor_blocks"]))
+    return _words(used, int(settings["feature_count"]), int(settings["slow_states"]), blocks)
+
+
+@functools.cache
+def _words(
+    used: frozenset[str], features: int, slow: int, sensor_blocks: tuple[int, ...]
+) -> tuple[NDArray[np.uint64], int]:
+    written: list[NDArray[np.int64]] = []
+    read: list[NDArray[np.int64]] = []
+    for part, fields in PARTS:
+        for name, shape, *_ in fields:
+            chosen = name in _OF_CORE if part == "core" else part in _PARTS & used
+            if chosen and name not in _NOT_READ:
+                first = offset_of(FLIGHT_BLOCK, name) // (8 * WIDTH)
+                words = first + np.arange(np.prod(shape, dtype=int)).reshape(shape)
+                (read if name in _NOT_WRITTEN else written).append(
+                    _in_use(name, words, features, slow, sensor_blocks)
+                )
+    words = np.concatenate([*written, *read])
+    return WIDTH * words.astype(np.uint64), sum(map(len, written))
+
+
+def _in_use(
+    name: str, words: NDArray[np.int64], features: int, slow: int, sensor_blocks: tuple[int, ...]
+) -> NDArray[np.int64]:
+    """The words of a field that a configuration uses."""
+    if name == "L":
+        return words[np.tril_indices(len(words))]
+    if name == "L_slow":
+        return words[:slow][np.tri(slow, words.shape[1], 15, dtype=bool)]
+    if name == "pixels":
+        words = words[:features]
+    elif name == "slow_hat":
+        words = words[:slow]
+    elif words.ndim > 0 and len(words) == MAX_BLOCKS:
+        blocks = [
+            first + k
+            for first, count in zip(FIRST_BLOCK, sensor_blocks, strict=True)
+            for k in range(count)
+        ]
+        words = words[blocks]
+    return words.ravel()
+
+
+# --------------------------------------------------------------------------------------------------
+# Users' trajectories as records, shared by all flights of a batch.
+#
+# A path is a row of PATH; its segments are consecutive rows of PIECE.
+# --------------------------------------------------------------------------------------------------
+
+# fmt: off
+PATH_FIELDS = (
+    Field("first", (), "-", "index of the first piece", "i8"),
+    Field("pieces", (), "-", "number of pieces", "i8"),
+    Field("closed", (), "0 or 1", "1 if the path repeats", "i8"),
+    Field("duration", (), "s", "duration of the path, or of one round"),
+    Field("heading", (), "-", "0: toward the point; 2: along the velocity; 3: the yaw"),
+    Field("point", (2,), "m", "point that body x faces, in I"),
+    Field("begin_heading", (2,), "-", "horizontal direction of the velocity at the start, even from rest"),
+    Field("end_heading", (2,), "-", "horizontal direction of the velocity at the end"),
+)
+PIECE_FIELDS = (
+    Field("begin", (), "s", "time at which the segment begins"),
+    Field("terms", (TERMS, 4), "mixed", "coefficients of x, y, z [m] and yaw [rad], the highest power first"),
+)
+# fmt: on
+
+PATH, PIECE = scalar_dtype(PATH_FIELDS), scalar_dtype(PIECE_FIELDS)

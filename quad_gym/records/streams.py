@@ -6,9 +6,24 @@ the instant and n. Each quantity has a range of indices. A draw yields two rando
 
 from typing import NamedTuple
 
-from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.enums import AID_MOST, Aid
+from quad_gym.records.params import DRAWN_SIZE
 from quad_gym.records.sizes import *
+
+# --------------------------------------------------------------------------------------------------
+# Heights of drawn references, constants that checks of the ground can import without kernels.
+# --------------------------------------------------------------------------------------------------
+
+LOWEST_GATE, GATE_SPREAD = 0.7, 0.6
+"""Lowest height of a gate, and range of heights above it, divided by `TaskParams.height`."""
+RANDOM_RISE = 0.3
+"""Ratio of vertical to horizontal coefficients of a random trajectory before scaling. Its vertical
+extent is typically below this share of `TaskParams.radius`."""
+
+
+# --------------------------------------------------------------------------------------------------
+# Indices of all random draws in one table, so that no two quantities share a draw.
+# --------------------------------------------------------------------------------------------------
 
 DRAWS_OF_FAULT = 8
 """Draws for a kind of fault: its times (2), size and direction (2), effect on one sample (4)."""

@@ -6,10 +6,8 @@ flight, `save_video` writes a flight as a video, and `save_side_by_side` several
 episode.
 """
 
-from quad_gym.rendering.live import RENDER_MODES, Rendering
-from quad_gym.rendering.renderer import VIEWS, Renderer, tile
-from quad_gym.rendering.side_by_side import Side, SideBySide, save_side_by_side
-from quad_gym.rendering.video import record_flight, save_video
+from quad_gym.rendering.renderer import RENDER_MODES, VIEWS, Renderer, Rendering, tile
+from quad_gym.rendering.video import Side, SideBySide, record_flight, save_side_by_side, save_video
 
 __all__ = [
     "RENDER_MODES",

@@ -14,8 +14,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.rendering import colors
-from quad_gym.rendering.colors import Color
+
+# --------------------------------------------------------------------------------------------------
+# Colors, based on the palette of Okabe and Ito.
+#
+# People with a color vision deficiency can distinguish them; they are darker, for contrast on a
+# pale ground, and shifted to remain distinct.
+# --------------------------------------------------------------------------------------------------
+
+Color = tuple[int, int, int]  #: red, green and blue, from 0 to 255
+
+WHITE: Color = (255, 255, 255)
+SKY: Color = (250, 251, 253)
+GROUND: Color = (236, 239, 243)
+GRID: Color = (206, 211, 218)
+PALE: Color = (221, 221, 221)
+GREY: Color = (118, 118, 118)
+INK: Color = (34, 34, 34)
+BLUE: Color = (0, 95, 165)
+LIGHT_BLUE: Color = (86, 180, 233)
+VERMILLION: Color = (198, 81, 0)
+GREEN: Color = (0, 145, 80)
+PURPLE: Color = (190, 90, 150)
+PALE_PURPLE: Color = (218, 176, 204)
+
+
+# --------------------------------------------------------------------------------------------------
+# Canvas with smooth lines, translucent areas and text, on pygame's software surfaces.
+# --------------------------------------------------------------------------------------------------
 
 Floats = NDArray[np.float64]
 Label = tuple[str, Floats, Color]  #: text, its place (2,) [pixels], and its color
@@ -159,7 +185,7 @@ class Canvas:
         """Brighten a rectangle of the finished picture, for text to stand out."""
         box = (0, 0, round(width), round(height))
         self._layer.set_clip(None)
-        self._layer.fill((*colors.WHITE, 190), box)
+        self._layer.fill((*WHITE, 190), box)
         self.surface.blit(self._layer, (round(left), round(top)), box)
 
     def text(
@@ -168,7 +194,7 @@ class Canvas:
         x: float,
         y: float,
         size: int,
-        color: Color = colors.INK,
+        color: Color = INK,
         anchor: float = 0.0,
     ) -> int:
         """Write a text at x, y, shifted left by `anchor` widths; return its width [pixels]."""
@@ -193,12 +219,12 @@ class Canvas:
             self.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
         else:
             left, top = round(x + 1), round(y + 0.5 * step - 5)
-            self.surface.fill(colors.INK, (left, top, 8, 8))
+            self.surface.fill(INK, (left, top, 8, 8))
             self.surface.fill(color, (left + 1, top + 1, 6, 6))
 
     def width_of(self, words: str, size: int) -> int:
         """Width of a text [pixels]."""
-        return int(self._word(words, size, colors.INK).get_width())
+        return int(self._word(words, size, INK).get_width())
 
     def fitting(self, wordings: Sequence[str], size: int, width: float) -> str:
         """First of the wordings that is no wider than `width` [pixels], or the last one."""

@@ -4,27 +4,415 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.resets import checked_mask
-from quad_gym.packing.configuration import FlightConfiguration
+from quad_gym.batch.starts import checked_mask, checked_start
+from quad_gym.configuration import FlightConfiguration
 from quad_gym.params import checks as check
+from quad_gym.params.checks import did_you_mean
+from quad_gym.params.task import TaskParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import RESULTS, Autoreset, Ending, Result
 from quad_gym.records.state import State
-from quad_gym.tasks import answers
-from quad_gym.tasks.answers import Start
-from quad_gym.tasks.memory import ReadableBatch
-from quad_gym.tasks.observing import Joiner, Part
-from quad_gym.tasks.random import FlightRandom
-from quad_gym.tasks.task import METHODS, Task, label
-from quad_gym.tasks.view import View
+from quad_gym.tasks.task import BOUND, METHODS, FlightRandom, Task, TaskError, label
+from quad_gym.tasks.view import VIEW_FIELDS, BuiltinView, Group, ReadableBatch, View, field
+
+if TYPE_CHECKING:
+    from quad_gym.params.suites import SensorSuite
+
+
+# --------------------------------------------------------------------------------------------------
+# Checks of the return values of a task's methods; errors name the method and the flights.
+# --------------------------------------------------------------------------------------------------
 
 Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Truths = NDArray[np.bool_]
+
+LONE = "observed"
+"""Name in the table of observations for an array that `observe` returns without a name."""
+
+Start = dict[str, Any]
+
+_SHAPES: dict[str, tuple[int, ...]] = {"position": (3,), "velocity": (3,), "yaw": ()}
+"""Start values that `reset` may return, with the shapes of their rows."""
+
+
+def ask(task: Task, method: str, *arguments: Any) -> Any:
+    """Call a task's method; an exception that it raises becomes the cause of a TaskError."""
+    try:
+        return getattr(task, method)(*arguments)
+    except Exception as error:
+        raise TaskError(
+            f"{label(task)}.{method} failed, for all flights: {type(error).__name__}: {error}"
+            + _meant(error)
+        ) from error
+
+
+def _meant(error: Exception) -> str:
+    """Suggestion of an attribute's name, for the end of a message about one that is missing."""
+    if not isinstance(error, AttributeError) or error.name is None:
+        return ""
+    if not isinstance(error.obj, Group | State):
+        return ""  # attributes of users' objects may have side effects
+    if isinstance(error.obj, Group):  # in another group?
+        for field in VIEW_FIELDS:
+            if field.name.rpartition(".")[2] == error.name:
+                return f"; did you mean view.{field.name}?"
+    return did_you_mean(error.name, [name for name in dir(error.obj) if name[0] != "_"])
+
+
+def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]:
+    """Convert a return value to an array of numbers."""
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError):
+        found = np.array(None)
+    if found.dtype.kind not in "fiub":
+        _refuse(task, method, f"numbers{_of(name)}", _short(value))
+    return found
+
+
+def reward_terms(task: Task, view: View) -> dict[str, Floats]:
+    """Terms of a task's reward, (n,) each, which may still be NaN or infinite."""
+    value = ask(task, "reward", view)
+    if not isinstance(value, Mapping):
+        return {"reward": _reward(task, value, view.count)}
+    if not value:
+        _refuse(task, "reward", "at least one term", "none")
+    return {str(name): _reward(task, term, view.count, str(name)) for name, term in value.items()}
+
+
+def _reward(task: Task, value: Any, count: int, name: str = "") -> Floats:
+    """Reward, or its term with this name, (n,)."""
+    found = numbers(task, "reward", value, name)
+    if found.shape != (count,):
+        must = f"shape ({count},), one number per flight{_of(name)}"
+        _refuse(task, "reward", must, found.shape)
+    return found.astype(np.float64)
+
+
+def truths(task: Task, method: str, view: View) -> Truths:
+    """Boolean values that a method returns, (n,)."""
+    found = numbers(task, method, ask(task, method, view))
+    if found.dtype.kind != "b" or found.shape != (view.count,):
+        must = f"booleans of shape ({view.count},)"
+        _refuse(task, method, must, f"{found.dtype} of {found.shape}")
+    return found
+
+
+def parts_of(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
+    """Convert the return value of `observe` to (n, k) arrays by name, in its order."""
+    named = value if isinstance(value, Mapping) else {LONE: value}
+    found = {}
+    for name, part in named.items():
+        array = numbers(task, "observe", part, str(name))
+        if array.ndim not in (1, 2) or len(array) != count:
+            must = f"shape ({count},) or ({count}, k){_of(str(name))}"
+            _refuse(task, "observe", must, array.shape)
+        found[str(name)] = array[:, np.newaxis] if array.ndim == 1 else array
+    return found
+
+
+def starts(
+    task: Task,
+    returned: Any,
+    chosen: NDArray[np.bool_],
+    given: Start,
+    params: TaskParams,
+    world: WorldParams,
+) -> Start:
+    """Combine start values that `reset` of a task returns with `given` ones, which take precedence.
+
+    Rows of flights that are not `chosen` (n,) to begin an episode are ignored.
+    """
+    if not isinstance(returned, Mapping) or not set(returned) <= set(_SHAPES):
+        raise TaskError(
+            f"{label(task)}.reset must return None or a dictionary with any of "
+            f"{', '.join(_SHAPES)}; got {returned!r}"
+        )
+    count, found = len(chosen), {name: given.get(name) for name in _SHAPES}
+    for name, value in returned.items():
+        values = numbers(task, "reset", value, name)
+        shape = (count, *_SHAPES[name])
+        if values.shape not in (shape, _SHAPES[name]):
+            _refuse(task, "reset", f"shape {shape} for {name!r}", values.shape)
+        rows = np.zeros(shape)
+        rows[chosen] = np.broadcast_to(values, shape)[chosen]
+        sound = np.asarray(np.isfinite(rows).reshape(count, -1).all(axis=1))
+        require(sound, task, "reset", rows, f"finite numbers for {name!r}")
+        if given.get(name) is None:
+            found[name] = rows
+    try:
+        checked_start(count, **found, task=params, world=world, chosen=chosen)
+    except ValueError as error:
+        raise TaskError(f"{label(task)}.reset returned an invalid start: {error}") from None
+    return found
+
+
+def require(sound: Truths, task: Task, method: str, values: NDArray[Any], required: str) -> None:
+    """Reject values (n, ...) of flights that are not sound, (n,)."""
+    wrong = np.flatnonzero(~sound)
+    if wrong.size:
+        got = f"{_short(values[wrong[0]])} for {flights_named(wrong)}"
+        _refuse(task, method, required, got)
+
+
+def flights_named(flights: NDArray[np.intp]) -> str:
+    """List flights by number, at most five."""
+    first = ", ".join(str(i) for i in flights[:5])
+    more = f" and {len(flights) - 5} more" if len(flights) > 5 else ""
+    return f"flight {first}" if len(flights) == 1 else f"flights {first}{more}"
+
+
+def _refuse(task: Task, method: str, must: str, got: Any) -> NoReturn:
+    """Raise a TaskError for what a method has returned."""
+    raise TaskError(f"{label(task)}.{method} must return {must}, got {got}")
+
+
+def _of(name: str) -> str:
+    return f" for {name!r}" if name and name != LONE else ""
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+# --------------------------------------------------------------------------------------------------
+# Observations of a task: joined with the built-in observation, checked and clipped.
+# --------------------------------------------------------------------------------------------------
+
+Singles = NDArray[np.float32]
+
+
+class Part(NamedTuple):
+    """Size and bounds of one array that `observe` returns."""
+
+    size: int
+    low: float
+    high: float
+
+
+class Joiner:
+    """Assembly of observations: built-in values that are kept, the task's, and privileged ones.
+
+    The task's values are inserted at index `split` of the built-in observation, of whose indices
+    before it the `kept` remain (None: all).
+    """
+
+    def __init__(
+        self,
+        count: int,
+        parts: Mapping[str, Part],
+        builtin: int,
+        split: int,
+        kept: Sequence[int] | None,
+    ) -> None:
+        self._count = count
+        self._sizes = {name: part.size for name, part in parts.items()}
+        self._kept: slice | Sequence[int] = slice(0, split)
+        if kept is not None and len(kept) < split:
+            self._kept = kept
+        self._split = split
+        begin = split if kept is None else len(kept)
+        bounds = [(part.low, part.high) for part in parts.values() for _ in range(part.size)]
+        self._own = slice(begin, begin + len(bounds))
+        self._low, self._high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
+        self._least, self._most = self._low.max(initial=-BOUND), self._high.min(initial=BOUND)
+        self.size = self._own.stop + builtin - split
+        """Size of an observation."""
+
+    def join(self, flights: ReadableBatch, task: Task, value: Any, builtin: Singles) -> Singles:
+        """Assemble observations from the return value of `observe` and the built-in ones, (n, k).
+
+        Sizes must be as in the first call, and values finite, except for flights whose state is
+        not finite: finite numbers replace theirs.
+        """
+        parts = parts_of(task, value, self._count)
+        sizes = {name: part.shape[1] for name, part in parts.items()}
+        if sizes != self._sizes:
+            raise TaskError(
+                f"{label(task)}.observe must always return the same sizes, "
+                f"{self._sizes}, got {sizes}"
+            )
+        own = [parts[name] for name in self._sizes]
+        joined = np.concatenate(
+            [builtin[:, self._kept], *own, builtin[:, self._split :]], axis=1, dtype=np.float32
+        )
+        ours = joined[:, self._own]
+        if ours.min(initial=0.0) >= self._least and ours.max(initial=0.0) <= self._most:
+            return joined  # almost always; clipping takes longer
+        if not np.isfinite(ours).all():
+            for name, values in parts.items():
+                wrong = ~np.isfinite(values).all(axis=1)
+                wrong[wrong] = flights.finite(np.flatnonzero(wrong))
+                require(~wrong, task, "observe", values, f"finite {name!r}")
+            np.nan_to_num(ours, copy=False)
+        np.clip(ours, self._low, self._high, out=ours)
+        return joined
+
+
+# --------------------------------------------------------------------------------------------------
+# `LaidTask`: a user's task laid over the task of an id, whose methods stay where it has none.
+# --------------------------------------------------------------------------------------------------
+
+
+class LaidTask(Task):
+    """A task over the task of an environment, as `LookAround` is the task of its id.
+
+    Reward, endings and observation are those of `over` where it overrides them, otherwise those of
+    `base`. `reset` and `update` of both are called, first of `base`, so that `over` reads a
+    complete state. In methods of `over`, `view.builtin` has reward and endings of `base`, and its
+    observation is appended to that of `base`, as to any built-in observation.
+
+    Args:
+        over: The user's task.
+        base: The task of the environment.
+
+    Raises:
+        ValueError: If both have a variable of the same name in `state`.
+    """
+
+    def __init__(self, over: Task, base: Task) -> None:
+        self.over, self.base = over, base
+        both = sorted(set(over.state) & set(base.state))
+        if both:
+            raise ValueError(
+                f"state of {label(over)} must not have {both[0]!r}, which the environment's task "
+                f"{label(base)} has: choose another name, or derive from {label(base)}"
+            )
+        self.state: Mapping[str, ArrayLike] = {**base.state, **over.state}
+        self._label = label(over)
+        self.replaces_observation, self.keeps = base.replaces_observation, base.keeps
+        self.privileged = over.privileged or base.privileged
+        replaces = over.has("observe") and over.replaces_observation
+        if replaces:
+            kept = [n for n in over.keeps if not base.replaces_observation or n in base.keeps]
+            self.replaces_observation, self.keeps = True, tuple(kept)
+        self._of_base = frozenset(over.keeps) if replaces else None
+        self.observes = {
+            **{name: spec for name, spec in base.observes.items() if self._keeps_part(name)},
+            **(over.observes if over.has("observe") else {}),
+        }
+
+    def has(self, method: str) -> bool:
+        """Return True if one of both tasks overrides a method."""
+        return self.over.has(method) or self.base.has(method)
+
+    def _require(self, sensors: "SensorSuite", world: "WorldParams") -> None:
+        self.base._require(sensors, world)
+        self.over._require(sensors, world)
+
+    def reset(self, view: "View", rng: "FlightRandom") -> Mapping[str, ArrayLike] | None:
+        """Begin episodes in both tasks; start values of `over` have precedence."""
+        start = self.base.reset(view, rng)
+        with self._over(view):
+            again = self.over.reset(view, rng)
+        return again if start is None else start if again is None else {**start, **again}
+
+    def update(self, view: "View", rng: "FlightRandom") -> None:
+        """Change the state of both tasks."""
+        self.base.update(view, rng)
+        with self._over(view):
+            self.over.update(view, rng)
+
+    def reward(self, view: "View") -> Floats | dict[str, Floats]:
+        """Return the reward, (n,), or its terms."""
+        return self._asked("reward", view)
+
+    def terminated(self, view: "View") -> Truths:
+        """Return True for episodes that end by a crash or at the goal, (n,)."""
+        return self._asked("terminated", view)
+
+    def truncated(self, view: "View") -> Truths:
+        """Return True for episodes that are cut short, (n,)."""
+        return self._asked("truncated", view)
+
+    def observe(self, view: "View") -> dict[str, NDArray[Any]]:
+        """Return the parts of the observation by name: of `base`, then of `over`."""
+        parts: dict[str, NDArray[Any]] = {}
+        if self.base.has("observe"):
+            named = parts_of(self.base, self.base.observe(view), view.count)
+            parts = {name: part for name, part in named.items() if self._keeps_part(name)}
+        if self.over.has("observe"):
+            with self._over(view):
+                own = parts_of(self.over, self.over.observe(view), view.count)
+            both = sorted(set(own) & set(parts))
+            if both:
+                raise ValueError(
+                    f"observe must not return {both[0]!r}, a name of a part of {label(self.base)}"
+                )
+            parts |= own
+        return parts
+
+    def _keeps_part(self, name: str) -> bool:
+        """Return True if a part of the observation of `base` is observed."""
+        return self._of_base is None or name in self._of_base
+
+    def _asked(self, method: str, view: "View") -> Any:
+        if not self.over.has(method):
+            return getattr(self.base, method)(view)
+        with self._over(view):
+            return getattr(self.over, method)(view)
+
+    @contextmanager
+    def _over(self, view: "View") -> Iterator[None]:
+        """Show reward and endings of `base` as the built-in ones."""
+        builtin = view._builtin
+        view._builtin = _BaseView(view, self.base, builtin)
+        try:
+            yield
+        finally:
+            view._builtin = builtin
+
+
+class _BaseView(BuiltinView):
+    """Reward and endings of a task in Python, computed when they are read."""
+
+    __slots__ = ("_base", "_beneath", "_view")
+
+    def __init__(self, view: "View", base: Task, beneath: BuiltinView) -> None:
+        super().__init__(view._flights)
+        self._view, self._base, self._beneath = view, base, beneath
+
+    @contextmanager
+    def _beneath_it(self) -> Iterator["View"]:
+        """View in which the built-in reward and endings are again those beneath the task."""
+        view = self._view
+        view._builtin = self._beneath
+        try:
+            yield view
+        finally:
+            view._builtin = self
+
+    @field("(n,)", "-", "-", "reward of the environment's task, per step")
+    def reward(self) -> Floats:
+        with self._beneath_it() as view:
+            terms = reward_terms(self._base, view)
+        return np.where(self._flights.began, 0.0, reduce(np.add, terms.values()))
+
+    @field("(n,) bool", "-", "-", "True where the environment's task terminates the episode")
+    def terminated(self) -> Truths:
+        with self._beneath_it() as view:
+            return truths(self._base, "terminated", view) & ~self._flights.began
+
+    @field("(n,) bool", "-", "-", "True where the environment's task cuts the episode short")
+    def truncated(self) -> Truths:
+        with self._beneath_it() as view:
+            return truths(self._base, "truncated", view) & ~self._flights.began
+
+    @field("(n,) int", "-", "-", "reason of the ending, see `quad_gym.records.Ending`")
+    def ending(self) -> NDArray[np.int64]:
+        over, why = self.terminated | self.truncated, self._beneath.ending
+        return np.where(over, np.where(why > 0, why, int(Ending.TASK)), 0)
+
+
+# --------------------------------------------------------------------------------------------------
+# `TaskBatch`: flights with the rewards, endings, observations and starts of a user's task.
+# --------------------------------------------------------------------------------------------------
 
 LARGEST_REWARD = 1e30
 """Larger rewards are errors; learning algorithms hold rewards in single precision."""
@@ -102,7 +490,7 @@ class TaskBatch(ReadableBatch):
         if self._failed.any():
             raise check.NotResetError(
                 f"call reset() before step(): a method of {label(self.own_task)} has failed for "
-                f"{answers.flights_named(np.flatnonzero(self._failed))}"
+                f"{flights_named(np.flatnonzero(self._failed))}"
             )
         self.view.forget()
         builtin = super().step(actions)
@@ -120,10 +508,10 @@ class TaskBatch(ReadableBatch):
             builtin = self._begin(self.began, {}, builtin)
         if "update" in self.methods:
             with self._writing(~self.began, _UPDATE_DRAWS) as rng:
-                answers.ask(self.own_task, "update", self.view, rng)
+                ask(self.own_task, "update", self.view, rng)
         terms: dict[str, Floats] = {}
         if "reward" in self.methods:
-            terms = answers.reward_terms(self.own_task, self.view)
+            terms = reward_terms(self.own_task, self.view)
         terminated, truncated = self._asked_truths("terminated"), self._asked_truths("truncated")
         observations = self._observed(builtin)
         if terms:
@@ -148,10 +536,10 @@ class TaskBatch(ReadableBatch):
         if "reset" not in self.methods:
             return builtin
         with self._writing(chosen, _RESET_DRAWS) as rng:
-            start = answers.ask(self.own_task, "reset", self.view, rng)
+            start = ask(self.own_task, "reset", self.view, rng)
         if start is not None:
             builtin = self._begin_again(
-                chosen, answers.starts(self.own_task, start, chosen, given, self.task, self.world)
+                chosen, starts(self.own_task, start, chosen, given, self.task, self.world)
             )
         return builtin
 
@@ -171,7 +559,7 @@ class TaskBatch(ReadableBatch):
         """Return value of `terminated` or `truncated`; None: the built-in endings stay."""
         if method not in self.methods:
             return None
-        return answers.truths(self.own_task, method, self.view)
+        return truths(self.own_task, method, self.view)
 
     def _write_rewards(self, terms: Mapping[str, Floats]) -> None:
         """Write rewards; flights that begin, or whose state is not finite, have none."""
@@ -180,7 +568,7 @@ class TaskBatch(ReadableBatch):
         if not sound.all():
             failed = ~sound & ~self.began
             failed[failed] = self.finite(np.flatnonzero(failed))
-            answers.require(~failed, self.own_task, "reward", rewards, "finite rewards")
+            require(~failed, self.own_task, "reward", rewards, "finite rewards")
         self._terms, self._rewarded = terms, sound & ~self.began
         reward = np.where(self._rewarded, self.reward_scale * rewards, 0.0)
         self._returns += reward
@@ -246,13 +634,13 @@ class TaskBatch(ReadableBatch):
 
     def ask_parts(self) -> dict[str, NDArray[Any]]:
         """Arrays that `observe` returns at the present instant, (count, k) each."""
-        return answers.parts(self.own_task, self._asked_to_observe(), self.count)
+        return parts_of(self.own_task, self._asked_to_observe(), self.count)
 
     def _asked_to_observe(self) -> Any:
         view = self.view
         view.hide(not self.own_task.privileged)
         try:
-            return answers.ask(self.own_task, "observe", view)
+            return ask(self.own_task, "observe", view)
         finally:
             view.hide(False)
 

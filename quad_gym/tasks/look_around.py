@@ -11,7 +11,7 @@ from quad_gym.tasks.rewards import Crash, Heading, Term, Tracking
 from quad_gym.tasks.task import ObservationSpec, Task
 
 if TYPE_CHECKING:
-    from quad_gym.params.sensors import SensorSuite
+    from quad_gym.params.suites import SensorSuite
     from quad_gym.params.world import WorldParams
     from quad_gym.tasks.view import View
 

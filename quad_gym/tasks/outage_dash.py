@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.obstacles import Wall
-from quad_gym.params.reward import RewardParams
+from quad_gym.params.task import RewardParams
+from quad_gym.params.world import Wall
 from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, Term
 from quad_gym.tasks.task import ObservationSpec, Task
 
 if TYPE_CHECKING:
-    from quad_gym.params.sensors import SensorSuite
+    from quad_gym.params.suites import SensorSuite
     from quad_gym.params.world import WorldParams
-    from quad_gym.tasks.random import FlightRandom
+    from quad_gym.tasks.task import FlightRandom
     from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
@@ -119,8 +119,12 @@ class OutageDash(Task):
 
     replaces_observation = True
     keeps: Collection[str] = (
-        *("last_action", "position_sigma", "velocity_sigma", "attitude_sigma"),
-        *("accel_bias_sigma", "gyro_bias_sigma"),
+        "last_action",
+        "position_sigma",
+        "velocity_sigma",
+        "attitude_sigma",
+        "accel_bias_sigma",
+        "gyro_bias_sigma",
     )
     observes: Mapping[str, ObservationSpec] = {
         "position_error": ObservationSpec("m", "B", -200.0, 200.0),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.reward import RewardParams
+from quad_gym.params.task import RewardParams
 from quad_gym.records import Ending
 
 if TYPE_CHECKING:
@@ -25,8 +25,11 @@ BLOCKS = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 """Blocks of the filter's covariance."""
 
 _CRASHES = (
-    *(Ending.OUT_OF_BOUNDS, Ending.TIPPED_OVER, Ending.BELOW_MIN_HEIGHT),
-    *(Ending.COLLISION, Ending.LEFT_GEOFENCE),
+    Ending.OUT_OF_BOUNDS,
+    Ending.TIPPED_OVER,
+    Ending.BELOW_MIN_HEIGHT,
+    Ending.COLLISION,
+    Ending.LEFT_GEOFENCE,
 )
 _CRASHED = np.array([float(ending in _CRASHES) for ending in range(max(Ending) + 1)])
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.reward import RewardParams
+from quad_gym.params.task import RewardParams
 from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, GatePassed, Progress, Term
 from quad_gym.tasks.task import Task
 

@@ -15,9 +15,9 @@ from typing import Literal
 from tyro.conf import Positional
 
 from quad_gym.analysis.reports import require_writable
+from quad_gym.batch.own_estimator import Estimator
 from quad_gym.commands.benchmark import BenchmarkArgs, run_sections
 from quad_gym.commands.options import SuiteNames, parse, require_at_least, usage_errors
-from quad_gym.estimation.own import Estimator
 from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import WIDTH

@@ -11,9 +11,8 @@ import gymnasium
 import numpy as np
 
 import quad_gym
-from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.interfaces import time_batch, time_env, time_single
-from quad_gym.experiments.benchmark.suites import hovering
+from quad_gym.commands import benchmark
+from quad_gym.commands.benchmark import hovering, time_batch, time_env, time_single
 from quad_gym.records import WIDTH
 from scripts.benchmarks.filter import record_one
 from scripts.benchmarks.peers import Estimate, MeasuredTick, peers
@@ -32,9 +31,9 @@ SIMULATORS: dict[str, tuple[str, Make]] = {
 """Module that registers an environment, and the function that makes it, or many of them."""
 
 
-def _time_simulators(scope: Scope) -> list[timing.Row]:
+def _time_simulators(scope: Scope) -> list[benchmark.Row]:
     """Time steps of this package at 50 Hz and of the others with their own rates."""
-    rows = list[timing.Row]()
+    rows = list[benchmark.Row]()
     for observation in ("estimate", "truth"):
         own: dict[str, Any] = {"observation": observation, "control_rate": 50}
         rows.append(time_single(scope.effort, **own))
@@ -52,9 +51,9 @@ def _time_simulators(scope: Scope) -> list[timing.Row]:
             timed, _ = time_env(env, itertools.repeat(rest), scope.effort)
         else:
             env.reset(seed=0)
-            timed = timing.measure(partial(env.step, rest), scope.effort)
+            timed = benchmark.measure(partial(env.step, rest), scope.effort)
             env.close()
-        rows.append(timing.report(name, timed.per(envs), envs=envs))
+        rows.append(benchmark.report(name, timed.per(envs), envs=envs))
     return [row | {"position": None, "attitude": None} for row in rows]
 
 
@@ -70,9 +69,9 @@ def _error(found: list[Estimate], flight: list[MeasuredTick]) -> tuple[float, fl
     return position, attitude
 
 
-def _time_filters(scope: Scope) -> list[timing.Row]:
+def _time_filters(scope: Scope) -> list[benchmark.Row]:
     """Time cycles of filters on fixes and baselines, and compare estimates with the truth."""
-    sensors, rows = quad_gym.sensor_suite("lab").replace(camera=None), list[timing.Row]()
+    sensors, rows = quad_gym.sensor_suite("lab").replace(camera=None), list[benchmark.Row]()
     # the filters start in motion: with the suite's 3 cm/s they would take velocity for tilt
     moving = sensors.estimator.replace(initial_velocity_variance=0.1)
     sensors = sensors.replace(estimator=moving)
@@ -83,27 +82,27 @@ def _time_filters(scope: Scope) -> list[timing.Row]:
     for name in runs[0]:
         found = [_error(run[name](), flight) for run, flight in zip(runs, flights, strict=True)]
         position, attitude = np.sqrt(np.mean(np.square(found), axis=0)).tolist()
-        timed = timing.measure(runs[0][name], scope.effort).per(ticks)
+        timed = benchmark.measure(runs[0][name], scope.effort).per(ticks)
         what = {"envs": 1, "position": position, "attitude": attitude}
-        rows.append(timing.report(f"filter cycle, {name}", timed, **what))
+        rows.append(benchmark.report(f"filter cycle, {name}", timed, **what))
     return rows
 
 
-def time_peers(scope: Scope) -> list[timing.Row]:
+def time_peers(scope: Scope) -> list[benchmark.Row]:
     """Time other simulators and other filters."""
     return _time_simulators(scope) + _time_filters(scope)
 
 
-SECTION = timing.Section(
+SECTION = benchmark.Section(
     time_peers,
     {
         "Simulators, a thread each, and filters on the same measurements": {
-            "steps or cycles": timing.NAME,
-            "envs": timing.column("envs", ","),
-            "per second": timing.per_second,
-            "spread": timing.SPREAD,
-            "position error, mm": timing.column("position", ".1f", 1e3),
-            "attitude error, deg": timing.column("attitude", ".3f", 180.0 / np.pi),
+            "steps or cycles": benchmark.NAME,
+            "envs": benchmark.column("envs", ","),
+            "per second": benchmark.per_second,
+            "spread": benchmark.SPREAD,
+            "position error, mm": benchmark.column("position", ".1f", 1e3),
+            "attitude error, deg": benchmark.column("attitude", ".3f", 180.0 / np.pi),
         }
     },
 )

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 import quad_gym
-from quad_gym.experiments.benchmark import timing
+from quad_gym.commands import benchmark
 from scripts.benchmarks.scope import Scope
 
 PACKAGE = Path(quad_gym.__file__).resolve().parent
@@ -72,12 +72,12 @@ def empty_cache(package: Path) -> None:
         file.unlink()
 
 
-def time_compile(scope: Scope) -> list[timing.Row]:
+def time_compile(scope: Scope) -> list[benchmark.Row]:
     """Time the first reset with an empty and a full cache, and a step after an edit.
 
     With `scope.quick`, only the fastest configuration and one edit are measured.
     """
-    quick, rows = scope.quick, list[timing.Row]()
+    quick, rows = scope.quick, list[benchmark.Row]()
 
     def add(name: str, cache: str, suite: str | None, seconds: float) -> None:
         print(f"  {name}, {cache}: {seconds:.1f} s", file=sys.stderr, flush=True)
@@ -103,14 +103,14 @@ def time_compile(scope: Scope) -> list[timing.Row]:
     return rows
 
 
-SECTION = timing.Section(
+SECTION = benchmark.Section(
     time_compile,
     {
         f"A new process with {ENVS:,} flights of the circle": {
-            "up to the first reset": timing.NAME,
+            "up to the first reset": benchmark.NAME,
             "suite": lambda row: row["suite"] or "-",
-            "cache": timing.column("cache"),
-            "s": timing.column("seconds", ".1f"),
+            "cache": benchmark.column("cache"),
+            "s": benchmark.column("seconds", ".1f"),
         }
     },
 )

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.suites import hovering
+from quad_gym.commands import benchmark
+from quad_gym.commands.benchmark import hovering
 from quad_gym.kernels.stages import Stage
 from quad_gym.records import FEATURE_SLICE, WIDTH, aligned_zeros
 from quad_gym.rotations import quaternion_to_dcm
@@ -39,9 +39,9 @@ def repeated(batch: FlightBatch, flights: NDArray[np.intp], count: int) -> NDArr
     return blocks
 
 
-def time_filter(scope: Scope) -> list[timing.Row]:
+def time_filter(scope: Scope) -> list[benchmark.Row]:
     """Time cycles of update and prediction on one core."""
-    rows: list[timing.Row] = []
+    rows: list[benchmark.Row] = []
     count, effort, recorded_ticks = scope.batch, scope.effort, 5 if scope.quick else 40
     with_camera = quad_gym.sensor_suite("lab")
     for measurements, sensors in ((6, with_camera.replace(camera=None)), (12, with_camera)):
@@ -56,34 +56,34 @@ def time_filter(scope: Scope) -> list[timing.Row]:
             update(blocks)
             predict(blocks)
 
-        def add(name: str, timed: timing.Timing, n: int = measurements) -> None:
+        def add(name: str, timed: benchmark.Timing, n: int = measurements) -> None:
             what = {"kind": name, "measurements": n, "suite": "lab"}
-            rows.append(timing.report(f"{name}, {n} measurements, lab", timed, **what))
+            rows.append(benchmark.report(f"{name}, {n} measurements, lab", timed, **what))
 
         start = blocks.copy()
 
         def again(blocks: Any = blocks, start: Any = start) -> None:
             blocks[:] = start
 
-        add("lanes", timing.measure(in_lanes, effort, again).per(count))
+        add("lanes", benchmark.measure(in_lanes, effort, again).per(count))
         recorded = record_one(batch, int(seeing[0]), recorded_ticks)
         recorded = [now for now in recorded if len(now.pixels) == features]
         for name, run in peers(sensors, recorded).items():
-            add(name, timing.measure(run, effort).per(len(recorded)))
+            add(name, benchmark.measure(run, effort).per(len(recorded)))
     of_lanes = {row["measurements"]: row["seconds"] for row in rows if row["kind"] == "lanes"}
     for row in rows:
         row["times_lanes"] = row["seconds"] / of_lanes[row["measurements"]]
     return rows
 
 
-SECTION = timing.Section(
+SECTION = benchmark.Section(
     time_filter,
     {
         "UKF cycle, one core": {
-            "filter": timing.NAME,
-            "us": timing.column("seconds", ",.2f", 1e6),
-            "spread": timing.SPREAD,
-            "x lanes": timing.column("times_lanes", ",.1f"),
+            "filter": benchmark.NAME,
+            "us": benchmark.column("seconds", ",.2f", 1e6),
+            "spread": benchmark.SPREAD,
+            "x lanes": benchmark.column("times_lanes", ",.1f"),
         }
     },
 )

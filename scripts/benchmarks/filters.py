@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.pd import PDPolicy
-from quad_gym.analysis.consistency import PARTS, InnovationRecorder, flight_errors
-from quad_gym.analysis.consistency_flights import ASTRAY, endless
-from quad_gym.analysis.intervals import in_brackets, mean_interval, rate_over_trainings
-from quad_gym.analysis.metrics import nees
+from quad_gym.analysis.consistency import ASTRAY, PARTS, InnovationRecorder, endless, flight_errors
+from quad_gym.analysis.metrics import in_brackets, mean_interval, nees, rate_over_trainings
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands import benchmark
 from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.evaluation import roll_out
-from quad_gym.experiments.benchmark import timing
-from quad_gym.faults.presets import possible
+from quad_gym.faults import possible
 from quad_gym.params.suites import sensor_suite
 from quad_gym.records import Source
 from scripts.benchmarks.posterior_bound import posterior_bound
@@ -42,7 +40,7 @@ HEADINGS = ("none", "GNSS outage", "GNSS outliers", "wrong features")
 Floats = NDArray[np.float64]
 
 
-def time_filters(scope: Scope) -> list[timing.Row]:
+def time_filters(scope: Scope) -> list[benchmark.Row]:
     """Fly every filter with every suite, and compute the bound of each suite."""
     rows = []
     for suite in scope.suites:
@@ -70,7 +68,7 @@ def time_filters(scope: Scope) -> list[timing.Row]:
     return rows
 
 
-EMPTY: timing.Row = {
+EMPTY: benchmark.Row = {
     **{f"{part}_rmse": None for part in QUANTITIES},
     **{f"{part}_ratio": None for part in QUANTITIES},
     **dict.fromkeys(("nees", "nis", "seconds", "tracking", "failed")),
@@ -107,7 +105,7 @@ def flights_on_truth(suite: str, estimator: str, scope: Scope) -> FlightBatch:
     )
 
 
-def on_truth(suite: str, estimator: str, scope: Scope) -> timing.Row:
+def on_truth(suite: str, estimator: str, scope: Scope) -> benchmark.Row:
     """Errors, consistency and time of a filter."""
     batch, stop = flights_on_truth(suite, estimator, scope), length_of(scope)
     batch.reset(seeds=range(scope.batch))
@@ -126,7 +124,7 @@ def on_truth(suite: str, estimator: str, scope: Scope) -> timing.Row:
             error, P = flight_errors(batch), batch.covariance()
             errors.append(error)
             squares.append(nees(error[:, MOTION], P[:, MOTION, MOTION]) / MOTION.stop)
-    row: timing.Row = {"seconds": seconds / tick / scope.batch}
+    row: benchmark.Row = {"seconds": seconds / tick / scope.batch}
     mean_squares = np.square(errors).mean(axis=0)  # over time
     for part in QUANTITIES:
         found = with_interval(mean_squares[:, PARTS[part]].mean(axis=1))
@@ -140,9 +138,9 @@ def on_truth(suite: str, estimator: str, scope: Scope) -> timing.Row:
     return row
 
 
-def on_estimate(suite: str, estimator: str, scope: Scope) -> timing.Row:
+def on_estimate(suite: str, estimator: str, scope: Scope) -> benchmark.Row:
     """Circles flown on the estimate: the tracking error, and the shares of lost flights."""
-    row: timing.Row = {"lost": {}}
+    row: benchmark.Row = {"lost": {}}
     for fault in FAULTS:
         if not possible(fault, sensor_suite(suite)):
             continue
@@ -173,42 +171,42 @@ def with_interval(values: Floats) -> list[float]:
     return [float(values.mean()), *mean_interval(values)]
 
 
-def _mean(key: str, form: str, scale: float = 1.0) -> timing.CellText:
+def _mean(key: str, form: str, scale: float = 1.0) -> benchmark.CellText:
     """Column of a mean, with its interval where there is one."""
 
-    def cell(row: timing.Row) -> str:
+    def cell(row: benchmark.Row) -> str:
         value = row[key]
         return "-" if value is None else in_brackets(value[0], value[1:] or None, form, scale)
 
     return cell
 
 
-def _lost(fault: str) -> timing.CellText:
+def _lost(fault: str) -> benchmark.CellText:
     """Column of the share of lost flights."""
     return lambda row: f"{row['lost'][fault][0]:.0%}" if fault in row["lost"] else "-"
 
 
-def _failures(rows: list[timing.Row]) -> str:
+def _failures(rows: list[benchmark.Row]) -> str:
     """Sentences about filters that failed."""
     failed = [row for row in rows if row["failed"]]
     return "".join(f"\n{row['suite']}, {row['name']}: {row['failed']}" for row in failed)
 
 
-SECTION = timing.Section(
+SECTION = benchmark.Section(
     time_filters,
     {
-        "": {"suite": timing.column("suite"), "filter": timing.NAME},
+        "": {"suite": benchmark.column("suite"), "filter": benchmark.NAME},
         "RMSE after 5 s": {
             "position [mm]": _mean("position_rmse", ".1f", 1e3),
             "velocity [mm/s]": _mean("velocity_rmse", ".1f", 1e3),
             "attitude [mrad]": _mean("attitude_rmse", ".2f", 1e3),
         },
-        "over the bound": {part: timing.column(f"{part}_ratio", ".2f") for part in QUANTITIES},
+        "over the bound": {part: benchmark.column(f"{part}_ratio", ".2f") for part in QUANTITIES},
         "per degree of freedom": {
             "NEES": _mean("nees", ".2f"),
-            "NIS": timing.column("nis", ".2f"),
+            "NIS": benchmark.column("nis", ".2f"),
         },
-        "a tick": {"us": timing.column("seconds", ",.1f", 1e6)},
+        "a tick": {"us": benchmark.column("seconds", ",.1f", 1e6)},
         "circle": {"error [mm]": _mean("tracking", ".0f", 1e3)},
         "lost with fault": {
             heading: _lost(fault) for heading, fault in zip(HEADINGS, FAULTS, strict=True)

@@ -120,7 +120,7 @@ def _prepare(folder: Path, name: str) -> str:
 
 def _module_of(batch: Any) -> dict[str, Any]:
     """Return what flights need on a GPU: plan, PTX, and the task in Python, if they have one."""
-    from quad_gym.device.emission import plan_of, ptx_of
+    from quad_gym.device import plan_of, ptx_of
 
     plan = plan_of(batch)
     return {"plan": plan, "ptx": ptx_of(plan), "task": getattr(batch, "made", None)}
@@ -128,7 +128,7 @@ def _module_of(batch: Any) -> dict[str, Any]:
 
 def _flights(content: dict[str, Any], count: int, make: Make, device: str) -> Any:
     """Return the flights of a file."""
-    from quad_gym.device.tasks import flights_on
+    from quad_gym.device import flights_on
 
     launcher = make(content["ptx"])
     return flights_on(device, content["plan"], count, launcher, content.get("task"))
@@ -258,7 +258,7 @@ class _Flights:
         self._batch = batch
 
     def reset(self, seed: int) -> tuple[Any, dict[str, Any]]:
-        from quad_gym.batch.seeding import keys_of
+        from quad_gym.batch.starts import keys_of
 
         return self._batch.reset(keys_of(np.arange(self._batch.count, dtype=np.uint64) + seed)), {}
 
@@ -320,7 +320,7 @@ def _on_cuda(ptx: bytes) -> Any:
     """Return the launcher on the GPU."""
     import torch
 
-    from quad_gym.device.launching import CudaLauncher
+    from quad_gym.device import CudaLauncher
 
     return CudaLauncher(ptx, torch.device("cuda"))
 

@@ -9,21 +9,19 @@ import tempfile
 from pathlib import Path
 
 from baselines.pd import PDPolicy
-from baselines.plans import Plan
-from baselines.recipes import recipe
-from baselines.seeds import first_seed
+from baselines.recipes import Plan, first_seed, recipe
 from baselines.training import train
+from quad_gym.commands import benchmark
 from quad_gym.evaluation import roll_out
-from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.experiment import read_evaluations
+from quad_gym.experiments import read_evaluations
 from scripts.benchmarks.scope import Scope
 
 ENV_ID = "QuadGym/Circle-v0"
 
 
-def time_learning(scope: Scope) -> list[timing.Row]:
+def time_learning(scope: Scope) -> list[benchmark.Row]:
     """Train with each seed; with `scope.quick`, one short training."""
-    quick, rows = scope.quick, list[timing.Row]()
+    quick, rows = scope.quick, list[benchmark.Row]()
     chosen = recipe(ENV_ID)
     chosen = chosen.replace(steps=(2 * 8_192 if quick else scope.steps) or chosen.steps)
     for seed in range(1 if quick else scope.seeds):
@@ -61,7 +59,7 @@ def pd_error(plan: Plan) -> float:
     return episodes.summary()["mean_error"]
 
 
-def summary(evaluations: list[dict[str, float]], pd: float) -> timing.Row:
+def summary(evaluations: list[dict[str, float]], pd: float) -> benchmark.Row:
     """First evaluation better than PD without a crash, and the last evaluation."""
     better = [r for r in evaluations if r["mean_error"] < pd and r["crash_rate"] == 0.0]
     last = evaluations[-1]
@@ -74,27 +72,27 @@ def summary(evaluations: list[dict[str, float]], pd: float) -> timing.Row:
     }
 
 
-def _in_words(rows: list[timing.Row]) -> str:
+def _in_words(rows: list[benchmark.Row]) -> str:
     """Number of trainings that became better than PD, and the latest of them."""
     times = [row["seconds_to_pd"] for row in rows if row["seconds_to_pd"] is not None]
     latest = f", the last after {max(times):.1f} s" if times else ""
     return f"\n{len(times)} of {len(rows)} below tuned PD{latest} of training."
 
 
-SECTION = timing.Section(
+SECTION = benchmark.Section(
     time_learning,
     {
-        "": {"seed": timing.column("seed", "d")},
+        "": {"seed": benchmark.column("seed", "d")},
         "below tuned PD after": {
-            "steps": timing.column("steps_to_pd", ",.0f"),
-            "s": timing.column("seconds_to_pd", ".1f"),
-            "PD [mm]": timing.column("pd_error", ".1f", 1e3),
+            "steps": benchmark.column("steps_to_pd", ",.0f"),
+            "s": benchmark.column("seconds_to_pd", ".1f"),
+            "PD [mm]": benchmark.column("pd_error", ".1f", 1e3),
         },
         "at the end": {
-            "steps": timing.column("steps", ","),
-            "s": timing.column("seconds", ".1f"),
-            "error [mm]": timing.column("error", ".1f", 1e3),
-            "crashed": timing.column("crash_rate", ".1%"),
+            "steps": benchmark.column("steps", ","),
+            "s": benchmark.column("seconds", ".1f"),
+            "error [mm]": benchmark.column("error", ".1f", 1e3),
+            "crashed": benchmark.column("crash_rate", ".1%"),
         },
     },
     _in_words,

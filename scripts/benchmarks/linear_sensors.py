@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.analysis.consistency import PARTS
-from quad_gym.estimation.filtering.engine import Engine
+from quad_gym.estimation.engine import Engine
 from quad_gym.kernels.entries import run_stage
 from quad_gym.kernels.stages import Stage
 from quad_gym.params.camera import CameraParams
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import SensorSuite
 from quad_gym.records import (
     AID_BLOCK,
     AID_FREEDOMS,

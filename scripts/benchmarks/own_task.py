@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym import rewards
-from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.interfaces import random_actions
+from quad_gym.commands import benchmark
+from quad_gym.commands.benchmark import random_actions
 from quad_gym.tasks.task import Task
 from scripts.benchmarks.scope import Scope
 
@@ -54,9 +54,9 @@ class OwnCircle(Task):
         }
 
 
-def time_own_task(scope: Scope) -> list[timing.Row]:
+def time_own_task(scope: Scope) -> list[benchmark.Row]:
     """Time steps of both tasks in alternation, at 50 Hz on the estimate."""
-    rows, effort = list[timing.Row](), scope.effort
+    rows, effort = list[benchmark.Row](), scope.effort
     options: dict[str, Any] = {"control_rate": 50.0, "threads": scope.threads}
     kinds = (options, {**options, "task": OwnCircle()})
     for count in COUNTS:
@@ -64,16 +64,18 @@ def time_own_task(scope: Scope) -> list[timing.Row]:
         steps = [partial(_step, env, random_actions(count)) for env in envs]
         for env in envs:
             env.reset(seed=0)
-        first = timing.by_turns([partial(timing.lasting, step, 1) for step in steps], 3)  # warms up
+        first = benchmark.by_turns(
+            [partial(benchmark.lasting, step, 1) for step in steps], 3
+        )  # warms up
         calls = max(1, round(effort.seconds / 4.0 / first[0].best))
-        jobs = [partial(timing.lasting, step, calls) for step in steps]
-        found = timing.by_turns(jobs, 4 * effort.repeats)
+        jobs = [partial(benchmark.lasting, step, calls) for step in steps]
+        found = benchmark.by_turns(jobs, 4 * effort.repeats)
         for env in envs:
             env.close()
         for name, timed in zip(("shipped", "own, in NumPy"), found, strict=True):
             share = found[0].best / timed.best
             label = f"circle {name}, {count} flights"
-            rows.append(timing.report(label, timed.per(count), envs=count, share=share))
+            rows.append(benchmark.report(label, timed.per(count), envs=count, share=share))
     return rows
 
 
@@ -81,14 +83,14 @@ def _step(env: Any, actions: Any) -> None:
     env.step(next(actions))
 
 
-SECTION = timing.Section(
+SECTION = benchmark.Section(
     time_own_task,
     {
         "The circle, built-in and as a user-defined task, 50 Hz, estimate": {
-            "task": timing.NAME,
-            "steps/s": timing.per_second,
-            "spread": timing.SPREAD,
-            "of shipped": timing.column("share", ".2f"),
+            "task": benchmark.NAME,
+            "steps/s": benchmark.per_second,
+            "spread": benchmark.SPREAD,
+            "of shipped": benchmark.column("share", ".2f"),
         }
     },
 )

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from quad_gym.experiments.benchmark import timing
+from quad_gym.commands import benchmark
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scope(timing.Scope):
+class Scope(benchmark.Scope):
     """Extent of the measurements."""
 
     batch: int

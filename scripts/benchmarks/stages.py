@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands import benchmark
+from quad_gym.commands.benchmark import hovering
 from quad_gym.envs.spaces import layout_bounds, observation_layout
-from quad_gym.experiments.benchmark import timing
-from quad_gym.experiments.benchmark.suites import hovering
-from quad_gym.kernels.entries import run_stage
-from quad_gym.kernels.linked import linked_table
+from quad_gym.kernels.entries import linked_table, run_stage
 from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.records import Act, Sensor
 from scripts.benchmarks.scope import Scope
@@ -73,23 +72,23 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
     return blocks
 
 
-def time_tick(scope: Scope) -> list[timing.Row]:
+def time_tick(scope: Scope) -> list[benchmark.Row]:
     """Time a whole tick on one core, per flight, and its stages, with `SUITES`."""
     return [row for suite in SUITES for row in _time_suite(suite, scope.batch, scope.effort)]
 
 
-def _time_suite(suite: str, count: int, effort: timing.Effort) -> list[timing.Row]:
+def _time_suite(suite: str, count: int, effort: benchmark.Effort) -> list[benchmark.Row]:
     batch = hovering(count, sensors=suite, bounds=layout_bounds(observation_layout()))
     start, blocks = over_a_period(batch), batch._blocks
 
     def again() -> None:
         batch.restore(start)
 
-    def add(name: str, timed: timing.Timing, kind: str) -> None:
-        rows.append(timing.report(f"{name}, {suite}", timed, part=name, kind=kind, suite=suite))
+    def add(name: str, timed: benchmark.Timing, kind: str) -> None:
+        rows.append(benchmark.report(f"{name}, {suite}", timed, part=name, kind=kind, suite=suite))
 
-    rows: list[timing.Row] = []
-    add("whole tick", timing.measure(batch.step, effort, again).per(count), "whole")
+    rows: list[benchmark.Row] = []
+    add("whole tick", benchmark.measure(batch.step, effort, again).per(count), "whole")
     needed = needed_stages(batch._settings[0]).keys()
     for when, kind in ((needed - AT_THE_START, "tick"), (needed & AT_THE_START, "start")):
         for stage in sorted(when):
@@ -98,28 +97,28 @@ def _time_suite(suite: str, count: int, effort: timing.Effort) -> list[timing.Ro
             def once(run: Staged = run) -> None:
                 run(blocks)
 
-            add(stage.name.lower(), timing.measure(once, effort, again).per(count), kind)
+            add(stage.name.lower(), benchmark.measure(once, effort, again).per(count), kind)
     for name, parts in (
         ("filter", [row for row in rows if row["part"] in {s.name.lower() for s in FILTER}]),
         ("sum of the tick's stages", [row for row in rows if row["kind"] == "tick"]),
     ):
-        add(name, timing.Timing(float(np.sum([row["seconds"] for row in parts])), 0.0), "sum")
+        add(name, benchmark.Timing(float(np.sum([row["seconds"] for row in parts])), 0.0), "sum")
     for row in rows:
         row["share"] = row["seconds"] / rows[0]["seconds"]
     return rows
 
 
-SECTION = timing.Section(
+SECTION = benchmark.Section(
     time_tick,
     {
         "One flight's tick, one core": {
-            "suite": timing.column("suite"),
+            "suite": benchmark.column("suite"),
             "stage": lambda row: (
                 row["part"] + (" (at the start)" if row["kind"] == "start" else "")
             ),
-            "us": timing.column("seconds", ".3f", 1e6),
-            "spread": timing.SPREAD,
-            "of the whole": timing.percent("share"),
+            "us": benchmark.column("seconds", ".3f", 1e6),
+            "spread": benchmark.SPREAD,
+            "of the whole": benchmark.percent("share"),
         }
     },
 )

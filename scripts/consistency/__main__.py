@@ -21,10 +21,10 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from quad_gym import sensor_suite
-from quad_gym.analysis.consistency_flights import ASTRAY
+from quad_gym.analysis.consistency import ASTRAY
 from quad_gym.analysis.reports import require_writable, versions, write_json
+from quad_gym.commands.consistency import CaseFlights
 from quad_gym.commands.options import SuiteName, Threads, parse, require_at_least, usage_errors
-from quad_gym.experiments.consistency import CaseFlights
 from scripts.consistency import ablation, matrix, recovery
 from scripts.consistency.tables import run_cases, unexpected
 

@@ -8,13 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quad_gym.analysis.consistency import PARTS
-from quad_gym.analysis.consistency_flights import Findings
+from quad_gym.analysis.consistency import PARTS, Findings
 from quad_gym.analysis.reports import text_table
-from quad_gym.experiments.benchmark.timing import by_turns, lasting
-from quad_gym.experiments.consistency import Case, CaseFlights, fly
-from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import sensor_suite
+from quad_gym.commands.benchmark import by_turns, lasting
+from quad_gym.commands.consistency import Case, CaseFlights, fly
+from quad_gym.params.suites import SensorSuite, sensor_suite
 from quad_gym.params.vehicle import vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from scripts.consistency.tables import CaseResults

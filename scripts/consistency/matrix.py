@@ -13,13 +13,11 @@ from typing import Any, Literal
 
 from quad_gym.analysis.consistency import PARTS, SENSOR_BLOCKS
 from quad_gym.analysis.metrics import chi_square_band
+from quad_gym.commands.consistency import Case, CaseFlights, fly
 from quad_gym.envs.config import TASK_DEFAULTS
-from quad_gym.experiments.consistency import Case, CaseFlights, fly
-from quad_gym.faults.presets import PRESETS, possible
-from quad_gym.params.distributions import Uniform
-from quad_gym.params.randomization import Randomization
-from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.suites import SUITES, sensor_suite
+from quad_gym.faults import PRESETS, possible
+from quad_gym.params.randomization import Randomization, Uniform
+from quad_gym.params.suites import SUITES, SensorSuite, sensor_suite
 from quad_gym.records import FREEDOMS
 from scripts.consistency.tables import CaseResults, case_table
 

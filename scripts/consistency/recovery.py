@@ -10,9 +10,16 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from quad_gym.experiments.consistency import Case, CaseFlights
-from quad_gym.faults import AccelBiasStep, Fault, GnssOutage, GyroBiasStep, PositionJump
-from quad_gym.faults.presets import PRESETS, possible
+from quad_gym.commands.consistency import Case, CaseFlights
+from quad_gym.faults import (
+    PRESETS,
+    AccelBiasStep,
+    Fault,
+    GnssOutage,
+    GyroBiasStep,
+    PositionJump,
+    possible,
+)
 from quad_gym.params.suites import SUITES, sensor_suite
 from scripts.consistency.recovered import REQUIRED, Recovery, follow_recovery
 from scripts.consistency.tables import CaseResults, case_table

@@ -10,14 +10,14 @@ from tqdm import tqdm
 
 import quad_gym
 from quad_gym.analysis.reports import as_json, versions, write_json
-from quad_gym.experiments.consistency import Case, CaseFlights
+from quad_gym.commands.consistency import Case, CaseFlights
 
 CaseResults = dict[str, dict[str, Any]]  #: results of cases, by name
 
 
 def flights_digest() -> str:
     """Digest of all sources on which flights depend: after a change, they are measured again."""
-    root, apart = Path(quad_gym.__file__).parent, {"commands", "experiments", "rendering"}
+    root, apart = Path(quad_gym.__file__).parent, {"commands", "experiments.py", "rendering"}
     files = (f for f in sorted(root.rglob("*.py")) if not apart & {*f.relative_to(root).parts})
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 

@@ -21,14 +21,13 @@ from typing import Annotated, Literal
 from tyro.conf import arg
 
 from baselines.keeping import RunError
-from baselines.recipes import Recipe, recipe
-from baselines.seeds import first_seed
+from baselines.recipes import Recipe, first_seed, recipe
 from baselines.training import train
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
-from quad_gym.experiments.driver import progress, stopped
+from quad_gym.experiments import progress, stopped
 from scripts.studies.arms import Arm, chosen_arms, read_arms
 from scripts.studies.films import require_film, write_film
 from scripts.studies.report import conclusions, table_text, write_report

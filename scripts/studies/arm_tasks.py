@@ -17,7 +17,7 @@ from quad_gym.tasks.task import ObservationSpec
 from scripts.studies import residuals
 
 if TYPE_CHECKING:
-    from quad_gym.tasks.random import FlightRandom
+    from quad_gym.tasks.task import FlightRandom
     from quad_gym.tasks.view import View
 
 REMEMBERED = 4  #: number of instants in a history

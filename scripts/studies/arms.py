@@ -16,7 +16,7 @@ from baselines.policies import is_included
 from baselines.recipes import ALGORITHMS, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
-from quad_gym.params.checked import Checked
+from quad_gym.params.checks import Checked
 
 
 def _word(name: str, value: Any) -> str:
@@ -73,7 +73,7 @@ class Arm(Checked, kw_only=False):
 
     @property
     def engine(self) -> str:
-        """Training engine of the arm, one of `baselines.plans.ENGINES`."""
+        """Training engine of the arm, one of `baselines.recipes.ENGINES`."""
         return "compiled" if self.algorithm == "ppo" else "sb3"
 
 

@@ -16,8 +16,14 @@ _WITH_STD = "baselines.arm_tasks:WithStd"
 
 
 _NOISES = (
-    *("accel_noise_density", "gyro_noise_density", "accel_vibration", "gyro_vibration"),
-    *("accel_bias_sigma", "gyro_bias_sigma", "accel_scale_sigma", "accel_misalignment_sigma"),
+    "accel_noise_density",
+    "gyro_noise_density",
+    "accel_vibration",
+    "gyro_vibration",
+    "accel_bias_sigma",
+    "gyro_bias_sigma",
+    "accel_scale_sigma",
+    "accel_misalignment_sigma",
 )
 """Parameters of all IMU errors, which the filter may assume wrongly."""
 

@@ -14,8 +14,8 @@ from scipy.signal import savgol_filter
 
 from baselines.crazyflie_pid import CrazyfliePID
 from quad_gym import SensorSuite, Uniform, VehicleParams, WorldParams, sensor_suite
-from quad_gym.estimation.logs.tables import csv_columns
-from quad_gym.params.gravity import GRAVITY
+from quad_gym.logs.formats.tables import csv_columns
+from quad_gym.params.vehicle import GRAVITY
 from quad_gym.rotations import quaternion_to_dcm
 from scripts.studies.onboard_filter import OnboardFilter
 
@@ -188,12 +188,19 @@ def fly(
     """
     seconds = max(float(log.time[-1]) for log in logs)
     keywords: dict[str, Any] = {
-        **{"vehicle": vehicle, "world": world, "randomization": randomization},
+        "vehicle": vehicle,
+        "world": world,
+        "randomization": randomization,
         **({"estimator": OnboardFilter()} if onboard else {"filter_start": "warm"}),
         "sensors": suite.replace(imu=suite.imu.replace(rate=RATE)),
         "true_sensors": suite.replace(imu=IMU.replace(rate=RATE)),
-        **{"action": "motor", "layout": "absolute", "control_rate": RATE},
-        **{"start": "ground", "radius": 1e-6, "out_of_bounds": 100.0, "duration": seconds + 1.0},
+        "action": "motor",
+        "layout": "absolute",
+        "control_rate": RATE,
+        "start": "ground",
+        "radius": 1e-6,
+        "out_of_bounds": 100.0,
+        "duration": seconds + 1.0,
     }
     env: Any = gymnasium.make_vec("QuadGym/Hover-v0", len(logs) * draws, **keywords)
     policy, batch = CrazyfliePID(env), env.unwrapped.flights.batch

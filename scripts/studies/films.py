@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from quad_gym.experiments.flown import flight_of_episode
+from quad_gym.experiments import flight_of_episode
 from quad_gym.rendering.canvas import load_pygame
-from quad_gym.rendering.side_by_side import Side, save_side_by_side
-from quad_gym.rendering.video import checked_video_path
+from quad_gym.rendering.video import Side, checked_video_path, save_side_by_side
 from scripts.studies.study import Study, StudyResults
 
 RATE = 10.0  #: pictures per second of a film

@@ -20,7 +20,7 @@ from scipy.special import ndtr
 
 from baselines.pd import MARGIN, WAITS_BEFORE, PDPolicy
 from quad_gym.params import checks as check
-from quad_gym.params.gravity import GRAVITY
+from quad_gym.params.vehicle import GRAVITY
 from quad_gym.tasks.look_around import HEADING_WEIGHT
 from quad_gym.tasks.outage_dash import CRASH_COST, PROGRESS_WEIGHT
 

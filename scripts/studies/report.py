@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from quad_gym import IDS, sensor_suite
-from quad_gym.analysis.comparison_plots import learning_figure
-from quad_gym.analysis.intervals import Estimated, in_brackets
-from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
-from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.experiments.pages import Report
+from quad_gym.analysis.metrics import Estimated, in_brackets
+from quad_gym.analysis.plots import learning_figure
+from quad_gym.analysis.reports import Report, stacked, text_table, versions, write_csv, write_json
+from quad_gym.envs.config import BENCHMARKS
 from scripts.studies.films import CHOICES, label_of, pair_of
 from scripts.studies.plots import glance_figure, pace_figure
 from scripts.studies.scores import difference
@@ -162,7 +161,7 @@ def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
         f"{flown} episodes with each policy, evaluated on the "
         "estimate unless the arm says otherwise. A crashed episode counts with the position error "
         "out_of_bounds of the task from its crash on. Means over seeds; in brackets 95 % "
-        "intervals over seeds and episodes (quad_gym.analysis.intervals). Success: "
+        "intervals over seeds and episodes (quad_gym.analysis.metrics). Success: "
         f"{study.about.meaning}.",
     )
     report.add_table(heads, rows)

@@ -121,10 +121,10 @@ def fit_task(env_id: str, policy: str = "pd", episodes: int = 500) -> ResidualMo
     Args:
         env_id: Id from `quad_gym.IDS`.
         policy: Name or file, see `baselines.policies.load_policy`.
-        episodes: Number of episodes, with seeds for training (`baselines.seeds`).
+        episodes: Number of episodes, with seeds for training (`baselines.recipes`).
     """
     from baselines.policies import load_policy
-    from baselines.seeds import first_seed
+    from baselines.recipes import first_seed
 
     env = gymnasium.make_vec(env_id, num_envs=episodes)
     errors, velocities = record(load_policy(policy, env), env, first_seed("training", 0, episodes))

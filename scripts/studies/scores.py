@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.analysis.intervals import TAIL, Estimated, center_of, half_width, variance_of
+from quad_gym.analysis.metrics import TAIL, Estimated, center_of, half_width, variance_of
 
 Floats = NDArray[np.float64]
 Score = Callable[[Floats], Floats]  #: from numbers (..., e) of episodes to one number (...)

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.plans import Plan
-from baselines.recipes import Recipe
-from quad_gym.analysis.intervals import Estimated, rate_over_trainings
+from baselines.recipes import Plan, Recipe
+from quad_gym.analysis.metrics import Estimated, rate_over_trainings
 from quad_gym.analysis.reports import as_json
 from quad_gym.envs.config import with_effect
 from quad_gym.evaluation import Policy
-from quad_gym.experiments.experiment import Experiment, Floats
-from quad_gym.experiments.flown import Flown, Trial
+from quad_gym.experiments import Experiment, Floats, Flown, Trial
 from scripts.studies.arms import Arm
 from scripts.studies.planning import PlanningPolicy
 from scripts.studies.scores import Score, mean_over_trainings, probability_of_improvement

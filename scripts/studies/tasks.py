@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.experiments.flown import Flown
+from quad_gym.experiments import Flown
 from scripts.studies.arms import ARMS, OUTAGE_DASH, STALE_RACE, Arm
 from scripts.studies.scores import Score, mean, worst_tenth
 
@@ -93,8 +93,11 @@ STUDIED: Mapping[str, StudiedTask] = {
     "look_around": StudiedTask(
         arms=ARMS,
         carrying=(
-            *("pd_reference", "pd_features", "pd_features_when_uncertain"),
-            *("truth", "std_certainty"),
+            "pd_reference",
+            "pd_features",
+            "pd_features_when_uncertain",
+            "truth",
+            "std_certainty",
         ),
         success=stays,
         meaning=f"completed, with a mean position error below {WITHIN:g} m in the second half",
@@ -111,7 +114,11 @@ STUDIED: Mapping[str, StudiedTask] = {
     "stale_race": StudiedTask(
         arms=STALE_RACE,
         carrying=(
-            *("pd", "truth", "std", "truth_on_truth", "truth_delay_compensated"),
+            "pd",
+            "truth",
+            "std",
+            "truth_on_truth",
+            "truth_delay_compensated",
             "std_delay_compensated",
         ),
         evaluations=8,

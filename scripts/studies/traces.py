@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.experiments.flown import Floats
+from quad_gym.experiments import Floats
 
 MARKERS = 2  #: number of features that determine position and heading if the vertical is known
 

@@ -4,8 +4,7 @@ import numpy as np
 
 import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
-from quad_gym.faults import RotorLoss
-from quad_gym.faults.presets import faults_of
+from quad_gym.faults import RotorLoss, faults_of
 from tests.estimators import Certain, Simple
 from tests.golden.flights import AIDED
 from tests.tasks.tasks import Chase, Near

@@ -3,8 +3,8 @@
 import json
 
 from quad_gym.commands import benchmark as script
+from quad_gym.commands.benchmark import Timing, by_turns
 from quad_gym.commands.options import parse
-from quad_gym.experiments.benchmark.timing import Timing, by_turns
 
 
 def run(folder, *options):

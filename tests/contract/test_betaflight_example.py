@@ -10,8 +10,7 @@ from baselines.policies import load_policy
 from docs.examples.betaflight import BehindBetaflight, firmware, firmware_settings, flights_behind
 from docs.examples.betaflight.rate_loop import Motors
 from quad_gym.evaluation import roll_out
-from quad_gym.params.control import ActionParams
-from quad_gym.params.vehicle import vehicle_params
+from quad_gym.params.vehicle import ActionParams, vehicle_params
 
 needs_firmware = pytest.mark.skipif(
     not firmware.is_built(),

@@ -13,7 +13,7 @@ from gymnasium.vector import AsyncVectorEnv
 
 from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.kernels import cores
+from quad_gym.kernels import library
 from tests.builders import actions_of, run_python, vec_env
 from tests.contract.comparing import assert_same
 from tests.contract.hovering import SHORT, make_hover, next_steps
@@ -106,12 +106,12 @@ def test_cores_are_limited_by_quota_affinity_and_variable(monkeypatch):
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
     for quota, expected in ((None, 16), (4, 4), (64, 16)):
-        monkeypatch.setattr(cores, "_cgroup_cores", lambda quota=quota: quota)
-        assert cores.available_cores() == expected
-    monkeypatch.setattr(cores, "_cgroup_cores", lambda: None)
+        monkeypatch.setattr(library, "_cgroup_cores", lambda quota=quota: quota)
+        assert library.available_cores() == expected
+    monkeypatch.setattr(library, "_cgroup_cores", lambda: None)
     for limit, expected in (("3", 3), ("999", 16), ("", 16), ("0", 16), ("-2", 16), ("many", 16)):
         monkeypatch.setenv("NUMBA_NUM_THREADS", limit)
-        assert cores.available_cores() == expected
+        assert library.available_cores() == expected
 
 
 def test_an_environment_takes_the_available_cores(monkeypatch):

@@ -22,8 +22,16 @@ def read_csv(file):
 def test_evaluate_writes_the_printed_numbers(tmp_path):
     done = run(
         "evaluate",
-        *("--policy", "pd", "pd:lab", "pretrained", "--episodes", 20, "--output", tmp_path / "out"),
-        *("--env", "duration=10.0"),
+        "--policy",
+        "pd",
+        "pd:lab",
+        "pretrained",
+        "--episodes",
+        20,
+        "--output",
+        tmp_path / "out",
+        "--env",
+        "duration=10.0",
         where=tmp_path,
         figures=True,
     )

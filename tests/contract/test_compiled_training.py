@@ -12,9 +12,8 @@ import pytest
 from baselines.compiled_ppo import CompiledPPO
 from baselines.keeping import STATE
 from baselines.mlp import MlpPolicy
-from baselines.plans import Plan
 from baselines.policies import PRETRAINED, load_policy
-from baselines.recipes import recipe
+from baselines.recipes import Plan, recipe
 from baselines.training import export, train
 from tests import console_commands
 from tests.builders import run_python

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.analysis.consistency import MeanSquare
-from quad_gym.analysis.consistency_flights import Findings
+from quad_gym.analysis.consistency import Findings, MeanSquare
 from tests import console_commands
 
 

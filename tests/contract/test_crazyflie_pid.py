@@ -17,8 +17,12 @@ RATE = 500.0
 def environment(**keywords):
     suite = quad_gym.sensor_suite("mocap")
     given = {
-        **{"action": "motor", "layout": "absolute", "control_rate": RATE},
-        **{"observation": "truth", "vehicle": "crazyflie", "radius": 1e-6},
+        "action": "motor",
+        "layout": "absolute",
+        "control_rate": RATE,
+        "observation": "truth",
+        "vehicle": "crazyflie",
+        "radius": 1e-6,
         "sensors": suite.replace(imu=suite.imu.replace(rate=RATE)),
     }
     return gymnasium.make_vec("QuadGym/Hover-v0", 1, **{**given, **keywords})

@@ -10,10 +10,8 @@ import time
 import pytest
 
 from baselines.keeping import BusyError, holder, is_locked, locked
-from quad_gym.experiments.driver import Driver
-from quad_gym.experiments.processes import Ended, work
-from quad_gym.experiments.sweep_plan import expand, read
-from quad_gym.experiments.sweep_table import FILES
+from quad_gym.commands.sweep import FILES, expand, read
+from quad_gym.experiments import Driver, Ended, work
 from tests import console_commands
 from tests.contract.test_sweep import SMALL, TRUTH, pretend
 

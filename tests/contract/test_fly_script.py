@@ -20,7 +20,7 @@ def fly(*options, cwd, **environment):
 def test_fly_writes_video_and_flight_that_replays_to_same_video(tmp_path):
     size = ("--size", 320, 240, "--fps", 5)
     done = fly(
-        *("hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif"), cwd=tmp_path
+        "hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif", cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
     assert "time limit after 1.00 s" in done.stdout

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from quad_gym.records.width import WIDTHS
+from quad_gym.records.sizes import WIDTHS
 from tests.golden.flights import DIGESTS, cases, fly
 
 GOLDEN, CASES = json.loads(DIGESTS.read_text()), cases()

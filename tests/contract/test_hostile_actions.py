@@ -51,11 +51,19 @@ def refuses(env, action):
 
 MASKED = np.ma.masked_array(np.zeros(4), mask=[0, 0, 1, 0])
 ROWS = [
-    *(MASKED, np.array([0.0, np.nan, 0.0, 0.0]), [0.0, 0.0, 0.0, -np.inf], np.zeros((4, 1))),
-    *([0.0, None, 0.0, 0.0], ["0.1", "0.2", "0.3", "0.4"], [b"0", b"1", b"0", b"1"]),
-    *(np.array([1j, 0.0, 0.0, 0.0]), [1j, 0.0, 0.0, 0.0], np.array([0, 1, 2, 3], "datetime64[s]")),
+    MASKED,
+    np.array([0.0, np.nan, 0.0, 0.0]),
+    [0.0, 0.0, 0.0, -np.inf],
+    np.zeros((4, 1)),
+    [0.0, None, 0.0, 0.0],
+    ["0.1", "0.2", "0.3", "0.4"],
+    [b"0", b"1", b"0", b"1"],
+    np.array([1j, 0.0, 0.0, 0.0]),
+    [1j, 0.0, 0.0, 0.0],
+    np.array([0, 1, 2, 3], "datetime64[s]"),
     [10**400, 0, 0, 0],  # too large for a float
-    *([[0.0], [0.0, 1.0], 0.0, 0.0], [set(), set(), set(), set()]),
+    [[0.0], [0.0, 1.0], 0.0, 0.0],
+    [set(), set(), set(), set()],
 ]
 NO_ACTIONS = [None, "forward", 0.0, {}, {"a": 1}, object(), (), [], np.zeros((2, 4))]
 
@@ -102,7 +110,9 @@ def test_actions_of_any_real_type_or_sequence_are_accepted(interface):
     dtypes = [np.float64, np.float32, np.float16, np.int64, np.int8, bool]
     for action in [
         *(plain.astype(dtype) for dtype in dtypes),
-        *(for_all(interface, row), tuple(for_all(interface, tuple(row))), padded[..., 1]),
+        for_all(interface, row),
+        tuple(for_all(interface, tuple(row))),
+        padded[..., 1],
     ]:
         env = make(interface)
         env.step(action)

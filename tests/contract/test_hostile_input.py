@@ -15,7 +15,7 @@ import pytest
 import quad_gym
 from quad_gym import BarometerParams, FlightBatch, TaskParams, WorldParams
 from quad_gym import faults as fault_kinds
-from quad_gym.faults.base import DirectedFault
+from quad_gym.faults import DirectedFault
 from quad_gym.records import Control
 from tests.builders import flat
 from tests.filter_states import at_rest
@@ -277,7 +277,9 @@ def test_any_value_of_fault_field_is_refused_by_name_or_flown(kind, name, half):
         *(("initialize", name) for name in ("gnss_position_G", "gnss_baseline_G", "heading")),
         *(("set_state", name) for name in ("position", "R_BI", "covariance")),
         *(("update", f"gnss_{name}_G") for name in ("position", "baseline", "velocity")),
-        *(("update", "pixels"), ("predict", "gyro"), ("predict", "accel")),
+        ("update", "pixels"),
+        ("predict", "gyro"),
+        ("predict", "accel"),
     ],
 )
 def test_any_value_of_filter_argument_is_refused_by_name_or_finite(kind, method, name):

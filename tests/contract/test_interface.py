@@ -71,7 +71,7 @@ def test_declared_keywords_match_task_params_and_flight_batch():
     fields = {field.name for field in dataclasses.fields(quad_gym.TaskParams)} - {"kind"}
     assert set(inspect.get_annotations(TaskKeywords)) == fields == set(TASK_KEYWORDS)
     of_flights = set(inspect.signature(FlightBatch).parameters)
-    assert set(DEFAULTS) - of_flights == {*("observation", "action", "camera", "reward_terms")}
+    assert set(DEFAULTS) - of_flights == {"observation", "action", "camera", "reward_terms"}
     others = {"max_episode_steps", *RENDERING_KEYWORDS, *TASK_KEYWORDS}
     assert set(inspect.get_annotations(EnvKeywords)) == set(DEFAULTS) | others
 

@@ -8,7 +8,7 @@ import quad_gym
 from quad_gym import Wall, WorldParams
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.flights.record import Flight
+from quad_gym.flights import Flight
 from quad_gym.records import Ending
 from quad_gym.tasks.rewards import Crash
 from tests.builders import recorded_flight, single_env

@@ -431,12 +431,12 @@ def test_commands_fly_on_an_estimator(named, tmp_path):
     (other,) = json.loads((tmp_path / "b" / "summary.json").read_text())["cases"]
     assert cases[1]["estimation_error"] > 1.5 * other["estimation_error"]
     flown = console_commands.run(
-        *("fly", "hover", "--duration", 0.5, "--output", tmp_path / "flight.npz"), *own
+        "fly", "hover", "--duration", 0.5, "--output", tmp_path / "flight.npz", *own
     )
     assert flown.returncode == 0, flown.stderr
     assert np.isnan(quad_gym.Flight.load(tmp_path / "flight.npz")["nees"][1:]).all()
     film = console_commands.run(
-        *("fly", "hover", "--duration", 0.2, "--output", tmp_path / "flight.gif"), *own
+        "fly", "hover", "--duration", 0.2, "--output", tmp_path / "flight.gif", *own
     )
     assert film.returncode == 0, film.stderr
     wrong = console_commands.run("fly", "hover", *own, "--env", "estimator=ekf")
@@ -461,9 +461,26 @@ def test_consistency_command_uses_own_estimator(tmp_path, monkeypatch):
 
 def test_train_command_uses_own_estimator(named, tmp_path):
     done = console_commands.run(
-        *("train", "hover", "--engine", "compiled", "--steps", 4096, "--n-envs", 8),
-        *("--set", "n_steps=32", "batch_size=64", "--evaluations", 1, "--episodes", 2),
-        *("--estimator", named, "--output", tmp_path / "run", "--no-progress"),
+        "train",
+        "hover",
+        "--engine",
+        "compiled",
+        "--steps",
+        4096,
+        "--n-envs",
+        8,
+        "--set",
+        "n_steps=32",
+        "batch_size=64",
+        "--evaluations",
+        1,
+        "--episodes",
+        2,
+        "--estimator",
+        named,
+        "--output",
+        tmp_path / "run",
+        "--no-progress",
     )
     assert done.returncode == 0, done.stderr
     plan = json.loads((tmp_path / "run" / "training.json").read_text())

@@ -50,7 +50,8 @@ def direct():
 @pytest.mark.parametrize(
     ("action", "layout"),
     [
-        *(("motor", "relative"), ("wrench", "absolute")),
+        ("motor", "relative"),
+        ("wrench", "absolute"),
         *(
             pytest.param(*both, marks=pytest.mark.slow)
             for both in (("motor", "absolute"), ("wrench", "relative"))

@@ -22,6 +22,7 @@ from quad_gym import (
     Uniform,
     UnscentedKalmanFilter,
 )
+from quad_gym.configuration import FlightConfiguration
 from quad_gym.faults import (
     CameraOcclusion,
     Fault,
@@ -30,9 +31,8 @@ from quad_gym.faults import (
     PositionJump,
     RotorLoss,
     WrongAssociations,
+    faults_of,
 )
-from quad_gym.faults.presets import faults_of
-from quad_gym.packing.configuration import FlightConfiguration
 from quad_gym.records import Control, Source
 from tests.builders import MAKERS, single_env
 
@@ -188,8 +188,13 @@ DRAWS = [
     *(
         ({name: Uniform(0.0, 0.0)}, f"randomization of '{name}'.*Params.{name} must be")
         for name in (
-            *("accel_noise_density", "gyro_noise_density", "accel_bias_sigma"),
-            *("gyro_bias_sigma", "position_sigma_I", "baseline_sigma", "pixel_sigma"),
+            "accel_noise_density",
+            "gyro_noise_density",
+            "accel_bias_sigma",
+            "gyro_bias_sigma",
+            "position_sigma_I",
+            "baseline_sigma",
+            "pixel_sigma",
         )
     ),
     *(

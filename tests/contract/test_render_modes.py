@@ -181,7 +181,7 @@ def test_pygame_is_imported_at_the_first_drawing():
     done = run_code(
         """
 import os, sys, gymnasium, numpy as np, quad_gym
-from quad_gym.flights.record import FlightRecorder
+from quad_gym.flights import FlightRecorder
 import quad_gym.rendering
 env = gymnasium.make("QuadGym/Hover-v0")
 env.reset(seed=0), env.step(np.zeros(4, np.float32))

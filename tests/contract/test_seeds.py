@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from baselines.seeds import BLOCK, MAX_SEED, PURPOSES, TEST_END, first_seed, flight_seeds
+from baselines.recipes import BLOCK, MAX_SEED, PURPOSES, TEST_END, first_seed, flight_seeds
 from tests.builders import vec_env
 
 SEEDS, COUNT = range(10), 256
@@ -68,10 +68,8 @@ def test_refuses_seeds_out_of_their_block(purpose, seed, count, message):
 def test_trainings_are_evaluated_on_seeds_of_validation_block():
     """The algorithm also seeds its environment, which must not change the flights."""
     pytest.importorskip("stable_baselines3")
-    from baselines.checkpoints import Keeper
-    from baselines.models import make_model
-    from baselines.plans import Plan
-    from baselines.recipes import recipe
+    from baselines.models import Keeper, make_model
+    from baselines.recipes import Plan, recipe
 
     flown = []
     for seed in (0, 4):

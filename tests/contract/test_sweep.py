@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from baselines.plans import description
-from quad_gym.experiments.sweep_plan import expand
-from quad_gym.experiments.sweep_table import FILES, groups_of, row_of, write_tables
+from baselines.recipes import description
+from quad_gym.commands.sweep import FILES, expand, groups_of, row_of, write_tables
 from tests import console_commands
 
 TRUTH = {"duration": 1.0, "observation": "truth"}

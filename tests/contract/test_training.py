@@ -17,9 +17,13 @@ pytest.importorskip("stable_baselines3")
 
 from baselines.mlp import MlpPolicy, mlp_of  # noqa: E402
 from baselines.models import _checked_parameters, algorithm_class, make_model  # noqa: E402
-from baselines.plans import Plan  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
-from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
+from baselines.recipes import (  # noqa: E402
+    ALGORITHMS,
+    Plan,
+    Recipe,
+    recipe,
+)
 from baselines.training import train  # noqa: E402
 from quad_gym.evaluation import roll_out  # noqa: E402
 from tests import console_commands  # noqa: E402
@@ -98,14 +102,15 @@ def test_td3_explores_with_action_noise():
 @pytest.mark.parametrize(
     ("algorithm", "steps"),
     [
-        *(("ppo", 70), ("sac", 75)),
+        ("ppo", 70),
+        ("sac", 75),
         *(pytest.param(*case, marks=pytest.mark.slow) for case in (("ppo", 20), ("td3", 75))),
     ],
 )
 def test_resumed_run_equals_uninterrupted_run(tmp_path, monkeypatch, algorithm, steps):
     plan = small_plan(algorithm)
     train(plan, tmp_path / "whole", **QUIET)
-    from baselines.checkpoints import Keeper
+    from baselines.models import Keeper
 
     calls = iter(range(10_000))
 

@@ -7,7 +7,7 @@ import pytest
 import quad_gym
 from baselines import PDPolicy
 from quad_gym import FlightBatch, FlightRecorder, TaskParams, Trajectory, Wall, WorldParams
-from quad_gym.batch.surroundings import nearest_obstacle
+from quad_gym.batch.starts import nearest_obstacle
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Source

@@ -32,8 +32,14 @@ ARGUMENTS = {
 """Arguments of wrappers that have no default."""
 PICTURES = {"AddRenderObservation", "HumanRendering", "RenderCollection"}
 OTHERS = {
-    *("AtariPreprocessing", "AddWhiteNoise", "FilterObservation", "GrayscaleObservation"),
-    *("ObstructView", "ResizeObservation", "RecordVideo", "vector"),
+    "AtariPreprocessing",
+    "AddWhiteNoise",
+    "FilterObservation",
+    "GrayscaleObservation",
+    "ObstructView",
+    "ResizeObservation",
+    "RecordVideo",
+    "vector",
 }
 """Wrappers of pictures and of dictionaries as observations, and the module of the others.
 `test_render_modes.py` records videos."""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quad_gym.device.emission import LANES
+from quad_gym.device import LANES
 from quad_gym.records import WARP, WIDTH, Call
 
 ROOT = Path(__file__).parents[2]
@@ -24,21 +24,21 @@ ROOT = Path(__file__).parents[2]
 
 def write_library(file, settings, stages, *, module=False):
     """Write a library with the code of a configuration; `module`: as one module, as for a GPU."""
-    from quad_gym.kernels.compiling import building, device, foreign
+    from quad_gym.kernels.compiling import building
     from quad_gym.kernels.library import machine
 
     lanes = {"x86_64": 4, "aarch64": 2}[machine()]
     host = building.PROCESSORS[machine()][lanes]
     if module:
-        found = device.module_of(settings, stages, host)
-        objects = [bytes(foreign.machine_of(host).emit_object(found))]
+        found = building.module_of(settings, stages, host)
+        objects = [bytes(building.machine_of(host).emit_object(found))]
     else:
-        names = [device.ENTRY, *sorted(set(stages.values()))]
-        missing = [name for name in names if not foreign.is_cached(name, host)]
+        names = [building.ENTRY, *sorted(set(stages.values()))]
+        missing = [name for name in names if not building.is_cached(name, host)]
         if len(missing) > 1:
             building.objects_of(missing, host)
-        objects = [foreign.object_of(name, host) for name in names]
-        objects.append(foreign.emitted(device.dispatcher(settings, stages), host))
+        objects = [building.object_of(name, host) for name in names]
+        objects.append(building.emitted(building.dispatcher(settings, stages), host))
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder, f"{k}.o") for k in range(len(objects))]
         for made, content in zip(files, objects, strict=True):
@@ -73,7 +73,7 @@ def launcher_of(plan):
 
 def _by_threads(batch, command, *, module, made):
     """Fly a command of a batch by device code: in place of `FlightBatch._fly`."""
-    from quad_gym.batch.calls import address_of
+    from quad_gym.batch.memory import address_of
     from quad_gym.kernels.stages import STAGE_TABLE
 
     if id(batch) not in made:

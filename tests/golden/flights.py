@@ -14,7 +14,7 @@ import numpy as np
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.faults.presets import PRESETS
+from quad_gym.faults import PRESETS
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.suites import ALL_SUITES, SUITES
 from quad_gym.records import COLUMNS
@@ -23,8 +23,22 @@ DIGESTS = Path(__file__).with_name("flights.json")
 FLIGHTS, STEPS, SEED = 8, 300, 2026
 FIRST = COLUMNS["action_delay"].stop
 STATES = (
-    *("r", "v", "q", "w", "rotor_speeds", "b_a", "b_g"),
-    *("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L", "filter_status", "faults", "drawn"),
+    "r",
+    "v",
+    "q",
+    "w",
+    "rotor_speeds",
+    "b_a",
+    "b_g",
+    "r_hat",
+    "v_hat",
+    "R_hat",
+    "b_a_hat",
+    "b_g_hat",
+    "L",
+    "filter_status",
+    "faults",
+    "drawn",
 )
 RANDOMIZATION = {
     "mass": Uniform(0.8, 1.2, relative=True),
@@ -93,8 +107,12 @@ def _families():
         found[f"observation {observation}"] = {"observation": observation}
     for suite in SUITES:
         found[f"observation truth, {suite}"] = {
-            **{"observation": "truth", "sensors": suite, "randomize_reference": True},
-            **{"faults": ["rotor_loss"], "world": "fresh_breeze", "action_delay": 0.5},
+            "observation": "truth",
+            "sensors": suite,
+            "randomize_reference": True,
+            "faults": ["rotor_loss"],
+            "world": "fresh_breeze",
+            "action_delay": 0.5,
         }
     for action in ("motor", "wrench", "attitude", "velocity"):
         found[f"action {action}"] = {"action": action}
@@ -138,14 +156,18 @@ def _single_cases():
                 optical_flow=quad_gym.OpticalFlowParams(latency=0.01),
                 range_finder=quad_gym.RangeFinderParams(latency=0.04),
             ),
-            **{"estimator": "ekf", "filter_start": "warm", "observation": "measurements"},
+            "estimator": "ekf",
+            "filter_start": "warm",
+            "observation": "measurements",
         },
         "uwb": {"sensors": "uwb", "vehicle": "crazyflie", "innovations": True},
         "uwb, late, ekf, warm, raw": {
             "sensors": quad_gym.sensor_suite("uwb").replace(
                 uwb_range=quad_gym.UwbRangeParams(tag_B=(0.02, 0.0, 0.01), latency=0.04)
             ),
-            **{"estimator": "ekf", "filter_start": "warm", "observation": "measurements"},
+            "estimator": "ekf",
+            "filter_start": "warm",
+            "observation": "measurements",
         },
         "ekf": {"estimator": "ekf", "sensors": "rtk"},
         "innovations": rtk | {"innovations": True},
@@ -181,12 +203,19 @@ def _single_cases():
         "privileged": rtk | {"privileged": True, "include_std": True},
         "absolute": rtk | {"layout": "absolute"},
         "trajectories": {
-            **{"id": "Trajectory", "trajectory": trajectories(), "randomize_reference": True},
-            **{"sensors": "rtk", "layout": "absolute", "start": "mixed"},
+            "id": "Trajectory",
+            "trajectory": trajectories(),
+            "randomize_reference": True,
+            "sensors": "rtk",
+            "layout": "absolute",
+            "start": "mixed",
         },
         "many options": {
-            **{"sensors": _late("rtk"), "world": "fresh_breeze", "randomization": RANDOMIZATION},
-            **{"faults": [*_early("gnss_outage"), "wrong_associations"], "innovations": True},
+            "sensors": _late("rtk"),
+            "world": "fresh_breeze",
+            "randomization": RANDOMIZATION,
+            "faults": [*_early("gnss_outage"), "wrong_associations"],
+            "innovations": True,
         },
     }
 

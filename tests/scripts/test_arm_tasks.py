@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
-from baselines.recipes import recipe
+from baselines.recipes import Plan, recipe
 from scripts.studies.arms import OUTAGE_DASH
 from tests.builders import part
 

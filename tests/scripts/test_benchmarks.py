@@ -5,9 +5,9 @@ import json
 import pytest
 
 import quad_gym
+from quad_gym.commands.benchmark import hovering
 from quad_gym.commands.options import parse
 from quad_gym.envs.config import TASK_DEFAULTS
-from quad_gym.experiments.benchmark.suites import hovering
 from quad_gym.kernels.stages import needed_stages
 from quad_gym.records import POSITION_BLOCK, WIDTH
 from scripts.benchmarks import __main__ as script

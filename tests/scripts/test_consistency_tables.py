@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 import quad_gym
+from quad_gym.commands.consistency import CaseFlights
 from quad_gym.commands.options import parse
-from quad_gym.experiments.consistency import CaseFlights
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.suites import SUITES
 from scripts.consistency import __main__ as script
@@ -66,7 +66,10 @@ def test_run_continues_and_repeats_with_other_flights(tmp_path, monkeypatch):
     def measured(cell, flights):
         flown.append(cell.name)
         return {
-            **{"values": {"state": 15.0}, "misses": [], "expected": {}, "filters_failed": 0},
+            "values": {"state": 15.0},
+            "misses": [],
+            "expected": {},
+            "filters_failed": 0,
             "sensors": cell.sensors,
         }
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_gym.rendering.side_by_side import HOLD, SIDE
+from quad_gym.rendering.video import HOLD, SIDE
 from scripts.studies import __main__ as command
 from scripts.studies.films import RATE, pair_of, side_of
 from tests.scripts.running import run
@@ -49,7 +49,8 @@ def test_film_shows_same_flights_as_evaluation(filmed):
     folder, _ = filmed
     study = command.configure(
         command.StudyArgs(
-            *("look_around", ("truth", "std")),
+            "look_around",
+            ("truth", "std"),
             quick=True,
             steps=4096,
             env={"duration": DURATION},

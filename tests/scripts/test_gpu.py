@@ -14,7 +14,7 @@ from quad_gym.kernels.library import machine
 from tests.golden.ptx import PtxLauncher
 
 pytest.importorskip("torch")
-from quad_gym.device.emission import plan_of
+from quad_gym.device import plan_of
 from scripts.benchmarks import gpu
 from tests.builders import vec_env
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from quad_gym.analysis.consistency_flights import endless
+from quad_gym.analysis.consistency import endless
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.records import Source

@@ -107,7 +107,9 @@ def test_onboard_filter_mistakes_drag_for_velocity_as_its_linear_model_does():
     Q, H = 1e-3 * dt * np.diag([0.0, 0.5**2, 0.1**2]), np.array([1.0, 0.0, 0.0])
     gnss = SimpleNamespace(primary_antenna_B=(0.0, 0.0, 0.0))
     common = {
-        **{"dt": dt, "gyro": np.zeros((1, 3)), "accel": np.array([[0.0, 0.0, 9.8]])},
+        "dt": dt,
+        "gyro": np.zeros((1, 3)),
+        "accel": np.array([[0.0, 0.0, 9.8]]),
         "sensors": SimpleNamespace(gnss=gnss),
         "vehicle": SimpleNamespace(gravity=9.8),
     }

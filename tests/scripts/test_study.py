@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quad_gym.evaluation import Episodes
-from quad_gym.experiments.flown import Flown
+from quad_gym.experiments import Flown
 from scripts.studies import __main__ as command
 from scripts.studies.arms import Arm
 from scripts.studies.tasks import stays

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.faults.presets import PRESETS
+from quad_gym.faults import PRESETS
 from quad_gym.records import FilterStatus, GateDecision, Source
 from tests.field_flights import fly
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.envs.config import BENCHMARKS
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import FLIGHT_FIELDS
 from tests.contract.comparing import ACTIONS, OBSERVATIONS
@@ -17,7 +17,11 @@ STEPS = int(float(os.environ.get("QUAD_GYM_SOAK_STEPS", "1e6")))
 COUNT = 1000
 COMBINATIONS = [(task, action) for task in quad_gym.IDS.values() for action in ACTIONS]
 NOT_MEASURED = (
-    *("start_given", "innovation", "innovation_sigma", "block_nis", "obstacle_distance"),
+    "start_given",
+    "innovation",
+    "innovation_sigma",
+    "block_nis",
+    "obstacle_distance",
     "nis",  # after an update in steps
     "stamps",  # without a waiting measurement
     "drawn",  # for a sensor that the suite lacks

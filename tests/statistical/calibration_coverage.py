@@ -18,9 +18,9 @@ import numpy as np
 
 import quad_gym
 from quad_gym.estimation import calibrate, read_log
-from quad_gym.estimation.calibrating.calibration import _prior_of
-from quad_gym.estimation.calibrating.numbers import numbers_in
-from quad_gym.params.sensors import SENSOR_PARAMS
+from quad_gym.logs.calibrating.calibration import _prior_of
+from quad_gym.logs.calibrating.search import numbers_in
+from quad_gym.params.suites import SENSOR_PARAMS
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.logged_flights import Recorded, flown
 
@@ -39,9 +39,14 @@ SUITES = (
 SECONDS = {"standard": 26.0, "lab": 26.0}
 LONG = 50.0
 SPREADS = {
-    **{"declination": 0.2, "inclination": 0.1, "log_rotation": 0.04, "primary_antenna_B": 0.05},
+    "declination": 0.2,
+    "inclination": 0.1,
+    "log_rotation": 0.04,
+    "primary_antenna_B": 0.05,
     **dict.fromkeys(SENSOR_PARAMS, 0.05),
-    **{"gnss": 0.2, "magnetometer": 0.08, "barometer": 0.1},
+    "gnss": 0.2,
+    "magnetometer": 0.08,
+    "barometer": 0.1,
 }
 """Standard deviations of numbers of either sign; the means are the suite's numbers."""
 GROUPS = {

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.analysis.intervals import rate_over_trainings
+from quad_gym.analysis.metrics import rate_over_trainings
 
 EPISODES, SEEDS = 100, (3, 5, 10)
 

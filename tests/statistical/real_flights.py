@@ -15,8 +15,8 @@ import numpy as np
 
 import quad_gym
 from quad_gym.estimation import calibrate, read_log, replay
-from quad_gym.estimation.calibrating.validation import validate
-from quad_gym.estimation.logs.tables import csv_columns
+from quad_gym.logs.calibrating.likelihood import validate
+from quad_gym.logs.formats.tables import csv_columns
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
 sys.path.append(str(Path(__file__).parents[2] / "docs" / "examples"))

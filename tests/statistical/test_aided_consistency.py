@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import BarometerParams, MagnetometerParams
-from quad_gym.packing.aids import slow_states
+from quad_gym.packing import slow_states
 from quad_gym.records import AID_BLOCKS, Aid
 from tests.field_flights import fly, nees, state_errors, steps
 

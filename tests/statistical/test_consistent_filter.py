@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.analysis.consistency import flight_errors
-from quad_gym.analysis.consistency_flights import endless, measure_consistency
+from quad_gym.analysis.consistency import endless, flight_errors, measure_consistency
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.records import Source

@@ -218,8 +218,18 @@ def step(table, rng, suite):
 
 
 HARMLESS = (
-    *(nothing, wash, iron, outliers, drift, outage),
-    *(jitter, biases, vibration, noise, losses, pessimism),
+    nothing,
+    wash,
+    iron,
+    outliers,
+    drift,
+    outage,
+    jitter,
+    biases,
+    vibration,
+    noise,
+    losses,
+    pessimism,
 )
 FAULTS = (noisy, ramp, jump, too_late, clock, silence, course, compass, units, axes, step)
 NEEDS = {

@@ -10,7 +10,7 @@ from baselines import PDPolicy
 from baselines.pd import UNCERTAIN
 from baselines.policies import keywords_of_policy, load_policy
 from quad_gym.commands.main import main
-from quad_gym.experiments.flown import fly
+from quad_gym.experiments import fly
 from quad_gym.tasks.look_around import LookAround
 from scripts.studies.traces import ViewRecorder
 from tests.builders import part, run_python

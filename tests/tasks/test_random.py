@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from quad_gym.tasks.random import FlightRandom, threefry
+from quad_gym.tasks.task import FlightRandom, threefry
 
 ALARM = 1e-6  # probability that a correct generator fails one statistical test
 

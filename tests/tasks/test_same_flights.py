@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.envs.config import BENCHMARKS
 from scripts.benchmarks.own_task import OwnCircle
 from tests.builders import SHORT, actions_for, vec_env
 from tests.contract.comparing import assert_same

@@ -64,8 +64,11 @@ def test_results_and_records_have_rewards_and_endings_of_task(methods, per):
             reward = random_answers.reward * (0.02 if per == "second" else 1.0)
         returns = returns + reward
         for name, values in {
-            **{"terminated": terminated, "truncated": truncated, "ending": why},
-            **{"reward": reward, "episode_return": returns},
+            "terminated": terminated,
+            "truncated": truncated,
+            "ending": why,
+            "reward": reward,
+            "episode_return": returns,
         }.items():
             np.testing.assert_array_equal(own.result(name), values, name)
             np.testing.assert_array_equal(own.record(name), values, name)

@@ -53,10 +53,16 @@ def test_fields_have_the_shape_and_type_of_the_table(task):
 def test_truth_equals_the_records():
     batch, view = view_of(world="breeze")
     for name, field in {
-        **{"position": "r", "velocity": "v", "quaternion": "q", "body_rates": "w"},
-        **{"rotor_speeds": "rotor_speeds", "accel_bias": "b_a", "gyro_bias": "b_g"},
-        **{"wind": "wind", "position_error": "position_error"},
-        **{"estimation_error": "estimation_error"},
+        "position": "r",
+        "velocity": "v",
+        "quaternion": "q",
+        "body_rates": "w",
+        "rotor_speeds": "rotor_speeds",
+        "accel_bias": "b_a",
+        "gyro_bias": "b_g",
+        "wind": "wind",
+        "position_error": "position_error",
+        "estimation_error": "estimation_error",
     }.items():
         np.testing.assert_array_equal(getattr(view.truth, name), batch.record(field))
     R_IB = Rotation.from_quat(view.quaternion, scalar_first=True).as_matrix()
@@ -70,8 +76,12 @@ def test_estimate_equals_the_state_of_the_filter():
     batch, view = view_of()
     estimate, P = view.estimate, batch.covariance()
     for name, field in {
-        **{"position": "r_hat", "velocity": "v_hat", "R_BI": "R_hat"},
-        **{"accel_bias": "b_a_hat", "gyro_bias": "b_g_hat", "factor": "L"},
+        "position": "r_hat",
+        "velocity": "v_hat",
+        "R_BI": "R_hat",
+        "accel_bias": "b_a_hat",
+        "gyro_bias": "b_g_hat",
+        "factor": "L",
     }.items():
         np.testing.assert_array_equal(getattr(estimate, name), batch.record(field))
     np.testing.assert_allclose(estimate.covariance, P, rtol=1e-12, atol=1e-18)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from quad_gym.kernels.compiling import entry, kernel
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.numbers.blocks import lanes_of
 from quad_gym.records import WIDTH, aligned_zeros
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.estimation.replaying.held_position import lacks_position
-from quad_gym.packing.aids import pack_aids, slow_states
+from quad_gym.logs.replaying.measurements import lacks_position
+from quad_gym.packing import pack_aids, slow_states
 from quad_gym.params.aid_table import _shape_of
 from quad_gym.params.aids import AidParams, SlowError
 from quad_gym.records import PARAMS

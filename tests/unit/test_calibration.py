@@ -12,27 +12,29 @@ import quad_gym
 from quad_gym import estimation
 from quad_gym.commands import calibrate as command
 from quad_gym.estimation import calibrate, read_log, replay
-from quad_gym.estimation.calibrating import search as search_module
-from quad_gym.estimation.calibrating.calibration import turn_on_biases
-from quad_gym.estimation.calibrating.differences import spread_between
-from quad_gym.estimation.calibrating.likelihood import (
+from quad_gym.logs.calibrating import search as search_module
+from quad_gym.logs.calibrating.calibration import turn_on_biases
+from quad_gym.logs.calibrating.likelihood import (
     NU,
     SETTLING,
     SPACING,
     Likelihood,
     in_flight,
     tails,
+    validate,
 )
-from quad_gym.estimation.calibrating.numbers import MAX_SPREAD, NUMBERS
-from quad_gym.estimation.calibrating.search import NumberSearch, widening
-from quad_gym.estimation.calibrating.validation import validate
-from quad_gym.estimation.logs import Log, Stream
-from quad_gym.estimation.replaying.findings import Finding, Severity
-from quad_gym.estimation.replaying.fits import correlation_time
+from quad_gym.logs.calibrating.search import (
+    MAX_SPREAD,
+    NUMBERS,
+    NumberSearch,
+    spread_between,
+    widening,
+)
+from quad_gym.logs.formats import Log, Stream
+from quad_gym.logs.replaying.results import Finding, Severity, correlation_time
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.range_finder import RangeFinderParams
-from quad_gym.params.sensors import SENSOR_PARAMS
-from quad_gym.params.suites import CONSUMER
+from quad_gym.params.suites import CONSUMER, SENSOR_PARAMS
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.console_commands import run
 from tests.logged_flights import Recorded, flown

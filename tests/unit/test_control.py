@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.maths.linalg import load3, load4, store
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.numbers.blocks import lanes_of
+from quad_gym.kernels.numbers.linalg import load3, load4, store
 from quad_gym.kernels.vehicle.control import act, allocate
-from quad_gym.packing.flight import params_block, params_record
+from quad_gym.packing import params_block, params_record
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, Control, aligned_zeros
 
 LAB, GAINS = quad_gym.vehicle_params("lab"), quad_gym.pd_gains("lab")

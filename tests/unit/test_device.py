@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.device import emission
-from quad_gym.device.emission import plan_of, ptx_of
+from quad_gym import device as emission
+from quad_gym.device import plan_of, ptx_of
 from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.kernels.compiling.building import PROCESSORS
 from quad_gym.kernels.library import machine

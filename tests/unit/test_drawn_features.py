@@ -6,8 +6,8 @@ from scipy import stats
 
 import quad_gym
 from quad_gym import Cylinder, FlightBatch, Randomization, TaskParams, Uniform, Wall, WorldParams
-from quad_gym.batch.surroundings import hidden_points
-from quad_gym.flights.record import FlightRecorder
+from quad_gym.batch.starts import hidden_points
+from quad_gym.flights import FlightRecorder
 from quad_gym.records import FEATURE_SLICE
 from quad_gym.rotations import quaternion_to_dcm
 from tests.contract.configurations import FEATURES

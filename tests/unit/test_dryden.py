@@ -8,11 +8,7 @@ from scipy.linalg import expm
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.vehicle.gusts import (
-    first_order,
-    gust_scales,
-    second_order,
-)
+from quad_gym.kernels.vehicle.air import first_order, gust_scales, second_order
 from quad_gym.records import Control, Source
 from tests.unit.alarms import assert_normal
 from tests.unit.compiled import Compiled

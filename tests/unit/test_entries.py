@@ -5,13 +5,13 @@ import inspect
 import numpy as np
 import pytest
 
-from quad_gym.kernels import batch, entries, single, tape, window
+from quad_gym.kernels import batch, entries, single, tape
 from quad_gym.kernels.compiling.decorators import EntryDispatcher
 from quad_gym.kernels.compiling.workers import dispatcher_of
 from quad_gym.records import FLIGHT, PARAMS
 from tests.builders import run_python
 
-CATALOG = "from quad_gym.kernels import entries, linked, stages; import sys"
+CATALOG = "from quad_gym.kernels import entries, stages; import sys"
 
 
 def test_catalog_and_stages_are_imported_without_numba():
@@ -20,7 +20,7 @@ def test_catalog_and_stages_are_imported_without_numba():
 
 
 def test_catalog_has_the_entries_of_kernels_with_their_arguments():
-    modules = (batch, single, tape, window)
+    modules = (batch, single, tape)
     found = {
         f"{module.__name__}:{name}"
         for module in modules

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quad_gym.estimation.own import checked_estimate, factors
+from quad_gym.batch.own_estimator import checked_estimate, factors
 from tests.builders import vec_env
 from tests.estimators import Given
 

@@ -11,14 +11,14 @@ from baselines import PDPolicy
 from baselines.keeping import score
 from baselines.pd import pd_gains
 from baselines.policies import keywords_of_policy, load_policy, pretrained_file
-from quad_gym.analysis.comparison_plots import error_over_time_figure
+from quad_gym.analysis.plots import error_over_time_figure
+from quad_gym.commands import tune
+from quad_gym.commands.compare import MatrixCell
+from quad_gym.commands.evaluate import evaluation_table, remark_on_crashes
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.evaluation import Episodes, evaluate, roll_out
-from quad_gym.experiments import tuning
-from quad_gym.experiments.compare import MatrixCell
-from quad_gym.experiments.evaluated import evaluation_table, remark_on_crashes
-from quad_gym.experiments.flown import Flown, PathRecorder, fly
+from quad_gym.experiments import Flown, PathRecorder, fly
 from quad_gym.records import Ending
 
 LIMIT = 41
@@ -188,9 +188,9 @@ def test_table_of_a_course_has_gates_success_and_time(base, total, rate):
 
 def test_tuning_counts_a_crash_as_ten_times_the_initial_error(monkeypatch):
     env = QuadVectorEnv(10, "hover", duration=3.0)
-    search = tuning.Search({"hover": env}, pd_gains("tuned"), False, 0)
+    search = tune.Search({"hover": env}, pd_gains("tuned"), False, 0)
     search.cost(np.zeros(4))
-    monkeypatch.setattr(tuning, "PDPolicy", lambda env, gains: Quitting(env, 0.5))
+    monkeypatch.setattr(tune, "PDPolicy", lambda env, gains: Quitting(env, 0.5))
     assert search.cost(np.zeros(4)) > np.log(0.5 * 10.0)
 
 

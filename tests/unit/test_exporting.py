@@ -17,7 +17,7 @@ import quad_gym
 from baselines.exporting import c_source, controller_of, save_onnx
 from baselines.exporting.controller import action_fields
 from baselines.mlp import MlpPolicy
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
@@ -76,8 +76,7 @@ def stable_baselines_file(folder, algorithm, keywords=None):
     """Save an untrained policy of Stable-Baselines3."""
     pytest.importorskip("stable_baselines3")
     from baselines.models import make_model
-    from baselines.plans import Plan
-    from baselines.recipes import recipe
+    from baselines.recipes import Plan, recipe
 
     chosen = recipe(CIRCLE, algorithm).replace(n_envs=2)
     if algorithm == "ppo":
@@ -105,8 +104,7 @@ def let_act(model):
 def compiled_ppo_file(folder, algorithm="ppo"):
     """Save an untrained policy of the compiled PPO as training does."""
     from baselines.compiled_ppo.run import make_compiled
-    from baselines.plans import Plan, description
-    from baselines.recipes import recipe
+    from baselines.recipes import Plan, description, recipe
 
     chosen = recipe(CIRCLE).replace(n_envs=2)
     plan = Plan(recipe=chosen, threads=1, engine="compiled")

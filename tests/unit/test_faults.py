@@ -9,6 +9,8 @@ from scipy import stats
 
 import quad_gym
 from quad_gym.faults import (
+    ALL,
+    PRESETS,
     AccelBiasStep,
     BaselineLoss,
     CameraOcclusion,
@@ -21,8 +23,8 @@ from quad_gym.faults import (
     PositionJump,
     RotorLoss,
     WrongAssociations,
+    faults_of,
 )
-from quad_gym.faults.presets import ALL, PRESETS, faults_of
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.records import (

@@ -19,9 +19,9 @@ from baselines.exporting import controller_of, export_filter
 from baselines.exporting.filter_library import LIBRARY, archive
 from quad_gym.commands.main import main
 from quad_gym.estimation import UnscentedKalmanFilter, replay
-from quad_gym.estimation.filtering.starts import state_at_rest
-from quad_gym.estimation.logs import read_log
-from quad_gym.estimation.replaying.first_motion import wide_start
+from quad_gym.estimation.starts import state_at_rest
+from quad_gym.logs.formats import read_log
+from quad_gym.logs.replaying.log_start import wide_start
 from quad_gym.params.suites import ALL_SUITES
 from tests.console_commands import refused
 from tests.logged_flights import Recorded, flown
@@ -399,7 +399,8 @@ def test_example_refuses_wrong_options(words):
 
 class Estimate(ctypes.Structure):
     _fields_ = (
-        *(("time", ctypes.c_double), ("numbers", ctypes.c_double * (3 + 3 + 9 + 4 + 3 + 3 + 15))),
+        ("time", ctypes.c_double),
+        ("numbers", ctypes.c_double * (3 + 3 + 9 + 4 + 3 + 3 + 15)),
         ("diverged", ctypes.c_int),
     )
 

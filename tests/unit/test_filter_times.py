@@ -7,7 +7,7 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import LONGEST_STEP, ExtendedKalmanFilter, UnscentedKalmanFilter
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 from quad_gym.params.vehicle import VehicleParams
 from tests.level_flights import R_IG
 

@@ -5,9 +5,9 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.estimation.logs import read_log
-from quad_gym.estimation.replaying.first_motion import wide_start
 from quad_gym.frames import ecef_to_enu
+from quad_gym.logs.formats import read_log
+from quad_gym.logs.replaying.log_start import wide_start
 
 ORIGIN = quad_gym.sensor_suite("rtk").gnss.reference_antenna_G
 RTK = quad_gym.sensor_suite("rtk")

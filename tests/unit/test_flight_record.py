@@ -15,9 +15,7 @@ from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, GnssOutliers
-from quad_gym.flights.columns import COLUMNS
-from quad_gym.flights.files import table
-from quad_gym.flights.flight_scene import FlightScene
+from quad_gym.flights import COLUMNS, FlightScene, table
 from quad_gym.records import FaultKind, GateDecision
 from quad_gym.rendering import record_flight
 from quad_gym.rotations import quaternion_to_dcm
@@ -147,8 +145,8 @@ def test_rows_do_not_depend_on_when_they_are_read():
 
 def test_nothing_is_computed_for_frames_that_are_not_rendered(monkeypatch):
     """Stable-Baselines3 requests "rgb_array" in training and never renders."""
-    monkeypatch.setattr("quad_gym.flights.record._fill", None)
-    monkeypatch.setattr("quad_gym.rendering.live.Renderer", None)
+    monkeypatch.setattr("quad_gym.flights._fill", None)
+    monkeypatch.setattr("quad_gym.rendering.renderer.Renderer", None)
     for render_mode in (None, "rgb_array"):
         env = QuadEnv("hover", render_mode=render_mode, max_episode_steps=5)
         for _ in range(2):

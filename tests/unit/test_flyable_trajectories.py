@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym import Trajectory
-from quad_gym.params.trajectories.feasibility import sampling_times
-from quad_gym.params.trajectories.flatness import motion_of
+from quad_gym.params.trajectories import motion_of, sampling_times
 from tests.unit.test_trajectory import FIVE
 
 VEHICLE = quad_gym.vehicle_params("lab")

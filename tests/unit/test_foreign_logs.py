@@ -10,7 +10,7 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import read_log, replay
-from quad_gym.estimation.logs.quantities import compared
+from quad_gym.logs.formats.quantities import compared
 from quad_gym.rotations import dcm_to_euler, euler_to_dcm, quaternion_to_dcm
 from tests import foreign_logs as foreign
 from tests.foreign_logs import BOOT, EPOCH, Bag

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 import quad_gym
 from quad_gym.estimation import replay
-from quad_gym.estimation.logs.earth_field import at_place, earth_field
 from quad_gym.frames import ecef_to_enu, ecef_to_geodetic, geodetic_to_ecef
+from quad_gym.logs.formats.earth_field import at_place, earth_field
 
 EQUATOR, POLE = 6378137.0, 6356752.314245179  # WGS-84 semi-axes [m]
 

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.frames import ecef_to_enu
-from quad_gym.kernels.maths.linalg import load3, store
-from quad_gym.kernels.sensors.gnss_baseline import noisy_baseline
-from quad_gym.packing.flight import params_record
+from quad_gym.kernels.numbers.linalg import load3, store
+from quad_gym.kernels.sensors.gnss import noisy_baseline
+from quad_gym.packing import params_record
 from quad_gym.sensors import GnssReceiver
 from tests.unit.alarms import assert_normal
 from tests.unit.compiled import Compiled

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import quad_gym
 from quad_gym.kernels.entries import integrate_flight
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 from quad_gym.records import FLIGHT
 from quad_gym.rotations import quaternion_to_dcm
 from quad_gym.sensors import Imu

@@ -6,7 +6,7 @@ from scipy import stats
 
 import quad_gym
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import (
     BASELINE_BLOCK,
@@ -106,7 +106,8 @@ def test_a_rejected_block_is_as_good_as_not_measured(wrong):
         "gnss_position_G": (POSITION_BLOCK, RECORDING.gnss_position[k] + 0.5, None),
         "gnss_baseline_G": (BASELINE_BLOCK, baseline @ np.diag([-1.0, -1.0, 1.0]), None),
         "pixels": (
-            *(FEATURE_BLOCKS, pixels + np.array([[600.0, 0.0], [0.0, 0.0]])),
+            FEATURE_BLOCKS,
+            pixels + np.array([[600.0, 0.0], [0.0, 0.0]]),
             np.where([[True], [False]], np.nan, pixels),
         ),
     }[wrong]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from quad_gym.kernels.entries import integrate_flight
 from quad_gym.kernels.vehicle.dynamics import integrate
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 from quad_gym.records import FLIGHT
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 from quad_gym.vehicle import state_derivative

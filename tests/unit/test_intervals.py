@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest, mannwhitneyu, norm, ttest_1samp
 
-from quad_gym.analysis.intervals import (
+from quad_gym.analysis.metrics import (
     Estimated,
     mean_interval,
     paired_difference,

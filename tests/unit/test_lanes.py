@@ -7,9 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quad_gym.kernels.maths.elementary import clip, is_finite, maximum, minimum
-from quad_gym.kernels.simd.bits import fused_multiply_add, one_to_two, rotate_left, round_to_even
-from quad_gym.kernels.simd.lanes import all_of, any_of, logical_not, select
+from quad_gym.kernels.numbers.elementary import clip, is_finite, maximum, minimum
+from quad_gym.kernels.numbers.lanes import (
+    all_of,
+    any_of,
+    fused_multiply_add,
+    logical_not,
+    one_to_two,
+    rotate_left,
+    round_to_even,
+    select,
+)
 from quad_gym.records import WIDTH
 from tests.unit.compiled import Compiled
 
@@ -42,9 +50,20 @@ def arithmetic(f, option):
 def truth_of_arithmetic(x, y, option):
     chosen = [np.where(x < y, x, y), np.where(x > y, x, y)]
     return [
-        *(x + y, x - y, x * y, x / y, -x, np.abs(x), np.sqrt(np.abs(x))),
-        *(2.0 * x, x / 3, 1 - x, option + x, np.rint(x)),
-        *(*chosen, np.minimum(np.where(x > -1.0, x, -1.0), 1.0)),
+        x + y,
+        x - y,
+        x * y,
+        x / y,
+        -x,
+        np.abs(x),
+        np.sqrt(np.abs(x)),
+        2.0 * x,
+        x / 3,
+        1 - x,
+        option + x,
+        np.rint(x),
+        *chosen,
+        np.minimum(np.where(x > -1.0, x, -1.0), 1.0),
     ]
 
 
@@ -80,9 +99,20 @@ def asking(f, option):
 def truth_of_asking(x, y, option):
     less, one = x < y, option == 1
     masks = [
-        *(less, x <= y, x > y, x >= y, x == y, x < 1, x <= 0.5),
-        *(less & (x > 0.0), less | (y < 0.0), ~less, np.isfinite(x)),
-        *(one & (y <= x), one | (y <= x), np.where(less, x == 0.0, y == 0.0)),
+        less,
+        x <= y,
+        x > y,
+        x >= y,
+        x == y,
+        x < 1,
+        x <= 0.5,
+        less & (x > 0.0),
+        less | (y < 0.0),
+        ~less,
+        np.isfinite(x),
+        one & (y <= x),
+        one | (y <= x),
+        np.where(less, x == 0.0, y == 0.0),
     ]
     chosen = [np.where(less, a, b) for a, b in ((x, y), (1.0, y), (x, math.nan), (3.0, 4.0))]
     return [m.astype(float) for m in masks] + chosen
@@ -166,8 +196,14 @@ def test_words_are_added_and_rotated_modulo_2_to_the_64(instance):
     wrap = 2**64
     expected = [
         [
-            *((i + j) % wrap, i ^ j, i & j, i | j, (i + int(MANY)) % wrap, i ^ int(MANY)),
-            *((i << 13 | i >> 51) % wrap, (i << 63 | i >> 1) % wrap),
+            (i + j) % wrap,
+            i ^ j,
+            i & j,
+            i | j,
+            (i + int(MANY)) % wrap,
+            i ^ int(MANY),
+            (i << 13 | i >> 51) % wrap,
+            (i << 63 | i >> 1) % wrap,
             i if i == j else (j + 1) % wrap,
         ]
         for i, j in pairs

@@ -13,14 +13,13 @@ import pytest
 
 import quad_gym
 from quad_gym import TaskParams, faults
-from quad_gym.faults import Fault, SensorLoss
-from quad_gym.faults.base import _duration, span
+from quad_gym.faults import Fault, SensorLoss, _duration, span
 from quad_gym.params import checks as check
 from quad_gym.params.camera import _features
-from quad_gym.params.checked import Checked, _unless_none
-from quad_gym.params.clocks import Clocks
-from quad_gym.params.obstacles import Obstacle
+from quad_gym.params.checks import Checked, _unless_none
 from quad_gym.params.uwb_range import _anchors
+from quad_gym.params.vehicle import Clocks
+from quad_gym.params.world import Obstacle
 from quad_gym.records import MAX_FEATURES
 
 LARGEST, SMALLEST = 1e15, 1e-15
@@ -202,9 +201,17 @@ def examples():
         collect(quad_gym.sensor_suite(name))
     collect(LAB)
     for kind in (
-        *(quad_gym.ActionParams, quad_gym.PDGains, quad_gym.RewardParams, TaskParams, Clocks),
-        *(quad_gym.WorldParams, quad_gym.BatteryParams, quad_gym.GroundParams, Obstacle),
-        *(quad_gym.Wall, quad_gym.Cylinder),
+        quad_gym.ActionParams,
+        quad_gym.PDGains,
+        quad_gym.RewardParams,
+        TaskParams,
+        Clocks,
+        quad_gym.WorldParams,
+        quad_gym.BatteryParams,
+        quad_gym.GroundParams,
+        Obstacle,
+        quad_gym.Wall,
+        quad_gym.Cylinder,
         *(getattr(faults, name) for name in faults.__all__),
     ):
         if isinstance(kind, type) and issubclass(kind, Checked) and kind not in (Fault, SensorLoss):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
+from quad_gym.kernels.numbers.factors import cholesky, solve_left_vector, solve_right
 from tests.unit.compiled import Compiled
 
 LARGEST, ROWS = 18, 9

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from quad_gym.estimation import read_log, replay
-from quad_gym.estimation.calibrating.numbers import NUMBERS
-from quad_gym.estimation.replaying.default_suite import suite_for
+from quad_gym.logs.calibrating.search import NUMBERS
+from quad_gym.logs.replaying.replay import suite_for
 from tests import foreign_logs
 from tests.console_commands import refused, run
 

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 import quad_gym
 from quad_gym import Cylinder, Wall, WorldParams
-from quad_gym.batch.surroundings import hidden_points, nearest_obstacle, require_room
+from quad_gym.batch.starts import hidden_points, nearest_obstacle, require_room
 from quad_gym.records import FEATURE_SLICE, MAX_OBSTACLES, Ending, Source
 from tests.builders import batch as batch_of
 

@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import FlightBatch, UnscentedKalmanFilter
-from quad_gym.packing.aids import slow_states
+from quad_gym.packing import slow_states
 from quad_gym.records import AID_BLOCKS, BASELINE_BLOCK, Aid
 from quad_gym.sensors import GnssReceiver
 from tests.field_flights import fly, state_errors, steps

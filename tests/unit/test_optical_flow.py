@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
-from quad_gym.packing.flight import params_record
+from quad_gym.packing import params_record
 from quad_gym.params.portable import euler_dcm
 from quad_gym.params.vehicle import vehicle_params
 from quad_gym.records import AID_BLOCKS, Aid, Control, GateDecision

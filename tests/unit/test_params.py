@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.packing.flight import params_record
-from quad_gym.params.clocks import Clocks
-from quad_gym.params.sensors import SENSOR_PARAMS
+from quad_gym.packing import params_record
+from quad_gym.params.suites import SENSOR_PARAMS
+from quad_gym.params.vehicle import Clocks
 from quad_gym.records import MAX_FEATURES, MAX_GATES
 
 NO_NUMBERS = ["fast", "3", b"3", True, np.True_, 3j, np.array([3.0]), 10**400]
@@ -31,12 +31,17 @@ BAD_VALUES = {
         "motor_time_constant": [*NOT_POSITIVE, 50.0],
         "disc_area drag_coefficient air_density": BELOW_ZERO,
         "inertia": [
-            *(*NO_MATRICES, np.zeros((3, 3)), np.eye(3) + np.eye(3, k=1)),
-            *(np.diag([1.0, 1.0, 0.0]), np.diag([1.0, -1.0, 1.0])),
+            *NO_MATRICES,
+            np.zeros((3, 3)),
+            np.eye(3) + np.eye(3, k=1),
+            np.diag([1.0, 1.0, 0.0]),
+            np.diag([1.0, -1.0, 1.0]),
             np.diag([2600.0, 5000.0, 7000.0]),  # kg mm^2
         ],
         "rotor_positions_B": [
-            *(*NO_MATRICES, np.zeros((4, 3)), np.zeros((3, 3))),
+            *NO_MATRICES,
+            np.zeros((4, 3)),
+            np.zeros((3, 3)),
             [(x, 0.0, 0.0) for x in (-2.0, -1.0, 1.0, 2.0)],
         ],
         "rotor_spins": [*NO_VECTORS[:5], (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, 0.5)],
@@ -81,7 +86,12 @@ BAD_VALUES = {
         "focal_length pixel_sigma": NOT_POSITIVE,
         "image_size": [(1.0, 2.0, 3.0), 1.0, (0.0, 1.0), (100.0, -1.0), None],
         "features_I": [
-            *((), np.zeros((2, 2)), [1.0, 2.0, 3.0], [[0.0, 0.0, float("nan")]], None, 5.0),
+            (),
+            np.zeros((2, 2)),
+            [1.0, 2.0, 3.0],
+            [[0.0, 0.0, float("nan")]],
+            None,
+            5.0,
             np.zeros((MAX_FEATURES + 1, 3)),
         ],
     },

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quad_gym.estimation import replay
-from quad_gym.estimation.replaying.findings import Severity
+from quad_gym.logs.replaying.results import Severity
 from quad_gym.rotations import euler_to_dcm
 from tests import foreign_logs
 

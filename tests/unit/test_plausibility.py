@@ -10,7 +10,7 @@ import pytest
 import quad_gym
 from quad_gym.commands.main import main
 from quad_gym.estimation import replay
-from quad_gym.estimation.replaying.findings import Severity
+from quad_gym.logs.replaying.results import Severity
 from quad_gym.params.magnetometer import MICROTESLA
 from quad_gym.rotations import quaternion_to_dcm
 from tests.filter_states import at_rest

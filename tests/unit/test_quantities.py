@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from quad_gym import FlightBatch, TaskParams, sensor_suite
 from quad_gym.batch.quantities import QUANTITIES
-from quad_gym.flights.columns import COLUMNS
+from quad_gym.flights import COLUMNS
 from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.records import Source
 from quad_gym.tasks.view import VIEW_FIELDS
@@ -63,8 +63,14 @@ def test_attitudes_agree_with_scipy():
 @pytest.mark.parametrize(
     "task",
     [
-        *("hover", "circle", "lemniscate", "random_trajectory", "waypoints", "trajectory"),
-        *("look_around", "outage_dash"),
+        "hover",
+        "circle",
+        "lemniscate",
+        "random_trajectory",
+        "waypoints",
+        "trajectory",
+        "look_around",
+        "outage_dash",
     ],
 )
 def test_reference_quantities_equal_the_view_of_tasks(task):

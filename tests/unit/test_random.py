@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quad_gym.kernels.maths.random import normal_pair, threefry, uniform_pair
+from quad_gym.kernels.numbers.random import normal_pair, threefry, uniform_pair
 from tests.unit.alarms import assert_normal
 from tests.unit.compiled import Compiled
 

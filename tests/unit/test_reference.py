@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.configuration import FlightConfiguration
 from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.maths.linalg import store
-from quad_gym.kernels.maths.random import stream_of
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.numbers.blocks import lanes_of
+from quad_gym.kernels.numbers.linalg import store
+from quad_gym.kernels.numbers.random import stream_of
 from quad_gym.kernels.task.episode import draw_reference
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
-from quad_gym.packing.configuration import FlightConfiguration
-from quad_gym.packing.settings import settings_record
+from quad_gym.packing import settings_record
 from quad_gym.records import (
     FLIGHT,
     FLIGHT_BLOCK,

@@ -5,16 +5,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from quad_gym.rendering import colors
+from quad_gym.rendering import canvas
 
-BACKGROUNDS = {"white": colors.WHITE, "sky": colors.SKY, "ground": colors.GROUND}
-TEXT = {name: getattr(colors, name) for name in ("INK", "BLUE", "VERMILLION", "GREY")}
+BACKGROUNDS = {"white": canvas.WHITE, "sky": canvas.SKY, "ground": canvas.GROUND}
+TEXT = {name: getattr(canvas, name) for name in ("INK", "BLUE", "VERMILLION", "GREY")}
 THINGS = {
-    "reference": colors.GREEN,
-    "truth": colors.BLUE,
-    "estimate": colors.VERMILLION,
-    "fix": colors.PURPLE,
-    "ray": colors.LIGHT_BLUE,
+    "reference": canvas.GREEN,
+    "truth": canvas.BLUE,
+    "estimate": canvas.VERMILLION,
+    "fix": canvas.PURPLE,
+    "ray": canvas.LIGHT_BLUE,
 }
 
 # G. M. Machado, M. M. Oliveira, L. A. F. Fernandes, A physiologically-based model for simulation of
@@ -61,7 +61,7 @@ def lab(light):
 
 @pytest.mark.parametrize("name", TEXT)
 def test_text_has_sufficient_contrast_to_white(name):
-    assert contrast(TEXT[name], colors.WHITE) >= 4.5  # WCAG 2.1, level AA
+    assert contrast(TEXT[name], canvas.WHITE) >= 4.5  # WCAG 2.1, level AA
 
 
 @pytest.mark.parametrize("background", BACKGROUNDS)

@@ -5,7 +5,7 @@ import pytest
 
 from quad_gym import CameraParams
 from quad_gym.envs.flights import Flights
-from quad_gym.flights.record import FlightRecorder
+from quad_gym.flights import FlightRecorder
 from quad_gym.records import Autoreset
 from quad_gym.rendering.geometry import (
     chase_view,
@@ -15,7 +15,7 @@ from quad_gym.rendering.geometry import (
     fixed_view,
     look_at,
 )
-from quad_gym.rendering.inset import inset_box, place_in_inset
+from quad_gym.rendering.scene import inset_box, place_in_inset
 from quad_gym.rotations import euler_to_dcm
 from quad_gym.sensors import Camera
 

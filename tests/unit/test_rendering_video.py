@@ -6,9 +6,9 @@ import pytest
 import quad_gym
 from quad_gym.faults import GnssOutliers
 from quad_gym.records import GateDecision
-from quad_gym.rendering import Renderer, colors, record_flight, save_video, tile
+from quad_gym.rendering import Renderer, canvas, record_flight, save_video, tile
 from quad_gym.rendering.geometry import fixed_view
-from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
+from quad_gym.rendering.scene import inset_box, last_image, place_in_inset
 from tests.builders import Still
 
 pygame = pytest.importorskip("pygame")
@@ -30,12 +30,12 @@ def test_features_and_reference_are_drawn_where_they_project(flight):
     frame = Renderer("fixed", (640, 480)).draw(flight)
     view = fixed_view(flight, 640, 480)
     for feature in flight.scene.features_I:
-        assert color_near(frame, view.project(feature)[0], 5, colors.INK, 90)  # perhaps an outline
-    assert color_near(frame, view.project(flight["position"][-1])[0], 25, colors.BLUE)
+        assert color_near(frame, view.project(feature)[0], 5, canvas.INK, 90)  # perhaps an outline
+    assert color_near(frame, view.project(flight["position"][-1])[0], 25, canvas.BLUE)
     start = record_flight(Still(), "QuadGym/Circle-v0", max_episode_steps=1)  # 1 m too low
     frame = Renderer("fixed", (640, 480)).draw(start)
     at = fixed_view(start, 640, 480).project(start["reference_position"][-1])[0]
-    assert color_near(frame, at, 8, colors.GREEN)
+    assert color_near(frame, at, 8, canvas.GREEN)
 
 
 def test_the_inset_is_drawn_where_the_camera_measured(flight):
@@ -44,7 +44,7 @@ def test_the_inset_is_drawn_where_the_camera_measured(flight):
     seen = flight["pixels"][-1][np.isfinite(flight["pixels"][-1]).all(axis=1)]
     assert len(seen)
     for pixel in seen:
-        assert color_near(frame, place_in_inset(pixel, flight.scene, box), 2, colors.INK)
+        assert color_near(frame, place_in_inset(pixel, flight.scene, box), 2, canvas.INK)
 
 
 def test_an_image_is_shown_until_the_next_one_is_due():
@@ -69,8 +69,8 @@ def test_rejected_fix_is_drawn_in_gray():
     for k, is_purple in ((measured[2], True), (measured[-1], False)):
         frame = Renderer("fixed", (640, 480)).draw(flight.until(flight["time"][k]))
         at = view.project(flight["gnss_position"][k])[0]
-        assert color_near(frame, at, 8, colors.PURPLE) == is_purple
-        assert color_near(frame, at, 3, colors.GREY) or is_purple
+        assert color_near(frame, at, 8, canvas.PURPLE) == is_purple
+        assert color_near(frame, at, 3, canvas.GREY) or is_purple
 
 
 def test_replayed_frames_equal_live_frames(flight):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quad_gym.estimation import read_log, replay
-from quad_gym.estimation.logs.repeats import repeats
+from quad_gym.logs.formats.clocks import repeats
 from quad_gym.rotations import quaternion_to_dcm
 from tests import foreign_logs
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.analysis.log_plots import replay_figure
 from quad_gym.estimation import LOG_COLUMNS, Stream, read_log, replay
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
+from quad_gym.logs.plots import replay_figure
 from quad_gym.params.suites import CONSUMER
 from tests.console_commands import run
 from tests.estimators import Simple

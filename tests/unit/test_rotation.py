@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from quad_gym import rotations
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.linalg import load3, store
-from quad_gym.kernels.maths.rotation import (
+from quad_gym.kernels.numbers.linalg import load3, store
+from quad_gym.kernels.numbers.rotation import (
     dcm_to_quaternion,
     euler_to_dcm,
     quaternion_rate,

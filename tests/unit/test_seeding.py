@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_gym.batch.seeding import keys_of, stream_key, stream_keys
+from quad_gym.batch.starts import keys_of, stream_key, stream_keys
 
 EDGES = [0, 1, *(2**k + d for k in (31, 32, 63, 64, 96, 127, 128, 200) for d in (-1, 0, 5))]
 

@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.params.sensors import InitialPoseParams
-from quad_gym.params.suites import SUITES
+from quad_gym.params.suites import SUITES, InitialPoseParams
 from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK, VELOCITY_BLOCK
 from quad_gym.sensors import GnssReceiver
 from tests.field_flights import attitudes, fly, state_errors, steps

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quad_gym.rendering import Side, SideBySide, record_flight, save_side_by_side
-from quad_gym.rendering.side_by_side import LEGEND, SIDE
+from quad_gym.rendering.video import LEGEND, SIDE
 from tests.builders import Still
 
 pytest.importorskip("pygame")

@@ -24,7 +24,8 @@ LINEAR = RTK.replace(
     imu=RTK.imu.replace(
         **dict.fromkeys(("accel_vibration", "gyro_vibration"), 0.0),
         **dict.fromkeys(("accel_scale_sigma", "accel_misalignment_sigma"), 0.0),
-        **{"accel_bias_tau": 2.0, "gyro_bias_tau": 3.0},
+        accel_bias_tau=2.0,
+        gyro_bias_tau=3.0,
     ),
     estimator=RTK.estimator.replace(false_alarm_probability=0.0, recursive_update_threshold=None),
 )

@@ -14,8 +14,8 @@ import quad_gym
 import quad_gym.kernels
 from quad_gym.faults import GnssJump, GnssOutage
 from quad_gym.kernels.entries import sense_features, sense_gnss, sense_imu, step_biases
-from quad_gym.packing.flight import params_record
-from quad_gym.params.distributions import Normal, Uniform
+from quad_gym.packing import params_record
+from quad_gym.params.randomization import Normal, Uniform
 from quad_gym.params.task import TaskParams
 from quad_gym.records import (
     AID_MOST,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from baselines.plans import Plan, description
+from baselines.recipes import Plan, description
 from quad_gym.commands.compare import CompareArgs, configure
 from quad_gym.params.suites import ALL_SUITES
 from tests import console_commands

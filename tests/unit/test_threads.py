@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
-from quad_gym.records import WIDTH, Control, Source, board
+from quad_gym.records import WIDTH, Control, Source, call
 from tests.builders import batch
 
 COUNT = 3 * MIN_BLOCKS_PER_THREAD * WIDTH + 3
@@ -94,12 +94,12 @@ def crew_of(fly):
 
 def post(words):
     """Post a step of which no block is finished, as a caller does first in compiled code."""
-    words[board.FINISHED] = 0
-    words[board.TICKET] += 1
+    words[call.FINISHED] = 0
+    words[call.TICKET] += 1
 
 
 def finish(words):
-    words[board.FINISHED] = 2 * MIN_BLOCKS_PER_THREAD
+    words[call.FINISHED] = 2 * MIN_BLOCKS_PER_THREAD
 
 
 def test_exception_in_helper_thread_is_raised_in_caller():
@@ -125,7 +125,7 @@ def test_step_after_an_interrupted_one_waits_for_it():
             time.sleep(0.05)
             finish(words)
             seen.append("helper")
-            words[board.RANGES + board.WORDS_OF_RANGE + board.PRESENT] = 0
+            words[call.RANGES + call.WORDS_OF_RANGE + call.PRESENT] = 0
         elif not seen:
             post(words)
             raise KeyboardInterrupt
@@ -148,11 +148,11 @@ def test_step_after_an_interrupted_one_waits_for_it():
 @pytest.mark.parametrize("parts", [1, 2, 5])
 def test_the_ranges_of_a_board_hold_every_block_once(blocks, parts):
     words = board_of(blocks, parts)
-    ranges = words[board.RANGES :].reshape(parts, board.WORDS_OF_RANGE)
-    flown = [i for row in ranges for i in range(row[board.FIRST], row[board.LAST])]
+    ranges = words[call.RANGES :].reshape(parts, call.WORDS_OF_RANGE)
+    flown = [i for row in ranges for i in range(row[call.FIRST], row[call.LAST])]
     assert flown == list(range(blocks))
-    assert words[board.FINISHED] == blocks  # nothing is posted
-    assert 1 <= words[board.CHUNK] <= blocks
+    assert words[call.FINISHED] == blocks  # nothing is posted
+    assert 1 <= words[call.CHUNK] <= blocks
 
 
 def test_run_during_another_run_raises_runtime_error():

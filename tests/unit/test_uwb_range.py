@@ -6,8 +6,8 @@ import pytest
 import quad_gym
 from quad_gym.analysis.consistency import InnovationRecorder
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
-from quad_gym.estimation.logs import read_log
-from quad_gym.estimation.replaying.measurements import LogMeasurements
+from quad_gym.logs.formats import read_log
+from quad_gym.logs.replaying.measurements import LogMeasurements
 from quad_gym.params.portable import euler_dcm
 from quad_gym.records import AID_BLOCK, Aid, Control, GateDecision
 from quad_gym.rotations import quaternion_to_dcm

@@ -5,10 +5,18 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quad_gym.kernels.maths import linalg
-from quad_gym.kernels.maths.linalg import load3, load4, load33, load44, store
-from quad_gym.kernels.maths.matrices import store_column3
-from quad_gym.kernels.maths.vectors import outer, rounded, vector
+from quad_gym.kernels.numbers import linalg
+from quad_gym.kernels.numbers.linalg import (
+    load3,
+    load4,
+    load33,
+    load44,
+    outer,
+    rounded,
+    store,
+    store_column3,
+    vector,
+)
 from tests.unit.compiled import Compiled
 
 INSTANCES = ("on_floats", "on_lanes")

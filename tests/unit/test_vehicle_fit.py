@@ -7,7 +7,7 @@ import quad_gym
 from quad_gym import VehicleParams, WorldParams, vehicle_params, world_params
 from quad_gym.commands.calibrate import CalibrateArgs, fit_body
 from quad_gym.estimation import fit_vehicle
-from quad_gym.estimation.calibrating.vehicle_fit import _mean_squares
+from quad_gym.logs.calibrating.vehicle_fit import _mean_squares
 from tests.logged_flights import RTK, Recorded, flown
 
 LAB = VehicleParams()

@@ -11,13 +11,21 @@ import pytest
 from scipy.stats import chi2
 
 from quad_gym.estimation import replay
-from quad_gym.estimation.logs import Log, Stream
-from quad_gym.estimation.replaying import sensor_rules
-from quad_gym.estimation.replaying.dead_reckoning import HORIZONS, changes
-from quad_gym.estimation.replaying.findings import QUANTITIES, Finding, Severity, by_quantity
-from quad_gym.estimation.replaying.fits import exceeds, fit_of, larger, runs_beyond_chance
-from quad_gym.estimation.replaying.results import Measured
-from quad_gym.estimation.replaying.verdict import in_one_line
+from quad_gym.logs.formats import Log, Stream
+from quad_gym.logs.replaying import rules
+from quad_gym.logs.replaying.results import (
+    QUANTITIES,
+    Finding,
+    Measured,
+    Severity,
+    by_quantity,
+    exceeds,
+    fit_of,
+    larger,
+    runs_beyond_chance,
+)
+from quad_gym.logs.replaying.rules import HORIZONS, changes
+from quad_gym.logs.replaying.verdict import in_one_line
 from quad_gym.records import GateDecision
 from tests import foreign_logs
 from tests.statistical import verdicts
@@ -221,7 +229,7 @@ def test_errors_of_twice_the_assumed_ones_make_a_log_unusable(times, severity):
     case = measured(errors, np.zeros(2000, bool))
     fit = fit_of(case)
     fits = SimpleNamespace(fits={"gnss_velocity": fit})
-    found = [finding.severity for finding in sensor_rules._size(fits, "gnss_velocity", case, fit)]
+    found = [finding.severity for finding in rules._size(fits, "gnss_velocity", case, fit)]
     assert found == ([] if severity is None else [severity])
 
 

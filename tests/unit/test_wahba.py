@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quad_gym.estimation import solve_wahba
-from quad_gym.kernels.filter.wahba import wahba
-from quad_gym.kernels.maths.linalg import load33, store
+from quad_gym.kernels.filter.starts import wahba
+from quad_gym.kernels.numbers.linalg import load33, store
 from quad_gym.rotations import euler_to_dcm
 from tests.unit.compiled import Compiled
 

@@ -6,7 +6,7 @@ import pytest
 import quad_gym
 from quad_gym import Uniform
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.batch.warm_start import WARM_UP
+from quad_gym.batch.starts import WARM_UP
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params.suites import SUITES
@@ -16,9 +16,25 @@ from tests.unit.alarms import assert_normal
 
 BIASES = slice(9, 15)
 ESTIMATES = (
-    *("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L", "block_nis", "diverged"),
-    *("accepted_tick", "refused_tick", "alarm_tick", "estimation_error", "gate"),
-    *("r_seen", "v_seen", "R_seen", "w_seen", "block_valid", "configuration"),
+    "r_hat",
+    "v_hat",
+    "R_hat",
+    "b_a_hat",
+    "b_g_hat",
+    "L",
+    "block_nis",
+    "diverged",
+    "accepted_tick",
+    "refused_tick",
+    "alarm_tick",
+    "estimation_error",
+    "gate",
+    "r_seen",
+    "v_seen",
+    "R_seen",
+    "w_seen",
+    "block_valid",
+    "configuration",
 )
 
 

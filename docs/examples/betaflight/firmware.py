@@ -190,7 +190,8 @@ class Firmware:
         """
         roll, pitch, yaw = (round(0.5 * _SPAN * stick) for stick in sticks)
         channels = (
-            *(_CENTER + roll, _CENTER + pitch),  # its body axes are x forward, y left, z up ...
+            _CENTER + roll,
+            _CENTER + pitch,  # its body axes are x forward, y left, z up ...
             _LOW + (_DEAD + round((_SPAN - _DEAD) * throttle) if throttle > 0.0 else 0),
             _CENTER - yaw,  # ... but this stick is positive to the right
             _LOW + _SPAN * armed,

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from docs.examples.betaflight.firmware import Firmware, configured
 from quad_gym.evaluation import Policy
-from quad_gym.params.control import ActionParams
-from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.vehicle import ActionParams, VehicleParams
 
 _P_SCALE, _MIXER_SCALE = 0.032029, 1000.0
 """Betaflight's units: sum per P and deg/s, and sum that is all of a motor's range (PTERM_SCALE,

@@ -48,9 +48,16 @@ def exponential(x):
 
 class InvariantEKF(quad_gym.Estimator):
     state = {
-        **{"R": EYE, "v": np.zeros(3), "r": np.zeros(3), "b_a": np.zeros(3), "b_g": np.zeros(3)},
-        **{"P": np.eye(15), "Y_R": np.zeros((STAMPS, 3, 3)), "Y_v": np.zeros((STAMPS, 3))},
-        **{"Y_r": np.zeros((STAMPS, 3)), "w": np.zeros((STAMPS, 3))},  # w: body rates
+        "R": EYE,
+        "v": np.zeros(3),
+        "r": np.zeros(3),
+        "b_a": np.zeros(3),
+        "b_g": np.zeros(3),
+        "P": np.eye(15),
+        "Y_R": np.zeros((STAMPS, 3, 3)),
+        "Y_v": np.zeros((STAMPS, 3)),
+        "Y_r": np.zeros((STAMPS, 3)),
+        "w": np.zeros((STAMPS, 3)),  # w: body rates
     }
 
     def reset(self, view, mask):

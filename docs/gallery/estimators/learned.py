@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import quad_gym
-from quad_gym.analysis.consistency_flights import endless
+from quad_gym.analysis.consistency import endless
 from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.records import Source
 from quad_gym.rotations import euler_to_dcm
@@ -73,8 +73,14 @@ def correct(xp, W, state, fix, T, gyro):
 
 class Learned(quad_gym.Estimator):
     state = {
-        **{"r": np.zeros(3), "v": np.zeros(3), "R": np.eye(3), "b_a": np.zeros(3)},
-        **{"b_g": np.zeros(3), "h": np.zeros(SIZE), "v_0": np.zeros(3), "T": 0.0},
+        "r": np.zeros(3),
+        "v": np.zeros(3),
+        "R": np.eye(3),
+        "b_a": np.zeros(3),
+        "b_g": np.zeros(3),
+        "h": np.zeros(SIZE),
+        "v_0": np.zeros(3),
+        "T": 0.0,
         "sigma": np.ones(15),
     }
 
@@ -102,8 +108,11 @@ class Learned(quad_gym.Estimator):
                 getattr(s, name)[new] = values
             s.sigma[new, :9], s.T[new] = sigma, 0.0
         return {
-            **{"position": s.r, "velocity": s.v, "R_BI": s.R},
-            **{"accel_bias": s.b_a, "gyro_bias": s.b_g},
+            "position": s.r,
+            "velocity": s.v,
+            "R_BI": s.R,
+            "accel_bias": s.b_a,
+            "gyro_bias": s.b_g,
             "covariance": s.sigma[:, :, None] ** 2 * np.eye(15),
         }
 

@@ -11,9 +11,9 @@ from functools import cache
 
 import numpy as np
 
-from quad_gym.estimation.logs import Floats
-from quad_gym.estimation.replaying.cases import Case, lost, note, uncertain
-from quad_gym.estimation.replaying.findings import Finding
+from quad_gym.logs.formats import Floats
+from quad_gym.logs.replaying.results import Finding
+from quad_gym.logs.replaying.rules import Evidence, lost, note, uncertain
 from quad_gym.rotations import euler_to_dcm
 
 STRENGTH = 0.1  #: relative change of the strength that iron and currents make, at least [-]
@@ -32,7 +32,7 @@ the share of such changes, at most [-]."""
 STEP = math.radians(15.0)  #: step of the angles about the vertical axis
 
 
-def strength(case: Case) -> Iterator[Finding]:
+def strength(case: Evidence) -> Iterator[Finding]:
     """A field whose strength changes: iron and currents, or power lines."""
     compass, params = case.log.magnetometer, case.suite.magnetometer
     if compass is None or params is None or len(compass) < MIN_TURNS:
@@ -70,7 +70,7 @@ def _smoothed(time: Floats, values: Floats) -> Floats:
     return np.array([np.median(values[a:b]) for a, b in zip(low, high, strict=True)])
 
 
-def axes(case: Case) -> Iterator[Finding]:
+def axes(case: Evidence) -> Iterator[Finding]:
     """Axes of the IMU and of the magnetometer that differ."""
     turns = _turns(case)
     if turns is None:
@@ -91,7 +91,7 @@ def axes(case: Case) -> Iterator[Finding]:
         )
 
 
-def jumps(case: Case) -> Iterator[Finding]:
+def jumps(case: Evidence) -> Iterator[Finding]:
     """A field that jumps as no turn explains, and stays there."""
     turns = _turns(case)
     if turns is None or case.suite.magnetometer is None:
@@ -115,7 +115,7 @@ def jumps(case: Case) -> Iterator[Finding]:
     )
 
 
-def _turns(case: Case) -> tuple[Floats, Floats, Floats, Floats] | None:
+def _turns(case: Evidence) -> tuple[Floats, Floats, Floats, Floats] | None:
     """Return turns of the IMU (n, 3) [rad], changes of the field, mean fields [T], and times.
 
     None: the log has none.

@@ -18,7 +18,7 @@ from typing import Any
 from numba.core.errors import NumbaError
 from numba.core.ir import Loc
 
-from quad_gym.kernels.compiling import stages
+from quad_gym.kernels.compiling import decorators
 from quad_gym.params import checks as check
 
 _PLACE = re.compile(r"^During: (?:typing of .*|lowering .*) at (.*) \((\d+)\)$", re.MULTILINE)
@@ -92,7 +92,7 @@ def _module_of(name: str) -> ModuleType | None:
 def _explained(error: Exception) -> str:
     """Return the place of an error, its reason, and the kernels that lead to it."""
     text = re.sub(r"\x1b\[\d*m", "", str(error))
-    wrapper = inspect.getfile(stages)
+    wrapper = inspect.getfile(decorators)
     places = dict[str, tuple[str, int, str]]()  # the first of each kernel
     for file, line in _PLACE.findall(text) or _places_of(error):
         kernel, source = _at(Path(file), int(line))

@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from quad_gym.kernels.compiling.cache import CodeCache, locked, where_cached
-from quad_gym.kernels.cores import available_cores
-from quad_gym.kernels.library import say
+from quad_gym.kernels.library import available_cores, say
 
 MAX_WORKERS = 8
 _START = (

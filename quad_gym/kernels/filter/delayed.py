@@ -1,7 +1,7 @@
 """Updates with delayed measurements, which arrive with their time stamps.
 
 A measurement in transit waits in a flight's record, with the sums of the IMU when it was taken
-(`kernels/sensors/latency.py`). When it arrives, the estimate is retrodicted to that instant over
+(`kernels/sensors/common.py`). When it arrives, the estimate is retrodicted to that instant over
 the IMU's samples since then (`preintegration.py`), updated as usual, and carried forward again. For
 the covariance, the white noise of these samples is removed on the way back and added on the way
 forward, as it is independent of the measurement. That neglects the drift of the biases in the
@@ -19,8 +19,8 @@ from quad_gym.kernels.filter.measurements import (
     choose_valid,
     count_failure,
     count_measured,
+    forget_corrections,
 )
-from quad_gym.kernels.filter.monitoring import forget_corrections
 from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_columns, take_mean
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
@@ -30,11 +30,20 @@ from quad_gym.kernels.filter.slow import (
     shift_carried_slow,
     stages_of,
 )
-from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import keep, load3, load33, outer, store
-from quad_gym.kernels.maths.matrices import load_column3, store_block, store_column3, sum_of_outers
-from quad_gym.kernels.simd.blocks import keep_fields
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.numbers.blocks import keep_fields
+from quad_gym.kernels.numbers.factors import cholesky
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.numbers.linalg import (
+    keep,
+    load3,
+    load33,
+    load_column3,
+    outer,
+    store,
+    store_block,
+    store_column3,
+    sum_of_outers,
+)
 from quad_gym.records import SENSORS, FilterForm
 
 _ESTIMATE = "r_hat v_hat v_corrected R_hat b_a_hat b_g_hat"

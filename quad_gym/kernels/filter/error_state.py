@@ -1,4 +1,4 @@
-"""The filters' error state (r_I, v_I, e, b_a, b_g), and its covariance when e is reset to zero.
+"""The filters' error state (r_I, v_I, e, b_a, b_g), its covariance, and resets of states.
 
 The error Euler angles e are relative to the estimated attitude, R_BI = R(e) R_hat. After a step
 with the mean error m, R_hat becomes R(m) R_hat and e is relative to that: R(e_new) R(m) = R(e).
@@ -25,16 +25,25 @@ Li and A. I. Mourikis, Int. J. Robotics Research 32(6), 2013, for first estimate
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import cross, keep, load33
-from quad_gym.kernels.maths.matrices import (
+from quad_gym.kernels.numbers.elementary import maximum, minimum, sin_cos
+from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.linalg import (
+    cross,
+    diagonal,
+    dot,
+    keep,
+    load33,
     load_block,
     load_column3,
+    outer,
     store_block,
     store_column3,
     sum_of_outers,
 )
-from quad_gym.kernels.simd.lanes import zero_like
+
+# --------------------------------------------------------------------------------------------------
+# The filters' error state (r_I, v_I, e, b_a, b_g), and its covariance when e is reset to zero.
+# --------------------------------------------------------------------------------------------------
 
 R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
 """First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
@@ -130,3 +139,43 @@ def _clear(L9, row, kept, cleared, rows):
         L9[i, kept] = c * a + s * b
         L9[i, cleared] = c * b - s * a
     L9[row, cleared] = zero_like(x)
+
+
+# --------------------------------------------------------------------------------------------------
+# Resets of single states: covariances with others are cut, and variances set.
+# --------------------------------------------------------------------------------------------------
+
+MAX_ANGLE = math.pi / math.sqrt(3.0)
+"""Largest standard deviation of an angle [rad], when it is unknown."""
+
+
+@kernel
+def reset_variance(P, row, states, lanes, variance):
+    """Cut the covariances of a state, and set its variance, which becomes no smaller."""
+    for i in range(row, states):
+        for j in range(i // 3 * 3 + 3):
+            if i != j and (i == row or j == row):
+                P[i, j] = select(lanes, 0.0, P[i, j])
+    P[row, row] = maximum(P[row, row], select(lanes, variance, 0.0))
+
+
+@kernel
+def reset_variances(P, first, states, lanes, variances):
+    """Do the same for three states from the row `first` on."""
+    for i in range(3):
+        reset_variance(P, first + i, states, lanes, variances[i])
+
+
+@kernel
+def reset_heading(P, R_BI, states, lanes, variance):
+    """Cut the covariances of the heading, the angle about the vertical, and set its variance."""
+    k = R_BI.T[2]
+    cut, P_ee = select(lanes, 1.0, 0.0), load_block(P, E, E)
+    one = zero_like(cut) + 1.0
+    M = diagonal((one, one, one)) + outer(-cut * k, k)
+    for j in range(0, E, 3):
+        store_block(P, E, j, M @ load_block(P, E, j))
+    heading = cut * maximum(minimum(variance, MAX_ANGLE * MAX_ANGLE), dot(k, P_ee @ k))
+    store_block(P, E, E, M @ P_ee @ M + outer(heading * k, k))
+    for i in range(E + 3, states, 3):
+        store_block(P, i, E, load_block(P, i, E) @ M)

@@ -18,8 +18,13 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.measurements import rows_of, rows_of_blocks
-from quad_gym.kernels.filter.monitoring import follow_ratio, forget_corrections
+from quad_gym.kernels.filter.measurements import (
+    columns_of,
+    follow_ratio,
+    forget_corrections,
+    rows_of,
+    rows_of_blocks,
+)
 from quad_gym.kernels.filter.recovery import (
     OUTLIER,
     count_rejections,
@@ -27,12 +32,21 @@ from quad_gym.kernels.filter.recovery import (
     limit_of,
     supported,
 )
-from quad_gym.kernels.filter.rows import columns_of
-from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, outer, unit_or, vector
-from quad_gym.kernels.maths.matrices import load_block, store_block, sum_of_outers_of_rows
-from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
+from quad_gym.kernels.numbers.blocks import reset
+from quad_gym.kernels.numbers.elementary import clip, maximum, minimum
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
+from quad_gym.kernels.numbers.linalg import (
+    cross,
+    dot,
+    keep,
+    load3,
+    load_block,
+    outer,
+    store_block,
+    sum_of_outers_of_rows,
+    unit_or,
+    vector,
+)
 from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_BLOCKS,

@@ -47,8 +47,12 @@ from quad_gym.kernels.filter.error_state import (
     turn_covariance,
     velocity_error,
 )
-from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
-from quad_gym.kernels.filter.preintegration import accel_variance, gyro_sigma
+from quad_gym.kernels.filter.preintegration import (
+    LEVER_ARM,
+    accel_variance,
+    gyro_sigma,
+    lever_force,
+)
 from quad_gym.kernels.filter.slow import (
     decay_slow,
     keep_factor,
@@ -56,33 +60,31 @@ from quad_gym.kernels.filter.slow import (
     stages_of,
     turn_slow,
 )
-from quad_gym.kernels.maths.elementary import is_finite
-from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import (
+from quad_gym.kernels.numbers.elementary import is_finite
+from quad_gym.kernels.numbers.factors import cholesky
+from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.linalg import (
     add_to_diagonal,
     cross,
     diagonal,
     keep,
     load3,
     load33,
-    outer,
-)
-from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
+    outer,
     store_block,
     store_column3,
     sum_of_outers,
     sum_of_squares,
 )
-from quad_gym.kernels.maths.rotation import (
+from quad_gym.kernels.numbers.rotation import (
     euler_to_dcm,
     split_rotation,
     split_turn,
     turn_pair_back,
     vector_to_dcm,
 )
-from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import FilterForm, FilterStatus
 
 

@@ -25,11 +25,10 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.freedoms import is_direction
 from quad_gym.kernels.filter.gate import MONITORED
-from quad_gym.kernels.maths.linalg import dot, keep, load3
-from quad_gym.kernels.maths.matrices import sum_of_squares
-from quad_gym.kernels.simd.lanes import any_of, no_lane, select, zero_like
+from quad_gym.kernels.filter.measurements import is_direction
+from quad_gym.kernels.numbers.lanes import any_of, no_lane, select, zero_like
+from quad_gym.kernels.numbers.linalg import dot, keep, load3, sum_of_squares
 from quad_gym.records import (
     FEATURE_BLOCKS,
     FIRST_BLOCK,

@@ -24,25 +24,34 @@ D'Souza (editors), Navigation Filter Best Practices, NASA/TP-2018-219822.
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.covariance_resets import reset_variance, reset_variances
-from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, put_covariance
-from quad_gym.kernels.filter.measurements import call_sensors, count_failure
-from quad_gym.kernels.filter.monitoring import (
+from quad_gym.kernels.filter.error_state import (
+    BA,
+    BG,
+    D,
+    E,
+    R,
+    V,
+    put_covariance,
+    reset_variance,
+    reset_variances,
+)
+from quad_gym.kernels.filter.measurements import (
     CORRECTION_TIME,
     LIKELY,
     RECENT,
     SHIFTED,
+    call_sensors,
+    count_failure,
     forget_corrections,
     largest_square,
     shifted,
 )
 from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stages_of, stationary
-from quad_gym.kernels.maths.elementary import maximum, minimum
-from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import dot, load33, outer
-from quad_gym.kernels.maths.matrices import load_block, store_block
-from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
+from quad_gym.kernels.numbers.blocks import reset
+from quad_gym.kernels.numbers.elementary import maximum, minimum
+from quad_gym.kernels.numbers.factors import cholesky
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
+from quad_gym.kernels.numbers.linalg import dot, load33, load_block, outer, store_block
 from quad_gym.records import (
     AID_GROUPS,
     FIRST_GROUP,

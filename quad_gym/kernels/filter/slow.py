@@ -27,8 +27,12 @@ from typing import Any
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
-from quad_gym.kernels.maths.linalg import add_diagonal, cross, load3, load33
-from quad_gym.kernels.maths.matrices import (
+from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.linalg import (
+    add_diagonal,
+    cross,
+    load3,
+    load33,
     load_block,
     load_column3,
     store_block,
@@ -36,8 +40,7 @@ from quad_gym.kernels.maths.matrices import (
     sum_of_outers,
     sum_of_squares,
 )
-from quad_gym.kernels.maths.rotation import euler_to_dcm
-from quad_gym.kernels.simd.lanes import select, zero_like
+from quad_gym.kernels.numbers.rotation import euler_to_dcm
 from quad_gym.records import AID_NUMBERS, Aid
 
 _MAGNETOMETER = int(Aid["MAGNETOMETER"])

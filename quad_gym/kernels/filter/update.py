@@ -12,15 +12,17 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
-from quad_gym.kernels.filter.freedoms import without_directions
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     call_measured,
+    columns_of,
     count_failure,
     count_measured,
+    flag_shifted,
+    follow_corrections,
     mark_failed,
+    without_directions,
 )
-from quad_gym.kernels.filter.monitoring import flag_shifted, follow_corrections
 from quad_gym.kernels.filter.progressive import (
     FEW,
     MOST_STEPS,
@@ -32,29 +34,31 @@ from quad_gym.kernels.filter.progressive import (
     share_second_order,
     show_hidden,
 )
-from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.filter.slow import load_slow, shift_slow, stages_of, turn_iron
-from quad_gym.kernels.maths.elementary import is_finite, maximum
-from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
-from quad_gym.kernels.maths.linalg import (
+from quad_gym.kernels.numbers.elementary import is_finite, maximum
+from quad_gym.kernels.numbers.factors import cholesky, solve_left_vector, solve_right
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
+from quad_gym.kernels.numbers.linalg import (
     add_to_diagonal,
     keep,
     load3,
     load33,
-    outer,
-    store,
-    vector,
-)
-from quad_gym.kernels.maths.matrices import (
     load_block,
     load_column3,
+    outer,
+    store,
     store_block,
     sum_of_outers,
     sum_of_outers_of_rows,
     sum_of_squares,
+    vector,
 )
-from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation, split_turn, vector_to_dcm
-from quad_gym.kernels.simd.lanes import any_of, logical_not, no_lane, select, zero_like
+from quad_gym.kernels.numbers.rotation import (
+    euler_to_dcm,
+    split_rotation,
+    split_turn,
+    vector_to_dcm,
+)
 from quad_gym.records import Act, FilterForm
 
 

@@ -6,14 +6,13 @@ filter (`filter/slow.py`). The model is linear, so sigma points and derivatives 
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.covariance_resets import reset_variance
-from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.rows import columns_of, put_block, put_three
-from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import diagonal, load3
-from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.sensors.aid import aid_stage
-from quad_gym.kernels.simd.lanes import select, zero_like
+from quad_gym.kernels.filter.error_state import D, R, reset_variance
+from quad_gym.kernels.filter.measurements import columns_of, put_block, put_three
+from quad_gym.kernels.numbers.elementary import maximum
+from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.linalg import diagonal, load3
+from quad_gym.kernels.numbers.random import normal_pair, stream_of
+from quad_gym.kernels.sensors.common import aid_stage
 from quad_gym.records import AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["BAROMETER"])

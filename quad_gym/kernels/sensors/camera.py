@@ -17,25 +17,39 @@ so it would pass any gate, and its update would be wrong and overconfident.
 import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.covariance_resets import MAX_ANGLE, reset_variances
-from quad_gym.kernels.filter.directions import direction_noise, direction_pair
-from quad_gym.kernels.filter.error_state import D, E, R
-from quad_gym.kernels.filter.recovery import reset_drifted_velocity
-from quad_gym.kernels.filter.rows import (
+from quad_gym.kernels.filter.error_state import MAX_ANGLE, D, E, R, reset_variances
+from quad_gym.kernels.filter.measurements import (
     by_derivative,
     columns_of,
+    direction_noise,
+    direction_pair,
     put_block,
     put_three,
     with_pairs,
 )
-from quad_gym.kernels.maths.elementary import maximum, minimum
-from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, norm, outer, store
-from quad_gym.kernels.maths.matrices import load_column3
-from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm, turn_pair
-from quad_gym.kernels.sensors.latency import begin_clock, begin_sample, deliver, tick_clock
-from quad_gym.kernels.sensors.stage import sensor_stage
-from quad_gym.kernels.simd.lanes import any_of, select, zero_like
+from quad_gym.kernels.filter.recovery import reset_drifted_velocity
+from quad_gym.kernels.numbers.elementary import maximum, minimum
+from quad_gym.kernels.numbers.lanes import any_of, select, zero_like
+from quad_gym.kernels.numbers.linalg import (
+    cross,
+    dot,
+    load3,
+    load4,
+    load33,
+    load_column3,
+    norm,
+    outer,
+    store,
+)
+from quad_gym.kernels.numbers.random import normal_pair, stream_of, uniform_pair
+from quad_gym.kernels.numbers.rotation import quaternion_to_dcm, turn_pair
+from quad_gym.kernels.sensors.common import (
+    begin_clock,
+    begin_sample,
+    deliver,
+    sensor_stage,
+    tick_clock,
+)
 from quad_gym.records import (
     DRAW_FEATURE,
     DRAW_PHASE,

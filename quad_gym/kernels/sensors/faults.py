@@ -11,11 +11,11 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.elementary import clip, log, sin_cos
-from quad_gym.kernels.maths.linalg import dot, keep, load3, load33, load44, store
-from quad_gym.kernels.maths.random import stream_of, uniform_pair
-from quad_gym.kernels.simd.blocks import reset
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.numbers.blocks import reset
+from quad_gym.kernels.numbers.elementary import clip, log, sin_cos
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.numbers.linalg import dot, keep, load3, load33, load44, store
+from quad_gym.kernels.numbers.random import stream_of, uniform_pair
 from quad_gym.records import (
     DRAW_FAULTS,
     DRAW_HIDDEN,

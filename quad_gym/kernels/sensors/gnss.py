@@ -1,32 +1,249 @@
-"""The GNSS receiver: one clock and latency for position, baseline and velocity."""
+"""The GNSS receiver: position, baseline and velocity, with one clock and latency."""
+
+import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.error_state import D
-from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import keep, load3, load4
-from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.sensors import gnss_baseline, gnss_position, gnss_velocity
-from quad_gym.kernels.sensors.faults import gnss_heard
-from quad_gym.kernels.sensors.latency import (
+from quad_gym.kernels.filter.error_state import D, R, V, reset_heading, reset_variances
+from quad_gym.kernels.filter.measurements import (
+    columns_of,
+    direction_noise,
+    lever_column,
+    put_block,
+    put_column,
+)
+from quad_gym.kernels.filter.recovery import reset_drifted_velocity
+from quad_gym.kernels.filter.slow import stationary
+from quad_gym.kernels.numbers.elementary import exp, log, minimum
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.numbers.linalg import (
+    cross,
+    diagonal,
+    dot,
+    keep,
+    load3,
+    load4,
+    load33,
+    load_column3,
+    norm,
+    outer,
+    rounded,
+    unit_or,
+    vector,
+)
+from quad_gym.kernels.numbers.random import six_normals, stream_of, uniform_pair
+from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
+from quad_gym.kernels.sensors.common import (
     begin_clock,
     begin_sample,
     deliver_arrived,
     exchange,
     find_arrivals,
+    sensor_stage,
     stamp,
     tick_clock,
 )
-from quad_gym.kernels.sensors.stage import sensor_stage
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.records import (
     BASELINE_BLOCK,
+    DRAW_DRIFT,
     DRAW_GNSS,
     DRAW_PHASE,
+    DRAW_VELOCITY,
     POSITION_BLOCK,
     VELOCITY_BLOCK,
     Sensor,
 )
+
+# --------------------------------------------------------------------------------------------------
+# GNSS position: of the primary antenna.
+#
+# It measures `z = r + R^T l_p + d + v` in I, with white noise v and, where positions drift, a slow
+# error d, which may be a state of the filter (`filter/slow.py`). With a pair of sigma points,
+# R(+-e) R_hat = (I + even +- odd) R_hat, that is
+#
+#     odd:   dr + R_hat^T odd^T l_p + dd,   even:   R_hat^T even^T l_p,
+#
+# and the derivative along an offset is dr + R_hat^T (de x l_p) + dd.
+# --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def measure_position(flight, p, R_BI, normals, mask):
+    """Measure the antenna's position in G, in the lanes `mask`."""
+    s = load3(p.position_sigma_I)
+    antenna_I = load3(flight.r) + R_BI.T @ load3(p.antenna)
+    noise_I = vector(s[0] * normals[0], s[1] * normals[1], s[2] * normals[2])
+    noise_I = noise_I + load3(flight.gnss_drift)
+    keep(flight.gnss_position, mask, load33(p.R_IG).T @ (antenna_I + noise_I))
+
+
+@kernel
+def drift_gnss(flight, p, mask, share):
+    """Advance the slow error of GNSS positions to the next measurement, in the lanes `mask`.
+
+    The first measurement comes a `share` of the period after the start.
+    """
+    n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
+    d, s, whole = load3(flight.gnss_drift), load3(p.drift_drive), p.drift_decay
+    decay = exp(share * log(whole))
+    root = math.sqrt((1.0 - decay) * (1.0 + decay) / ((1.0 - whole) * (1.0 + whole)))
+    drive = vector(root * s[0] * n[0], root * s[1] * n[1], root * s[2] * n[2])
+    keep(flight.gnss_drift, mask, decay * d + rounded(drive))
+
+
+@kernel
+def expect_position(flight, p, work, settings, k, valid):
+    """Fill rows k to k + 2."""
+    R_BI, l_B, s = load33(flight.R_hat), load3(p.antenna), load3(p.position_sigma_I)
+    antenna_I = load3(flight.r_hat) + R_BI.T @ l_B
+    if settings.estimates_drift:
+        antenna_I = antenna_I + load3(flight.slow_hat)
+    z = load33(p.R_IG) @ load3(flight.gnss_position)
+    noise = diagonal((s[0] * s[0], s[1] * s[1], s[2] * s[2]))
+    put_block(work, settings, k, valid, z, antenna_I, noise)
+    for j in range(9):
+        a, s = lever_column(flight, work, settings, j, R_BI, l_B)
+        put_column(work, settings, k, j, valid, load_column3(flight.L, R, j) + a, s)
+    if settings.estimates_drift:
+        last = columns_of(settings) - 1
+        for j in range(last + 1):
+            row = work.A[last - j]
+            for i in range(3):
+                row[k + i] = row[k + i] + select(valid, flight.L_slow[i, j], 0.0)
+
+
+@kernel
+def reset_position(flight, p, work, settings, states, lanes, nu):
+    """Reset the position, and its slow error to the stationary one.
+
+    Where the estimate has drifted off, the velocity is reset, too.
+    """
+    square = dot(nu, nu)
+    reset_drifted_velocity(flight, p, work, states, POSITION_BLOCK, lanes, square)
+    zero = zero_like(square)
+    drift = (zero, zero, zero)
+    if settings.estimates_drift:
+        drift = (stationary(p, 0), stationary(p, 1), stationary(p, 2))
+        reset_variances(work.P, D, states, lanes, drift)
+    squares = (square + drift[0], square + drift[1], square + drift[2])
+    reset_variances(work.P, R, states, lanes, squares)
+
+
+# --------------------------------------------------------------------------------------------------
+# GNSS baseline: the direction from the primary to the secondary antenna.
+#
+# It measures `z = unit(R^T l_b)` in I with noise across that direction. With a pair of sigma
+# points, R(+-e) R_hat = (I + even +- odd) R_hat, that is R_hat^T odd^T u and R_hat^T even^T u, u =
+# unit(l_b); the derivative along an offset is R_hat^T (de x u).
+#
+# Noise n across a unit vector shortens its part along the direction by n^2 / 2, whose mean square
+# is 2 sigma^4 for two axes of standard deviation sigma. It is added along the direction if sigma
+# exceeds `_COARSE`: the sigma points of an uncertain attitude are shortened, too, so that the
+# filter would attribute an innovation along the direction to the attitude.
+#
+# A heading alone is a level baseline of which only the horizontal component across it was measured.
+# A sigma above pi says so: it adds this noise along the other two axes.
+# --------------------------------------------------------------------------------------------------
+
+_COARSE = 0.05
+"""Noise up to which this term is left out [rad], as in the laboratory: it makes no difference."""
+
+
+@kernel
+def noisy_baseline(r_b, normals, sigma_b, floor, length):
+    """Measured baseline of known length, covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I.
+
+    The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section
+    3.1).
+    """
+    size = norm(r_b)
+    u = (1.0 / size) * r_b
+    b = math.sqrt(floor)
+    a = math.sqrt((size * sigma_b) * (size * sigma_b) + floor)
+    noisy = a * normals + r_b + rounded((b - a) * dot(u, normals) * u)
+    return (length / norm(noisy)) * noisy
+
+
+@kernel
+def measure_baseline(flight, p, R_BI, normals, mask):
+    """Measure the baseline in G, in the lanes `mask`."""
+    r_b = load33(p.R_IG).T @ (R_BI.T @ load3(p.baseline))
+    sigma, floor, length = p.baseline_sigma, p.direction_floor, p.baseline_length
+    keep(flight.gnss_baseline, mask, noisy_baseline(r_b, normals, sigma, floor, length))
+
+
+@kernel
+def expect_baseline(flight, p, work, settings, k, valid):
+    """Fill rows k to k + 2."""
+    R_BI, u_B = load33(flight.R_hat), (1.0 / p.baseline_length) * load3(p.baseline)
+    u_I, z = R_BI.T @ u_B, load33(p.R_IG) @ load3(flight.gnss_baseline)
+    noise = direction_noise(u_I, p.baseline_noise * p.baseline_noise, p.direction_floor)
+    white = p.baseline_sigma * p.baseline_sigma
+    along = select(p.baseline_sigma > _COARSE, 2.0 * white * white, 0.0)
+    noise = noise + outer(along * u_I, u_I)
+    alone = p.baseline_sigma > math.pi
+    if any_of(alone):
+        side = unit_or((-u_I[1], u_I[0], zero_like(u_I[0])), (1.0, 0.0, 0.0))
+        up = cross(u_I, side)
+        noise = noise + outer(select(alone, along, 0.0) * up, up)
+    put_block(work, settings, k, valid, (1.0 / norm(z)) * z, u_I, noise)
+    for j in range(9):
+        a, s = lever_column(flight, work, settings, j, R_BI, u_B)
+        put_column(work, settings, k, j, valid, a, s)
+
+
+@kernel
+def reset_baseline(flight, work, states, lanes, nu):
+    """Reset the heading to the sideward innovation."""
+    reset_heading(work.P, load33(flight.R_hat), states, lanes, nu[0] * nu[0] + nu[1] * nu[1])
+
+
+# --------------------------------------------------------------------------------------------------
+# GNSS velocity: of the primary antenna.
+#
+# It measures `z = v + R^T (w x l_p) + v_noise` in I, with body rates w from the gyro. The lever
+# arm's share depends on the attitude. Filters with slow errors take this into account
+# (`filter/slow.py`): where a magnetometer gives the heading, it is off by a few degrees, and the
+# share at 6 rad/s by 0.02 m/s. Where two antennas give the heading to half a degree, this is
+# neglected, so that the model is linear: dz = dv.
+# --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def measure_velocity(flight, p, mask):
+    """Measure the antenna's velocity in G, in the lanes `mask`."""
+    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
+    n, _ = six_normals(stream_of(flight), DRAW_VELOCITY)
+    v_I = load3(flight.v) + R_BI.T @ cross(load3(flight.w), load3(p.antenna))
+    keep(flight.gnss_velocity, mask, R_IG.T @ (p.velocity_sigma * n + v_I))
+
+
+@kernel
+def expect_velocity(flight, p, work, settings, k, valid):
+    """Fill rows k to k + 2."""
+    R_BI, variance = load33(flight.R_hat), p.velocity_sigma * p.velocity_sigma
+    lever_B = cross(load3(flight.w_meas) - load3(flight.b_g_hat), load3(p.antenna))
+    z, z_hat = load33(p.R_IG) @ load3(flight.gnss_velocity), load3(flight.v_hat) + R_BI.T @ lever_B
+    put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
+    for j in range(9):
+        dv = load_column3(flight.L, V, j)
+        s = zero_like(dv)
+        if settings.slow_states > 0:
+            a, s = lever_column(flight, work, settings, j, R_BI, lever_B)
+            dv = dv + a
+        put_column(work, settings, k, j, valid, dv, s)
+
+
+@kernel
+def reset_velocity(work, states, lanes, nu):
+    """Reset the velocity."""
+    squares = (nu[0] * nu[0], nu[1] * nu[1], nu[2] * nu[2])
+    reset_variances(work.P, V, states, lanes, squares)
+
+
+# --------------------------------------------------------------------------------------------------
+# The GNSS receiver: one clock and latency for position, baseline and velocity.
+# --------------------------------------------------------------------------------------------------
 
 _GNSS = int(Sensor.GNSS)
 _BLOCKS = (POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK)
@@ -44,9 +261,9 @@ def measure_gnss(flight, p, paired, mask):
     """Measure the antenna's position and, if `paired`, the baseline, in G, in the lanes `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
-    gnss_position.measure(flight, p, R_BI, n_p, mask)
+    measure_position(flight, p, R_BI, n_p, mask)
     if paired:
-        gnss_baseline.measure(flight, p, R_BI, n_b, mask)
+        measure_baseline(flight, p, R_BI, n_b, mask)
 
 
 @kernel
@@ -58,7 +275,7 @@ def _measure(flight, p, settings, work, stages, mask, corrupted):
     if corrupted:
         call_stage(stages, Stage.CORRUPT_GNSS, flight, p, p, settings, work, 0)
     if settings.gnss_velocity > 0:
-        gnss_velocity.measure(flight, p, mask)
+        measure_velocity(flight, p, mask)
 
 
 @kernel
@@ -82,7 +299,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
         return
     if settings.gnss_drifts > 0 and not starting and any_of(due):
         share = minimum(flight.tick / period, 1.0)
-        gnss_position.drift_gnss(flight, p, due, share)
+        drift_gnss(flight, p, due, share)
     measured = mask if starting else due
     paired = measured
     initializes = starting and not settings.warm  # this fix has no faults
@@ -116,11 +333,11 @@ def _expect(flight, p, work, settings, k):
         valid = flight.block_valid[block] > 0.0
         if any_of(valid):
             if block == POSITION_BLOCK:
-                gnss_position.expect(flight, p, work, settings, k, valid)
+                expect_position(flight, p, work, settings, k, valid)
             elif block == BASELINE_BLOCK:
-                gnss_baseline.expect(flight, p, work, settings, k, valid)
+                expect_baseline(flight, p, work, settings, k, valid)
             else:
-                gnss_velocity.expect(flight, p, work, settings, k, valid)
+                expect_velocity(flight, p, work, settings, k, valid)
             k += 3
 
 
@@ -130,11 +347,11 @@ def _reset(flight, p, work, settings):
     for block in _BLOCKS:
         nu, lanes = load3(flight.innovation[block]), work.reset[block] > 0.0
         if block == POSITION_BLOCK:
-            gnss_position.reset(flight, p, work, settings, states, lanes, nu)
+            reset_position(flight, p, work, settings, states, lanes, nu)
         elif block == BASELINE_BLOCK:
-            gnss_baseline.reset(flight, work, states, lanes, nu)
+            reset_baseline(flight, work, states, lanes, nu)
         else:
-            gnss_velocity.reset(work, states, lanes, nu)
+            reset_velocity(work, states, lanes, nu)
 
 
 gnss_stage = sensor_stage(Sensor.GNSS, _begin, _sample, _expect, _reset)

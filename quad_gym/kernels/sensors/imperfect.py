@@ -7,11 +7,20 @@ nothing else.
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.elementary import sin_cos
-from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, load4, load33, norm, rounded
-from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.numbers.elementary import sin_cos
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, select
+from quad_gym.kernels.numbers.linalg import (
+    cross,
+    dot,
+    keep,
+    load3,
+    load4,
+    load33,
+    norm,
+    rounded,
+)
+from quad_gym.kernels.numbers.random import normal_pair, six_normals, stream_of, uniform_pair
+from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.records import (
     DRAW_BLUR,
     DRAW_HEADING,

@@ -5,10 +5,14 @@ measurements.
 """
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
-from quad_gym.kernels.maths.linalg import keep, load3, load4, store
-from quad_gym.kernels.maths.random import six_normals, stream_of
-from quad_gym.kernels.maths.rotation import mean_quaternion, quaternion_to_dcm, rotation_between
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.numbers.lanes import select
+from quad_gym.kernels.numbers.linalg import keep, load3, load4, store
+from quad_gym.kernels.numbers.random import six_normals, stream_of
+from quad_gym.kernels.numbers.rotation import (
+    mean_quaternion,
+    quaternion_to_dcm,
+    rotation_between,
+)
 from quad_gym.kernels.vehicle.dynamics import (
     air_accelerations,
     body_point_velocity,

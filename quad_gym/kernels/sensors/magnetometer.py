@@ -24,10 +24,17 @@ along s, so that the derivative relates the heading's error to others:
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.align import lever_of_attitude
-from quad_gym.kernels.filter.covariance_resets import reset_heading, reset_variances
-from quad_gym.kernels.filter.error_state import BA, D, E, R, V, put_covariance
-from quad_gym.kernels.filter.rows import (
+from quad_gym.kernels.filter.error_state import (
+    BA,
+    D,
+    E,
+    R,
+    V,
+    put_covariance,
+    reset_heading,
+    reset_variances,
+)
+from quad_gym.kernels.filter.measurements import (
     by_derivative,
     columns_of,
     put_block,
@@ -35,9 +42,11 @@ from quad_gym.kernels.filter.rows import (
     with_pairs,
 )
 from quad_gym.kernels.filter.slow import keep_factor
-from quad_gym.kernels.maths.elementary import maximum, sin_cos
-from quad_gym.kernels.maths.factors import cholesky
-from quad_gym.kernels.maths.linalg import (
+from quad_gym.kernels.filter.starts import lever_of_attitude
+from quad_gym.kernels.numbers.elementary import maximum, sin_cos
+from quad_gym.kernels.numbers.factors import cholesky
+from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.linalg import (
     cross,
     diagonal,
     dot,
@@ -45,16 +54,17 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load4,
     load33,
+    load_block,
+    load_column3,
     outer,
     rounded,
     store,
+    store_block,
     vector,
 )
-from quad_gym.kernels.maths.matrices import load_block, load_column3, store_block
-from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
-from quad_gym.kernels.sensors.aid import aid_stage, draw_matrix
-from quad_gym.kernels.simd.lanes import select, zero_like
+from quad_gym.kernels.numbers.random import normal_pair, stream_of
+from quad_gym.kernels.numbers.rotation import level_attitude, quaternion_to_dcm
+from quad_gym.kernels.sensors.common import aid_stage, draw_matrix
 from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["MAGNETOMETER"])
@@ -131,7 +141,7 @@ def _tie_heading(p, P, m, R_BI, iron, delta):
 
 @kernel
 def _tie_position(p, P, R_BI, iron, delta):
-    """Correlate the position with the attitude in P, as an antenna was measured: see `align.py`."""
+    """Correlate the position with the attitude in P, as an antenna was measured: see `starts.py`."""
     J, s = lever_of_attitude(R_BI, load3(p.antenna)), load3(p.position_sigma_I)
     k, with_attitude = p.initial_covariance_scale, _full(P) @ J.T
     white = diagonal((k * s[0] * s[0], k * s[1] * s[1], k * s[2] * s[2]))

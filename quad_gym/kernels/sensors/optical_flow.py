@@ -19,17 +19,28 @@ and the derivative along an offset is (dV + W x de) G + W (du / h - u dh / h^2).
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.covariance_resets import reset_variances
-from quad_gym.kernels.filter.error_state import E, R, V
-from quad_gym.kernels.filter.rows import by_derivative, put_block, put_column, with_pairs
-from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import cross, diagonal, load3, load4, load33, vector
-from quad_gym.kernels.maths.matrices import load_column3
-from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.sensors.aid import aid_stage
+from quad_gym.kernels.filter.error_state import E, R, V, reset_variances
+from quad_gym.kernels.filter.measurements import (
+    by_derivative,
+    put_block,
+    put_column,
+    with_pairs,
+)
+from quad_gym.kernels.numbers.elementary import maximum
+from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.linalg import (
+    cross,
+    diagonal,
+    load3,
+    load4,
+    load33,
+    load_column3,
+    vector,
+)
+from quad_gym.kernels.numbers.random import normal_pair, stream_of
+from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
+from quad_gym.kernels.sensors.common import aid_stage
 from quad_gym.kernels.sensors.range_finder import MIN_COSINE, ground_range
-from quad_gym.kernels.simd.lanes import select, zero_like
 from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["OPTICAL_FLOW"])

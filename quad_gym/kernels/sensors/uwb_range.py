@@ -14,22 +14,20 @@ A detour of the signal, which the filter does not model, lengthens some ranges.
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.covariance_resets import reset_variances
-from quad_gym.kernels.filter.error_state import R
-from quad_gym.kernels.filter.rows import (
+from quad_gym.kernels.filter.error_state import R, reset_variances
+from quad_gym.kernels.filter.measurements import (
     by_derivative,
     lever_column,
     put_block,
     put_column,
     with_pairs,
 )
-from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import diagonal, dot, load3, load4, load33, norm
-from quad_gym.kernels.maths.matrices import load_column3
-from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.sensors.aid import aid_stage
-from quad_gym.kernels.simd.lanes import select, zero_like
+from quad_gym.kernels.numbers.elementary import maximum
+from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.linalg import diagonal, dot, load3, load4, load33, load_column3, norm
+from quad_gym.kernels.numbers.random import normal_pair, stream_of, uniform_pair
+from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
+from quad_gym.kernels.sensors.common import aid_stage
 from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["UWB_RANGE"])

@@ -1,10 +1,10 @@
 """Errors, reward and endings of a step, computed from the true state."""
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.elementary import exp, is_finite
-from quad_gym.kernels.maths.linalg import dot, keep, load3, load4, norm
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import logical_not, select, zero_like
+from quad_gym.kernels.numbers.elementary import exp, is_finite
+from quad_gym.kernels.numbers.lanes import logical_not, select, zero_like
+from quad_gym.kernels.numbers.linalg import dot, keep, load3, load4, norm
+from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import MAX_GATES, Ending, RewardTerm, TaskKind
 

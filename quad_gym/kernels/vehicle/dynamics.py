@@ -4,8 +4,12 @@ A state is (r_I, v_I, q, w_B, rotor_speeds), a tuple of tuples; its derivative h
 """
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, load44, store
-from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
+from quad_gym.kernels.numbers.linalg import cross, dot, load3, load4, load33, load44, store
+from quad_gym.kernels.numbers.rotation import (
+    normalize_quaternion,
+    quaternion_rate,
+    quaternion_to_dcm,
+)
 
 
 @kernel

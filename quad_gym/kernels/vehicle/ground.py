@@ -1,4 +1,4 @@
-"""The ground as a level plane that carries a vehicle: contact of its feet and rotor hubs.
+"""The ground as a level plane that carries a vehicle, and the launch pad.
 
 Each tick is flown freely first. Where a point would be below the plane at its end, impulses act at
 all points: with the gap g_i, velocity u_i and impulse j_i of point i, and the tick h,
@@ -17,12 +17,21 @@ normal forces and static friction can hold keeps its exact state.
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.elementary import clip, maximum, minimum, sin_cos
-from quad_gym.kernels.maths.linalg import cross, dot, keep, load3, load4, load33, rounded, store
-from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_to_dcm
-from quad_gym.kernels.simd.lanes import any_of, logical_not, select, zero_like
-from quad_gym.kernels.vehicle.dynamics import air_accelerations, load_start
+from quad_gym.kernels.numbers.elementary import clip, maximum, minimum, sin_cos
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.numbers.linalg import cross, dot, keep, load3, load4, load33, rounded, store
+from quad_gym.kernels.numbers.rotation import normalize_quaternion, quaternion_to_dcm
+from quad_gym.kernels.vehicle.dynamics import (
+    accelerations,
+    air_accelerations,
+    load_start,
+    load_state,
+)
 from quad_gym.records import Ending
+
+# --------------------------------------------------------------------------------------------------
+# The ground as a level plane that carries a vehicle: contact of its feet and rotor hubs.
+# --------------------------------------------------------------------------------------------------
 
 SWEEPS = 24  #: Gauss-Seidel sweeps over all points in a tick
 STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
@@ -303,3 +312,41 @@ def judge_landing_stage(flight, world, model, settings, work, stages, flag):
     over, flying = (work.mask > 0.0) & (flight.crashed > 0.0), flight.terminated <= 0.0
     flight.ending = select(over & flying, Ending.BELOW_MIN_HEIGHT, flight.ending)
     flight.terminated = select(over, 1.0, flight.terminated)
+
+
+# --------------------------------------------------------------------------------------------------
+# The launch pad: it carries a vehicle that starts on the ground until its thrust lifts it.
+# --------------------------------------------------------------------------------------------------
+
+
+@stage
+def keep_start_stage(flight, world, model, settings, work, stages, flag):
+    """Keep the true state at the start of a tick, for contact and for IMU samples that average."""
+    if settings.grounded or settings.imu_averages or any_of(flight.on_pad > 0.0):
+        r, v, q, w, W = load_state(flight)
+        store(work.start, r)
+        store(work.start[3:], v)
+        store(work.start[6:], q)
+        store(work.start[10:], w)
+        store(work.start[13:], W)
+
+
+@stage
+def rest_on_pad_stage(flight, world, model, settings, work, stages, flag):
+    """Undo the tick's motion of vehicles on the pad, and release those that lift off.
+
+    On the pad only the rotors move: its normal force balances weight less thrust, and friction
+    holds position and attitude. It can push, not pull: a vehicle that the other forces accelerate
+    upward has lifted off. The pad does no work, as nothing moves on it.
+    """
+    on_pad = flight.on_pad > 0.0
+    if any_of(on_pad):
+        r, v, q, w, _ = load_start(work)
+        keep(flight.r, on_pad, r)
+        keep(flight.v, on_pad, v)
+        keep(flight.w, on_pad, w)
+        keep(flight.q, on_pad, q)
+        d_I = load3(flight.disturbance) + load3(flight.air_force)
+        W, v_air_I = load4(flight.rotor_speeds), v - load3(flight.wind)
+        a_I, _ = accelerations(quaternion_to_dcm(q), v_air_I, w, W, d_I, world)
+        flight.on_pad = select(on_pad & (a_I[2] <= 0.0), 1.0, 0.0)

@@ -9,7 +9,7 @@ import pytest
 
 from quad_gym.kernels.compiling import cache as caches
 from quad_gym.kernels.compiling import entry, kernel, routine
-from quad_gym.kernels.maths.linalg import cross
+from quad_gym.kernels.numbers.linalg import cross
 from tests.unit.compiling.parts import PREPARE, RIGHT, Parts
 
 FULL_DISK = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))\n" + PREPARE

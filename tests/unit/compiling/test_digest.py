@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.digest import digest_of_function
+from quad_gym.kernels.compiling.cache import digest_of_function
 from tests.builders import run_python
 
 ROOT = Path(__file__).parents[3]
 SCRIPT = """
 import importlib, json, sys
 from pathlib import Path
-from quad_gym.kernels import digest
-from quad_gym.kernels.digest import digest_of
+from quad_gym.kernels.compiling import cache
+from quad_gym.kernels.compiling.cache import digest_of
 
 root = Path.cwd()
 modules = [name.removesuffix(".py").replace("/", ".") for name in json.loads(sys.argv[1])]
@@ -28,7 +28,7 @@ for name, old, new in json.loads(sys.argv[2]):
     text = file.read_text()
     assert old in text, (name, old)
     file.write_text(text.replace(old, new, 1) if old else text + new)
-    digest._read.cache_clear()
+    cache._read.cache_clear()
     found.append([digest_of(name) for name in modules])
     file.write_text(text)
 print(json.dumps(found))
@@ -42,7 +42,7 @@ STATEMENT, COMMENT = "\n_MORE = 1\n", "\n# a comment\n"
 DOCSTRING = '"""Another docstring."""'
 EDITS = {
     # edit: (file, old, new, 1 or 0 if the code of MOVE, UPDATE and HELPER depends on it or not)
-    "a leaf kernel": ("quad_gym/kernels/maths/linalg.py", "", STATEMENT, (1, 1, 1)),
+    "a leaf kernel": ("quad_gym/kernels/numbers/linalg.py", "", STATEMENT, (1, 1, 1)),
     "a constant": (MOVE, "h / 6.0", "h / 7.0", (1, 0, 0)),
     "a record's field": (
         "quad_gym/records/flight.py",
@@ -57,7 +57,7 @@ EDITS = {
     "a test's own file": (HELPER, "", STATEMENT, (0, 0, 1)),
     "a test's helper": ("tests/help.py", "", STATEMENT, (0, 0, 1)),
     "a helper by a relative name": ("tests/near.py", "", STATEMENT, (0, 0, 1)),
-    "a comment": ("quad_gym/kernels/maths/linalg.py", "", COMMENT, (0, 0, 0)),
+    "a comment": ("quad_gym/kernels/numbers/linalg.py", "", COMMENT, (0, 0, 0)),
     "a docstring": (HELPER, "What it does.", "What it did.", (0, 0, 0)),
     "environments": ("quad_gym/envs/single.py", "", STATEMENT, (0, 0, 0)),
     "parameters": ("quad_gym/params/task.py", "", STATEMENT, (0, 0, 0)),
@@ -66,7 +66,7 @@ EDITS = {
 TESTS = {
     "__init__.py": "",
     "case.py": '"""What it does."""\n'
-    "from quad_gym.kernels.maths.linalg import cross\n"
+    "from quad_gym.kernels.numbers.linalg import cross\n"
     "from tests.help import helped\nfrom .near import nearby\n",
     "help.py": "helped = 1\n",
     "near.py": "nearby = 1\n",

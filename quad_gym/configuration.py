@@ -1,0 +1,240 @@
+"""`FlightConfiguration`: the keywords of `FlightBatch`, checked."""
+
+import math
+from dataclasses import KW_ONLY, fields
+from enum import IntEnum
+from functools import cached_property, partial
+from typing import Annotated, Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.faults import Fault, FaultsGiven, faults_of
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
+from quad_gym.params.filter import FilterParams
+from quad_gym.params.randomization import DrawingTable, Randomization, check_draws
+from quad_gym.params.suites import ALL_SUITES, SensorSuite, given_suite, sensor_suite
+from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.vehicle import (
+    ActionParams,
+    Clocks,
+    PDGains,
+    VehicleParams,
+    pd_gains,
+    vehicle_params,
+)
+from quad_gym.params.world import WorldParams, world_params
+from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
+
+MAX_FLIGHTS = 10**7  #: largest number of flights in a batch
+_WITHOUT = {
+    "gains": tuple(control for control in Control if control is not Control.PD),
+    "action_params": (Control.PD, Control.MOTOR, Control.WRENCH),
+}
+"""Arguments of controllers, and the meanings of an action with which they have no effect."""
+
+
+def _vehicle(name: str, given: Any) -> VehicleParams:
+    return check.instance(
+        name, vehicle_params(given) if isinstance(given, str) else given, VehicleParams
+    )
+
+
+def _unresolved(_: str, given: Any) -> Any:
+    return given
+
+
+def _member(kind: type[IntEnum]) -> check.Rule:
+    return lambda _, given: kind(given)
+
+
+def _task(name: str, given: Any) -> TaskParams:
+    return check.instance(name, TaskParams() if given is None else given, TaskParams)
+
+
+def _randomization(_: str, given: Any) -> Randomization:
+    return Randomization.of(given)
+
+
+class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
+    """Arguments of `FlightBatch`: number of flights, and everything that they have in common.
+
+    `quad_gym.QuadEnv` explains the fields that are keywords of environments, too. Vehicle, sensors
+    and world may be given by their names. See `quad_gym.batch.starts` and `warm_start` for the
+    bounds and the details of `filter_start`.
+
+    Raises:
+        ValueError: If a value is invalid, or has no effect with the others.
+    """
+
+    count: Annotated[int, partial(check.whole, most=MAX_FLIGHTS)]
+    """number of flights"""
+    _: KW_ONLY
+    vehicle: Annotated[VehicleParams, _vehicle] = cast(Any, "lab")
+    sensors: Annotated[SensorSuite, given_suite] = cast(Any, "standard")
+    gains: PDGains | str | None = None
+    """gains of `Control.PD`, or the name of a preset; None: "lab\""""
+    action_params: ActionParams | None = None
+    task: Annotated[TaskParams, _task] = cast(Any, None)
+    """reference, start and termination"""
+    source: Annotated[Source, _member(Source)] = Source.ESTIMATE
+    """source of the state that the controller observes"""
+    control: Annotated[Control, _member(Control)] = Control.PD
+    """meaning of an action; `Control.PD` flies without actions"""
+    control_rate: float | None = None
+    """actions per second, which must divide the IMU rate; None: the IMU rate [Hz]"""
+    substeps: int = 1
+    action_delay: Annotated[float, check.between(0.0, float(MAX_ACTION_DELAY))] = 0.0
+    layout: Annotated[Layout, _member(Layout)] = Layout.RELATIVE
+    """layout of the observations"""
+    include_std: bool = False
+    privileged: bool = False
+    bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    """(low, high) of the observations, each (n,); None: no observations"""
+    autoreset: Annotated[Autoreset, _member(Autoreset)] = Autoreset.DISABLED
+    """start of the next episode after one has ended"""
+    run_filter: bool | None = None
+    """True: sensors and filter run; None: they run if another argument needs them"""
+    estimator: object = None
+    """an own `quad_gym.Estimator`, its class, or "module:Class"; None: the filter of the sensors"""
+    filter_start: Literal["cold", "warm"] = "cold"
+    innovations: bool = False
+    """True: keep innovations and NIS block by block, for `record`: "innovation",
+    "innovation_sigma", "block_nis". Filters with an innovation gate, with `faults`, or with
+    `truncate_when_diverged` in their task always keep them"""
+    threads: int | None = None
+    true_vehicle: VehicleParams | None = None
+    true_sensors: SensorSuite | None = None
+    world: Annotated[WorldParams, _unresolved] = cast(Any, "calm")
+    """a preset is that of the flown vehicle"""
+    randomization: Annotated[Randomization, _randomization] = cast(Any, None)
+    faults: FaultsGiven = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        world: Any = self.world
+        if isinstance(world, str):
+            world = world_params(world, self.flown_vehicle)
+        self._set("world", check.instance("world", world, WorldParams))
+        check.instance("gains", self.pd_gains, PDGains)
+        check_limit(self.task, self.clocks.imu_rate, "IMU rate")
+        self.sensors.require_like(self.flown_sensors)
+        self._require_effect()
+        if self.filters:
+            self.sensors.require_filter()
+        if self.longest_delay > 0 and self.control is Control.PD:
+            raise ValueError("action_delay needs actions: Control.PD flies without any")
+        check_draws(self.draws, self.flown_vehicle, self.world, self.clocks)
+
+    def _require_effect(self) -> None:
+        """Refuse arguments of another controller, and of a filter that does not run."""
+        for name, without in _WITHOUT.items():
+            if getattr(self, name) is not None and self.control in without:
+                raise ValueError(
+                    f"{name} must not be given with Control.{self.control.name}: it uses none"
+                )
+        if self.filters:
+            if self.estimator is not None:
+                self._require_effect_on_own()
+            return
+        for name, value, idle in (
+            ("estimator", self.estimator, None),
+            ("include_std", self.include_std, False),
+            ("innovations", self.innovations, False),
+            ("truncate_when_diverged", self.task.truncate_when_diverged, False),
+            ("filter_start", self.filter_start, "cold"),
+        ):
+            if value != idle:
+                raise ValueError(f"{name} needs a filter, and none runs here, got {value!r}")
+
+    def _require_effect_on_own(self) -> None:
+        """Refuse arguments that have an effect on the built-in filter only."""
+        for name, value in (
+            ("innovations", self.innovations),
+            ("truncate_when_diverged", self.task.truncate_when_diverged),
+        ):
+            if value:
+                raise ValueError(
+                    f"{name} has no effect with an own estimator, and must not be given"
+                )
+        presets = [sensor_suite(name).estimator for name in ALL_SUITES]
+        for field in fields(FilterParams):
+            value = getattr(self.sensors.estimator, field.name)
+            chosen = all(value != getattr(preset, field.name) for preset in presets)
+            if chosen and not field.name.startswith("initial") and field.name != "reuse_first_fix":
+                raise ValueError(
+                    f"SensorSuite.estimator.{field.name} has no effect with an own estimator, and "
+                    f"must have the value of a preset, got {value!r}"
+                )
+
+    @cached_property
+    def pd_gains(self) -> PDGains:
+        """Gains of `Control.PD`."""
+        if isinstance(self.gains, str | None):
+            return pd_gains(self.gains or "lab", self.vehicle)
+        return self.gains
+
+    @property
+    def actions(self) -> ActionParams:
+        """Scales of the actions."""
+        return ActionParams() if self.action_params is None else self.action_params
+
+    @property
+    def flown_vehicle(self) -> VehicleParams:
+        """The true vehicle."""
+        return self.vehicle if self.true_vehicle is None else self.true_vehicle
+
+    @property
+    def flown_sensors(self) -> SensorSuite:
+        """The true sensors."""
+        return self.sensors if self.true_sensors is None else self.true_sensors
+
+    @cached_property
+    def clocks(self) -> Clocks:
+        """Rates of simulation and control."""
+        rate = self.sensors.imu.rate if self.control_rate is None else self.control_rate
+        return Clocks(imu_rate=self.sensors.imu.rate, control_rate=rate, substeps=self.substeps)
+
+    @cached_property
+    def possible_faults(self) -> tuple[Fault, ...]:
+        """Faults that can occur, at most one of each kind."""
+        return faults_of(self.faults, self.flown_sensors)
+
+    @property
+    def filters(self) -> bool:
+        """True if sensors and filter run."""
+        if self.run_filter is not None:
+            return self.run_filter
+        needed = self.include_std or self.innovations
+        return needed or self.source in (Source.ESTIMATE, Source.MEASUREMENTS)
+
+    @property
+    def keeps_innovations(self) -> bool:
+        """True if innovations are kept block by block."""
+        diverges = self.task.truncate_when_diverged
+        return self.filters and (self.innovations or bool(self.possible_faults) or diverges)
+
+    @property
+    def begins_after_step(self) -> bool:
+        """True if the batch itself begins episodes after a step.
+
+        The kernels would begin them before the last innovations can be read.
+        """
+        return self.innovations and self.autoreset is Autoreset.SAME_STEP
+
+    @property
+    def compiled_autoreset(self) -> Autoreset:
+        """The mode of the kernels."""
+        return Autoreset.DISABLED if self.begins_after_step else self.autoreset
+
+    @cached_property
+    def draws(self) -> DrawingTable:
+        """Distributions of the parameters that episodes draw."""
+        true = (self.flown_vehicle, self.flown_sensors, self.world)
+        return DrawingTable(self.randomization, *true, self.action_delay)
+
+    @property
+    def longest_delay(self) -> int:
+        """Longest delay of an action, drawn or not [control steps]."""
+        return math.ceil(self.draws.high[COLUMNS["action_delay"]][0])

@@ -1,1 +1,0 @@
-"""Flights on a GPU: their memory as torch tensors, and the launches of their kernel."""

@@ -1,1 +1,0 @@
-"""A filter for one vehicle: its memory, starts, inputs and estimate."""

@@ -1,1 +1,0 @@
-"""Experiments: trainings and flights that become tables, figures and pages."""

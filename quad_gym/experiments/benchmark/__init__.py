@@ -1,1 +1,0 @@
-"""Benchmark of all parts, a module for each section."""

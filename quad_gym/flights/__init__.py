@@ -1,1 +1,0 @@
-"""The record of one flight: its columns and its files."""

@@ -1,1 +1,0 @@
-"""Elementary functions, small linear algebra, rotations and random numbers. Imports simd."""

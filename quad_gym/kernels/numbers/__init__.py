@@ -1,0 +1,1 @@
+"""Number types of the kernels: lanes, vectors, matrices, rotations, and random numbers."""

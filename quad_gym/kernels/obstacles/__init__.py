@@ -1,1 +1,0 @@
-"""Obstacles: shapes, contact and lines of sight. Imports maths."""

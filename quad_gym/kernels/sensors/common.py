@@ -1,0 +1,388 @@
+"""The parts that sensors share: clock, latency, delivery, errors, and the stage itself."""
+
+from typing import Any
+
+import numpy as np
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.error_state import D
+from quad_gym.kernels.filter.measurements import ACTS
+from quad_gym.kernels.numbers.elementary import maximum
+from quad_gym.kernels.numbers.lanes import any_of, no_lane, select, zero_like
+from quad_gym.kernels.numbers.linalg import keep, load3
+from quad_gym.kernels.numbers.random import normal_pair, stream_of, uniform_pair
+from quad_gym.records import (
+    AID_BLOCK,
+    AID_GROUPS,
+    AID_MOST,
+    AID_ROW,
+    DELAY_SLOTS,
+    DRAW_AID_DRIFT,
+    DRAW_AID_MATRIX,
+    DRAW_AID_PHASE,
+    DRAW_AID_VECTOR,
+    DRAW_SLOW,
+    FIRST_AID,
+    FIRST_BLOCK,
+    STAMP,
+    Act,
+    Aid,
+    FaultKind,
+    Sensor,
+)
+
+# --------------------------------------------------------------------------------------------------
+# Clocks of sensors, and their latency: measurements in transit wait in a flight's record.
+#
+# A clock has the ticks of a sensor's first and next measurement. A measurement in transit is stored
+# with its time stamp: the sums of the IMU when it was taken, with which `filter/delayed.py`
+# retrodicts the estimate to that instant.
+# --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def _first_wait(phase, period, share):
+    """Ticks to a sensor's first measurement: its phase, or random within its period."""
+    ticks = zero_like(share)
+    for k in range(1, period):
+        ticks = ticks + select(share * period >= 1.0 * k, 1.0, 0.0)
+    if phase >= 0:
+        ticks = zero_like(share) + phase
+    return ticks
+
+
+@kernel
+def begin_clock(flight, settings, sensor, share, mask):
+    """Begin an episode of a sensor, in the lanes `mask`: nothing is measured yet.
+
+    A random phase is a `share` of the period.
+    """
+    wait = _first_wait(settings.sensor_phase[sensor], settings.sensor_ticks[sensor], share)
+    flight.wait[sensor] = select(mask, wait, flight.wait[sensor])
+    first = FIRST_BLOCK[sensor]
+    for block in range(first, first + settings.sensor_blocks[sensor]):
+        flight.block_fresh[block] = select(mask, 0.0, flight.block_fresh[block])
+        flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
+    if settings.sensor_delay[sensor] > 0:
+        for slot in range(DELAY_SLOTS):
+            row = flight.stamps[sensor, slot]
+            row[0] = select(mask, np.nan, row[0])
+
+
+@kernel
+def tick_clock(flight, settings, sensor, mask):
+    """Advance a sensor's clock by a tick; return the lanes in which it measures now."""
+    wait, period = flight.wait[sensor], settings.sensor_ticks[sensor]
+    due = mask & (wait <= 0.0) & (period > 0)
+    flight.wait[sensor] = select(mask, select(due, 1.0 * period, wait) - 1.0, wait)
+    return due
+
+
+@kernel
+def _put_stamp(stamps, flight, under_way, taken):
+    """Shift the stamps of a sensor, (DELAY_SLOTS, STAMP), and stamp the first with the present."""
+    for slot in range(under_way, 0, -1):
+        for i in range(STAMP):
+            stamps[slot, i] = select(taken, stamps[slot - 1, i], stamps[slot, i])
+    row = stamps[0]
+    row[0] = select(taken, flight.tick, row[0])
+    for i in range(3):
+        for j in range(3):
+            k = 1 + 3 * i + j
+            row[k] = select(taken, flight.imu_turn[i, j], row[k])
+            row[k + 15] = select(taken, flight.imu_bias_gain[i, j], row[k + 15])
+        row[10 + i] = select(taken, flight.imu_velocity[i], row[10 + i])
+        row[13 + i] = select(taken, flight.imu_position[i], row[13 + i])
+        row[25 + i] = select(taken, flight.w_meas[i], row[25 + i])
+
+
+@kernel
+def find_arrivals(flight, work, settings, sensor, mask):
+    """Fill work.arrives with the slot that arrives now; return the lanes in which one does."""
+    stamps, delay = flight.stamps[sensor], settings.sensor_delay[sensor]
+    some = no_lane(flight.tick)
+    for slot in range(settings.under_way[sensor]):
+        here = mask & (stamps[slot, 0] == flight.tick - delay)
+        work.arrives[slot] = select(here, 1.0, 0.0)
+        some = some | here
+    return some
+
+
+@kernel
+def stamp(flight, settings, sensor, mask):
+    """Stamp the measurements just taken; return the lanes that have any."""
+    first, valid = FIRST_BLOCK[sensor], zero_like(flight.tick)
+    for block in range(first, first + settings.sensor_blocks[sensor]):
+        valid = valid + flight.block_valid[block]
+    taken = mask & (valid > 0.0)
+    if any_of(taken):
+        _put_stamp(flight.stamps[sensor], flight, settings.under_way[sensor], taken)
+    return taken
+
+
+@kernel
+def exchange(flight, work, block, values, numbers, under_way, mask, taken):
+    """Hold back the block that has just been measured, and deliver the one that arrives.
+
+    Args:
+        flight: Record.
+        work: Workspace; reads the results of `begin_sample` and `find_arrivals`.
+        block: Number of the block.
+        values: Its numbers in the record.
+        numbers: Count of these numbers.
+        under_way: Largest number of measurements in transit.
+        mask: Lanes to work on.
+        taken: Lanes in which the sensor has measured.
+    """
+    waiting, flags = flight.waiting[block], flight.waiting_valid[block]
+    valid, arrived = flight.block_valid[block], zero_like(flight.tick)
+    for slot in range(under_way):
+        here = work.arrives[slot] > 0.0
+        for i in range(numbers):
+            kept = work.arrived[block, i]
+            work.arrived[block, i] = select(here, waiting[slot, i], kept)
+        arrived = select(here, flags[slot], arrived)
+    if any_of(taken):
+        for slot in range(under_way - 1, 0, -1):
+            for i in range(numbers):
+                waiting[slot, i] = select(taken, waiting[slot - 1, i], waiting[slot, i])
+            flags[slot] = select(taken, flags[slot - 1], flags[slot])
+        for i in range(numbers):
+            waiting[0, i] = select(taken, values[i], waiting[0, i])
+        flags[0] = select(taken, valid, flags[0])
+    flight.block_valid[block] = select(mask, arrived, valid)
+    fresh = flight.block_fresh[block]
+    flight.block_fresh[block] = select(mask & (arrived > 0.0), 1.0, fresh)
+
+
+@kernel
+def deliver_arrived(work, block, values, numbers, mask):
+    """Replace the numbers that have just been measured by those that arrived last."""
+    for i in range(numbers):
+        values[i] = select(mask, work.arrived[block, i], values[i])
+
+
+@kernel
+def begin_sample(flight, work, settings, sensor, values, numbers, mask):
+    """Invalidate the blocks of the last sample, and keep their numbers if there are delays.
+
+    `values` (blocks, numbers): those of the sensor in the record.
+    """
+    first = FIRST_BLOCK[sensor]
+    for i in range(settings.sensor_blocks[sensor]):
+        flight.block_valid[first + i] = select(mask, 0.0, flight.block_valid[first + i])
+        if settings.sensor_delay[sensor] > 0:
+            for n in range(numbers):
+                work.arrived[first + i, n] = values[i][n]
+
+
+@kernel
+def deliver(flight, work, settings, sensor, values, numbers, mask, due):
+    """Deliver the measurement of a sensor in the lanes `due`, now or after its latency."""
+    first, count = FIRST_BLOCK[sensor], settings.sensor_blocks[sensor]
+    if settings.sensor_delay[sensor] == 0:
+        for block in range(first, first + count):
+            new = due & (flight.block_valid[block] > 0.0)
+            flight.block_fresh[block] = select(new, 1.0, flight.block_fresh[block])
+    elif any_of(due | find_arrivals(flight, work, settings, sensor, mask)):
+        taken, under_way = stamp(flight, settings, sensor, mask), settings.under_way[sensor]
+        for i in range(count):
+            exchange(flight, work, first + i, values[i], numbers, under_way, mask, taken)
+            deliver_arrived(work, first + i, values[i], numbers, mask)
+
+
+# --------------------------------------------------------------------------------------------------
+# The stage of a sensor, composed of the sensor's kernels.
+# --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def _cannot_align(flight, p, work, settings, mask):
+    """Placeholder for sensors that observe no heading; never called."""
+
+
+def sensor_stage(
+    sensor: Sensor,
+    begin: Any,
+    sample: Any,
+    expect: Any,
+    reset: Any,
+    align: Any = _cannot_align,
+) -> Any:
+    """Make the stage of a sensor; its flag is an `Act`, and an argument times `ACTS`.
+
+    Args:
+        sensor: The sensor.
+        begin: `(flight, p, settings, mask)`: begin an episode: clock and constant errors.
+        sample: `(flight, world, settings, work, stages, mask, starting)`: measure when due, and
+            deliver.
+        expect: `(flight, p, work, settings, k)`: fill the sensor's rows, from k on.
+        reset: `(flight, p, work, settings)`: reset states where `work.reset`.
+        align: `(flight, p, work, settings, mask)`: initialize the heading.
+    """
+
+    def call(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
+        act, argument, mask = flag % ACTS, flag // ACTS, work.mask > 0.0
+        if act == Act.BEGIN:
+            begin(flight, world, settings, mask)
+        elif act == Act.SAMPLE:
+            sample(flight, world, settings, work, stages, mask, argument > 0)
+            work.mask = select(mask, 1.0, 0.0)
+        elif act == Act.EXPECT:
+            expect(flight, model, work, settings, argument)
+        elif act == Act.RESET:
+            reset(flight, model, work, settings)
+        else:
+            align(flight, model, work, settings, mask)
+
+    call.__name__ = call.__qualname__ = f"{sensor.name.lower()}_stage"  # for caches and messages
+    return stage(call)
+
+
+# --------------------------------------------------------------------------------------------------
+# Errors, delivery and gate shared by the sensors with parameters in the fields `aid_...`.
+#
+# A sensor has one block of up to three numbers, or several. It may have Gauss-Markov errors of
+# three numbers and of one, and constant errors of scale and alignment.
+# --------------------------------------------------------------------------------------------------
+
+AID_LOSS = FaultKind[f"{Aid(0).name}_LOSS"].value
+"""First of the faults that silence aiding sensors, which are in the same order."""
+
+for _aid in Aid:
+    assert FaultKind[f"{_aid.name}_LOSS"] == AID_LOSS + _aid
+
+
+@kernel
+def _begin(flight, p, settings, s, mask):
+    """Begin an episode of sensor s of `Aid`, in the lanes `mask`: draw its errors, set its clock.
+
+    A warm start uses the normals of slow errors, too, see `filter/starts.py`.
+    """
+    stream = stream_of(flight)
+    k = settings.aid_vector[s]
+    if k >= 0:
+        for i in range(3):
+            _, n = normal_pair(stream, DRAW_SLOW + k + i)
+            error = p.aid_vector_sigma[s] * n
+            flight.aid_vector[s, i] = select(mask, error, flight.aid_vector[s, i])
+    k = settings.aid_scalar[s]
+    if k >= 0:
+        _, n = normal_pair(stream, DRAW_SLOW + k)
+        flight.aid_scalar[s] = select(mask, p.aid_scalar_sigma[s] * n, flight.aid_scalar[s])
+    share, _ = uniform_pair(stream, DRAW_AID_PHASE[s])
+    begin_clock(flight, settings, FIRST_AID + s, share, mask)
+
+
+@kernel
+def draw_matrix(flight, p, s, mask):
+    """Draw the errors of scale and alignment of sensor s, in the lanes `mask`."""
+    stream, z = stream_of(flight), p.aid_matrix_sigma[s]
+    a, b = normal_pair(stream, DRAW_AID_MATRIX[s])
+    c, d = normal_pair(stream, DRAW_AID_MATRIX[s] + 1)
+    e, f = normal_pair(stream, DRAW_AID_MATRIX[s] + 2)
+    g, h = normal_pair(stream, DRAW_AID_MATRIX[s] + 3)
+    i, _ = normal_pair(stream, DRAW_AID_MATRIX[s] + 4)
+    keep(flight.aid_matrix[s], mask, z * ((a, b, c), (d, e, f), (g, h, i)))
+
+
+@kernel
+def _due(flight, p, settings, s, mask, starting):
+    """Lanes in which sensor s measures now; advances its clock and its Gauss-Markov errors."""
+    due = tick_clock(flight, settings, FIRST_AID + s, mask)
+    if not starting and any_of(due):
+        n, _ = normal_pair(stream_of(flight), DRAW_AID_DRIFT[s])
+        error = p.aid_scalar_decay[s] * flight.aid_scalar[s] + p.aid_scalar_drive[s] * n
+        flight.aid_scalar[s] = select(due, error, flight.aid_scalar[s])
+        if any_of(p.aid_vector_drive[s] > 0.0):
+            for i in range(3):
+                n, _ = normal_pair(stream_of(flight), DRAW_AID_VECTOR[s] + i)
+                last = flight.aid_vector[s, i]
+                error = p.aid_vector_decay[s] * last + p.aid_vector_drive[s] * n
+                flight.aid_vector[s, i] = select(due, error, last)
+    return due
+
+
+def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> Any:
+    """Make the stage of an aiding sensor.
+
+    Args:
+        aid: The sensor.
+        measure: `(flight, p, i) -> numbers, within`: three numbers that block i measures now, zero
+            beyond its own, and the lanes in which it can measure.
+        expect: `(flight, p, work, settings, i, k, valid)`: fill the rows of block i, from k on, in
+            these lanes.
+        reset: `(flight, p, work, settings, states, lanes, alone, nu)`: reset states to the sensor
+            in `lanes`, those of the vehicle where it is `alone`, by the innovation nu; of several
+            blocks, by the largest ones.
+        others: `(flight, p, mask)`, draw further constant errors of an episode, and `align` of
+            `sensor_stage`; optional.
+    """
+    s, group, sensor = int(aid), AID_GROUPS + aid, FIRST_AID + int(aid)
+    first, row, several = AID_BLOCK[s], AID_ROW[s], AID_MOST[aid] > 1
+    draw, *align = others or (_draw_nothing,)
+
+    @kernel
+    def begin(flight, p, settings, mask):  # type: ignore[no-untyped-def]
+        _begin(flight, p, settings, s, mask)
+        draw(flight, p, mask)
+
+    @kernel
+    def sample(flight, p, settings, work, stages, mask, starting):  # type: ignore[no-untyped-def]
+        due = _due(flight, p, settings, s, mask, starting)
+        if starting and settings.heading_sensor == sensor and settings.warm == 0:
+            # it initializes the filter, which uses it only once
+            (x, y, z), _ = measure(flight, p, 0)
+            keep(flight.aid_measurement[row], mask, (x, y, z))
+            flight.block_fresh[first] = select(mask, 1.0, flight.block_fresh[first])
+            return
+        if settings.faults:
+            due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
+        values = flight.aid_measurement[row : row + AID_MOST[s]]
+        begin_sample(flight, work, settings, sensor, values, 3, mask)
+        if any_of(due):
+            for i in range(settings.sensor_blocks[sensor]):
+                (x, y, z), within = measure(flight, p, i)
+                taken = due & within
+                keep(values[i], taken, (x, y, z))
+                flight.block_valid[first + i] = select(taken, 1.0, flight.block_valid[first + i])
+        deliver(flight, work, settings, sensor, values, 3, mask, due)
+
+    @kernel
+    def expect_valid(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
+        for i in range(settings.sensor_blocks[sensor]):
+            valid = flight.block_valid[first + i] > 0.0
+            if any_of(valid):
+                expect(flight, p, work, settings, i, k, valid)
+                k += 3
+
+    @kernel
+    def reset_states(flight, p, work, settings):  # type: ignore[no-untyped-def]
+        lanes, alone, states = work.reset[group], work.alone[group], D + settings.slow_states
+        nu = load3(flight.innovation[first])
+        if several:
+            nu = _largest(flight, first, settings.sensor_blocks[sensor])
+        reset(flight, p, work, settings, states, lanes > 0.0, alone > 0.0, nu)
+
+    return sensor_stage(Sensor[aid.name], begin, sample, expect_valid, reset_states, *align)
+
+
+@kernel
+def _largest(flight, first, count):
+    """Magnitudes of the largest innovations among the valid blocks of a sensor."""
+    zero = zero_like(flight.tick)
+    largest = (zero, zero, zero)
+    for block in range(first, first + count):
+        nu, valid = load3(flight.innovation[block]), flight.block_valid[block] > 0.0
+        size = (abs(nu[0]), abs(nu[1]), abs(nu[2]))
+        largest = (
+            maximum(largest[0], select(valid, size[0], zero)),
+            maximum(largest[1], select(valid, size[1], zero)),
+            maximum(largest[2], select(valid, size[2], zero)),
+        )
+    return largest
+
+
+@kernel
+def _draw_nothing(flight, p, mask):
+    """Placeholder for sensors without further constant errors."""

@@ -1,0 +1,573 @@
+"""Rules of the verdict: on innovations, times and motion, and on what no sample explains."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_gym.logs.formats import Floats, Log
+from quad_gym.logs.formats.clocks import PAUSE
+from quad_gym.logs.replaying.results import (
+    MIN_COUNT,
+    Finding,
+    Fit,
+    Measured,
+    Replay,
+    Severity,
+    correlations,
+    exceeds,
+    larger,
+    runs_beyond_chance,
+)
+from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.suites import SensorSuite
+from quad_gym.rotations import quaternion_to_dcm
+
+# --------------------------------------------------------------------------------------------------
+# What the rules of a verdict look at: a log, its replay, and the innovations of each sensor.
+# --------------------------------------------------------------------------------------------------
+
+FALSE_ALARM = 1e-3  #: probability of a chance event that counts as a finding
+
+NAMES = {
+    "gnss_position": "GNSS position",
+    "gnss_baseline": "GNSS baseline",
+    "gnss_velocity": "GNSS velocity",
+    "features": "camera features",
+    **{name: name.replace("_", " ") for name in AID_PARAMS},
+}
+"""Sensors in sentences."""
+
+
+def _observing(*states: str) -> tuple[str, ...]:
+    return tuple(name for name, kind in AID_PARAMS.items() if {*states} & {*kind.observes})
+
+
+MEASURED_BY = {
+    "position": ("gnss_position", "gnss_velocity", "features", *_observing("position", "velocity")),
+    "height": ("gnss_position", "gnss_velocity", "features", *_observing("height")),
+    "heading": ("gnss_baseline", "features", *_observing("heading")),
+}
+"""Sensors that correct a quantity."""
+OF_SENSOR = {"gnss_baseline": "heading"} | {
+    name: kind.observes[0]
+    for name, kind in AID_PARAMS.items()
+    if kind.observes in (("height",), ("heading",))
+}
+"""Quantities of sensors; the position for others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A replay to be judged."""
+
+    log: Log  #: corrected by the suite
+    body: str  #: axes of the IMU in a table, "flu" or "frd"
+    suite: SensorSuite
+    result: Replay  #: its rows until the motors stop for good
+    sensors: Mapping[str, Measured]  #: innovations, of all blocks of a sensor together
+    fits: Mapping[str, Fit]  #: their statistics
+    start: Mapping[str, Any] = field(default_factory=dict)  #: that the caller has given
+
+
+def lost(quantity: str, text: str) -> Finding:
+    """Return a finding with which a quantity cannot be used."""
+    return Finding(quantity=quantity, severity=Severity.LOST, text=text)
+
+
+def uncertain(quantity: str, text: str) -> Finding:
+    """Return a finding with which a quantity has larger errors than its standard deviation."""
+    return Finding(quantity=quantity, severity=Severity.UNCERTAIN, text=text)
+
+
+def note(quantity: str, text: str) -> Finding:
+    """Return a finding for information."""
+    return Finding(quantity=quantity, severity=Severity.NOTE, text=text)
+
+
+# --------------------------------------------------------------------------------------------------
+# Changes of an estimate that its IMU samples do not explain.
+#
+# From each of many instants, the estimate is propagated with IMU samples for some time. In a
+# consistent filter the later estimate differs from this by at most the standard deviation of the
+# propagation, because measurements then only remove a part of it. A filter that follows a drift or
+# a jump of GNSS, or finds out that it was wrong, changes by many standard deviations.
+# --------------------------------------------------------------------------------------------------
+
+HORIZONS = (0.5, 2.0)
+"""Durations of the propagations [s]: jumps, and changes within the seconds after which a filter
+accepts measurements that it has rejected."""
+IMPACT = 30.0
+"""Specific force of a touchdown [m/s^2]: samples do not show a shock in full."""
+SETTLED = 5.0  #: time after the start from which changes of the estimate count [s]
+GRAVITY = 9.80665  #: [m/s^2]
+
+
+class Change(NamedTuple):
+    """Largest unexplained change of a quantity."""
+
+    quantity: str  #: "position", "velocity", "tilt" or "heading"
+    time: float  #: [s]
+    size: float  #: [m], [m/s] or [rad]
+    ratio: float  #: largest ratio of a component to its standard deviation
+
+
+def changes(log: Log, result: Replay, settled: float) -> tuple[list[Change], int]:
+    """Return the largest changes after a time, and the number of components that were compared.
+
+    Changes within `SETTLED` after a pause do not count, as the filter starts again. The standard
+    deviations of the propagation leave out correlations of the estimate's errors.
+    """
+    time = result.time
+    rows = np.flatnonzero(time >= settled)
+    if len(rows) < 3 or not np.isfinite(result.sigma[rows]).all():
+        return [], 0
+    first = rows[0]
+    time, dt = time[first:], np.diff(time[first:])
+    R = quaternion_to_dcm(result.quaternion[first:])
+    r, v = result.position[first:], result.velocity[first:]
+    gyro, accel = (increments(log, result, name)[first:] for name in ("gyro", "accel"))
+    turns = gyro - result.gyro_bias[first:-1] * dt[:, np.newaxis]
+    steps = accel - result.accel_bias[first:-1] * dt[:, np.newaxis]
+    predicted = small_rotations(-turns) @ R[:-1]
+    middle = 0.5 * (R[:-1] + predicted)
+    gains = np.einsum("kji,kj->ki", middle, steps) - np.outer(dt, [0.0, 0.0, GRAVITY])
+    V = np.vstack([np.zeros(3), np.cumsum(gains, axis=0)])
+    S = np.cumsum((V[:-1] + 0.5 * gains) * dt[:, np.newaxis], axis=0)
+    S = np.vstack([np.zeros(3), S])
+    W = np.cumsum(np.einsum("kji,kj->ki", R[1:], _small_angles(R[1:], predicted)), axis=0)
+    W = np.vstack([np.zeros(3), W])
+    hardest = np.linalg.norm(accel, axis=1)  # parts may follow each other without time between
+    np.divide(hardest, dt, out=hardest, where=dt > 0.0)
+    began = np.maximum.accumulate(np.append(-np.inf, np.where(dt > PAUSE, time[1:], -np.inf)))
+    found: dict[str, Change] = {}
+    count = 0
+    for T in HORIZONS:
+        i = np.searchsorted(time, np.arange(time[0], time[-1] - T, 0.25 * T))
+        j = np.minimum(np.searchsorted(time, time[i] + T), len(time) - 1)
+        span = (time[j] - time[i])[:, np.newaxis]
+        calm = np.array([hardest[a : b + 1].max() for a, b in zip(i, j, strict=True)]) < IMPACT
+        calm &= time[i] - began[j] >= SETTLED
+        i, j, span = i[calm], j[calm], span[calm]
+        far = v[j] - v[i] - (V[j] - V[i])
+        moved = r[j] - r[i] - v[i] * span - (S[j] - S[i] - V[i] * span)
+        turned = W[j] - W[i]
+        sigma = _propagated(result, first + i, span)
+        for quantity, values, errors in (
+            ("position", moved, sigma[0]),
+            ("velocity", far, sigma[1]),
+            ("tilt", turned[:, :2], sigma[2][:, :2]),
+            ("heading", turned[:, 2:], sigma[2][:, 2:]),
+        ):
+            count += values.size
+            ratios = (np.abs(values) / errors).max(axis=1)
+            if not len(ratios):
+                continue
+            k = int(np.argmax(ratios))
+            if quantity not in found or ratios[k] > found[quantity].ratio:
+                size = float(np.linalg.norm(values[k]))
+                found[quantity] = Change(quantity, float(time[i[k]]), size, float(ratios[k]))
+    return list(found.values()), count
+
+
+def increments(log: Log, result: Replay, name: str) -> Floats:
+    """Return integrals (n - 1, 3) of IMU samples between the rows of a replay."""
+    stamps, values = log.imu.time, log.imu.values[name]
+    steps = np.diff(stamps)[:, np.newaxis]
+    held = values[1:] if result.sensors.imu.samples == "average" else values[:-1]
+    total = np.vstack([np.zeros(3), np.cumsum(held * steps, axis=0)])
+    at = np.column_stack([np.interp(result.time, stamps, axis) for axis in total.T])
+    return np.diff(at, axis=0)
+
+
+def small_rotations(turns: Floats) -> Floats:
+    """Return matrices (n, 3, 3) of rotation vectors (n, 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(turns, axis=1)[:, np.newaxis, np.newaxis]
+    K = np.zeros((len(turns), 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        K[:, j, i], K[:, i, j] = turns[:, k], -turns[:, k]
+    safe = np.maximum(angle, 1e-9)
+    return np.eye(3) + np.sin(angle) / safe * K + (1.0 - np.cos(angle)) / safe**2 * (K @ K)
+
+
+def _small_angles(later: Floats, predicted: Floats) -> Floats:
+    """Return rotation vectors (n, 3) in B from predicted to later attitudes, if they are small."""
+    D = later @ predicted.swapaxes(1, 2)
+    parts = (D[:, 1, 2] - D[:, 2, 1], D[:, 2, 0] - D[:, 0, 2], D[:, 0, 1] - D[:, 1, 0])
+    return 0.5 * np.stack(parts, axis=1)
+
+
+def _propagated(result: Replay, rows: Floats, span: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return standard deviations (k, 3) of position, velocity and attitude after a span (k, 1)."""
+    imu = result.sensors.imu
+    r, v, e, b_a, b_g = np.split(result.sigma[rows] ** 2, 5, axis=1)
+    turn = e + span**2 * b_g + imu.gyro_noise**2 * imu.dt * span
+    tilt = turn[:, :2].max(axis=1, keepdims=True)
+    force = b_a.max(axis=1, keepdims=True) + GRAVITY**2 * tilt * [1.0, 1.0, 0.0]
+    white = imu.accel_noise**2 * imu.dt * span
+    position = r + span**2 * v + 0.25 * span**4 * force + white * span**2 / 3.0
+    return np.sqrt(position), np.sqrt(v + span**2 * force + white), np.sqrt(turn)
+
+
+# --------------------------------------------------------------------------------------------------
+# Rules of the verdict on innovations: their size, correlation, and runs of rejections.
+# --------------------------------------------------------------------------------------------------
+
+RATIO = 2.0  #: ratio of true and assumed standard deviations with which a filter still works [-]
+MAX_REJECTED = 0.1  #: share of the measurements of a sensor that the gate rejects [-]
+LONG_RUN = 0.1  #: share of the measurements of a sensor that are rejected in one run [-]
+MAX_MEAN = 25.0
+"""Mean NIS per degree of freedom that no noise model explains: standard deviations five times as
+large. Outliers that chance explains are left out of the mean."""
+MAX_CORRELATED = 0.8  #: correlation of successive innovations of GNSS that noise does not have
+PESSIMISTIC = 0.3
+"""NIS per degree of freedom below which noise is assumed much too large: innovations of such a
+filter are correlated, as it follows the measurements slowly."""
+PATIENCE = 10.0  #: time for which GNSS may be refused [s]
+
+
+def misfits(case: Evidence) -> Iterator[Finding]:
+    """Innovations that are larger, smaller or more correlated than the suite has them."""
+    for name, fit in case.fits.items():
+        m, quantity = case.sensors[name], OF_SENSOR.get(name, "position")
+        yield from _size(case, name, m, fit)
+        if name.startswith("gnss") and len(m.nis) >= MIN_COUNT:
+            yield from _correlated(name, m, quantity)
+        if fit.mean_nis < PESSIMISTIC:
+            factor = 1.0 / math.sqrt(max(fit.mean_nis, 1e-6))
+            yield note(
+                quantity,
+                f"{_nis(name, fit)}: pessimistic, noise is assumed about {factor:.1f} times too "
+                "large",
+            )
+
+
+def _nis(name: str, fit: Fit) -> str:
+    return f"{NAMES[name]}: NIS per degree of freedom {fit.mean_nis:.3g}, 1 expected"
+
+
+def _size(case: Evidence, name: str, m: Measured, fit: Fit) -> Iterator[Finding]:
+    """Innovations of a sensor that are too large, or rejected for long."""
+    quantity = OF_SENSOR.get(name, "position")
+    known = np.isfinite(m.nis)
+    nis, d = m.nis[known], fit.freedoms
+    others = any(other in case.fits for other in MEASURED_BY[quantity] if other != name)
+    shared = quantity == "height" and others
+    ratio = RATIO**2 if not shared else RATIO**4
+    many = exceeds(m.rejected[known], MAX_REJECTED)
+    heavy = larger(nis, d, RATIO) and fit.mean_nis > 2.0 * ratio  # in the median, and in the mean
+    rows = known & (m.time > m.time[0] + SETTLED)
+    runs = runs_beyond_chance(m.rejected[rows], FALSE_ALARM)
+    longest = max(runs, key=lambda run: run[1] - run[0], default=None)
+    share = 0.0 if longest is None else (longest[1] - longest[0] + 1) / len(nis)
+    rejected = f"{100.0 * fit.rejected:.0f} % rejected"
+    far = _mean_with_runs(m, known, rows, runs) > MAX_MEAN * d
+    if larger(nis, d, ratio) or heavy or (not shared and (many or far)):
+        text = f"{_nis(name, fit)}, {rejected}: the suite's noise model does not fit this log"
+        yield lost(quantity, text)
+    elif many or larger(nis, d, RATIO):
+        factor = math.sqrt(max(fit.median_nis, 1.0))
+        yield uncertain(
+            quantity,
+            f"{_nis(name, fit)}, {rejected}: errors about {factor:.1f} times as large as the suite "
+            "has them",
+        )
+    if longest is None:
+        return
+    since, until = m.time[rows][list(longest)]
+    text = f"{NAMES[name]} refused for {until - since:.1f} s in a row from {since:.1f} s on"
+    long = quantity == "position" and until - since >= PATIENCE
+    if not shared and (long or share > LONG_RUN):
+        yield lost(quantity, f"{text}: it drifts or jumps, or others do")
+    elif not many:
+        yield uncertain(quantity, text)
+
+
+def _mean_with_runs(
+    m: Measured, known: np.ndarray, rows: np.ndarray, runs: list[tuple[int, int]]
+) -> float:
+    """Return the mean NIS without the rejections that chance explains."""
+    counts = known & ~m.rejected
+    settled = np.flatnonzero(rows)
+    for begin, end in runs:
+        counts[settled[begin : end + 1]] = True
+    return float(m.nis[counts].mean()) if counts.any() else math.inf
+
+
+def _correlated(name: str, m: Measured, quantity: str) -> Iterator[Finding]:
+    """Innovations whose successive values are correlated, in the worst axis of each quantity."""
+    scaled = (m.innovation / m.sigma)[np.isfinite(m.nis) & ~m.gated]
+    scaled = scaled[len(scaled) // 5 :]
+    if len(scaled) < MIN_COUNT:
+        return
+    rho, size = correlations(scaled), (scaled**2).mean(axis=0)
+    parts = ((0, 1), "position"), ((2,), "height")
+    for axes, part in parts if name == "gnss_position" else (((*range(len(rho)),), quantity),):
+        worst = max(axes, key=lambda k: rho[k])
+        # the lower end of the interval, by Fisher's transformation
+        sure = math.tanh(math.atanh(min(rho[worst], 0.999)) - 3.0 / math.sqrt(len(scaled) - 3))
+        if sure > MAX_CORRELATED and size[worst] > PESSIMISTIC:
+            text = (
+                f"{NAMES[name]}: successive innovations have a correlation of {rho[worst]:.2f}, 0 "
+                "expected: check the suite's time stamps and noise"
+            )
+            severity = Severity.UNCERTAIN if part == "height" else Severity.LOST
+            yield Finding(quantity=part, severity=severity, text=text)
+
+
+# --------------------------------------------------------------------------------------------------
+# Rules of the verdict on times: clocks, times without a correction, and the end of the log.
+# --------------------------------------------------------------------------------------------------
+
+LATE = 0.5  #: share of late measurements above which the clocks do not agree [-]
+MANY_LOST = 0.05  #: share of lost samples of the IMU that is worth a note [-]
+SHORT_PAUSE = 0.3  #: time without samples of the IMU in which a vehicle turns by some degrees [s]
+BLOCK = 20  #: measurements in a row that are late together, so that a clock has changed
+
+
+def late(case: Evidence) -> Iterator[Finding]:
+    """Measurements that are older than the window at their arrival."""
+    for sensor, ages in case.result.late.items():
+        stream = case.log.streams[sensor]
+        count, name = len(stream), sensor.replace("gnss", "GNSS").replace("_", " ")
+        share = len(ages) / count
+        low, middle, high = np.percentile(ages, [5.0, 50.0, 95.0])
+        text = f"{len(ages)} of {count} measurements of {name} arrive too late for the window"
+        since, length = _late_block(stream.received - stream.time, float(ages.min()))
+        stepped = length > max(BLOCK, LONG_RUN * count) and 0 < since < count - length + 1
+        if high - low < 0.2 * middle and stepped:
+            text += (
+                f", all from {stream.received[since]:.1f} s on, by about {middle:.2f} s: the time "
+                "stamps step back there, as with a leap second or a clock that is set; use "
+                f"--until {stream.received[since]:.1f}, or correct the stamps"
+            )
+        elif high - low < 0.2 * middle:
+            text += (
+                f", all by about {middle:.2f} s: the clocks differ, use log_delays.{sensor} = "
+                f"{-middle:.2f} in the suite, or a longer window"
+            )
+        quantity = OF_SENSOR.get(sensor, "position")
+        if share > LATE or stepped:
+            yield lost(quantity, text)
+        elif exceeds(np.arange(count) < len(ages), MAX_REJECTED):
+            yield uncertain(quantity, text)
+
+
+def _late_block(ages: Floats, least: float) -> tuple[int, int]:
+    """Return begin and length of the longest run of ages that are at least `least`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], ages >= least - 1e-9, [0]])))
+    if not len(edges):
+        return 0, 0
+    k = int(np.argmax(edges[1::2] - edges[::2]))
+    return int(edges[2 * k]), int(edges[2 * k + 1] - edges[2 * k])
+
+
+def gaps(case: Evidence) -> Iterator[Finding]:
+    """Times without a measurement that corrects position or height, over all parts of a log.
+
+    A pause of the IMU is no flown time, and no correction: without GNSS, a part begins where the
+    part before has ended.
+    """
+    result, sensors = case.result, case.sensors
+    steps = np.diff(result.time)
+    flown = np.concatenate([[0.0], np.cumsum(np.where(steps > PAUSE, 0.0, steps))])
+    for quantity in ("position", "height"):
+        some = [sensors[name] for name in MEASURED_BY[quantity] if name in sensors]
+        times = np.concatenate([np.empty(0), *(m.time[~m.gated] for m in some)])
+        edges = np.sort(np.concatenate([result.time[[0, -1]], times]))
+        lengths = np.diff(np.interp(edges, result.time, flown))
+        k = int(np.argmax(lengths))
+        since, until, length = float(edges[k]), float(edges[k + 1]), float(lengths[k])
+        if length < PATIENCE and len(times):
+            continue
+        text = f"nothing corrects it for {length:.0f} s"
+        inside = [n for n in MEASURED_BY[quantity] if _refused(sensors, n, since, until)]
+        if inside:
+            text = f"{NAMES[inside[0]]} refused for {length:.0f} s in a row"
+        axes = slice(0, 2) if quantity == "position" else slice(2, 3)
+        during = (result.time >= since) & (result.time <= until)
+        sigma = float(np.linalg.norm(result.sigma[during, axes], axis=1).max())
+        known = "" if math.isnan(sigma) else f", standard deviation up to {sigma:.3g} m"
+        where = f" from {since:.1f} s on" if len(times) else ", the whole log"
+        yield lost(quantity, f"{text}{where}: dead reckoning{known}")
+        if quantity == "position":
+            return  # which the height shares
+
+
+def _refused(sensors: Mapping[str, Measured], name: str, since: float, until: float) -> bool:
+    """Return True if a sensor was refused between two times."""
+    m = sensors.get(name)
+    return m is not None and bool((m.gated & (m.time > since) & (m.time < until)).any())
+
+
+def lost_samples(case: Evidence) -> Iterator[Finding]:
+    """Samples of the IMU that the log lacks."""
+    steps = np.diff(case.log.imu.time)
+    steps = steps[steps <= PAUSE]
+    if len(steps) < BLOCK:
+        return
+    usual = float(np.quantile(steps, 0.2))
+    missing = float(np.maximum(np.round(steps / usual) - 1.0, 0.0)[steps > 1.5 * usual].sum())
+    share = missing / (missing + len(steps))
+    most = float(steps.max())
+    count = int((steps > max(SHORT_PAUSE, 10.0 * usual)).sum())
+    if count:
+        yield uncertain(
+            "attitude",
+            f"the IMU has {count} {'pause' if count == 1 else 'pauses'} of up to {most:.2f} s, in "
+            "which the attitude is extrapolated",
+        )
+    elif share > MANY_LOST:
+        yield note(
+            "attitude",
+            f"the log lacks about {100.0 * share:.0f} % of the IMU's samples, for up to "
+            f"{most:.3f} s: of averaged samples nothing is lost, of others motion is",
+        )
+
+
+def flagged(case: Evidence) -> Iterator[Finding]:
+    """A filter that is flagged as diverged at the end, of the log or of a part before a pause."""
+    result = case.result
+    ends = [*np.flatnonzero(np.diff(result.time) > PAUSE).tolist(), len(result) - 1]
+    for row in ends:
+        if not np.asarray(result.diverged)[row]:
+            continue
+        time = float(result.time[row])
+        names = [name for name, m in case.sensors.items() if _ends_refused(m, time)]
+        if not names:
+            continue  # accepted since
+        refused = " and ".join(NAMES[name] for name in names)
+        quantities = [OF_SENSOR.get(name, "position") for name in names]
+        quantity = "position" if "position" in quantities else quantities[0]
+        where = "at the end" if row == ends[-1] else f"at {time:.1f} s, before a pause"
+        yield lost(quantity, f"the filter is flagged as diverged {where}, as it refuses {refused}")
+        return
+
+
+def _ends_refused(m: Measured, time: float) -> Any:
+    """Return True if the last two measurements before a time were rejected."""
+    last = m.rejected[m.time <= time][-2:]
+    return len(last) == 2 and last.all()
+
+
+# --------------------------------------------------------------------------------------------------
+# Rules of the verdict on the motion: what the IMU does not explain, biases, and headings.
+# --------------------------------------------------------------------------------------------------
+
+SUDDEN = 4.0
+"""Ratio of true and assumed standard deviations of dead reckoning over seconds [-]: measurements
+correct a filter more often, so that noise of the IMU matters less."""
+SMALL = {"attitude": math.radians(1.0), "heading": math.radians(2.0)}
+"""Changes of the attitude that do not matter [rad]: mounting is no more accurate."""
+MAX_BIAS = {"accel": 2.0, "gyro": 0.2}
+"""Biases that no sensor has [m/s^2], [rad/s]: data sheets of cheap parts admit 0.5 m/s^2 and 0.09
+rad/s (TDK ICM-20948)."""
+WRONG = math.radians(20.0)  #: error of a heading at the start that matters [rad]
+CERTAIN = 4.0  #: standard deviations beyond which such an error is no chance
+BEYOND = 4.0  #: ratio of a bias and its standard deviation in the suite that is worth a note [-]
+
+
+def unexplained(case: Evidence) -> Iterator[Finding]:
+    """Changes of the estimate that the IMU does not explain."""
+    from scipy.stats import norm
+
+    result = case.result
+    known = result.time[np.asarray(result.heading_known, bool)]
+    if not len(known):
+        return
+    found, count = changes(case.log, result, float(known[0]) + SETTLED)
+    if not found:
+        return
+    limit = SUDDEN * float(norm.isf(0.5 * FALSE_ALARM / count))
+    worst: dict[str, Change] = {}
+    for each in found:
+        quantity = {"tilt": "attitude", "velocity": "position"}.get(each.quantity, each.quantity)
+        least = SMALL.get(quantity, 0.0)
+        if each.size > least and each.ratio > max(
+            limit, getattr(worst.get(quantity), "ratio", 0.0)
+        ):
+            worst[quantity] = each
+    for quantity, each in worst.items():
+        size = f"{each.size:.3g} m"
+        if each.quantity == "velocity":
+            size = f"{each.size:.3g} m/s of velocity"
+        elif quantity != "position":
+            size = f"{math.degrees(each.size):.3g} degrees"
+        yield lost(
+            quantity,
+            f"the estimate changes by {size} at about {each.time:.1f} s, {each.ratio:.0f} standard "
+            "deviations, which the IMU does not explain: the filter was wrong before, or follows "
+            "wrong measurements",
+        )
+
+
+def first_heading(case: Evidence) -> Iterator[Finding]:
+    """A heading at the start that the flight contradicts.
+
+    The gyro, with the bias of a later estimate, turns that estimate back to the start. The heading
+    there has the error of the estimate, and of the turn.
+    """
+    result = case.result
+    pause = np.flatnonzero(np.diff(result.time) > PAUSE)
+    rows = slice(0, int(pause[0]) + 1 if len(pause) else len(result))
+    time, known = result.time[rows], np.asarray(result.heading_known, bool)[rows]
+    if not known[0] or len(time) < 3 or not np.isfinite(result.sigma[rows]).all():
+        return
+    T = time - time[0]
+    white = result.sensors.imu.gyro_noise_density**2 * T
+    spread = np.sqrt(result.sigma[rows, 8] ** 2 + (T * result.sigma[rows, 14]) ** 2 + white)
+    last = len(T) - 1  # an estimate that was thrown by a wrong start has recovered by then
+    if T[last] < SETTLED or spread[last] > WRONG:
+        return
+    turns = increments(case.log, result, "gyro")[:last]
+    turns = turns - result.gyro_bias[last] * np.diff(time[: last + 1])[:, np.newaxis]
+    R_BI = quaternion_to_dcm(result.quaternion[[0, last]])
+    back = R_BI[1]
+    for step in small_rotations(turns[::-1]):
+        back = step @ back
+    headings = [math.atan2(R[0, 1], R[0, 0]) for R in (R_BI[0], back)]
+    off = math.remainder(headings[0] - headings[1], 2.0 * math.pi)
+    if abs(off) < max(WRONG, CERTAIN * math.hypot(spread[last], float(result.sigma[0, 8]))):
+        return
+    text = f"the heading at the start is off by about {math.degrees(abs(off)):.0f} degrees"
+    given = case.start.get("heading")
+    if given is not None:
+        text = (
+            f"the given heading at the start (--heading {math.degrees(given):.0f}) is off by about "
+            f"{math.degrees(abs(off)):.0f} degrees, as the motion shows"
+        )
+        other = math.remainder(0.5 * math.pi - given - headings[1], 2.0 * math.pi)
+        if abs(other) < WRONG:
+            text += ": it counts from east toward north, not from north (--heading-from-north)"
+    yield lost("heading", text)
+
+
+def unknown_heading(case: Evidence) -> Iterator[Finding]:
+    """A heading that no sensor and no motion shows until the end."""
+    if not case.result.heading_known[-1]:
+        yield uncertain(
+            "heading",
+            "unknown until the end: no sensor measures it, and the motion does not show it; "
+            "give a heading or the course (--heading, --course)",
+        )
+
+
+def biases(case: Evidence) -> Iterator[Finding]:
+    """Biases of the IMU that the suite, or any sensor, does not admit."""
+    result, suite = case.result, case.suite
+    for name, unit in (("accel", "m/s^2"), ("gyro", "rad/s")):
+        found = np.sqrt((getattr(result, f"{name}_bias") ** 2).mean(axis=0)).max()
+        sigma = getattr(suite.imu, f"{name}_bias_sigma")
+        text = (
+            f"{'accelerometer' if name == 'accel' else 'gyro'}: estimated bias {found:.2g} {unit}"
+        )
+        if not found <= max(MAX_BIAS[name], BEYOND * sigma):
+            yield lost(
+                "attitude",
+                f"{text}, which no sensor has: check the suite's magnetic field, time stamps, "
+                "mounting and noise",
+            )
+        elif found > BEYOND * sigma:
+            yield note("attitude", f"{text}, {sigma:.2g} expected by the suite")

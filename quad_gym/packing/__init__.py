@@ -1,1 +1,0 @@
-"""Conversion of parameters to the records that kernels read."""
