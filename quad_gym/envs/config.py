@@ -143,7 +143,7 @@ _BATCH: dict[str, Any] = {field.name: field.default for field in fields(FlightCo
 
 
 class ObservationConfig(Checked, bare=True):
-    """What the controller receives, and what `info` contains."""
+    """The controller's input, and contents of `info`."""
 
     observation: Annotated[str, partial(check.choice, choices=tuple(OBSERVATIONS))] = "estimate"
     layout: Annotated[str, partial(check.choice, choices=tuple(LAYOUTS))] = "relative"
@@ -154,7 +154,7 @@ class ObservationConfig(Checked, bare=True):
 
 
 class VehicleConfig(Checked, bare=True):
-    """The vehicle, and what an action means to it."""
+    """The vehicle, and the meaning of an action."""
 
     action: Annotated[str, partial(check.choice, choices=tuple(ACTIONS))] = "ctbr"
     vehicle: Any = _BATCH["vehicle"]
@@ -181,7 +181,7 @@ class FilterConfig(Checked, bare=True):
 
 
 class WorldConfig(Checked, bare=True):
-    """The world, what differs between episodes, and what fails."""
+    """The world, differences between episodes, and faults."""
 
     world: Any = _BATCH["world"]
     randomization: Any = _BATCH["randomization"]
@@ -217,7 +217,7 @@ class EnvConfig(Checked, eq=False, bare=True):
     max_steps: int | None
     """time limit in steps, in addition to the task's duration; None: none"""
     asked: frozenset[str]
-    """names of the keywords that were given, except those of the task"""
+    """names of the given keywords, except the task's"""
 
     @classmethod
     def of(cls, task: "Own | None", base: "Base | None", keywords: Mapping[str, Any]) -> Self:

@@ -1,6 +1,6 @@
 """Libraries of compiled kernels: for this machine, for other processors, and for a GPU.
 
-Entries and stages are emitted as for other processors (`building.py`), with one process for each
+Entries and stages are emitted as for other processors, with one process for each
 core, and linked by the system's C compiler together with a small C source, through which Python
 calls the entries. Records depend on the number of lanes, so each library has a process of its own.
 """

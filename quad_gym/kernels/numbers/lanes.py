@@ -29,7 +29,7 @@ from quad_gym.records import REGISTER
 # |-----------|-------------|-------------------|---------------------------------------------|
 # | `Lanes`   | float64     | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt` |
 # | `Mask`    | bool        | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`   |
-# | `Words`   | uint64      | `uint64`          | `+ ^ & \\|`, `==`, operations of `lanes.py`  |
+# | `Words`   | uint64      | `uint64`          | `+ ^ & \\|`, `==`, primitives below          |
 #
 # There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. Lanes do not
 # affect each other, so a flight does not depend on the other flights in its block, even if they are

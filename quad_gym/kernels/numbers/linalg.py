@@ -363,7 +363,7 @@ def keep(typing_context, array, mask, value):  # type: ignore[no-untyped-def]
 
 
 # --------------------------------------------------------------------------------------------------
-# Products of vectors and matrices, which `linalg.py` gives operators.
+# Products of vectors and matrices, which have operators.
 # --------------------------------------------------------------------------------------------------
 
 

@@ -141,7 +141,7 @@ def _tie_heading(p, P, m, R_BI, iron, delta):
 
 @kernel
 def _tie_position(p, P, R_BI, iron, delta):
-    """Correlate the position with the attitude in P, as an antenna was measured: see `starts.py`."""
+    """Correlate the position with the attitude in P, as an antenna is measured: `starts.py`."""
     J, s = lever_of_attitude(R_BI, load3(p.antenna)), load3(p.position_sigma_I)
     k, with_attitude = p.initial_covariance_scale, _full(P) @ J.T
     white = diagonal((k * s[0] * s[0], k * s[1] * s[1], k * s[2] * s[2]))

@@ -2,7 +2,7 @@
 
 `r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)`: hover has no terms, a circle one, a lemniscate
 two, a random trajectory several. One kernel evaluates them all, with exact derivatives. A user's
-trajectory is looked up by the stage of `reference.py`, and read here.
+trajectory is looked up by the stage FOLLOW.
 """
 
 import math
@@ -76,7 +76,7 @@ def evaluate_reference(flight, t, harmonics=MAX_HARMONICS):
     """Return (r*, v*, a*, x*) in I at the time t of the episode [s].
 
     `harmonics`: number of nonzero terms of the series; FOLLOWED: the reference is a trajectory, and
-    t the present instant, for which `reference.py` has looked it up.
+    t the present instant, for which the stage FOLLOW has looked it up.
     """
     if harmonics == FOLLOWED:
         return _followed(flight)

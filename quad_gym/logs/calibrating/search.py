@@ -280,7 +280,7 @@ def lowest(places: Floats, losses: Floats) -> float:
 # Search for the numbers of a sensor suite.
 #
 # The search maximizes the likelihood of the innovations (`likelihood.py`) in the first part of the
-# log, with priors about the numbers (`search.py`). It begins on grids of delays, in a short part of
+# log, with priors about the numbers. It begins on grids of delays, in a short part of
 # the flight. Newton steps follow, whose derivatives are differences between filters: side by side
 # for numbers of the suite, on a log each for delays and the mounting of the IMU. Their second
 # derivatives are exact on the diagonal, and otherwise as correlated as the scores of parts of the

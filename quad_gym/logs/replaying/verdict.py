@@ -3,7 +3,7 @@
 A finding is LOST if the estimate of its quantity cannot be used, or the suite does not describe
 the sensors that measure it; UNCERTAIN if errors are larger than the suite has them; or a NOTE.
 `RULES` lists the rules; their limits are sizes that matter, next to their sentences in
-`rules.py`, `rules.py` and `rules.py`. A test counts as many independent
+`rules.py`. A test counts as many independent
 innovations as their autocorrelation leaves.
 """
 
