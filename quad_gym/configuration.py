@@ -120,6 +120,13 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
         check.instance("gains", self.pd_gains, PDGains)
         check_limit(self.task, self.clocks.imu_rate, "IMU rate")
         self.sensors.require_like(self.flown_sensors)
+        if self.run_filter is not None:
+            check.flag("run_filter", self.run_filter)
+        if self.run_filter is False and self._needs_filter:
+            raise ValueError(
+                "run_filter must not be False where the observation, include_std or innovations "
+                "need the filter"
+            )
         self._require_effect()
         if self.filters:
             self.sensors.require_filter()
@@ -204,8 +211,11 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
     @property
     def filters(self) -> bool:
         """True if sensors and filter run."""
-        if self.run_filter is not None:
-            return self.run_filter
+        return self._needs_filter if self.run_filter is None else self.run_filter
+
+    @property
+    def _needs_filter(self) -> bool:
+        """True if another argument needs sensors and filter."""
         needed = self.include_std or self.innovations
         return needed or self.source in (Source.ESTIMATE, Source.MEASUREMENTS)
 

@@ -5,6 +5,9 @@
     python -m docs.renewal --only circle compare
     python -m docs.renewal --only speed_suites --again   # even if it is up to date
 
+Studies and the benchmark are measured by `python -m scripts.studies run --all`, in many core hours,
+and their rows in docs/data are written into the pages here.
+
 Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables resume where
 an interrupted run stopped.
 """
@@ -18,6 +21,8 @@ from pathlib import Path
 
 from docs.renewal import ledger, pages
 from docs.renewal.catalog import CATALOG, Result
+from scripts.studies.conclusions import incomplete
+from scripts.studies.run import PARTS
 
 OUTPUT = Path("results/renewal")
 
@@ -67,6 +72,8 @@ def main() -> int:
         minutes = entries.get(result.name, {}).get("minutes")
         last = "" if minutes is None else f", {minutes:g} min last time"
         print(f"{result.name}: {'again' if args.again else 'stale'}{last}")
+    for part in incomplete(PARTS) if args.only is None else ():
+        print(f"{part.table}: stale, {part.decides} (python -m scripts.studies run --all)")
     if args.list:
         return 0
     for result in due:

@@ -150,27 +150,6 @@ CATALOG = {
             flights=("RandomTrajectory, rtk", "breeze"),
             texts=texts.ablation("models"),
         ),
-        Result(
-            name="look_around",
-            commands=[
-                "scripts.studies look_around --output OUT --first-episode 100000 "
-                "--arms pd_reference pd_features pd_features_when_uncertain truth noisy noisier "
-                "certainty std std_certainty std_certainty_privileged"
-            ],
-            flights=("LookAround", "LookAround, truth"),
-            texts=texts.study(
-                "look_around",
-                "pd_features_when_uncertain",
-                "truth",
-                "noisy",
-                "noisier",
-                "certainty",
-                "std",
-                "std_certainty",
-                "std_certainty_privileged",
-            ),
-            figures={"0/arms.csv": "docs/data/look_around.csv"},
-        ),
         _pictures("look_around", "LookAround", "--arms included_truth included", "glance.png"),
         _pictures("stale_race", "StaleRace", _FILMED, "film.webp", "pace.png"),
         _pictures("outage_dash", "OutageDash", _FILMED, "film.webp", "pace.png"),
@@ -203,19 +182,6 @@ CATALOG = {
             texts=texts.variants("miscalibrated", "condition", "success", "crashed", "error"),
         ),
         Result(
-            name="stale_race",
-            commands=[
-                "scripts.studies stale_race --output OUT --first-episode 100000 "
-                "--arms pd truth residual std std_history truth_on_truth truth_delay_compensated "
-                "std_delay_compensated"
-            ],
-            flights=("StaleRace", "StaleRace, truth"),
-            texts=texts.study(
-                "stale_race", "pd", "truth", "residual", "std", "truth_delay_compensated"
-            ),
-            figures={"0/arms.csv": "docs/data/stale_race.csv"},
-        ),
-        Result(
             name="masked",
             commands=[
                 "scripts.studies stale_race --arms-file scripts/studies/arms_masked.py "
@@ -223,16 +189,6 @@ CATALOG = {
             ],
             flights=("StaleRace",),
             texts=texts.variants("masked", "observed", "success", "crashed"),
-        ),
-        Result(
-            name="outage_dash",
-            commands=[
-                "scripts.studies outage_dash --output OUT --first-episode 100000 "
-                "--arms pd pd_slow pd_waiting truth std std_privileged truth_on_truth"
-            ],
-            flights=("OutageDash", "OutageDash, truth"),
-            texts=texts.study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),
-            figures={"0/arms.csv": "docs/data/outage_dash.csv"},
         ),
         Result(
             name="sb3_defaults",

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from docs.renewal.catalog import Result
+from scripts.estimate_bench.table import table as bench_table
+from scripts.studies import conclusions
 
 FILE = Path(__file__).with_name("ledger.json")
 GOLDEN = Path(__file__).parents[2] / "tests/golden/flights.json"
@@ -54,4 +56,9 @@ def texts(entries: dict[str, Any]) -> dict[str, str]:
     minutes = [entry["minutes"] for entry in entries.values()]
     hours = "several" if None in minutes else f"{sum(minutes) / 60.0:.0f}"
     found = {name: text for entry in entries.values() for name, text in entry["texts"].items()}
-    return found | {"total.hours": hours}
+    return found | measured_per_seed() | {"total.hours": hours}
+
+
+def measured_per_seed() -> dict[str, str]:
+    """Texts of studies and of the benchmark, computed from the rows per seed in docs/data."""
+    return conclusions.texts() | {"benchmark.table": f"\n{bench_table()}\n"}

@@ -259,25 +259,6 @@ def flown(estimators: Sequence[str]) -> Texts:
     return texts
 
 
-def study(name: str, *arms: str) -> Texts:
-    """Conclusions, success and crashes of arms; a CSV file has all columns."""
-
-    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
-        summary = _read(folder / "0/summary.json")
-        lines = (folder / "0/table.md").read_text(encoding="utf-8").splitlines()
-        first, _rule, *rows = (line for line in lines if line.startswith("|"))
-        with (folder / "0/arms.csv").open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerows([each.strip() for each in r.split("|")[1:-1]] for r in (first, *rows))
-        concluded = "\n".join(line for line in lines if line.startswith("- "))
-        return {
-            f"{name}.conclusions": f"\n{concluded}\n",
-            f"{name}.short": study_rows(summary, "trained on", arms, ("success", "crashed")),
-        }
-
-    return texts
-
-
 def included(name: str) -> Texts:
     """Crashes of each controller of an evaluation, with intervals."""
 

@@ -59,6 +59,7 @@ class EnvKeywords(TaskKeywords, total=False):
     include_std: bool
     privileged: bool
     sensors: SensorSuite | str
+    run_filter: bool | None
     innovations: bool
     reward_terms: bool
     vehicle: VehicleParams | str

@@ -163,6 +163,10 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
             report's form, with an overconfident filter), "rtk", "consumer", "indoor", a suite for
             one task (`quad_gym.params.suites`), a ".toml" file, or a `SensorSuite`; by default
             "one_wall" on `LookAround`, "stale" on `StaleRace`, "consumer" on `OutageDash`.
+        run_filter: True: sensors and filter run although the controller observes the truth, with or
+            without noise, so that a task can use the estimate: a reward for certainty
+            (`quad_gym.tasks.rewards.Uncertainty`), or an observation with standard deviations of
+            its choice. None: they run if another keyword needs them.
         innovations: Add the filter's innovations to `info` and `flights.batch.record`, block by
             block; the latter always has them with a gate, `faults` or `truncate_when_diverged`.
         reward_terms: Add the terms of the reward to `info`.

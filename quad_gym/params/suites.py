@@ -8,7 +8,7 @@
 | `consumer` | single frequency, one antenna, 10 Hz; barometer, magnetometer | none | cheap MEMS |
 | `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
-| `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
+| `stale` | as `rtk`, 120 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
 | `crazyflie` | none: starts from a mark; optical flow, range finder | none | as `indoor` |
 | `uwb` | none: starts from a mark; ranges to four anchors | none | as `indoor` |
 | `mocap` | positions and heading by motion capture, 50 Hz | none | as a Crazyflie's in flight |
@@ -514,9 +514,11 @@ random trajectories under PD control, the NEES is 32 on average after 4 s, and 1
 
 STALE = _changed(
     RTK,
-    # smaller than in `rtk`, whose filter compensates them: with 0.1 s and 0.04 s a controller that
-    # passes 97 % of the gates on the true state passes 20 %, with these 64 %
-    gnss={"latency": 0.04},
+    # as of receivers of hobby vehicles: ArduPilot assumes 0.12 s of a u-blox M8, from flight logs,
+    # and 0.22 s of a 6 (AP_GPS_UBLOX, get_lag). With 0.04, 0.12 and 0.2 s, PD control passes all
+    # gates of StaleRace in 100, 99 and 90 % of 200 episodes, and a policy that was trained with
+    # 0.04 s in 99, 46 and 2 %
+    gnss={"latency": 0.12},
     camera={"latency": 0.01},
     estimator={"delay_compensation": "none"},
 )

@@ -46,21 +46,18 @@ class Gaps(NamedTuple):
 
 
 class OutageDash(Task):
-    """Fly through the gaps of ten walls while GNSS is lost for 5 to 15 s.
+    """Fly through the gaps of ten walls while GNSS is lost again and again, for 5 to 15 s.
 
     The sensors are typical of hobby vehicles (`consumer`). With GNSS the position error of the
     filter is 0.2 m; without it the error grows to 0.25 m after two seconds, 0.8 m after five, 2 m
     after eight, and 4 m after twelve (root mean square). Gaps are 3 to 6 m wide, walls 12 m apart.
     A controller that continues through an outage hits a wall; one that waits for GNSS needs time,
     and drifts. The best distance to continue depends on the filter's uncertainty and on the width
-    of the next gap.
+    of the next gap. Outages recur, so that waiting for the first one to end, before the first wall,
+    wins nothing.
 
-    The task has a loophole: GNSS fails only once, and early. A controller that waits in the open
-    air in front of the first wall until the outage is over, and then dashes, needs no covariance,
-    and crashes in 1.3 % of the episodes.
-
-    At 5 m/s the course takes 27 s of the 45 s, and time that remains is not rewarded: there is
-    enough time to wait for the end of every outage, but not to fly the whole course slowly.
+    At 5 m/s the course takes 27 s of the 90 s, and time that remains is not rewarded: there is
+    enough time to wait for the end of most outages, but not to fly the whole course slowly.
 
     Actions command velocities (`action="velocity"`) at 10 Hz (`control_rate=10`), and an inner loop
     tracks them on the estimate: the task is to decide when to continue, not to stabilize the
@@ -73,8 +70,8 @@ class OutageDash(Task):
     and the width uniformly in [3, 6] m. A geofence keeps the vehicle within 14 m of the line and
     below 12 m.
 
-    GNSS (position and velocity) fails once per episode, at a time in [2, 8] s, for a duration in
-    [5, 15] s.
+    GNSS (position and velocity) fails at random instants, 0.1 per second of availability, for a
+    duration in [5, 15] s each: half of the time on average.
 
     ## Reward
     In each step of h seconds, with the true speed v to the west [m/s] until 12 m behind the last
@@ -106,7 +103,7 @@ class OutageDash(Task):
 
     ## Endings
     The finish, 12 m behind the last wall; contact with a wall, leaving the geofence, the ground at
-    height 0, tipping over, and the time limit of 45 s, as in `QuadEnv`. `info["gates_passed"]`
+    height 0, tipping over, and the time limit of 90 s, as in `QuadEnv`. `info["gates_passed"]`
     counts the gaps that are at least 0.7 m behind the vehicle.
 
     Args:

@@ -24,14 +24,11 @@ class StaleRace(Task):
     """Race through gates with sensor latency that the filter does not model.
 
     Eight gates lie on a course that is drawn for each episode, as in `Waypoints`; a gate is passed
-    within 0.6 m of its center. GNSS is delayed by 40 ms and images by 10 ms. These delays are
-    short, and the filter ignores them, as many filters do. Their effect depends on the controller:
-    at rest a delayed position is correct, at 4 m/s it is off by 16 cm, many times the standard
-    deviation that the filter assumes, so that attitude and biases become wrong as well. The faster
-    the flight, the worse the estimate.
-
-    With the present filter, PD control on the estimate passes all gates in 300 of 300 episodes, so
-    that the race does not decide between training observations.
+    within 0.6 m of its center. GNSS is delayed by 120 ms, as of receivers of hobby vehicles, and
+    images by 10 ms. The filter ignores these delays, as many filters do. Their effect depends on
+    the controller: at rest a delayed position is correct, at 4 m/s it is off by 0.5 m, many times
+    the standard deviation that the filter assumes, so that attitude and biases become wrong as
+    well. The faster the flight, the worse the estimate.
 
     With `sensors` whose filter uses the time stamps (`delay_compensation="retrodict"`) the same
     race is easy; this is the control condition of the experiment.

@@ -253,7 +253,7 @@ class EstimateView(Group):
         if not self._flights.run_filter:
             raise ValueError(
                 'view.estimate needs a filter: observation="estimate" or "measurements", or '
-                "include_std=True or innovations=True"
+                "run_filter=True, include_std=True or innovations=True"
             )
 
     position = quantity("estimated_position")
@@ -402,7 +402,7 @@ class MeasuredView(Group):
         if not self._flights.run_filter:
             raise ValueError(
                 'view.measured needs simulated sensors: observation="estimate" or "measurements", '
-                "or include_std=True or innovations=True"
+                "or run_filter=True, include_std=True or innovations=True"
             )
 
     gyro, accel = quantity("gyro"), quantity("accel")

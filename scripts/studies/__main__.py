@@ -5,6 +5,7 @@
     python -m scripts.studies stale_race --video webp      # with a film of two policies
     python -m scripts.studies look_around --quick          # minutes: a check, not a result
     python -m scripts.studies look_around --arms-file my_arms.py --arms truth mine
+    python -m scripts.studies run --all                    # everything behind the pages
 
 Arms of scripts/studies/arms.py (or of a file like it) are trained with the compiled PPO, or
 with another algorithm of Stable-Baselines3 that they name, and every policy
@@ -13,6 +14,7 @@ intervals over seeds and episodes, and conclusions, and writes figures, numbers 
 training is a folder: an interrupted study continues where it stopped.
 """
 
+import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -150,4 +152,18 @@ def main(args: StudyArgs) -> None:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["run"]:
+        from scripts.studies import run
+
+        words = sys.argv[2:]
+        sys.exit(
+            run.main(
+                options.parse(
+                    run.RunArgs,
+                    words,
+                    prog="python -m scripts.studies run",
+                    description=run.__doc__,
+                )
+            )
+        )
     main(options.parse(StudyArgs, prog="python -m scripts.studies", description=__doc__))

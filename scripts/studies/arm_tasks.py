@@ -206,6 +206,33 @@ class ConstantCrashCostWithUncertainty(ConstantCrashCost, WithUncertainty):
     """`WithUncertainty` for training, with the changes of `ConstantCrashCost`."""
 
 
+class WithTimeSinceFix(WithUncertainty):
+    """`WithUncertainty` whose observation also contains the time since the last fix of GNSS.
+
+    It is observed as log2(1 + t / 1 s), and is known to every controller that receives the fixes.
+    """
+
+    state: Mapping[str, ArrayLike] = {**WithUncertainty.state, "since_fix": 0.0}
+    observes: Mapping[str, ObservationSpec] = {
+        **WithUncertainty.observes,
+        "since_fix": ObservationSpec("log2", "-", 0.0, 10.0),
+    }
+
+    def update(self, view: "View", rng: "FlightRandom") -> None:
+        """Count the time since the last fix [s], (n,)."""
+        super().update(view, rng)
+        missing = np.isnan(view.measured.gnss_position[:, 0])
+        view.state.since_fix = np.where(missing, view.state.since_fix + view.period, 0.0)
+
+    def observe(self, view: "View") -> Parts:
+        """Return the observation of `WithUncertainty`, and `since_fix` (n,)."""
+        return {**super().observe(view), "since_fix": np.log2(1.0 + view.state.since_fix)}
+
+
+class ConstantCrashCostWithTimeSinceFix(ConstantCrashCost, WithTimeSinceFix):
+    """`WithTimeSinceFix` for training, with the changes of `ConstantCrashCost`."""
+
+
 class MaskedStd(StaleRace):
     """`StaleRace` with the 15 standard deviations in its observation, some of them masked.
 

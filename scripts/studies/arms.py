@@ -6,7 +6,7 @@ episodes. To define your own arms, write a file like this one with a tuple `ARMS
 """
 
 import runpy
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import KW_ONLY, field
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from baselines.recipes import ALGORITHMS, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
+from scripts.studies.fitting import errors_of
 
 
 def _word(name: str, value: Any) -> str:
@@ -82,17 +83,26 @@ def _task(name: str, module: str = "scripts.studies.arm_tasks") -> dict[str, str
     return {"task": f"{module}:{name}"}
 
 
-_FAR_SIGHTED = {"gamma": 0.995}
-"""Longer horizon: without a reward for certainty, looking at the markers is rewarded only seconds
-later. With the recipe's 0.99, a third of the flights crashed in preliminary trainings."""
-_ONE_WALL = sensor_suite("one_wall")
-_NOISIER = _ONE_WALL.replace(
-    noisy=NoisyObservationParams(position=0.11, velocity=0.10, attitude=0.012, body_rates=0.011)
-)
-"""Noise as large as the errors of the estimate: root mean squares of position and velocity over 300
-episodes of `pd_features_when_uncertain`, attitude in proportion. The suite's own noise, 8 mm, has
-the size of the errors of a filter that always has features in view."""
+TRUTH: Mapping[str, Any] = {"observation": "truth"}
+"""Keyword of training on the truth. In `learning`, the checkpoint is chosen on the estimate."""
+_FILTERED_TRUTH = {**TRUTH, "run_filter": True}
+"""Training on the truth while the filter flies along, for its standard deviation and a reward; the
+flights are the same as with `TRUTH`."""
+STD: Mapping[str, Any] = {"include_std": True}
+
+
+def _matched_noise(suite: str, task: str) -> dict[str, Any]:
+    """Keywords of training on the truth with noise as large as the errors of the estimate."""
+    noise = NoisyObservationParams(**errors_of(task))
+    return {"observation": "noisy", "sensors": sensor_suite(suite).replace(noisy=noise)}
+
+
+_NOISY, _MATCHED = {"observation": "noisy"}, _matched_noise("one_wall", "look_around")
+"""Independent noise. The suite's own, 8 mm, has the size of the errors of a filter that always has
+features in view; the matched one of the errors of `pd_features_when_uncertain`."""
 _WITH_STD = _task("WithStd", "baselines.arm_tasks")
+_CERTAINTY, _STD_CERTAINTY = _task("CertaintyReward"), _task("WithStdCertaintyReward")
+_FILTER = {"run_filter": True}
 
 ARMS = (
     Arm("pd_reference", "PD, tracks the rewarded heading", policy="pd"),
@@ -101,35 +111,54 @@ ARMS = (
         "pd_features_when_uncertain",
         "PD, facing the features when uncertain",
         policy="pd:features_when_uncertain",
-        environment={"include_std": True},
+        environment=STD,
     ),
+    Arm("pd_planning", "PD that plans by covariances", policy="planning", environment=STD),
     Arm(
-        "pd_planning",
-        "PD that plans by covariances",
-        policy="planning",
-        environment={"include_std": True},
+        "truth_std_certainty",
+        "truth + standard deviation, reward for certainty",
+        environment=_WITH_STD,
+        learning={**_FILTERED_TRUTH, **_STD_CERTAINTY},
     ),
-    Arm("truth", "truth", training={"observation": "truth"}),
-    Arm("noisy", "truth + independent noise", training={"observation": "noisy"}),
-    Arm(
-        "noisier",
-        "truth + noise matched to observed errors",
-        training={"observation": "noisy", "sensors": _NOISIER},
-    ),
-    Arm("estimate", "estimate", parameters=_FAR_SIGHTED),
-    Arm("std", "estimate + standard deviation", environment=_WITH_STD, parameters=_FAR_SIGHTED),
-    Arm(
-        "std_history",
-        "estimate + standard deviation + history",
-        environment=_task("WithStdHistory"),
-        parameters=_FAR_SIGHTED,
-    ),
-    Arm("certainty", "estimate, reward for certainty", learning=_task("CertaintyReward")),
     Arm(
         "std_certainty",
         "estimate + standard deviation, reward for certainty",
         environment=_WITH_STD,
-        learning=_task("WithStdCertaintyReward"),
+        learning=_STD_CERTAINTY,
+    ),
+    Arm("truth", "truth", learning=TRUTH),
+    Arm("estimate", "estimate"),
+    Arm(
+        "truth_std",
+        "truth + standard deviation",
+        environment=_WITH_STD,
+        learning=_FILTERED_TRUTH,
+    ),
+    Arm("std", "estimate + standard deviation", environment=_WITH_STD),
+    Arm(
+        "truth_certainty",
+        "truth, reward for certainty",
+        learning={**_FILTERED_TRUTH, **_CERTAINTY},
+    ),
+    Arm("certainty", "estimate, reward for certainty", learning=_CERTAINTY),
+    Arm(
+        "noisy_std_certainty",
+        "truth + independent noise + standard deviation, reward for certainty",
+        environment=_WITH_STD,
+        learning={**_NOISY, **_FILTER, **_STD_CERTAINTY},
+    ),
+    Arm(
+        "matched_std_certainty",
+        "truth + noise matched to observed errors + standard deviation, reward for certainty",
+        environment=_WITH_STD,
+        learning={**_MATCHED, **_FILTER, **_STD_CERTAINTY},
+    ),
+    Arm("noisy", "truth + independent noise", learning=_NOISY),
+    Arm("matched", "truth + noise matched to observed errors", learning=_MATCHED),
+    Arm(
+        "std_history",
+        "estimate + standard deviation + history",
+        environment=_task("WithStdHistory"),
     ),
     Arm(
         "std_certainty_privileged",
@@ -146,29 +175,31 @@ ARMS = (
         environment=_WITH_STD,
     ),
 )
-"""Arms of `QuadGym/LookAround-v0`."""
+"""Arms of `QuadGym/LookAround-v0`. Eight of them are all combinations of the observation in
+training (truth, estimate), the standard deviation, and the reward for certainty."""
 
-_TRUTH = {"observation": "truth"}
-_STD = {"include_std": True}
 _STALE = sensor_suite("stale")
 _COMPENSATED = {
     "sensors": _STALE.replace(estimator=_STALE.estimator.replace(delay_compensation="retrodict"))
 }
 """Sensors of the race, with a filter that uses the time stamps of their measurements."""
-_WITH_HISTORY = {**_task("RaceWithHistory"), **_STD}
+_RACE_NOISE = _matched_noise("stale", "stale_race")
+_WITH_HISTORY = {**_task("RaceWithHistory"), **STD}
 
 STALE_RACE = (
     Arm("pd", "PD", policy="pd"),
-    Arm("truth", "truth", training=_TRUTH),
-    Arm("std", "estimate + 15 standard deviations", environment=_STD),
-    Arm("std_history", "estimate + 15 standard deviations + history", environment=_WITH_HISTORY),
+    Arm("truth", "truth", learning=TRUTH),
+    Arm("std", "estimate + 15 standard deviations", environment=STD),
+    Arm("estimate", "estimate"),
+    Arm("noisy", "truth + noise matched to observed errors", learning=_RACE_NOISE),
     Arm(
         "residual",
         "truth + residual model",
         environment=_task("ObservedRace"),
-        training={**_task("ResidualRace"), **_TRUTH},
+        learning={**_task("ResidualRace"), **TRUTH},
     ),
-    Arm("truth_on_truth", "truth, tested on the truth", flies="truth", environment=_TRUTH),
+    Arm("std_history", "estimate + 15 standard deviations + history", environment=_WITH_HISTORY),
+    Arm("truth_on_truth", "truth, tested on the truth", flies="truth", environment=TRUTH),
     Arm(
         "truth_delay_compensated",
         "truth, tested with delay compensation",
@@ -179,28 +210,60 @@ STALE_RACE = (
         "std_delay_compensated",
         "estimate + 15 standard deviations, tested with delay compensation",
         flies="std",
-        environment={**_STD, **_COMPENSATED},
+        environment={**STD, **_COMPENSATED},
     ),
-    Arm("included", "estimate + 15 standard deviations", policy="pretrained", environment=_STD),
+    Arm(
+        "compensated",
+        "estimate with delay compensation, in training and test",
+        environment=_COMPENSATED,
+    ),
+    Arm("included", "estimate + 15 standard deviations", policy="pretrained", environment=STD),
 )
 """Arms of `QuadGym/StaleRace-v0`."""
 
 _SCALED = _task("Scaled", "baselines.arm_tasks")
 _WITH_UNCERTAINTY = _task("WithUncertainty", "baselines.arm_tasks")
+_SINCE_FIX = _task("WithTimeSinceFix")
 _CONSTANT_CRASH_COST = _task("ConstantCrashCost")
+_CONSTANT_WITH_UNCERTAINTY = _task("ConstantCrashCostWithUncertainty")
 
 OUTAGE_DASH = (
     Arm("pd", "PD at 4.7 m/s", policy="pd"),
     Arm("pd_slow", "PD at 2.4 m/s", policy="pd:slow"),
-    Arm("pd_waiting", "PD that waits when uncertain", policy="pd:waiting", environment=_STD),
-    Arm("pd_planning", "PD that plans by covariances", policy="planning", environment=_STD),
-    Arm("truth", "truth", environment=_SCALED, training=_TRUTH, learning=_CONSTANT_CRASH_COST),
+    Arm("pd_waiting", "PD that waits when uncertain", policy="pd:waiting", environment=STD),
+    Arm(
+        "pd_backs_off",
+        "PD that waits when uncertain, and backs off from walls",
+        policy="backs_off",
+        environment=STD,
+    ),
+    Arm(
+        "pd_waits_at_start",
+        "PD that waits at the start for the end of an outage",
+        policy="waits_at_start",
+        environment=STD,
+    ),
+    Arm("pd_planning", "PD that plans by covariances", policy="planning", environment=STD),
+    Arm("truth", "truth", environment=_SCALED, learning={**_CONSTANT_CRASH_COST, **TRUTH}),
     Arm("estimate", "estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
     Arm(
         "std",
         "estimate + normalized uncertainty",
         environment=_WITH_UNCERTAINTY,
-        learning=_task("ConstantCrashCostWithUncertainty"),
+        learning=_CONSTANT_WITH_UNCERTAINTY,
+    ),
+    Arm(
+        "since_fix",
+        "estimate + normalized uncertainty + time since the last fix",
+        environment=_SINCE_FIX,
+        learning=_task("ConstantCrashCostWithTimeSinceFix"),
+    ),
+    Arm(
+        "recurrent",
+        "estimate + normalized uncertainty, recurrent policy",
+        environment=_WITH_UNCERTAINTY,
+        learning=_CONSTANT_WITH_UNCERTAINTY,
+        algorithm="recurrent_ppo",
     ),
     Arm(
         "std_privileged",
@@ -213,7 +276,7 @@ OUTAGE_DASH = (
         "truth_on_truth",
         "truth, tested on the truth",
         flies="truth",
-        environment={**_SCALED, **_TRUTH},
+        environment={**_SCALED, **TRUTH},
     ),
     Arm(
         "included",
@@ -223,6 +286,16 @@ OUTAGE_DASH = (
     ),
 )
 """Arms of `QuadGym/OutageDash-v0`."""
+
+TRACKING = (
+    Arm("pd", "PD", policy="pd"),
+    Arm("pd_on_truth", "PD, tested on the truth", policy="pd", environment=TRUTH),
+    Arm("truth", "truth", learning=TRUTH),
+    Arm("estimate", "estimate"),
+    Arm("truth_on_truth", "truth, tested on the truth", flies="truth", environment=TRUTH),
+)
+"""Arms of tasks that follow a reference: the cost of flying on the estimate, `truth` minus
+`truth_on_truth`, and the gain of training on it, `truth` minus `estimate`."""
 
 
 def read_arms(file: Path) -> tuple[Arm, ...]:

@@ -214,7 +214,7 @@ def _add_figures(report: Report, results: StudyResults) -> None:
             "estimate, which compares the arms.",
         )
     pair, kind = pair_of(results), study.about.figure
-    if pair is None:
+    if pair is None or kind == "none":
         return
     episodes = {}
     for name, k in pair.trainings.items():

@@ -2,9 +2,9 @@
 
 The method is the one of E. Kaufmann et al., "Champion-level drone racing using deep reinforcement
 learning", Nature 620, 2023: fly, record the difference between estimate and truth, fit a model of
-it, and train on the truth plus errors drawn from the model. They use Gaussian processes; this model
-is a linear autoregression with the velocity as input, because delayed measurements cause errors
-that depend on it:
+it (`scripts.studies.fitting`), and train on the truth plus errors drawn from the model. They use
+Gaussian processes; this model is a linear autoregression with the velocity as input, because
+delayed measurements cause errors that depend on it:
 
     e' = A e + B (v, 1) + L w,  w normal with unit covariance,
 
@@ -92,15 +92,21 @@ def fit(errors: Floats, velocities: Floats) -> ResidualModel:
 def record(
     policy: Policy, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int = 0
 ) -> tuple[Floats, Floats]:
-    """Run an episode in each flight; return errors (t, n, 12) and true velocities (t, n, 3)."""
+    """Run an episode in each flight; return errors (t, n, 12) and true velocities (t, n, 3).
+
+    Errors are NaN after the end of a flight, and of a flight that crashes, whose errors belong
+    to a lost vehicle.
+    """
     errors, velocities = [], []
 
     def watch(step: int, batch: Any, flying: NDArray[np.bool_]) -> None:
         errors.append(np.where(flying[:, np.newaxis], error_of(batch.view), np.nan))
         velocities.append(batch.view.velocity.copy())
 
-    roll_out(policy, env, seed=seed, watch=watch)
-    return np.array(errors), np.array(velocities)
+    crashed = roll_out(policy, env, seed=seed, watch=watch).crashed
+    found = np.array(errors)
+    found[:, crashed] = np.nan
+    return found, np.array(velocities)
 
 
 def error_of(view: Any) -> Floats:
@@ -113,19 +119,3 @@ def error_of(view: Any) -> Floats:
 
 def _inputs(velocity: Floats) -> Floats:
     return np.concatenate([velocity, np.ones((*velocity.shape[:-1], 1))], axis=-1)
-
-
-def fit_task(env_id: str, policy: str = "pd", episodes: int = 500) -> ResidualModel:
-    """Fit the model to episodes of a task, flown on the estimate.
-
-    Args:
-        env_id: Id from `quad_gym.IDS`.
-        policy: Name or file, see `baselines.policies.load_policy`.
-        episodes: Number of episodes, with seeds for training (`baselines.recipes`).
-    """
-    from baselines.policies import load_policy
-    from baselines.recipes import first_seed
-
-    env = gymnasium.make_vec(env_id, num_envs=episodes)
-    errors, velocities = record(load_policy(policy, env), env, first_seed("training", 0, episodes))
-    return fit(errors, velocities)

@@ -14,28 +14,30 @@ from quad_gym.analysis.metrics import Estimated, rate_over_trainings
 from quad_gym.analysis.reports import as_json
 from quad_gym.envs.config import with_effect
 from quad_gym.evaluation import Policy
-from quad_gym.experiments import Experiment, Floats, Flown, Trial
+from quad_gym.experiments import Experiment, Floats, Flown, Recorder, Trial
 from scripts.studies.arms import Arm
-from scripts.studies.planning import PlanningPolicy
+from scripts.studies.rules import RULES
 from scripts.studies.scores import Score, mean_over_trainings, probability_of_improvement
 from scripts.studies.tasks import StudiedTask
-from scripts.studies.traces import ViewRecorder
+from scripts.studies.traces import SpeedRecorder, ViewRecorder
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyTrial(Trial):
-    """Test episodes that also the policy "planning" flies, with traces of the first ones."""
+    """Test episodes that also the rules of `RULES` fly, with traces of the first ones."""
 
     traced: tuple[str, ...]
     """Names from `TRACES`"""
 
-    def recorder(self) -> ViewRecorder:
+    def recorder(self) -> Recorder:
         """Make the recorder of the episodes."""
-        return ViewRecorder(self.traced)
+        if hasattr(self.env.unwrapped.flights.batch, "view"):
+            return ViewRecorder(self.traced)
+        return SpeedRecorder()
 
     def load(self, policy: str) -> Policy:
         """Load a policy by name or file."""
-        return PlanningPolicy(self.env) if policy == "planning" else super().load(policy)
+        return RULES[policy](self.env) if policy in RULES else super().load(policy)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.experiments import Flown
-from scripts.studies.arms import ARMS, OUTAGE_DASH, STALE_RACE, Arm
+from scripts.studies.arms import ARMS, OUTAGE_DASH, STALE_RACE, TRACKING, Arm
 from scripts.studies.scores import Score, mean, worst_tenth
 
 
@@ -47,7 +47,8 @@ class StudiedTask:
     evaluations: int = 9
     """Number of evaluations during a training, of which the best policy is kept"""
     figure: str
-    """"glance": heading of policies; "pace": speed, and standard deviations of the filter"""
+    """Figure of an episode. "glance": heading of policies; "pace": speed, and standard deviations
+    of the filter; "none": no figure"""
     course: tuple[str, int] | None = None
     """Name and number of the gates of a course; None: no course"""
     film_speed: float = 1.0
@@ -87,6 +88,23 @@ def _gates(heading: str) -> dict[str, StudyColumn]:
             "mean speed up to the end [m/s]", lambda run: run.recorded["mean_speed"], digits=2
         ),
     }
+
+
+def _tracking(gates: int = 0) -> StudiedTask:
+    """Definition of the studies of a task with a built-in reference."""
+    error = StudyColumn("position error [m]", lambda run: run.episodes.mean_error, digits=3)
+    return StudiedTask(
+        arms=TRACKING,
+        carrying=tuple(arm.name for arm in TRACKING),
+        success=lambda run: passes(run, gates),
+        meaning=f"all {gates} gates passed" if gates else "completed without a crash",
+        columns={"error": error, **(_gates(f"gates passed, of {gates}") if gates else {})},
+        telling="error",
+        traced=(),
+        evaluations=8,
+        figure="none",
+        course=("gates", gates) if gates else None,
+    )
 
 
 STUDIED: Mapping[str, StudiedTask] = {
@@ -143,5 +161,8 @@ STUDIED: Mapping[str, StudiedTask] = {
         course=("gaps", 10),
         film_speed=3.0,
     ),
+    "circle": _tracking(),
+    "random_trajectory": _tracking(),
+    "waypoints": _tracking(gates=5),
 }
 """Definitions by task."""

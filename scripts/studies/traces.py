@@ -50,6 +50,28 @@ class ViewRecorder:
         }
 
 
+class SpeedRecorder:
+    """Recorder of "mean_speed", (e,) [m/s], for tasks without a view; "in_view" is NaN."""
+
+    def __init__(self) -> None:
+        self._distance = self._steps = np.zeros(0)
+
+    def add(self, step: int, batch: Any, flying: Any) -> None:
+        """Record an instant; see `quad_gym.evaluation.Watch`."""
+        if step == 0:
+            self._distance, self._steps = np.zeros((2, len(flying)))
+        speed = np.linalg.norm(batch.read("velocity"), axis=1)
+        self._distance += np.where(flying, speed, 0.0)
+        self._steps += flying
+
+    def recorded(self) -> dict[str, Any]:
+        """Return the speeds by name."""
+        return {
+            "mean_speed": self._distance / self._steps,
+            "in_view": np.full(len(self._steps), np.nan),
+        }
+
+
 def _sigma(view: Any, k: slice) -> Floats:
     try:
         return np.asarray(view.estimate.position_sigma[k].max(axis=1))

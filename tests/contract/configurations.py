@@ -75,6 +75,7 @@ CONFIGURATIONS = {
         "circle",
         {"observation": "truth", "action": "velocity", "randomize_reference": True},
     ),
+    "truth with a filter": ("random_trajectory", {"observation": "truth", "run_filter": True}),
     "absolute": ("circle", {"include_std": True, "layout": "absolute", "action": "wrench"}),
     "fast control": ("circle", {"camera": False, "control_rate": 100}),
     "averages": ("circle", {"sensors": AVERAGES.with_rates(gnss=20.0)}),

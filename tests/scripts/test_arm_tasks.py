@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from baselines.policies import interface_of, load_policy
 from baselines.recipes import Plan, recipe
 from scripts.studies.arms import OUTAGE_DASH
+from scripts.studies.rules import RULES
 from tests.builders import part
 
 ID = "QuadGym/LookAround-v0"
@@ -146,8 +147,39 @@ def test_rules_fly_the_plain_task_and_policies_the_scaled_one():
         plain = "gap_width" in interface_of(env)["observation"]
         is_rule = arm.policy is not None and not arm.learned
         assert plain == is_rule, arm.name
-        if plain and arm.policy != "planning":
-            load_policy(arm.policy, env)
+        if plain:
+            RULES[arm.policy](env) if arm.policy in RULES else load_policy(arm.policy, env)
+
+
+def test_time_since_fix_counts_from_the_last_measured_position():
+    env, seen = make("WithTimeSinceFix", env_id=DASH_ID)
+    view, expected = env.unwrapped.flights.batch.view, np.zeros(6)
+    for _ in range(120):
+        seen, *_ = env.step(np.zeros((6, 4), np.float32))
+        fixed = np.isfinite(view.measured.gnss_position[:, 0])
+        expected = np.where(fixed, 0.0, expected + 0.1)
+        found = part(env, seen, "since_fix")[:, 0]
+        np.testing.assert_allclose(found, np.log2(1.0 + expected), atol=1e-5)
+    assert expected.max() > 2.0
+
+
+def flown_alone(rule, parts):
+    """Position error that a rule pursues for an observation with these parts."""
+    env = gymnasium.make_vec(DASH_ID, num_envs=1, include_std=True)
+    rows = np.zeros((1, env.single_observation_space.shape[0]))
+    ahead = {"up": (0.0, 0.0, 1.0), "heading": (1.0, 0.0, 0.0)}
+    for field in env.unwrapped.flights.table:
+        rows[:, field.slice] = {**ahead, **parts}.get(field.name, 0.0)
+    return RULES[rule](env)._read(rows).position_error[0]
+
+
+def test_rule_backs_off_from_a_wall_near_the_gap_only_if_certain():
+    near = {"position_error": (2.0, 3.0, 0.0), "gap_width": 4.0}
+    np.testing.assert_allclose(flown_alone("backs_off", near), [-1.0, 3.0, 0.0])
+    inside = near | {"position_error": (2.0, 1.0, 0.0)}
+    np.testing.assert_allclose(flown_alone("backs_off", inside), [2.0, 1.0, 0.0])
+    uncertain = near | {"position_sigma": 1.0}
+    np.testing.assert_allclose(flown_alone("backs_off", uncertain), [-4.0, 3.0, 0.0])
 
 
 def test_critic_of_look_around_observes_the_truth():

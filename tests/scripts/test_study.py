@@ -126,7 +126,7 @@ def test_success_needs_a_complete_episode_and_a_small_late_error():
         ("look_around --arms nobody", "--arms must be one of"),
         ("look_around --arms-file text.toml", "--arms-file must be a Python file, got text.toml"),
         ("stale_race --arms truth_delay_compensated", "--arms must name truth, whose policies"),
-        ("QuadGym/Circle-v0", "ENV_ID must be one of QuadGym/LookAround-v0"),
+        ("QuadGym/Hover-v0", "ENV_ID must be one of QuadGym/Circle-v0"),
         ("look_around --env observation=truth", "must not contain observation: use --arms instead"),
         ("look_around --arms certainty --set clip=1", "clip is not a keyword of the compiled PPO"),
         (

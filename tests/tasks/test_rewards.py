@@ -94,3 +94,24 @@ def test_uncertainty_of_unknown_blocks_is_refused():
         rewards.Uncertainty("height")
     with pytest.raises(ValueError, match="measure must be one of"):
         rewards.Uncertainty(measure="det")
+
+
+def test_uncertainty_on_the_truth_uses_a_filter_that_changes_nothing_else():
+    certain = quad_gym.Task.of(reward=1.0 * rewards.Uncertainty("position"))
+    runs = {}
+    for name, keywords in {
+        "truth alone": {"observation": "truth"},
+        "truth": {"observation": "truth", "run_filter": True, "task": certain},
+        "estimate": {"observation": "estimate", "task": certain},
+    }.items():
+        env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, threads=1, **keywords)
+        seen = [env.reset(seed=5)[0]]
+        for _ in range(5):
+            observation, reward, *_, info = env.step(np.zeros((3, 4), np.float32))
+            seen.append(observation)
+        runs[name] = np.array(seen), reward, set(info)
+    np.testing.assert_array_equal(runs["truth"][0], runs["truth alone"][0])
+    np.testing.assert_array_equal(runs["truth"][1], runs["estimate"][1])
+    assert "innovations" not in runs["truth"][2]
+    with pytest.raises(ValueError, match="run_filter must not be False"):
+        gymnasium.make_vec("QuadGym/Circle-v0", num_envs=1, run_filter=False)

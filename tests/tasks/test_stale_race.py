@@ -18,7 +18,7 @@ def test_defaults_equal_documented_values():
     assert flights.task.kind == "waypoints"
     assert (flights.task.gate_count, flights.task.gate_radius) == (8, 0.6)
     suite = flights.batch.sensors
-    assert (suite.gnss.latency, suite.camera.latency) == (0.04, 0.01)
+    assert (suite.gnss.latency, suite.camera.latency) == (0.12, 0.01)
     assert suite.estimator.delay_compensation == "none"
 
 

@@ -1,0 +1,355 @@
+"""Conclusions of the studies, each computed from rows per seed.
+
+A conclusion is a function of the rows of a table. It names arms, seeds, budget and intervals, and
+its verdict follows from the interval: a difference is significant if its 95 % interval excludes
+zero. Where a row is missing, or of other flights, it is `NOT_MEASURED`. `docs.renewal` writes the
+texts into the pages, and a test compares these with the rows.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from quad_gym.analysis.metrics import Estimated
+from scripts.studies.campaign import DATA, Part, flights_digest, is_complete
+from scripts.studies.parts import (
+    CURVE_ARMS,
+    DASH_STEPS,
+    LOOK_STEPS,
+    PARTS,
+    RACE_CURVE,
+    RACE_STEPS,
+    SUITES,
+    TRACKING_STEPS,
+)
+from scripts.studies.report import number, share
+from scripts.studies.rows import Rows, effect, mean_effect
+
+NOT_MEASURED = "Not yet measured with the present flights (`python -m scripts.studies run --all`)."
+"""Text of a conclusion or table whose rows are missing or of other flights."""
+
+Conclusion = Callable[[Rows], str]
+
+
+class MissingRowsError(ValueError):
+    """Error raised if an arm has not been measured."""
+
+
+def points(found: Estimated) -> str:
+    """Difference of rates in percentage points, with its interval and verdict."""
+    scaled = Estimated(*(100.0 * value for value in found))
+    return f"{number(scaled, 0)} percentage points ({_verdict(found)})"
+
+
+def _verdict(found: Estimated) -> str:
+    return "not significant" if found.holds(0.0) else "significant"
+
+
+class Arms:
+    """Rows of arms with one number of steps, and words about them."""
+
+    def __init__(self, rows: Rows, steps: int) -> None:
+        self._rows, self._steps = rows, steps
+
+    def __getitem__(self, name: str) -> Rows:
+        found = self._rows.of(name, self._steps)
+        if not found.rows:
+            raise MissingRowsError(name)
+        return found
+
+    def named(self, name: str) -> str:
+        """Label of an arm in quotes, with its success."""
+        found = self[name]
+        return f'"{found.label}" ({share(found.estimated("success"))})'
+
+    def budget(self, *names: str) -> str:
+        """Number of seeds, and of steps."""
+        counts = sorted({self[name].seeds for name in names})
+        seeds = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        return f"{seeds} seeds, {self._steps:,} steps"
+
+    def against(self, first: str, second: str, column: str = "success") -> str:
+        """Difference of two arms."""
+        return points(effect(self[first], self[second], column))
+
+
+def look_around_control(rows: Rows) -> str:
+    """Effect of the training observation, all else equal."""
+    arms, pair = Arms(rows, LOOK_STEPS), ("std_certainty", "truth_std_certainty")
+    crashes = arms.against(*pair, "crashed")
+    return (
+        f"LookAround, trained on the estimate instead of the truth, with standard deviation and "
+        f"reward for certainty in both arms ({arms.budget(*pair)}): {arms.named(pair[0])} "
+        f"succeeds more often than {arms.named(pair[1])} by {arms.against(*pair)}, and crashes "
+        f"differ by {crashes}."
+    )
+
+
+_FACTORS = {
+    "training on the estimate": (
+        ("estimate", "truth"),
+        ("std", "truth_std"),
+        ("certainty", "truth_certainty"),
+        ("std_certainty", "truth_std_certainty"),
+    ),
+    "observing the standard deviation": (
+        ("truth_std", "truth"),
+        ("std", "estimate"),
+        ("truth_std_certainty", "truth_certainty"),
+        ("std_certainty", "certainty"),
+    ),
+    "the reward for certainty": (
+        ("truth_certainty", "truth"),
+        ("certainty", "estimate"),
+        ("truth_std_certainty", "truth_std"),
+        ("std_certainty", "std"),
+    ),
+}
+"""Pairs of arms of LookAround that differ in one factor only."""
+
+
+def look_around_factors(rows: Rows) -> str:
+    """Share of each of the three factors, averaged over the others."""
+    arms = Arms(rows, LOOK_STEPS)
+    parts = []
+    for factor, pairs in _FACTORS.items():
+        found = mean_effect([(arms[first], arms[second]) for first, second in pairs])
+        parts.append(f"{factor} {points(found)}")
+    names = {name for pairs in _FACTORS.values() for pair in pairs for name in pair}
+    return (
+        f"LookAround, success, each factor averaged over all combinations of the other two "
+        f"(8 arms, {arms.budget(*sorted(names))}): {'; '.join(parts)}."
+    )
+
+
+def look_around_noise(rows: Rows) -> str:
+    """Noise on the truth instead of the filter, all else equal."""
+    arms = Arms(rows, LOOK_STEPS)
+    noisy = ("noisy_std_certainty", "matched_std_certainty")
+    parts = [
+        f"{arms.named(name)} differs from the truth by "
+        f"{arms.against(name, 'truth_std_certainty')} and from the estimate by "
+        f"{arms.against(name, 'std_certainty')}"
+        for name in noisy
+    ]
+    return f"LookAround, noise ({arms.budget(*noisy)}): {'; '.join(parts)}."
+
+
+def stale_race_training(rows: Rows) -> str:
+    """Training on the estimate in the race with late measurements."""
+    arms, pair = Arms(rows, RACE_STEPS), ("std", "truth")
+    return (
+        f"StaleRace ({arms.budget(*pair)}): {arms.named(pair[0])} and {arms.named(pair[1])} differ "
+        f"by {arms.against(*pair)}; the rule {arms.named('pd')}."
+    )
+
+
+def stale_race_compensation(rows: Rows) -> str:
+    """Compensating the delay in the filter instead of training on its errors."""
+    arms = Arms(rows, RACE_STEPS)
+    pair = ("truth_delay_compensated", "std_delay_compensated")
+    return (
+        f"StaleRace with delay compensation in the test ({arms.budget(*pair)}): "
+        f"{arms.named(pair[0])} and {arms.named(pair[1])} differ by {arms.against(*pair)}; the "
+        f"former differs from the estimate without compensation by "
+        f"{arms.against(pair[0], 'std')}."
+    )
+
+
+def stale_race_substitutes(rows: Rows) -> str:
+    """Noise and a residual model instead of the filter."""
+    arms, names = Arms(rows, RACE_STEPS), ("noisy", "residual")
+    parts = [
+        f"{arms.named(name)} differs from the truth by {arms.against(name, 'truth')} and from the "
+        f"estimate by {arms.against(name, 'std')}"
+        for name in names
+    ]
+    return f"StaleRace, errors added to the truth ({arms.budget(*names)}): {'; '.join(parts)}."
+
+
+def stale_race_curve(rows: Rows) -> str:
+    """Success by budget."""
+    parts = []
+    budgets = sorted((*RACE_CURVE, RACE_STEPS))
+    for steps in budgets:
+        arms = Arms(rows, steps)
+        parts.append(
+            f"{steps / 1e6:g} million steps: {arms.named(CURVE_ARMS[1])}, "
+            f"{arms.named(CURVE_ARMS[0])}"
+        )
+    seeds = Arms(rows, RACE_STEPS)[CURVE_ARMS[0]].seeds
+    return f"StaleRace, success by budget ({seeds} seeds each): {'; '.join(parts)}."
+
+
+def outage_dash_rules(rows: Rows) -> str:
+    """Rules: waiting once does not pay."""
+    arms = Arms(rows, DASH_STEPS)
+    names = ("pd", "pd_waits_at_start", "pd_waiting", "pd_backs_off")
+    shown = ", ".join(arms.named(name) for name in names)
+    lost = arms.against("pd_waits_at_start", "pd_waiting")
+    return (
+        f"OutageDash, fixed rules ({arms['pd'].episodes:,} episodes): {shown}. Waiting once, at "
+        f"the start, differs from waiting when uncertain by {lost}."
+    )
+
+
+def outage_dash_learned(rows: Rows) -> str:
+    """Learned policies against the best rule, without and with memory."""
+    arms, best = Arms(rows, DASH_STEPS), "pd_backs_off"
+    names = ("truth", "std", "since_fix", "recurrent")
+    parts = [f"{arms.named(name)}, {arms.against(name, best)}" for name in names]
+    return (
+        f"OutageDash, learned policies against the rule {arms.named(best)} "
+        f"({arms.budget(*names)}): {'; '.join(parts)}."
+    )
+
+
+def when_to_train(rows: Rows) -> str:
+    """Cost of flying on the estimate and gain of training on it, by task and suite, as a table."""
+    body = []
+    for task, steps in TRACKING_STEPS.items():
+        for suite in SUITES:
+            arms = Arms(rows.where(task=task, suite=suite), steps)
+            column = "success" if task == "Waypoints" else "error"
+            ideal, truth, estimate = (
+                arms[name] for name in ("truth_on_truth", "truth", "estimate")
+            )
+            cost, gain = effect(truth, ideal, column), effect(truth, estimate, column)
+            if column == "success":
+                cost, gain = _negative(cost), _negative(gain)
+            rule = arms["pd"].estimated(column)
+            body.append(
+                [
+                    task,
+                    f"`{suite}`",
+                    _shown(rule, column),
+                    _shown(ideal.estimated(column), column),
+                    _shown(cost, column),
+                    f"{_shown(gain, column)}, {_verdict(gain)}",
+                    f"{truth.seeds}",
+                ]
+            )
+    heads = [
+        "task",
+        "sensors",
+        "PD on the estimate",
+        "trained and tested on the truth",
+        "cost of flying on the estimate",
+        "gain of training on it",
+        "seeds",
+    ]
+    lines = [heads, ["---", "---", *["---:"] * 5], *body]
+    return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def when_to_train_summary(rows: Rows) -> str:
+    """In how many of the cases training on the estimate wins or loses significantly."""
+    wins: list[str] = []
+    losses: list[str] = []
+    cases = 0
+    for task, steps in TRACKING_STEPS.items():
+        for suite in SUITES:
+            arms = Arms(rows.where(task=task, suite=suite), steps)
+            column = "success" if task == "Waypoints" else "error"
+            gain = effect(arms["truth"], arms["estimate"], column)
+            gain = _negative(gain) if column == "success" else gain
+            cases += 1
+            if not gain.holds(0.0):
+                (wins if gain.value > 0.0 else losses).append(f"{task} with `{suite}`")
+    seeds = Arms(rows.where(task="Circle", suite="standard"), TRACKING_STEPS["Circle"])
+    return (
+        f"Training on the estimate is significantly better in {len(wins)} of {cases} cases"
+        f"{_listed(wins)}, and significantly worse in {len(losses)}{_listed(losses)} "
+        f"({seeds['truth'].seeds} seeds of each arm)."
+    )
+
+
+def _listed(names: list[str]) -> str:
+    return f" ({', '.join(names)})" if names else ""
+
+
+def _negative(found: Estimated) -> Estimated:
+    return Estimated(-found.value, -found.high, -found.low)
+
+
+def _shown(found: Estimated, column: str) -> str:
+    """Errors in millimeters, rates in percent."""
+    scale, unit = (100.0, "%") if column == "success" else (1e3, "mm")
+    return f"{number(Estimated(*(scale * value for value in found)), 0)} {unit}"
+
+
+def arms_table(table: str, steps: int) -> Conclusion:
+    """Make the table of the arms of a study with one budget, as Markdown."""
+
+    def text(rows: Rows) -> str:
+        own = [part for part in PARTS if part.table == table and part.steps == steps]
+        names = dict.fromkeys(name for part in own for name in part.arms)
+        arms, body = Arms(rows, steps), []
+        for name in names:
+            try:
+                found = arms[name]
+            except MissingRowsError:
+                continue  # of a part that is not complete
+            trained = found.rows[0]["seed"] is not None
+            body.append(
+                [
+                    found.label,
+                    str(found.seeds) if trained else "rule",
+                    share(found.estimated("success")),
+                    share(found.estimated("crashed")),
+                    number(found.estimated("return"), 1),
+                ]
+            )
+        if not body:
+            raise MissingRowsError(table)
+        heads = ["trained on", "seeds", "success", "crashed", "return"]
+        lines = [heads, ["---", *["---:"] * 4], *body]
+        return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+    return text
+
+
+CONCLUSIONS: Mapping[str, tuple[str, Conclusion]] = {
+    "look_around.table": ("look_around", arms_table("look_around", LOOK_STEPS)),
+    "look_around.control": ("look_around", look_around_control),
+    "look_around.factors": ("look_around", look_around_factors),
+    "look_around.noise": ("look_around", look_around_noise),
+    "stale_race.table": ("stale_race", arms_table("stale_race", RACE_STEPS)),
+    "stale_race.training": ("stale_race", stale_race_training),
+    "stale_race.compensation": ("stale_race", stale_race_compensation),
+    "stale_race.substitutes": ("stale_race", stale_race_substitutes),
+    "stale_race.curve": ("stale_race", stale_race_curve),
+    "outage_dash.table": ("outage_dash", arms_table("outage_dash", DASH_STEPS)),
+    "outage_dash.rules": ("outage_dash", outage_dash_rules),
+    "outage_dash.learned": ("outage_dash", outage_dash_learned),
+    "when_to_train.table": ("when_to_train", when_to_train),
+    "when_to_train.summary": ("when_to_train", when_to_train_summary),
+}
+"""Table and function of each conclusion, by the name of its mark on pages."""
+
+
+def present_rows(table: str, folder: Path = DATA) -> Rows:
+    """Rows of a table that were measured on the present flights."""
+    digests = {flights_digest(part.flights) for part in PARTS if part.table == table}
+    rows = Rows.read(folder / f"{table}.csv")
+    return Rows([row for row in rows.rows if row["flights"] in digests])
+
+
+def texts(folder: Path = DATA) -> dict[str, str]:
+    """Texts of all conclusions by mark; `NOT_MEASURED` where rows are missing."""
+    found, rows = {}, {}
+    for mark, (table, conclude) in CONCLUSIONS.items():
+        if table not in rows:
+            rows[table] = present_rows(table, folder)
+        try:
+            found[mark] = conclude(rows[table])
+        except MissingRowsError:
+            # a mark of a table is on a line of its own
+            found[mark] = f"\n{NOT_MEASURED}\n" if mark.endswith(".table") else NOT_MEASURED
+    return found
+
+
+def incomplete(parts: tuple[Part, ...] = PARTS, folder: Path = DATA) -> list[Part]:
+    """Parts whose rows are missing, or of other flights."""
+    return [
+        part for part in parts if not is_complete(part, Rows.read(folder / f"{part.table}.csv"))
+    ]

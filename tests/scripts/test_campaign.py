@@ -1,0 +1,173 @@
+"""The campaign of studies: cells, their rows, resumption, and remaining work."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from quad_gym.analysis.metrics import mean_interval, rate_over_trainings
+from scripts.studies import campaign, conclusions, run
+from scripts.studies.campaign import Part, is_complete
+from scripts.studies.parts import PARTS
+from scripts.studies.rows import Rows, effect, mean_effect
+
+SMALL = Part(
+    table="small",
+    decides="whether it works",
+    env_id="QuadGym/LookAround-v0",
+    arms=("pd_features", "truth_std_certainty", "std_certainty"),
+    steps=16_384,
+    seeds=2,
+    flights=("LookAround",),
+    environment={"duration": 0.4},
+)
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    monkeypatch.setattr(campaign, "EPISODES", 6)
+    monkeypatch.setattr(run, "PARTS", (SMALL,))
+    monkeypatch.setattr(run, "TABLES", ("small",))
+    monkeypatch.setattr(run, "DATA", tmp_path / "data")
+    monkeypatch.setattr(run.os, "nice", lambda _: 0)
+    return run.RunArgs(all=True, output=tmp_path / "out")
+
+
+def test_campaign_continues_where_it_stopped_and_repeats_lost_rows(small, capsys):
+    assert run.main(dataclasses.replace(small, cells=2)) == 0
+    text = capsys.readouterr().out
+    assert "0 of 5 rows" in text
+    assert "2 of 5 rows" in text
+    assert not (run.DATA / "small.csv").exists()  # incomplete
+    assert run.main(small) == 0
+    assert "5 of 5 rows, complete" in capsys.readouterr().out
+    found = Rows.read(run.DATA / "small.csv")
+    assert [(row["arm"], row["seed"]) for row in found.rows] == [
+        ("pd_features", None),
+        *[("truth_std_certainty", seed) for seed in (0, 1)],
+        *[("std_certainty", seed) for seed in (0, 1)],
+    ]
+    assert is_complete(SMALL, found)
+    assert not is_complete(dataclasses.replace(SMALL, seeds=3), found)
+    assert not is_complete(dataclasses.replace(SMALL, flights=("StaleRace",)), found)
+    lost = next(cell for cell in SMALL.cells(small.output) if cell.seed == 1)
+    before = lost.row
+    lost.file.unlink()
+    assert run.main(small) == 0
+    assert lost.row["return"] == before["return"]
+    assert lost.row["seconds"] == before["seconds"] > 0.0  # it was not trained again
+
+
+def test_every_arm_is_validated_on_the_estimate_and_control_differs_in_one_factor():
+    for part in PARTS:
+        study = part.study(campaign.OUTPUT)
+        for arm in study.arms:
+            if arm.trained:
+                assert study.cases()[arm.name].environment.get("observation") in (None, "estimate")
+                assert not arm.training, arm.name
+    arms = {arm.name: arm for arm in PARTS[0].study(campaign.OUTPUT).arms}
+    truth, estimate = arms["truth_std_certainty"], arms["std_certainty"]
+    assert truth.environment == estimate.environment
+    assert set(truth.learning.items()) - set(estimate.learning.items()) == {
+        ("observation", "truth"),
+        ("run_filter", True),
+    }
+    plans = PARTS[0].study(campaign.OUTPUT).cases()
+    assert plans["truth_std_certainty"].recipe == plans["std_certainty"].recipe
+
+
+def test_intervals_and_effects_follow_from_rows():
+    rates = [0.5, 0.75, 1.0]
+    rows = Rows(
+        [
+            {"arm": arm, "label": arm, "seed": k, "steps": 9, "episodes": 100, "success": rate - d}
+            | {"crashed": 0.0, "return": 10.0 * rate, "return_sd": 0.0, "error": rate}
+            for arm, d in (("a", 0.0), ("b", 0.5))
+            for k, rate in enumerate(rates)
+        ]
+    )
+    a, b = rows.of("a"), rows.of("b")
+    assert a.estimated("success") == rate_over_trainings(rates, 100)
+    np.testing.assert_allclose(a.estimated("error")[1:], mean_interval(rates), rtol=1e-12)
+    np.testing.assert_allclose(a.estimated("return")[1:], 10.0 * np.array(mean_interval(rates)))
+    assert effect(a, b).value == pytest.approx(0.5)
+    same = mean_effect([(a, b), (a, b)])
+    assert same.value == pytest.approx(0.5)
+    narrower = (same.high - same.low) / (effect(a, b).high - effect(a, b).low)
+    assert narrower == pytest.approx(np.sqrt(0.5))
+
+
+def test_files_without_seeds_are_refused(tmp_path):
+    file = tmp_path / "old.csv"
+    file.write_text("arm,return\nPD,3 [2; 4]\n")
+    with pytest.raises(ValueError, match="must have a column crashed, and one row per seed"):
+        Rows.read(file)
+    assert Rows.read(tmp_path / "none.csv").rows == ()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [({}, "must have --all or --tables"), ({"tables": ("nothing",)}, "must be of look_around")],
+)
+def test_wrong_tables_are_refused(given, message, capsys):
+    with pytest.raises(SystemExit):
+        run.main(run.RunArgs(**given))
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow  # makes all environments once
+def test_all_parts_can_be_made():
+    for part in run.PARTS:
+        part.study(campaign.OUTPUT).check()
+
+
+def complete_rows(part, success):
+    """Rows of all arms of a part, with a success rate by arm."""
+    found = []
+    for cell in part.cells(campaign.OUTPUT):
+        rate = success(cell.arm.name)
+        trained = cell.training and cell.training.plan.recipe.steps
+        row = {"arm": cell.arm.name, "label": cell.arm.label, "seed": cell.seed, "steps": trained}
+        row |= {"episodes": 1000, "success": rate, "crashed": 1.0 - rate, "return": 100.0 * rate}
+        row |= {"return_sd": 1.0, "seconds": 9.0, "flights": part.digest, "error": 1.0 - rate}
+        found.append(row | dict(part.columns))
+    return found
+
+
+def test_conclusions_follow_from_rows_and_name_arms_seeds_budget_and_interval(tmp_path):
+    def success(arm):
+        estimate = not arm.startswith("truth")
+        return 0.2 + 0.3 * estimate + 0.2 * ("std" in arm) + 0.1 * ("certainty" in arm)
+
+    own = [part for part in PARTS if part.table == "look_around"]
+    rows = Rows([row for part in own[:2] for row in complete_rows(part, success)])
+    rows.write(tmp_path / "look_around.csv")
+    found = conclusions.texts(tmp_path)
+    control = found["look_around.control"]
+    assert '"estimate + standard deviation, reward for certainty" (80 [' in control
+    assert '"truth + standard deviation, reward for certainty" (50 [' in control
+    assert "(20 seeds, 2,000,000 steps)" in control
+    assert "by 30 [" in control
+    assert "percentage points (significant)" in control
+    factors = found["look_around.factors"]
+    for words in ("estimate 30 [", "standard deviation 20 [", "certainty 10 ["):
+        assert words in factors
+    assert found["look_around.noise"] == conclusions.NOT_MEASURED
+    assert found["stale_race.table"].strip() == conclusions.NOT_MEASURED
+    assert own[0] not in conclusions.incomplete(folder=tmp_path)
+    assert own[2] in conclusions.incomplete(folder=tmp_path)
+    Rows([row | {"flights": "others"} for row in rows.rows]).write(tmp_path / "look_around.csv")
+    assert conclusions.texts(tmp_path)["look_around.control"] == conclusions.NOT_MEASURED
+
+
+def test_every_conclusion_can_be_computed_once_all_parts_are_measured(tmp_path):
+    for table in {part.table for part in PARTS}:
+        rows = [
+            row
+            for part in PARTS
+            if part.table == table
+            for row in complete_rows(part, lambda arm: 0.5 + 0.01 * len(arm) % 0.5)
+        ]
+        Rows(rows).write(tmp_path / f"{table}.csv")
+    assert conclusions.NOT_MEASURED not in "".join(conclusions.texts(tmp_path).values())
+    assert conclusions.incomplete(folder=tmp_path) == []
