@@ -34,7 +34,7 @@ from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.checks import Checked
 from quad_gym.params.portable import norm
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import FAULT_KINDS, Aid, FaultKind
+from quad_gym.records import FAULT_KINDS, Aid, FaultKind, FieldFault
 
 __all__ = [
     "AccelBiasStep",
@@ -47,6 +47,7 @@ __all__ = [
     "GnssRamp",
     "GyroBiasStep",
     "ImuSaturation",
+    "MagnetometerDisturbance",
     "PositionJump",
     "RotorLoss",
     "SensorLoss",
@@ -343,6 +344,39 @@ class SensorLoss(Fault):
         return self.sensor
 
 
+class MagnetometerDisturbance(DirectedFault):
+    """A wrong compass: turned about body z, near iron, or frozen at one reading.
+
+    Wrong orientations in an autopilot's parameters, iron and currents near the sensor, and drivers
+    that repeat the last reading are usual in logs of hobby vehicles. PX4's checks before a flight
+    refuse compasses that are inconsistent or in a field of the wrong strength for these reasons.
+    """
+
+    how: Literal["turned", "iron", "frozen"] = "turned"
+    """form of the disturbance: "turned" by an `angle` about body z, to either side; "iron", a
+    constant field in B with the strength `iron`; "frozen", which repeats the last reading"""
+    angle: Size = (math.radians(30.0), math.radians(180.0))
+    """angle, with "turned" [rad]; the orientations in an autopilot's parameters are multiples of 45
+    degrees"""
+    iron: Size = (10e-6, 40e-6)
+    """strength of the added field, with "iron" [T]; engineering judgment: a fraction of the Earth's
+    field of 25e-6 to 65e-6 T"""
+
+    needs = "magnetometer"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.direction is not None and self.how != "iron":
+            self._refuse("direction", 'be given with how="iron" only')
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Angle or strength as the size, direction, and the form."""
+        size = self.iron if self.how == "iron" else self.angle
+        kind = FieldFault[self.how.upper()]
+        return super().numbers | {"size": size, "fault_field": int(kind)}
+
+
 class PositionJump(DirectedFault):
     """Sudden displacement of the vehicle at the onset of the fault, without any acceleration.
 
@@ -412,6 +446,7 @@ PRESETS: dict[str, tuple[Fault, ...]] = {
         f"{sensor}_loss": (SensorLoss(sensor=sensor, start=_SOON, duration=_A_WHILE),)
         for sensor in AID_PARAMS
     },
+    "magnetometer_disturbance": (MagnetometerDisturbance(start=_SOON, duration=_A_WHILE),),
 }
 """Presets of faults by name, for episodes of ten seconds and more."""
 

@@ -148,12 +148,27 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
             p["aid_numbers"][row] = numbers
 
 
+def follows_motion(sensors: SensorSuite) -> int:
+    """Return 1 if a suite's filter compares its heading with the motion, by GNSS velocities.
+
+    With a baseline or a camera, which measure the heading better, it is 2: the motion only shows a
+    heading that is unknown. Without GNSS velocities or a gate it is 0.
+    """
+    gnss = sensors.gnss
+    if gnss is None or gnss.velocity_sigma is None:
+        return 0
+    if not sensors.estimator.false_alarm_probability > 0.0:
+        return 0
+    return 2 if gnss.has_baseline or sensors.camera is not None else 1
+
+
 def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
     """Write the sensors that a filter assumes into a SETTINGS record, with their slow errors."""
     states = slow_states(sensors)
     settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated
     settings["estimates_drift"] = states.drifts
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
+    settings["by_motion"] = follows_motion(sensors)
     heading = sensors.heading_aid
     settings["heading_sensor"] = -1 if heading is None else FIRST_AID + heading
     features = 0 if sensors.camera is None else len(sensors.camera.features_I)

@@ -26,7 +26,7 @@ from quad_gym.estimation.starts import (
     moments,
     update_and_weigh,
 )
-from quad_gym.packing import blocks_of
+from quad_gym.packing import blocks_of, follows_motion
 from quad_gym.params import checks as check
 from quad_gym.params.checks import takes
 from quad_gym.params.suites import SensorSuite
@@ -102,11 +102,17 @@ class FilterEstimate:
     def heading_known(self) -> bool:
         """True if the heading is certain enough for a single Gaussian.
 
-        False after a start without any heading, until the motion has revealed it. Meanwhile,
-        estimate and covariance are the moments of a Gaussian sum: a bank of filters, one for each
-        of many headings.
+        False after a start without any heading, and where the motion contradicts the heading, until
+        the motion has revealed it. Meanwhile, measurements of position and velocity do not correct
+        the attitude. In suites without GNSS velocity, or with a camera, estimate and covariance are
+        then the moments of a Gaussian sum: a bank of filters, one for each of many headings.
         """
         self._require_start()
+        return self._log_weights is None and bool(self._of_lane("heading_lost") <= 0.0)
+
+    @property
+    def is_single(self) -> bool:
+        """True unless a bank of filters has a heading for each of its lanes."""
         return self._log_weights is None
 
     @property
@@ -525,11 +531,15 @@ class KalmanFilter(FilterEstimate):
             self._choose_form()
 
     def _choose_form(self) -> None:
-        """Use the gate only with a single flight: unlikely innovations weigh headings."""
-        form = int(self._engine.form)
+        """Use the gate, and the heading by motion, only with a single flight.
+
+        Unlikely innovations weigh headings, and wrong ones are not to be replaced.
+        """
+        form, engine = int(self._engine.form), self._engine
         if self._log_weights is not None:
             form &= ~_OF_GATES
-        self._engine.settings["form"] = form
+        engine.settings["form"] = form
+        engine.settings["by_motion"] = follows_motion(self.sensors) if self.is_single else 0
 
     def warn_of_news(self, before: FilterStatus) -> None:
         """Warn of failures that `status` did not have before."""
@@ -589,7 +599,7 @@ class Results(NamedTuple):
     """Results of a piece of a tape."""
 
     estimates: Floats
-    """(n, KEPT + 1) estimates, whose last number is 1 where the heading is known"""
+    """(n, KEPT + 1) estimates, whose last number is 0 while there is a bank of filters"""
     innovations: Floats  #: (m, blocks, REPORTED)
     valid: Any  #: (m, MAX_BLOCKS) True where a block was measured
 
@@ -601,12 +611,12 @@ def run_filter(kf: KalmanFilter, writer: TapeWriter) -> Iterator[Results]:
         kf: The filter.
         writer: The tape, and its measurements.
     """
-    status = kf.status
+    status, bank = kf.status, not kf.is_single
     copies: dict[int, Any] = {}
     slots: NDArray[Any] | None = None
     for piece in writer.pieces():
         first, estimates, innovations = 0, _no_rows(KEPT + 1), _no_rows(0)
-        if slots is None:
+        if slots is None and bank:
             first, before, reports = run_while_unknown(kf, writer, piece, copies)
             estimates = np.reshape(before, (-1, KEPT + 1))
             innovations = np.array(reports)
@@ -674,6 +684,6 @@ def _estimate(kf: KalmanFilter) -> Floats:
         kf.accel_bias,
         kf.gyro_bias,
         np.diag(kf.covariance),
-        [kf.diverged, kf.heading_known],
+        [kf.diverged, 0.0, 0.0, 0.0, 0.0, kf.heading_known],
     )
     return np.concatenate(values)

@@ -11,7 +11,7 @@ from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.inputs import Measurement, checked_baseline, gnss_noise, require_gnss
 from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels import entries
-from quad_gym.packing import slow_states
+from quad_gym.packing import follows_motion, slow_states
 from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
 from quad_gym.params.suites import SensorSuite
@@ -60,6 +60,8 @@ STEEP = 0.2
 the heading; as in `kernels/filter/starts.py`."""
 
 _D = 15  #: the first time-correlated error among the states
+
+UNKNOWN = math.pi / math.sqrt(3.0)  #: standard deviation of a heading that is unknown [rad]
 
 
 class FirstEstimate(NamedTuple):
@@ -419,6 +421,8 @@ class FilterStart:
     """horizontal direction of the body x axis, for a steep baseline; zero: unknown"""
     estimates: list[FirstEstimate] = field(default_factory=list)
     """estimates with a known tilt, one or one for each heading; empty with Wahba's problem"""
+    lost: bool = False
+    """True: no heading is known, and the motion is to show it"""
     numbers: dict[str, float] = field(default_factory=dict)
     """parameters that differ from the suite's, for the start alone"""
 
@@ -431,6 +435,7 @@ class FilterStart:
         engine.restore_noise(kept)
         if self.estimates:
             write_starts(engine, self.estimates)
+            engine.fill("heading_lost", np.array(float(self.lost)))
         elif self.velocity_I is not None:
             engine.fill("v_hat", self.velocity_I)
             L = engine.read("L")
@@ -473,7 +478,31 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     still = np.zeros(3) if velocity is None else velocity
     starts = _first_headings(sensors, fix, start, velocity, float(speeds[0]), baseline)
     found = [still_start(start, still) for start in starts]
-    return FilterStart(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), found)
+    headed = fix.heading is not None or fix.magnetometer is not None or fix.course
+    lost = not (headed or baseline is not None) and _waits_for_motion(sensors)
+    if lost:
+        found = [_without_heading(found[0], np.array(sensors.gnss.primary_antenna_B))]
+    ahead = np.array([1.0, 0, 0])
+    return FilterStart(position, sigmas, None, speeds, ahead, np.zeros(3), found, lost)
+
+
+def _without_heading(first: FirstEstimate, arm_B: Floats) -> FirstEstimate:
+    """Return a start whose position is uncertain by its antenna's lever arm, with no correlation.
+
+    The heading is uniform on the circle, so the correlation with its error is not linear.
+    """
+    P = first.factor @ first.factor.T
+    apart, e = np.ones(len(P), bool), slice(6, 9)
+    apart[e] = False
+    P[apart, e] = P[e, apart] = 0.0
+    P[range(2), range(2)] += arm_B @ arm_B
+    values, vectors = np.linalg.eigh(P)
+    return first._replace(factor=lower_factor(vectors * np.sqrt(np.maximum(values, 0.0))))
+
+
+def _waits_for_motion(sensors: SensorSuite) -> bool:
+    """Return True if one filter waits for its heading: no camera needs to weigh headings."""
+    return follows_motion(sensors) > 0 and sensors.camera is None
 
 
 def _require_relative(position_G: Floats) -> None:
@@ -572,6 +601,8 @@ def _first_headings(
         R_IG = ecef_to_enu(sensors.gnss.reference_antenna_G)
         head_by_baseline(start, sensors, turned(R_IG, baseline_G))
         return [start]
+    elif _waits_for_motion(sensors):
+        start["heading_sigma"] = UNKNOWN
     else:  # with half the spacing as standard deviation they overlap to a uniform distribution
         start["heading_sigma"] = 0.5 * SPACING
         starts = [start.copy() for _ in range(COUNT)]

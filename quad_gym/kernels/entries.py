@@ -187,6 +187,8 @@ FILTER_STAGES = (
     Stage.PREDICT,
     Stage.GATE,
     Stage.RECOVER,
+    Stage.MOTION,
+    Stage.HEADING,
     *(Stage[sensor.name] for sensor in Sensor),
 )
 """Stages that a filter runs, as far as it needs them."""

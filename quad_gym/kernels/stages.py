@@ -77,6 +77,8 @@ class Stage(IntEnum):
     SHOW = auto()
     # called by other stages
     GATE = auto()
+    MOTION = auto()
+    HEADING = auto()
     RECOVER = auto()
     FEEL_GROUND = auto()
     DISTURB_IMU = auto()
@@ -169,6 +171,14 @@ SOURCES = (
     _stage("filter.update:update", _built_in(), "filter"),
     _stage("filter.recovery:recover_with_slow", _formed(FilterForm.GATE, "slow_states"), "watch"),
     _stage("filter.recovery:recover", _formed(FilterForm.GATE), "watch"),
+    _stage(
+        "filter.motion:motion_with_slow", _built_in("by_motion", "slow_states"), "filter", "slow"
+    ),
+    _stage("filter.motion:motion", _built_in("by_motion"), "filter"),
+    _stage(
+        "filter.motion:heading_with_slow", _built_in("by_motion", "slow_states"), "filter", "slow"
+    ),
+    _stage("filter.motion:heading", _built_in("by_motion"), "filter"),
     _stage("filter.gate:gate", _formed(_MONITORED), "watch"),
     _stage("filter.predict:predict_with_slow", _built_in("slow_states"), "filter", "slow"),
     _stage("filter.predict:predict", _built_in(), "filter"),

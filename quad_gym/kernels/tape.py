@@ -188,6 +188,10 @@ def keep_estimate(flight, address):
     for i in range(15):
         store_lanes(address + (place + i) * _LANES, variance_of(flight, i))
     store_lanes(address + (place + 15) * _LANES, flight.diverged + 0.0)
+    store_lanes(address + (place + 16) * _LANES, flight.level_apart + 0.0)
+    store_lanes(address + (place + 17) * _LANES, flight.level_sigma + 0.0)
+    store_lanes(address + (place + 18) * _LANES, flight.compass_out + 0.0)
+    store_lanes(address + (place + 19) * _LANES, flight.heading_lost + 0.0)
 
 
 @kernel

@@ -254,6 +254,15 @@ class FaultKind(IntEnum):
     _ignore_ = "aid"
     for aid in Aid:  # the sensor is silent: BAROMETER_LOSS and so on
         vars()[f"{aid.name}_LOSS"] = 12 + aid
+    MAGNETOMETER_DISTURBANCE = 12 + len(Aid)
+
+
+class FieldFault(IntEnum):
+    """Disturbances of a magnetometer."""
+
+    TURNED = 0  #: about body z
+    IRON = 1  #: a constant field in B is added
+    FROZEN = 2  #: the last field before the onset is repeated
 
 
 class RewardTerm(IntEnum):

@@ -245,8 +245,10 @@ STEP_BLOCK = block_dtype(
 )
 """Numbers that a tape needs in addition to the parameters."""
 
-KEPT = 3 + 3 + 9 + 3 + 3 + 15 + 1
-"""Length of a row of estimates: r, v, R, b_a, b_g, 15 variances, and 1 if it has diverged."""
+KEPT = 3 + 3 + 9 + 3 + 3 + 15 + 5
+"""Length of a row of estimates: r, v, R, b_a, b_g, 15 variances; 1 if it has diverged; the chord
+between the headings by motion and of the filter, the standard deviation of the former, 1 if the
+compass is left out, and 1 if the heading is unknown."""
 REPORTED = 8
 """Numbers per block in a row of innovations: innovation, sigma (3 each), NIS, gate decision."""
 

@@ -238,6 +238,7 @@ SETTINGS_FIELDS = (
     Field("under_way", (SENSORS,), "-", "measurements in transit, at most", "i8"),
     Field("gnss_velocity", (), "0 or 1", "1 if GNSS measures velocity", "i8"),
     Field("gnss_baseline", (), "0 or 1", "1 if there is a baseline, from two antennas or from a mark", "i8"),
+    Field("by_motion", (), "0 to 2", "1 if the filter compares its heading with the motion, from GNSS velocities; 2: the motion only shows an unknown one", "i8"),
     Field("gnss_drifts", (), "0 or 1", "1 if GNSS positions have a slow error", "i8"),
     Field("estimates_drift", (), "0 or 1", "1 if the first three slow states of the filter are this error", "i8"),
     Field("slow_states", (), "-", "slow states of the filter, padded to a multiple of three", "i8"),
@@ -346,6 +347,7 @@ SETTINGS_FIELDS = (
     Field("fault_direction", (FAULT_KINDS, 3), "-", "unit vector; zeros: drawn"),
     Field("fault_pick", (2,), "-", "rotor as a fraction of four: least, and its range"),
     Field("fault_swaps", (), "0 or 1", "1 if two features are swapped; 0: one replaces another", "i8"),
+    Field("fault_field", (), "-", "disturbance of the magnetometer, see `FieldFault`", "i8"),
     Field("imu_range", (2,), "m/s^2, rad/s", "saturation of accelerometer and gyro"),
 )
 # fmt: on

@@ -135,7 +135,7 @@ MAX_STATES = 15 + MAX_SLOW  #: number of states of a filter with all slow errors
 WARM_SLOW_DRAWS = 2 * MAX_SLOW
 """Further standard normals for the slow errors of a warm start: for every three
 errors, three for the estimate, then three for the true values."""
-STAMP = 28  #: length of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates
+STAMP = 31  #: length of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates; sums in N
 FAULT_KINDS = len(FaultKind)  #: number of kinds of faults
 NEVER = 1e18  #: a tick that no flight reaches
 # fmt: on

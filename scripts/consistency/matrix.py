@@ -92,7 +92,8 @@ def _conditions(name: str) -> Iterator[dict[str, Any]]:
     for fault, parts in PRESETS.items():
         ends = parts and all(getattr(part, "duration", math.inf) != math.inf for part in parts)
         if ends and possible(fault, suite):
-            corrupted = "corrupted measurements" if fault == "gnss_jump" else ""
+            corrupts = fault in ("gnss_jump", "magnetometer_disturbance")
+            corrupted = "corrupted measurements" if corrupts else ""
             yield {"condition": fault, "wrong": corrupted, "faults": fault}
     for periods, text in enumerate(("no latency", "one period late", "two periods late")):
         yield {"condition": text, "sensors": _late(suite, periods)}

@@ -17,6 +17,7 @@ from quad_gym.faults import (
     Fault,
     GnssOutage,
     GyroBiasStep,
+    MagnetometerDisturbance,
     PositionJump,
     possible,
 )
@@ -64,7 +65,10 @@ def cases() -> Iterator[Case]:
     """Every suite with every fault that it can have, and without faults."""
     catalog = {name: tuple(map(_timed, parts)) for name, parts in PRESETS.items() if parts}
     middle = FAULT_START + 0.5 * FAULT_DURATION
+    field: dict[str, Any] = {"start": FAULT_START, "duration": FAULT_DURATION}
     catalog |= {
+        "magnetometer near iron": (MagnetometerDisturbance(how="iron", **field),),
+        "magnetometer frozen": (MagnetometerDisturbance(how="frozen", **field),),
         "gyro step of 1 deg/s": (GyroBiasStep(start=FAULT_START, size=math.radians(1.0)),),
         "gnss_outage with imu_bias_step": (
             GnssOutage(start=FAULT_START, duration=FAULT_DURATION),

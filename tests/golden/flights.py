@@ -120,6 +120,7 @@ def _families():
         suite = "indoor" if "camera" in fault else "rtk"
         sensor = fault.removesuffix("_loss")
         suite = AIDED if getattr(AIDED, sensor, None) else suite
+        suite = "consumer" if fault == "magnetometer_disturbance" else suite
         if sensor in AID_PARAMS and suite == "rtk":
             having = [name for name in ALL_SUITES if getattr(quad_gym.sensor_suite(name), sensor)]
             own = quad_gym.sensor_suite("uwb").replace(**{sensor: AID_PARAMS[sensor]()})

@@ -20,6 +20,7 @@ from quad_gym.faults import (
     GnssRamp,
     GyroBiasStep,
     ImuSaturation,
+    MagnetometerDisturbance,
     PositionJump,
     RotorLoss,
     WrongAssociations,
@@ -341,6 +342,47 @@ def test_fault_presets_are_found_by_name():
     camera = AIDED.camera.replace(features_I=AIDED.camera.features_I[:2])
     every = AIDED.replace(camera=camera, **{name: kind() for name, kind in AID_PARAMS.items()})
     assert len(faults_of(ALL, every)) == len(kinds)
-    assert len(faults_of(ALL, RTK)) == len(kinds) - len(Aid)
+    assert len(faults_of(ALL, RTK)) == len(kinds) - len(Aid) - 1  # no aid, nor its disturbance
     for suite in ("consumer", "indoor"):
         assert 0 < len(faults_of(ALL, quad_gym.sensor_suite(suite))) < len(FaultKind)
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.04])
+def test_disturbed_magnetometer_is_turned_near_iron_or_frozen(latency):
+    suite = AIDED.replace(magnetometer=quad_gym.MagnetometerParams(rate=50.0, latency=latency))
+    times, late = {"start": 0.2, "duration": 0.4}, latency + 1e-9
+    found = {}
+    for how in ("turned", "iron", "frozen"):
+        size = {"turned": {"angle": 0.5}, "iron": {"iron": 2e-5, "direction": (0.0, 3.0, 4.0)}}
+        fault = MagnetometerDisturbance(how=how, **size.get(how, {}), **times)
+        calm, faulty = both(suite, fault, count=4)
+        fields = []
+        for _ in range(200):
+            step(calm, faulty)
+            measured = (batch.record("aid_measurement") for batch in (calm, faulty))
+            fields.append([rows[:, Aid.MAGNETOMETER] for rows in measured])
+        found[how] = np.array(fields)
+    t = DT * np.arange(1, 201)
+    during = (t > 0.23 + late) & (t < 0.59 + late)
+    for fields in found.values():
+        outside = (t < 0.2 + late - DT) | (t > 0.63 + late)
+        np.testing.assert_array_equal(fields[outside, 0], fields[outside, 1])
+    np.testing.assert_allclose(
+        found["iron"][during, 1] - found["iron"][during, 0],
+        np.broadcast_to([0.0, 1.2e-5, 1.6e-5], (during.sum(), 4, 3)),
+        atol=1e-15,
+    )
+    before, after = (found["turned"][during, k] for k in (0, 1))
+    np.testing.assert_allclose(after[..., 2], before[..., 2], atol=1e-18)
+    levels = [values[..., 0] + 1j * values[..., 1] for values in (before, after)]
+    angles = np.angle(levels[1] / levels[0])
+    np.testing.assert_allclose(np.abs(angles), 0.5, rtol=1e-9)
+    assert (angles == angles[0]).all() or np.ptp(angles, axis=0).max() < 1e-9
+    frozen = found["frozen"][during, 1]
+    assert (frozen == frozen[0]).all()
+    assert (np.ptp(found["frozen"][during, 0], axis=0) > 0.0).all()
+
+
+def test_direction_of_a_turned_magnetometer_is_refused():
+    with pytest.raises(ValueError, match="direction must be given with how"):
+        MagnetometerDisturbance(direction=(1.0, 0.0, 0.0))

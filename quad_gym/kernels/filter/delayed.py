@@ -77,6 +77,7 @@ def _find_stamp(flight, p, work, sensor, delay, under_way, arrived):
     Where a measurement arrives, w_meas becomes the rates at that instant, for lever arms.
     """
     keep_fields(work, flight, True, "turn bias_gain velocity position", "since_", "imu_")
+    store(work.since_level, load3(flight.level_sum))
     stamps = flight.stamps[sensor]
     for slot in range(under_way + 1):
         row, here = stamps[slot], arrived & (stamps[slot, 0] == flight.tick - delay)
@@ -85,6 +86,7 @@ def _find_stamp(flight, p, work, sensor, delay, under_way, arrived):
         keep(work.since_velocity, here, (row[10], row[11], row[12]))
         keep(work.since_position, here, (row[13], row[14], row[15]))
         keep(flight.w_meas, here, (row[25], row[26], row[27]))
+        keep(work.since_level, here, (row[28], row[29], row[30]))
     work.since_time = select(arrived, delay * p.dt, 0.0)
     work.since_noise = select(arrived, 1.0, 0.0)
     C_s, B_s = load33(work.since_turn), load33(work.since_bias_gain)
@@ -206,6 +208,7 @@ def update_by_sensor(flight, p, work, settings, stages, slow):
         arrived = mask & measured if delayed else mask
         if not any_of(mask & measured):
             continue
+        store(work.since_level, load3(flight.level_sum))
         if delayed:
             _keep_estimate(flight, work, slow)
             _find_stamp(flight, p, work, sensor, delay, settings.under_way[sensor], arrived)

@@ -25,6 +25,7 @@ from quad_gym.kernels.filter.measurements import (
     rows_of,
     rows_of_blocks,
 )
+from quad_gym.kernels.filter.motion import watch_compass
 from quad_gym.kernels.filter.recovery import (
     OUTLIER,
     count_rejections,
@@ -48,6 +49,7 @@ from quad_gym.kernels.numbers.linalg import (
     vector,
 )
 from quad_gym.records import (
+    AID_GROUPS,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     FIRST_BLOCK,
@@ -56,11 +58,13 @@ from quad_gym.records import (
     GROUP_FREEDOMS,
     SENSORS,
     SEVERAL,
+    Aid,
     FilterForm,
     GateDecision,
 )
 
 _FREEDOMS = tuple(map(float, GROUP_FREEDOMS))
+_COMPASS = AID_GROUPS + int(Aid["MAGNETOMETER"])
 _GAIN = 0.05  #: change of a factor on the noise by one measurement
 _ADAPTED = 1.3  #: mean NIS over the degrees of freedom above which the noise is adapted
 _SERIES = 3.0  #: rejections in a row beyond which further ones do not adapt the noise
@@ -198,6 +202,8 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
     beyond, rejected = none, none
     if gating:
         beyond = first & logical_not(unsure) & (nis > limit_of(flight, group, limit))
+        if group == _COMPASS:
+            beyond = beyond | watch_compass(flight, p, first, nis < limit)
         rejected = _weigh(flight, p, settings, group, beyond, nis, limit)
     weakened = beyond & logical_not(rejected)
     _store_decision(flight, s, first, rejected, unsure, weakened)

@@ -35,7 +35,7 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import (
     BA,
     BG,
@@ -47,6 +47,7 @@ from quad_gym.kernels.filter.error_state import (
     turn_covariance,
     velocity_error,
 )
+from quad_gym.kernels.filter.motion import turn_level
 from quad_gym.kernels.filter.preintegration import (
     LEVER_ARM,
     accel_variance,
@@ -62,7 +63,7 @@ from quad_gym.kernels.filter.slow import (
 )
 from quad_gym.kernels.numbers.elementary import is_finite
 from quad_gym.kernels.numbers.factors import cholesky
-from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.lanes import any_of, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     add_to_diagonal,
     cross,
@@ -305,6 +306,9 @@ def predict(flight, p, work, settings, stages, slow):
     """
     dt, form = p.dt, settings.form
     midpoint = (form & FilterForm.MIDPOINT.value) != 0
+    if settings.by_motion:
+        if any_of(flight.level_fresh > 0.0):
+            call_stage(stages, Stage.HEADING, flight, p, p, settings, work, 0)
     w_B = load3(flight.gyro) - load3(flight.b_g_hat)
     f_B = load3(flight.accel) - load3(flight.b_a_hat)
     R_BI = load33(flight.R_hat)
@@ -313,6 +317,9 @@ def predict(flight, p, work, settings, stages, slow):
         half = vector_to_dcm(0.5 * dt * w_B)
     if (form & LEVER_ARM) != 0:
         f_B = f_B - lever_force(flight, p, form, half)
+    if settings.by_motion:
+        halfway = half if midpoint else vector_to_dcm(0.5 * dt * w_B)
+        turn_level(flight, p, f_B + load3(flight.b_a_hat), halfway)
     states, augmented = 15, 27.0  # the latter with the noise
     if slow is not None:
         states, augmented = 15 + slow.slow_states, 27.0 + 2.0 * slow.slow_errors

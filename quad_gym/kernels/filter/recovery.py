@@ -46,6 +46,7 @@ from quad_gym.kernels.filter.measurements import (
     largest_square,
     shifted,
 )
+from quad_gym.kernels.filter.motion import begin_motion, forget_heading
 from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stages_of, stationary
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum, minimum
@@ -71,6 +72,8 @@ from quad_gym.records import (
 
 _BAROMETER = AID_GROUPS + int(Aid["BAROMETER"])
 _MAGNETOMETER = int(Aid["MAGNETOMETER"])
+_HEADING_BIT = int(Observes.HEADING).bit_length() - 1
+_COMPASS = AID_GROUPS + _MAGNETOMETER
 _VELOCITY_BIT = int(Observes.VELOCITY).bit_length() - 1
 OUTLIER = 4.0
 """Ratio of NIS and gate beyond which a first refusal is a step of the sensor: an innovation of
@@ -83,6 +86,7 @@ _ACCEL_OFFSET, _GYRO_OFFSET = 0.5, 0.09
 def begin_recovery(flight, mask):
     """Reset the monitoring at the start of an episode, in the lanes `mask`."""
     reset(flight, mask, 0.0, "accepted_tick refused_tick stepped diverged")
+    begin_motion(flight, mask)
     reset(flight, mask, 1.0, "noise_factor nis_ratio")
     flight.alarm_tick = select(mask, -1e9, flight.alarm_tick)
 
@@ -104,6 +108,8 @@ def count_rejections(flight, group, first, beyond, glitch):
 def _confirmed(flight, p, settings, refused, bit):
     """Lanes in which another group than `refused` has lately measured a quantity of `Observes`."""
     found = no_lane(flight.tick)
+    if bit == _HEADING_BIT:
+        found = found | ((flight.tick - flight.level_tick) * p.dt < RECENT)
     for sensor in range(SENSORS):
         if settings.sensor_blocks[sensor] > 0:
             first = FIRST_GROUP[sensor]
@@ -240,7 +246,10 @@ def _choose(flight, p, work, settings, mask):
     for sensor in range(SENSORS):
         first, refused = FIRST_GROUP[sensor], none
         for group in range(first, first + GROUP_COUNT[sensor]):
-            refused = refused | (flight.rejected_in_row[group] >= 2.0)
+            many = flight.rejected_in_row[group] >= 2.0
+            if group == _COMPASS:
+                many = many & (flight.compass_out <= 0.0)
+            refused = refused | many
             work.reset[group], work.alone[group] = zero_like(sensors), zero_like(sensors)
         sensors = sensors + select(refused, 1.0, 0.0)
     work.drifted = zero_like(sensors)
@@ -253,6 +262,12 @@ def _choose(flight, p, work, settings, mask):
         long = mask & (row >= 2.0) & (waited >= p.reset_timeout)
         flight.alarm_tick = select(long & alone, flight.tick, flight.alarm_tick)
         due = long & (row >= p.max_rejections)
+        if group == _COMPASS:
+            # hard iron that explains a wrong field at one heading is wrong at the next one
+            known = (flight.tick - flight.level_tick) * p.dt < RECENT
+            flight.compass_out = select(due & known, 1.0, flight.compass_out)
+            flight.compass_agrees = select(due & known, 0.0, flight.compass_agrees)
+            due = due & (flight.compass_out <= 0.0) & (flight.level_against <= 0.0)
         if group not in WITH_OWN_ERROR:
             due = due & logical_not(stepped & (sensors < 2.0) & (waited < p.glitch_timeout))
         late = late | (due & alone)
@@ -260,6 +275,8 @@ def _choose(flight, p, work, settings, mask):
         work.alone[group], work.reset[group] = select(alone, 1.0, 0.0), select(due, 1.0, 0.0)
     for group in range(SENSOR_GROUPS):
         refused = mask & (flight.rejected_in_row[group] >= 2.0)
+        if group == _COMPASS:
+            refused = refused & (flight.compass_out <= 0.0)
         chosen = refused & late & (work.alone[group] > 0.0)
         if group in WITH_OWN_ERROR:
             chosen = chosen | (work.reset[group] > 0.0)
@@ -282,6 +299,8 @@ def reset_states(flight, p, work, settings, stages, slow):
             limit = select(flight.diverged > 0.0, LIKELY, SHIFTED)
             moved = mask & (shifted(flight, 6, R, limit) | altered)
             moved = moved & logical_not(supported(flight, p, settings, POSITION_BLOCK))
+    if settings.by_motion:  # N has turned, too
+        forget_heading(flight, mask & shifted(flight, 3, BG, SHIFTED))
     alarmed = alarmed | jumped | moved
     if not any_of(alarmed):
         return

@@ -127,6 +127,8 @@ def update(flight, p, work, settings, stages, slow):
     `progressive.py`.
     """
     mask, form = work.mask > 0.0, settings.form
+    if settings.by_motion:
+        call_stage(stages, Stage.MOTION, flight, p, p, settings, work, 0)
     gradual, extended = (form & FilterForm.GRADUAL.value) != 0, (form & FilterForm.EKF.value) != 0
     curved = True  # the half-sums of sigma pairs count
     hidden, further = no_lane(p.sigma_spread), zero_like(p.sigma_spread)
@@ -154,6 +156,8 @@ def update(flight, p, work, settings, stages, slow):
             steps = (step, further, factor, curved)
             _update_by(flight, p, work, settings, stages, n, taking, steps, slow)
         step += 1
+    if settings.by_motion:
+        call_stage(stages, Stage.MOTION, flight, p, p, settings, work, 1)
     if any_of(hidden):
         show_hidden(flight, work, settings, hidden)
     if gradual:

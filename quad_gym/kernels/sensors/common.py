@@ -94,6 +94,7 @@ def _put_stamp(stamps, flight, under_way, taken):
         row[10 + i] = select(taken, flight.imu_velocity[i], row[10 + i])
         row[13 + i] = select(taken, flight.imu_position[i], row[13 + i])
         row[25 + i] = select(taken, flight.w_meas[i], row[25 + i])
+        row[28 + i] = select(taken, flight.level_sum[i], row[28 + i])
 
 
 @kernel
@@ -303,7 +304,9 @@ def _due(flight, p, settings, s, mask, starting):
     return due
 
 
-def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> Any:
+def aid_stage(
+    aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any, disturb: Any = None
+) -> Any:
     """Make the stage of an aiding sensor.
 
     Args:
@@ -317,10 +320,13 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
             blocks, by the largest ones.
         others: `(flight, p, mask)`, draw further constant errors of an episode, and `align` of
             `sensor_stage`; optional.
+        disturb: `(flight, settings, numbers, due) -> numbers`: the fault of a sensor that measures
+            wrong numbers, `numbers` without it; optional.
     """
     s, group, sensor = int(aid), AID_GROUPS + aid, FIRST_AID + int(aid)
     first, row, several = AID_BLOCK[s], AID_ROW[s], AID_MOST[aid] > 1
     draw, *align = others or (_draw_nothing,)
+    disturbs, disturbed = disturb is not None, disturb or _disturb_nothing
 
     @kernel
     def begin(flight, p, settings, mask):  # type: ignore[no-untyped-def]
@@ -344,6 +350,8 @@ def aid_stage(aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any) -> 
             for i in range(settings.sensor_blocks[sensor]):
                 (x, y, z), within = measure(flight, p, i)
                 taken = due & within
+                if disturbs and settings.faults:
+                    x, y, z = disturbed(flight, settings, (x, y, z), taken)
                 keep(values[i], taken, (x, y, z))
                 flight.block_valid[first + i] = select(taken, 1.0, flight.block_valid[first + i])
         deliver(flight, work, settings, sensor, values, 3, mask, due)
@@ -381,6 +389,12 @@ def _largest(flight, first, count):
             maximum(largest[2], select(valid, size[2], zero)),
         )
     return largest
+
+
+@kernel
+def _disturb_nothing(flight, settings, numbers, due):
+    """Placeholder for sensors without such a fault."""
+    return numbers
 
 
 @kernel

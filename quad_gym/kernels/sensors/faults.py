@@ -24,6 +24,7 @@ from quad_gym.records import (
     FEATURE_BLOCKS,
     NEVER,
     FaultKind,
+    FieldFault,
 )
 
 _FIRST, _FIRST_HIDDEN = np.uint64(DRAW_FAULTS), np.uint64(DRAW_HIDDEN)
@@ -243,6 +244,26 @@ def _mistake_features(flight, settings, mask):
         mistaken = select(here | there, 1.0, 0.0)
         flight.feature_mistaken[i] = select(mask, mistaken, flight.feature_mistaken[i])
         rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
+
+
+@kernel
+def disturb_field(flight, settings, field_B, due):
+    """The field in B that a disturbed magnetometer measures, in the lanes `due`.
+
+    The sign of an angle is that of the vertical part of the fault's direction.
+    """
+    k = FaultKind.MAGNETOMETER_DISTURBANCE
+    active, vector = due & (flight.fault_active[k] > 0.0), load3(flight.fault_vector[k])
+    disturbed = load3(flight.field_frozen)
+    if settings.fault_field == FieldFault.IRON:
+        disturbed = field_B + vector
+    elif settings.fault_field == FieldFault.TURNED:
+        s, c = sin_cos(select(vector[2] > 0.0, flight.fault_size[k], -flight.fault_size[k]))
+        x, y, z = field_B
+        disturbed = (c * x - s * y, s * x + c * y, z)
+    field_B = select(active, disturbed, field_B)
+    keep(flight.field_frozen, due, field_B)
+    return field_B
 
 
 @stage

@@ -65,6 +65,7 @@ from quad_gym.kernels.numbers.linalg import (
 from quad_gym.kernels.numbers.random import normal_pair, stream_of
 from quad_gym.kernels.numbers.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.common import aid_stage, draw_matrix
+from quad_gym.kernels.sensors.faults import disturb_field
 from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["MAGNETOMETER"])
@@ -204,4 +205,6 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
     reset_heading(work.P, load33(flight.R_hat), states, lanes & alone, variance)
 
 
-magnetometer_stage = aid_stage(Aid(_S), _measure, _expect, _reset, _draw, _align)
+magnetometer_stage = aid_stage(
+    Aid(_S), _measure, _expect, _reset, _draw, _align, disturb=disturb_field
+)

@@ -164,6 +164,13 @@ class Replay(Estimates):
     heading_known: Any
     """(n,) True where the heading was known, from a measurement or from the motion"""
     diverged: Any  #: (n,) True where the innovations showed that the filter had diverged
+    heading_apart: Any
+    """(n,) heading by motion, from IMU and GNSS velocities alone, minus the heading of the filter
+    [rad]; 0 without GNSS velocities"""
+    motion_sigma: Any
+    """(n,) standard deviation of the heading by motion [rad]; infinite without GNSS velocities"""
+    compass_out: Any
+    """(n,) True where the magnetometer was left out, because it contradicted the motion"""
     measured: dict[str, Measured]
     """innovations by measurement: "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0",
     ..., "barometer" and "magnetometer\""""
@@ -464,8 +471,11 @@ def _columns_of(kept: Floats) -> dict[str, Any]:
         "accel_bias": b_a,
         "gyro_bias": b_g,
         "sigma": np.sqrt(variances),
-        "heading_known": state[:, 1] > 0.0,
+        "heading_known": (state[:, 5] > 0.0) & (state[:, 4] <= 0.0),
         "diverged": state[:, 0] > 0.0,
+        "heading_apart": 2.0 * np.arcsin(np.clip(0.5 * state[:, 1], -1.0, 1.0)),
+        "motion_sigma": np.where(state[:, 2] > 0.0, state[:, 2], np.inf),
+        "compass_out": state[:, 3] > 0.0,
     }
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from quad_gym.estimation.replaying import compass_rules
 from quad_gym.logs.formats import Log
 from quad_gym.logs.formats.clocks import running_motors
-from quad_gym.logs.replaying import rules
+from quad_gym.logs.replaying import heading_rules, rules
 from quad_gym.logs.replaying.measurements import implausible, nothing_in_common
 from quad_gym.logs.replaying.results import (
     QUANTITIES,
@@ -72,6 +72,11 @@ RULES = (
     Rule(compass_rules.strength, "", "the strength of the magnetic field changes by 10 % for 2 s"),
     Rule(rules.first_heading, "the motion contradicts the heading at the start"),
     Rule(rules.lost_samples, "", "the IMU pauses for 0.3 s"),
+    Rule(
+        heading_rules.contradicted,
+        "a heading 10 degrees and 4 standard deviations from the motion's, reset or for 2 s",
+        "a magnetometer that was left out",
+    ),
     Rule(rules.unexplained, "the estimate changes as no sample of the IMU explains"),
     Rule(rules.flagged, "the filter is flagged as diverged at the end"),
     Rule(rules.biases, "biases of the IMU that no sensor has"),

@@ -1,0 +1,172 @@
+"""Heading by motion, from IMU and GNSS velocities, against a compass or a start that is wrong."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.faults import MagnetometerDisturbance
+from quad_gym.logs.replaying.heading_rules import contradicted
+from quad_gym.logs.replaying.results import Severity
+from quad_gym.records import Source
+from tests.field_flights import fly, state_errors, steps
+from tests.level_flights import MAGNETIC, LevelFlight
+
+FLIGHTS = 48
+
+
+def flown(suite, task, seconds=0.0, **options):
+    options = {"source": Source.TRUTH, "run_filter": True} | options
+    batch = fly(suite, FLIGHTS, task=task, **options)
+    steps(batch, seconds)
+    return batch
+
+
+def tilts(batch):
+    """Angles (n,) between the estimated and the true vertical in B [rad]."""
+    apart = batch.record("R_hat")[:, :, 2] - batch.read("R_BI")[:, :, 2]
+    return 2.0 * np.arcsin(0.5 * np.linalg.norm(apart, axis=1))
+
+
+def nees(batch):
+    """NEES (n,) per state."""
+    errors, P = state_errors(batch), batch.covariance()
+    return np.einsum("ni,ni->n", errors, np.linalg.solve(P, errors[..., None])[..., 0]) / 15.0
+
+
+def heading_of_motion(batch):
+    """Errors and standard deviations (n,) of the heading by motion [rad]."""
+    M = np.einsum("nji,njk->nik", batch.read("R_BI"), batch.record("level_turn"))
+    psi = np.arctan2(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])
+    state = batch.record("level_state")
+    u = state[:, 2] + 1j * state[:, 3]
+    sigma = np.sqrt(0.5 * batch.record("level_P")[:, 1]) / np.abs(u)
+    return np.angle(u * np.exp(-1j * psi)), sigma
+
+
+@pytest.mark.parametrize("suite", ["consumer", "field"])
+def test_heading_by_motion_has_errors_of_its_standard_deviation(suite):
+    """No bound fails by chance in a million runs, even if errors of a flight are all equal."""
+    batch, squares = flown(suite, "circle", 1.0), []
+    for _ in range(8):
+        steps(batch, 1.0)
+        errors, sigma = heading_of_motion(batch)
+        assert (sigma < 0.2).all()
+        squares.append((errors / sigma) ** 2)
+    assert 0.15 < np.mean(squares) < 2.2
+    assert not batch.record("compass_out").any()
+
+
+def test_rest_shows_no_heading_and_no_other_one_replaces_the_compass():
+    """The compass is turned by a right angle after 2 s, and is the only witness."""
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(1), amplitude=0.0), 0.02
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    kf.initialize(flight.gnss(0.0)[0], magnetometer=flight.field())
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for k in range(1, 401):
+        kf.predict(*flight.sample((k - 1) * dt, dt), dt=dt)
+        if k % 5 == 0:
+            position, velocity = flight.gnss(k * dt)
+            field = flight.field() if k < 100 else turn @ flight.field()
+            kf.update(position, gnss_velocity_G=velocity, magnetometer=field)
+            assert k < 10 or kf._engine.read("level_sigma")[0] > 0.35
+    assert kf._engine.read("level_tick")[0] < 0.0
+    assert kf._engine.read("compass_out")[0] == 0.0
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+@pytest.mark.parametrize("how", ["turned", "iron"])
+def test_wrong_compass_is_left_out_and_the_heading_replaced(kind, how):
+    suite = quad_gym.sensor_suite("consumer")
+    suite = suite.replace(estimator=suite.estimator.replace(kind=kind))
+    size = {"turned": {"angle": (1.0, math.pi)}, "iron": {"iron": 30e-6, "direction": (1, 1, 0)}}
+    fault = MagnetometerDisturbance(how=how, start=3.0, **size[how])
+    batch, worst = flown(suite, "circle", 3.0, faults=fault), 0.0
+    for _ in range(16):
+        steps(batch, 0.25)
+        worst = max(worst, tilts(batch).max())
+    assert math.degrees(worst) < 10.0
+    steps(batch, 3.0)
+    assert np.mean(nees(batch)) < 1.3
+    assert np.abs(state_errors(batch)[:, 8]).max() < math.radians(15.0)
+
+
+@pytest.mark.parametrize("task", ["circle", "random_trajectory"])
+def test_wrong_compass_from_the_start_is_found(task):
+    batch, worst = flown("consumer", task, faults=MagnetometerDisturbance(angle=math.pi)), 0.0
+    for _ in range(40):
+        steps(batch, 0.25)
+        worst = max(worst, tilts(batch).max())
+    assert math.degrees(worst) < 10.0
+    assert np.mean(nees(batch)) < 1.3
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+@pytest.mark.parametrize("off", [1.0, -1.6, 3.1])
+def test_wrong_given_heading_is_replaced_by_that_of_the_motion(kind, off):
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(3), amplitude=0.5), 0.02
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = kind(MAGNETIC.replace(magnetometer=None, gnss=gnss))
+    kf.initialize(flight.gnss(0.0)[0], heading=flight.yaw + off)
+    for k in range(1, 301):
+        kf.predict(*flight.sample((k - 1) * dt, dt), dt=dt)
+        if k % 5 == 0:
+            position, velocity = flight.gnss(k * dt)
+            kf.update(position, gnss_velocity_G=velocity)
+    sigma = math.sqrt(kf.covariance[8, 8])
+    assert sigma < 0.1
+    assert abs(flight.error(kf, 300 * dt)[8]) < 4.0 * sigma
+
+
+def test_unknown_heading_keeps_its_standard_deviation_without_motion():
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(0), amplitude=0.0), 0.02
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    kf.initialize(flight.gnss(0.0)[0])
+    first = math.sqrt(kf.covariance[8, 8])
+    for k in range(1, 501):
+        kf.predict(*flight.sample((k - 1) * dt, dt), dt=dt)
+        if k % 5 == 0:
+            position, velocity = flight.gnss(k * dt)
+            kf.update(position, gnss_velocity_G=velocity)
+            assert math.sqrt(kf.covariance[8, 8]) > 0.98 * first
+    assert not kf.heading_known
+
+
+def found_by_the_verdict(compass, apart, sigma, out, unknown=0.0):
+    """Findings on a replay of 40 s, whose heading differs from 10 s on until it is reset."""
+    time = np.arange(0.0, 40.0, 0.01)
+    until = 14.0 if out else 40.0
+    wrong = (time >= 10.0) & (time < until)
+    result = SimpleNamespace(
+        time=time,
+        heading_apart=np.where(wrong, math.radians(apart), 0.01),
+        motion_sigma=np.where(time < 8.0, np.inf, math.radians(sigma)),
+        heading_known=(time < until) | (time >= until + unknown),
+        compass_out=(time >= until) & (time < 30.0),
+    )
+    streams = {"magnetometer": None} if compass else {}
+    suite = SimpleNamespace(magnetometer=object())
+    log = SimpleNamespace(streams=streams)
+    return [*contradicted(SimpleNamespace(result=result, suite=suite, log=log))]
+
+
+def test_verdict_says_which_heading_the_motion_contradicts():
+    (turned,) = found_by_the_verdict(True, 92.0, 5.0, True)
+    assert turned.severity == Severity.LOST
+    for part in ("by 92 degrees (18 standard deviations) from 10.0 to 14.0 s", "about 90 degrees",
+                 "reset to that of the motion", "left out for 16 s"):  # fmt: skip
+        assert part in turned.text
+    (given,) = found_by_the_verdict(False, -30.0, 5.0, False)
+    assert given.severity == Severity.LOST
+    assert "the given heading (--heading) contradicts the GNSS velocities by 30" in given.text
+    (small,) = found_by_the_verdict(True, 8.0, 1.0, True)  # the filter left the compass out in time
+    assert small.severity == Severity.UNCERTAIN
+    assert not found_by_the_verdict(True, 12.0, 5.0, False)  # 2.4 standard deviations
+    (thrown,) = found_by_the_verdict(False, 5.0, 1.0, True, unknown=3.0)
+    assert thrown.severity == Severity.LOST
+    assert "wrong until 14.0 s, and unknown until 17.0 s" in thrown.text
+    (vague,) = found_by_the_verdict(True, 0.0, 30.0, False)
+    assert "no motion shows the heading" in vague.text
