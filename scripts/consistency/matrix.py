@@ -17,9 +17,9 @@ from quad_gym.commands.consistency import Case, CaseFlights, fly
 from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.faults import PRESETS, possible
 from quad_gym.params.randomization import Randomization, Uniform
-from quad_gym.params.suites import SUITES, SensorSuite, sensor_suite
+from quad_gym.params.suites import SensorSuite, sensor_suite
 from quad_gym.records import FREEDOMS
-from scripts.consistency.tables import CaseResults, case_table
+from scripts.consistency.tables import FLOWN, CaseResults, case_table, vehicle_of
 
 STARTS: tuple[Literal["cold", "warm"], ...] = ("cold", "warm")
 CONDITIONS_TASK = "random_trajectory"
@@ -43,6 +43,7 @@ def case_of(
 ) -> Case:
     """One configuration; `wrong` is a difference between the filter's model and the simulation."""
     flown = sensors or sensor_suite(suite)
+    keywords = vehicle_of(suite) | keywords
     expected = {}
     if suite == "lab":
         expected = {"": "the report's filter"}
@@ -112,10 +113,10 @@ def _conditions(name: str) -> Iterator[dict[str, Any]]:
 
 def cases_of(kind: str) -> list[Case]:
     """Cases: "suites" on all tasks, "conditions" on one task, or "all" of these."""
-    suites = [case_of(s, task, start) for s in SUITES for task in TASK_DEFAULTS for start in STARTS]
+    suites = [case_of(s, task, start) for s in FLOWN for task in TASK_DEFAULTS for start in STARTS]
     conditions = [
         case_of(suite, CONDITIONS_TASK, start, **fields)
-        for suite in SUITES
+        for suite in FLOWN
         for start in STARTS
         for fields in _conditions(suite)
     ]

@@ -21,12 +21,13 @@ from quad_gym.faults import (
     PositionJump,
     possible,
 )
-from quad_gym.params.suites import SUITES, sensor_suite
+from quad_gym.params.suites import sensor_suite
 from scripts.consistency.recovered import REQUIRED, Recovery, follow_recovery
-from scripts.consistency.tables import CaseResults, case_table
+from scripts.consistency.tables import FLOWN, CaseResults, case_table, vehicle_of
 
 FAULT_START, FAULT_DURATION, RECOVERY_TIME = 3.0, 5.0, 10.0
 """Start and duration of faults, and time that filters have to recover [s]."""
+LONG = 15.0  #: duration of long losses of a sensor, after which priors are wide [s]
 CALM_TASKS = ("hover", "random_trajectory", "waypoints")
 CALM_DURATION = 60.0  #: length of flights without a fault [s]
 INSTANTANEOUS = (AccelBiasStep, GyroBiasStep, PositionJump)  #: faults that end at once
@@ -65,6 +66,11 @@ def cases() -> Iterator[Case]:
     """Every suite with every fault that it can have, and without faults."""
     catalog = {name: tuple(map(_timed, parts)) for name, parts in PRESETS.items() if parts}
     middle = FAULT_START + 0.5 * FAULT_DURATION
+    catalog |= {
+        f"{name} of {LONG:g} s": tuple(part.replace(duration=LONG) for part in parts)
+        for name, parts in catalog.items()
+        if name.endswith(("_loss", "_outage")) and name not in ("rotor_loss", "baseline_loss")
+    }
     field: dict[str, Any] = {"start": FAULT_START, "duration": FAULT_DURATION}
     catalog |= {
         "magnetometer near iron": (MagnetometerDisturbance(how="iron", **field),),
@@ -76,17 +82,17 @@ def cases() -> Iterator[Case]:
             GyroBiasStep(start=middle),
         ),
     }
-    for name in SUITES:
+    for name in FLOWN:
         suite = sensor_suite(name)
         gated = suite.estimator.false_alarm_probability > 0.0
         expected = {} if gated else {"": "no gate, so it cannot correct itself"}
         for fault, parts in catalog.items():
             if possible(parts, suite):
-                keywords = {"faults": parts}
+                keywords = {"faults": parts} | vehicle_of(name)
                 yield Case(f"{name}, {fault}", suite, CALM_TASKS[1], "warm", keywords, expected)
-    for name in SUITES:
+    for name in FLOWN:
         for task in CALM_TASKS:
-            yield Case(f"{name}, {task}", sensor_suite(name), task, "warm")
+            yield Case(f"{name}, {task}", sensor_suite(name), task, "warm", vehicle_of(name))
 
 
 def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:

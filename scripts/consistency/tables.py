@@ -11,8 +11,20 @@ from tqdm import tqdm
 import quad_gym
 from quad_gym.analysis.reports import as_json, versions, write_json
 from quad_gym.commands.consistency import Case, CaseFlights
+from quad_gym.params.suites import ALL_SUITES
+from quad_gym.params.vehicle import vehicle_params
+
+APART = ("one_wall", "stale")
+"""Suites of tasks, with filters that are inconsistent by design, or for want of markers."""
+FLOWN = tuple(name for name in ALL_SUITES if name not in APART)  #: suites of the tables
+SMALL = ("crazyflie", "uwb", "mocap")  #: suites of a small vehicle
 
 CaseResults = dict[str, dict[str, Any]]  #: results of cases, by name
+
+
+def vehicle_of(name: str) -> dict[str, Any]:
+    """Keyword of the vehicle that flies a suite, if it is not the default one."""
+    return {"vehicle": vehicle_params("crazyflie")} if name in SMALL else {}
 
 
 def flights_digest() -> str:

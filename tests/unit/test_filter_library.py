@@ -491,7 +491,7 @@ def test_calls_give_the_estimates_of_the_python_filter():
 
 
 @needs_compiler
-def test_missing_and_late_ranges_give_the_estimates_of_the_python_filter():
+def test_ranges_missing_late_and_after_an_outage_give_the_estimates_of_the_python_filter():
     ukf, c = started("uwb")
     anchors, rng = np.array(ukf.sensors.uwb_range.anchors_I), np.random.default_rng(1)
     for _ in range(300):
@@ -505,6 +505,15 @@ def test_missing_and_late_ranges_give_the_estimates_of_the_python_filter():
             gyro, accel = rng.normal(0.0, 0.2, 3), rng.normal([0.0, 0.0, 9.8], 0.3)
             ukf.predict(gyro, accel, dt=0.005)
             assert c.call("predict", gyro, accel, 0.005) == OK
+    assert np.isfinite(ukf.nis[0])
+    rest = np.zeros(3), np.array([0.0, 0.0, 9.8])
+    for _ in range(2000):  # an outage of 10 s, after which ranges are processed in steps
+        ukf.predict(*rest, dt=0.005)
+        assert c.call("predict", *rest, 0.005) == OK
+    ranges = np.linalg.norm(anchors - ukf.position - ukf.covariance[0, 0] ** 0.5, axis=1)
+    ukf.update(uwb_range=ranges, time=ukf.time)
+    assert c.call("update_uwb_range", ranges, ukf.time) == OK
+    assert np.isnan(ukf.nis[0])
     parts = np.split(c.estimate(), np.cumsum([3, 3, 9, 4, 3, 3]))
     wanted = (ukf.position, ukf.velocity, ukf.R_BI.ravel(), ukf.accel_bias, ukf.gyro_bias)
     for found, values in zip((*parts[:3], *parts[4:6]), wanted, strict=True):

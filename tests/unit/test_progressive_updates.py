@@ -22,7 +22,7 @@ def in_one_step(suite):
 
 
 def gauss_newton(ranges, sigma):
-    """Most likely position, and its covariance, for a prior about PLACE with deviation sigma."""
+    """Most likely position, and its covariance, from a prior about PLACE with variance sigma^2."""
     r = PLACE.copy()
     for _ in range(15):
         offset = r - ANCHORS
