@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_gym.estimation.replaying import compass_rules
 from quad_gym.logs.formats import Log
 from quad_gym.logs.formats.clocks import running_motors
 from quad_gym.logs.replaying import heading_rules, rules
@@ -67,9 +66,9 @@ RULES = (
         "mean NIS of 25; correlated innovations of GNSS",
         "1.4 times as large; a run of rejections that chance does not explain",
     ),
-    Rule(compass_rules.axes, "axes of magnetometer and IMU differ"),
-    Rule(compass_rules.jumps, "", "the magnetic field jumps by a fifth, as no turn explains"),
-    Rule(compass_rules.strength, "", "the strength of the magnetic field changes by 10 % for 2 s"),
+    Rule(heading_rules.axes, "axes of magnetometer and IMU differ"),
+    Rule(heading_rules.jumps, "", "the magnetic field jumps by a fifth, as no turn explains"),
+    Rule(heading_rules.strength, "", "the strength of the magnetic field changes by 10 % for 2 s"),
     Rule(rules.first_heading, "the motion contradicts the heading at the start"),
     Rule(rules.lost_samples, "", "the IMU pauses for 0.3 s"),
     Rule(
