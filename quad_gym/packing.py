@@ -167,6 +167,9 @@ def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
     states = slow_states(sensors)
     settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated
     settings["estimates_drift"] = states.drifts
+    velocity = sensors.gnss is not None and sensors.gnss.velocity_sigma is not None
+    velocity = velocity or any(params.reads_velocity for params in sensors.aids.values())
+    settings["motion_columns"] = 9 if velocity else 6
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
     settings["by_motion"] = follows_motion(sensors)
     heading = sensors.heading_aid

@@ -27,7 +27,7 @@ from quad_gym.records import (
 
 EIGHT = 8
 """Number of filters: one block or more, with 2, 4 or 8 lanes each."""
-STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
+STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "P")
 
 
 class LaneFilter:

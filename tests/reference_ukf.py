@@ -121,6 +121,14 @@ def cholesky(P):
     return L
 
 
+def root(P):
+    """Root of P with the columns of sigma points: the lower factor with the error angles first."""
+    order = [*range(6, 9), *range(6), *range(9, len(P))]
+    found = 0 * P
+    found[order] = cholesky(P[np.ix_(order, order)])
+    return found
+
+
 def solve_positive_definite(P, B):
     """P^-1 B."""
     if P.dtype == np.float64:
@@ -165,7 +173,7 @@ class PlainUKF:
             number(choice.kappa),
         )
         self.g_I = array([0.0, 0.0, choice.gravity])
-        self.floor = number(choice.direction_variance_floor) * eye
+        self.floor = number(choice.direction_variance_floor)
         self.R_IG = east_north_up(gnss.reference_antenna_G, number)
         self.l_p = array(gnss.primary_antenna_B)
         self.l_b = array(gnss.secondary_antenna_B) - self.l_p
@@ -203,7 +211,7 @@ class PlainUKF:
         """Points (2n + 1, n), and the weights of mean and covariance."""
         n = len(x)
         lam = self.alpha**2 * (self.kappa + n) - n
-        offsets = np.sqrt(n + lam) * cholesky(P).T
+        offsets = np.sqrt(n + lam) * root(P).T
         points = np.concatenate([x[np.newaxis], x + offsets, x - offsets])
         weights = array_of(self.number, np.ones(2 * n + 1)) / (2 * (n + lam))
         weights[0] = lam / (n + lam)
@@ -348,13 +356,17 @@ class PlainUKF:
         if self.sensors.estimator.bearing_noise_at == "pinhole":
             projector = eye_of(self.number) - np.outer(across, across)
             in_image = self._array(np.diag([1.0, 1.0, 0.0]))
-            noise = variance * projector @ in_image @ projector + self.floor
+            noise = variance * projector @ in_image @ projector + self._floor(variance)
         measured.append(unit(v))
         noises.append(noise)
         models.append(direction)
 
     def _direction_noise(self, u, variance):
-        return variance * (eye_of(self.number) - np.outer(u, u)) + self.floor
+        return variance * (eye_of(self.number) - np.outer(u, u)) + self._floor(variance)
+
+    def _floor(self, variance):
+        """Noise along a direction."""
+        return max(self.floor, self.number(1e-5) * variance) * eye_of(self.number)
 
     # ---- the estimate ----
 

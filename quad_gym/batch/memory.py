@@ -26,6 +26,8 @@ from quad_gym.records import (
     aligned_zeros,
     covariance_of,
     field_of_flights,
+    joint_covariance,
+    lower_factors,
 )
 
 # --------------------------------------------------------------------------------------------------
@@ -37,9 +39,18 @@ _UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis", "obsta
 
 _PARTS_OF = {
     "gnss_drift_hat": ("slow_hat", (slice(0, 3),)),
-    "L_drift": ("L_slow", (slice(0, 3), slice(0, 18))),
 }
 """Names of parts of fields, for suites with GNSS drift."""
+
+
+_FACTORS = {
+    "L": (slice(0, 15), slice(0, 15)),
+    "L_slow": (slice(15, None),),
+    "L_drift": (slice(15, 18), slice(0, 18)),
+}
+
+
+"""Parts of the lower factor of the covariance of r, v, e, b_a, b_g and slow errors, by names."""
 
 
 def configuration_digest(*records: NDArray[Any]) -> int:
@@ -103,7 +114,8 @@ class FlightMemory:
         `FlightBatch.read` returns the quantities that users need, by their public names.
 
         Args:
-            name: The field, such as "r" or "b_a_hat".
+            name: The field, such as "r" or "b_a_hat"; or "L", the lower factor of the covariance,
+                in the order r, v, e, b_a, b_g, and "L_slow", its rows of slow errors below.
             flights: Indices of the flights; None: all of them.
 
         Raises:
@@ -112,6 +124,8 @@ class FlightMemory:
         if name in _PARTS_OF:
             field, part = _PARTS_OF[name]
             return self.record(field, flights)[(slice(None), *part)]
+        if name in _FACTORS:
+            return self._joint_factor(flights)[(slice(None), *_FACTORS[name])]
         if name not in (FLIGHT_BLOCK.names or ()):
             known = check.did_you_mean(name, FLIGHT_BLOCK.names or ())
             raise ValueError(f"name must be a field of a flight's record, got {name!r}{known}")
@@ -122,6 +136,11 @@ class FlightMemory:
             base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
             return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
         return self._fetched(name, flights)
+
+    def _joint_factor(self, flights: NDArray[np.intp] | None) -> NDArray[np.float64]:
+        """Return the factors (n, 24, 24) of the covariances of all states, slow errors last."""
+        P_slow = self.record("P_slow", flights)
+        return lower_factors(joint_covariance(self.record("P", flights), P_slow))
 
     def _fetched(self, name: str, flights: NDArray[np.intp] | None) -> NDArray[Any]:
         """Return a field of the records that this configuration uses, as `record` does."""
@@ -166,7 +185,7 @@ class FlightMemory:
 
     def covariance(self) -> NDArray[np.float64]:
         """Return the covariances (count, 15, 15) of the filters, in the order r, v, e, b_a, b_g."""
-        return covariance_of(self.record("L"), self.record("arc"))
+        return covariance_of(self.record("P"), self.record("arc"))
 
     # ---- keeping ------------------------------------------------------------------------------
 

@@ -31,6 +31,7 @@ from quad_gym.records import (
     Result,
     Sensor,
     field_of_flights,
+    lower_triangle,
     put_in_flights,
 )
 from quad_gym.records.inputs import SensorReading
@@ -532,12 +533,13 @@ class OwnFilter:
             put_in_flights(exchange, field, values)
         if not with_covariance or (covariance is None and not self._has_covariance and everyone):
             return
-        factor = np.tril(np.full((batch.count, 15, 15), np.nan))
+        P = np.tril(np.full((batch.count, 15, 15), np.nan))
         if covariance is not None:
-            factor = factors(method, covariance, rows)
+            factors(method, covariance, rows)  # raises for one that is none
+            P[rows] = lower_triangle(covariance[rows])
         if not everyone:
-            factor = np.where(mask[:, np.newaxis, np.newaxis], factor, batch.record("L"))
-        put_in_flights(batch._blocks, "L", factor)
+            P = np.where(mask[:, np.newaxis, np.newaxis], P, batch.record("P"))
+        put_in_flights(batch._blocks, "P", P)
         self._has_covariance = covariance is not None
 
 

@@ -21,7 +21,17 @@ from quad_gym.params.task import TaskParams
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import ActionParams, VehicleParams
 from quad_gym.params.world import Obstacle, WorldParams
-from quad_gym.records import COLUMNS, MAX_STATES, SETTINGS, WARM_DRAWS, Autoreset, Control, Source
+from quad_gym.records import (
+    COLUMNS,
+    MAX_STATES,
+    SETTINGS,
+    WARM_DRAWS,
+    Autoreset,
+    Control,
+    Source,
+    joint_covariance,
+    shown_rows,
+)
 from quad_gym.records.streams import GATE_SPREAD, LOWEST_GATE, RANDOM_RISE
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
@@ -570,8 +580,9 @@ def pack_warm_start(settings: Any, make: Callable[..., Any], c: FlightConfigurat
     W = root_with_truth(P, c.sensors)
     settings["warm"] = True
     states, draws = W.shape
-    settings["warm_root"][:states, :draws] = W
-    settings["warm_covariance"][:states, :states] = portable.product(W, W.T)
+    order = np.argsort(shown_rows(states))
+    settings["warm_root"][:states, :draws] = W[order]
+    settings["warm_covariance"][:states, :states] = portable.product(W[order], W[order].T)
     if c.flown_sensors.gnss is not None:
         settings["warm_drift_sigma"] = drift_sigma(c.flown_sensors.gnss)
 
@@ -628,13 +639,12 @@ def converged_covariance(
             "heading, such as a level baseline or the heading of `initial_pose`?"
         )
     states = 15 + len(slow_states(sensors).errors)
-    factors = np.zeros((batch.count, MAX_STATES, MAX_STATES))
-    factors[:, :15, :15], factors[:, 15:] = batch.record("L"), batch.record("L_slow")
+    joint = joint_covariance(batch.record("P"), batch.record("P_slow"))[:, :states, :states]
     mean = np.zeros((states, states))
-    for q, L in zip(batch.record("q"), factors, strict=True):
-        root = portable.product(_turned_east(q, sensors).T[:states, :states], L[:states, :states])
-        mean += portable.product(root, root.T) / FLIGHTS
-    return mean
+    for q, P in zip(batch.record("q"), joint, strict=True):
+        turn = _turned_east(q, sensors).T[:states, :states]
+        mean += portable.product(portable.product(turn, P), turn.T) / FLIGHTS
+    return 0.5 * (mean + mean.T)
 
 
 def _turned_east(q: Floats, sensors: SensorSuite) -> Floats:

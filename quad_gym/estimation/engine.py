@@ -44,6 +44,8 @@ from quad_gym.records import (
     WORK_BLOCK,
     FilterForm,
     aligned_zeros,
+    joint_covariance,
+    lower_triangle,
     room_of,
 )
 
@@ -127,22 +129,18 @@ class Engine:
         """Number of time-correlated errors among the states."""
         return int(self.settings["slow_states"][0])
 
-    def factors(self) -> Floats:
-        """Return the lower factors (lanes, 15 + n, 15 + n) of all states' covariances."""
-        n = self.slow_states
-        joint = np.zeros((self.lanes, 15 + n, 15 + n))
-        joint[:, :15, :15] = self.read("L")
-        joint[:, 15:] = self.read("L_slow")[:, :n, : 15 + n]
-        return joint
+    def covariances(self) -> Floats:
+        """Return the covariances (lanes, 15 + n, 15 + n) of r, v, e, b_a, b_g and slow errors."""
+        return joint_covariance(self.read("P"), self.read("P_slow")[:, : self.slow_states])
 
-    def write_factors(self, factors: Floats) -> None:
-        """Write the factors of all lanes."""
-        n = self.slow_states
-        self.write("L", factors[:, :15, :15])
+    def write_covariances(self, covariances: Floats) -> None:
+        """Write the covariances of all lanes."""
+        n, lower = self.slow_states, lower_triangle(covariances)
+        self.write("P", lower[:, :15, :15])
         if n:
-            rows = self.read("L_slow")
-            rows[:, :n, : 15 + n] = factors[:, 15:]
-            self.write("L_slow", rows)
+            rows = self.read("P_slow")
+            rows[:, :n, : 15 + n] = lower[:, 15:]
+            self.write("P_slow", rows)
 
     def copy(self) -> NDArray[Any]:
         """Return a copy of the filter's memory for `restore`: one lane if all are equal."""

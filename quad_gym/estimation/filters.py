@@ -30,7 +30,16 @@ from quad_gym.packing import blocks_of, follows_motion
 from quad_gym.params import checks as check
 from quad_gym.params.checks import takes
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import KEPT, WIDTH, FilterForm, FilterStatus, Operation, covariance_of
+from quad_gym.records import (
+    KEPT,
+    WIDTH,
+    FilterForm,
+    FilterStatus,
+    Operation,
+    covariance_of,
+    joint_covariance,
+    lower_triangle,
+)
 from quad_gym.records.inputs import SAME_TIME
 
 # --------------------------------------------------------------------------------------------------
@@ -96,7 +105,7 @@ class FilterEstimate:
         mixed = self._mixed()
         if mixed is not None:
             return mixed.covariance[:15, :15].copy()
-        return covariance_of(self._read("L"), self._read("arc"))
+        return covariance_of(self._read("P"), self._read("arc"))
 
     @property
     def heading_known(self) -> bool:
@@ -130,8 +139,9 @@ class FilterEstimate:
         mixed = self._mixed()
         if mixed is not None and self.sensors.drifts:
             return mixed.covariance[15:18, 15:18].copy()
-        L = self._read("L_slow")[:3]
-        return L @ L.T * self.sensors.drifts
+        rows = slice(15, 18)
+        P = joint_covariance(self._read("P"), self._read("P_slow"))
+        return P[rows, rows] * self.sensors.drifts
 
     @property
     def aid_errors(self) -> dict[str, NDArray[np.float64]]:
@@ -346,7 +356,7 @@ class KalmanFilter(FilterEstimate):
         if not np.allclose(P, P.T, rtol=1e-9, atol=0.0):
             raise ValueError("covariance must be symmetric")
         try:
-            L = np.linalg.cholesky(P)
+            np.linalg.cholesky(P)
         except np.linalg.LinAlgError:
             raise ValueError("covariance must be positive definite") from None
         values = (
@@ -359,7 +369,7 @@ class KalmanFilter(FilterEstimate):
         begin = check.number("time", time)
         self._begin(begin)
         self._engine.start(np.zeros(3))  # all memory is cleared; the estimate is given
-        for name, value in zip((*_STATE, "L"), (*values, L), strict=True):
+        for name, value in zip((*_STATE, "P"), (*values, lower_triangle(P)), strict=True):
             self._engine.fill(name, value)
         self._running = True
 

@@ -15,8 +15,9 @@ from quad_gym.packing import follows_motion, slow_states
 from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import START, Aid
+from quad_gym.records import START, Aid, lower_factors, shown_rows
 from quad_gym.records.inputs import FARTHEST_FIX, FIX, MIN_COURSE
+from quad_gym.records.states import V
 from quad_gym.rotations import dcm_to_euler, euler_to_dcm
 
 # --------------------------------------------------------------------------------------------------
@@ -70,8 +71,8 @@ class FirstEstimate(NamedTuple):
     position: Floats  #: (3,) position in I [m]
     velocity: Floats  #: (3,) velocity in I [m/s]
     R_BI: Floats  #: (3, 3) attitude
-    factor: Floats
-    """(15 + n, 15 + n) lower factor of the covariance, with n time-correlated errors last"""
+    covariance: Floats
+    """(15 + n, 15 + n) covariance of r, v, e, b_a, b_g and n time-correlated errors"""
 
 
 def level(angle: float) -> Floats:
@@ -164,12 +165,13 @@ def head_by_baseline(start: NDArray[Any], sensors: SensorSuite, baseline_I: Floa
 
 
 def still_start(start: NDArray[Any], velocity: Floats) -> FirstEstimate:
-    """Return the first estimate of a vehicle of known tilt, with the factor of its covariance."""
+    """Return the first estimate of a vehicle of known tilt, with its covariance."""
     entries.start_level(start)
     found = start[0]
     n = _D + int(found["slow_states"])
-    factor = found["factor"][:n, :n].copy()
-    return FirstEstimate(found["position"].copy(), velocity, found["R_BI"].copy(), factor)
+    rows = shown_rows(n)
+    P = found["P"][rows[:, np.newaxis], rows]
+    return FirstEstimate(found["position"].copy(), velocity, found["R_BI"].copy(), P)
 
 
 def state_at_rest(
@@ -199,13 +201,6 @@ def state_at_rest(
         "covariance": np.diag(variances),
         "time": time,
     }
-
-
-def lower_factor(root: Floats) -> Floats:
-    """Return the lower factor L, with a nonnegative diagonal, of L L^T = root root^T."""
-    upper = np.linalg.qr(root.T, mode="r")
-    signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
-    return np.ascontiguousarray((signs[:, np.newaxis] * upper).T)
 
 
 def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> Floats:
@@ -283,20 +278,20 @@ def write_starts(engine: Engine, starts: list[FirstEstimate]) -> None:
     engine.write("r_hat", np.array([s.position for s in fill]))
     engine.write("v_hat", np.array([s.velocity for s in fill]))
     engine.write("R_hat", np.array([s.R_BI for s in fill]))
-    engine.write_factors(np.array([s.factor for s in fill]))
+    engine.write_covariances(np.array([s.covariance for s in fill]))
 
 
-def _log_determinant(factors: Floats) -> Floats:
+def _log_determinant(covariances: Floats) -> Floats:
     """Return the log determinant of each lane's covariance, without exactly known errors."""
-    diagonal = np.diagonal(factors, axis1=1, axis2=2)
+    diagonal = np.diagonal(lower_factors(covariances), axis1=1, axis2=2)
     return 2.0 * np.log(np.where(diagonal > 0.0, diagonal, 1.0)).sum(axis=1)
 
 
 def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floats) -> Floats:
     """Update all lanes with a measurement; return their new weights, normalized."""
-    before, failures = _log_determinant(engine.factors()), engine.read("update_failures")
+    before, failures = _log_determinant(engine.covariances()), engine.read("update_failures")
     engine.update(measurement)
-    after = _log_determinant(engine.factors())
+    after = _log_determinant(engine.covariances())
     nis, dimension = engine.read("nis"), engine.read("nis_dimension")
     if not dimension.any() or not measurement.blocks:
         return log_weights
@@ -326,8 +321,7 @@ def moments(engine: Engine, log_weights: Floats) -> Moments:
     means["slow_hat"] = w @ slow
     apart = [engine.read(name) - means[name] for name in _VECTORS]
     d = np.hstack([*apart[:2], turns, *apart[2:], slow - means["slow_hat"]])
-    factors = engine.factors()
-    covariance = np.einsum("k,kij,klj->il", w, factors, factors)
+    covariance = np.einsum("k,kij->ij", w, engine.covariances())
     covariance += np.einsum("k,ki,kj->ij", w, d, d)
     return Moments(means, R_mean, covariance)
 
@@ -346,9 +340,7 @@ def collapse(engine: Engine, log_weights: Floats, m: Moments) -> None:
         slow = engine.read("slow_hat")
         slow[:, :n] = m.vectors["slow_hat"]
         engine.write("slow_hat", slow)
-    values, vectors = np.linalg.eigh(m.covariance)
-    factor = lower_factor(vectors * np.sqrt(np.maximum(values, 0.0)))
-    engine.write_factors(np.repeat(factor[np.newaxis], engine.lanes, axis=0))
+    engine.write_covariances(np.repeat(m.covariance[np.newaxis], engine.lanes, axis=0))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -438,9 +430,9 @@ class FilterStart:
             engine.fill("heading_lost", np.array(float(self.lost)))
         elif self.velocity_I is not None:
             engine.fill("v_hat", self.velocity_I)
-            L = engine.read("L")
-            L[:, range(3, 6), range(3, 6)] = self.speeds
-            engine.write("L", L)
+            P, rows = engine.read("P"), range(V, V + 3)
+            P[:, rows, rows] = np.square(self.speeds)
+            engine.write("P", P)
 
 
 def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
@@ -491,13 +483,12 @@ def _without_heading(first: FirstEstimate, arm_B: Floats) -> FirstEstimate:
 
     The heading is uniform on the circle, so the correlation with its error is not linear.
     """
-    P = first.factor @ first.factor.T
+    P = first.covariance.copy()
     apart, e = np.ones(len(P), bool), slice(6, 9)
     apart[e] = False
     P[apart, e] = P[e, apart] = 0.0
     P[range(2), range(2)] += arm_B @ arm_B
-    values, vectors = np.linalg.eigh(P)
-    return first._replace(factor=lower_factor(vectors * np.sqrt(np.maximum(values, 0.0))))
+    return first._replace(covariance=P)
 
 
 def _waits_for_motion(sensors: SensorSuite) -> bool:

@@ -10,7 +10,7 @@ from numba import types
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling import entry, kernel
-from quad_gym.kernels.filter.error_state import E
+from quad_gym.kernels.filter.error_state import V
 from quad_gym.kernels.filter.starts import set_heading, start_still, turned
 from quad_gym.kernels.numbers.blocks import array_at, lanes_of, store_lanes
 from quad_gym.kernels.numbers.elementary import sin_cos
@@ -53,6 +53,7 @@ from quad_gym.records.inputs import (
     WINDOW,
     Outcome,
 )
+from quad_gym.records.states import ROWS
 
 _FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _MEASUREMENT, _START = map(
     from_dtype,
@@ -345,16 +346,16 @@ def start(block, params, settings, work, first, fix):
             for j in range(3):
                 flight.R_hat[i, j] = first.R_BI[i, j]
         for i in range(n):
-            for j in range(n):
+            for j in range(i + 1):
                 if i >= 15:
-                    flight.L_slow[i - 15, j] = first.factor[i, j]
-                elif j < 15:
-                    flight.L[i, j] = first.factor[i, j]
+                    flight.P_slow[i - 15, j] = first.P[i, j]
+                else:
+                    flight.P[i, j] = first.P[i, j]
     if fix.levels or fix.has_velocity:
         for i in range(3):
             flight.v_hat[i] = fix.velocity_I[i]
             if not fix.levels:
-                flight.L[3 + i, 3 + i] = fix.velocity_sigma
+                flight.P[V + i, V + i] = fix.velocity_sigma * fix.velocity_sigma
 
 
 @kernel
@@ -396,13 +397,12 @@ def state(flight, window, address, e):
 def covariance(flight, address):
     """Write the covariance, row by row."""
     lanes = lanes_of(flight)
-    L, arc = lanes.L, lanes.arc
+    P, arc = lanes.P, lanes.arc
     for i in range(15):
         for j in range(15):
-            total = L[i, 0] * L[j, 0]
-            for k in range(1, min(i, j) + 1):
-                total = total + L[i, k] * L[j, k]
-            if max(i, j) < E:
+            row, column = max(ROWS[i], ROWS[j]), min(ROWS[i], ROWS[j])
+            total = P[row, column] + 0.0
+            if max(i, j) < 6:
                 total = total + arc[i] * arc[j]
             store_lanes(address + 8 * (15 * i + j), total)
 

@@ -26,6 +26,7 @@ from quad_gym.records import (
     Aid,
 )
 from quad_gym.records.inputs import KEPT, REPORTED, SAME_TIME, Kept, Operation, Outcome
+from quad_gym.records.states import ROWS
 
 # --------------------------------------------------------------------------------------------------
 # Entry that runs a filter over a tape: predictions, updates and copies, in their order.
@@ -186,7 +187,7 @@ def keep_estimate(flight, address):
     place = _store3(address, place, flight.b_a_hat)
     place = _store3(address, place, flight.b_g_hat)
     for i in range(15):
-        store_lanes(address + (place + i) * _LANES, variance_of(flight, i))
+        store_lanes(address + (place + i) * _LANES, variance_of(flight, ROWS[i]))
     store_lanes(address + (place + 15) * _LANES, flight.diverged + 0.0)
     store_lanes(address + (place + 16) * _LANES, flight.level_apart + 0.0)
     store_lanes(address + (place + 17) * _LANES, flight.level_sigma + 0.0)

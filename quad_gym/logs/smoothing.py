@@ -35,7 +35,7 @@ from quad_gym.logs.replaying.replay import in_parts, named_start, prepared
 from quad_gym.logs.replaying.results import Smoothed
 from quad_gym.params import checks as check
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import OPERATION, Operation
+from quad_gym.records import OPERATION, Operation, joint_covariance
 from quad_gym.rotations import dcm_to_euler, dcm_to_quaternion, euler_to_dcm
 
 _AT_ONCE = 256  #: operations between two readings of the filter's memory
@@ -113,8 +113,8 @@ class _Forward:
 
     x: Floats  #: (n + 1, N) estimates, zero for the error angles
     R_BI: Floats  #: (n + 1, 3, 3) estimated attitudes
-    factor: Floats  #: (n + 1, N, N) lower factors of the covariance
-    variances: Floats  #: (n + 1, N) its diagonal
+    covariance: Floats  #: (n + 1, N, N) covariances
+    variances: Floats  #: (n + 1, N) their diagonals
     sample: Any  #: (n,) number of the sample of a prediction; -1: an update
     jacobian: Floats  #: (n, 15, 15) of predictions, without slow errors
     decay: Floats  #: (n, N - 15) of predictions, for slow errors
@@ -141,7 +141,7 @@ def _filter_forward(player: Player) -> _Forward:
     for first in range(0, len(operations), _AT_ONCE):
         parts.append(_run_and_copy(kf, tape, operations[first : first + _AT_ONCE]))
     kf.warn_of_news(status)
-    x, R_BI, factor, changes = (np.concatenate(values) for values in zip(*parts, strict=True))
+    x, R_BI, covariance, changes = (np.concatenate(values) for values in zip(*parts, strict=True))
     predicts = operations["code"] == Operation.PREDICT
     sample = np.where(predicts, operations["index"], -1)
     jacobian, decay = _jacobians(kf, tape.samples[sample], x, R_BI, changes[:-1])
@@ -150,8 +150,8 @@ def _filter_forward(player: Player) -> _Forward:
     return _Forward(
         x,
         R_BI,
-        factor,
-        np.square(factor).sum(axis=2),
+        covariance,
+        np.diagonal(covariance, axis1=1, axis2=2),
         sample,
         jacobian,
         decay,
@@ -162,7 +162,7 @@ def _filter_forward(player: Player) -> _Forward:
 
 
 def _run_and_copy(kf: KalmanFilter, tape: Tape, operations: Any) -> tuple[Floats, ...]:
-    """Run operations; return x, R_BI, factors and v_corrected after each, or the present ones."""
+    """Run operations; return x, R_BI, P and v_corrected after each, or the present ones."""
     engine, count = kf._engine, len(operations)
     slots = engine.words[0].reshape(1, -1)
     if count:
@@ -172,14 +172,12 @@ def _run_and_copy(kf: KalmanFilter, tape: Tape, operations: Any) -> tuple[Floats
         piece = replace(tape, operations=both.ravel(), slots=count, kept=0)
         slots = engine.empty_slots(piece)
         engine.run(piece, slots)
-    names = ("r_hat", "v_hat", "b_a_hat", "b_g_hat", "slow_hat", "R_hat", "L", "L_slow")
-    r, v, b_a, b_g, d, R_BI, L, L_slow = (engine.of_copies(slots, name) for name in names)
+    names = ("r_hat", "v_hat", "b_a_hat", "b_g_hat", "slow_hat", "R_hat", "P", "P_slow")
+    r, v, b_a, b_g, d, R_BI, P, P_slow = (engine.of_copies(slots, name) for name in names)
     slow = engine.slow_states
     x = np.hstack([r, v, 0.0 * r, b_a, b_g, d[:, :slow]])
-    factor = np.zeros((len(x), 15 + slow, 15 + slow))
-    factor[:, :15, :15] = L
-    factor[:, 15:] = L_slow[:, :slow, : 15 + slow]
-    return x, R_BI.copy(), np.tril(factor), engine.of_copies(slots, "v_corrected").copy()
+    joint = joint_covariance(P, P_slow[:, :slow])
+    return x, R_BI.copy(), joint, engine.of_copies(slots, "v_corrected").copy()
 
 
 def _jacobians(
@@ -229,7 +227,7 @@ def _jacobians(
 def _smooth_back(f: _Forward) -> tuple[Floats, Floats, Floats]:
     """Return smoothed x, R_BI and covariances (m, 15, 15) at the rows."""
     row = len(f.rows) - 1
-    x, R_BI, P = f.x[-1], f.R_BI[-1], f.factor[-1] @ f.factor[-1].T
+    x, R_BI, P = f.x[-1], f.R_BI[-1], f.covariance[-1]
     xs, Rs = f.x[f.rows], f.R_BI[f.rows]
     Ps = np.empty((row + 1, 15, 15))
     for k in range(len(f.sample), -1, -1):
@@ -238,7 +236,7 @@ def _smooth_back(f: _Forward) -> tuple[Floats, Floats, Floats]:
             row -= 1
         if k == 0 or row < 0:
             break
-        before = f.factor[k - 1] @ f.factor[k - 1].T
+        before = f.covariance[k - 1]
         predicts = f.sample[k - 1] >= 0
         Phi = _transition(f, k - 1) if predicts else np.eye(len(before))
         moved = Phi @ before
@@ -284,7 +282,7 @@ def _added(f: _Forward, k: int, expected: Floats, least: float) -> Floats:
         expected: Covariance without it.
         least: Smallest share of a variance that is not neglected.
     """
-    after = f.factor[k] @ f.factor[k].T
+    after = f.covariance[k]
     if f.resets and f.sample[k - 1] < 0:
         moved = dcm_to_euler(f.R_BI[k] @ f.R_BI[k - 1].T)
         after = _turned(after, _resets(moved), back=True)

@@ -68,6 +68,8 @@ class AidParams(SensorBase):
     observes: ClassVar[tuple[str, ...]]
     """OBSERVED states. Where other sensors in use observe all of them, the gate attributes an
     implausible measurement to this sensor; a replay assumes that it corrects them."""
+    reads_velocity: ClassVar[bool] = True
+    """False if the measurement does not depend on the velocity, which makes updates faster"""
     unit: ClassVar[str]  #: of the measurement
     frame: ClassVar[str]  #: of the measurement
     meaning: ClassVar[str]  #: of the measurement, in a few words

@@ -18,6 +18,7 @@ class BarometerParams(AidParams):
     engineering judgment. The filter estimates the bias as an augmented state"""
 
     observes = ("height",)
+    reads_velocity = False
     unit, frame, meaning = "m", "I", "height by static pressure"
     raw = ("m", "I", 1000.0)
 

@@ -23,6 +23,7 @@ class RangeFinderParams(AidParams):
     """longest distance [m]; ST VL53L1X user manual: in the dark, over a light floor"""
 
     observes = ("height",)
+    reads_velocity = False
     unit, frame, meaning = "m", "B", "distance to the ground along body -z"
     raw = ("m", "B", 100.0)
 

@@ -47,6 +47,7 @@ class UwbRangeParams(AidParams):
 
     _ideal: ClassVar = {"latency": 0.0, "outlier_probability": 0.0}
     most_blocks, rows, observes = 8, 10, ("position", "height", "velocity")
+    reads_velocity = False
     unit, frame, meaning = "m", "-", "distances to the anchors"
     raw = ("m", "-", 100.0)
 

@@ -196,7 +196,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("compass_tick", (), "ticks", "time since when a compass that is left out has agreed"),
         Field("compass_from", (2,), "-", "cosine and sine of the heading then"),
         Field("compass_least", (), "-", "least cosine of the change of the heading since then"),
-        Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
+        Field("P", (15, 15), "mixed", "lower triangle of the covariance; order e, r, v, b_a, b_g, see `records.states`"),
     )),
     ("errors", (
         # errors of sensors that are constant over an episode
@@ -227,7 +227,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
     ("slow", (
         # slow errors of sensors, where the filter estimates them
         Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
-        Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
+        Field("P_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below P in the joint covariance"),
     )),
     ("aids", (
         # sensors other than GNSS and camera, in the order of Aid
@@ -255,24 +255,23 @@ WORK_FIELDS = (
     Field("mask", (), "0 or 1", "lanes that the stage works on"),
     Field("start", (17,), "mixed", "true state at the start of the tick: r, v, q, w, rotor speeds"),
     # prediction
-    Field("P", (MAX_STATES, MAX_STATES), "mixed", "lower triangle of the predicted covariance; then its factor"),
-    Field("F", (9, 15), "mixed", "half-differences of the propagated sigma points / c; rows r, v, e"),
-    Field("S", (6, 9), "mixed", "half-sums of the propagated sigma points less the center / c: of the acceleration, then e"),
-    # update; the nine columns of L that matter, in reverse order; with slow errors, all columns
+    Field("P", (MAX_STATES, MAX_STATES), "mixed", "lower triangle of a covariance, for resets and starts"),
+    # update; the columns of L that matter, first those of e, r, v and the slow errors
+    Field("L", (MAX_STATES, MAX_STATES), "mixed", "these columns, and behind them the covariance that they leave"),
     Field("X_B", (MAX_FEATURES, 3), "m", "features relative to the center of mass, in B"),
     Field("inverse_distance", (MAX_FEATURES,), "1/m", "of the features from the camera"),
     Field("z_hat", (MAX_MEASUREMENTS,), "mixed", "measurement predicted at the center"),
     Field("z", (MAX_MEASUREMENTS,), "mixed", "measurement"),
     Field("nu", (MAX_MEASUREMENTS,), "mixed", "innovation; then whitened"),
     Field("A", (MAX_STATES, MAX_MEASUREMENTS), "mixed", "half-differences of the measured sigma points / c; then whitened"),
-    Field("odd", (9, 3, 3), "-", "odd parts of the turns R(+-e) of the sigma points"),
-    Field("even", (9, 3, 3), "-", "even parts, less the identity"),
+    Field("odd", (3, 3, 3), "-", "odd parts of the turns R(+-e) of the sigma points"),
+    Field("even", (3, 3, 3), "-", "even parts, less the identity"),
     Field("E", (9, MAX_MEASUREMENTS), "mixed", "half-sums of the measured sigma points less the center / c"),
     Field("mu", (MAX_MEASUREMENTS,), "mixed", "mean of the measured sigma points less the center"),
     Field("Rz", (MAX_MEASUREMENTS, MAX_MEASUREMENTS), "mixed", "noise, part even in the sigma points included; then its factor"),
     Field("M", (MAX_STATES, MAX_STATES), "-", "I + C C^T; then its factor M"),
     Field("y", (MAX_STATES,), "-", "C times the whitened innovation; then M^-1 times it"),
-    Field("L9", (MAX_STATES, MAX_STATES), "mixed", "the columns of L that matter; then of the updated factor"),
+    Field("L9", (MAX_STATES, MAX_STATES), "mixed", "the columns of L that matter, last first; then of the updated covariance's root"),
     Field("dx", (MAX_STATES,), "mixed", "correction of the state"),
     Field("inverse_diagonal", (MAX_MEASUREMENTS,), "mixed", "of a Cholesky factor"),
     # shared by the update and the sensors
@@ -323,9 +322,9 @@ WORK_FIELDS = (
     Field("kept_R_hat", (3, 3), "-", "R_hat"),
     Field("kept_b_a_hat", (3,), "m/s^2", "b_a_hat"),
     Field("kept_b_g_hat", (3,), "rad/s", "b_g_hat"),
-    Field("kept_L", (15, 15), "mixed", "L"),
+    Field("kept_P", (15, 15), "mixed", "P"),
     Field("kept_slow_hat", (MAX_SLOW,), "mixed", "slow_hat"),
-    Field("kept_L_slow", (MAX_SLOW, MAX_STATES), "mixed", "L_slow"),
+    Field("kept_P_slow", (MAX_SLOW, MAX_STATES), "mixed", "P_slow"),
     Field("kept_block_valid", (MAX_BLOCKS,), "0 or 1", "measured blocks"),
     Field("kept_w_meas", (3,), "rad/s", "w_meas"),
     Field("kept_update_failures", (), "-", "update_failures"),
@@ -340,7 +339,7 @@ WORK_FIELDS = (
     Field("since_position", (3,), "m", "X of then"),
     Field("since_bias_gain", (3, 3), "s", "B_s, gain of the biases since then"),
     Field("since_noise", (), "0 or 1", "1 if the noise since then was removed"),
-    Field("columns", (15, 21), "mixed", "L and six columns of noise, taken back or on"),
+    Field("columns", (15, 21 + MAX_SLOW), "mixed", "errors of the state, taken back or on: columns of P, of P_slow^T, and six of noise"),
 )
 # fmt: on
 

@@ -279,7 +279,8 @@ START = np.dtype(
         # results
         ("position", "f8", 3),
         ("R_BI", "f8", (3, 3)),
-        ("factor", "f8", (MAX_STATES, MAX_STATES + 1)),  # lower, in the first columns
+        ("P", "f8", (MAX_STATES, MAX_STATES)),  # covariance in the order of memory
+        ("root", "f8", (MAX_STATES, MAX_STATES + 1)),  # states by independent errors
         ("e", "f8", (3, MAX_STATES + 1)),  # error angles by independent errors
     ]
 )

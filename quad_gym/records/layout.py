@@ -90,13 +90,6 @@ def field_of_flights(blocks: NDArray[Any], name: str, count: int) -> NDArray[Any
     return values.reshape(-1, *values.shape[2:])[:count]
 
 
-def covariance_of(L: NDArray[Any], arc: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the covariances (..., 15, 15) of filters, from two fields of their records."""
-    P: NDArray[np.float64] = L @ np.swapaxes(L, -1, -2)
-    P[..., :6, :6] += arc[..., np.newaxis] * arc[..., np.newaxis, :]
-    return P
-
-
 def put_in_flights(blocks: NDArray[Any], name: str, values: NDArray[Any]) -> None:
     """Write one field of the first flights from an array (count, ...)."""
     target, whole, shape = blocks[name], len(values) // WIDTH, values.shape[1:]
@@ -175,9 +168,9 @@ def _in_use(
     name: str, words: NDArray[np.int64], features: int, slow: int, sensor_blocks: tuple[int, ...]
 ) -> NDArray[np.int64]:
     """The words of a field that a configuration uses."""
-    if name == "L":
+    if name == "P":
         return words[np.tril_indices(len(words))]
-    if name == "L_slow":
+    if name == "P_slow":
         return words[:slow][np.tri(slow, words.shape[1], 15, dtype=bool)]
     if name == "pixels":
         words = words[:features]

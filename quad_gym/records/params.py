@@ -243,6 +243,7 @@ SETTINGS_FIELDS = (
     Field("estimates_drift", (), "0 or 1", "1 if the first three slow states of the filter are this error", "i8"),
     Field("slow_states", (), "-", "slow states of the filter, padded to a multiple of three", "i8"),
     Field("slow_errors", (), "-", "slow states of the filter, without padding", "i8"),
+    Field("motion_columns", (), "-", "columns of e, r and, if a measurement depends on it, v: 6 or 9", "i8"),
     Field("aid_vector", (AIDS,), "-", "index of the sensor's first of three slow states; -1: none", "i8"),
     Field("aid_scalar", (AIDS,), "-", "index of the sensor's single slow state; -1: none", "i8"),
     Field("heading_sensor", (), "-", "sensor that initializes the heading; -1: none", "i8"),
@@ -285,7 +286,7 @@ SETTINGS_FIELDS = (
     Field("preview", (2,), "s", "times ahead at which the observation shows the reference"),
     Field("start_velocity_variance", (3,), "m^2/s^2", "mean square of the drawn part of the initial velocity"),
     Field("start_tilt_variance", (3,), "rad^2", "mean squares of drawn roll and pitch, then 0"),
-    Field("warm_covariance", (MAX_STATES, MAX_STATES), "mixed", "covariance of a converged filter whose vehicle looks east, slow errors last"),
+    Field("warm_covariance", (MAX_STATES, MAX_STATES), "mixed", "covariance of a converged filter whose vehicle looks east, in the order of memory"),
     Field("warm_root", (MAX_STATES, WARM_DRAWS + WARM_SLOW_DRAWS), "mixed", "W with W W^T = warm_covariance; six columns from the 16th on: of the true biases; the rest as WARM_SLOW_DRAWS says"),
     Field("warm_drift_sigma", (3,), "m", "standard deviation of the true slow error after the filter's convergence"),
     # late measurements

@@ -232,12 +232,7 @@ def _block(first: int, unit: str, frame: str, of: str) -> tuple[GroupField[Float
 
     @field("(n, 3, 3)", squared, frame, f"covariance of the {of}")
     def covariance(self: "EstimateView") -> Floats:
-        rows = np.ascontiguousarray(self.factor[:, first : first + 3, : first + 3])
-        P = rows @ rows.transpose(0, 2, 1)
-        if first < 6:
-            arc = self._flights.rows("arc")[:, first : first + 3]
-            P += arc[:, :, np.newaxis] * arc[:, np.newaxis]
-        return P
+        return self.covariance[:, first : first + 3, first : first + 3].copy()
 
     @field("(n, 3)", unit, frame, f"standard deviations of the {of}")
     def sigma(self: "EstimateView") -> Floats:
@@ -265,15 +260,13 @@ class EstimateView(Group):
 
     @field("(n, 15, 15)", "mixed", "mixed", "covariance of position and velocity in I, attitude, accelerometer and gyro bias in B")
     def covariance(self) -> Floats:
-        return covariance_of(self.factor, self._flights.rows("arc"))
+        return covariance_of(self._flights.rows("P"), self._flights.rows("arc"))
 
     factor = record("L", "(n, 15, 15)", "mixed", "mixed", "lower Cholesky factor of the covariance, without the second order of a heading's error")
 
     @field("(n, 15)", "mixed", "mixed", "standard deviations, square roots of the diagonal of the covariance")
     def sigma(self) -> Floats:
-        variances = (self.factor * self.factor).sum(axis=2)
-        variances[:, :6] += self._flights.rows("arc") ** 2
-        return np.sqrt(variances)
+        return np.sqrt(np.einsum("nii->ni", self.covariance))
 
     position_covariance, position_sigma = _block(0, "m", "I", "position")
     velocity_covariance, velocity_sigma = _block(3, "m/s", "I", "velocity")

@@ -23,11 +23,14 @@ from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_SLICE,
     MAX_BLOCKS,
+    MAX_STATES,
     OWN_ERRORS,
     POSITION_BLOCK,
+    WIDTH,
     Act,
     Aid,
     Sensor,
+    shown_rows,
 )
 from quad_gym.rotations import euler_to_dcm
 
@@ -191,16 +194,18 @@ class SuiteModel:
         for name, values in zip(("r_hat", "v_hat", "R_hat", "w_meas"), truth, strict=True):
             padded = np.resize(values, (engine.lanes, *values.shape[1:]))
             engine.write(name, padded)
-        engine.fill("L", np.eye(15))
         engine.fill("block_valid", np.ones(MAX_BLOCKS))
-        last, blocks = 8 if engine.slow_states == 0 else 14 + engine.slow_states, []
+        motion, blocks = int(engine.settings["motion_columns"][0]), []
+        last, places = motion + engine.slow_states - 1, np.argsort(shown_rows(15))[:motion]
         used = np.arange(3 * self.sensors.aids[aid].blocks)
         used = used[used % 3 < AID_FREEDOMS[aid]]
         work, table = engine._work, engine._table()
+        work["L"] = np.eye(MAX_STATES)[..., np.newaxis]
         arguments = (engine.params, engine.params, engine.settings, work, table, int(Act.EXPECT))
         for block in np.split(engine.blocks, len(engine.blocks)):
             run_stage(block.ctypes.data, 0, 1, int(Stage[aid.name]), *arguments)
-            columns = work["A"][0, last - np.arange(9)][:, used]
+            columns = np.zeros((9, len(used), WIDTH))
+            columns[places] = work["A"][0, last - np.arange(motion)][:, used]
             blocks.append((columns.T, work["Rz"][0, used, used].T))
         H, variance = (np.concatenate(parts)[:count] for parts in zip(*blocks, strict=True))
         return H, variance

@@ -123,7 +123,7 @@ def test_any_value_of_reset_argument_is_refused_by_name_or_flown(name):
         assert_refused_or_flown(reset, name, value)
 
 
-FIELDS = ("r", "v", "q", "w", "rotor_speeds", "r_hat", "v_hat", "R_hat", "b_a_hat", "L", "reward")
+FIELDS = ("r", "v", "q", "w", "rotor_speeds", "r_hat", "v_hat", "R_hat", "b_a_hat", "P", "reward")
 
 
 def fly_batch(controls=(Control.PD, Control.VELOCITY), **keywords):

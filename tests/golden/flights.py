@@ -35,7 +35,7 @@ STATES = (
     "R_hat",
     "b_a_hat",
     "b_g_hat",
-    "L",
+    "P",
     "filter_status",
     "faults",
     "drawn",

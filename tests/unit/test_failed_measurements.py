@@ -80,11 +80,11 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
         for name in ("position_sigma_I", "baseline_noise", "velocity_sigma", "pixel_sigma"):
             filters.put_params(BAD, **{name: 0.0})
         filters.put_params(BAD, direction_floor=0.0)
-        filters.put(BAD, L=0.0)
+        filters.put(BAD, P=0.0)
     else:
-        factor = filters.get("L")[BAD]
-        factor[8, 1] = np.nan
-        filters.put(BAD, L=factor)
+        covariance = filters.get("P")[BAD]
+        covariance[8, 1] = np.nan
+        filters.put(BAD, P=covariance)
     before = {name: filters.get(name) for name in KEPT}
     filters.update()
     free.update()
@@ -117,12 +117,12 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
 
 @pytest.mark.parametrize("form", [0, FilterForm.EKF], ids=["ukf", "ekf"])
 @pytest.mark.parametrize("sensors", [LAB, FIELD], ids=["report", "field"])
-@pytest.mark.parametrize("field", ["gyro", "accel", "L"])
+@pytest.mark.parametrize("field", ["gyro", "accel", "P"])
 def test_a_failed_prediction_changes_nothing(field, sensors, form):
     filters, free = (filters_with(("position",), sensors, form) for _ in range(2))
     filters.put(BAD, **{field: np.nan})
-    if field == "L":
-        filters.put(BAD, L=1e200 * np.tri(15))  # squares overflow
+    if field == "P":
+        filters.put(BAD, P=1e200 * np.tri(15))  # squares overflow
     before = {name: filters.get(name) for name in STATE}
     for lanes in (filters, free):
         lanes.predict()
@@ -142,7 +142,7 @@ def test_environment_reports_failed_filter_and_resets_the_flight():
     env.reset(seed=1)
     batch = env.flights.batch
     flights = batch.snapshot()
-    flights["L"][3 // WIDTH, 4, 4, 3 % WIDTH] = np.nan
+    flights["P"][3 // WIDTH, 4, 4, 3 % WIDTH] = np.nan
     batch.restore(flights)
     *_, truncated, info = env.step(np.zeros((9, 4)))
     np.testing.assert_array_equal(np.flatnonzero(truncated), [3])

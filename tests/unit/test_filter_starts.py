@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
-from quad_gym.records import Aid
+from quad_gym.records import Aid, joint_covariance
 from tests.field_flights import fly
 from tests.filter_states import set_at_rest
 from tests.level_flights import MAGNETIC, R_IG, LevelFlight
@@ -77,7 +77,7 @@ def test_batch_and_filter_class_start_with_same_heading_from_magnetometer(suite)
     batch, kf = fly(suite, 4, task="hover", seed=3), UnscentedKalmanFilter(suite)
     read = {
         name: batch.record(name)
-        for name in ("R_hat", "r_hat", "v_hat", "L", "L_slow", "gnss_position", "aid_measurement")
+        for name in ("R_hat", "r_hat", "v_hat", "P", "P_slow", "gnss_position", "aid_measurement")
     }
     states = int(kf._engine.settings["slow_states"][0])
     for n in range(4):
@@ -86,10 +86,11 @@ def test_batch_and_filter_class_start_with_same_heading_from_magnetometer(suite)
         np.testing.assert_allclose(kf.R_BI, read["R_hat"][n], atol=1e-12)
         np.testing.assert_allclose(kf.position, read["r_hat"][n], atol=1e-12)
         np.testing.assert_allclose(kf.velocity, read["v_hat"][n], atol=1e-12)
-        np.testing.assert_allclose(kf._engine.read("L")[0], read["L"][n], atol=1e-12)
-        ours, theirs = kf._engine.read("L_slow")[0][:states], read["L_slow"][n][:states]
-        scale = 1e-30 + np.sqrt((theirs**2).sum(axis=1, keepdims=True))
-        np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-9)
+        ours = kf._engine.covariances()[0]
+        theirs = joint_covariance(read["P"][n], read["P_slow"][n, :states])
+        sigma = 1e-30 + np.sqrt(np.diag(theirs))
+        units = sigma * sigma[:, np.newaxis]
+        np.testing.assert_allclose(ours / units, theirs / units, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -124,13 +124,13 @@ def variance_along_rotation(kf):
 
     The covariance is that of the linear model, without the second order of the heading's error.
     """
-    L, N = kf._engine.factors()[0, :15, :15], np.zeros((15, 3))
+    P, N = kf._engine.covariances()[0, :15, :15], np.zeros((15, 3))
     z = np.array([0.0, 0.0, 1.0])
     N[:, 0] = np.concatenate(
         [np.cross(z, kf.position), np.cross(z, kf.velocity), kf.R_BI @ z, z, z]
     )
     N[9:, 0], N[0, 1], N[1, 2] = 0.0, 1.0, 1.0
-    return np.linalg.inv(N.T @ np.linalg.solve(L @ L.T, N))[0, 0]
+    return np.linalg.inv(N.T @ np.linalg.solve(P, N))[0, 0]
 
 
 @pytest.mark.parametrize(

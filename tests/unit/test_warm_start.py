@@ -21,7 +21,7 @@ ESTIMATES = (
     "R_hat",
     "b_a_hat",
     "b_g_hat",
-    "L",
+    "P",
     "block_nis",
     "diverged",
     "accepted_tick",
@@ -178,7 +178,9 @@ def test_warm_start_without_heading_source_raises_value_error():
     with pytest.raises(ValueError, match=r"filter_start must be 'cold'"):
         FlightBatch(1, sensors=blind.replace(**unknown), filter_start="warm")
     FlightBatch(1, sensors=blind.replace(**unknown))  # a cold start is allowed
-    FlightBatch(1, sensors=seeing.replace(**unknown), filter_start="warm")  # features show it
+    # features show it; beyond 1 rad, one of 200 filters converges to a wrong attitude
+    vague = {"initial_pose": quad_gym.InitialPoseParams(heading_sigma=1.0)}
+    FlightBatch(1, sensors=seeing.replace(**vague), filter_start="warm")
 
 
 def test_each_episode_draws_new_warm_start():

@@ -104,7 +104,10 @@ class PlainUKF(quad_gym.Estimator):
 
     def transform(self, model, count, choice):
         """mu (n, k), covariance without noise, and the half differences a (n, 15, k), L and c."""
-        L = np.linalg.cholesky(self.state.P)
+        # a lower factor in which the error angles come first: only three columns are nonlinear
+        order = [*range(6, 9), *range(6), *range(9, 15)]
+        L = np.empty_like(self.state.P)
+        L[:, order] = np.linalg.cholesky(self.state.P[:, order][:, :, order])
         c = choice.alpha * np.sqrt(choice.kappa + count)[:, np.newaxis, np.newaxis]
         step = (c * L.transpose(0, 2, 1)).astype(np.longdouble)
         plus, minus, center = model(step), model(-step), model(0.0 * step[:, :1])
@@ -147,14 +150,19 @@ class PlainUKF(quad_gym.Estimator):
         """Update with position, baseline and features; a flight lacks the rows of the others."""
         s, gnss, camera = self.state, m.sensors.gnss, m.sensors.camera
         choice, blocks = m.sensors.estimator, []  # valid, measured, model, noise
-        floor = choice.direction_variance_floor * np.eye(3)
+
+        def noise_of(u, variance):
+            """Noise of directions u (n, 3), with a floor along them that rounding cannot use up."""
+            floor = np.maximum(choice.direction_variance_floor, 1e-5 * variance)
+            return variance * across(u) + floor * np.eye(3)
+
         if gnss is not None:
             position, baseline = m.gnss_position, m.gnss_baseline
             l_p = np.array(gnss.primary_antenna_B)
             l_b = unit(np.array(gnss.secondary_antenna_B) - l_p)
             noise = np.diag(gnss.position_sigma_I) ** 2 + np.zeros((m.count, 3, 3))
             blocks.append((position.new, position.value, lambda r, R_IB: r + R_IB @ l_p, noise))
-            noise = gnss.baseline_sigma**2 * across(s.R.swapaxes(1, 2) @ l_b) + floor
+            noise = noise_of(s.R.swapaxes(1, 2) @ l_b, gnss.baseline_sigma**2)
             blocks.append((baseline.new, unit(baseline.value), lambda r, R_IB: R_IB @ l_b, noise))
         if camera is not None:
             R_CB, l_c = euler_to_dcm(np.array(camera.attitude)), np.array(camera.position_B)
@@ -171,7 +179,7 @@ class PlainUKF(quad_gym.Estimator):
                 u = unit(ray)
                 if choice.bearing_noise_at == "predicted":
                     u = direction(s.r[:, np.newaxis], s.R.swapaxes(1, 2)[:, np.newaxis])[:, 0]
-                noise = variance[:, np.newaxis, np.newaxis] * across(u) + floor
+                noise = noise_of(u, variance[:, np.newaxis, np.newaxis])
                 blocks.append((new, unit(ray), direction, noise))
         blocks = [block for block in blocks if block[0].any()]
         if blocks:

@@ -13,7 +13,12 @@ measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 4
 """
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.error_state import D, E, V, velocity_error
+from quad_gym.kernels.filter.error_state import (
+    D,
+    copy_triangle,
+    keep_covariance,
+    take_up_corrections,
+)
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     choose_valid,
@@ -25,24 +30,22 @@ from quad_gym.kernels.filter.preintegration import NOISE, put_noise, take_column
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
     carry_slow,
-    copy_factor,
-    keep_factor,
     shift_carried_slow,
     stages_of,
 )
 from quad_gym.kernels.numbers.blocks import keep_fields
-from quad_gym.kernels.numbers.factors import cholesky
-from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
+from quad_gym.kernels.numbers.factors import eliminate
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, select
 from quad_gym.kernels.numbers.linalg import (
     keep,
     load3,
     load33,
+    load_block,
     load_column3,
+    load_symmetric,
     outer,
     store,
     store_block,
-    store_column3,
-    sum_of_outers,
 )
 from quad_gym.records import SENSORS, FilterForm
 
@@ -55,10 +58,10 @@ def _keep_estimate(flight, work, slow):
     """Copy the estimate, for lanes in which nothing arrives or an update fails."""
     keep_fields(work, flight, True, _KEPT, "kept_", "")
     all_lanes = flight.tick == flight.tick
-    copy_factor(work.kept_L, flight.L, 0, D, all_lanes)
+    copy_triangle(work.kept_P, flight.P, 0, D, all_lanes)
     if slow is not None:
         keep_fields(work, flight, True, "slow_hat", "kept_", "")
-        copy_factor(work.kept_L_slow, flight.L_slow, D, slow.slow_states, all_lanes)
+        copy_triangle(work.kept_P_slow, flight.P_slow, D, slow.slow_states, all_lanes)
 
 
 @kernel
@@ -95,35 +98,49 @@ def _find_stamp(flight, p, work, sensor, delay, under_way, arrived):
 
 
 @kernel
-def _factor_columns(flight, p, work, noise, slow, back):
-    """Factor the covariance of work.columns, noise scaled by `noise`; return the least pivot."""
-    M, P = work.columns, work.P
+def _add_noise(flight, p, work, noise, slow, back):
+    """Fill work.P with the propagated covariance and `noise` times the noise; return the pivot.
+
+    work.columns has the propagated covariance, its covariances with slow errors, and the noise.
+    """
+    M, P, states = work.columns, work.P, 15
     for i in range(0, 15, 3):
         for j in range(0, i + 3, 3):
-            block = sum_of_outers(M, i, M, j, 15)
+            block = load_block(M, i, j)
             for k in range(NOISE, NOISE + 6):
                 block = block + outer(noise * load_column3(M, i, k), load_column3(M, j, k))
             store_block(P, i, j, block)
-    states = 15
     if slow is not None:
         states = 15 + slow.slow_states
         carry_slow(flight, slow, p, work, noise, back)
-    return cholesky(P, states, work.inverse_diagonal)
+    return eliminate(P, work.L, states, states)
 
 
 @kernel
-def _load_factor(flight, work, form):
-    """Fill the first fifteen columns of work.columns with L."""
-    zero = zero_like(work.since_time)
-    for i in range(15):
-        for j in range(15):
-            work.columns[i, j] = flight.L[i, j] if j <= i else zero
-    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
-        R_BI, change = load33(flight.R_hat), load3(flight.v_corrected)
-        for j in range(9):
-            v, e = load_column3(work.columns, V, j), load_column3(work.columns, E, j)
-            store_column3(work.columns, V, j, velocity_error(v, e, R_BI, change))
-        store(flight.v_corrected, (zero, zero, zero))
+def _load_columns(flight, work, slow):
+    """Fill work.columns with the covariance of fifteen states, and theirs with slow errors."""
+    M = work.columns
+    for i in range(0, 15, 3):
+        store_block(M, i, i, load_symmetric(flight.P, i))
+        for j in range(0, i, 3):
+            block = load_block(flight.P, i, j)
+            store_block(M, i, j, block)
+            store_block(M, j, i, block.T)
+    if slow is not None:
+        for i in range(0, slow.slow_states, 3):
+            for j in range(0, 15, 3):
+                store_block(M, j, D + i, load_block(flight.P_slow, i, j).T)
+
+
+@kernel
+def _transpose(M):
+    """Transpose the first fifteen columns of M."""
+    for i in range(0, 15, 3):
+        store_block(M, i, i, load_block(M, i, i).T)
+        for j in range(0, i, 3):
+            lower, upper = load_block(M, i, j), load_block(M, j, i)
+            store_block(M, i, j, upper.T)
+            store_block(M, j, i, lower.T)
 
 
 @kernel
@@ -144,22 +161,28 @@ def _carry(flight, p, work, form, back, ticks, slow):
     Returns:
         Lanes in which the covariance stays positive definite.
     """
-    _load_factor(flight, work, form)
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        take_up_corrections(flight, slow, load33(flight.R_hat))
+    _load_columns(flight, work, slow)
     R_s, dR, dv, dr = take_mean(flight, p, work, back)
     put_noise(p, work, R_s, dR, dv)
-    take_columns(work, R_s, dR, dv, dr, back)
+    for side in range(2):  # A P, then A (A P)^T; covariances with slow errors and noise once
+        columns = NOISE + 6 if side == 0 else 15
+        take_columns(work, columns, R_s, dR, dv, dr, back)
+        if side == 0:
+            _transpose(work.columns)
     noise, sign = work.since_noise, -1.0 if back else 1.0
     if slow is not None:
         begin_to_carry_slow(slow, p, work, ticks)
     good = noise > 0.0
     for _ in range(2):
-        good = _factor_columns(flight, p, work, sign * noise, slow, back) > 0.0
+        good = _add_noise(flight, p, work, sign * noise, slow, back) >= 0.0
         if not any_of(logical_not(good)):
             break
         if back:
             noise = select(good, noise, 0.0)
     work.since_noise = noise
-    keep_factor(flight, slow, work, noise == noise)
+    keep_covariance(flight, slow, work.P, noise == noise)
     if slow is not None:
         shift_carried_slow(flight, slow, work, back)
     return good
@@ -174,10 +197,10 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     old = logical_not(arrived & good)
     keep_fields(flight, work, old, _ESTIMATE, "", "kept_")
     keep_fields(flight, work, True, "w_meas", "", "kept_")
-    copy_factor(flight.L, work.kept_L, 0, D, old)
+    copy_triangle(flight.P, work.kept_P, 0, D, old)
     if slow is not None:
         keep_fields(flight, work, old, "slow_hat", "", "kept_")
-        copy_factor(flight.L_slow, work.kept_L_slow, D, slow.slow_states, old)
+        copy_triangle(flight.P_slow, work.kept_P_slow, D, slow.slow_states, old)
     failed = arrived & old
     if (settings.form & MONITORED) != 0 and any_of(failed):
         forget_corrections(flight, failed)

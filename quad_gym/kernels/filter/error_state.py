@@ -1,4 +1,4 @@
-"""The filters' error state (r_I, v_I, e, b_a, b_g), its covariance, and resets of states.
+"""The filters' error state (e, r_I, v_I, b_a, b_g), and its covariance when e is reset to zero.
 
 The error Euler angles e are relative to the estimated attitude, R_BI = R(e) R_hat. After a step
 with the mean error m, R_hat becomes R(m) R_hat and e is relative to that: R(e_new) R(m) = R(e).
@@ -28,26 +28,28 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.numbers.elementary import maximum, minimum, sin_cos
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import (
-    cross,
     diagonal,
     dot,
     keep,
+    keep_lower,
+    load3,
     load33,
     load_block,
-    load_column3,
+    load_symmetric,
     outer,
+    store,
     store_block,
-    store_column3,
-    sum_of_outers,
 )
+from quad_gym.records.states import BA as BA
+from quad_gym.records.states import BG as BG
+from quad_gym.records.states import D as D
+from quad_gym.records.states import E as E
+from quad_gym.records.states import R as R
+from quad_gym.records.states import V as V
 
 # --------------------------------------------------------------------------------------------------
 # The filters' error state (r_I, v_I, e, b_a, b_g), and its covariance when e is reset to zero.
 # --------------------------------------------------------------------------------------------------
-
-R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
-"""First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
-of the slow errors of sensors in filters that estimate them, see `slow.py`."""
 
 
 @kernel
@@ -64,9 +66,33 @@ def reset_matrix(m):
 
 
 @kernel
-def velocity_error(v, e, R_BI, change):
-    """Velocity error v with error angles e when an update has changed v_hat."""
-    return v + cross(R_BI.T @ e, change)
+def crossed(f):
+    """The matrix of d -> d x f."""
+    zero = zero_like(f[0])
+    return ((zero, f[2], -f[1]), (-f[2], zero, f[0]), (f[1], -f[0], zero))
+
+
+@kernel
+def take_up_corrections(flight, slow, R_BI):
+    """Add to the velocity's error what changes of v_hat by updates add to it, and forget these.
+
+    With an error e, the error v becomes v + R_BI^T e x change, see above.
+    """
+    P, N = flight.P, crossed(load3(flight.v_corrected)) @ R_BI.T
+    ee, ve, re = load_symmetric(P, E), load_block(P, V, E), load_block(P, R, E)
+    moved = ve + N @ ee
+    vv = load_symmetric(P, V) + moved @ N.T + N @ ve.T
+    store_block(P, V, E, moved)
+    store_block(P, V, R, load_block(P, V, R) + N @ re.T)
+    keep_lower(P, V, flight.tick == flight.tick, vv)
+    for i in (BA, BG):
+        store_block(P, i, V, load_block(P, i, V) + load_block(P, i, E) @ N.T)
+    if slow is not None:
+        rows = flight.P_slow
+        for i in range(0, slow.slow_states, 3):
+            store_block(rows, i, V, load_block(rows, i, V) + load_block(rows, i, E) @ N.T)
+    zero = zero_like(flight.tick)
+    store(flight.v_corrected, (zero, zero, zero))
 
 
 @kernel
@@ -78,67 +104,46 @@ def keep_arc(flight, ok):
     c in the second has the standard deviation 1 / sqrt(2).
     """
     z_B, half = load33(flight.R_hat).T[2], math.sqrt(0.5)
-    for i in range(0, E, 3):
-        c = sum_of_outers(flight.L, i, flight.L, E, i + 3) @ z_B
-        keep(flight.arc[i:], ok, (-half * c[1], half * c[0], zero_like(c[2])))
+    for i in (R, V):
+        c = load_block(flight.P, i, E) @ z_B
+        keep(flight.arc[i - R :], ok, (-half * c[1], half * c[0], zero_like(c[2])))
 
 
 @kernel
 def variance_of(flight, row):
-    """Variance of a state in I or B, from its row of the factor and its arc."""
-    variance = flight.L[row, 0] * flight.L[row, 0]
-    for j in range(1, row + 1):
-        variance = variance + flight.L[row, j] * flight.L[row, j]
-    if row < E:
-        variance = variance + flight.arc[row] * flight.arc[row]
+    """Variance of a state in I or B, by its row in memory, with its arc."""
+    variance = flight.P[row, row]
+    if row >= R and row < BA:
+        variance = variance + flight.arc[row - R] * flight.arc[row - R]
     return variance
 
 
 @kernel
-def put_covariance(P, L, factor):
-    """P <- factor L L^T, in the lower triangle by blocks of three."""
+def load_covariance(P, flight, slow):
+    """Copy the lower triangle of the covariance of all states to P, by blocks of three."""
     for i in range(0, D, 3):
         for j in range(0, i + 3, 3):
-            store_block(P, i, j, factor * sum_of_outers(L, i, L, j, j + 3))
+            store_block(P, i, j, load_block(flight.P, i, j))
+    if slow is not None:
+        for i in range(0, slow.slow_states, 3):
+            for j in range(0, D + i + 3, 3):
+                store_block(P, D + i, j, load_block(flight.P_slow, i, j))
 
 
 @kernel
-def turn_covariance(P, T):
-    """P <- diag(I, I, T, I, I) P diag(...)^T in the lower triangle of P, by blocks of three."""
-    store_block(P, E, R, T @ load_block(P, E, R))
-    store_block(P, E, V, T @ load_block(P, E, V))
-    store_block(P, E, E, T @ load_block(P, E, E) @ T.T)
-    store_block(P, BA, E, load_block(P, BA, E) @ T.T)
-    store_block(P, BG, E, load_block(P, BG, E) @ T.T)
+def copy_triangle(P, source, first, rows, ok):
+    """Copy `rows` of a lower triangle, from row `first` of the whole one on, where `ok`."""
+    for i in range(rows):
+        for j in range(first + i + 1):
+            P[i, j] = select(ok, source[i, j], P[i, j])
 
 
 @kernel
-def turn_factor(L9, T, rows, columns):
-    """Transform the factor of a covariance as well, and make it lower triangular again.
-
-    L9 has `columns` of the factor, last first, at least the nine up to the error angles. Its rows
-    of e are multiplied by T, which fills the three places above the diagonal that Givens rotations
-    of columns clear.
-    """
-    first = columns - 9
-    for j in range(first, columns):
-        store_column3(L9, E, j, T @ load_column3(L9, E, j))
-    _clear(L9, E, first + 2, first + 1, rows)
-    _clear(L9, E, first + 2, first, rows)
-    _clear(L9, E + 1, first + 1, first, rows)
-
-
-@kernel
-def _clear(L9, row, kept, cleared, rows):
-    """Rotate two columns so that `cleared` vanishes at `row`; above it both are zero."""
-    x, y = L9[row, kept], L9[row, cleared]
-    inverse = 1.0 / math.sqrt(x * x + y * y)
-    c, s = inverse * x, inverse * y
-    for i in range(row, rows):
-        a, b = L9[i, kept], L9[i, cleared]
-        L9[i, kept] = c * a + s * b
-        L9[i, cleared] = c * b - s * a
-    L9[row, cleared] = zero_like(x)
+def keep_covariance(flight, slow, P, ok):
+    """Store the covariance P of all states, where `ok`."""
+    copy_triangle(flight.P, P, 0, D, ok)
+    if slow is not None:
+        copy_triangle(flight.P_slow, P[D:], D, slow.slow_states, ok)
 
 
 # --------------------------------------------------------------------------------------------------

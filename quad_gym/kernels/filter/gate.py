@@ -18,8 +18,8 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.columns import columns_of
 from quad_gym.kernels.filter.measurements import (
-    columns_of,
     follow_ratio,
     forget_corrections,
     rows_of,
@@ -77,7 +77,9 @@ def _covariance(p, work, settings, k):
     A, E, mu = work.A, work.E, load3(work.mu[k : k + 3])
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     P_zz = sum_of_outers_of_rows(A, A, k, k, columns_of(settings))
-    P_zz = P_zz + sum_of_outers_of_rows(E, E, k, k, 9) + outer(excess * mu, mu)
+    P_zz = (
+        P_zz + sum_of_outers_of_rows(E, E, k, k, settings.motion_columns) + outer(excess * mu, mu)
+    )
     return P_zz + load_block(work.Rz, k, k)
 
 
@@ -142,7 +144,7 @@ def mask_block(work, settings, k, rejected):
     for i in range(k, k + 3):
         for j in range(columns_of(settings)):
             work.A[j, i] = select(rejected, 0.0, work.A[j, i])
-        for j in range(9):
+        for j in range(settings.motion_columns):
             work.E[j, i] = select(rejected, 0.0, work.E[j, i])
         work.mu[i] = select(rejected, 0.0, work.mu[i])
         work.nu[i] = select(rejected, 0.0, work.nu[i])

@@ -10,7 +10,8 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.error_state import BA, BG, D, E, variance_of
+from quad_gym.kernels.filter.columns import columns_of, row_of
+from quad_gym.kernels.filter.error_state import BA, BG, E, variance_of
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum, minimum
 from quad_gym.kernels.numbers.factors import cholesky, solve_left_vector
@@ -25,6 +26,7 @@ from quad_gym.kernels.numbers.linalg import (
     load_column3,
     outer,
     polynomial,
+    rounded,
     store,
 )
 from quad_gym.records import (
@@ -160,15 +162,6 @@ def count_failure(flight, failed):
 
 
 @kernel
-def columns_of(settings):
-    """Columns of L that measurements depend on: without slow errors, the first nine."""
-    columns = 9
-    if settings.slow_states > 0:
-        columns = D + settings.slow_states
-    return columns
-
-
-@kernel
 def put_three(row, k, valid, values):
     """Write three numbers, in the lanes `valid`."""
     for i in range(3):
@@ -183,16 +176,16 @@ def put_block(work, settings, k, valid, z, z_hat, noise):
     for i in range(3):
         for j in range(3):
             work.Rz[k + i, k + j] = select(valid, noise[i][j], 1.0 if i == j else 0.0)
-    for row in range(columns_of(settings) - 9):
+    for row in range(settings.slow_states):
         for i in range(3):
             work.A[row, k + i] = zero_like(work.spread)
 
 
 @kernel
 def put_column(work, settings, k, j, valid, a, s):
-    """Write half-difference and half-sum of column j < 9, both over c, in the lanes `valid`."""
+    """Write half-difference and half-sum of a column j of motion, over c, in the lanes `valid`."""
     put_three(work.A[columns_of(settings) - 1 - j], k, valid, a)
-    put_three(work.E[8 - j], k, valid, s)
+    put_three(work.E[j], k, valid, s)
 
 
 @kernel
@@ -208,13 +201,16 @@ def with_pairs(settings):
 
 
 @kernel
-def lever_column(flight, work, settings, j, R_BI, l_B):
+def lever_column(work, settings, j, R_BI, l_B):
     """Half-difference and half-sum of R^T l along column j; in an EKF derivative and half-sum."""
+    if j >= 3:  # these columns do not change the attitude
+        zero = zero_like(work.spread)
+        return (zero, zero, zero), (zero, zero, zero)
     odd, even, inverse_c = load33(work.odd[j]), load33(work.even[j]), work.inverse_spread
     a = R_BI.T @ (inverse_c * (odd.T @ l_B))
     s = R_BI.T @ (inverse_c * (even.T @ l_B))
     if by_derivative(settings):
-        a = R_BI.T @ cross(load_column3(flight.L, E, j), l_B)
+        a = R_BI.T @ cross(load_column3(work.L, E, j), l_B)
         if not with_pairs(settings):
             s = zero_like(a)
     return a, s
@@ -235,9 +231,16 @@ _SERIES = (
 )
 
 
+_FLOOR = 1e-5  #: share of a direction's variance along it, which changes no estimate measurably
+
+
 @kernel
 def direction_noise(direction, variance, floor):
-    """Variance (I - u u^T) + floor I: noise of a direction u, of rank 2 except for the floor."""
+    """Variance (I - u u^T) + floor I: noise of a direction u, of rank 2 except for the floor.
+
+    The floor is at least `_FLOOR` times the variance, which rounding errors do not use up.
+    """
+    floor = maximum(floor, _FLOOR * variance)
     return add_to_diagonal(outer(-variance * direction, direction), variance + floor)
 
 
@@ -271,6 +274,19 @@ def direction_pair(v, inverse_norm, v_even, v_odd):
     both, gap = 0.5 * (plus + minus), 0.5 * (plus - minus)
     difference = v_odd + both * v_odd + gap * center
     half_sum = v_even + both * center + gap * v_odd
+    return inverse_norm * difference, inverse_norm * half_sum
+
+
+@kernel
+def direction_shift(v, inverse_norm, v_odd):
+    """As `direction_pair` without an even part."""
+    inverse_square = inverse_norm * inverse_norm
+    d_even = inverse_square * dot(v_odd, v_odd)
+    d_odd = inverse_square * (2.0 * dot(v, v_odd))
+    plus, minus = _shrinkage(d_even + d_odd), _shrinkage(d_even - d_odd)
+    both, gap = 0.5 * (plus + minus), 0.5 * (plus - minus)
+    difference = v_odd + both * v_odd + gap * v
+    half_sum = both * v + rounded(gap * v_odd)
     return inverse_norm * difference, inverse_norm * half_sum
 
 
@@ -425,39 +441,34 @@ def follow_ratio(flight, p, nis, freedoms, mask):
 
 
 @kernel
-def follow_corrections(flight, p, L9, dx, columns, ok, slow):
-    """Add up an update's corrections dx of the biases and the drift, and their variances.
+def follow_corrections(flight, p, work, columns, ok, slow):
+    """Add up an update's corrections work.dx of the biases and the drift, and their variances.
 
-    In the lanes `ok`. L9 is the updated factor, last column first; the record still has the factor
-    before.
+    In the lanes `ok`. A variance falls by the difference of the squares of its rows in work.L and
+    work.L9.
     """
     passed = (flight.tick - flight.corrected_tick) * p.dt
     kept = maximum(1.0 - passed / CORRECTION_TIME, 0.0)
     for i in range(6):
-        before, shift = flight.L[BA + i], dx[BA + i]
-        _follow(flight, i, before, L9[BA + i], shift, min(columns, 15), columns, kept, ok)
+        _follow(flight, work, i, row_of(slow, BA + i), columns, kept, ok)
     if slow is not None:
         if slow.estimates_drift:
             kept = maximum(1.0 - passed / _JUMP_TIME, 0.0)
             for i in range(3):
-                before, shift = flight.L_slow[i], dx[D + i]
-                _follow(flight, 6 + i, before, L9[D + i], shift, columns, columns, kept, ok)
+                _follow(flight, work, 6 + i, slow.motion_columns + i, columns, kept, ok)
     flight.corrected_tick = select(ok, flight.tick, flight.corrected_tick)
 
 
 @kernel
-def _follow(flight, i, before, after, shift, filled, columns, kept, ok):
-    """Add a state's correction and its variance to sums of which a share is `kept`, where `ok`.
-
-    Rows of the factor `before`, of which the first `filled` numbers are not zero, and `after`.
-    """
+def _follow(flight, work, i, row, columns, kept, ok):
+    """Add a state's correction and its variance to sums of which a share is `kept`, where `ok`."""
     removed, sums, variances = zero_like(kept), flight.corrected, flight.corrected_variance
+    before, after = work.L[row], work.L9[row]
     for j in range(columns):
-        if j < filled:
-            removed = removed + before[j] * before[j]
+        removed = removed + before[j] * before[j]
         removed = removed - after[j] * after[j]
     variance = kept * kept * variances[i] + maximum(removed, 0.0)
-    sums[i] = select(ok, kept * sums[i] + shift, sums[i])
+    sums[i] = select(ok, kept * sums[i] + work.dx[row], sums[i])
     variances[i] = select(ok, variance, variances[i])
 
 

@@ -54,14 +54,15 @@ from quad_gym.kernels.filter.error_state import (
     E,
     R,
     V,
-    put_covariance,
+    keep_covariance,
+    load_covariance,
     reset_variances,
 )
 from quad_gym.kernels.filter.measurements import RECENT, forget_corrections
-from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stages_of
+from quad_gym.kernels.filter.slow import stages_of
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import clip, exp, maximum, minimum
-from quad_gym.kernels.numbers.factors import cholesky
+from quad_gym.kernels.numbers.factors import eliminate
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
@@ -71,10 +72,10 @@ from quad_gym.kernels.numbers.linalg import (
     load3,
     load33,
     load_block,
+    load_symmetric,
     outer,
     store,
     store_block,
-    sum_of_squares,
     vector,
 )
 from quad_gym.kernels.numbers.rotation import level_attitude, vector_to_dcm
@@ -212,7 +213,7 @@ def _is_known(uu, square):
 def _lean_of(flight, p):
     """Variance of d at the beginning: that of the filter's tilt times g, as W begins with it."""
     k = load33(flight.R_hat).T[2]
-    P_ee = sum_of_squares(flight.L, E, E + 3)
+    P_ee = load_symmetric(flight.P, E)
     whole = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
     tilt = maximum(whole - dot(k, P_ee @ k), 0.0)
     bias = maximum(p.accel_bias_sigma, _TILT)
@@ -273,7 +274,7 @@ def _measure_motion(flight, p, work, mask):
     _keep_all(x, begins, (z[0], z[1], zero, zero, zero, zero))
     first = (r, zero + 1.0, _lean_of(flight, p), zero, zero, zero, zero, zero, zero)
     _keep_all(P, begins, first)
-    drift = sum_of_squares(flight.L, BG, BG + 3)
+    drift = load_symmetric(flight.P, BG)
     lost = T * T * (drift[0][0] + drift[1][1] + drift[2][2])
     square = x[2] * x[2] + x[3] * x[3]
     _keep_all(x, gap, (z[0], z[1], u[0], u[1], d[0], d[1]))
@@ -313,7 +314,7 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     n = 1.0 / math.sqrt(maximum(c * c + s * s, 1e-9))
     c, s = n * c, n * s
     apart = 2.0 - 2.0 * (u[0] * c + u[1] * s) / length
-    own = dot(k, sum_of_squares(flight.L, E, E + 3) @ k)
+    own = dot(k, load_symmetric(flight.P, E) @ k)
     lost = flight.heading_lost > 0.0
     holds = fresh & (square > _SHORT * _SHORT) & (square < _LONG * _LONG)
     holds = holds & (flight.level_force[2] > _SETTLED)
@@ -383,9 +384,8 @@ def _reset_attitude(flight, p, work, slow, lanes, R_BI, variance, moves):
     Where it `moves`, the velocity becomes that of the motion, too.
     """
     zero, P, states = zero_like(p.dt), work.P, 15
-    put_covariance(P, flight.L, 1.0 + zero)
+    load_covariance(P, flight, slow)
     if slow is not None:
-        fill_slow(flight, slow, P)
         states = 15 + slow.slow_states
         iron = slow.aid_vector[_MAGNETOMETER]
         if iron >= 0:
@@ -407,8 +407,8 @@ def _reset_attitude(flight, p, work, slow, lanes, R_BI, variance, moves):
         a, g = flight.b_a_hat[i], flight.b_g_hat[i]
         flight.b_a_hat[i] = select(lanes, 0.0, a)
         flight.b_g_hat[i] = select(lanes, clip(g, -3.0 * bg, 3.0 * bg), g)
-    ok = lanes & (cholesky(P, states, work.inverse_diagonal) > 0.0)
-    keep_factor(flight, slow, work, ok)
+    ok = lanes & (eliminate(P, work.L, states, states) >= 0.0)
+    keep_covariance(flight, slow, P, ok)
     keep(flight.R_hat, ok, R_BI)
     if moves:
         x, last, sums = flight.level_state, flight.level_last, load3(flight.level_sum)
@@ -462,7 +462,7 @@ def _hold_attitude(flight, p, work, settings, slow, mask, pushed):
     itself, the attitude is turned to it first, so that the update is linear; that is the heading.
     """
     k = load33(flight.R_hat).T[2]
-    vague = mask & (dot(k, sum_of_squares(flight.L, E, E + 3) @ k) > _VAGUE * _VAGUE)
+    vague = mask & (dot(k, load_symmetric(flight.P, E) @ k) > _VAGUE * _VAGUE)
     if settings.by_motion < 2:  # otherwise a baseline or a camera shows it again
         flight.heading_lost = select(vague, 1.0, flight.heading_lost)
     lanes = mask & (flight.heading_lost > 0.0)
@@ -470,10 +470,9 @@ def _hold_attitude(flight, p, work, settings, slow, mask, pushed):
     if not any_of(lanes):
         return
     P, zero, states = work.P, zero_like(p.dt), 15
-    put_covariance(P, flight.L, 1.0 + zero)
+    load_covariance(P, flight, slow)
     iron, delta = -1, -1
     if slow is not None:
-        fill_slow(flight, slow, P)
         states = 15 + slow.slow_states
         if slow.aid_vector[_MAGNETOMETER] >= 0:
             iron = D + slow.aid_vector[_MAGNETOMETER]
@@ -501,8 +500,8 @@ def _hold_attitude(flight, p, work, settings, slow, mask, pushed):
         turn, shown = select(field, level, turn), shown | field
     sigma = select(shown, _ALIGNED, MAX_ANGLE)
     _put_attitude(P, k, states, lanes, sigma * sigma)
-    ok = lanes & (cholesky(P, states, work.inverse_diagonal) > 0.0)
-    keep_factor(flight, slow, work, ok)
+    ok = lanes & (eliminate(P, work.L, states, states) >= 0.0)
+    keep_covariance(flight, slow, P, ok)
     keep(flight.R_hat, ok & shown, R_BI @ turn)
     flight.heading_lost = select(ok & shown, 0.0, flight.heading_lost)
     lanes = lanes & (flight.heading_lost > 0.0)
@@ -522,9 +521,8 @@ def _release_attitude(flight, p, work, slow):
     if not any_of(lanes):
         return
     P, states = work.P, 15
-    put_covariance(P, flight.L, 1.0 + zero_like(work.held))
+    load_covariance(P, flight, slow)
     if slow is not None:
-        fill_slow(flight, slow, P)
         states = 15 + slow.slow_states
     keep(flight.R_hat, lanes, load33(work.held_attitude))
     k = load33(flight.R_hat).T[2]
@@ -532,8 +530,8 @@ def _release_attitude(flight, p, work, slow):
     arm = load3(p.antenna)
     for i in range(R, R + 2):
         P[i, i] = P[i, i] + select(lanes, dot(arm, arm), 0.0)
-    ok = lanes & (cholesky(P, states, work.inverse_diagonal) > 0.0)
-    keep_factor(flight, slow, work, ok)
+    ok = lanes & (eliminate(P, work.L, states, states) >= 0.0)
+    keep_covariance(flight, slow, P, ok)
 
 
 @kernel

@@ -1,34 +1,35 @@
-"""The unscented Kalman filter of the report, with its structure exploited, its result unchanged.
+"""The prediction of the filter: of the unscented Kalman filter of the report, its result unchanged.
 
-State (r_I, v_I, e, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The
-filter stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are the same
-as in the augmented filter (27 columns in the prediction, 15 + n_z in the update), but
+State (e, r_I, v_I, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The
+sigma points are the same as in the augmented filter (27 columns of a root of the covariance here,
+15 + n_z in the update), but
 
-* the augmented factor is block diagonal, so that noise which enters linearly contributes in closed
-  form, and so do the columns for states on which a model does not depend: 9 pairs of points remain;
+* the augmented root is block diagonal, so that noise which enters linearly contributes in closed
+  form, and so do the columns for states on which a model does not depend;
+* with e first, only three columns of the lower factor change the attitude. The model is linear
+  in all other ones, which so contribute as in a linear filter: A P A^T, without any factor;
 * a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and s, its half-sum minus
   f(x0), since the rotation is split into parts even and odd in e. With c^2 = n + lambda the moments
   are
       mean = f(x0) + mu,  mu = sum s / c^2
       cov  = sum (a a^T + s s^T) / c^2 + (beta - alpha^2) mu mu^T + noise
-  in which nothing cancels, unlike in the usual weights near -1e6;
-* the update never forms P_zz. With A and E the columns a / c and s / c of the measurement, and Rz =
-  E E^T + (beta - alpha^2) mu mu^T + R its noise, so that P_zz = A A^T + Rz, the matrix inversion
-  lemma gives  P+ = L (I + C C^T)^-1 L^T  with  C = A^T Rz^-T/2  over the nine columns that matter.
-  The new factor is L times the factor of that inverse, lower triangular again, and stays accurate
-  when a measurement is 10^8 times as good as the prediction.
+  in which nothing cancels, unlike in the usual weights near -1e6. Of the three columns, a / c is
+  A l plus a remainder q of third order, so that the sum of a a^T / c^2 over all columns is A P A^T
+  + sum (A l q^T + q l^T A^T + q q^T) over these;
+* the update never forms P_zz, see `update.py`.
 
-The extended Kalman filter (EKF) shares everything with the UKF: state, error angles, models, noise,
-and the factor L of the covariance. Where the UKF puts the half-differences of a pair of sigma
-points into a column, the EKF puts the derivative of the model times the column of L; the half-sums
-minus the center, which carry the second order, are zero. With `R(e) = I - [e x] + ...`:
+The filter carries its covariance from tick to tick. Its factor is computed where a measurement is.
+
+The extended Kalman filter (EKF) shares everything with the UKF: state, error angles, models and
+noise. Its derivatives are the matrices A, and q and s are zero. With `R(e) = I - [e x] + ...`:
 
 * `a = R_hat^T R(e)^T (f - b_a) - g e3`:  da = R_hat^T (de x f - db_a)
 * `e+ = e + dt S(e) (w - b_g)`:  de+ = de + dt ((de_th w_z, -de_phi w_z, -de_th w_x) - db_g)
 
 The derivatives of measurements are in the files of these, in `kernels/sensors/`.
 
-Sources: report section 3.4; S. J. Julier and J. K. Uhlmann, Proc. IEEE 92(3), 2004.
+Sources: report section 3.4; S. J. Julier and J. K. Uhlmann, Proc. IEEE 92(3), 2004; M. Morelande
+and B. Moran, "An Unscented Transformation for Conditionally Linear Models", ICASSP 2007.
 """
 
 import math
@@ -42,10 +43,10 @@ from quad_gym.kernels.filter.error_state import (
     E,
     R,
     V,
+    crossed,
     keep_arc,
     reset_matrix,
-    turn_covariance,
-    velocity_error,
+    take_up_corrections,
 )
 from quad_gym.kernels.filter.motion import turn_level
 from quad_gym.kernels.filter.preintegration import (
@@ -56,31 +57,28 @@ from quad_gym.kernels.filter.preintegration import (
 )
 from quad_gym.kernels.filter.slow import (
     decay_slow,
-    keep_factor,
     predict_slow,
     stages_of,
-    turn_slow,
 )
-from quad_gym.kernels.numbers.elementary import is_finite
-from quad_gym.kernels.numbers.factors import cholesky
+from quad_gym.kernels.numbers.elementary import is_finite, minimum
+from quad_gym.kernels.numbers.factors import KNOWN, cholesky33, lower33, solve_right33
 from quad_gym.kernels.numbers.lanes import any_of, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     add_to_diagonal,
     cross,
     diagonal,
     keep,
+    keep_block,
+    keep_lower,
     load3,
     load33,
     load_block,
-    load_column3,
+    load_symmetric,
     outer,
-    store_block,
-    store_column3,
-    sum_of_outers,
-    sum_of_squares,
 )
 from quad_gym.kernels.numbers.rotation import (
     euler_to_dcm,
+    orthonormal,
     split_rotation,
     split_turn,
     turn_pair_back,
@@ -113,175 +111,197 @@ def _euler_rate_parts(parts, w_B, dg):
 
 
 @kernel
-def _acceleration_column(L, j, R_BI, f_B, df_B):
-    """Derivative of the acceleration in I along column j, whose share of biases in f is df_B."""
-    return R_BI.T @ (cross(load_column3(L, E, j), f_B) - df_B)
+def _column(form, c, d, da, dg, f_B, f_start, w_B, R_BI, half, dt):
+    """Odd and even parts of acceleration and error angles along a column of the factor, over c.
 
-
-@kernel
-def _angle_column(L, j, w_B, dt):
-    """Derivative of the Euler step e + dt S(e) (w - b_g) along column j."""
-    d, dg = load_column3(L, E, j), load_column3(L, BG, j)
-    rate = (d[1] * w_B[2] - dg[0], -d[0] * w_B[2] - dg[1], -d[1] * w_B[0] - dg[2])
-    return d + dt * rate
-
-
-@kernel
-def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
-    """Offset of the measured force along c times column j of L, in B at the tick's start.
-
-    Halfway through the tick, an offset of the gyro's bias has rotated the force by half its angle.
+    Args:
+        form: Options of the filter.
+        c: Spread of the sigma points.
+        d, da, dg: Offsets of the error angles and of both biases, times c.
+        f_B: Specific force halfway through the tick, in B.
+        f_start: The same in B at the tick's start.
+        w_B: Angular rate.
+        R_BI: Attitude at the tick's start.
+        half: Rotation over half a tick, with MIDPOINT.
+        dt: Tick.
     """
-    df = c * load_column3(L, BA, j)
-    if midpoint:
-        dg = c * load_column3(L, BG, j)
-        df = half.T @ (df + half_dt * cross(dg, f_B))
-    return df
-
-
-@kernel
-def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
-    """Fill work.F and work.S with the propagated pairs; return the means minus the center's.
-
-    Position and velocity share the half-sums of the acceleration: S and the means have these and
-    the half-sums of the error angles.
-    """
-    L, F, S = flight.L, work.F, work.S
-    R_BI = load33(flight.R_hat)
-    dt = p.dt
-    half_dt, half_dt2 = 0.5 * dt, 0.5 * dt * dt
-    midpoint, extended = (form & FilterForm.MIDPOINT.value) != 0, (form & FilterForm.EKF.value) != 0
-    first = (form & FilterForm.FIRST_ESTIMATES.value) != 0
-    c = p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
-    inverse_c = 1.0 / c
+    midpoint, inverse_c = (form & FilterForm.MIDPOINT.value) != 0, 1.0 / c
+    even, odd, parts = split_rotation(d)
+    df = da
+    if midpoint:  # halfway, an offset of the gyro's bias has rotated the force by half its angle
+        df = half.T @ (da + 0.5 * dt * cross(dg, f_B))
+    # a_I = R^T R(e)^T (f - b_a) - g: parts odd and even in the offset, minus the center
+    odd_B, even_B = turn_pair_back(even, odd, f_start, df)
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        even, odd = split_turn(d)
+        odd_B = odd.T @ f_start - df - even.T @ df
+        even_B = even.T @ f_start - odd.T @ df
     zero = zero_like(c)
-    nothing = (zero, zero, zero)
-    mean_a, mean_e = nothing, nothing
-    f_start, full = f_B, half
-    if midpoint:
-        f_start, full = half.T @ f_B, half @ half
-
-    for j in range(9):
-        if extended:
-            df = _force_offset(L, j, 1.0, f_B, half, half_dt, midpoint)
-            a_odd, a_even = _acceleration_column(L, j, R_BI, f_start, df), nothing
-            e_odd, e_even = _angle_column(L, j, w_B, dt), nothing
-        else:
-            d, dg = c * load_column3(L, E, j), c * load_column3(L, BG, j)
-            df = _force_offset(L, j, c, f_B, half, half_dt, midpoint)
-            even, odd, parts = split_rotation(d)
-            # a_I = R^T R(e)^T (f - b_a) - g: parts odd and even in the offset, minus the center
-            odd_B, even_B = turn_pair_back(even, odd, f_start, df)
-            if first:
-                even, odd = split_turn(d)
-                odd_B = odd.T @ f_start - df - even.T @ df
-                even_B = even.T @ f_start - odd.T @ df
-            a_odd = inverse_c * (R_BI.T @ odd_B)
-            a_even = inverse_c * (R_BI.T @ even_B)
-            e_odd, e_even = nothing, nothing
-            if not midpoint:
-                rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
-                e_odd = inverse_c * (d + dt * rate_odd)
-                e_even = dt * inverse_c * rate_even
-        if midpoint:
-            # about the new R_hat: R_half (R_half e - dt b_g)
-            e_odd = full @ load_column3(L, E, j) - dt * (half @ load_column3(L, BG, j))
-
-        v_j = load_column3(L, V, j)
-        if first:
-            v_j = velocity_error(v_j, load_column3(L, E, j), R_BI, load3(flight.v_corrected))
-        store_column3(F, R, j, load_column3(L, R, j) + dt * v_j + half_dt2 * a_odd)
-        store_column3(F, V, j, v_j + dt * a_odd)
-        store_column3(F, E, j, e_odd)
-        store_column3(S, 0, j, a_even)
-        store_column3(S, 3, j, e_even)
-        mean_a, mean_e = mean_a + a_even, mean_e + e_even
-
-    for j in range(9, 15):  # offsets of the biases alone: linear
-        df = _force_offset(L, j, -1.0, f_B, half, half_dt, midpoint)
-        a_odd, e_odd = R_BI.T @ df, -dt * load_column3(L, BG, j)
-        if midpoint:
-            e_odd = half @ e_odd
-        store_column3(F, R, j, half_dt2 * a_odd)
-        store_column3(F, V, j, dt * a_odd)
-        store_column3(F, E, j, e_odd)
-
-    return inverse_c * mean_a, inverse_c * mean_e
-
-
-@kernel
-def _add_gyro_noise(P, p, R_BI, f_B, half):
-    """Add the gyro's white noise to P; half of its angle error rotates the force."""
-    dt, sigma = p.dt, gyro_sigma(p, f_B)
-    for axis in diagonal((sigma, sigma, sigma)):
-        dv = 0.5 * dt * dt * (R_BI.T @ (half.T @ cross(f_B, axis)))
-        dr, de = 0.5 * dt * dv, -dt * (half @ axis)
-        store_block(P, R, R, load_block(P, R, R) + outer(dr, dr))
-        store_block(P, V, R, load_block(P, V, R) + outer(dv, dr))
-        store_block(P, V, V, load_block(P, V, V) + outer(dv, dv))
-        store_block(P, E, R, load_block(P, E, R) + outer(de, dr))
-        store_block(P, E, V, load_block(P, E, V) + outer(de, dv))
-        store_block(P, E, E, load_block(P, E, E) + outer(de, de))
-
-
-@kernel
-def _add_second_order(work, p, mean_a, mean_e, midpoint):
-    """Add the half-sums of acceleration and error angles to work.P.
-
-    With MIDPOINT, the error angles have none.
-    """
-    S, P = work.S, work.P
-    dt = p.dt
-    half_dt2 = 0.5 * dt * dt
-    excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
-    aa = sum_of_squares(S, 0, 9) + outer(excess * mean_a, mean_a)
-    store_block(P, R, R, load_block(P, R, R) + half_dt2 * half_dt2 * aa)
-    store_block(P, V, R, load_block(P, V, R) + dt * half_dt2 * aa)
-    store_block(P, V, V, load_block(P, V, V) + dt * dt * aa)
+    e_odd, e_even = (zero, zero, zero), (zero, zero, zero)
     if not midpoint:
-        ea = sum_of_outers(S, 3, S, 0, 9) + outer(excess * mean_e, mean_a)
-        ee = sum_of_squares(S, 3, 9) + outer(excess * mean_e, mean_e)
-        store_block(P, E, R, load_block(P, E, R) + half_dt2 * ea)
-        store_block(P, E, V, load_block(P, E, V) + dt * ea)
-        store_block(P, E, E, load_block(P, E, E) + ee)
+        rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
+        e_odd = inverse_c * (d + dt * rate_odd)
+        e_even = dt * inverse_c * rate_even
+    return inverse_c * (R_BI.T @ odd_B), inverse_c * (R_BI.T @ even_B), e_odd, e_even
 
 
 @kernel
-def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
-    """Fill the lower triangle of work.P from the propagated pairs and the process noise.
+def _maps(form, f_B, f_start, w_B, R_BI, half, dt):
+    """Matrices A of the prediction, (full, B, K, G, H).
 
-    The gyro's noise is added here only if the sample counts as of the tick's start.
+    e+ = full e + B b_g, and v+ = v + K e + G b_a + H b_g.
     """
-    L, F, P = flight.L, work.F, work.P
-    dt = p.dt
-    half_dt2 = 0.5 * dt * dt
-    decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
-    variance = accel_variance(p, f_B)
-    extended, midpoint = (form & FilterForm.EKF.value) != 0, (form & FilterForm.MIDPOINT.value) != 0
-    angle = zero_like(dt) if midpoint else dt * gyro_sigma(p, f_B)
-    gyro_variance = angle * angle
+    zero = zero_like(dt)
+    one = 1.0 + zero
+    eye = diagonal((one, one, one))
+    K = dt * (R_BI.T @ crossed(f_start))
+    if (form & FilterForm.MIDPOINT.value) != 0:
+        # about the new R_hat: R_half (R_half e - dt b_g)
+        full, B, G = half @ half, -dt * half, -dt * (half @ R_BI).T
+        H = 0.5 * dt * (G @ crossed(f_B))
+    else:
+        rate = ((zero, w_B[2], zero), (-w_B[2], zero, zero), (zero, -w_B[0], zero))
+        full, B, G = eye + dt * rate, -dt * eye, -dt * R_BI.T
+        H = diagonal((zero, zero, zero))
+    return full, B, K, G, H
 
-    for i in range(0, 9, 3):
-        store_block(P, i, i, sum_of_squares(F, i, 15))
-        for j in range(0, i, 3):
-            store_block(P, i, j, sum_of_outers(F, i, F, j, 15))
+
+@kernel
+def _predict_covariance(flight, p, settings, slow, f_B, w_B, R_BI, half, sound):
+    """Predict the covariance, in the lanes `sound` where it stays one.
+
+    Returns:
+        Mean of the acceleration minus the center's, mean of the error angles, and the lanes.
+
+    With v+ = v + K e + G b_a + H b_g + q, and r+ = r + dt (v + v+) / 2, covariances of v+, r+ and
+    e+ with the states before follow first. The last sums up those with the states after.
+    """
+    P, dt, form = flight.P, p.dt, settings.form
+    midpoint, extended = (form & FilterForm.MIDPOINT.value) != 0, (form & FilterForm.EKF.value) != 0
+    augmented = 27.0  # states with the noise
+    if slow is not None:
+        augmented = 27.0 + 2.0 * slow.slow_errors
+    half_dt = 0.5 * dt
+    f_start = f_B
+    if midpoint:
+        f_start = half.T @ f_B
+    full, B, K, G, H = _maps(form, f_B, f_start, w_B, R_BI, half, dt)
+
+    ee, rr, vv = load_symmetric(P, E), load_symmetric(P, R), load_symmetric(P, V)
+    aa, gg, ga = load_symmetric(P, BA), load_symmetric(P, BG), load_block(P, BG, BA)
+    re, ve, vr = load_block(P, R, E), load_block(P, V, E), load_block(P, V, R)
+    ae, ar, av = load_block(P, BA, E), load_block(P, BA, R), load_block(P, BA, V)
+    ge, gr, gv = load_block(P, BG, E), load_block(P, BG, R), load_block(P, BG, V)
+
+    # of v+, of e+ with the states before
+    Ve = ve + K @ ee + G @ ae + H @ ge
+    Vr = vr + K @ re.T + G @ ar + H @ gr
+    Vv = vv + K @ ve.T + G @ av + H @ gv
+    Va = av.T + K @ ae.T + G @ aa + H @ ga
+    Vg = gv.T + K @ ge.T + G @ ga.T + H @ gg
+    Ee, Ea, Eg = full @ ee + B @ ge, full @ ae.T + B @ ga, full @ ge.T + B @ gg
+
+    zero = zero_like(dt)
+    nothing = (zero, zero, zero)
+    none = (nothing, nothing, nothing)
+    factor, diagonal_e, pivot = cholesky33(add_to_diagonal(ee, KNOWN))
+    mean_a, mean_e = nothing, nothing
+    q, q_e, S_v, S_ve, S_e = none, none, none, none, none
+    v_q, v_qe, r_qe, e_qe = none, none, none, none
     if not extended:
-        _add_second_order(work, p, mean_a, mean_e, midpoint)
-    for i in range(3):
-        P[R + i, R + i] += half_dt2 * half_dt2 * variance
-        P[V + i, R + i] += half_dt2 * dt * variance
-        P[V + i, V + i] += dt * dt * variance
-        P[E + i, E + i] += gyro_variance
+        c = p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
+        l_e, l_a = lower33(factor, diagonal_e), solve_right33(ae, factor)
+        l_g, l_v, l_r = (
+            solve_right33(ge, factor),
+            solve_right33(ve, factor),
+            solve_right33(re, factor),
+        )
+        e_0, e_1, e_2 = c * l_e.T
+        a_0, a_1, a_2 = c * l_a.T
+        g_0, g_1, g_2 = c * l_g.T
+        odd_0, s_0, turn_0, t_0 = _column(form, c, e_0, a_0, g_0, f_B, f_start, w_B, R_BI, half, dt)
+        odd_1, s_1, turn_1, t_1 = _column(form, c, e_1, a_1, g_1, f_B, f_start, w_B, R_BI, half, dt)
+        odd_2, s_2, turn_2, t_2 = _column(form, c, e_2, a_2, g_2, f_B, f_start, w_B, R_BI, half, dt)
+        inverse_c, excess = 1.0 / c, p.sigma_beta - p.sigma_spread * p.sigma_spread
+        odd = (dt * odd_0, dt * odd_1, dt * odd_2)  # rows are columns of the factor
+        q = odd - (K @ l_e + G @ l_a + H @ l_g).T
+        mean_a = inverse_c * (s_0 + s_1 + s_2)
+        S_v = outer(s_0, s_0) + outer(s_1, s_1) + outer(s_2, s_2) + outer(excess * mean_a, mean_a)
+        S_v = dt * dt * S_v
+        f_v = l_v + odd.T
+        v_q = f_v @ q
+        Ve, Vr, Vv = Ve + q.T @ l_e.T, Vr + q.T @ l_r.T, Vv + q.T @ l_v.T
+        Va, Vg = Va + q.T @ l_a.T, Vg + q.T @ l_g.T
+        if not midpoint:
+            turned = (turn_0, turn_1, turn_2)
+            q_e = turned - (full @ l_e + B @ l_g).T
+            mean_e = inverse_c * (t_0 + t_1 + t_2)
+            S_ve = outer(s_0, t_0) + outer(s_1, t_1) + outer(s_2, t_2)
+            S_ve = dt * (S_ve + outer(excess * mean_a, mean_e))
+            S_e = outer(t_0, t_0) + outer(t_1, t_1) + outer(t_2, t_2)
+            S_e = S_e + outer(excess * mean_e, mean_e)
+            v_qe, r_qe = f_v @ q_e, (l_r + half_dt * (l_v + f_v)) @ q_e
+            e_qe = turned.T @ q_e
+            Ee, Ea, Eg = Ee + q_e.T @ l_e.T, Ea + q_e.T @ l_a.T, Eg + q_e.T @ l_g.T
 
-    # the biases are linear: their propagated rows are the rows of L times the decay
-    for j in range(0, 9, 3):
-        store_block(P, BA, j, decay_a * sum_of_outers(L, BA, F, j, 12))
-        store_block(P, BG, j, decay_g * sum_of_outers(L, BG, F, j, 15))
-    aa, gg = sum_of_squares(L, BA, 12), sum_of_squares(L, BG, 15)
+    # of r+ with the states before
+    Re, Rr, Rv = re + half_dt * (ve + Ve), rr + half_dt * (vr + Vr), vr.T + half_dt * (vv + Vv)
+    Ra, Rg = ar.T + half_dt * (av.T + Va), gr.T + half_dt * (gv.T + Vg)
+    # the gyro's noise acts as an error of its bias does
+    sigma, accel = gyro_sigma(p, f_B), accel_variance(p, f_B)
+    noise = sigma * sigma
+    Vn, Rn, En = Vg + noise * H, Rg + (half_dt * noise) * H, Eg + noise * B
+    # after
+    new_vv = Vv + Ve @ K.T + Va @ G.T + Vn @ H.T + (v_q + S_v)
+    new_vv = add_to_diagonal(new_vv, dt * dt * accel)
+    new_rv = Vr.T + half_dt * (Vv.T + new_vv)
+    new_rr = Rr + half_dt * (Rv + new_rv)
+    new_re, new_ve = Re @ full.T + Rn @ B.T, Ve @ full.T + Vn @ B.T
+    new_ee = Ee @ full.T + En @ B.T
+    if not (midpoint or extended):
+        new_re, new_ve = new_re + r_qe + half_dt * S_ve, new_ve + v_qe + S_ve
+        new_ee = new_ee + e_qe + S_e
+    turn = mean_e + dt * w_B
+    turns = not midpoint and (form & FilterForm.TURN.value) != 0
+    if turns:
+        T = reset_matrix(turn)
+        new_ee, new_re, new_ve = T @ new_ee @ T.T, new_re @ T.T, new_ve @ T.T
+        Ea, Eg = T @ Ea, T @ Eg
+    a, g = p.accel_bias_decay, p.gyro_bias_decay
     drive_a, drive_g = p.accel_bias_drive, p.gyro_bias_drive
-    store_block(P, BA, BA, add_to_diagonal(decay_a * decay_a * aa, drive_a * drive_a))
-    store_block(P, BG, BA, decay_g * decay_a * sum_of_outers(L, BG, L, BA, 12))
-    store_block(P, BG, BG, add_to_diagonal(decay_g * decay_g * gg, drive_g * drive_g))
+    new_aa = add_to_diagonal(a * a * aa, drive_a * drive_a)
+    new_gg = add_to_diagonal(g * g * gg, drive_g * drive_g)
+
+    ok = sound & (pivot > 0.0) & _are_variances(new_ee, new_rr, new_vv, new_aa, new_gg)
+    keep_lower(P, E, ok, new_ee)
+    keep_block(P, R, E, ok, new_re)
+    keep_lower(P, R, ok, new_rr)
+    keep_block(P, V, E, ok, new_ve)
+    keep_block(P, V, R, ok, new_rv.T)
+    keep_lower(P, V, ok, new_vv)
+    keep_block(P, BA, E, ok, a * Ea.T)
+    keep_block(P, BA, R, ok, a * Ra.T)
+    keep_block(P, BA, V, ok, a * Va.T)
+    keep_lower(P, BA, ok, new_aa)
+    keep_block(P, BG, E, ok, g * Eg.T)
+    keep_block(P, BG, R, ok, g * Rg.T)
+    keep_block(P, BG, V, ok, g * Vg.T)
+    keep_block(P, BG, BA, ok, (g * a) * ga)
+    keep_lower(P, BG, ok, new_gg)
+    if slow is not None:
+        maps = (full, B, K, G, H, q, q_e)
+        predict_slow(flight, slow, p, maps, factor, turn, turns, midpoint, ok)
+    return mean_a, turn, ok
+
+
+@kernel
+def _are_variances(*blocks):
+    """Lanes in which no number on the diagonals is negative, and all are finite."""
+    least, total = blocks[0][0][0], blocks[0][0][0]
+    for m in blocks:
+        least = minimum(minimum(least, m[0][0]), minimum(m[1][1], m[2][2]))
+        total = total + m[0][0] + m[1][1] + m[2][2]
+    return (least >= 0.0) & is_finite(total)
 
 
 @kernel
@@ -300,9 +320,9 @@ def predict(flight, p, work, settings, stages, slow):
     With TURN, the covariance is transformed with the reset of e, see `error_state.py`; with EKF,
     derivatives replace sigma points.
 
-    A lane whose predicted covariance is not positive definite keeps its state, sets
-    PREDICTION_FAILED, and counts the failure. `slow`: the settings if sensors have slow errors
-    (`slow.py`), else None.
+    A lane whose covariance of e is not positive definite, or whose predicted estimate or variances
+    are not finite, keeps its state, sets PREDICTION_FAILED, and counts the failure. `slow`: the
+    settings if sensors have slow errors (`slow.py`), else None.
     """
     dt, form = p.dt, settings.form
     midpoint = (form & FilterForm.MIDPOINT.value) != 0
@@ -320,39 +340,29 @@ def predict(flight, p, work, settings, stages, slow):
     if settings.by_motion:
         halfway = half if midpoint else vector_to_dcm(0.5 * dt * w_B)
         turn_level(flight, p, f_B + load3(flight.b_a_hat), halfway)
-    states, augmented = 15, 27.0  # the latter with the noise
-    if slow is not None:
-        states, augmented = 15 + slow.slow_states, 27.0 + 2.0 * slow.slow_errors
-    mean_a, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented)
-    _sum_moments(flight, p, work, mean_a, mean_e, f_B, form)
-    if slow is not None:
-        predict_slow(flight, slow, p, work)
-    turn = mean_e + dt * w_B
+    if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+        take_up_corrections(flight, slow, R_BI)
+    f_start = f_B
     if midpoint:
-        _add_gyro_noise(work.P, p, R_BI, f_B, half)
-        R_pred, f_B = half @ (half @ R_BI), half.T @ f_B
+        f_start = half.T @ f_B
+    a_I = R_BI.T @ f_start - (0.0, 0.0, p.gravity)
+    r, v = load3(flight.r_hat), load3(flight.v_hat)
+    moved = r + v + a_I
+    sound = is_finite(moved[0] + moved[1] + moved[2])
+    mean_a, turn, ok = _predict_covariance(flight, p, settings, slow, f_B, w_B, R_BI, half, sound)
+    if midpoint:
+        R_pred = half @ (half @ R_BI)
     else:
         R_pred = euler_to_dcm(turn) @ R_BI
-        if (form & FilterForm.TURN.value) != 0:
-            turn_covariance(work.P, reset_matrix(turn))
-            if slow is not None:
-                turn_slow(slow, work.P, reset_matrix(turn))
-    ok = cholesky(work.P, states, work.inverse_diagonal) > 0.0
+    a_I = a_I + mean_a
 
-    a_I = R_BI.T @ f_B - (0.0, 0.0, p.gravity) + mean_a
-    r, v = load3(flight.r_hat), load3(flight.v_hat)
-    r_pred = r + dt * v + 0.5 * dt * dt * a_I
-    v_pred = v + dt * a_I
-    ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
-
-    keep(flight.r_hat, ok, r_pred)
-    keep(flight.v_hat, ok, v_pred)
+    keep(flight.r_hat, ok, r + dt * v + 0.5 * dt * dt * a_I)
+    keep(flight.v_hat, ok, v + dt * a_I)
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
         keep(flight.v_corrected, ok, dt * mean_a)
-    keep(flight.R_hat, ok, R_pred)
+    keep(flight.R_hat, ok, orthonormal(R_pred))
     keep(flight.b_a_hat, ok, p.accel_bias_decay * load3(flight.b_a_hat))
     keep(flight.b_g_hat, ok, p.gyro_bias_decay * load3(flight.b_g_hat))
-    keep_factor(flight, slow, work, ok)
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
         keep_arc(flight, ok)
     if slow is not None:

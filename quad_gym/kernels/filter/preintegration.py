@@ -25,7 +25,7 @@ Dellaert and D. Scaramuzza, IEEE Trans. Robotics 33(1), 2017.
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum
 from quad_gym.kernels.numbers.lanes import select, zero_like
@@ -41,8 +41,8 @@ from quad_gym.kernels.numbers.linalg import (
     store,
     store_column3,
 )
-from quad_gym.kernels.numbers.rotation import euler_to_dcm, vector_to_dcm
-from quad_gym.records import FilterForm
+from quad_gym.kernels.numbers.rotation import euler_to_dcm, orthonormal, vector_to_dcm
+from quad_gym.records import MAX_SLOW, FilterForm
 
 # --------------------------------------------------------------------------------------------------
 # The specific force at the center of mass, from an accelerometer that is mounted elsewhere.
@@ -81,7 +81,11 @@ def lever_force(flight, p, form, half):
 # Preintegrated IMU samples, which propagate an estimate from one instant to another and back.
 # --------------------------------------------------------------------------------------------------
 
-NOISE = 15  #: first of the six columns of white noise, after the fifteen of the covariance's factor
+NOISE = D + MAX_SLOW
+
+
+"""First of the six columns of white noise, after those of the covariance with states and slow
+errors."""
 
 
 @stage
@@ -105,9 +109,9 @@ def increment_stage(flight, world, model, settings, work, stages, flag):
         force = force - lever_force(flight, p, form, half)
     if (form & FilterForm.MIDPOINT.value) != 0:
         C = half @ C
-        store(flight.imu_turn, half @ C)
+        store(flight.imu_turn, orthonormal(half @ C))
     else:
-        store(flight.imu_turn, euler_to_dcm(turn) @ C)
+        store(flight.imu_turn, orthonormal(euler_to_dcm(turn) @ C))
     dv, v = rounded(dt * (C.T @ force)), load3(flight.imu_velocity)
     store(flight.imu_velocity, v + dv)
     moved = dt * v + rounded(0.5 * dt * dv)
@@ -213,10 +217,13 @@ def put_noise(p, work, R_s, dR, dv):
 
 
 @kernel
-def take_columns(work, R_s, dR, dv, dr, back):
-    """Propagate work.columns, errors of the state, back or forward; the noise only back."""
+def take_columns(work, columns, R_s, dR, dv, dr, back):
+    """Propagate the first columns of work.columns, errors of the state, back or forward.
+
+    The noise of the samples refers to the last instant and is propagated back only.
+    """
     M, T, B = work.columns, work.since_time, load33(work.since_bias_gain)
-    for j in range(NOISE + 6 if back else NOISE):
+    for j in range(columns if back else min(columns, NOISE)):
         alpha, beta = B @ load_column3(M, BA, j), B @ load_column3(M, BG, j)
         r, v, e = load_column3(M, R, j), load_column3(M, V, j), load_column3(M, E, j)
         if back:

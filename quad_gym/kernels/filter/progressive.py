@@ -28,7 +28,7 @@ from quad_gym.kernels.filter.error_state import E, R
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import is_direction
 from quad_gym.kernels.numbers.lanes import any_of, no_lane, select, zero_like
-from quad_gym.kernels.numbers.linalg import dot, keep, load3, sum_of_squares
+from quad_gym.kernels.numbers.linalg import dot, keep, load3
 from quad_gym.records import (
     FEATURE_BLOCKS,
     FIRST_BLOCK,
@@ -96,9 +96,9 @@ def find_unsure(flight, p, work, feature_count):
     The error of a direction comes from attitude and position; the position's share grows as the
     feature gets nearer.
     """
-    P_rr, P_ee = sum_of_squares(flight.L, R, 3), sum_of_squares(flight.L, E, 9)
-    position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
-    attitude = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
+    P = flight.P
+    position = P[R, R] + P[R + 1, R + 1] + P[R + 2, R + 2]
+    attitude = P[E, E] + P[E + 1, E + 1] + P[E + 2, E + 2]
     r = load3(flight.r_hat)
     for i in range(feature_count):
         offset = load3(p.features[i]) - r
@@ -137,7 +137,7 @@ def show_hidden(flight, work, settings, mask):
 
 
 @kernel
-def share_second_order(work, n, further):
+def share_second_order(work, n, rows, further):
     """Multiply the second order's part of the noise by the number of steps, where they are many.
 
     The steps have it in common: without this, where it stays large (a single range cannot reduce
@@ -147,15 +147,15 @@ def share_second_order(work, n, further):
     root = math.sqrt(1.0 + root)
     for k in range(n):
         work.mu[k] = root * work.mu[k]
-        for j in range(9):
+        for j in range(rows):
             work.E[j, k] = root * work.E[j, k]
 
 
 @kernel
-def drop_even(work, n, mask, others):
+def drop_even(work, n, rows, mask, others):
     """Neglect the second order, as an EKF does, in the lanes `mask`; `others`: there are others."""
     for k in range(n):
         work.mu[k] = select(mask, 0.0, work.mu[k])
         if others:
-            for j in range(9):
+            for j in range(rows):
                 work.E[j, k] = select(mask, 0.0, work.E[j, k])

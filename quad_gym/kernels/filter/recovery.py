@@ -31,7 +31,8 @@ from quad_gym.kernels.filter.error_state import (
     E,
     R,
     V,
-    put_covariance,
+    keep_covariance,
+    load_covariance,
     reset_variance,
     reset_variances,
 )
@@ -47,10 +48,10 @@ from quad_gym.kernels.filter.measurements import (
     shifted,
 )
 from quad_gym.kernels.filter.motion import begin_motion, forget_heading
-from quad_gym.kernels.filter.slow import fill_slow, keep_factor, stages_of, stationary
+from quad_gym.kernels.filter.slow import stages_of, stationary
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum, minimum
-from quad_gym.kernels.numbers.factors import cholesky
+from quad_gym.kernels.numbers.factors import eliminate
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import dot, load33, load_block, outer, store_block
 from quad_gym.records import (
@@ -304,13 +305,11 @@ def reset_states(flight, p, work, settings, stages, slow):
     alarmed = alarmed | jumped | moved
     if not any_of(alarmed):
         return
-    put_covariance(work.P, flight.L, 1.0 + zero_like(flight.tick))
-    if slow is not None:
-        fill_slow(flight, slow, work.P)
+    load_covariance(work.P, flight, slow)
     _reset_motion(flight, p, work, slow, states, jumped, moved)
     call_sensors(flight, p, p, settings, work, stages, Act.RESET, 0)
-    ok = alarmed & (cholesky(work.P, states, work.inverse_diagonal) > 0.0)
-    keep_factor(flight, slow, work, ok)
+    ok = alarmed & (eliminate(work.P, work.L, states, states) >= 0.0)
+    keep_covariance(flight, slow, work.P, ok)
     failed = alarmed & logical_not(ok)
     count_failure(flight, failed)
     flight.alarm_tick = select(alarmed, flight.tick, flight.alarm_tick)

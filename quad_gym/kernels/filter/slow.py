@@ -16,29 +16,32 @@ errors of other sensors (`kernels/sensors/`): vectors first, then scalars. As bl
 3, their number is a multiple of three; the states that pad it are constant, with variance one, and
 never measured.
 
-The factor of the joint covariance has the rows of `flight.L`, and below them the rows of
-`flight.L_slow`. As d comes last, the first fifteen rows are the factor of the covariance of the
-fifteen states, as without d, and their prediction does not depend on d. Kernels of the filter take
-`slow`, which is the settings record, or None if no sensor has a slow error: the compiler evaluates
-`slow is None`, so that a filter without d has none of this code.
+The joint covariance has the rows of `flight.P`, and below them the rows of `flight.P_slow`, so that
+the prediction of the fifteen states is the same with and without d. An update takes d before the
+biases, on which no measurement depends: its factor has the rows e, r, v, d, b_a, b_g, see
+`columns.py`. Kernels of the filter take `slow`, which is the settings record, or None if no sensor
+has a slow error: the compiler evaluates `slow is None`, so that a filter without d has none of this
+code.
 """
 
 from typing import Any
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.error_state import BA, BG, D, E
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, reset_matrix
+from quad_gym.kernels.numbers.factors import solve_right33
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     add_diagonal,
     cross,
+    keep_block,
+    keep_lower,
     load3,
     load33,
     load_block,
     load_column3,
+    load_symmetric,
     store_block,
     store_column3,
-    sum_of_outers,
-    sum_of_squares,
 )
 from quad_gym.kernels.numbers.rotation import euler_to_dcm
 from quad_gym.records import AID_NUMBERS, Aid
@@ -73,8 +76,9 @@ def begin_slow(flight, p, slow, mask):
     for i in range(slow.slow_states):
         flight.slow_hat[i] = select(mask, 0.0, flight.slow_hat[i])
         for j in range(D + slow.slow_states):
-            value = p.slow_sigma[i] if j == D + i else zero_like(p.slow_sigma[i])
-            flight.L_slow[i, j] = select(mask, value, flight.L_slow[i, j])
+            sigma = p.slow_sigma[i]
+            value = sigma * sigma if j == D + i else zero_like(sigma)
+            flight.P_slow[i, j] = select(mask, value, flight.P_slow[i, j])
 
 
 @kernel
@@ -97,38 +101,44 @@ def _product(a, b):
 
 
 @kernel
-def copy_factor(L, source, first, rows, ok):
-    """Copy `rows` of a lower factor, from row `first` of the whole one on, where `ok`."""
-    for i in range(rows):
-        for j in range(first + i + 1):
-            L[i, j] = select(ok, source[i, j], L[i, j])
+def predict_slow(flight, slow, p, maps, factor, turn, turns, midpoint, ok):
+    """Predict the rows of d in the covariance, where `ok`; d does not act on other states.
 
-
-@kernel
-def keep_factor(flight, slow, work, ok):
-    """Store the factor in work.P, where `ok`."""
-    copy_factor(flight.L, work.P, 0, D, ok)
-    if slow is not None:
-        copy_factor(flight.L_slow, work.P[D:], D, slow.slow_states, ok)
-
-
-@kernel
-def predict_slow(flight, slow, p, work):
-    """Predict the rows of d in work.P; d does not act on other states."""
-    L, F, P, M = flight.L, work.F, work.P, flight.L_slow
+    Args:
+        flight: Record.
+        slow: The settings.
+        p: Parameters assumed by the filter.
+        maps: Matrices of the prediction, and its nonlinear remainders, see `predict.py`.
+        factor: Factor of the covariance of the error angles.
+        turn, turns: Mean of the error angles; True if the covariance is transformed with its reset.
+        midpoint: True for the midpoint rule.
+        ok: Lanes.
+    """
+    full, B, K, G, H, q, q_e = maps
+    P, half_dt = flight.P_slow, 0.5 * p.dt
     for i in range(0, slow.slow_states, 3):
-        a, s = load3(p.slow_decay[i : i + 3]), load3(p.slow_drive[i : i + 3])
-        for j in range(0, BA, 3):
-            store_block(P, D + i, j, _product(a, sum_of_outers(M, i, F, j, 15)))
-        with_a, with_g = sum_of_outers(M, i, L, BA, 12), sum_of_outers(M, i, L, BG, 15)
-        store_block(P, D + i, BA, _product(p.accel_bias_decay * a, with_a))
-        store_block(P, D + i, BG, _product(p.gyro_bias_decay * a, with_g))
+        decay, drive = load3(p.slow_decay[i : i + 3]), load3(p.slow_drive[i : i + 3])
+        e, r, v = load_block(P, i, E), load_block(P, i, R), load_block(P, i, V)
+        with_a, with_g = load_block(P, i, BA), load_block(P, i, BG)
+        l_d = solve_right33(e, factor)
+        new_v = v + e @ K.T + with_a @ G.T + with_g @ H.T + l_d @ q
+        new_e = e @ full.T + with_g @ B.T
+        if not midpoint:
+            new_e = new_e + l_d @ q_e
+            if turns:
+                new_e = new_e @ reset_matrix(turn).T
+        keep_block(P, i, E, ok, _product(decay, new_e))
+        keep_block(P, i, R, ok, _product(decay, r + half_dt * (v + new_v)))
+        keep_block(P, i, V, ok, _product(decay, new_v))
+        keep_block(P, i, BA, ok, _product(p.accel_bias_decay * decay, with_a))
+        keep_block(P, i, BG, ok, _product(p.gyro_bias_decay * decay, with_g))
         for j in range(0, i, 3):
-            b = load3(p.slow_decay[j : j + 3])
-            other = sum_of_outers(M, i, M, j, D + j + 3)
-            store_block(P, D + i, D + j, _scale_both(a, b, other))
-        own = _scale_both(a, a, sum_of_squares(M, i, D + i + 3))
-        store_block(P, D + i, D + i, add_diagonal(own, _product(s, s)))
+            other = load3(p.slow_decay[j : j + 3])
+            scaled = _scale_both(decay, other, load_block(P, i, D + j))
+            keep_block(P, i, D + j, ok, scaled)
+        own = P[:, D:]
+        scaled = _scale_both(decay, decay, load_symmetric(own, i))
+        keep_lower(own, i, ok, add_diagonal(scaled, _product(drive, drive)))
 
 
 @kernel
@@ -137,25 +147,6 @@ def decay_slow(flight, slow, p, ok):
     for i in range(slow.slow_states):
         d = flight.slow_hat[i]
         flight.slow_hat[i] = select(ok, p.slow_decay[i] * d, d)
-
-
-@kernel
-def turn_slow(slow, P, T):
-    """Transform the correlation of d with the error angles, as `turn_covariance` the other ones."""
-    for i in range(0, slow.slow_states, 3):
-        store_block(P, D + i, E, load_block(P, D + i, E) @ T.T)
-
-
-@kernel
-def load_slow(flight, slow, columns):
-    """Add the columns of d to the factor of fifteen states in `columns`, last column first."""
-    last = D + slow.slow_states - 1
-    for i in range(D):
-        for j in range(D, last + 1):
-            columns[i, last - j] = zero_like(flight.slow_hat[0])
-    for i in range(slow.slow_states):
-        for j in range(last + 1):
-            columns[D + i, last - j] = flight.L_slow[i, j]
 
 
 @kernel
@@ -183,33 +174,23 @@ def turn_iron(flight, slow, p, L9, T, correction, columns):
         field_I = flight.slow_hat[delta] * turned + m
         before = load33(flight.R_hat) @ field_I
         after = euler_to_dcm(correction) @ before
-        for j in range(columns - 9, columns):
+        for j in range(columns - 3, columns):  # of e; the others do not change it
             e = load_column3(L9, E, j)
             more = cross(T @ e, after) - cross(e, before)
-            store_column3(L9, D + first, j, load_column3(L9, D + first, j) + more)
+            store_column3(
+                L9,
+                slow.motion_columns + first,
+                j,
+                load_column3(L9, slow.motion_columns + first, j) + more,
+            )
 
 
 @kernel
-def shift_slow(flight, slow, columns, ok, shift):
-    """Store d and its rows after an update, where `ok`, from the factor, last column first."""
-    last = D + slow.slow_states - 1
+def shift_slow(flight, slow, ok, shift):
+    """Correct the estimates of d by an update, where `ok`."""
     for i in range(slow.slow_states):
         d = flight.slow_hat[i]
-        flight.slow_hat[i] = select(ok, d + shift[D + i], d)
-        for j in range(D + i + 1):
-            flight.L_slow[i, j] = select(ok, columns[D + i, last - j], flight.L_slow[i, j])
-
-
-@kernel
-def fill_slow(flight, slow, P):
-    """Fill the rows of d in P with the present ones."""
-    L, M = flight.L, flight.L_slow
-    for i in range(0, slow.slow_states, 3):
-        for j in range(0, D, 3):
-            store_block(P, D + i, j, sum_of_outers(M, i, L, j, j + 3))
-        for j in range(0, i, 3):
-            store_block(P, D + i, D + j, sum_of_outers(M, i, M, j, D + j + 3))
-        store_block(P, D + i, D + i, sum_of_squares(M, i, D + i + 3))
+        flight.slow_hat[i] = select(ok, d + shift[slow.motion_columns + i], d)
 
 
 @kernel
@@ -247,21 +228,21 @@ def _factors(work, i, back):
 
 @kernel
 def carry_slow(flight, slow, p, work, noise, back):
-    """Propagate the rows of d in work.P back in time by work.slow_decay, or forward.
+    """Propagate the rows of d in the covariance back in time by work.slow_decay, or forward.
 
     The variance that d has gained since then is multiplied by `noise`, as the noise of the IMU is:
-    -1 or 0 on the way back, 1 or 0 on the way forward. work.columns has the fifteen propagated
-    columns of the other states.
+    -1 or 0 on the way back, 1 or 0 on the way forward. Behind the fifteen columns of other states,
+    work.columns has the propagated covariances of these with d. The result is in work.P.
     """
-    M, P, rows = work.columns, work.P, flight.L_slow
+    M, P, rows = work.columns, work.P, flight.P_slow
     for i in range(0, slow.slow_states, 3):
         a, gained = _factors(work, i, back), _gained(p, work, i, noise)
         for j in range(0, D, 3):
-            store_block(P, D + i, j, _product(a, sum_of_outers(rows, i, M, j, 15)))
+            store_block(P, D + i, j, _product(a, load_block(M, j, D + i).T))
         for j in range(0, i, 3):
-            other = sum_of_outers(rows, i, rows, j, D + j + 3)
-            store_block(P, D + i, D + j, _scale_both(a, _factors(work, j, back), other))
-        own = sum_of_squares(rows, i, D + i + 3)
+            other = _scale_both(a, _factors(work, j, back), load_block(rows, i, D + j))
+            store_block(P, D + i, D + j, other)
+        own = load_symmetric(rows[:, D:], i)
         if back:
             own = _scale_both(a, a, add_diagonal(own, gained))
         else:

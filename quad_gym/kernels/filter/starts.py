@@ -5,23 +5,25 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
-from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, keep_covariance
 from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
-from quad_gym.kernels.filter.slow import begin_slow, keep_factor, stages_of
+from quad_gym.kernels.filter.slow import begin_slow, stages_of
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import atan2, maximum, minimum, sin_cos
-from quad_gym.kernels.numbers.factors import cholesky, cholesky33, lower33, solve_right33
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
     diagonal,
     dot,
     keep,
+    keep_block,
+    keep_lower,
     load3,
     load4,
     load33,
     load_block,
+    load_symmetric,
     outer,
     rounded,
     store,
@@ -147,16 +149,17 @@ def lever_of_attitude(R_BI, l_B):
 
 
 @kernel
-def _tie_position_to_attitude(L, R_BI, l_B, mask):
-    """Add to L the dependence of the start's position on its attitude, in the lanes `mask`."""
-    root_r, root_e = load_block(L, R, R), load_block(L, E, E)  # diagonal
-    tied = lever_of_attitude(R_BI, l_B) @ root_e
-    factor, diagonal_r, _ = cholesky33(root_r @ root_r + tied @ tied.T)
-    L_er = solve_right33(root_e @ tied.T, factor)
-    keep(L[R : R + 3, R : R + 3], mask, lower33(factor, diagonal_r))
-    keep(L[E : E + 3, R : R + 3], mask, L_er)
-    factor, diagonal_e, _ = cholesky33(root_e @ root_e - L_er @ L_er.T)
-    keep(L[E : E + 3, E : E + 3], mask, lower33(factor, diagonal_e))
+def _tie_position_to_attitude(P, R_BI, l_B, mask):
+    """Add to P the dependence of the start's position on its attitude, in the lanes `mask`."""
+    J = lever_of_attitude(R_BI, l_B)
+    tied = J @ load_symmetric(P, E)
+    keep_block(P, R, E, mask, tied)
+    keep_lower(P, R, mask, load_symmetric(P, R) + tied @ J.T)
+
+
+@kernel
+def _put(P, row, mask, variance):
+    P[row, row] = select(mask, variance, P[row, row])
 
 
 @kernel
@@ -207,20 +210,20 @@ def initialize(flight, p, mask, x_I, v_I=_NOTHING, v_variance=_NOTHING, tilt_var
     reset(flight, mask, 0.0, "nis nis_dimension v_corrected arc")
     begin_recovery(flight, mask)
 
-    L = flight.L
+    P, tilt = flight.P, select(level, p.initial_tilt_sigma, attitude)
     for i in range(15):
-        for j in range(i + 1):
-            L[i, j] = select(mask, 0.0, L[i, j])
+        for j in range(i):
+            P[i, j] = select(mask, 0.0, P[i, j])
     for i in range(3):
-        L[R + i, R + i] = select(mask, inflation * p.position_sigma_I[i], L[R + i, R + i])
-        speed = math.sqrt(p.initial_velocity_variance + v_variance[i])
-        L[V + i, V + i] = select(mask, speed, L[V + i, V + i])
-        tilt = select(level, p.initial_tilt_sigma, attitude)
-        angle = heading if i == 2 else math.sqrt(tilt * tilt + tilt_variance[i])
-        L[E + i, E + i] = select(mask, angle, L[E + i, E + i])
-        L[BA + i, BA + i] = select(mask, p.accel_bias_sigma, L[BA + i, BA + i])
-        L[BG + i, BG + i] = select(mask, p.gyro_bias_sigma, L[BG + i, BG + i])
-    _tie_position_to_attitude(L, R_BI, load3(p.antenna), mask & level)
+        place, angle = inflation * p.position_sigma_I[i], tilt * tilt + tilt_variance[i]
+        if i == 2:
+            angle = heading * heading
+        _put(P, R + i, mask, place * place)
+        _put(P, V + i, mask, p.initial_velocity_variance + v_variance[i])
+        _put(P, E + i, mask, angle)
+        _put(P, BA + i, mask, p.accel_bias_sigma * p.accel_bias_sigma)
+        _put(P, BG + i, mask, p.gyro_bias_sigma * p.gyro_bias_sigma)
+    _tie_position_to_attitude(P, R_BI, load3(p.antenna), mask & level)
 
 
 @kernel
@@ -284,7 +287,6 @@ def forget_innovations_stage(flight, world, model, settings, work, stages, flag)
 # --------------------------------------------------------------------------------------------------
 
 _OK, _RANGE = int(Outcome.OK), int(Outcome.OUT_OF_RANGE)
-_R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
 
 
 @kernel
@@ -354,9 +356,9 @@ def _set_magnetic_heading(s, fix):
 
 @kernel
 def start_still(s):
-    """Compute position, attitude and factor of the covariance of a START record."""
-    n = _D + s.slow_states
-    G, e, T = s.factor, s.e, s.T
+    """Compute position, attitude and covariance of a START record."""
+    n = D + s.slow_states
+    G, e, T = s.root, s.e, s.T
     for j in range(n + 1):
         for i in range(n):
             G[i, j] = 0.0
@@ -371,24 +373,24 @@ def start_still(s):
     for j in range(n + 1):
         e_x, e_y, e_z = e[0, j], e[1, j], e[2, j]
         for i in range(3):
-            G[_E + i, j] = T[i, 0] * e_x + T[i, 1] * e_y + T[i, 2] * e_z
+            G[E + i, j] = T[i, 0] * e_x + T[i, 1] * e_y + T[i, 2] * e_z
     k = (T[0, 2], T[1, 2], T[2, 2])
     bend = math.sqrt(0.75) * _variance(e, n)  # of second order in the heading, see there
-    G[_E, n], G[_E + 1, n] = bend * k[1] * k[2], -bend * k[0] * k[2]
-    G[_E + 2, n] = -bend * k[0] * k[1]
+    G[E, n], G[E + 1, n] = bend * k[1] * k[2], -bend * k[0] * k[2]
+    G[E + 2, n] = -bend * k[0] * k[1]
     for j in range(n + 1):  # r = antenna - R^T l
-        e_j = vector(G[_E, j], G[_E + 1, j], G[_E + 2, j])
+        e_j = vector(G[E, j], G[E + 1, j], G[E + 2, j])
         moved = R_BI.T @ cross(lever, e_j)
         for i in range(3):
-            G[_R + i, j] = moved[i]
+            G[R + i, j] = moved[i]
     for i in range(3):
         for j in range(3):
-            G[_R + i, j] += s.position_root[i, j]
-        G[_V + i, _V + i] = s.velocity_sigma[i]
-        G[_BA + i, _BA + i], G[_BG + i, _BG + i] = s.accel_bias_sigma, s.gyro_bias_sigma
+            G[R + i, R + j] += s.position_root[i, j]
+        G[V + i, V + i] = s.velocity_sigma[i]
+        G[BA + i, BA + i], G[BG + i, BG + i] = s.accel_bias_sigma, s.gyro_bias_sigma
     for i in range(s.slow_states):
-        G[_D + i, _D + i] = s.slow_sigma[i]
-    _reduce(G, n)
+        G[D + i, D + i] = s.slow_sigma[i]
+    _square(G, s.P, n)
 
 
 @kernel
@@ -405,46 +407,32 @@ def _error_angles(s, e, T, n):
     """Set the error angles in the level frame, by independent errors."""
     bias = s.tilt_of_bias * s.accel_bias_sigma
     for i in range(3):
-        e[0, _BA + i], e[1, _BA + i] = -bias * T[i, 1], bias * T[i, 0]
-    e[0, _E] = s.tilt_sigma
-    e[1, _E + 1] = s.tilt_sigma
+        e[0, BA + i], e[1, BA + i] = -bias * T[i, 1], bias * T[i, 0]
+    e[0, E] = s.tilt_sigma
+    e[1, E + 1] = s.tilt_sigma
     for j in range(n):
         e[2, j] = s.heading_of_tilt[0] * e[0, j] + s.heading_of_tilt[1] * e[1, j]
-    e[2, _E + 2] = s.heading_sigma
+    e[2, E + 2] = s.heading_sigma
     for i in range(s.slow_states):
-        e[2, _D + i] = s.heading_of_slow[i] * s.slow_sigma[i]
+        e[2, D + i] = s.heading_of_slow[i] * s.slow_sigma[i]
     variance = _variance(e, n)
     turned = bias * math.sqrt(variance)  # an error of the tilt by one of the heading
     steepness = math.sqrt(T[0, 2] * T[0, 2] + T[1, 2] * T[1, 2])
     third = math.sqrt(15.0 * variance * variance * variance) / 6.0 * steepness
     tilt = math.sqrt(s.tilt_sigma * s.tilt_sigma + turned * turned + third * third)
-    e[0, _E] = tilt
-    e[1, _E + 1] = tilt
+    e[0, E] = tilt
+    e[1, E + 1] = tilt
 
 
 @kernel
-def _reduce(G, n):
-    """Replace G (n, n + 1) by the lower factor L of L L^T = G G^T, by reflections of columns."""
-    for k in range(n):
-        square = 0.0
-        for j in range(k, n + 1):
-            square += G[k, j] * G[k, j]
-        size = math.sqrt(square)
-        if size > 0.0:
-            v_k = G[k, k] + math.copysign(size, G[k, k])
-            half = size * abs(v_k)
-            for i in range(k + 1, n):
-                along = v_k * G[i, k]
-                for j in range(k + 1, n + 1):
-                    along += G[k, j] * G[i, j]
-                along = along / half
-                # the reflected column, with the sign that makes the diagonal positive
-                G[i, k] = math.copysign(1.0, v_k) * (along * v_k - G[i, k])
-                for j in range(k + 1, n + 1):
-                    G[i, j] -= along * G[k, j]
-            G[k, k] = size
-        for j in range(k + 1, n + 1):
-            G[k, j] = 0.0
+def _square(G, P, n):
+    """Fill P (n, n) with G G^T."""
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n + 1):
+                total += G[i, k] * G[j, k]
+            P[i, j] = total
 
 
 # --------------------------------------------------------------------------------------------------
@@ -552,16 +540,15 @@ def _start_warm(flight, p, work, settings, stages, slow):
     one = 1.0 + zero_like(T[0][0])
     eye = diagonal((one, one, one))
     for i in range(0, states, 3):
-        left = T if i < E else eye  # the rest is in B
+        left = T if i in (R, V) else eye  # the rest is in B
         if slow is not None:
             left = _turn_of_slow(slow, i, T, left)
         for j in range(0, i + 3, 3):
-            right = T if j < E else eye
+            right = T if j in (R, V) else eye
             if slow is not None:
                 right = _turn_of_slow(slow, j, T, right)
             store_block(P, i, j, left @ load_block(settings.warm_covariance, i, j) @ right.T)
-    cholesky(P, states, work.inverse_diagonal)  # P is known to be positive definite
-    keep_factor(flight, slow, work, mask)
+    keep_covariance(flight, slow, P, mask)
     if slow is not None:
         if slow.estimates_drift:
             s = load3(settings.warm_drift_sigma)

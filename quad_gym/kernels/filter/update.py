@@ -1,6 +1,15 @@
 """The measurement update of the filter, with all blocks of a measurement at once.
 
-See `predict.py` for the form of the unscented transform, and for the EKF. Sensors
+See `predict.py` for the form of the unscented transform, and for the EKF. The update never forms
+P_zz. With A and E the columns a / c and s / c of the measurement, and Rz = E E^T + (beta - alpha^2)
+mu mu^T + R its noise, so that P_zz = A A^T + Rz, the matrix inversion lemma gives
+
+    P+ = L1 (I + C C^T)^-1 L1^T + diag(0, S),  C = A^T Rz^-T/2,
+
+over the columns L1 that measurements depend on (`columns.py`). As a sum of squares it stays
+accurate when a measurement is 10^8 times as good as the prediction.
+
+Sensors
 (`kernels/sensors/`) fill three rows of the stacked measurement for each block. A block that a lane
 lacks is masked: its columns and innovation are zero and its noise is one, which gives exactly the
 update without it. Blocks that no lane has are left out.
@@ -11,11 +20,11 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
+from quad_gym.kernels.filter.columns import columns_of, factor_columns, keep_updated, row_of
+from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     call_measured,
-    columns_of,
     count_failure,
     count_measured,
     flag_shifted,
@@ -34,7 +43,7 @@ from quad_gym.kernels.filter.progressive import (
     share_second_order,
     show_hidden,
 )
-from quad_gym.kernels.filter.slow import load_slow, shift_slow, stages_of, turn_iron
+from quad_gym.kernels.filter.slow import shift_slow, stages_of, turn_iron
 from quad_gym.kernels.numbers.elementary import is_finite, maximum
 from quad_gym.kernels.numbers.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
@@ -48,6 +57,7 @@ from quad_gym.kernels.numbers.linalg import (
     outer,
     store,
     store_block,
+    store_column3,
     sum_of_outers,
     sum_of_outers_of_rows,
     sum_of_squares,
@@ -63,10 +73,10 @@ from quad_gym.records import Act, FilterForm
 
 
 @kernel
-def _split_turns(flight, work, c, form):
+def _split_turns(work, c, form):
     """Fill work.odd and work.even with the rotations of the sigma points."""
-    for j in range(9):
-        d = c * load_column3(flight.L, E, j)
+    for j in range(3):  # other columns do not change the attitude
+        d = c * load_column3(work.L, E, j)
         even, odd, _ = split_rotation(d)
         if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
             even, odd = split_turn(d)
@@ -75,12 +85,12 @@ def _split_turns(flight, work, c, form):
 
 
 @kernel
-def _mean_even(work, n, c):
+def _mean_even(work, n, c, rows):
     """Fill work.mu with the mean of the sigma points minus the center."""
     even, mu = work.E, work.mu
     for k in range(n):
         total = even[0, k]
-        for j in range(1, 9):
+        for j in range(1, rows):
             total = total + even[j, k]
         mu[k] = total / c
 
@@ -93,7 +103,7 @@ def _innovate(work, n):
 
 
 @kernel
-def _sum_noise(p, work, n, factor):
+def _sum_noise(p, work, n, factor, rows):
     """Multiply the measurement noise in work.Rz by `factor` and add the even parts' share."""
     even, mu = work.E, work.mu
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
@@ -101,7 +111,7 @@ def _sum_noise(p, work, n, factor):
         mu_i = excess * vector(mu[i], mu[i + 1], mu[i + 2])
         for j in range(0, i + 3, 3):
             mu_j = vector(mu[j], mu[j + 1], mu[j + 2])
-            block = sum_of_outers_of_rows(even, even, i, j, 9) + outer(mu_i, mu_j)
+            block = sum_of_outers_of_rows(even, even, i, j, rows) + outer(mu_i, mu_j)
             if i == j:
                 block = factor * load_block(work.Rz, i, i) + block
             store_block(work.Rz, i, j, block)
@@ -138,10 +148,10 @@ def update(flight, p, work, settings, stages, slow):
             hidden = hide_unsure(flight, work, settings.feature_count, mask)
     failures, step, last = flight.update_failures, 0, 0
     while step <= last:
-        n = _expect(flight, p, work, settings, stages, slow)
+        n, pivot = _expect(flight, p, work, settings, stages, slow)
         if n > 0:
             if not extended or gradual:
-                _mean_even(work, n, work.spread)
+                _mean_even(work, n, work.spread, settings.motion_columns)
             if gradual and step == 0:
                 further = count_steps(flight, p, work, settings, mask)
                 for m in range(1, MOST_STEPS + 1):
@@ -149,12 +159,12 @@ def update(flight, p, work, settings, stages, slow):
                         last = m
             if extended:
                 curved = any_of(further > 0.0)
-                drop_even(work, n, further < 1.0, curved)
+                drop_even(work, n, settings.motion_columns, further < 1.0, curved)
             well = flight.update_failures == failures  # a step that fails is the last
             taking = mask & well & (further >= 1.0 * step)
             factor = factor_of(further, step)
             steps = (step, further, factor, curved)
-            _update_by(flight, p, work, settings, stages, n, taking, steps, slow)
+            _update_by(flight, p, work, settings, stages, n, taking, steps, pivot, slow)
         step += 1
     if settings.by_motion:
         call_stage(stages, Stage.MOTION, flight, p, p, settings, work, 1)
@@ -197,17 +207,15 @@ def _whiten(work, n, columns):
 
 
 @kernel
-def _correct(flight, work, states, columns, slow):
-    """Fill work.L9 with L9 M^-T, the updated factor, and work.dx; return the sum of dx.
+def _correct(work, states, columns):
+    """Fill work.L9 with L1 M^-T, the root of the updated covariance, and work.dx; return its sum.
 
-    With the columns last first, L9 M^-T is the updated factor's, last first again.
+    The columns are last first, so that L1 M^-T is a lower triangle as L1 is.
     """
-    L, L9, y, dx, last = flight.L, work.L9, work.y, work.dx, columns - 1
-    for i in range(15):
-        for j in range(min(columns, 15)):
-            L9[i, last - j] = L[i, j]
-    if slow is not None:
-        load_slow(flight, slow, L9)
+    L9, y, dx, last = work.L9, work.y, work.dx, columns - 1
+    for i in range(states):
+        for j in range(columns):
+            L9[i, last - j] = work.L[i, j]
     solve_right(L9, states, work.M, columns, work.inverse_diagonal, columns - 3)
     total = zero_like(work.spread)
     for i in range(states):
@@ -220,55 +228,59 @@ def _correct(flight, work, states, columns, slow):
 
 
 @kernel
-def _keep(flight, p, work, form, columns, ok, slow):
-    """Keep the updated estimate and factor, in the lanes `ok`."""
-    L, L9, dx, last = flight.L, work.L9, work.dx, columns - 1
+def _keep(flight, p, work, form, states, columns, ok, slow):
+    """Keep the updated estimate and covariance, in the lanes `ok`."""
+    dx, v, b_a, b_g = work.dx, row_of(slow, V), row_of(slow, BA), row_of(slow, BG)
     keep(flight.r_hat, ok, load3(flight.r_hat) + load3(dx[R:]))
-    keep(flight.v_hat, ok, load3(flight.v_hat) + load3(dx[V:]))
+    keep(flight.v_hat, ok, load3(flight.v_hat) + load3(dx[v:]))
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
-        keep(flight.v_corrected, ok, load3(flight.v_corrected) + load3(dx[V:]))
+        keep(flight.v_corrected, ok, load3(flight.v_corrected) + load3(dx[v:]))
     if (form & MONITORED) != 0:
-        follow_corrections(flight, p, L9, dx, columns, ok, slow)
+        follow_corrections(flight, p, work, columns, ok, slow)
     turn = euler_to_dcm(load3(dx[E:]))
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
         turn = vector_to_dcm(load3(dx[E:]))
     keep(flight.R_hat, ok, turn @ load33(flight.R_hat))
-    keep(flight.b_a_hat, ok, load3(flight.b_a_hat) + load3(dx[BA:]))
-    keep(flight.b_g_hat, ok, load3(flight.b_g_hat) + load3(dx[BG:]))
-    for i in range(15):
-        for j in range(min(i + 1, columns)):
-            L[i, j] = select(ok, L9[i, last - j], L[i, j])
+    keep(flight.b_a_hat, ok, load3(flight.b_a_hat) + load3(dx[b_a:]))
+    keep(flight.b_g_hat, ok, load3(flight.b_g_hat) + load3(dx[b_g:]))
+    keep_updated(flight, work, slow, states, columns, ok)
     if slow is not None:
-        shift_slow(flight, slow, L9, ok, dx)
+        shift_slow(flight, slow, ok, dx)
 
 
 @kernel
 def _expect(flight, p, work, settings, stages, slow):
-    """Fill the stacked measurement, its prediction, noise and columns; return its length."""
+    """Fill the stacked measurement, its prediction, noise and columns.
+
+    Returns:
+        Its length, and the least pivot of the covariance: negative or NaN where this is none.
+    """
     n, form = count_measured(flight, work, settings), settings.form
-    estimated = 15
+    states, estimated, pivot = 15, 15, zero_like(p.sigma_spread)
     if slow is not None:
+        states = 15 + slow.slow_states
         estimated = 15 + slow.slow_errors  # the others only fill up a block
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + work.measured)
     work.spread, work.inverse_spread = c, 1.0 / c
     if n > 0:
+        pivot = factor_columns(flight, work, slow, states, columns_of(settings))
         if (form & FilterForm.EKF.value) == 0 or (form & FilterForm.GRADUAL.value) != 0:
-            _split_turns(flight, work, c, form)
+            _split_turns(work, c, form)
         call_measured(flight, p, work, settings, stages, Act.EXPECT)
-    return n
+    return n, pivot
 
 
 @kernel
-def _update_by(flight, p, work, settings, stages, n, mask, steps, slow):
+def _update_by(flight, p, work, settings, stages, n, mask, steps, pivot, slow):
     """Update with the n measurements, in the lanes `mask`.
 
     `steps`: the number of this step with these measurements, the number of steps that follow the
-    first, the factor on the noise, and True if second-order terms count.
+    first, the factor on the noise, and True if second-order terms count. `pivot`: see `_expect`.
     """
     step, further, factor, curved = steps
-    form, columns, states = settings.form, 9, 15
+    form, columns, states = settings.form, columns_of(settings), 15
     if slow is not None:
-        columns, states = columns_of(slow), 15 + slow.slow_states
+        states = 15 + slow.slow_states
     measured = work.measured
     _innovate(work, n)
     if (form & MONITORED) != 0:
@@ -278,14 +290,14 @@ def _update_by(flight, p, work, settings, stages, n, mask, steps, slow):
         call_stage(stages, Stage.GATE, flight, p, p, settings, work, 0)
         measured = measured - work.left_out
     if any_of(further > FEW):
-        share_second_order(work, n, further)
+        share_second_order(work, n, settings.motion_columns, further)
     if curved:
-        _sum_noise(p, work, n, factor)
+        _sum_noise(p, work, n, factor, settings.motion_columns)
     else:
         _put_noise(work, n)
     along, without = without_directions(flight, p, work, settings)
     nis, definite = _whiten(work, n, columns)
-    total = _correct(flight, work, states, columns, slow)
+    total = _correct(work, states, columns)
     if (form & FilterForm.TURN.value) != 0:
         correction = load3(work.dx[E:])
         T = reset_matrix(correction)
@@ -293,10 +305,11 @@ def _update_by(flight, p, work, settings, stages, n, mask, steps, slow):
             T = vector_to_dcm(correction)
         if slow is not None:
             turn_iron(flight, slow, p, work.L9, T, correction, columns)
-        turn_factor(work.L9, T, states, columns)
+        for j in range(columns - 3, columns):
+            store_column3(work.L9, E, j, T @ load_column3(work.L9, E, j))
     wanted = mask & (measured > 0.0)
-    ok = wanted & definite & is_finite(total) & is_finite(nis)
-    _keep(flight, p, work, form, columns, ok, slow)
+    ok = wanted & definite & (pivot >= 0.0) & is_finite(total) & is_finite(nis)
+    _keep(flight, p, work, form, states, columns, ok, slow)
     nis = maximum(nis - along, 0.0)  # a difference of rounding errors where it is zero
     if (form & FilterForm.GATE.value) != 0:
         nis = select(work.used_nis > 0.0, nis * work.suite_nis / work.used_nis, nis)

@@ -5,7 +5,19 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.numbers.elementary import minimum
 from quad_gym.kernels.numbers.lanes import select, zero_like
-from quad_gym.kernels.numbers.linalg import load_block, load_column3, outer, store_block
+from quad_gym.kernels.numbers.linalg import (
+    add_to_diagonal,
+    load_block,
+    load_column3,
+    load_symmetric,
+    outer,
+    store_block,
+)
+
+KNOWN = 1e-30
+
+
+"""Variance of a state that is exactly known, added to the others, too, which it does not change."""
 
 
 @kernel
@@ -86,6 +98,47 @@ def cholesky(a, n, inverse_diagonal):
             for k in range(j):
                 block = block - outer(load_column3(a, i, k), load_column3(a, j, k))
             store_block(a, i, j, solve_right33(block, factor))
+    return least
+
+
+@kernel
+def eliminate(a, factor, n, columns):
+    """Fill `factor` with the first `columns` of the Cholesky factor of a (n, n), and with the rest.
+
+    The rest, behind and below these columns, is the Schur complement: what remains of the lower
+    triangle of a. Above the diagonal, the columns are zero. Both numbers are multiples of three.
+
+    Returns:
+        The least of the pivots and the diagonal of the rest: negative, or NaN, where the matrix
+        is no covariance, except where only the rest is none.
+    """
+    zero = zero_like(a[0, 0])
+    none = ((zero, zero, zero), (zero, zero, zero), (zero, zero, zero))
+    least = a[0, 0]
+    for j in range(0, n, 3):
+        block, known = load_symmetric(a, j), min(j, columns)
+        for k in range(known):
+            column = load_column3(factor, j, k)
+            block = block - outer(column, column)
+        if j < columns:
+            for i in range(0, j, 3):
+                store_block(factor, i, j, none)
+            inverse, diagonal, pivot = cholesky33(add_to_diagonal(block, KNOWN))
+            x = select(block[0][0] == 0.0, 0.0, diagonal[0])
+            y = select(block[1][1] == 0.0, 0.0, diagonal[1])
+            z = select(block[2][2] == 0.0, 0.0, diagonal[2])
+            block = lower33(inverse, (x, y, z))
+        else:
+            inverse, pivot = block, minimum(minimum(block[0][0], block[1][1]), block[2][2])
+        store_block(factor, j, j, block)
+        least = select(pivot < least, pivot, select(pivot == pivot, least, pivot))
+        for i in range(j + 3, n, 3):
+            block = load_block(a, i, j)
+            for k in range(known):
+                block = block - outer(load_column3(factor, i, k), load_column3(factor, j, k))
+            if j < columns:
+                block = solve_right33(block, inverse)
+            store_block(factor, i, j, block)
     return least
 
 

@@ -449,6 +449,30 @@ def load_block(a, i, j):
 
 
 @kernel
+def load_symmetric(a, i):
+    """The 3 x 3 block on the diagonal of a symmetric matrix, from its lower triangle."""
+    xx, yx, yy = a[i, i], a[i + 1, i], a[i + 1, i + 1]
+    zx, zy, zz = load_row3(a, i + 2, i)
+    return ((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))
+
+
+@kernel
+def keep_lower(a, i, mask, m):
+    """Write the lower triangle of a 3 x 3 block on the diagonal, in the lanes `mask`."""
+    for k in range(3):
+        for j in range(k + 1):
+            a[i + k, i + j] = select(mask, m[k][j], a[i + k, i + j])
+
+
+@kernel
+def keep_block(a, i, j, mask, m):
+    """Write a 3 x 3 block, in the lanes `mask`."""
+    for k in range(3):
+        for n in range(3):
+            a[i + k, j + n] = select(mask, m[k][n], a[i + k, j + n])
+
+
+@kernel
 def store_block(a, i, j, m):
     """Write a 3 x 3 block."""
     a[i, j], a[i, j + 1], a[i, j + 2] = m[0]

@@ -8,7 +8,7 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.numbers.elementary import atan2, sin_cos, sin_cos_minus_one
 from quad_gym.kernels.numbers.lanes import select, zero_like
-from quad_gym.kernels.numbers.linalg import unit_or
+from quad_gym.kernels.numbers.linalg import add_to_diagonal, unit_or
 
 
 @kernel
@@ -22,6 +22,12 @@ def euler_to_dcm(e):
         (-c_phi * s_psi, c_phi * c_psi, s_phi),
         (c_psi * s_th + c_th * s_phi * s_psi, s_psi * s_th - c_psi * c_th * s_phi, c_phi * c_th),
     )
+
+
+@kernel
+def orthonormal(R):
+    """R without rounding errors that make it no rotation: a Newton step toward orthonormality."""
+    return R - 0.5 * (add_to_diagonal(R @ R.T, -1.0) @ R)
 
 
 @kernel

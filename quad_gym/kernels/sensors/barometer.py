@@ -6,8 +6,9 @@ filter (`filter/slow.py`). The model is linear, so sigma points and derivatives 
 """
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.columns import columns_of
 from quad_gym.kernels.filter.error_state import D, R, reset_variance
-from quad_gym.kernels.filter.measurements import columns_of, put_block, put_three
+from quad_gym.kernels.filter.measurements import put_block, put_three
 from quad_gym.kernels.numbers.elementary import maximum
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import diagonal, load3
@@ -34,11 +35,11 @@ def _expect(flight, p, work, settings, i, k, valid):
     z = load3(flight.aid_measurement[_ROW])
     put_block(work, settings, k, valid, z, (altitude, zero, zero), noise)
     for j in range(last + 1):
-        value = flight.L_slow[first, j]
+        value = work.L[settings.motion_columns + first, j]
         if j <= R + 2:
-            value = value + flight.L[R + 2, j]
+            value = value + work.L[R + 2, j]
         put_three(work.A[last - j], k, valid, (value, zero, zero))
-    for j in range(9):
+    for j in range(settings.motion_columns):
         put_three(work.E[j], k, valid, (zero, zero, zero))
 
 

@@ -17,12 +17,13 @@ so it would pass any gate, and its update would be wrong and overconfident.
 import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.columns import columns_of
 from quad_gym.kernels.filter.error_state import MAX_ANGLE, D, E, R, reset_variances
 from quad_gym.kernels.filter.measurements import (
     by_derivative,
-    columns_of,
     direction_noise,
     direction_pair,
+    direction_shift,
     put_block,
     put_three,
     with_pairs,
@@ -132,11 +133,14 @@ def _center(flight, p, work, settings, k, i, R_BI, pixel_sigma):
 
 @kernel
 def _column(flight, p, work, settings, k, j, A, S, R_BI):
-    """Fill the rows of all features in column j, with a derivative or a pair of sigma points."""
-    L, c, inverse_c, camera = flight.L, work.spread, work.inverse_spread, load3(p.camera)
+    """Fill the rows of all features in column j, with a derivative or a pair of sigma points.
+
+    Columns from the fourth on do not change the attitude.
+    """
+    L, c, inverse_c, camera = work.L, work.spread, work.inverse_spread, load3(p.camera)
     d, dr_B = load_column3(L, E, j), load_column3(L, R, j)
     dr_B = R_BI @ dr_B if by_derivative(settings) else R_BI @ (c * dr_B)
-    odd, even = load33(work.odd[j]), load33(work.even[j])
+    odd, even = load33(work.odd[min(j, 2)]), load33(work.even[min(j, 2)])
     for i in range(settings.feature_count):
         valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
         if any_of(valid):
@@ -145,8 +149,11 @@ def _column(flight, p, work, settings, k, j, A, S, R_BI):
             if with_pairs(settings):
                 # (I + even +- odd) (X_B -+ dr_B) - l_c
                 shift = c * dr_B if by_derivative(settings) else dr_B
-                v_odd, v_even = turn_pair(even, odd, X_B, shift)
-                a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
+                if j >= 3:
+                    a, s = direction_shift(X_B - camera, per_distance, -shift)
+                else:
+                    v_odd, v_even = turn_pair(even, odd, X_B, shift)
+                    a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
                 a, s = inverse_c * a, inverse_c * s
             if by_derivative(settings):
                 u_B = load3(work.z_hat[k : k + 3])
@@ -167,8 +174,8 @@ def _expect(flight, p, work, settings, k):
             _center(flight, p, work, settings, end, i, R_BI, pixel_sigma)
             end += 3
     last = columns_of(settings) - 1
-    for j in range(9):
-        _column(flight, p, work, settings, k, j, work.A[last - j], work.E[8 - j], R_BI)
+    for j in range(settings.motion_columns):
+        _column(flight, p, work, settings, k, j, work.A[last - j], work.E[j], R_BI)
 
 
 @kernel

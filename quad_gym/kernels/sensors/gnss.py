@@ -3,9 +3,9 @@
 import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.columns import columns_of
 from quad_gym.kernels.filter.error_state import D, R, V, reset_heading, reset_variances
 from quad_gym.kernels.filter.measurements import (
-    columns_of,
     direction_noise,
     lever_column,
     put_block,
@@ -101,15 +101,15 @@ def expect_position(flight, p, work, settings, k, valid):
     z = load33(p.R_IG) @ load3(flight.gnss_position)
     noise = diagonal((s[0] * s[0], s[1] * s[1], s[2] * s[2]))
     put_block(work, settings, k, valid, z, antenna_I, noise)
-    for j in range(9):
-        a, s = lever_column(flight, work, settings, j, R_BI, l_B)
-        put_column(work, settings, k, j, valid, load_column3(flight.L, R, j) + a, s)
+    for j in range(settings.motion_columns):
+        a, s = lever_column(work, settings, j, R_BI, l_B)
+        put_column(work, settings, k, j, valid, load_column3(work.L, R, j) + a, s)
     if settings.estimates_drift:
-        last = columns_of(settings) - 1
+        last, first = columns_of(settings) - 1, settings.motion_columns
         for j in range(last + 1):
             row = work.A[last - j]
             for i in range(3):
-                row[k + i] = row[k + i] + select(valid, flight.L_slow[i, j], 0.0)
+                row[k + i] = row[k + i] + select(valid, work.L[first + i, j], 0.0)
 
 
 @kernel
@@ -187,8 +187,8 @@ def expect_baseline(flight, p, work, settings, k, valid):
         up = cross(u_I, side)
         noise = noise + outer(select(alone, along, 0.0) * up, up)
     put_block(work, settings, k, valid, (1.0 / norm(z)) * z, u_I, noise)
-    for j in range(9):
-        a, s = lever_column(flight, work, settings, j, R_BI, u_B)
+    for j in range(settings.motion_columns):
+        a, s = lever_column(work, settings, j, R_BI, u_B)
         put_column(work, settings, k, j, valid, a, s)
 
 
@@ -225,11 +225,11 @@ def expect_velocity(flight, p, work, settings, k, valid):
     lever_B = cross(load3(flight.w_meas) - load3(flight.b_g_hat), load3(p.antenna))
     z, z_hat = load33(p.R_IG) @ load3(flight.gnss_velocity), load3(flight.v_hat) + R_BI.T @ lever_B
     put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
-    for j in range(9):
-        dv = load_column3(flight.L, V, j)
+    for j in range(settings.motion_columns):
+        dv = load_column3(work.L, V, j)
         s = zero_like(dv)
         if settings.slow_states > 0:
-            a, s = lever_column(flight, work, settings, j, R_BI, lever_B)
+            a, s = lever_column(work, settings, j, R_BI, lever_B)
             dv = dv + a
         put_column(work, settings, k, j, valid, dv, s)
 

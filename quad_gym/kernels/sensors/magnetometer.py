@@ -24,27 +24,21 @@ along s, so that the derivative relates the heading's error to others:
 import math
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.columns import columns_of
 from quad_gym.kernels.filter.error_state import (
     BA,
     D,
     E,
     R,
     V,
-    put_covariance,
+    keep_covariance,
+    load_covariance,
     reset_heading,
     reset_variances,
 )
-from quad_gym.kernels.filter.measurements import (
-    by_derivative,
-    columns_of,
-    put_block,
-    put_three,
-    with_pairs,
-)
-from quad_gym.kernels.filter.slow import keep_factor
+from quad_gym.kernels.filter.measurements import by_derivative, put_block, put_three, with_pairs
 from quad_gym.kernels.filter.starts import lever_of_attitude
 from quad_gym.kernels.numbers.elementary import maximum, sin_cos
-from quad_gym.kernels.numbers.factors import cholesky
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
@@ -56,6 +50,7 @@ from quad_gym.kernels.numbers.linalg import (
     load33,
     load_block,
     load_column3,
+    load_symmetric,
     outer,
     rounded,
     store,
@@ -97,22 +92,15 @@ def _align(flight, p, work, settings, mask):
     P, R_BI = work.P, load33(flight.R_hat)
     m, z = load3(p.aid_numbers[_N]), load3(flight.aid_measurement[_ROW])
     R_BI = R_BI @ level_attitude(R_BI.T @ z, m)
-    put_covariance(P, flight.L, 1.0)
+    load_covariance(P, flight, None)
     for i in range(settings.slow_states):
         for j in range(D + i):
             P[D + i, j] = zero_like(p.dt)
-        sigma = p.slow_sigma[i]
-        P[D + i, D + i] = select(sigma > 0.0, sigma * sigma, 1.0)  # GNSS has not drifted yet
+        P[D + i, D + i] = p.slow_sigma[i] * p.slow_sigma[i]
     iron, delta = D + settings.aid_vector[_S], D + settings.aid_scalar[_S]
     _tie_heading(p, P, m, R_BI, iron, delta)
     _tie_position(p, P, R_BI, iron, delta)
-    cholesky(P, D + settings.slow_states, work.inverse_diagonal)
-    keep_factor(flight, None, work, mask)
-    for i in range(settings.slow_states):
-        estimated = mask & (p.slow_sigma[i] > 0.0)
-        for j in range(D + i + 1):
-            kept = flight.L_slow[i, j]
-            flight.L_slow[i, j] = select(estimated, P[D + i, j], kept)
+    keep_covariance(flight, settings, P, mask)
     antenna_I = load33(p.R_IG) @ load3(flight.gnss_position)
     keep(flight.R_hat, mask, R_BI)
     keep(flight.r_hat, mask, antenna_I - R_BI.T @ load3(p.antenna))
@@ -130,8 +118,8 @@ def _tie_heading(p, P, m, R_BI, iron, delta):
     P_bb, P_dd = P[iron, iron], P[delta, delta]
     white = p.initial_covariance_scale * p.aid_sigma[_S] * p.aid_sigma[_S]
     alone = P_dd + (white + P_bb) / (level * level)
-    store_block(P, E, E, F @ _full(P) @ F.T + outer(alone * k, k))
-    store_block(P, E, V, F @ load_block(P, E, V))
+    store_block(P, E, E, F @ load_symmetric(P, E) @ F.T + outer(alone * k, k))
+    store_block(P, V, E, load_block(P, V, E) @ F.T)
     for i in range(BA, D, 3):
         store_block(P, i, E, load_block(P, i, E) @ F.T)
     with_iron = P_bb / level * s
@@ -144,22 +132,15 @@ def _tie_heading(p, P, m, R_BI, iron, delta):
 def _tie_position(p, P, R_BI, iron, delta):
     """Correlate the position with the attitude in P, as an antenna is measured: `starts.py`."""
     J, s = lever_of_attitude(R_BI, load3(p.antenna)), load3(p.position_sigma_I)
-    k, with_attitude = p.initial_covariance_scale, _full(P) @ J.T
+    k, with_attitude = p.initial_covariance_scale, load_symmetric(P, E) @ J.T
     white = diagonal((k * s[0] * s[0], k * s[1] * s[1], k * s[2] * s[2]))
     store_block(P, R, R, white + J @ with_attitude)
-    store_block(P, E, R, with_attitude)
-    store_block(P, V, R, load_block(P, E, V).T @ J.T)
+    store_block(P, R, E, with_attitude.T)
+    store_block(P, V, R, load_block(P, V, E) @ J.T)
     for i in range(BA, D, 3):
         store_block(P, i, R, load_block(P, i, E) @ J.T)
     for i in (iron, iron + 1, iron + 2, delta):
-        store(P[i], J @ load3(P[i, E : E + 3]))
-
-
-@kernel
-def _full(P):
-    """Full covariance of the error angles, from the lower triangle in P."""
-    (a, _, _), (b, c, _), (d, e, f) = load_block(P, E, E)
-    return ((a, b, d), (b, c, e), (d, e, f))
+        store(P[i, R : R + 3], J @ load3(P[i, E : E + 3]))
 
 
 @kernel
@@ -173,16 +154,17 @@ def _expected_field(flight, p, settings):
 @kernel
 def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2."""
-    L, M, inverse_c, last = flight.L, flight.L_slow, work.inverse_spread, columns_of(settings) - 1
+    L, inverse_c, last = work.L, work.inverse_spread, columns_of(settings) - 1
     first, delta = settings.aid_vector[_S], settings.aid_scalar[_S]
     f_B, g_B = _expected_field(flight, p, settings)
     z, variance = load3(flight.aid_measurement[_ROW]), p.aid_sigma[_S] * p.aid_sigma[_S]
     z_hat = f_B + load3(flight.slow_hat[first : first + 3])
     put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
+    iron, declination = settings.motion_columns + first, settings.motion_columns + delta
     for j in range(last + 1):
-        db, turned = load_column3(M, first, j), M[delta, j] * g_B
+        db, turned = load_column3(L, iron, j), L[declination, j] * g_B
         a, s = turned + db, zero_like(db)
-        if j < 9:
+        if j < 3:  # other columns do not change the attitude
             odd, even = load33(work.odd[j]), load33(work.even[j])
             if with_pairs(settings):
                 s = odd @ turned + inverse_c * (even @ f_B)
@@ -190,7 +172,8 @@ def _expect(flight, p, work, settings, i, k, valid):
                 a = a + cross(f_B, load_column3(L, E, j))
             else:
                 a = a + (even @ turned + inverse_c * (odd @ f_B))
-            put_three(work.E[8 - j], k, valid, s)
+        if j < settings.motion_columns:
+            put_three(work.E[j], k, valid, s)
         put_three(work.A[last - j], k, valid, a)
 
 

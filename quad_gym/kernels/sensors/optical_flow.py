@@ -71,7 +71,7 @@ def _flow(g, v_B):
 @kernel
 def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2: two rates, and a masked row."""
-    L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
+    L, R_BI, inverse_c, c = work.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
     h, W = maximum(h, 0.5 * p.aid_numbers[_N, 0]), R_BI @ load3(flight.v_hat)
     G, z_B, zero, w = u / h, R_BI.T[2], zero_like(h), load3(flight.w_meas) - load3(flight.b_g_hat)
@@ -79,7 +79,7 @@ def _expect(flight, p, work, settings, i, k, valid):
     variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
     noise = diagonal((variance, variance, zero + 1.0))
     put_block(work, settings, k, valid, load3(flight.aid_measurement[_ROW]), z_hat, noise)
-    for j in range(9):
+    for j in range(settings.motion_columns):
         dV, dh = R_BI @ load_column3(L, V, j), L[R + 2, j] if j <= R + 2 else zero
         a, s = (zero, zero, zero), (zero, zero, zero)
         if by_derivative(settings):
@@ -87,7 +87,10 @@ def _expect(flight, p, work, settings, i, k, valid):
             du = cross(z_B, e)[2]
             a = _flow(G, dV + cross(W, e)) + _flow((du - G * dh) / h, W)
         if with_pairs(settings):
-            odd, even = load33(work.odd[j]), load33(work.even[j])
+            zeros = diagonal((zero, zero, zero))
+            odd, even = zeros, zeros  # columns from the fourth on do not change the attitude
+            if j < 3:
+                odd, even = load33(work.odd[j]), load33(work.even[j])
             dV, dh = c * dV, c * dh
             V_e = even @ W + odd @ dV
             V_o = dV + odd @ W + even @ dV

@@ -51,20 +51,22 @@ def _measure(flight, p, i):
 @kernel
 def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2: the distance, and two masked ones."""
-    L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
+    L, R_BI, inverse_c, c = work.L, load33(flight.R_hat), work.inverse_spread, work.spread
     h, u = ground_range(p, flight.r_hat, R_BI)
     zero, sigma = zero_like(u), p.aid_sigma[_S]
     u = maximum(u, MIN_COSINE)
     z, noise = load3(flight.aid_measurement[_ROW]), (sigma * sigma, zero + 1.0, zero + 1.0)
     put_block(work, settings, k, valid, z, (h / u, zero, zero), diagonal(noise))
     z_B = R_BI.T[2]
-    for j in range(9):
+    for j in range(settings.motion_columns):
         dh = L[R + 2, j] if j <= R + 2 else zero
         a, s = zero, zero
-        if by_derivative(settings):
+        if j >= 3:  # these columns do not change the attitude
+            a = dh / u
+        elif by_derivative(settings):
             du = cross(z_B, load_column3(L, E, j))[2]
             a = (dh - h * du / u) / u
-        if with_pairs(settings):
+        if j < 3 and with_pairs(settings):
             dh, odd, even = c * dh, load33(work.odd[j]) @ z_B, load33(work.even[j]) @ z_B
             U = u + even[2]
             divisor = 1.0 / (U * U - odd[2] * odd[2])

@@ -56,13 +56,13 @@ def _measure(flight, p, i):
 @kernel
 def _expect(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2: the range to anchor i, and two masked ones."""
-    L, R_BI, c, inverse_c = flight.L, load33(flight.R_hat), work.spread, work.inverse_spread
+    L, R_BI, c, inverse_c = work.L, load33(flight.R_hat), work.spread, work.inverse_spread
     d, l_B = _to_antenna(p, i, load3(flight.r_hat), R_BI), load3(p.aid_numbers[_TAG])
     D, zero, sigma = maximum(norm(d), _NEAR), zero_like(c), p.aid_sigma[_S]
     noise, z = (sigma * sigma, zero + 1.0, zero + 1.0), load3(flight.aid_measurement[_ROW + i])
     put_block(work, settings, k, valid, z, (D, zero, zero), diagonal(noise))
-    for j in range(9):
-        o, e = lever_column(flight, work, settings, j, R_BI, l_B)
+    for j in range(settings.motion_columns):
+        o, e = lever_column(work, settings, j, R_BI, l_B)
         o = o + load_column3(L, R, j)
         a, s = dot(d, o) / D, zero
         if with_pairs(settings):

@@ -29,6 +29,7 @@ from quad_gym.records import (
     Source,
     TaskKind,
 )
+from quad_gym.records.states import ROWS
 
 # --------------------------------------------------------------------------------------------------
 # Observed state of the controller: the truth, the estimate, or the truth with noise.
@@ -280,7 +281,7 @@ def observe_stage(flight, world, model, settings, work, stages, flag):
     k += 4
     if settings.include_std:
         for i in range(15):
-            row[k + i] = math.sqrt(variance_of(flight, i))
+            row[k + i] = math.sqrt(variance_of(flight, ROWS[i]))
         k += 15
     if settings.privileged:
         k = _put_privileged(flight, p, settings, row, k)
