@@ -36,6 +36,7 @@ from quad_gym.records import (
     Room,
     aligned_zeros,
     offset_of,
+    require_double,
 )
 from quad_gym.records.sizes import RESIDENT
 from quad_gym.tasks.batch import TaskBatch
@@ -428,8 +429,10 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
     """Return the plan of a batch that has never been reset, for any number of flights.
 
     Raises:
-        ValueError: If the batch needs Python during its steps, other than the methods of a task.
+        ValueError: If the batch needs Python during its steps, other than the methods of a task,
+            or the process computes in single precision.
     """
+    require_double("a flight on a GPU")
     c = batch.configuration
     for python, what in (
         (c.estimator is not None, "an own estimator"),
@@ -447,7 +450,7 @@ def plan_of(batch: FlightBatch) -> DevicePlan:
     return DevicePlan(
         settings=batch._settings.tobytes(),
         stages=batch._stages,
-        flight=batch.copied_record(0),
+        flight=batch.copied_record(0).view(np.uint64),
         skipped=room.skipped // line,
         fields=fields,
         world=_first_lane(batch._world),

@@ -466,7 +466,7 @@ class FlightRecorder:
         features = 0 if camera is None else len(camera.features_I)
         self._rows = np.zeros(256, row_dtype(features))
         self._count = 0
-        self._copies: list[NDArray[np.uint64]] = []
+        self._copies: list[NDArray[np.uint32]] = []
         """instants not yet converted to rows: a copy takes a hundredth of the time of a row"""
         self._scene: FlightScene | None = None
         self._model = params_record(batch.vehicle, batch.sensors)[0]

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from baselines.exporting.controller import Controller, c_source, descriptions
 from quad_gym.params import checks as check
 from quad_gym.params.suites import SensorSuite
+from quad_gym.records import require_double
 
 # --------------------------------------------------------------------------------------------------
 # A policy for an exported filter: its observation from the estimate, as text of C sources.
@@ -128,12 +129,13 @@ def export_filter(
             measurements.
 
     Raises:
-        ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
-            observes more than the estimate.
+        ValueError: If the target is unknown, the filter of the suite cannot run, the policy
+            observes more than the estimate, or the process computes in single precision.
         ImportError: If Numba is not installed.
         RuntimeError: If the kernels cannot be emitted for the target.
     """
     check.choice("target", target, tuple(TARGETS))
+    require_double("the export of a filter")
     suite.require_filter()
     check.package("numba", "exporting a filter", "compile")
     values = {} if policy is None else policy_values(policy)

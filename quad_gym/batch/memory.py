@@ -26,8 +26,10 @@ from quad_gym.records import (
     aligned_zeros,
     covariance_of,
     field_of_flights,
+    in_double,
     joint_covariance,
     lower_factors,
+    places_of_lanes,
 )
 
 # --------------------------------------------------------------------------------------------------
@@ -106,7 +108,7 @@ class FlightMemory:
     @property
     def R_IG(self) -> NDArray[np.float64]:
         """Rotation (3, 3) from G, the frame of GNSS, to I."""
-        return np.array(self._model["R_IG"][0, ..., 0])
+        return np.array(self._model["R_IG"][0, ..., 0], np.float64)
 
     def record(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
         """Return a field of the records by its name in the kernels, as a new array (n, ...).
@@ -134,7 +136,7 @@ class FlightMemory:
             if name == "drawn":
                 return np.tile(self._undrawn, (count, 1))
             base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
-            return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
+            return in_double(np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base))
         return self._fetched(name, flights)
 
     def _joint_factor(self, flights: NDArray[np.intp] | None) -> NDArray[np.float64]:
@@ -146,12 +148,12 @@ class FlightMemory:
         """Return a field of the records that this configuration uses, as `record` does."""
         if flights is None:
             return field_of_flights(self._blocks, name, self.count)
-        return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
+        return in_double(self._blocks[name][flights // WIDTH, ..., flights % WIDTH])
 
     def _drawn(self, columns: slice) -> NDArray[np.float64]:
         """Return columns of the field `drawn`, as a new array (n, columns)."""
         values = np.moveaxis(self._blocks["drawn"][:, columns], -1, 1)
-        return values.reshape(-1, values.shape[-1])[: self.count].copy()
+        return in_double(values.reshape(-1, values.shape[-1])[: self.count].copy())
 
     def write(self, flights: NDArray[np.intp], **values: ArrayLike) -> None:
         """Write fields of the records of some flights, (len(flights), ...) each."""
@@ -176,7 +178,7 @@ class FlightMemory:
         if self._room.holds("feature_place"):
             return np.ascontiguousarray(self.record("feature_place")[:, :count])
         believed = self._world if self.randomization.known else self._model
-        nominal = believed["features"][0, :count, :, 0].copy()
+        nominal = believed["features"][0, :count, :, 0].astype(np.float64)
         return np.broadcast_to(nominal, (self.count, *nominal.shape))
 
     def active_faults(self) -> dict[str, NDArray[np.bool_]]:
@@ -210,21 +212,21 @@ class FlightMemory:
         self._blocks[:] = snapshot
         self._begun = False  # it may have been taken before a reset
 
-    def copied_record(self, flight: int) -> NDArray[np.uint64]:
+    def copied_record(self, flight: int) -> NDArray[np.uint32]:
         """Return the whole record of one flight at the present instant, for `with_records`."""
         block, lane = divmod(flight, WIDTH)
-        return _lanes(self._blocks[block : block + 1])[0, :, lane].copy()
+        return _parts(self._blocks)[block, places_of_lanes(self._room.dtype)[:, lane]]
 
-    def with_records(self, records: Sequence[NDArray[np.uint64]]) -> Self:
+    def with_records(self, records: Sequence[NDArray[np.uint32]]) -> Self:
         """Return flights with copied records, to `read` from: not to be stepped or reset."""
         found = object.__new__(type(self))
         found.__dict__.update(self.__dict__)
         found.count = len(records)
         found._blocks = aligned_zeros(-(-found.count // WIDTH), self._room.dtype)
-        lanes = _lanes(found._blocks)
+        parts, places = _parts(found._blocks), places_of_lanes(self._room.dtype)
         for flight, record in enumerate(records):
             block, lane = divmod(flight, WIDTH)
-            lanes[block, :, lane] = record
+            parts[block, places[:, lane]] = record
         return found
 
     # ---- switching ----------------------------------------------------------------------------
@@ -268,9 +270,9 @@ class FlightMemory:
             self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
 
 
-def _lanes(blocks: NDArray[Any]) -> NDArray[np.uint64]:
-    """Return the memory of blocks in words of 8 bytes, as all fields have: (blocks, n, WIDTH)."""
-    return blocks.view(np.uint64).reshape(len(blocks), -1, WIDTH)
+def _parts(blocks: NDArray[Any]) -> NDArray[np.uint32]:
+    """Return the memory of blocks in parts of 4 bytes, (blocks, n): see `places_of_lanes`."""
+    return blocks.view(np.uint32).reshape(len(blocks), -1)
 
 
 # --------------------------------------------------------------------------------------------------

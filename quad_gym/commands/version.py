@@ -1,8 +1,9 @@
-"""Print the version."""
+"""Print the version, and the precision of flights."""
 
 from dataclasses import dataclass
 
 import quad_gym
+from quad_gym.records.sizes import PRECISION
 
 
 @dataclass(frozen=True)
@@ -11,5 +12,5 @@ class VersionArgs:
 
 
 def main(args: VersionArgs) -> None:
-    """Print the version."""
-    print(quad_gym.__version__)
+    """Print the version, and the precision of the flights of this process."""
+    print(quad_gym.__version__ + ("" if PRECISION == "double" else f" ({PRECISION} precision)"))

@@ -46,6 +46,7 @@ from quad_gym.records import (
     aligned_zeros,
     joint_covariance,
     lower_triangle,
+    require_double,
     room_of,
 )
 
@@ -67,9 +68,13 @@ class Engine:
     Args:
         sensors: The suite that the filter assumes.
         kind: "ukf" or "ekf".
+
+    Raises:
+        ValueError: If the process computes in single precision.
     """
 
     def __init__(self, sensors: SensorSuite, kind: str) -> None:
+        require_double("a filter outside of a simulated flight, and so a replay of a log,")
         self.sensors = sensors
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         params = params_record(VehicleParams(), sensors)

@@ -29,6 +29,7 @@ from quad_gym.records import (
     FLIGHT_BLOCK,
     KINDS,
     MAX_BLOCKS,
+    REAL_BYTES,
     SENSORS,
     STAMP,
     WIDTH,
@@ -212,26 +213,31 @@ def _update_gathered(call, kind, model, settings, work, stages):
     if together == count:
         work.mask = 0.0
         for k in range(count):
-            plain.mask[(source[k] - block[0]) // 8] = 1.0
+            plain.mask[(source[k] - block[0]) // REAL_BYTES] = 1.0
         update((_flight_at(block[0]), model, model, settings, work, stages))
         return
     words = _words_at(call[Call.WORDS], call[Call.WORD_COUNT])
     gathered = _plain_flight_at(call[Call.GATHERED])
     for k in range(WIDTH):
         if k >= count:  # copied from and to itself
-            source[k] = call[Call.GATHERED] + 8 * k
+            source[k] = call[Call.GATHERED] + REAL_BYTES * k
             for i in range(MAX_BLOCKS):
                 gathered.block_valid[i, k] = 0.0
-        elif settings.late:
-            lane = (source[k] - block[k]) // 8
-            _gather_stamps(gathered, k, _plain_flight_at(block[k]), lane, settings)
+        else:
+            lane = (source[k] - block[k]) // REAL_BYTES
+            gathered.filter_status[k] = _plain_flight_at(block[k]).filter_status[lane]
+            if settings.late:
+                _gather_stamps(gathered, k, _plain_flight_at(block[k]), lane, settings)
         plain.mask[k] = 1.0 if k < count else 0.0
     sources, inside = work.source[kind], numbers_of(_flight_at(call[Call.GATHERED]))
     for i in range(call[Call.WORD_COUNT]):
-        inside[words[i] // WIDTH] = gather_lanes(sources, 8 * words[i])
+        inside[words[i] // WIDTH] = gather_lanes(sources, REAL_BYTES * words[i])
     update((_flight_at(call[Call.GATHERED]), model, model, settings, work, stages))
     for i in range(call[Call.WRITTEN_COUNT]):
-        scatter_lanes(sources, 8 * words[i], inside[words[i] // WIDTH])
+        scatter_lanes(sources, REAL_BYTES * words[i], inside[words[i] // WIDTH])
+    for k in range(count):
+        lane = (source[k] - block[k]) // REAL_BYTES
+        _plain_flight_at(block[k]).filter_status[lane] = gathered.filter_status[k]
 
 
 @kernel
@@ -267,7 +273,9 @@ def update_soon(call, index, model, settings, work, stages):
             for lane in range(WIDTH):
                 kind = int(plain.kind[lane])
                 if kind > 0:
-                    _put(call, kind, block + 8 * lane, block, model, settings, work, stages)
+                    _put(
+                        call, kind, block + REAL_BYTES * lane, block, model, settings, work, stages
+                    )
 
 
 @routine

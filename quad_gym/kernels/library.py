@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from quad_gym.kernels.sources import digest_in, sources_digest
-from quad_gym.records.sizes import WIDTH, runs_lanes
+from quad_gym.records.sizes import SINGLE, WIDTH, require_double, runs_lanes
 
 # --------------------------------------------------------------------------------------------------
 # Number of cores that this process may use.
@@ -121,6 +121,15 @@ def library() -> Library | None:
     if choice not in _CHOICES:
         raise ValueError(f"QUAD_GYM_KERNELS must be library or numba, got {choice!r}")
     if choice == "numba":
+        return None
+    if SINGLE and choice == "library":
+        require_double("the library of compiled kernels")
+    if SINGLE and importlib.util.find_spec("numba") is None:
+        raise NoKernelsError(
+            "Numba compiles the kernels in single precision, and it is not installed: "
+            'pip install "quad-gym[compile]"'
+        )
+    if SINGLE:
         return None
     file = file_of(WIDTH)
     found = _load(file)

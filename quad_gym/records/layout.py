@@ -1,7 +1,8 @@
 """Records in memory: of a single flight, of WIDTH flights as a block, and parts of them.
 
 In a block of flights (`block_dtype`) every field has a trailing axis of WIDTH. The scalar form
-(`scalar_dtype`) has these fields without that axis. Kernels read both by field name.
+(`scalar_dtype`) has these fields without that axis. Kernels read both by field name. The numbers in
+blocks have the precision of the process, and numbers in scalar records are float64.
 """
 
 import functools
@@ -12,7 +13,15 @@ from numpy.typing import NDArray
 
 from quad_gym.records.flight import FLIGHT_FIELDS, PARTS, WORK_FIELDS
 from quad_gym.records.params import PARAMS_FIELDS, SETTINGS_FIELDS
-from quad_gym.records.sizes import FIRST_BLOCK, MAX_BLOCKS, TERMS, WIDTH, Field
+from quad_gym.records.sizes import (
+    FIRST_BLOCK,
+    MAX_BLOCKS,
+    REAL,
+    REAL_BYTES,
+    TERMS,
+    WIDTH,
+    Field,
+)
 
 # --------------------------------------------------------------------------------------------------
 # Records in memory: of a single flight, and of WIDTH flights as a block.
@@ -20,13 +29,16 @@ from quad_gym.records.sizes import FIRST_BLOCK, MAX_BLOCKS, TERMS, WIDTH, Field
 
 
 def scalar_dtype(fields: tuple[Field, ...]) -> np.dtype:
-    """Data type of the record of one flight."""
+    """Data type of the record of one flight, in float64."""
     return np.dtype([(f.name, f.kind, f.shape) for f in fields], align=True)
 
 
 def block_dtype(fields: tuple[Field, ...]) -> np.dtype:
     """Data type of the record of WIDTH flights: every field with a trailing axis of WIDTH."""
-    return np.dtype([(f.name, f.kind, (*f.shape, WIDTH)) for f in fields], align=True)
+    kinds = {"f8": REAL}
+    return np.dtype(
+        [(f.name, kinds.get(f.kind, f.kind), (*f.shape, WIDTH)) for f in fields], align=True
+    )
 
 
 FLIGHT, FLIGHT_BLOCK = scalar_dtype(FLIGHT_FIELDS), block_dtype(FLIGHT_FIELDS)
@@ -83,11 +95,33 @@ def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:
 
 
 def field_of_flights(blocks: NDArray[Any], name: str, count: int) -> NDArray[Any]:
-    """Return a copy of one field of the first `count` flights, as an array (count, ...)."""
-    values = blocks[name]
+    """Return a copy of one field of the first `count` flights, as an array (count, ...).
+
+    Numbers of single precision are returned as float64, in which analyses compute.
+    """
+    values = in_double(blocks[name])
     lane = values.ndim - 1
     values = values.transpose(0, lane, *range(1, lane)).copy()
     return values.reshape(-1, *values.shape[2:])[:count]
+
+
+def in_double(values: NDArray[Any]) -> NDArray[Any]:
+    """Return numbers of flights as float64, and words as they are."""
+    return values.astype(np.float64) if values.dtype == np.float32 else values
+
+
+@functools.cache
+def places_of_lanes(dtype: np.dtype) -> NDArray[np.intp]:
+    """Return where a block of a type holds each flight, as indices (n, WIDTH) of 4 bytes."""
+    places = []
+    for name in dtype.names or ():
+        field = dtype[name]
+        parts = field.base.itemsize // 4
+        count = field.itemsize // (field.base.itemsize * WIDTH)
+        row, part, lane = np.ogrid[:count, :parts, :WIDTH]
+        found = offset_of(dtype, name) // 4 + (row * WIDTH + lane) * parts + part
+        places.append(found.reshape(-1, WIDTH))
+    return np.concatenate(places)
 
 
 def put_in_flights(blocks: NDArray[Any], name: str, values: NDArray[Any]) -> None:
@@ -104,7 +138,7 @@ def put_in_flights(blocks: NDArray[Any], name: str, values: NDArray[Any]) -> Non
 # The words of a flight's record that an update of its filter reads and writes.
 # --------------------------------------------------------------------------------------------------
 
-_OF_CORE = {"tick", "filter_status", "diverged"}
+_OF_CORE = {"tick", "diverged"}  # and `filter_status`, which is no number and is copied by itself
 _PARTS = {"filter", "watch", "late", "slow", "aids"}
 _NOT_READ = {
     "prediction_failures",
@@ -155,7 +189,7 @@ def _words(
         for name, shape, *_ in fields:
             chosen = name in _OF_CORE if part == "core" else part in _PARTS & used
             if chosen and name not in _NOT_READ:
-                first = offset_of(FLIGHT_BLOCK, name) // (8 * WIDTH)
+                first = offset_of(FLIGHT_BLOCK, name) // (REAL_BYTES * WIDTH)
                 words = first + np.arange(np.prod(shape, dtype=int)).reshape(shape)
                 (read if name in _NOT_WRITTEN else written).append(
                     _in_use(name, words, features, slow, sensor_blocks)

@@ -16,33 +16,68 @@ from quad_gym.records.enums import (
 )
 
 # --------------------------------------------------------------------------------------------------
-# Number of flights in a block, and of those that a kernel computes at once.
+# Precision of the numbers of flights, the number of flights in a block, and of those that a kernel
+# computes at once.
 # --------------------------------------------------------------------------------------------------
 
+PRECISIONS = ("double", "single")
+
+
+def precision_of_process() -> str:
+    """Return QUAD_GYM_PRECISION, or "double"."""
+    wanted = os.environ.get("QUAD_GYM_PRECISION") or "double"
+    if wanted not in PRECISIONS:
+        raise ValueError(f"QUAD_GYM_PRECISION must be double or single, got {wanted!r}")
+    return wanted
+
+
+PRECISION = precision_of_process()
+"""Precision of the numbers in blocks of flights, and of all that kernels compute with lanes."""
+
+SINGLE = PRECISION == "single"  #: the numbers of flights are float32, in place of float64
+REAL = "f4" if SINGLE else "f8"  #: kind of these numbers
+REAL_BYTES = 4 if SINGLE else 8
+
+
+def require_double(what: str) -> None:
+    """Refuse a call that does not work in single precision.
+
+    Raises:
+        ValueError: If the process computes in single precision.
+    """
+    if SINGLE:
+        raise ValueError(f"{what} needs double precision, got QUAD_GYM_PRECISION=single")
+
+
 WIDTHS = (1, 2, 4, 8)  #: supported numbers of lanes; 1 is for filters on other processors
+SINGLE_WIDTHS = (2, 4, 8, 16)  #: the same in single precision
 WARP = 32  #: number of flights in a block on a GPU, whose threads fly one each
 RESIDENT = 8  #: blocks that a multiprocessor of a GPU flies at once, with 255 registers a thread
 _NEEDED = {
-    8: {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"},
-    4: {"avx2"},
+    64: {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"},
+    32: {"avx2"},
 }
-"""Features of a processor of the x86 family with as many lanes in a register."""
+"""Features of a processor of the x86 family with as many bytes in a register."""
 
 
 def lanes_of_machine() -> int:
-    """Return QUAD_GYM_LANES, or 8 lanes with AVX-512, 4 with AVX2, else 2."""
+    """Return QUAD_GYM_LANES, or as many as fill a register: in double precision 8, 4 or 2.
+
+    Registers have 64 bytes with AVX-512, 32 with AVX2, else 16.
+    """
     wanted = os.environ.get("QUAD_GYM_LANES")
     if wanted:
-        if wanted not in map(str, (*WIDTHS, WARP)):
-            raise ValueError(f"QUAD_GYM_LANES must be 2, 4 or 8, got {wanted!r}")
+        if wanted not in map(str, SINGLE_WIDTHS if SINGLE else (*WIDTHS, WARP)):
+            known = "2, 4, 8 or 16 in single precision" if SINGLE else "2, 4 or 8"
+            raise ValueError(f"QUAD_GYM_LANES must be {known}, got {wanted!r}")
         return int(wanted)
     features = _features()
-    return next((lanes for lanes, needed in _NEEDED.items() if needed <= features), 2)
+    return next((size for size, needed in _NEEDED.items() if needed <= features), 16) // REAL_BYTES
 
 
 def runs_lanes(lanes: int) -> bool:
     """Return True if registers of this processor hold as many lanes."""
-    return _NEEDED.get(lanes, set()) <= _features()
+    return _NEEDED.get(lanes * REAL_BYTES, set()) <= _features()
 
 
 def _features() -> set[str]:
@@ -67,7 +102,7 @@ def _features() -> set[str]:
 
 
 WIDTH = lanes_of_machine()
-"""Number of flights in a block: as many as the float64 in a vector register of this machine, or
+"""Number of flights in a block: as many as the numbers in a vector register of this machine, or
 WARP. No result depends on it, not even in the last bit."""
 
 REGISTER = 1 if WIDTH == WARP else WIDTH

@@ -15,7 +15,15 @@ from quad_gym.batch.starts import hidden_points, nearest_obstacle
 from quad_gym.configuration import FlightConfiguration
 from quad_gym.kernels.stages import needed_stages
 from quad_gym.params.world import WorldParams
-from quad_gym.records import SHOWN, SHOWN_SHAPES, SHOWN_SIZE, Command, Result, covariance_of
+from quad_gym.records import (
+    SHOWN,
+    SHOWN_SHAPES,
+    SHOWN_SIZE,
+    Command,
+    Result,
+    covariance_of,
+    in_double,
+)
 from quad_gym.records.state import State
 
 # --------------------------------------------------------------------------------------------------
@@ -104,7 +112,7 @@ class ReadableBatch(FlightBatch):
     def nominal(self) -> dict[str, Any]:
         """Parameters of the nominal camera, and the rotation from G to I, by name."""
         names = ("camera", "R_CB", "focal_length", "half_image", "R_IG")
-        return {name: self._world[name][0, ..., 0] for name in names}
+        return {name: in_double(self._world[name][0, ..., 0]) for name in names}
 
     def finite(self, flights: NDArray[np.intp]) -> Truths:
         """True where the true state of some flights is finite."""

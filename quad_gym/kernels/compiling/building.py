@@ -47,7 +47,7 @@ from quad_gym.kernels.library import (
 )
 from quad_gym.kernels.sources import MARK, digest_in, sources_digest
 from quad_gym.kernels.stages import SOURCES, Stage
-from quad_gym.records import WIDTH
+from quad_gym.records import WIDTH, require_double
 from quad_gym.records.sizes import RESIDENT, WARP
 
 # --------------------------------------------------------------------------------------------------
@@ -305,6 +305,7 @@ def build(
     Returns:
         All libraries, the new ones and those that are up to date.
     """
+    require_double("a library of compiled kernels")
     family = family or machine()
     known = PROCESSORS.get(family, {}) if sys.platform == "linux" else {}
     if not known or not set(lanes) <= known.keys():

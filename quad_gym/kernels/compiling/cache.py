@@ -32,7 +32,7 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from quad_gym.kernels.library import say
-from quad_gym.records import REGISTER, WIDTH
+from quad_gym.records import PRECISION, REGISTER, WIDTH
 
 # --------------------------------------------------------------------------------------------------
 # Digests of everything that compiled code depends on, which show whether a cache is stale.
@@ -265,8 +265,8 @@ def _written(arguments: tuple[Any, ...]) -> str:
 def _compiler(context: Any) -> str:
     """The compiler, its options, and the processor that it compiles for."""
     options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
-    versions = f"{numba.__version__} {llvmlite.__version__}"
-    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {WIDTH} {REGISTER} {options}"
+    versions = f"{numba.__version__} {llvmlite.__version__} {_FORM}"
+    return f"{context.codegen().magic_tuple()} {versions} {PRECISION} {WIDTH} {REGISTER} {options}"
 
 
 def _needed(module: Any) -> tuple[str, ...]:

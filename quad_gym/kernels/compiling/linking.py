@@ -18,9 +18,9 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
 
-from quad_gym.records import REGISTER
+from quad_gym.records import REAL_BYTES, REGISTER
 
-_LANES_BYTES = 8 * REGISTER
+_LANES_BYTES = REAL_BYTES * REGISTER
 
 
 class _AlignedLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]

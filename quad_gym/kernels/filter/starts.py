@@ -10,7 +10,7 @@ from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
 from quad_gym.kernels.filter.slow import begin_slow, stages_of
 from quad_gym.kernels.numbers.blocks import reset
-from quad_gym.kernels.numbers.elementary import atan2, maximum, minimum, sin_cos
+from quad_gym.kernels.numbers.elementary import TINY, atan2, maximum, minimum, sin_cos
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
@@ -126,7 +126,7 @@ def wahba(B):
     R_IB = outer(v0, u0) + rounded(outer(v1, u1)) + rounded(outer(v2_right, u2))
     s0, s1 = math.sqrt(dot(a0, a0)), math.sqrt(dot(a1, a1))
     signed_s2 = dot(a2, u2) * dot(v2, v2_right)
-    return R_IB.T, (s1 + signed_s2) / maximum(s0, 1e-300)
+    return R_IB.T, (s1 + signed_s2) / maximum(s0, TINY)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from numba.np.arrayobj import make_array, populate_array
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.numbers.lanes import ASKED_FIRST, lanes, vector_of, words
-from quad_gym.records import REGISTER, WIDTH
+from quad_gym.records import REAL_BYTES, REGISTER, WIDTH
 
 # --------------------------------------------------------------------------------------------------
 # Records of WIDTH flights, read by field name inside kernels.
@@ -34,7 +34,10 @@ from quad_gym.records import REGISTER, WIDTH
 # float array.
 # --------------------------------------------------------------------------------------------------
 
-_PITCH = 8 * WIDTH  #: bytes from a number of a flight to its next one
+
+def _bytes_of(element: Any) -> int:
+    """Bytes of the number or word of one flight."""
+    return 8 if element == words else REAL_BYTES
 
 
 def _array_of_lanes(element: Any, axes: int) -> Any:
@@ -105,7 +108,7 @@ def _field_pointer(
 def _get_field(context, builder, block, pointer, name):  # type: ignore[no-untyped-def]
     kind = block.field(name)
     if not isinstance(kind, types.Array):
-        return builder.load(_field_pointer(builder, block, pointer, name, kind), align=8)
+        return builder.load(_field_pointer(builder, block, pointer, name, kind), align=REAL_BYTES)
 
     shape = block.record.typeof(name).shape[:-1]
     data = _field_pointer(builder, block, pointer, name, kind.dtype)
@@ -115,7 +118,7 @@ def _get_field(context, builder, block, pointer, name):  # type: ignore[no-untyp
 def _array_of(context: Any, builder: ir.IRBuilder, kind: Any, data: Any, shape: Any) -> Any:
     """Return an array of lanes in memory."""
     strides: list[int] = []
-    size = _PITCH
+    size = WIDTH * _bytes_of(kind.dtype)
     for length in reversed(shape):
         strides.insert(0, size)
         size *= length
@@ -125,7 +128,7 @@ def _array_of(context: Any, builder: ir.IRBuilder, kind: Any, data: Any, shape: 
         data=data,
         shape=cgutils.pack_array(builder, [context.get_constant(types.intp, n) for n in shape]),
         strides=cgutils.pack_array(builder, [context.get_constant(types.intp, s) for s in strides]),
-        itemsize=context.get_constant(types.intp, REGISTER * 8),
+        itemsize=context.get_constant(types.intp, REGISTER * _bytes_of(kind.dtype)),
         meminfo=None,
         parent=None,
     )
@@ -141,7 +144,8 @@ def numbers_of(typing_context, block):  # type: ignore[no-untyped-def]
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         data = builder.bitcast(args[0], kind.dtype.llvm_type.as_pointer())
-        return _array_of(context, builder, kind, data, (block.record.size // (WIDTH * 8),))
+        count = block.record.size // (WIDTH * REAL_BYTES)
+        return _array_of(context, builder, kind, data, (count,))
 
     return kind(block), lower
 
@@ -152,7 +156,7 @@ def _set_field(context, builder, sig, args, name):  # type: ignore[no-untyped-de
     pointer, value = args
     kind = block.field(name)
     vector = vector_of(context, builder, value, source, kind)
-    builder.store(vector, _field_pointer(builder, block, pointer, name, kind), align=8)
+    builder.store(vector, _field_pointer(builder, block, pointer, name, kind), align=REAL_BYTES)
 
 
 @intrinsic(prefer_literal=True)
@@ -187,8 +191,8 @@ def reset(typing_context, block, chosen, value, names):  # type: ignore[no-untyp
             first = _field_pointer(builder, block, args[0], name, element)
             for k in range(0, block.record.typeof(name).nitems // REGISTER, WIDTH // REGISTER):
                 pointer = builder.gep(first, [ir.Constant(ir.IntType(32), k)])
-                before = builder.load(pointer, align=8)
-                builder.store(builder.select(args[1], number, before), pointer, align=8)
+                before = builder.load(pointer, align=REAL_BYTES)
+                builder.store(builder.select(args[1], number, before), pointer, align=REAL_BYTES)
         return context.get_dummy_value()
 
     return types.none(block, chosen, types.unliteral(value), names), lower
@@ -215,8 +219,8 @@ def keep_fields(  # type: ignore[no-untyped-def]
             for k in range(0, block.record.typeof(to).nitems // REGISTER, WIDTH // REGISTER):
                 step = [ir.Constant(ir.IntType(32), k)]
                 pointer, place = builder.gep(first, step), builder.gep(copied, step)
-                numbers = (builder.load(where, align=8) for where in (place, pointer))
-                builder.store(builder.select(args[2], *numbers), pointer, align=8)
+                numbers = (builder.load(where, align=REAL_BYTES) for where in (place, pointer))
+                builder.store(builder.select(args[2], *numbers), pointer, align=REAL_BYTES)
         return context.get_dummy_value()
 
     return types.none(block, other, types.unliteral(chosen), names, prefix, others), lower
@@ -315,12 +319,15 @@ def array_at(dtype: Any) -> Any:
 
 @intrinsic
 def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
-    """Write lanes to consecutive float64 at an address."""
+    """Write lanes to consecutive float64 at an address, whatever the precision of lanes."""
     if value != lanes:
         return None
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        builder.store(args[1], builder.inttoptr(args[0], args[1].type.as_pointer()), align=8)
+        value, wide = args[1], ir.VectorType(ir.DoubleType(), REGISTER)
+        if value.type != wide:
+            value = builder.fpext(value, wide)
+        builder.store(value, builder.inttoptr(args[0], wide.as_pointer()), align=8)
         return context.get_dummy_value()
 
     return types.none(types.int64, lanes), lower
@@ -328,19 +335,19 @@ def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
 
 def _lane_pointer(builder: ir.IRBuilder, addresses: Any, offset: Any, lane: int) -> Any:
     address = builder.extract_element(addresses, _INDEX(lane))
-    return builder.inttoptr(builder.add(address, offset), ir.DoubleType().as_pointer())
+    return builder.inttoptr(builder.add(address, offset), lanes.llvm_type.element.as_pointer())
 
 
 @intrinsic
 def gather_lanes(typing_context, addresses, offset):  # type: ignore[no-untyped-def]
-    """Read a float64 for each lane, at an offset from its address (words)."""
+    """Read a number for each lane, at an offset from its address (words)."""
     if addresses != words:
         return None
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         value = ir.Constant(lanes.llvm_type, ir.Undefined)
         for lane in range(REGISTER):
-            number = builder.load(_lane_pointer(builder, *args, lane), align=8)
+            number = builder.load(_lane_pointer(builder, *args, lane), align=REAL_BYTES)
             value = builder.insert_element(value, number, _INDEX(lane))
         return value
 
@@ -356,7 +363,7 @@ def scatter_lanes(typing_context, addresses, offset, value):  # type: ignore[no-
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         for lane in range(REGISTER):
             number = builder.extract_element(args[2], _INDEX(lane))
-            builder.store(number, _lane_pointer(builder, *args[:2], lane), align=8)
+            builder.store(number, _lane_pointer(builder, *args[:2], lane), align=REAL_BYTES)
         return context.get_dummy_value()
 
     return types.none(words, types.int64, lanes), lower
@@ -391,8 +398,9 @@ def store_tile(typing_context, address, pitch, source, first):  # type: ignore[n
         for k in range(REGISTER):
             place = builder.add(first, context.get_constant(types.intp, k))
             pointer = cgutils.get_item_pointer(context, builder, sig.args[2], array, [place])
-            wide = builder.load(pointer, align=8)
-            rows.append(builder.fptrunc(wide, ir.VectorType(_SINGLE, REGISTER)))
+            row = builder.load(pointer, align=REAL_BYTES)
+            narrow = ir.VectorType(_SINGLE, REGISTER)
+            rows.append(row if row.type == narrow else builder.fptrunc(row, narrow))
         for lane, row in enumerate(_transposed(builder, rows)):
             offset = builder.mul(pitch, context.get_constant(types.int64, lane))
             pointer = builder.inttoptr(builder.add(begin, offset), row.type.as_pointer())

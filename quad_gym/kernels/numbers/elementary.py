@@ -18,12 +18,23 @@ from quad_gym.kernels.numbers.lanes import (
     select,
 )
 from quad_gym.kernels.numbers.linalg import polynomial
+from quad_gym.records import SINGLE
 
 # pi/2 in three parts (Cody and Waite): x - k * first is exact, k * second is for |k| < 2^20
 _PIO2_1, _PIO2_2, _PIO2_3 = 1.5707963267948966, 6.12323399538461e-17, 3.5215598651832e-27
 _MAX_TURNED = 1e9
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_LARGEST = 1.7976931348623157e308
+_EXP_LEAST, _EXP_MOST = -708.396, 709.782712893384  #: beyond which the result is 0, or infinite
+if SINGLE:  # the same for float32, whose split parts have fewer bits
+    _PIO2_1, _PIO2_2, _PIO2_3 = 1.57079637050628662109375, -4.37113882867379e-8, -1.71512451e-15
+    _MAX_TURNED = 3e4
+    _LN2_HIGH, _LN2_LOW = 0.693359375, -2.12194440e-4
+    _LARGEST = 3.4028234663852886e38
+    _EXP_LEAST, _EXP_MOST = -87.3, 88.7
 _SMALL_ANGLE = 0.05
+TINY = 1e-30 if SINGLE else 1e-100
+"""Least divisor, which replaces zero and nothing larger."""
 
 # fmt: off
 _SIN = (-1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04,
@@ -63,7 +74,7 @@ def clip(x, low, high):
 @kernel
 def is_finite(x):
     """True where x is neither infinite nor NaN."""
-    return abs(x) <= 1.7976931348623157e308
+    return abs(x) <= _LARGEST
 
 
 @kernel
@@ -99,8 +110,8 @@ def sin_cos(x):
     """(sin x, cos x) of an angle x [rad].
 
     The error is at most one unit in the last place for |x| <= 1e6, and at most 2^-53 for
-    |x| <= 1e9. Any larger angle counts as 0, which is as good as any: a unit in its last place may
-    be many degrees. Infinity and NaN give NaN.
+    |x| <= 1e9; in float32 it is at most 5e-8 for |x| <= 3e4. Any larger angle counts as 0, which is
+    as good as any: a unit in its last place may be many degrees. Infinity and NaN give NaN.
     """
     x = select(abs(x) <= _MAX_TURNED, x, x - x)
     turns = round_to_even(x * 0.63661977236758138243)
@@ -147,8 +158,8 @@ def sin_cos_minus_one(angles):
 
 @kernel
 def exp(x):
-    """E ** x, with 0 and infinity beyond the range of float64 (subnormal results are 0)."""
-    k = round_to_even(clip(x, -746.0, 710.0) * 1.44269504088896338700)
+    """E ** x, with 0 and infinity beyond the range of the number (subnormal results are 0)."""
+    k = round_to_even(clip(x, _EXP_LEAST - 1.0, _EXP_MOST + 1.0) * 1.44269504088896338700)
     high = fused_multiply_add(-k, _LN2_HIGH, x)
     low = k * _LN2_LOW
     r = high - low
@@ -158,7 +169,7 @@ def exp(x):
     # two factors, as 2**k alone overflows at k = 1024
     half = round_to_even(0.5 * k)
     value = mantissa * power_of_two(half) * power_of_two(k - half)
-    value = select(x > 709.782712893384, math.inf, select(x < -708.396, 0.0, value))
+    value = select(x > _EXP_MOST, math.inf, select(x < _EXP_LEAST, 0.0, value))
     return select(x == x, value, x)
 
 

@@ -1,9 +1,9 @@
-"""Number type of the kernels: one float64 for each of several flights; its primitives."""
+"""Number type of the kernels: one number for each of several flights; its primitives."""
 
 import math
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import types
@@ -15,7 +15,7 @@ from numba.core.typeconv.rules import default_type_manager
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, overload, register_model
 
-from quad_gym.records import REGISTER
+from quad_gym.records import REGISTER, SINGLE
 
 # --------------------------------------------------------------------------------------------------
 # Number type of the kernels: one float64 for each of several flights.
@@ -41,7 +41,11 @@ from quad_gym.records import REGISTER
 # no fused multiply-add, LLVM calls the C library's, which is slow but bitwise identical.
 # --------------------------------------------------------------------------------------------------
 
-_FLOATS = ir.VectorType(ir.DoubleType(), REGISTER)
+REAL = types.float32 if SINGLE else types.float64
+"""Type of the number in a lane: the precision of the process. Plain numbers are float64, and are
+rounded where they meet lanes."""
+
+_FLOATS = ir.VectorType(ir.FloatType() if SINGLE else ir.DoubleType(), REGISTER)
 _WORDS = ir.VectorType(ir.IntType(64), REGISTER)
 _BITS = ir.VectorType(ir.IntType(1), REGISTER)
 
@@ -56,7 +60,7 @@ class _VectorType(types.Type):
 
 
 class Lanes(_VectorType):
-    """Vector of float64, one per flight of a block."""
+    """Vector of numbers of type REAL, one per flight of a block."""
 
     llvm_type = _FLOATS
 
@@ -74,7 +78,7 @@ class Mask(_VectorType):
 
 
 class Floats(types.UniTuple):
-    """A vector of float64, or a matrix of such vectors, see `numbers/linalg.py`."""
+    """A vector of numbers, or a matrix of such vectors, see `numbers/linalg.py`."""
 
 
 lanes, words, mask = Lanes(), Words(), Mask()
@@ -107,7 +111,7 @@ def vector_of(
         return value
     if isinstance(source, types.IntEnumMember):
         source = source.dtype
-    plain = {lanes: types.float64, words: types.uint64, mask: types.boolean}[target]
+    plain = {lanes: REAL, words: types.uint64, mask: types.boolean}[target]
     return splat(builder, context.cast(builder, value, source, plain))
 
 
@@ -256,8 +260,9 @@ def _unary(operation: Any, emit: Callable[[Any, ir.IRBuilder, Any], Any]) -> Non
 def call_llvm(builder: ir.IRBuilder, name: str, value: ir.Value, *others: ir.Value) -> ir.Value:
     """Call the LLVM intrinsic `name` (such as `llvm.sqrt`) for the type of its first argument."""
     kind = value.type
-    scalar = "f64" if "double" in str(kind) else "i64"
-    suffix = f"v{REGISTER}{scalar}" if isinstance(kind, ir.VectorType) else scalar
+    vector = isinstance(kind, ir.VectorType)
+    scalar = (kind.element if vector else kind).intrinsic_name
+    suffix = f"v{REGISTER}{scalar}" if vector else scalar
     arguments = (value, *others)
     function = cgutils.get_or_insert_function(
         builder.module, ir.FunctionType(kind, [a.type for a in arguments]), f"{name}.{suffix}"
@@ -399,8 +404,26 @@ def _all_of(asked):  # type: ignore[no-untyped-def]
 # Each accepts a plain number or lanes, because LLVM's instructions do.
 # --------------------------------------------------------------------------------------------------
 
-_FLOAT = ir.DoubleType()
 _INT = ir.IntType(64)
+
+
+class _Form(NamedTuple):
+    """Form of floating-point numbers, by IEEE 754."""
+
+    real: ir.Type
+    word: ir.IntType  #: integer with as many bits
+    bits: int  #: of the mantissa
+    bias: int  #: of the exponent
+
+
+_DOUBLE_FORM = _Form(ir.DoubleType(), ir.IntType(64), 52, 1023)
+_SINGLE_FORM = _Form(ir.FloatType(), ir.IntType(32), 23, 127)
+_LANES_FORM = _SINGLE_FORM if SINGLE else _DOUBLE_FORM
+
+
+def _form_of(value: ir.Value) -> _Form:
+    """The form of a number, or of the numbers in lanes."""
+    return _LANES_FORM if isinstance(value.type, ir.VectorType) else _DOUBLE_FORM
 
 
 def _like(value: ir.Value, scalar: ir.Type) -> ir.Type:
@@ -434,32 +457,37 @@ def _of_float(emit: Callable[[ir.IRBuilder, ir.Value], ir.Value]) -> Any:
 
 
 def _power_of_two(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
-    biased = builder.fadd(x, _constant(builder, x, 1023.0, _FLOAT))
-    shifted = builder.shl(builder.fptosi(biased, _like(x, _INT)), _constant(builder, x, 52))
-    return builder.bitcast(shifted, _like(x, _FLOAT))
+    real, word, bits, bias = _form_of(x)
+    biased = builder.fadd(x, _constant(builder, x, float(bias), real))
+    shifted = builder.shl(builder.fptosi(biased, _like(x, word)), _constant(builder, x, bits, word))
+    return builder.bitcast(shifted, _like(x, real))
 
 
 def _exponent_of(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
-    pattern = builder.bitcast(x, _like(x, _INT))
-    biased = builder.lshr(pattern, _constant(builder, x, 52))
-    return builder.sitofp(builder.sub(biased, _constant(builder, x, 1023)), _like(x, _FLOAT))
+    real, word, bits, bias = _form_of(x)
+    pattern = builder.bitcast(x, _like(x, word))
+    biased = builder.lshr(pattern, _constant(builder, x, bits, word))
+    return builder.sitofp(builder.sub(biased, _constant(builder, x, bias, word)), _like(x, real))
 
 
 def _with_exponent_zero(builder: ir.IRBuilder, mantissa: ir.Value) -> ir.Value:
-    """The number from 1 to 2 whose mantissa has these 52 bits."""
-    one = builder.or_(mantissa, _constant(builder, mantissa, 1023 << 52))
-    return builder.bitcast(one, _like(mantissa, _FLOAT))
+    """The number from 1 to 2 with these bits of the mantissa."""
+    real, word, bits, bias = _form_of(mantissa)
+    one = builder.or_(mantissa, _constant(builder, mantissa, bias << bits, word))
+    return builder.bitcast(one, _like(mantissa, real))
 
 
 def _mantissa_of(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
-    pattern = builder.bitcast(x, _like(x, _INT))
-    return _with_exponent_zero(builder, builder.and_(pattern, _constant(builder, x, (1 << 52) - 1)))
+    _, word, bits, _ = _form_of(x)
+    pattern = builder.bitcast(x, _like(x, word))
+    kept = builder.and_(pattern, _constant(builder, x, (1 << bits) - 1, word))
+    return _with_exponent_zero(builder, kept)
 
 
 round_to_even = _of_float(lambda builder, x: call_llvm(builder, "llvm.rint", x))
 """Nearest integer, ties to even, as a float."""
 power_of_two = _of_float(_power_of_two)
-"""2 ** x, exact, for an integer-valued float in [-1022, 1023]."""
+"""2 ** x, exact, for an integer-valued float in [-1022, 1023], or [-126, 127] in float32."""
 exponent_of = _of_float(_exponent_of)
 """The e of x = m 2**e with m in [1, 2), as a float, for positive normal x."""
 mantissa_of = _of_float(_mantissa_of)
@@ -480,12 +508,15 @@ def fused_multiply_add(typing_context, a, b, c):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def one_to_two(typing_context, word):  # type: ignore[no-untyped-def]
-    """Return the top 52 bits of a word as a float in [1, 2)."""
+    """Return the top bits of a word, as many as a mantissa has, as a float in [1, 2)."""
     if not _is_word(word):
         return None
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        kept = builder.lshr(args[0], _constant(builder, args[0], 12))
+        form = _form_of(args[0])
+        kept = builder.lshr(args[0], _constant(builder, args[0], 64 - form.bits))
+        if form.word != _INT:
+            kept = builder.trunc(kept, _like(kept, form.word))
         return _with_exponent_zero(builder, kept)
 
     return (lanes if word == words else types.float64)(word), lower

@@ -42,7 +42,7 @@ from quad_gym.kernels.numbers.lanes import (
     is_product,
     lanes,
     select,
-    splat,
+    vector_of,
     zero_like,
 )
 
@@ -285,7 +285,9 @@ def polynomial(typing_context, x, coefficients):  # type: ignore[no-untyped-def]
         add = ir.IRBuilder.fadd
         *others, value = (builder.extract_value(args[1], i) for i in range(len(coefficients)))
         if number == lanes:
-            add, value, others = _add, splat(builder, value), [splat(builder, c) for c in others]
+            given = zip((value, *others), (coefficients[-1], *coefficients), strict=False)
+            value, *others = (vector_of(context, builder, c, kind, lanes) for c, kind in given)
+            add = _add
         for c in reversed(others):
             value = add(builder, c, builder.fmul(args[0], value))
         return value

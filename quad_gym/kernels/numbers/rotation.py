@@ -6,7 +6,7 @@ Quaternions are Hamilton's, (w, x, y, z), and turn body components into inertial
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.numbers.elementary import atan2, sin_cos, sin_cos_minus_one
+from quad_gym.kernels.numbers.elementary import TINY, atan2, sin_cos, sin_cos_minus_one
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import add_to_diagonal, unit_or
 
@@ -58,7 +58,7 @@ def split_turn(d):
     x, y, z = d
     angle = math.sqrt(x * x + y * y + z * z)
     sine, cosine = sin_cos(0.5 * angle)
-    turned = angle > 1e-100
+    turned = angle > TINY
     per_angle = select(turned, sine / select(turned, angle, 1.0), 0.5)
     q, k = 2.0 * per_angle * cosine, 2.0 * per_angle * per_angle
     even = (
@@ -131,7 +131,7 @@ def vector_to_dcm(phi):
     """exp(-[phi x]), the R_BI of a body rotated from I by the rotation vector phi [rad]."""
     angle = math.sqrt(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
     sine, cosine = sin_cos(0.5 * angle)
-    turned = angle > 1e-100
+    turned = angle > TINY
     per_angle = select(turned, sine / select(turned, angle, 1.0), 0.5)
     return quaternion_to_dcm((cosine, per_angle * phi[0], per_angle * phi[1], per_angle * phi[2]))
 
@@ -184,7 +184,7 @@ def rotation_between(a, b):
     z = a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1]
     near = select(w < 0.0, -1.0, 1.0)  # b and -b are the same attitude
     sine = math.sqrt(x * x + y * y + z * z)
-    turned = sine > 1e-100
+    turned = sine > TINY
     per_sine = near * select(turned, atan2(sine, near * w) / select(turned, sine, 1.0), 1.0)
     return (2.0 * per_sine * x, 2.0 * per_sine * y, 2.0 * per_sine * z)
 

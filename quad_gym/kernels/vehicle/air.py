@@ -6,7 +6,7 @@ The air's velocity is held over a tick, as the motor voltages are.
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.numbers.elementary import clip, exp, log, maximum, minimum
+from quad_gym.kernels.numbers.elementary import TINY, clip, exp, log, maximum, minimum
 from quad_gym.kernels.numbers.lanes import logical_not, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import dot, keep, load3, load4, load33, norm
 from quad_gym.kernels.numbers.random import normal_pair, stream_of
@@ -250,8 +250,8 @@ def battery_voltage(charge, power, current, p):
     U0 = p.max_voltage * (p.battery_empty_voltage + (1.0 - p.battery_empty_voltage) * charge)
     R = p.battery_resistance
     loaded = 0.5 * (U0 + math.sqrt(maximum(U0 * U0 - 4.0 * R * power, 0.0)))
-    loaded = minimum(loaded, 0.25 * U0 * U0 / maximum(R * current, 1e-300))
-    delivered = minimum(power, 0.25 * U0 * U0 / maximum(R, 1e-300))
+    loaded = minimum(loaded, 0.25 * U0 * U0 / maximum(R * current, TINY))
+    delivered = minimum(power, 0.25 * U0 * U0 / maximum(R, TINY))
     return select(charge > 0.0, loaded, 0.0), delivered
 
 

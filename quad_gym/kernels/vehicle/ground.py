@@ -17,7 +17,7 @@ normal forces and static friction can hold keeps its exact state.
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.numbers.elementary import clip, maximum, minimum, sin_cos
+from quad_gym.kernels.numbers.elementary import TINY, clip, maximum, minimum, sin_cos
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
 from quad_gym.kernels.numbers.linalg import cross, dot, keep, load3, load4, load33, rounded, store
 from quad_gym.kernels.numbers.rotation import normalize_quaternion, quaternion_to_dcm
@@ -126,7 +126,7 @@ def _share_without_gain(start, before, after, ahead, p):
     a = p.mass * dot(dv, dv) + dot(dw, J @ dw)
     b = p.mass * dot(start, dv) + dot(before[1], J @ dw)  # v_free - h a = v_start
     c = -p.mass * dot(before[0] - start, ahead) / p.dt
-    changes = a > 1e-300
+    changes = a > TINY
     root = math.sqrt(maximum(b * b - 2.0 * a * c, 0.0))
     return clip((root - b) / select(changes, a, 1.0), 0.0, 1.0)
 
@@ -232,7 +232,7 @@ def _turned(q, w_B, dt):
     """The attitude q exp(w dt), a quaternion."""
     half = 0.5 * dt * math.sqrt(dot(w_B, w_B))
     sine, cosine = sin_cos(half)
-    turns = half > 1e-100
+    turns = half > TINY
     per = select(turns, 0.5 * dt * sine / select(turns, half, 1.0), 0.5 * dt)
     (a, x, y, z), d = q, per * w_B
     return normalize_quaternion(
