@@ -135,8 +135,11 @@ def test_unknown_heading_keeps_its_standard_deviation_without_motion():
     assert not kf.heading_known
 
 
-def found_by_the_verdict(compass, apart, sigma, out, unknown=0.0):
-    """Findings on a replay of 40 s, whose heading differs from 10 s on until it is reset."""
+def found_by_the_verdict(compass, apart, sigma, out, unknown=0.0, fields=None):
+    """Findings on a replay of 40 s, whose heading differs from 10 s on until it is reset.
+
+    Every `fields`-th measurement of the compass contradicts the heading.
+    """
     time = np.arange(0.0, 40.0, 0.01)
     until = 14.0 if out else 40.0
     wrong = (time >= 10.0) & (time < until)
@@ -150,7 +153,14 @@ def found_by_the_verdict(compass, apart, sigma, out, unknown=0.0):
     streams = {"magnetometer": None} if compass else {}
     suite = SimpleNamespace(magnetometer=object())
     log = SimpleNamespace(streams=streams)
-    return [*contradicted(SimpleNamespace(result=result, suite=suite, log=log))]
+    sensors = {}
+    if fields is not None:
+        stamps = np.arange(0.0, 40.0, 0.1)
+        rejected = np.arange(len(stamps)) % fields == 0
+        nis = np.where(rejected, 100.0, 1.0)
+        sensors = {"magnetometer": SimpleNamespace(time=stamps, nis=nis, rejected=rejected)}
+    case = SimpleNamespace(result=result, suite=suite, log=log, sensors=sensors)
+    return [*contradicted(case)]
 
 
 def test_verdict_says_which_heading_the_motion_contradicts():
@@ -170,3 +180,14 @@ def test_verdict_says_which_heading_the_motion_contradicts():
     assert "wrong until 14.0 s, and unknown until 17.0 s" in thrown.text
     (vague,) = found_by_the_verdict(True, 0.0, 30.0, False)
     assert "no motion shows the heading" in vague.text
+
+
+def test_verdict_blames_the_heading_before_where_the_compass_agrees_with_the_later_one():
+    (start,) = found_by_the_verdict(True, 5.0, 1.0, True, unknown=3.0, fields=20)
+    assert start.severity == Severity.UNCERTAIN
+    assert "wrong until 14.0 s, and unknown until 17.0 s. The magnetometer agrees" in start.text
+    (left_out,) = found_by_the_verdict(True, 5.0, 1.0, True, fields=20)
+    assert "left out for 16 s: the heading was wrong until 14.0 s" in left_out.text
+    (compass,) = found_by_the_verdict(True, 5.0, 1.0, True, unknown=3.0, fields=2)
+    assert compass.severity == Severity.LOST
+    assert "the heading of the magnetometer contradicts" in compass.text

@@ -22,6 +22,7 @@ from quad_gym.logs.replaying.results import (
     exceeds,
     fit_of,
     larger,
+    rejected_for_their_size,
     runs_beyond_chance,
 )
 from quad_gym.logs.replaying.rules import HORIZONS, changes
@@ -94,6 +95,25 @@ def test_measurements_of_another_clock_are_named_with_the_difference():
     (text,) = (f.text for f in of(result, "height") if "clocks" in f.text)
     assert "all by about 1.50 s: the clocks differ, use log_delays.barometer = -1.50" in text
     assert any("nothing corrects it for 4" in p for p in result.problems)
+
+
+@pytest.mark.parametrize("skew", [0.0, 0.008])
+def test_clocks_that_run_apart_are_named_with_their_ratio(skew):
+    """The IMU's clock is slower by `skew`, so its stamps need the factor 1 / (1 - skew)."""
+    log, _ = flight()
+    result = replay(log, sensors=NAME)
+    own = np.isfinite(log["gyro"][:, 0])
+    imu = Stream(log["time"][own], log["time"][own], {n: log[n][own] for n in ("gyro", "accel")})
+    fixes = np.isfinite(log["gnss_velocity_enu"][:, 0])
+    stamps = log["time"][fixes] / (1.0 - skew)
+    gnss = Stream(stamps, stamps, {"velocity_I": log["gnss_velocity_enu"][fixes]})
+    case = SimpleNamespace(log=SimpleNamespace(imu=imu, gnss=gnss), result=result)
+    found = [*rules.clocks(case)]
+    assert bool(found) == (skew > 0.0)
+    for finding in found:
+        assert finding.severity == Severity.LOST
+        ratio = float(re.search(r"stamps of the IMU by ([0-9.]+)", finding.text)[1])
+        assert ratio == pytest.approx(1.0 / (1.0 - skew), abs=0.0015)
 
 
 def test_stamps_that_step_back_are_named_with_their_time():
@@ -216,6 +236,14 @@ def test_mean_nis_is_per_degree_of_freedom_and_includes_rejected_measurements():
     fit = fit_of(measured(innovation, [False, False, True, False]))
     assert fit.mean_nis == pytest.approx((1.0 + 1.0 + 18.0 + 2.0) / 4.0 / 2.0)
     assert fit.rejected == 0.25
+
+
+def test_measurements_within_the_gate_are_not_rejected_for_their_size():
+    """The limit for 1 % and two degrees of freedom is -2 log(0.01) = 9.21."""
+    innovation = np.array([[3.0, 0.0], [3.1, 0.0], [3.1, 0.0]])
+    own = rejected_for_their_size(measured(innovation, [True, True, False]), 0.01)
+    assert own.rejected.tolist() == [False, True, False]
+    assert own.gated.tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize(

@@ -285,7 +285,7 @@ def _agree_otherwise(moved: Floats, mean: Floats, limit: float) -> bool:
     if not len(apart) or len(apart) < 0.8 * (apart[-1] - apart[0] + 1):
         return False  # they differ again and again
     a, b = told[others], by_places[others]
-    if len(a) < max(ENOUGH, len(told) // 3) or not np.any(a):
+    if len(a) < max(ENOUGH, len(told) // 3) or not (np.any(a) and np.any(b)):
         return False
     ratio = complex(np.vdot(a, b) / np.vdot(a, a))  # of the positions' velocities to the told ones
     alike = np.abs(np.vdot(a, b)) / math.sqrt(float(np.vdot(a, a).real * np.vdot(b, b).real))

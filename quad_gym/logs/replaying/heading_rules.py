@@ -1,4 +1,4 @@
-"""Rules of the verdict on the heading: that of the motion, and what the compass shows alone."""
+"""Rules of the verdict on the heading, by the motion and by the compass alone."""
 
 import itertools
 import math
@@ -22,6 +22,9 @@ KNOWN = math.radians(15.0)  #: standard deviation below which the motion shows a
 LASTING = 2.0
 """Time of a disturbance, and for which headings contradict each other without a reset of the filter
 [s]."""
+FEW_FIELDS, CONTRADICTED = 10, 0.2
+"""Number of fields that show whether a compass agrees, and the share beyond the gate with which it
+does not."""
 _TURNS = (45.0, 90.0, 135.0, 180.0)  #: angles by which autopilots assume compasses turned
 
 
@@ -42,21 +45,47 @@ def contradicted(case: Evidence) -> Iterator[Finding]:
             yield _contradiction(result, compass, begin, end, k, reset)
             return
     unknown = [k for k in rises if not result.heading_known[k]]
-    if unknown:
+    if unknown and _agrees(case, out):
+        yield _wrong_start(result, int(unknown[0]))
+    elif unknown:
         yield _thrown(result, compass, int(unknown[0]))
     elif compass and len(rises):
-        text = _left_out(result, out, int(rises[0]))
-        yield uncertain(
-            "heading",
-            f"the magnetometer {text}: it contradicts the motion. It is turned, near iron, frozen "
-            "or disturbed",
-        )
+        text, time = _left_out(result, out, int(rises[0])), result.time[rises[0]]
+        why = "it contradicts the motion. It is turned, near iron, frozen or disturbed"
+        if _agrees(case, out):
+            why = f"the heading was wrong until {time:.1f} s. It agrees with the later one"
+        yield uncertain("heading", f"the magnetometer {text}: {why}")
     elif compass and len(sigma) and np.isfinite(sigma).any() and not (sigma < KNOWN).any():
         yield Finding(
             quantity="heading",
             severity=Severity.NOTE,
             text="no motion shows the heading: the magnetometer alone determines it",
         )
+
+
+def _agrees(case: Evidence, out: np.ndarray) -> bool:
+    """Return True if a compass agrees with the estimate while it is left out.
+
+    The heading that was wrong is then not the compass's. A filter waits before it trusts a compass
+    again, until the vehicle has turned.
+    """
+    m = case.sensors.get("magnetometer")
+    if m is None or not len(m.time):
+        return False
+    rows = np.interp(m.time, case.result.time, out.astype(np.float64)) > 0.5
+    rows &= np.isfinite(m.nis)
+    return rows.sum() >= FEW_FIELDS and float(m.rejected[rows].mean()) < CONTRADICTED
+
+
+def _wrong_start(result: Replay, k: int) -> Finding:
+    """A heading that was found wrong in row k, while the compass agrees with the later one."""
+    later = np.flatnonzero(np.asarray(result.heading_known, bool)[k:])
+    until = f"until {result.time[k + later[0]]:.1f} s" if len(later) else "until the end"
+    text = (
+        f"the heading tilted the estimate: it was wrong until {result.time[k]:.1f} s, and unknown "
+        f"{until}. The magnetometer agrees with the later one"
+    )
+    return lost("heading", text) if not len(later) else uncertain("heading", text)
 
 
 def _thrown(result: Replay, compass: bool, k: int) -> Finding:

@@ -274,6 +274,22 @@ def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
     return found
 
 
+def rejected_for_their_size(m: Measured, probability: float) -> Measured:
+    """Return innovations of which those within the gate do not count as rejected.
+
+    A filter also leaves out measurements of a sensor on probation, whatever they are.
+
+    Args:
+        m: The innovations.
+        probability: False-alarm probability of the gate.
+    """
+    from scipy.stats import chi2
+
+    limit = chi2.isf(probability, m.innovation.shape[1])
+    within = m.rejected & (m.nis < limit)
+    return replace(m, gate=np.where(within, float(GateDecision.UNSURE), m.gate))
+
+
 _Found = TypeVar("_Found", bound=Estimates)
 
 

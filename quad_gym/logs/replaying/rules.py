@@ -1,4 +1,4 @@
-"""Rules of the verdict: on innovations, times and motion, and on what no sample explains."""
+"""Rules of the verdict on innovations, times and motion, and on unexplained changes."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quad_gym.frames import ecef_to_enu
 from quad_gym.logs.formats import Floats, Log
 from quad_gym.logs.formats.clocks import PAUSE
 from quad_gym.logs.replaying.results import (
@@ -325,6 +326,14 @@ LATE = 0.5  #: share of late measurements above which the clocks do not agree [-
 MANY_LOST = 0.05  #: share of lost samples of the IMU that is worth a note [-]
 SHORT_PAUSE = 0.3  #: time without samples of the IMU in which a vehicle turns by some degrees [s]
 BLOCK = 20  #: measurements in a row that are late together, so that a clock has changed
+APART = 0.15  #: time by which clocks that run apart differ more at the end of a log [s]
+LAGS = np.arange(-1.5, 1.501, 0.03)  #: differences of the clocks of IMU and GNSS that are tried [s]
+WINDOW, CHANGE = 10.0, 0.9
+"""Times over which a difference of clocks is sought, and over which velocities change [s]."""
+FITS, CLEAR, SCATTER = 0.6, 2.0, 0.1
+"""Share of the squared changes of velocity that a lag leaves unexplained, at most; how many times
+more another lag leaves; and scatter of the lags about a line, at most [s]."""
+WINDOWS = 4  #: lags that show a line
 
 
 def late(case: Evidence) -> Iterator[Finding]:
@@ -362,6 +371,84 @@ def _late_block(ages: Floats, least: float) -> tuple[int, int]:
         return 0, 0
     k = int(np.argmax(edges[1::2] - edges[::2]))
     return int(edges[2 * k]), int(edges[2 * k + 1] - edges[2 * k])
+
+
+def clocks(case: Evidence) -> Iterator[Finding]:
+    """Clocks of IMU and GNSS that run apart.
+
+    In each window, the changes of the GNSS velocity are compared with those by the specific forces
+    of the IMU, for many differences of the two clocks. That which explains them best changes with
+    time if one clock is faster.
+    """
+    found = _clock_lags(case)
+    if len(found) < WINDOWS or np.ptp(found[:, 0]) < 2.0 * WINDOW:
+        return
+    time, lag = found.T
+    slope, first = np.polyfit(time, lag, 1)
+    scatter = float(np.std(lag - first - slope * time))
+    span = float(np.ptp(time))
+    doubt = scatter / (float(np.std(time)) * math.sqrt(len(time)))
+    if abs(slope) * span < APART or scatter > SCATTER or abs(slope) < CERTAIN * doubt:
+        return
+    begin, end = (first + slope * t for t in time[[0, -1]])
+    yield lost(
+        "log",
+        f"the clocks of IMU and GNSS run apart by {100.0 * abs(slope):.2g} %: velocities of GNSS "
+        f"fit samples of the IMU stamped {begin:+.2f} s from theirs at {time[0]:.0f} s, and "
+        f"{end:+.2f} s at {time[-1]:.0f} s. Put both on one clock: multiply the stamps of the IMU "
+        f"by {1.0 / (1.0 + slope):.4f}",
+    )
+
+
+def _clock_lags(case: Evidence) -> Floats:
+    """Return middles of windows, and differences of the stamps of IMU and GNSS, (n, 2) [s]."""
+    log, result, none = case.log, case.result, np.empty((0, 2))
+    gnss = log.gnss
+    if gnss is None or result.sensors.gnss is None or len(result) < BLOCK:
+        return none
+    velocity = gnss.values.get("velocity_I")
+    if velocity is None and "velocity_G" in gnss.values:
+        origin = np.array(result.sensors.gnss.reference_antenna_G)
+        velocity = gnss.values["velocity_G"] @ ecef_to_enu(origin).T
+    if velocity is None:
+        return none
+    rows = np.flatnonzero(np.isfinite(velocity).all(axis=1))
+    rows = rows[np.argsort(gnss.time[rows], kind="stable")]
+    stamps, velocity = gnss.time[rows], velocity[rows]
+    later = np.searchsorted(stamps, stamps + CHANGE)
+    first = np.flatnonzero(later < len(stamps))
+    later = later[first]
+    reach = float(LAGS[-1])
+    inside = (stamps[first] - reach > result.time[0]) & (stamps[later] + reach < result.time[-1])
+    inside &= stamps[later] - stamps[first] < 2.0 * CHANGE
+    first, later = first[inside], later[inside]
+    changed = velocity[later] - velocity[first]
+    dt = np.diff(result.time)[:, np.newaxis]
+    R = quaternion_to_dcm(result.quaternion)
+    steps = increments(log, result, "accel") - result.accel_bias[:-1] * dt
+    gains = np.einsum("kji,kj->ki", 0.5 * (R[:-1] + R[1:]), steps) - dt * [0.0, 0.0, GRAVITY]
+    total = np.vstack([np.zeros(3), np.cumsum(gains, axis=0)])
+
+    def between(begin: Floats, end: Floats) -> Floats:
+        parts = [np.interp(end, result.time, v) - np.interp(begin, result.time, v) for v in total.T]
+        return np.column_stack(parts)
+
+    predicted = np.array([between(stamps[first] + L, stamps[later] + L) for L in LAGS])
+    middle = 0.5 * (stamps[first] + stamps[later])
+    found = []
+    for begin in np.arange(result.time[0] + SETTLED, result.time[-1] - WINDOW, 0.5 * WINDOW):
+        rows = np.flatnonzero((middle >= begin) & (middle < begin + WINDOW))
+        if len(rows) < BLOCK:
+            continue
+        told = changed[rows] - changed[rows].mean(axis=0)
+        rest = told - predicted[:, rows] + predicted[:, rows].mean(axis=1, keepdims=True)
+        left = (rest**2).sum(axis=(1, 2))
+        best = int(np.argmin(left))
+        if 0 < best < len(LAGS) - 1 and left[best] < min(
+            FITS * float((told**2).sum()), float(left.max()) / CLEAR
+        ):
+            found.append((begin + 0.5 * WINDOW, LAGS[best]))
+    return np.array(found).reshape(-1, 2)
 
 
 def gaps(case: Evidence) -> Iterator[Finding]:

@@ -27,6 +27,7 @@ from quad_gym.logs.replaying.results import (
     Severity,
     by_sensor,
     fit_of,
+    rejected_for_their_size,
 )
 from quad_gym.logs.replaying.rules import NAMES, Evidence, lost
 from quad_gym.params.suites import SensorSuite
@@ -59,6 +60,7 @@ RULES = (
     Rule(_units, "units, axes or clocks are implausible"),
     Rule(_failures, "the filter failed, or the suite has no sensor of the log"),
     Rule(rules.late, "more than half of a sensor, or all from a time on, is late", "a tenth"),
+    Rule(rules.clocks, "clocks of IMU and GNSS run apart by more than 0.15 s"),
     Rule(rules.gaps, "10 s of flight without a correction, over all parts, or none at all"),
     Rule(
         rules.misfits,
@@ -81,7 +83,7 @@ RULES = (
     Rule(rules.biases, "biases of the IMU that no sensor has"),
     Rule(rules.unknown_heading, "", "a heading that nothing shows until the end"),
 )
-"""All rules: what makes a quantity unusable, and what makes it uncertain."""
+"""All rules, with the limits beyond which a quantity is unusable or uncertain."""
 
 
 def with_verdict(
@@ -93,6 +95,10 @@ def with_verdict(
     """
     flown = _until_landing(log, result)
     sensors = by_sensor(flown.measured)
+    probability = suite.estimator.false_alarm_probability
+    if "magnetometer" in sensors and probability:
+        own = rejected_for_their_size(sensors["magnetometer"], probability)
+        sensors = {**sensors, "magnetometer": own}
     fits = {name: fit for name, m in sensors.items() if (fit := fit_of(m))}
     case = Evidence(log, body, suite, flown, sensors, fits, start)
     found = [finding for rule in RULES for finding in rule.find(case)]
