@@ -553,7 +553,11 @@ def _follow_motion(flight, p, work, settings, slow, after):
             store(work.since_level, load3(flight.level_sum))
         pushed = load3(work.since_level) - load3(flight.level_last)
         _measure_motion(flight, p, work, mask)
-        _hold_attitude(flight, p, work, settings, slow, mask, pushed)
+        measured = flight.block_valid[0]
+        for block in range(1, len(flight.block_valid)):
+            measured = maximum(measured, flight.block_valid[block])
+        # a lane must not depend on the instants at which others are measured
+        _hold_attitude(flight, p, work, settings, slow, mask & (measured > 0.0), pushed)
 
 
 @stage
