@@ -121,9 +121,10 @@ def test_wrong_given_heading_is_replaced_by_that_of_the_motion(kind, off):
     assert abs(flight.error(kf, 300 * dt)[8]) < 4.0 * sigma
 
 
-def test_unknown_heading_keeps_its_standard_deviation_without_motion():
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_unknown_heading_keeps_its_standard_deviation_without_motion(kind):
     flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(0), amplitude=0.0), 0.02
-    kf = UnscentedKalmanFilter(MAGNETIC)
+    kf = kind(MAGNETIC)
     kf.initialize(flight.gnss(0.0)[0])
     first = math.sqrt(kf.covariance[8, 8])
     for k in range(1, 501):
@@ -133,6 +134,26 @@ def test_unknown_heading_keeps_its_standard_deviation_without_motion():
             kf.update(position, gnss_velocity_G=velocity)
             assert math.sqrt(kf.covariance[8, 8]) > 0.98 * first
     assert not kf.heading_known
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_heading_is_less_certain_after_a_long_loss_of_gnss_and_none_is_reset(kind):
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(3), amplitude=0.5), 0.02
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = kind(MAGNETIC.replace(magnetometer=None, gnss=gnss))
+    kf.initialize(flight.gnss(0.0)[0], heading=flight.yaw)
+    sigmas = []
+    for k in range(1, 2501):
+        kf.predict(*flight.sample((k - 1) * dt, dt), dt=dt)
+        if k % 5 == 0 and not 500 < k <= 2000:  # 30 s without GNSS
+            position, velocity = flight.gnss(k * dt)
+            kf.update(position, gnss_velocity_G=velocity)
+        sigmas.append(math.sqrt(kf.covariance[8, 8]))
+        assert abs(flight.error(kf, k * dt)[8]) < 4.0 * sigmas[-1]
+        assert kf.heading_known
+    assert (np.diff(sigmas[500:2000]) >= 0.0).all()
+    assert sigmas[1999] > 1.2 * sigmas[499]
+    assert kf._engine.read("compass_out")[0] == 0.0
 
 
 def found_by_the_verdict(compass, apart, sigma, out, unknown=0.0, fields=None):
