@@ -136,8 +136,14 @@ BATCHES = [
     ({"gains": "tuned", "control": Control.CTBR}, "gains must not be given with Control.CTBR"),
     ({"action_params": SCALES}, "action_params must not be given with Control.PD"),
     ({"source": Source.TRUTH, "filter_start": "warm"}, "filter_start needs a filter"),
-    ({"run_filter": False, "innovations": True}, "innovations needs a filter"),
-    ({"run_filter": False, "include_std": True}, "include_std needs a filter"),
+    (
+        {"run_filter": False, "innovations": True},
+        "run_filter must not be False where .* innovations need",
+    ),
+    (
+        {"run_filter": False, "include_std": True},
+        "run_filter must not be False where .* include_std",
+    ),
     ({"task": TaskParams(duration=0.001)}, "duration must be 0"),
     ({"sensors": AVERAGED}, "integration='midpoint'"),
     ({"threads": 1025}, "threads must be at most 1024"),
