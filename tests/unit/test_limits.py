@@ -197,6 +197,7 @@ def examples():
             for field in dataclasses.fields(value):
                 collect(getattr(value, field.name))
 
+    collect(faults.MagnetometerDisturbance(how="iron"))  # the only form with a direction
     for name in ("rtk", "consumer", "crazyflie", "uwb", "indoor"):
         collect(quad_gym.sensor_suite(name))
     collect(LAB)
