@@ -146,6 +146,30 @@ def test_a_lane_gates_for_itself():
     np.testing.assert_array_equal(filters.get("gate")[:, POSITION_BLOCK], [1, 1, 1, 2, 1, 1, 1, 1])
 
 
+@pytest.mark.parametrize("doubt", [1.0, 10.0])
+def test_nis_and_estimate_of_a_lane_do_not_depend_on_what_others_measure(doubt):
+    def updated(subsets):
+        filters = LaneFilter(CONSISTENT)
+        for lane in range(EIGHT):
+            filters.measure(lane, RECORDING, 0)
+        filters.initialize()
+        filters.blocks["P"] *= doubt**2
+        for lane, (position, baseline, camera) in enumerate(subsets):
+            seen = {"position": position, "baseline": baseline, "camera": camera}
+            filters.measure(lane, RECORDING, 0, **seen)
+        filters.update()
+        return {name: filters.get(name) for name in (*STATE, "nis", "nis_dimension")}
+
+    # where the estimate is uncertain, components along directions are not independent
+    some = [(0, 0, 1), (1, 0, 1), (0, 1, 1), (0, 0, 1), (1, 0, 0), (0, 1, 1), (1, 1, 1), (0, 0, 1)]
+    mixed = updated(some)
+    for lane, subset in enumerate(some):
+        alike = updated([subset] * EIGHT)
+        for name, values in mixed.items():
+            np.testing.assert_array_equal(values[lane], alike[name][lane], err_msg=name)
+    assert np.isfinite(mixed["nis"]).all()
+
+
 def test_valid_measurements_are_rejected_at_the_false_alarm_probability():
     suite = quad_gym.sensor_suite("consumer").simplified()
     two = suite.gnss.replace(secondary_antenna_B=(0.1, 0.0, 0.0472), baseline_sigma=0.035)

@@ -14,7 +14,6 @@ from quad_gym.kernels.filter.columns import columns_of, row_of
 from quad_gym.kernels.filter.error_state import BA, BG, E, variance_of
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum, minimum
-from quad_gym.kernels.numbers.factors import cholesky, solve_left_vector
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     add_to_diagonal,
@@ -373,24 +372,30 @@ def _find_directions(flight, work, settings):
 
 @kernel
 def _joint_nis(work, blocks):
-    """The NIS along directions whose components are not independent."""
-    M, y, size = work.M, work.y, (blocks + 2) // 3 * 3
-    zero = zero_like(work.spread)
-    for i in range(size):
-        M[i, i], y[i] = zero + 1.0, zero
+    """The NIS along directions whose components are not independent.
+
+    A block has a single number here, so its place among three depends on the blocks of other lanes.
+    The factor is therefore computed number by number: numbers that a lane lacks change no bit of
+    it. In blocks of three, as in `cholesky`, two numbers would be rounded by their place.
+    """
+    M, y, inverse = work.M, work.y, work.inverse_diagonal
+    nis = zero_like(work.spread)
+    for i in range(blocks):
+        u = load3(work.along[3 * i : 3 * i + 3])
+        rest = dot(u, load3(work.nu[3 * i : 3 * i + 3]))
         for j in range(i):
-            M[i, j] = zero
-        if i < blocks:
-            u = load3(work.along[3 * i : 3 * i + 3])
-            y[i] = dot(u, load3(work.nu[3 * i : 3 * i + 3]))
-            for j in range(i + 1):
-                other = load3(work.along[3 * j : 3 * j + 3])
-                M[i, j] = dot(u, load_block(work.Rz, 3 * i, 3 * j) @ other)
-            M[i, i] = select(M[i, i] > 0.0, M[i, i], 1.0)
-    cholesky(M, size, work.inverse_diagonal)
-    solve_left_vector(M, y, size, work.inverse_diagonal)
-    nis = zero
-    for i in range(size):
+            other = load3(work.along[3 * j : 3 * j + 3])
+            entry = dot(u, load_block(work.Rz, 3 * i, 3 * j) @ other)
+            for k in range(j):
+                entry = entry - M[i, k] * M[j, k]
+            M[i, j] = entry * inverse[j]
+            rest = rest - M[i, j] * y[j]
+        pivot = dot(u, load_block(work.Rz, 3 * i, 3 * i) @ u)
+        pivot = select(pivot > 0.0, pivot, 1.0)
+        for k in range(i):
+            pivot = pivot - M[i, k] * M[i, k]
+        inverse[i] = 1.0 / math.sqrt(pivot)
+        y[i] = rest * inverse[i]
         nis = nis + y[i] * y[i]
     return nis
 
