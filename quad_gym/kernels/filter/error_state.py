@@ -120,14 +120,20 @@ def variance_of(flight, row):
 
 @kernel
 def load_covariance(P, flight, slow):
-    """Copy the lower triangle of the covariance of all states to P, by blocks of three."""
+    """Copy the lower triangle of the covariance of all states to P, by blocks of three.
+
+    Blocks on the diagonal become symmetric. A record holds their lower triangles only.
+    """
     for i in range(0, D, 3):
-        for j in range(0, i + 3, 3):
+        for j in range(0, i, 3):
             store_block(P, i, j, load_block(flight.P, i, j))
+        store_block(P, i, i, load_symmetric(flight.P, i))
     if slow is not None:
+        own = flight.P_slow[:, D:]
         for i in range(0, slow.slow_states, 3):
-            for j in range(0, D + i + 3, 3):
+            for j in range(0, D + i, 3):
                 store_block(P, D + i, j, load_block(flight.P_slow, i, j))
+            store_block(P, D + i, D + i, load_symmetric(own, i))
 
 
 @kernel
