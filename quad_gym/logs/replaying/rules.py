@@ -142,7 +142,9 @@ def changes(log: Log, result: Replay, settled: float) -> tuple[list[Change], int
     W = np.vstack([np.zeros(3), W])
     hardest = np.linalg.norm(accel, axis=1)  # parts may follow each other without time between
     np.divide(hardest, dt, out=hardest, where=dt > 0.0)
-    began = np.maximum.accumulate(np.append(-np.inf, np.where(dt > PAUSE, time[1:], -np.inf)))
+    # a pause shortly before the first row counts, too
+    pauses = np.where(np.diff(result.time) > PAUSE, result.time[1:], -np.inf)
+    began = np.maximum.accumulate(np.append(-np.inf, pauses))[first:]
     found: dict[str, Change] = {}
     count = 0
     for T in HORIZONS:
