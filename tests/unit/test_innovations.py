@@ -29,6 +29,9 @@ GATED = LAB.replace(
         bearing_noise_at="predicted", false_alarm_probability=1e-4, max_rejections=5
     )
 )
+GRADUAL = GATED.replace(
+    estimator=GATED.estimator.replace(kind="ekf", recursive_update_threshold=0.3)
+)
 RECORDING = record_circle(CONSISTENT, 400, 11)
 FIX = slice(0, 3)
 
@@ -146,28 +149,42 @@ def test_a_lane_gates_for_itself():
     np.testing.assert_array_equal(filters.get("gate")[:, POSITION_BLOCK], [1, 1, 1, 2, 1, 1, 1, 1])
 
 
-@pytest.mark.parametrize("doubt", [1.0, 10.0])
-def test_nis_and_estimate_of_a_lane_do_not_depend_on_what_others_measure(doubt):
-    def updated(subsets):
-        filters = LaneFilter(CONSISTENT)
+@pytest.mark.parametrize("suite", [CONSISTENT, GRADUAL])
+def test_nis_and_estimate_of_a_lane_do_not_depend_on_others(suite):
+    # neither on what others measure, nor on their steps
+    names = (*STATE, "nis", "nis_dimension", "block_nis", "innovation_sigma", "gate")
+
+    def updated(lanes):
+        filters = LaneFilter(suite)
         for lane in range(EIGHT):
             filters.measure(lane, RECORDING, 0)
         filters.initialize()
-        filters.blocks["P"] *= doubt**2
-        for lane, (position, baseline, camera) in enumerate(subsets):
+        for lane, (doubt, position, baseline, camera) in enumerate(lanes):
+            filters.put(lane, P=doubt**2 * filters.get("P")[lane])
             seen = {"position": position, "baseline": baseline, "camera": camera}
             filters.measure(lane, RECORDING, 0, **seen)
         filters.update()
-        return {name: filters.get(name) for name in (*STATE, "nis", "nis_dimension")}
+        return {name: filters.get(name) for name in names}
 
-    # where the estimate is uncertain, components along directions are not independent
-    some = [(0, 0, 1), (1, 0, 1), (0, 1, 1), (0, 0, 1), (1, 0, 0), (0, 1, 1), (1, 1, 1), (0, 0, 1)]
-    mixed = updated(some)
-    for lane, subset in enumerate(some):
-        alike = updated([subset] * EIGHT)
+    sensors = [
+        (0, 0, 1),
+        (1, 0, 1),
+        (0, 1, 1),
+        (0, 0, 1),
+        (1, 0, 0),
+        (0, 1, 1),
+        (1, 1, 1),
+        (0, 0, 1),
+    ]
+    lanes = [(0.1 if k % 2 else 10.0, *seen) for k, seen in enumerate(sensors)]
+    mixed = updated(lanes)
+    in_steps = np.isnan(mixed["nis"])
+    assert in_steps.any() == (suite is GRADUAL)
+    assert not in_steps.all()
+    for lane, chosen in enumerate(lanes):
+        alike = updated([chosen] * EIGHT)
         for name, values in mixed.items():
             np.testing.assert_array_equal(values[lane], alike[name][lane], err_msg=name)
-    assert np.isfinite(mixed["nis"]).all()
 
 
 def test_valid_measurements_are_rejected_at_the_false_alarm_probability():

@@ -152,10 +152,12 @@ def share_second_order(work, n, rows, further):
 
 
 @kernel
-def drop_even(work, n, rows, mask, others):
-    """Neglect the second order, as an EKF does, in the lanes `mask`; `others`: there are others."""
+def drop_even(work, n, rows, mask):
+    """Neglect the second order, as an EKF does, in the lanes `mask`; `rows`: 0 if it is not known.
+
+    Not only where other lanes have it: the gate reads it in all.
+    """
     for k in range(n):
         work.mu[k] = select(mask, 0.0, work.mu[k])
-        if others:
-            for j in range(rows):
-                work.E[j, k] = select(mask, 0.0, work.E[j, k])
+        for j in range(rows):
+            work.E[j, k] = select(mask, 0.0, work.E[j, k])

@@ -159,7 +159,7 @@ def update(flight, p, work, settings, stages, slow):
                         last = m
             if extended:
                 curved = any_of(further > 0.0)
-                drop_even(work, n, settings.motion_columns, further < 1.0, curved)
+                drop_even(work, n, settings.motion_columns if gradual else 0, further < 1.0)
             well = flight.update_failures == failures  # a step that fails is the last
             taking = mask & well & (further >= 1.0 * step)
             factor = factor_of(further, step)
