@@ -116,7 +116,7 @@ def test_a_bias_that_the_suite_does_not_admit_is_a_note_if_a_sensor_can_have_it(
 
 
 @pytest.mark.xfail(
-    reason="with heading by motion, a gyro bias of 250 times its prior is not found", strict=True
+    reason="with updates in steps, a gyro bias of 250 times its prior is not found", strict=True
 )
 def test_a_bias_far_beyond_its_prior_is_found_and_the_verdict_names_the_time_before():
     """The suite admits 0.0004 of 0.1 rad/s: the heading is wrong until the bias is found."""
