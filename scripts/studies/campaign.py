@@ -77,7 +77,7 @@ class Part:
     recipe_of_task: str | None = None
     """Id whose recipe is used; None: the one of `env_id`"""
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """Digest of the golden flights of the part."""
         return flights_digest(self.flights)
@@ -150,6 +150,19 @@ class Cell:
         return self.study.folder / "rows" / f"{self.arm.name}_{seed}.json"
 
     @property
+    def key(self) -> tuple[Any, ...]:
+        """Values of the row's columns that name the cell; see `row_key`."""
+        plan = None if self.training is None else self.training.plan
+        named = {
+            "arm": self.arm.name,
+            "seed": self.seed,
+            "steps": None if plan is None else plan.recipe.steps,
+            "episodes": self.study.episodes,
+            "flights": self.part.digest,
+        }
+        return row_key({**named, **self.part.columns})
+
+    @property
     def row(self) -> dict[str, Any] | None:
         """The row; None before it is measured."""
         if not self.file.exists():
@@ -189,9 +202,13 @@ class Cell:
         flown = self.trial.flown(policy)
         row = self._row(flown, seconds if self.trains else 0.0)
         row["flown_in"] = round(time.process_time() - began, 1)
+        self.write(row)
+        return row
+
+    def write(self, row: Mapping[str, Any]) -> None:
+        """Write the row into its file, at once."""
         self.file.parent.mkdir(parents=True, exist_ok=True)
         write_json(self.file.with_suffix(".part"), row).replace(self.file)
-        return row
 
     def _row(self, flown: Flown, seconds: float) -> dict[str, Any]:
         about, returns = self.study.about, flown.episodes.returns
@@ -230,6 +247,14 @@ def _trained(training: Training) -> float:
     if not done.finished:
         raise StoppedError
     return float(spent)
+
+
+def row_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Values of the columns of a row that name its cell in a table."""
+    names = ("arm", "seed", "steps", "episodes", "flights", "task", "suite")
+    return tuple(
+        row.get(name) or None if name in ("task", "suite") else row[name] for name in names
+    )
 
 
 def flights_digest(patterns: Sequence[str]) -> str:

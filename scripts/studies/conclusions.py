@@ -12,12 +12,10 @@ from pathlib import Path
 from quad_gym.analysis.metrics import Estimated
 from scripts.studies.campaign import DATA, Part, flights_digest, is_complete
 from scripts.studies.parts import (
+    BUDGETS,
     CURVE_ARMS,
-    DASH_STEPS,
-    LOOK_STEPS,
     PARTS,
     RACE_CURVE,
-    RACE_STEPS,
     SUITES,
     TRACKING_STEPS,
 )
@@ -74,7 +72,7 @@ class Arms:
 
 def look_around_control(rows: Rows) -> str:
     """Effect of the training observation, all else equal."""
-    arms, pair = Arms(rows, LOOK_STEPS), ("std_certainty", "truth_std_certainty")
+    arms, pair = Arms(rows, BUDGETS["LookAround"]), ("std_certainty", "truth_std_certainty")
     crashes = arms.against(*pair, "crashed")
     return (
         f"LookAround, trained on the estimate instead of the truth, with standard deviation and "
@@ -109,7 +107,7 @@ _FACTORS = {
 
 def look_around_factors(rows: Rows) -> str:
     """Share of each of the three factors, averaged over the others."""
-    arms = Arms(rows, LOOK_STEPS)
+    arms = Arms(rows, BUDGETS["LookAround"])
     parts = []
     for factor, pairs in _FACTORS.items():
         found = mean_effect([(arms[first], arms[second]) for first, second in pairs])
@@ -123,7 +121,7 @@ def look_around_factors(rows: Rows) -> str:
 
 def look_around_noise(rows: Rows) -> str:
     """Noise on the truth instead of the filter, all else equal."""
-    arms = Arms(rows, LOOK_STEPS)
+    arms = Arms(rows, BUDGETS["LookAround"])
     noisy = ("noisy_std_certainty", "matched_std_certainty")
     parts = [
         f"{arms.named(name)} differs from the truth by "
@@ -136,7 +134,7 @@ def look_around_noise(rows: Rows) -> str:
 
 def stale_race_training(rows: Rows) -> str:
     """Training on the estimate in the race with late measurements."""
-    arms, pair = Arms(rows, RACE_STEPS), ("std", "truth")
+    arms, pair = Arms(rows, BUDGETS["StaleRace"]), ("std", "truth")
     return (
         f"StaleRace ({arms.budget(*pair)}): {arms.named(pair[0])} and {arms.named(pair[1])} differ "
         f"by {arms.against(*pair)}; the rule {arms.named('pd')}."
@@ -145,7 +143,7 @@ def stale_race_training(rows: Rows) -> str:
 
 def stale_race_compensation(rows: Rows) -> str:
     """Compensating the delay in the filter instead of training on its errors."""
-    arms = Arms(rows, RACE_STEPS)
+    arms = Arms(rows, BUDGETS["StaleRace"])
     pair = ("truth_delay_compensated", "std_delay_compensated")
     return (
         f"StaleRace with delay compensation in the test ({arms.budget(*pair)}): "
@@ -157,7 +155,7 @@ def stale_race_compensation(rows: Rows) -> str:
 
 def stale_race_substitutes(rows: Rows) -> str:
     """Noise and a residual model instead of the filter."""
-    arms, names = Arms(rows, RACE_STEPS), ("noisy", "residual")
+    arms, names = Arms(rows, BUDGETS["StaleRace"]), ("noisy", "residual")
     parts = [
         f"{arms.named(name)} differs from the truth by {arms.against(name, 'truth')} and from the "
         f"estimate by {arms.against(name, 'std')}"
@@ -169,20 +167,20 @@ def stale_race_substitutes(rows: Rows) -> str:
 def stale_race_curve(rows: Rows) -> str:
     """Success by budget."""
     parts = []
-    budgets = sorted((*RACE_CURVE, RACE_STEPS))
+    budgets = sorted((*RACE_CURVE, BUDGETS["StaleRace"]))
     for steps in budgets:
         arms = Arms(rows, steps)
         parts.append(
             f"{steps / 1e6:g} million steps: {arms.named(CURVE_ARMS[1])}, "
             f"{arms.named(CURVE_ARMS[0])}"
         )
-    seeds = Arms(rows, RACE_STEPS)[CURVE_ARMS[0]].seeds
+    seeds = Arms(rows, BUDGETS["StaleRace"])[CURVE_ARMS[0]].seeds
     return f"StaleRace, success by budget ({seeds} seeds each): {'; '.join(parts)}."
 
 
 def outage_dash_rules(rows: Rows) -> str:
     """Rules: waiting once does not pay."""
-    arms = Arms(rows, DASH_STEPS)
+    arms = Arms(rows, BUDGETS["OutageDash"])
     names = ("pd", "pd_waits_at_start", "pd_waiting", "pd_backs_off")
     shown = ", ".join(arms.named(name) for name in names)
     lost = arms.against("pd_waits_at_start", "pd_waiting")
@@ -194,7 +192,7 @@ def outage_dash_rules(rows: Rows) -> str:
 
 def outage_dash_learned(rows: Rows) -> str:
     """Learned policies against the best rule, without and with memory."""
-    arms, best = Arms(rows, DASH_STEPS), "pd_backs_off"
+    arms, best = Arms(rows, BUDGETS["OutageDash"]), "pd_backs_off"
     names = ("truth", "std", "since_fix", "recurrent")
     parts = [f"{arms.named(name)}, {arms.against(name, best)}" for name in names]
     return (
@@ -309,16 +307,16 @@ def arms_table(table: str, steps: int) -> Conclusion:
 
 
 CONCLUSIONS: Mapping[str, tuple[str, Conclusion]] = {
-    "look_around.table": ("look_around", arms_table("look_around", LOOK_STEPS)),
+    "look_around.table": ("look_around", arms_table("look_around", BUDGETS["LookAround"])),
     "look_around.control": ("look_around", look_around_control),
     "look_around.factors": ("look_around", look_around_factors),
     "look_around.noise": ("look_around", look_around_noise),
-    "stale_race.table": ("stale_race", arms_table("stale_race", RACE_STEPS)),
+    "stale_race.table": ("stale_race", arms_table("stale_race", BUDGETS["StaleRace"])),
     "stale_race.training": ("stale_race", stale_race_training),
     "stale_race.compensation": ("stale_race", stale_race_compensation),
     "stale_race.substitutes": ("stale_race", stale_race_substitutes),
     "stale_race.curve": ("stale_race", stale_race_curve),
-    "outage_dash.table": ("outage_dash", arms_table("outage_dash", DASH_STEPS)),
+    "outage_dash.table": ("outage_dash", arms_table("outage_dash", BUDGETS["OutageDash"])),
     "outage_dash.rules": ("outage_dash", outage_dash_rules),
     "outage_dash.learned": ("outage_dash", outage_dash_learned),
     "when_to_train.table": ("when_to_train", when_to_train),

@@ -4,14 +4,8 @@ from itertools import product
 
 from scripts.studies.campaign import Part
 
-_LOOK, _RACE, _DASH = (f"QuadGym/{task}-v0" for task in ("LookAround", "StaleRace", "OutageDash"))
-_LOOK_FLIGHTS = ("LookAround", "LookAround, truth")
-_RACE_FLIGHTS = ("StaleRace", "StaleRace, truth")
-_DASH_FLIGHTS = ("OutageDash", "OutageDash, truth")
-
 SEEDS = 20  #: number of training seeds of each arm behind a conclusion
 FEWER = 10  #: number of training seeds of slow arms, and of the many tracking tasks
-LOOK_STEPS, RACE_STEPS, DASH_STEPS = 2_000_000, 4_000_000, 1_200_000
 RACE_CURVE = (400_000, 800_000, 2_000_000, 8_000_000)  #: further budgets of StaleRace [steps]
 
 SUITES = {
@@ -24,49 +18,32 @@ SUITES = {
 """Keywords of the suites in which tracking is studied."""
 TRACKING_STEPS = {"Circle": 1_800_000, "RandomTrajectory": 1_800_000, "Waypoints": 3_000_000}
 """Budgets of the tracking tasks, as in their recipes [steps]."""
+BUDGETS = {"LookAround": 2_000_000, "StaleRace": 4_000_000, "OutageDash": 1_200_000}
+"""Steps of the trainings in the tasks in which the estimate matters."""
+_TABLES = {"LookAround": "look_around", "StaleRace": "stale_race", "OutageDash": "outage_dash"}
 
 
-def _look(decides: str, *arms: str) -> Part:
+def _part(
+    task: str, decides: str, *arms: str, steps: int | None = None, seeds: int = SEEDS
+) -> Part:
+    """Part of a task in which the estimate matters; steps are those of `BUDGETS` if None."""
     return Part(
-        table="look_around",
-        decides=decides,
-        env_id=_LOOK,
+        table=_TABLES[task],
+        decides=f"{task}: {decides}",
+        env_id=f"QuadGym/{task}-v0",
         arms=arms,
-        steps=LOOK_STEPS,
-        seeds=SEEDS,
-        flights=_LOOK_FLIGHTS,
-    )
-
-
-def _race(decides: str, *arms: str, steps: int = RACE_STEPS) -> Part:
-    return Part(
-        table="stale_race",
-        decides=decides,
-        env_id=_RACE,
-        arms=arms,
-        steps=steps,
-        seeds=SEEDS,
-        flights=_RACE_FLIGHTS,
-    )
-
-
-def _dash(decides: str, *arms: str, seeds: int = SEEDS) -> Part:
-    return Part(
-        table="outage_dash",
-        decides=decides,
-        env_id=_DASH,
-        arms=arms,
-        steps=DASH_STEPS,
+        steps=BUDGETS[task] if steps is None else steps,
         seeds=seeds,
-        flights=_DASH_FLIGHTS,
+        flights=(task, f"{task}, truth"),
     )
 
 
 CURVE_ARMS = ("truth", "std")  #: arms of the curve of success over steps in StaleRace
 
 PARTS: tuple[Part, ...] = (
-    _look(
-        "LookAround: training on the estimate, against its control",
+    _part(
+        "LookAround",
+        "training on the estimate, against its control",
         "pd_reference",
         "pd_features",
         "pd_features_when_uncertain",
@@ -74,8 +51,9 @@ PARTS: tuple[Part, ...] = (
         "truth_std_certainty",
         "std_certainty",
     ),
-    _look(
-        "LookAround: the share of each of three factors",
+    _part(
+        "LookAround",
+        "the share of each of three factors",
         "truth",
         "estimate",
         "truth_std",
@@ -83,13 +61,15 @@ PARTS: tuple[Part, ...] = (
         "truth_certainty",
         "certainty",
     ),
-    _look(
-        "LookAround: noise instead of the filter",
+    _part(
+        "LookAround",
+        "noise instead of the filter",
         "noisy_std_certainty",
         "matched_std_certainty",
     ),
-    _race(
-        "StaleRace: training on the estimate, and delay compensation",
+    _part(
+        "StaleRace",
+        "training on the estimate, and delay compensation",
         "pd",
         "truth",
         "std",
@@ -97,8 +77,9 @@ PARTS: tuple[Part, ...] = (
         "truth_delay_compensated",
         "std_delay_compensated",
     ),
-    _dash(
-        "OutageDash: rules, and policies without memory",
+    _part(
+        "OutageDash",
+        "rules, and policies without memory",
         "pd",
         "pd_slow",
         "pd_waiting",
@@ -124,21 +105,23 @@ PARTS: tuple[Part, ...] = (
         )
         for (suite, keywords), (task, steps) in product(SUITES.items(), TRACKING_STEPS.items())
     ),
-    _race(
-        "StaleRace: estimate without standard deviations, noise, residual model",
+    _part(
+        "StaleRace",
+        "estimate without standard deviations, noise, residual model",
         "estimate",
         "noisy",
         "residual",
         "compensated",
     ),
     *(
-        _race(f"StaleRace: success after {steps:,} steps", *CURVE_ARMS, steps=steps)
+        _part("StaleRace", f"success after {steps:,} steps", *CURVE_ARMS, steps=steps)
         for steps in RACE_CURVE
     ),
-    _dash("OutageDash: a policy with memory", "recurrent", seeds=FEWER),
-    _look("LookAround: noise alone, and a privileged critic", "noisy", "matched"),
-    _dash(
-        "OutageDash: estimate alone, and a privileged critic",
+    _part("OutageDash", "a policy with memory", "recurrent", seeds=FEWER),
+    _part("LookAround", "noise alone, and a privileged critic", "noisy", "matched"),
+    _part(
+        "OutageDash",
+        "estimate alone, and a privileged critic",
         "estimate",
         "std_privileged",
         seeds=FEWER,

@@ -8,8 +8,10 @@
 
 Work is done in the order of `scripts/studies/parts.py`, so that the most important conclusions are
 complete first, at the lowest priority of the processor. Stop it with Ctrl-C, and start the same
-command again to continue. Whenever a part is complete, its rows are written into docs/data. After a
-change of the flights everything begins again, in another folder.
+command again to continue. Whenever a part is complete, its rows are written into docs/data. Rows in
+docs/data that were measured on the present flights are not measured again, so that one machine
+continues what another one began. After a change of the flights everything begins again, in another
+folder.
 """
 
 import os
@@ -25,8 +27,19 @@ from filelock import FileLock, Timeout
 from quad_gym.commands import options
 from quad_gym.experiments import stopped
 from scripts.estimate_bench.rows import PARTS as BENCH_PARTS
-from scripts.studies.campaign import DATA, OUTPUT, Cell, Part, StoppedError, is_complete, tables
+from scripts.studies.campaign import (
+    DATA,
+    FLIGHT_SECONDS,
+    OUTPUT,
+    Cell,
+    Part,
+    StoppedError,
+    is_complete,
+    row_key,
+    tables,
+)
 from scripts.studies.parts import PARTS as STUDY_PARTS
+from scripts.studies.rows import Rows
 
 PARTS = (*STUDY_PARTS, *BENCH_PARTS)  #: everything, in its order
 TABLES = tuple(dict.fromkeys(part.table for part in PARTS))  #: names of the tables
@@ -85,7 +98,7 @@ def hours_left(cells: Sequence[Cell]) -> float:
         if row is None:
             left.append((cell, kind))
         else:
-            spent = row["seconds"] + row["flown_in"]
+            spent = row["seconds"] + row.get("flown_in", FLIGHT_SECONDS)
             measured.setdefault(kind, []).append(spent / cell.expected_seconds)
     factors = {kind: float(np.median(ratios)) for kind, ratios in measured.items()}
     other = float(np.median(list(factors.values()))) if factors else 1.0
@@ -128,6 +141,25 @@ def write_tables(parts: Sequence[Part], root: Path, *, partial: bool) -> list[Pa
     return written
 
 
+def take_over(cells: Sequence[Cell]) -> int:
+    """Take the rows over that docs/data has of cells, on the present flights.
+
+    Returns:
+        Number of rows that were taken over.
+    """
+    known = {
+        table: {row_key(row): row for row in Rows.read(DATA / f"{table}.csv").rows}
+        for table in {cell.part.table for cell in cells}
+    }
+    count = 0
+    for cell in cells:
+        row = known[cell.part.table].get(cell.key)
+        if row is not None and cell.row is None:
+            cell.write(row)
+            count += 1
+    return count
+
+
 def work(cells: Sequence[Cell], limit: int | None = None) -> bool:
     """Complete cells one after the other, except for those in work elsewhere.
 
@@ -163,6 +195,7 @@ def main(args: RunArgs) -> int:
     with options.usage_errors():
         parts = chosen_parts(args)
         options.require_at_least(args, jobs=1, seeds=1, cells=1)
+    take_over(cells_of(parts, args.output))
     if args.list:
         print(report(parts, args.output, args.seeds))
         return 0

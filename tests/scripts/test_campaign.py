@@ -53,9 +53,22 @@ def test_campaign_continues_where_it_stopped_and_repeats_lost_rows(small, capsys
     lost = next(cell for cell in SMALL.cells(small.output) if cell.seed == 1)
     before = lost.row
     lost.file.unlink()
+    (run.DATA / "small.csv").unlink()
     assert run.main(small) == 0
     assert lost.row["return"] == before["return"]
     assert lost.row["seconds"] == before["seconds"] > 0.0  # it was not trained again
+    elsewhere = dataclasses.replace(small, output=small.output / "elsewhere")
+    capsys.readouterr()
+    assert run.main(elsewhere) == 0  # continues from the table
+    assert capsys.readouterr().out.startswith("whether it works: 5 of 5 rows, complete")
+    assert list(elsewhere.output.rglob("*.npz")) == []
+    again = Rows.read(run.DATA / "small.csv")
+    assert again.rows == found.rows
+    stale = [{**row, "flights": "others"} for row in found.rows]
+    Rows(stale).write(run.DATA / "small.csv")
+    other = dataclasses.replace(small, output=small.output / "other", list=True)
+    assert run.main(other) == 0
+    assert "0 of 5 rows" in capsys.readouterr().out
 
 
 def test_every_arm_is_validated_on_the_estimate_and_control_differs_in_one_factor():
