@@ -14,7 +14,7 @@ copyright = author
 version = release = quad_gym.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
@@ -34,6 +34,7 @@ suppress_warnings = [
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 4
+nb_execution_mode = "off"  # notebooks are committed with their outputs
 
 # single backticks in docstrings are names, with links to their documentation
 default_role = "py:obj"

@@ -324,13 +324,17 @@ class ImuSaturation(Fault):
         return {"imu_range": (self.accel_range, self.gyro_range)}
 
 
+_AIDS = tuple(aid.name.lower() for aid in Aid)
+"""Names of the sensors that can be lost."""
+
+
 class SensorLoss(Fault):
     """Loss of all measurements of an aiding sensor, as during a bus failure.
 
     A magnetometer is also lost while an autopilot rejects it near iron.
     """
 
-    sensor: Annotated[str, partial(check.choice, choices=tuple(aid.name.lower() for aid in Aid))]
+    sensor: Annotated[str, partial(check.choice, choices=_AIDS)]
     """name of the lost sensor, such as "barometer\""""
 
     @property

@@ -168,12 +168,27 @@ def _keywords_page() -> str:
     missing = sorted(set(defaults) - set(said))
     if missing:
         raise ValueError(f"the specification says nothing of {', '.join(missing)}")
-    rows = [(f"`{name}`", _value(value), said[name]) for name, value in defaults.items()]
-    return (
-        "# Keywords of every environment\n\nOf `gymnasium.make`, `gymnasium.make_vec` and "
-        "`quad_gym.make_sb3_vec_env`, besides those of the task, which the page of each "
-        "environment lists.\n\n" + _table(("keyword", "default", "meaning"), rows) + _vehicles()
+    every = "".join(_keyword(name, _value(value), said[name]) for name, value in defaults.items())
+    common, docs = quad_gym.TaskParams(), _field_docs(quad_gym.TaskParams)
+    of_tasks = "".join(
+        _keyword(name, _value(getattr(common, name)), f"{docs[name]}{_only(name)}")
+        for name in TASK_KEYWORDS
     )
+    return (
+        "# Keywords\n\nOf `gymnasium.make`, `gymnasium.make_vec` and "
+        "`quad_gym.make_sb3_vec_env`, with their defaults.\n\n## Every environment\n\n"
+        f"{every}\n## Tasks\n\nFields of `quad_gym.TaskParams`. The page of an "
+        "[environment](environments/index.md) lists the defaults in which it differs.\n\n"
+        f"{of_tasks}{_vehicles()}"
+    )
+
+
+def _only(keyword: str) -> str:
+    """A sentence on the tasks that accept a keyword, if not all do."""
+    if keyword in ONE_TASK_KEYWORDS:
+        return f". Only with `{ONE_TASK_KEYWORDS[keyword]}`"
+    without = [kind for kind, keywords in KEYWORDS_WITHOUT_EFFECT.items() if keyword in keywords]
+    return f". Not with {' and '.join(f'`{kind}`' for kind in without)}" if without else ""
 
 
 def _vehicles() -> str:
@@ -203,20 +218,21 @@ def _task_sections(task: type[quad_gym.Task]) -> dict[str, str]:
     }
 
 
+SHARED_PAGES = ("keywords", "observations", "specification", "drawable")
 SHARED = ("Observation space", "Action space", "Reward", "Episode end", "Start", "Info", "World")
 
 
 def _specification_page(sections: dict[str, str]) -> str:
     """Sections of the specification that all environments share."""
-    text = "# Specification of the environments\n\nThe text of `help(quad_gym.QuadEnv)`. Keywords "
-    text += "are under [Keywords of every environment](keywords.md); each environment's page lists "
-    text += "those of its task, and the parts that differ.\n"
+    text = "# Specification of the environments\n\nThe text of `help(quad_gym.QuadEnv)`. "
+    text += "[Keywords](keywords.md) have their own page, and so has each "
+    text += "[environment](environments/index.md), with the parts that differ.\n"
     return text + "".join(f"\n## {name}\n\n{sections[name]}\n" for name in SHARED)
 
 
 def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str]) -> str:
     kind = quad_gym.IDS[env_id]
-    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", env_id.split("/")[1].removesuffix("-v0"))
+    name = env_id.split("/")[1].removesuffix("-v0")
     row = re.search(rf"^\| `{re.escape(env_id)}` \|(.+)\|$", sections["Description"], re.MULTILINE)
     if row is None:
         raise ValueError(f"the table of environments lacks {env_id}")
@@ -226,15 +242,18 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
     task = None if own is None else pkgutil.resolve_name(own.keywords["task"])
     spec = {} if task is None else _task_sections(task)
     settings = {} if own is None else dict(own.keywords)
-    rows = [
-        (f"`{key}`", _value(getattr(defaults, key)), docs[key])
-        for key in TASK_KEYWORDS
-        if ONE_TASK_KEYWORDS.get(key, defaults.kind) == defaults.kind
-        and key not in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ())
-        and not (own is not None and key == "reward_params")
+    common = quad_gym.TaskParams()
+    accepted = [key for key in TASK_KEYWORDS if _has_effect(key, defaults.kind)]
+    if own is not None:
+        accepted.remove("reward_params")  # its reward has no such weights
+    differ = [
+        _keyword(key, _value(getattr(defaults, key)), docs[key].partition(". ")[0])
+        for key in accepted
+        if getattr(defaults, key) != getattr(common, key)
     ]
     every = "a keyword of every environment"
-    rows += [(f"`{key}`", _value(value), every) for key, value in settings.items()]
+    differ += [_keyword(key, _value(value), every) for key, value in settings.items()]
+    others = ", ".join(f"`{key}`" for key in accepted)
     headings = () if task is None else ("Observation", "Reward", "Endings")
     different = "".join(f"## {heading}\n\n{spec[heading]}\n\n" for heading in headings)
     return "\n".join(
@@ -247,16 +266,49 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
             f"{FILM}\n",
             f"{different}Unless stated here, observation, action, reward, start, endings and "
             "`info` follow the [specification](../specification.md) of all environments.\n",
-            f"## Keywords of the task\n\n{_table(('keyword', 'default here', 'meaning'), rows)}",
-            "All others are under [Keywords of every environment](../keywords.md).\n",
+            "## Keywords\n",
+            "These defaults differ from the [common ones](../keywords.md):\n"
+            if differ
+            else "All defaults are the [common ones](../keywords.md).\n",
+            "".join(differ),
+            f"The keywords of a task that this environment accepts are {others}.\n",
         ]
+    )
+
+
+def _has_effect(keyword: str, kind: str) -> bool:
+    """Return True if a kind of task accepts a keyword."""
+    without = KEYWORDS_WITHOUT_EFFECT.get(kind, ())
+    return ONE_TASK_KEYWORDS.get(keyword, kind) == kind and keyword not in without
+
+
+def _keyword(name: str, default: str, meaning: str) -> str:
+    """An item of a list of keywords, with the meaning, without its source, under the keyword."""
+    meaning = re.sub(r" \(report section [\d.]+\)|; report section [\d.]+", "", meaning)
+    return f"- `{name}` = {default}\\\n  {meaning[:1].upper()}{meaning[1:]}\n"
+
+
+def _index_page() -> str:
+    """The list of all environments, with the pages that they share."""
+    ids = "".join(
+        f"| [{env_id.split('/')[1].removesuffix('-v0')}]({kind}.md) | `{env_id}` |\n"
+        for env_id, kind in quad_gym.IDS.items()
+    )
+    pages = "\n".join([*quad_gym.IDS.values(), *(f"../{name}" for name in SHARED_PAGES)])
+    return (
+        "# Environments by id\n\nEach page has the reference, start, reward and endings of an "
+        "environment, and the defaults in which it differs.\n\n"
+        f"| page | id |\n| --- | --- |\n{ids}\n"
+        "They share their [keywords](../keywords.md), [observations](../observations.md), "
+        "[specification](../specification.md) and [parameters that can be "
+        f"randomized](../drawable.md).\n\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
     )
 
 
 def _suites_page() -> str:
     """The numbers of every suite side by side."""
     suites = {name: quad_gym.sensor_suite(name) for name in ALL_SUITES}
-    text = "# Sensor suites in numbers\n\nThe fields of `quad_gym.SensorSuite`. Their meaning is "
+    text = "# Sensor suite parameters\n\nThe fields of `quad_gym.SensorSuite`. Their meaning is "
     text += "under [Parameters](../api/parameters.md), their sources are beside the numbers in "
     text += "`quad_gym/params/`.\n"
     for part, kind in {
@@ -348,19 +400,23 @@ def observation_table() -> str:
 def pages() -> dict[Path, str]:
     """The texts of all pages, by file, and of the guide."""
     sections, docs = _sections(), _field_docs(quad_gym.TaskParams)
-    found = {
-        f"environments/{kind}": _environment_page(env_id, sections, docs)
-        for env_id, kind in quad_gym.IDS.items()
-    } | {
-        "specification": _specification_page(sections),
-        "observations": _observations_page(),
-        "keywords": _keywords_page(),
-        "drawable": _drawable_page(),
-        "suites": _suites_page(),
-        "fields": _fields_page(),
-        "log-columns": _log_page(),
-        "policies": policy_cards.page(),
-    }
+    found = (
+        {"environments/index": _index_page()}
+        | {
+            f"environments/{kind}": _environment_page(env_id, sections, docs)
+            for env_id, kind in quad_gym.IDS.items()
+        }
+        | {
+            "specification": _specification_page(sections),
+            "observations": _observations_page(),
+            "keywords": _keywords_page(),
+            "drawable": _drawable_page(),
+            "suites": _suites_page(),
+            "fields": _fields_page(),
+            "log-columns": _log_page(),
+            "policies": policy_cards.page(),
+        }
+    )
     guide = re.sub(
         r"(<!-- observation -->\n).*?(<!-- /observation -->)",
         lambda marks: marks[1] + observation_table() + marks[2],

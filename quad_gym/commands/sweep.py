@@ -56,7 +56,7 @@ DEFAULTS: Mapping[str, Any] = {
     "set": {},
     "recipe": {},
 }
-"""Keys of a sweep, see `docs/sweeps.md`; None: as in the recipe."""
+"""Keys of a sweep, see `docs/training.md`; None: as in the recipe."""
 
 TABLES = ("env", "set", "recipe")
 _SINGLE = ("algorithm", "steps", "n_envs")  #: fields of a recipe that are separate keys
@@ -252,7 +252,7 @@ class SweepArgs:
 
     file: tyro.conf.Positional[
         Annotated[
-            Path | None, tyro.conf.arg(help="file (.toml) of the trainings, as in docs/sweeps.md")
+            Path | None, tyro.conf.arg(help="file (.toml) of the trainings, as in docs/training.md")
         ]
     ] = None
     env_ids: tuple[str, ...] = ()
