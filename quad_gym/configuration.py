@@ -46,7 +46,18 @@ def _unresolved(_: str, given: Any) -> Any:
 
 
 def _member(kind: type[IntEnum]) -> check.Rule:
-    return lambda _, given: kind(given)
+    """Return the rule of a member of an enumeration, or its number."""
+
+    def rule(name: str, given: Any) -> IntEnum:
+        try:
+            return kind(given)
+        except (TypeError, ValueError):
+            names = ", ".join(member.name for member in kind)
+            raise ValueError(
+                f"{name} must be a {kind.__name__}, one of {names}, got {given!r}"
+            ) from None
+
+    return rule
 
 
 def _task(name: str, given: Any) -> TaskParams:

@@ -4,19 +4,32 @@
 
 A seed chooses the lines, in kernels, packing, parameters, estimation and tasks, and how each is
 broken: an operator, a comparison, a number, a branch. A copy of the checkout has one broken line,
-and runs the test files that are nearest to it: those that import its module, or have the rarest
-words of its module, function and line. Golden flights, which notice any change of a flight, are
-left out. The table has one row for each mutant. A run that is interrupted continues where it
-stopped: mutants in the table are not run again.
+and runs the test files that are nearest to it: those that import its module, or share rare words
+with its line, its function and their docstrings. Of the tests in these files, the nearest ones run,
+in this order, and the first failure ends the run. Golden flights, which notice any change of a
+flight, are left out. The table has one row for each mutant:
+
+- `caught`: a test failed, which the table names. At the end, all these tests run once with
+  unbroken lines, where they must pass.
+- `survived`: these tests passed. The line is equivalent, another test notices it, or a test is
+  missing.
+- `stopped`: the tests took longer than the limit, so the result is open. Remove the row, and
+  continue with a larger limit.
+
+A run that is interrupted continues where it stopped: mutants in the table are not run again.
 """
 
 import ast
+import contextlib
 import csv
+import inspect
+import json
 import math
 import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,17 +38,33 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from quad_gym.commands.options import parse, require_at_least, usage_errors
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("kernels", "packing", "params", "estimation", "tasks")
 """Folders of the package in which lines are broken."""
-COLUMNS = ("mutant", "file", "line", "before", "after", "result", "seconds", "tests")
-_COPIED = ("quad_gym", "baselines", "scripts", "docs", "tests", "pyproject.toml", "README.md")
-_LEFT_OUT = {"tests/contract/test_golden.py"}
-_WORD = re.compile(r"[A-Za-z_]{3,}")
+COLUMNS = ("mutant", "file", "line", "before", "after", "result", "seconds", "noticed", "tests")
+_COPIED = (
+    "quad_gym",
+    "baselines",
+    "scripts",
+    "docs",
+    "tests",
+    "pyproject.toml",
+    "constraints.txt",
+    "Makefile",
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "CITATION.cff",
+)
+_LEFT_OUT = {"tests/contract/test_golden.py", "tests/scripts/test_mutants.py"}
+_WORD = re.compile(r"[A-Za-z][a-z]{3,}|[A-Z]{4,}")
+_FIRST, _MOST = 10, 60
+"""Number of tests that run first, and of all that run: the others in the order of their files."""
+_WORDS_OF = "QUAD_GYM_MUTANT"  #: variable with the words of the mutant, for pytest's process
 _OPERATORS: dict[type[ast.AST], str] = {
     ast.Add: "-",
     ast.Sub: "+",
@@ -82,7 +111,9 @@ class Mutant(NamedTuple):
     line: int  #: number of the line, from 1
     before: str
     after: str
-    words: tuple[str, ...]  #: of the module, the function and the line
+    weights: tuple[
+        tuple[str, float], ...
+    ]  #: words of line, function and module, how much each counts
 
     @property
     def name(self) -> str:
@@ -101,31 +132,46 @@ class MutantsArgs:
     nearest: int = 6
     """number of test files that run for each"""
     limit: float = 900.0
-    """time after which the tests of a mutant are stopped [s]; it then counts as noticed"""
+    """time after which the tests of a mutant are stopped [s]; its result is then open"""
     output: Path = Path("results/mutants.csv")
     """table, which is continued"""
+
+
+def words_of(text: str) -> list[str]:
+    """Split a text, and names in it, into words without their plural."""
+    return [word.lower().rstrip("s") for word in _WORD.findall(text)]
 
 
 def mutants_of(path: Path) -> list[Mutant]:
     """Return all ways of breaking lines of a file of the checkout."""
     text = (ROOT / path).read_text(encoding="utf-8")
-    lines, found = text.splitlines(), list[Mutant]()
-    for function, node in _nodes(ast.parse(text), ""):
+    lines, found, tree = text.splitlines(), list[Mutant](), ast.parse(text)
+    shared = Counter[str]()
+    for weight, words in ((3.0, path.stem), (0.5, ast.get_docstring(tree) or "")):
+        shared.update(dict.fromkeys(words_of(words), weight))  # type: ignore[arg-type]
+    for function, node in _nodes(tree, None):
         for line, begin, end, new in _edits(node, lines):
             before = lines[line - 1]
+            weights = shared.copy()
+            parts = [(1.0, before)]
+            if function is not None:
+                parts += [(2.0, function.name), (1.0, ast.get_docstring(function) or "")]
+            for weight, words in parts:
+                weights.update(dict.fromkeys(words_of(words), weight))  # type: ignore[arg-type]
             after = before[:begin] + new + before[end:]
-            words = _WORD.findall(f"{path.stem} {function} {before}")
-            found.append(Mutant(str(path), line, before, after, tuple(dict.fromkeys(words))))
+            found.append(Mutant(str(path), line, before, after, tuple(weights.items())))
     return found
 
 
-def _nodes(tree: ast.AST, function: str) -> Iterator[tuple[str, ast.AST]]:
-    """Yield the nodes of a tree with the names of their functions; no annotations and texts."""
+def _nodes(
+    tree: ast.AST, function: ast.FunctionDef | None
+) -> Iterator[tuple[ast.FunctionDef | None, ast.AST]]:
+    """Yield the nodes of a tree with their functions; no annotations and texts."""
     for name, value in ast.iter_fields(tree):
         for child in value if isinstance(value, list) else [value]:
             if not isinstance(child, ast.AST) or name in ("annotation", "returns"):
                 continue
-            inner = child.name if isinstance(child, ast.FunctionDef) else function
+            inner = child if isinstance(child, ast.FunctionDef) else function
             if not isinstance(child, ast.JoinedStr | ast.Raise | ast.Import | ast.ImportFrom):
                 yield inner, child
                 yield from _nodes(child, inner)
@@ -186,49 +232,96 @@ def chosen(count: int, seed: int) -> list[Mutant]:
     return list(by_line.values())[:count]
 
 
+def nearness(weights: dict[str, float], words: Sequence[str]) -> float:
+    """Return the nearness of a text to a mutant, by the words that they share.
+
+    This is the usual rank of texts in a search (BM25): rare words count more, as `weights` say,
+    and so do repeated words, and words in short texts.
+    """
+    counts = Counter(words)
+    half = 0.6 + 0.9 * len(words) / 1500.0
+    return sum(
+        weight * counts[word] / (counts[word] + half)
+        for word, weight in weights.items()
+        if counts[word]
+    )
+
+
 def nearest_tests(mutant: Mutant, count: int, texts: dict[str, str]) -> list[str]:
     """Return the test files nearest to a mutant, the nearest first.
 
-    Importing its module counts as four words of which only one test file has each.
+    Importing its module counts as a few rare words.
     """
     module = mutant.file.removesuffix(".py").replace("/", ".")
-    words = {name: set(_WORD.findall(text)) for name, text in texts.items()}
-    files = Counter(word for found in words.values() for word in found)
-    rare = {word: math.log(len(texts) / files[word]) for word in mutant.words if files[word]}
+    words = {name: words_of(text) for name, text in texts.items()}
+    files = Counter(word for found in words.values() for word in set(found))
+    weights = {
+        word: weight * math.log(len(texts) / files[word])
+        for word, weight in mutant.weights
+        if files[word]
+    }
+    rank = {
+        name: nearness(weights, words[name])
+        + 8.0 * (re.search(rf"\b{re.escape(module)}\b", text) is not None)
+        for name, text in texts.items()
+    }
+    return sorted(texts, key=lambda name: (-rank[name], name))[:count]
 
-    def nearness(name: str) -> float:
-        direct = re.search(rf"\b{re.escape(module)}\b", texts[name]) is not None
-        shared = sum(weight for word, weight in rare.items() if word in words[name])
-        return shared + 4.0 * math.log(len(texts)) * direct
 
-    return sorted(texts, key=lambda name: (-nearness(name), name))[:count]
+def pytest_collection_modifyitems(items: list[Any]) -> None:
+    """Run the tests first that are nearest to the mutant; a hook, as pytest loads this module."""
+    words = [words_of(inspect.getsource(item.function)) for item in items]
+    tests = Counter(word for found in words for word in set(found))
+    weights = {
+        word: weight * math.log(len(items) / tests[word])
+        for word, weight in json.loads(os.environ[_WORDS_OF])
+        if tests[word]
+    }
+    order = sorted(range(len(items)), key=lambda i: -nearness(weights, words[i]))
+    items[:] = [items[i] for i in [*order[:_FIRST], *sorted(order[_FIRST:_MOST])]]
 
 
-def run(mutant: Mutant, tests: Sequence[str], copy: Path, limit: float) -> tuple[str, float]:
-    """Run tests on a copy with one broken line; return the result and the time [s]."""
-    file, began = copy / mutant.file, time.monotonic()
-    kept = file.read_text(encoding="utf-8")
-    lines = kept.splitlines(keepends=True)
-    lines[mutant.line - 1] = mutant.after + "\n"
-    file.write_text("".join(lines), encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", *tests]
+def run(
+    mutant: Mutant | None, tests: Sequence[str], copy: Path, limit: float | None
+) -> tuple[str, float, str]:
+    """Run tests on a copy with one broken line; return result, time [s] and the test that failed.
+
+    Without a mutant, all lines are as they were.
+    """
+    began, command = time.monotonic(), [sys.executable, "-m", "pytest", "-q", "-m", "not slow"]
+    environment = {**os.environ, "PYTHONPATH": str(copy)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    if mutant is not None:
+        file = copy / mutant.file
+        kept = file.read_text(encoding="utf-8")
+        lines = kept.splitlines(keepends=True)
+        lines[mutant.line - 1] = mutant.after + "\n"
+        file.write_text("".join(lines), encoding="utf-8")
+        command += ["-x", "-p", "scripts.mutants"]
+        environment[_WORDS_OF] = json.dumps(mutant.weights)
+    running = subprocess.Popen(
+        [*command, *tests],
+        cwd=copy,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,  # with the processes that it starts, which end with it
+    )
     try:
-        done = subprocess.run(
-            command,
-            cwd=copy,
-            env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
-            capture_output=True,
-            timeout=limit,
-            check=False,
-        )
-        result = {0: "survived", 1: "caught"}.get(done.returncode, "not run")
-        if done.returncode in (2, 4):  # a file cannot be imported
-            result = "caught"
+        printed, _ = running.communicate(timeout=limit)
+        failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", printed, re.MULTILINE)
+        # 1: a test failed; 2, 4: a file cannot be imported
+        result = {0: "survived", 1: "caught", 2: "caught", 4: "caught"}.get(running.returncode)
+        return result or "not run", time.monotonic() - began, " ".join(failed)
     except subprocess.TimeoutExpired:
-        result = "too slow"
+        return "stopped", time.monotonic() - began, ""
     finally:
-        file.write_text(kept, encoding="utf-8")
-    return result, time.monotonic() - began
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
+        if mutant is not None:
+            file.write_text(kept, encoding="utf-8")
 
 
 def main(args: MutantsArgs) -> None:
@@ -236,10 +329,12 @@ def main(args: MutantsArgs) -> None:
     with usage_errors():
         require_at_least(args, count=1, seed=0, nearest=1)
         args.output.parent.mkdir(parents=True, exist_ok=True)
-        known = set()
+        known, noticed = set(), set[str]()
         if args.output.exists():
             with args.output.open(encoding="utf-8", newline="") as stream:
-                known = {row["mutant"] for row in csv.DictReader(stream)}
+                for row in csv.DictReader(stream):
+                    known.add(row["mutant"])
+                    noticed.add(row["noticed"])
     texts = {
         str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
         for path in sorted((ROOT / "tests").rglob("test_*.py"))
@@ -256,11 +351,16 @@ def main(args: MutantsArgs) -> None:
             if mutant.name in known:
                 continue
             tests = nearest_tests(mutant, args.nearest, texts)
-            result, seconds = run(mutant, tests, copy, args.limit)
-            words = (mutant.before.strip(), mutant.after.strip(), result, f"{seconds:.0f}")
+            result, seconds, failed = run(mutant, tests, copy, args.limit)
+            words = (mutant.before.strip(), mutant.after.strip(), result, f"{seconds:.0f}", failed)
             writer.writerow((mutant.name, mutant.file, mutant.line, *words, " ".join(tests)))
             stream.flush()
-            print(f"{result:9} {seconds:4.0f} s  {mutant.name}", flush=True)
+            noticed.add(failed)
+            print(f"{result:9} {seconds:4.0f} s  {mutant.name}  {failed}", flush=True)
+        names = sorted(name for name in noticed if "::" in name)
+        result, _, failed = run(None, names, copy, None) if names else ("survived", 0.0, "")
+        if result != "survived":
+            sys.exit(f"these tests fail without a broken line, too, and notice nothing: {failed}")
 
 
 if __name__ == "__main__":

@@ -421,7 +421,7 @@ def checked_start(
             continue
         width = columns.stop - columns.start
         try:
-            if np.asarray(value).dtype.kind not in "iuf":
+            if check.holds_no_numbers(value):
                 raise TypeError
             numbers = np.asarray(value, np.float64)
         except (TypeError, ValueError, OverflowError):

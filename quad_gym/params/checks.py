@@ -254,7 +254,7 @@ def array(
 ) -> NDArray[np.float64]:
     """`value` as a new float64 array in C order, of `shape` (None: any length), finite or NaN."""
     try:
-        if _holds_no_numbers(value):
+        if holds_no_numbers(value):
             raise TypeError
         result = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError):
@@ -271,12 +271,12 @@ def array(
     return result
 
 
-def _holds_no_numbers(value: Any) -> bool:
+def holds_no_numbers(value: Any) -> bool:
     """Return True if NumPy would convert text, booleans or nothing at all to numbers."""
     if isinstance(value, np.ndarray):
         return value.dtype.kind not in "iuf"
     if isinstance(value, (list, tuple)):
-        return any(_holds_no_numbers(part) for part in value)
+        return any(holds_no_numbers(part) for part in value)
     return value is None or isinstance(value, _NO_NUMBERS)
 
 

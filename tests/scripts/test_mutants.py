@@ -2,6 +2,7 @@
 
 import ast
 import csv
+import shutil
 from pathlib import Path
 
 import pytest
@@ -39,20 +40,60 @@ def test_lines_are_broken_in_all_ways(text, expected, tmp_path, monkeypatch):
 
 
 def test_nearest_tests_import_the_module_or_share_its_rare_words():
-    mutant = mutants.Mutant("quad_gym/params/gnss.py", 3, "", "", ("gnss", "baseline_noise"))
+    weights = (("gnss", 3.0), ("baseline", 1.0), ("noise", 1.0))
+    mutant = mutants.Mutant("quad_gym/params/gnss.py", 3, "", "", weights)
     texts = {f"tests/test_{k}.py": "import quad_gym" for k in range(9)}
     texts["tests/test_near.py"] = """assert record["baseline_noise"]"""
     texts["tests/test_direct.py"] = "from quad_gym.params.gnss import GnssParams"
     assert mutants.nearest_tests(mutant, 2, texts) == ["tests/test_direct.py", "tests/test_near.py"]
 
 
+def test_weights_of_words_fall_from_module_to_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(mutants, "ROOT", tmp_path)
+    (tmp_path / "clocks.py").write_text(
+        '"""Rates."""\ndef seconds_of(ticks):\n    """Duration."""\n    return ticks + period\n'
+    )
+    (mutant,) = mutants.mutants_of(Path("clocks.py"))
+    assert dict(mutant.weights) == {
+        **{"clock": 3.0, "rate": 0.5, "second": 2.0, "duration": 1.0},
+        **{"return": 1.0, "tick": 1.0, "period": 1.0},
+    }
+
+
+@pytest.mark.slow  # three runs of pytest
+def test_tests_that_fail_catch_a_mutant_and_stopped_ones_leave_it_open(tmp_path):
+    (tmp_path / "scripts").mkdir()
+    shutil.copy(mutants.__file__, tmp_path / "scripts" / "mutants.py")
+    (tmp_path / "part.py").write_text("a = 1 + 2\nb = 3\n")
+    (tmp_path / "test_part.py").write_text(
+        "import part\n\ndef test_b():\n    assert part.b\n\ndef test_a():\n    assert part.a == 3\n"
+    )
+    tests = ["test_part.py"]
+    for line, before, after, limit, expected in (
+        (1, "a = 1 + 2", "a = 1 - 2", 60.0, ("caught", "test_part.py::test_a")),
+        (2, "b = 3", "b = 4", 60.0, ("survived", "")),
+        (1, "a = 1 + 2", "a = 1 - 2", 0.01, ("stopped", "")),
+    ):
+        mutant = mutants.Mutant("part.py", line, before, after, (("part", 1.0),))
+        result, seconds, failed = mutants.run(mutant, tests, tmp_path, limit)
+        assert (result, failed) == expected
+        assert 0.0 < seconds < 60.0
+        assert (tmp_path / "part.py").read_text() == "a = 1 + 2\nb = 3\n"
+    assert mutants.run(None, tests, tmp_path, None)[0] == "survived"
+
+
 def test_campaign_continues_its_table(tmp_path, monkeypatch):
     ran, table = [], tmp_path / "mutants.csv"
 
+    passed = "survived", 1.0, ""
+
     def run(mutant, tests, copy, limit):
+        if mutant is None:  # at the end, without broken lines
+            assert tests == ["tests/test_it.py::test_it"]
+            return passed
         ran.append(mutant.name)
         assert len(tests) == 2
-        return "caught", 1.0
+        return "caught", 1.0, "tests/test_it.py::test_it"
 
     monkeypatch.setattr(mutants, "run", run)
     monkeypatch.setattr(mutants.shutil, "copytree", lambda source, to: to.mkdir())
@@ -62,3 +103,6 @@ def test_campaign_continues_its_table(tmp_path, monkeypatch):
         rows = list(csv.DictReader(stream))
     assert [row["mutant"] for row in rows] == ran == [m.name for m in mutants.chosen(3, 0)]
     assert {row["result"] for row in rows} == {"caught"}
+    passed = "caught", 1.0, "tests/test_it.py::test_it"
+    with pytest.raises(SystemExit, match=r"fail without a broken line, too.*test_it"):
+        mutants.main(mutants.MutantsArgs(count=3, nearest=2, output=table))

@@ -10,17 +10,22 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import quad_gym
-from quad_gym import TaskParams, faults
+from baselines import crazyflie_pid, recipes
+from quad_gym import TaskParams, configuration, faults
+from quad_gym.configuration import FlightConfiguration
+from quad_gym.envs.config import EnvConfig
 from quad_gym.faults import Fault, SensorLoss, _duration, span
 from quad_gym.params import checks as check
 from quad_gym.params.camera import _features
 from quad_gym.params.checks import Checked, _unless_none
+from quad_gym.params.suites import given_suite
 from quad_gym.params.uwb_range import _anchors
 from quad_gym.params.vehicle import Clocks
 from quad_gym.params.world import Obstacle
-from quad_gym.records import MAX_FEATURES
+from quad_gym.records import DRAWABLES, MAX_FEATURES, MAX_GATES, Autoreset, Control, Layout, Source
 
 LARGEST, SMALLEST = 1e15, 1e-15
 
@@ -94,12 +99,23 @@ KINDS = {
     _duration: lambda: [(math.inf, -math.inf), *spans(open_end=True)],
     _features: lambda: rows_of(MAX_FEATURES),
     _anchors: lambda: rows_of(8),
+    recipes._sizes: lambda: [((1,), ()), ((1,), (0,)), ((64, 1), (64, 0)), ((64,), (1.5,))],
+    recipes._rates: lambda: vectors(2, 0.0, open_end=True),
+    recipes._read_only: lambda: [({"start": "mixed"}, ["start"]), ({}, None)],
+    configuration._vehicle: lambda: [("crazyflie", "crazyfly"), (LAB, 3.0)],
+    configuration._task: lambda: [(None, "circle"), (TaskParams(), {})],
+    configuration._randomization: lambda: [(None, "mass"), ({}, {"colour": 1.0})],
+    configuration._unresolved: lambda: [("calm", "storm"), (quad_gym.WorldParams(), {})],
+    given_suite: lambda: [("rtk", "phone"), (quad_gym.sensor_suite("rtk"), 1)],
     check.choice: lambda choices: [(choices[-1], choices[-1].upper() + "x"), (choices[0], None)],
 }
 """Limits of each kind of rule, from the arguments that a field gives to it."""
 
 NEAR = 1.0 + 1e-9  #: factor beyond limits that follow from other numbers, and round
+RAREST = 200.0 / 100_000  #: actions per second with the longest period, in ticks [Hz]
+RARE = norm.isf(1e-6)  #: bound beyond which a normal draw has the least admitted probability
 LAB = quad_gym.vehicle_params("lab")
+PATH = quad_gym.Trajectory(times=(0.0, 1.0, 2.0), coefficients=np.ones((8, 2, 4)))
 THRUST = 4.0 * LAB.thrust_coefficient * (LAB.motor_speed_per_volt * LAB.max_voltage) ** 2
 HEAVIEST = THRUST / (LAB.mass * LAB.gravity)  #: thrust at full voltage over weight, from 1 to 1000
 FEET = [(x, y, -0.1) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
@@ -157,6 +173,33 @@ NARROWER = {
         (LAB.rotor_spins, (*LAB.rotor_spins[:3], above(LAB.rotor_spins[3]))),
         (LAB.rotor_spins, (1.0,) * 4),
     ],
+    ("LogUniform", "offset"): [(False, True), (False, 1)],
+    ("LogUniform", "low"): [(SMALLEST, 0.0), (2.0, above(2.0))],
+    ("LogUniform", "high"): [(1.0, below(1.0)), (LARGEST, above(LARGEST))],
+    ("Normal", "low"): [(RARE / NEAR, RARE * NEAR), (-math.inf, math.nan), (0.0, "0")],
+    ("Normal", "high"): [(-RARE / NEAR, -RARE * NEAR), (math.inf, math.nan), (0.0, "0")],
+    ("Trajectory", "times"): [
+        ((0.0, 1.0, above(1.0)), (0.0, 1.0, 1.0)),
+        ((0.0, 1.0, 2.0), (SMALLEST, 1.0, 2.0)),
+        ((0.0, 1.0, 2.0), (0.0, 1.0)),
+        ((0.0, 1.0, 2.0), (0.0, 1.0, math.inf)),
+        ((0.0, 1.0, 2.0), 3.0),
+    ],
+    ("Trajectory", "coefficients"): [
+        (np.ones((8, 2, 4)), np.ones(shape)) for shape in ((7, 2, 4), (8, 1, 4), (8, 2, 3), (8, 2))
+    ]
+    + [(np.ones((8, 2, 4)), np.full((8, 2, 4), bad)) for bad in (math.nan, math.inf, "1")],
+    ("FlightConfiguration", "control_rate"): [
+        (200.0, 200.0 * (1.0 + 2e-9)),
+        (RAREST, RAREST / 2.0),
+    ],
+    ("FlightConfiguration", "layout"): [(Layout.ABSOLUTE, 3), (Layout.RELATIVE, "absolute")],
+    ("FlightConfiguration", "source"): [(Source.MEASUREMENTS, 4), (Source.TRUTH, "truth")],
+    ("FlightConfiguration", "control"): [(Control.PD, 6), (Control.MOTOR, "motor")],
+    ("FlightConfiguration", "autoreset"): [(Autoreset.DISABLED, 4), (Autoreset.DISABLED, "off")],
+    ("FlightConfiguration", "run_filter"): [(True, 1)],
+    ("FlightConfiguration", "true_vehicle"): [(LAB, "lab"), (None, 1.0)],
+    ("FlightConfiguration", "true_sensors"): [(quad_gym.sensor_suite("standard"), "standard")],
     **{(kind, "center_I"): within(1e4) for kind in ("Obstacle", "Wall", "Cylinder")},
     **{
         (kind, "shift_I"): [within(1e4)[1], ((1.0, 1.0, 0.0), (1.0, 1.0, below(0.0)))]
@@ -174,6 +217,19 @@ BY_HAND = {
     ("VehicleParams", "rotor_positions_B"): "they belong to the inertia: tests/unit/test_params.py",
 }
 """Fields without a single limit, and where they are tested."""
+FLOWN = FlightConfiguration(1, control=Control.CTBR)
+WITHOUT_RULES = [
+    *((FLOWN, "substeps", good, bad) for good, bad in wholes(1, 1000)),
+    (FlightConfiguration(1), "gains", "tuned", "huge"),
+    (FlightConfiguration(1), "gains", quad_gym.PDGains(), {"position": 5.0}),
+    (TaskParams(kind="waypoints"), "gate_count", MAX_GATES, MAX_GATES + 1),
+    *((TaskParams(kind="trajectory"), "trajectory", PATH, bad) for bad in (3, "nowhere.csv", [])),
+    *(
+        (quad_gym.WorldParams(), "obstacles", (quad_gym.Wall(),), bad)
+        for bad in ("wall", [1.0], quad_gym.Wall())
+    ),
+]
+"""Rows of fields that a class checks otherwise."""
 
 
 def arguments_of(rule):
@@ -213,18 +269,29 @@ def examples():
         Obstacle,
         quad_gym.Wall,
         quad_gym.Cylinder,
+        recipes.Recipe,
+        recipes.Plan,
+        crazyflie_pid.CrazyflieGains,
         *(getattr(faults, name) for name in faults.__all__),
     ):
         if isinstance(kind, type) and issubclass(kind, Checked) and kind not in (Fault, SensorLoss):
             collect(kind())
-    for other in (SensorLoss(sensor="barometer"), quad_gym.Uniform(1.0, 2.0)):
+    for other in (
+        SensorLoss(sensor="barometer"),
+        quad_gym.Uniform(1.0, 2.0),
+        quad_gym.LogUniform(1.0, 2.0),
+        quad_gym.Normal(0.0, 1.0),
+        PATH,
+        FLOWN,
+        EnvConfig.of(None, "hover", {}),
+    ):
         collect(other)
     return found.values()
 
 
 def table():
     """Rows (instance, name of a field, last good value, first bad value)."""
-    rows = []
+    rows = list(WITHOUT_RULES)
     for nominal in examples():
         for name, field_rule in type(nominal)._rules.items():
             key = type(nominal).__name__, name
@@ -245,9 +312,23 @@ TABLE = table()
 FIELDS = {(type(nominal), name) for nominal, name, _, _ in TABLE}
 
 
+def classes(kind=Checked):
+    """All classes of parameters of the packages, without classes in tests."""
+    for part in kind.__subclasses__():
+        if part.__module__.partition(".")[0] in ("quad_gym", "baselines"):
+            yield part
+        yield from classes(part)
+
+
 def test_table_has_every_field_with_a_rule():
-    assert len(FIELDS) > 280
-    assert len(TABLE) > 1000
+    missing = [
+        (kind.__name__, name)
+        for kind in classes()
+        for name in kind._rules
+        if not any(issubclass(one, kind) and name == other for one, other in FIELDS)
+    ]
+    assert sorted(set(missing)) == sorted(BY_HAND)
+    assert len(FIELDS) > 350
     used = {(kind.__name__, name) for kind, name in FIELDS}
     assert not [key for key in NARROWER if key not in used]
 
@@ -264,8 +345,95 @@ def test_last_good_value_is_accepted_and_first_bad_one_refused(kind):
             nominal.replace(**{name: bad})
         words = str(error.value)
         narrow = kind is quad_gym.VehicleParams  # whose fields depend on each other
-        assert name in words or narrow, (name, bad, words)
-        assert kind.__name__ in words, (name, bad, words)
+        assert name in words.lower() or name in words or narrow, (name, bad, words)
+        assert not kind._prefix or kind.__name__ in words, (name, bad, words)
+
+
+NO_NUMBERS = ["fast", "3", b"3", True, np.True_, 3j, np.array([3.0]), [3.0], {}, object(), None]
+NO_NUMBERS += [math.nan, math.inf, -math.inf, 10**400]
+NO_VECTORS = [(1.0, 2.0), 1.0, "abc", b"abc", None, (1.0, 2.0, 3.0, 4.0), np.ones((3, 1)), {}]
+NO_VECTORS += [(*(1.0, 2.0), bad) for bad in ("3", True, 3j, None, [3.0], math.nan, 10**400)]
+NO_VECTORS += [np.ones(3, bool), np.ones(3, complex), [set()] * 3]
+
+
+@pytest.mark.parametrize("rule", [check.number, check.positive, check.whole])
+@pytest.mark.parametrize("bad", NO_NUMBERS, ids=repr)
+def test_number_of_another_type_is_refused(rule, bad):
+    with pytest.raises(ValueError, match=r"^it must be .*, got"):
+        rule("it", bad)
+
+
+@pytest.mark.parametrize(
+    "rule", [partial(check.vector, length=3), check.place, partial(check.array, shape=(3,))]
+)
+@pytest.mark.parametrize("bad", NO_VECTORS, ids=repr)
+def test_vector_of_another_type_or_shape_is_refused(rule, bad):
+    with pytest.raises(ValueError, match=r"^it must be .*, got|^it must have shape \(3\), got"):
+        rule("it", bad)
+
+
+def test_types_that_hold_real_numbers_are_accepted():
+    for good in (3, np.float32(3), np.int64(3), np.array(3.0), np.uint8(3)):
+        assert check.number("it", good) == 3.0
+        assert isinstance(check.number("it", good), float)
+    for good in ((1, 2, 3), [1, 2.0, np.float32(3)], np.arange(1, 4), np.arange(1.0, 4.0)[::1]):
+        assert check.vector("it", good, 3) == (1.0, 2.0, 3.0)
+
+
+RTK = quad_gym.sensor_suite("rtk")
+BATTERY = quad_gym.WorldParams(battery=quad_gym.BatteryParams())
+HOLDERS = {
+    "vehicle": (LAB, lambda part: {"true_vehicle": part}),
+    "world": (BATTERY, lambda part: {"world": part}),
+    "battery": (BATTERY.battery, lambda part: {"world": BATTERY.replace(battery=part)}),
+    "imu": (RTK.imu, lambda part: {"true_sensors": RTK.replace(imu=part)}),
+    "gnss": (RTK.gnss, lambda part: {"true_sensors": RTK.replace(gnss=part)}),
+    "antennas": (RTK.gnss, lambda part: {"true_sensors": RTK.replace(gnss=part)}),
+    "camera": (RTK.camera, lambda part: {"true_sensors": RTK.replace(camera=part)}),
+}
+"""Nominal parts that can be drawn, and keywords of flights with such a part."""
+DRAWN = [
+    drawable
+    for drawable in DRAWABLES
+    if drawable.of in HOLDERS
+    and hasattr(HOLDERS[drawable.of][0], drawable.field)
+    and drawable.name not in ("inertia", "position_sigma_I")
+]
+"""Draws with the rules of their fields; others have their own: `contract/test_refused_input.py`."""
+
+
+def accepted(name, **keywords):
+    """True if flights are accepted; otherwise the error names the field."""
+    try:
+        FlightConfiguration(1, **{"sensors": RTK, "world": BATTERY, **keywords})
+    except ValueError as error:
+        words = str(error)
+    else:
+        return True
+    assert name in words or "by mass" in words, words
+    return False
+
+
+@pytest.mark.parametrize("drawable", DRAWN, ids=lambda drawable: drawable.name)
+def test_draw_of_one_value_is_accepted_where_the_value_itself_is(drawable):
+    part, keywords = HOLDERS[drawable.of]
+    nominal = np.array(getattr(part, drawable.field))
+    for value in (*nominal.flat[:1], -1.0, 0.0, 1e-12, 0.05, 1.0, 99.0, 101.0, 1e15):
+        draws = {drawable.name: quad_gym.Uniform(value, value)}
+        try:
+            whole = part.replace(**{drawable.field: np.full(nominal.shape, value)})
+        except ValueError:
+            expected = False
+        else:
+            expected = accepted(drawable.field, **keywords(whole))
+        assert accepted(drawable.name, randomization=draws) == expected, value
+
+
+def test_limit_in_steps_is_a_whole_number_up_to_a_billion():
+    for good, bad in wholes(1, 10**9):
+        EnvConfig.of(None, "hover", {"max_episode_steps": good})
+        with pytest.raises(ValueError, match="max_episode_steps must be"):
+            EnvConfig.of(None, "hover", {"max_episode_steps": bad})
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

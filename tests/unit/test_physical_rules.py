@@ -102,7 +102,7 @@ def test_heading_from_north_that_is_given_as_from_east_is_named(table):
 
 
 def test_positions_that_drift_for_some_seconds_do_not_cost_the_velocities(table):
-    """They drift by 2 m/s for eight seconds, and the velocities are right all the time."""
+    """They drift by 2 m/s for eight seconds, and the velocities stay correct."""
     since = np.clip(table["time"] - 14.0, 0.0, 8.0)[:, np.newaxis]
     places = table["gnss_enu"] + 2.0 * since * [1.0, 0.0, 0.0]
     result = replay(table | {"gnss_enu": places}, sensors="field")

@@ -262,7 +262,7 @@ def drifting_receiver(rate, start=70.0, end=90.0):
     return log, drifting
 
 
-def test_receiver_that_drifts_off_in_a_real_flight_is_left_out_until_it_is_right_again():
+def test_receiver_that_drifts_off_in_a_real_flight_is_left_out_until_it_is_correct_again():
     """Positions and velocities drift off at 4 m/s for 20 s, in the air; the rest is as recorded."""
     start, end = 70.0, 90.0
     log, drifting = drifting_receiver(4.0, start, end)
