@@ -267,6 +267,7 @@ def pack_tick(p: Any, sensors: SensorSuite) -> None:
         p[f"{sensor}_bias_decay"], p[f"{sensor}_bias_drive"] = decay_and_drive(error, dt)
     for k, error in enumerate(biases[2:]):
         p["slow_decay"][k], p["slow_drive"][k] = decay_and_drive(error, dt)
+        p["slow_rate"][k], p["slow_stationary"][k] = 1.0 / error.tau, error.sigma
 
 
 def slow_errors_of(sensors: SensorSuite) -> list[SlowError]:
@@ -289,6 +290,7 @@ def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
         p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
         p["antenna"] = gnss.primary_antenna_B
         drift = SlowError(1.0, gnss.rate * gnss.drift_tau)  # in measurements
+        p["drift_step"] = 1.0 / drift.tau
         p["drift_decay"], drive = decay_and_drive(drift, 1.0)
         p["drift_drive"] = np.array(gnss.drift_sigma_I) * drive
     if gnss is not None and gnss.has_baseline:

@@ -10,7 +10,7 @@ from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel, routine
 from quad_gym.kernels.compiling.signatures import signature_of
 from quad_gym.kernels.filter.error_state import variance_of
 from quad_gym.kernels.numbers.blocks import lanes_of, store_lanes
-from quad_gym.kernels.numbers.elementary import exp
+from quad_gym.kernels.numbers.elementary import approached, exp
 from quad_gym.kernels.numbers.lanes import select
 from quad_gym.records import (
     AID_BLOCKS,
@@ -66,8 +66,8 @@ def _set_step(p, tick, step, slow_states, dt):
 @kernel
 def _decay_and_drive(step, k, dt):
     """The decay of a slow error, and the standard deviation of its driving noise."""
-    a = exp(-dt * step.rate[k])
-    return a, step.sigma[k] * math.sqrt((1.0 - a) * (1.0 + a))
+    x = dt * step.rate[k]
+    return exp(-x), step.sigma[k] * math.sqrt(approached(2.0 * x))
 
 
 @kernel

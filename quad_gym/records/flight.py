@@ -214,9 +214,9 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
     )),
     ("late", (
         # sums of the IMU's samples since the start of the episode, biases and gravity included
-        Field("imu_turn", (3, 3), "-", "C, from the body frame of the start to the present one"),
-        Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of the start"),
-        Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
+        Field("imu_turn", (3, 3), "-", "C, from the body frame of the instant that sums count from to the present one"),
+        Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of that instant"),
+        Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of that instant"),
         Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
         # these sums at the time stamps of the measurements in transit, the latest first
         Field("stamps", (SENSORS, DELAY_SLOTS, STAMP), "mixed", "the tick (NaN: none), C, V, X, B, w_meas"),

@@ -176,6 +176,7 @@ PARAMS_FIELDS = (
     Field("baseline", (3,), "m", "primary to secondary antenna in B"),
     Field("baseline_length", (), "m", "length of the baseline"),
     Field("drift_decay", (), "-", "decay of the slow position error between two measurements"),
+    Field("drift_step", (), "-", "the time between two measurements over the time constant of this error"),
     Field("drift_drive", (3,), "m", "standard deviation of the driving noise"),
     Field("heading_error_sigma", (), "rad", "standard deviation of the baseline's constant error"),
     Field("first_baseline_sigma", (), "rad", "standard deviation of the direction of one baseline"),
@@ -202,6 +203,8 @@ PARAMS_FIELDS = (
     # slow errors among the filter's states
     Field("slow_sigma", (MAX_SLOW,), "mixed", "standard deviation of each slow error at the start"),
     Field("slow_decay", (MAX_SLOW,), "-", "decay of each slow error over a tick"),
+    Field("slow_rate", (MAX_SLOW,), "1/s", "1 / tau of each slow error; 0: a constant"),
+    Field("slow_stationary", (MAX_SLOW,), "mixed", "standard deviation of each slow error in the long run"),
     Field("slow_drive", (MAX_SLOW,), "mixed", "standard deviation of the driving noise over a tick"),
     Field("sigma_spread", (), "-", "alpha of the unscented transform"),
     Field("sigma_beta", (), "-", "beta of the unscented transform"),

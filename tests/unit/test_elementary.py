@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quad_gym.kernels.numbers.elementary import atan2, exp, log, sin_cos, sin_cos_minus_one
+from quad_gym.kernels.numbers.elementary import (
+    approached,
+    atan2,
+    exp,
+    log,
+    sin_cos,
+    sin_cos_minus_one,
+)
 from quad_gym.records import WIDTH
 from tests.unit.compiled import Compiled
 
@@ -21,12 +28,13 @@ def functions(f, option):
         (x, 0.0 * x, x)
     )
     f.exp = exp(x)
+    f.approached = approached(x)
     f.log = log(x)
     f.angle = atan2(f.y, x)
 
 
 NAMES = ("sin", "cos", "sin_small", "cos_less_one", "sin_last", "cos_less_one_last")
-NAMES += ("exp", "log", "angle")
+NAMES += ("exp", "approached", "log", "angle")
 compiled = Compiled(functions, x=(), y=(), **dict.fromkeys(NAMES, ()))
 
 
@@ -137,6 +145,15 @@ def test_exponential_and_logarithm_match_numpy(evaluate):
     found = evaluate(x)["log"]
     assert ulps(found, np.log(x)) <= 3
     assert found[0] == 0.0
+
+
+def test_share_that_a_decay_has_lost_keeps_its_relative_accuracy(evaluate):
+    rng = np.random.default_rng(5)
+    limits = [0.0, 5e-324, 1e-300, 0.34, np.nextafter(0.34, 1.0), 0.35, 1.0, 40.0, 1e4, math.inf]
+    x = np.concatenate([limits, rng.uniform(0, 2, 3000), 10 ** rng.uniform(-300, 2, 3000)])
+    found = evaluate(x)["approached"]
+    assert ulps(found, -np.expm1(-x)) <= 3
+    assert np.isnan(evaluate([math.nan])["approached"]).all()
 
 
 def test_functions_return_limits_or_nan_beyond_their_range(evaluate):

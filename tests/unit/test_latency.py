@@ -166,6 +166,26 @@ def test_nees_is_consistent_only_with_delay_compensation(name, kind):
     assert (informed.record("rejections").sum(axis=1) > 0).mean() < 0.05
 
 
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        60,
+        # three hours of flight take a minute
+        pytest.param(3 * 3600, marks=pytest.mark.slow),
+    ],
+)
+def test_estimated_attitude_with_late_measurements_remains_a_rotation(seconds):
+    """It is multiplied by the sums of the IMU at each update, which must not drift off either."""
+    batch = fly(quad_gym.sensor_suite("rtk"), WIDTH, task="hover", control_rate=50.0)
+    for _ in range(50 * seconds):
+        batch.step()
+    for name in ("R_hat", "imu_turn"):
+        R = batch.record(name)
+        assert np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < 1e-12, name
+    assert np.abs(batch.record("imu_position")).max() < 10.0
+    assert not batch.record("filter_status").any()
+
+
 def test_failed_late_measurement_leaves_the_estimate():
     suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25), camera=None), gnss=0.05)
     batch = fly(suite, 10, task="hover")

@@ -182,7 +182,7 @@ def _carry(flight, p, work, form, back, ticks, slow):
         if back:
             noise = select(good, noise, 0.0)
     work.since_noise = noise
-    keep_covariance(flight, slow, work.P, noise == noise)
+    keep_covariance(flight, slow, work.P, good)
     if slow is not None:
         shift_carried_slow(flight, slow, work, back)
     return good

@@ -61,7 +61,7 @@ from quad_gym.kernels.filter.error_state import (
 from quad_gym.kernels.filter.measurements import RECENT, forget_corrections
 from quad_gym.kernels.filter.slow import stages_of
 from quad_gym.kernels.numbers.blocks import reset
-from quad_gym.kernels.numbers.elementary import clip, exp, maximum, minimum
+from quad_gym.kernels.numbers.elementary import approached, clip, exp, maximum, minimum
 from quad_gym.kernels.numbers.factors import eliminate
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
@@ -253,7 +253,7 @@ def _measure_motion(flight, p, work, mask):
     vd = (keeps * (vd[0] + Aud[0] + T * dd), keeps * (vd[1] + Aud[1]))
     ud, d = (keeps * ud[0], keeps * ud[1]), (keeps * d[0], keeps * d[1])
     uu = uu + 2.0 * _WALK * _WALK * T
-    dd = keeps * keeps * dd + 2.0 * _TILT * _TILT * (1.0 - keeps * keeps)
+    dd = keeps * keeps * dd + 2.0 * _TILT * _TILT * approached(2.0 * T / _TILT_TIME)
     # update
     nu, S = (z[0] - v[0], z[1] - v[1]), vv + r
     nis, g = 2.0 * (nu[0] * nu[0] + nu[1] * nu[1]) / S, 1.0 / S

@@ -1,9 +1,9 @@
 """Preintegrated IMU samples, which propagate an estimate from one instant to another and back.
 
 Over a tick in which the body rotates by exp(-[w dt x]) the filter adds R^T f dt to the velocity.
-Such increments are summed over many ticks independently of the estimate, in the frame of the
-episode's start: the rotation C, the velocity V = sum C^T f dt, the position X, and the gain of the
-biases B = sum C^T dt. Between instants s and k they give, in the body frame of s,
+Such increments are summed over many ticks independently of the estimate, in the body frame of an
+instant 0 that they count from: the rotation C, the velocity V = sum C^T f dt, the position X, and
+the gain of the biases B = sum C^T dt. Between instants s and k they give, in the body frame of s,
 
     dR = C_k C_s^T,  dv = C_s (V_k - V_s),  dr = C_s (X_k - X_s - V_s T),  B_s = C_s (B_k - B_s)
 
@@ -18,6 +18,14 @@ where the last is accurate to first order in the rotation, so that, with g = (0,
 
 and the errors are propagated in the same way. Solved for the state at s, these go back in time.
 
+The sums grow: within minutes V and X are kilometers per second and kilometers, of which the
+differences above would be small remainders. From time to time, the present instant k becomes
+instant 0. The stamps of measurements in transit, which hold the sums of instants s, then change to
+
+    C_s C_k^T,  C_k (V_s - V_k),  C_k (X_s - X_k - V_k (t_s - t_k)),  C_k (B_s - B_k)
+
+and the sums to I, 0, 0 and 0. Exact arithmetic would leave dR, dv, dr and B_s as they are.
+
 Sources: T. Lupton and S. Sukkarieh, IEEE Trans. Robotics 28(1), 2012; C. Forster, L. Carlone, F.
 Dellaert and D. Scaramuzza, IEEE Trans. Robotics 33(1), 2017.
 """
@@ -28,7 +36,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum
-from quad_gym.kernels.numbers.lanes import select, zero_like
+from quad_gym.kernels.numbers.lanes import any_of, round_to_even, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
     diagonal,
@@ -42,7 +50,7 @@ from quad_gym.kernels.numbers.linalg import (
     store_column3,
 )
 from quad_gym.kernels.numbers.rotation import euler_to_dcm, orthonormal, vector_to_dcm
-from quad_gym.records import MAX_SLOW, FilterForm
+from quad_gym.records import MAX_SLOW, SENSORS, FilterForm
 
 # --------------------------------------------------------------------------------------------------
 # The specific force at the center of mass, from an accelerometer that is mounted elsewhere.
@@ -88,12 +96,55 @@ NOISE = D + MAX_SLOW
 errors."""
 
 
+_TICKS_OF_SUMS = 32.0
+"""Ticks after which the sums count from the present instant on: few enough that V remains below
+some meters per second, and so many that the change of the stamps costs next to nothing."""
+
+
+@kernel
+def _begin_sums(flight, mask):
+    """Count the sums from the present instant on, where `mask`."""
+    keep(flight.imu_turn, mask, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    reset(flight, mask, 0.0, "imu_velocity imu_position imu_bias_gain")
+
+
 @stage
 def begin_late_stage(flight, world, model, settings, work, stages, flag):
     """Reset the sums of the IMU at the start of an episode."""
-    mask = work.mask > 0.0
-    keep(flight.imu_turn, mask, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-    reset(flight, mask, 0.0, "imu_velocity imu_position imu_bias_gain")
+    _begin_sums(flight, work.mask > 0.0)
+
+
+@kernel
+def _three(row, k):
+    return (row[k], row[k + 1], row[k + 2])
+
+
+@kernel
+def _keep_three(row, k, mask, values):
+    for i in range(3):
+        row[k + i] = select(mask, values[i], row[k + i])
+
+
+@kernel
+def _rebase(flight, p, settings, now, mask):
+    """Make the instant `now` [ticks] the one that sums and stamps count from, where `mask`."""
+    C, V = load33(flight.imu_turn), load3(flight.imu_velocity)
+    X, B = load3(flight.imu_position), load33(flight.imu_bias_gain)
+    for sensor in range(SENSORS):
+        if settings.sensor_delay[sensor] > 0:
+            for slot in range(settings.under_way[sensor] + 1):
+                row = flight.stamps[sensor, slot]
+                since = p.dt * (row[0] - now)
+                turn = (_three(row, 1), _three(row, 4), _three(row, 7)) @ C.T
+                v = C @ (_three(row, 10) - V)
+                x = C @ (_three(row, 13) - X - rounded(since * V))
+                gain = C @ ((_three(row, 16), _three(row, 19), _three(row, 22)) - B)
+                for i in range(3):
+                    _keep_three(row, 1 + 3 * i, mask, turn[i])
+                    _keep_three(row, 16 + 3 * i, mask, gain[i])
+                _keep_three(row, 10, mask, v)
+                _keep_three(row, 13, mask, x)
+    _begin_sums(flight, mask)
 
 
 @stage
@@ -117,6 +168,10 @@ def increment_stage(flight, world, model, settings, work, stages, flag):
     moved = dt * v + rounded(0.5 * dt * dv)
     store(flight.imu_position, load3(flight.imu_position) + moved)
     store(flight.imu_bias_gain, dt * C.T + load33(flight.imu_bias_gain))
+    now = flight.tick + 1.0  # `tick` advances after this stage
+    grown = now == _TICKS_OF_SUMS * round_to_even(now / _TICKS_OF_SUMS)
+    if any_of(grown):
+        _rebase(flight, p, settings, now, grown)
 
 
 @kernel

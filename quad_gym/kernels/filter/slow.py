@@ -28,6 +28,7 @@ from typing import Any
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, reset_matrix
+from quad_gym.kernels.numbers.elementary import approached
 from quad_gym.kernels.numbers.factors import solve_right33
 from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import (
@@ -84,8 +85,7 @@ def begin_slow(flight, p, slow, mask):
 @kernel
 def stationary(p, i):
     """Variance of a slow error in the long run."""
-    a, s = p.slow_decay[i], p.slow_drive[i]
-    return s * s / ((1.0 - a) * (1.0 + a))
+    return p.slow_stationary[i] * p.slow_stationary[i]
 
 
 @kernel
@@ -211,10 +211,8 @@ def _gained(p, work, i, noise):
 
 @kernel
 def _gain(p, work, i, noise):
-    decay, one, s = work.slow_decay[i], p.slow_decay[i], p.slow_drive[i]
-    fall = (1.0 - one) * (1.0 + one)
-    share = noise * ((1.0 - decay) * (1.0 + decay) / fall)
-    return select(fall > 0.0, share * s * s, 0.0)  # a constant gains nothing
+    # a constant, with a rate of zero, gains nothing
+    return noise * approached(2.0 * p.slow_rate[i] * work.since_time) * stationary(p, i)
 
 
 @kernel

@@ -157,20 +157,34 @@ def sin_cos_minus_one(angles):
 
 
 @kernel
+def _exp_rest(r):
+    """The c with exp(r) = 1 + r + r c / (2 - c), for |r| <= ln(2) / 2."""
+    z = r * r
+    return r - z * polynomial(z, _EXP)
+
+
+@kernel
 def exp(x):
     """E ** x, with 0 and infinity beyond the range of the number (subnormal results are 0)."""
     k = round_to_even(clip(x, _EXP_LEAST - 1.0, _EXP_MOST + 1.0) * 1.44269504088896338700)
     high = fused_multiply_add(-k, _LN2_HIGH, x)
     low = k * _LN2_LOW
     r = high - low
-    z = r * r
-    c = r - z * polynomial(z, _EXP)
+    c = _exp_rest(r)
     mantissa = 1.0 - ((low - (r * c) / (2.0 - c)) - high)
     # two factors, as 2**k alone overflows at k = 1024
     half = round_to_even(0.5 * k)
     value = mantissa * power_of_two(half) * power_of_two(k - half)
     value = select(x > _EXP_MOST, math.inf, select(x < _EXP_LEAST, 0.0, value))
     return select(x == x, value, x)
+
+
+@kernel
+def approached(x):
+    """1 - exp(-x) for x >= 0, without cancellation: the share that a decay has lost after x."""
+    r = minimum(0.34, x)  # NaN remains
+    c = _exp_rest(-r)
+    return select(x > 0.34, 1.0 - exp(-x), r + r * c / (2.0 - c))
 
 
 @kernel

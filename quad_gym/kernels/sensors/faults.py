@@ -12,7 +12,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.numbers.blocks import reset
-from quad_gym.kernels.numbers.elementary import clip, log, sin_cos
+from quad_gym.kernels.numbers.elementary import approached, clip, log, sin_cos
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
 from quad_gym.kernels.numbers.linalg import dot, keep, load3, load33, load44, store
 from quad_gym.kernels.numbers.random import stream_of, uniform_pair
@@ -77,12 +77,15 @@ def _draw_what(flight, settings, stream, k, mask):
 
 
 @kernel
-def _step_bias(flight, k, bias, decay, mask):
-    """Add a step to a bias that has just decayed, so that the step itself does not decay."""
+def _step_bias(flight, k, bias, decay, step, mask):
+    """Add a step to a bias that has just decayed, so that the step itself does not decay.
+
+    `step` is the duration of a tick over the bias's time constant, `decay` is exp(-step).
+    """
     vector, news = flight.fault_vector[k], flight.fault_news[k]
-    active = mask & (flight.fault_active[k] > 0.0)
+    active, lost = mask & (flight.fault_active[k] > 0.0), approached(step)
     for i in range(3):
-        held = select(active, (1.0 - decay) * vector[i], 0.0)
+        held = select(active, lost * vector[i], 0.0)
         step = select(news > 0.0, vector[i], select(news < 0.0, -decay * vector[i], held))
         bias[i] = bias[i] + step
 
@@ -146,11 +149,11 @@ def _advance_faults(flight, world, settings, mask):
         keep(flight.r, flight.fault_news[FaultKind.POSITION_JUMP] > 0.0, r_I)
     if settings.run_filter:
         if on[FaultKind.ACCEL_BIAS_STEP]:
-            decay = world.accel_bias_decay
-            _step_bias(flight, FaultKind.ACCEL_BIAS_STEP, flight.b_a, decay, mask)
+            decay, step = world.accel_bias_decay, world.dt / world.accel_bias_tau
+            _step_bias(flight, FaultKind.ACCEL_BIAS_STEP, flight.b_a, decay, step, mask)
         if on[FaultKind.GYRO_BIAS_STEP]:
-            decay = world.gyro_bias_decay
-            _step_bias(flight, FaultKind.GYRO_BIAS_STEP, flight.b_g, decay, mask)
+            decay, step = world.gyro_bias_decay, world.dt / world.gyro_bias_tau
+            _step_bias(flight, FaultKind.GYRO_BIAS_STEP, flight.b_g, decay, step, mask)
     if on[FaultKind.CAMERA_OCCLUSION]:
         came = flight.fault_news[FaultKind.CAMERA_OCCLUSION] > 0.0
         if any_of(came):
@@ -187,12 +190,12 @@ def _draw_outlier(flight, p, settings, mask):
     size = settings.fault_size[k, 0] + settings.fault_size[k, 1] * u
     size, direction = select(struck, size, 0.0), _any_direction(stream, _draw_of(k, 5))
     white, drive = load3(p.position_sigma_I), load3(p.drift_drive)
-    kept = (1.0 - p.drift_decay) * (1.0 + p.drift_decay)
+    gained = approached(2.0 * p.drift_step)
     flight.outlier = select(mask, select(struck, 1.0, 0.0), flight.outlier)
     return (
-        size * math.sqrt(white[0] * white[0] + drive[0] * drive[0] / kept) * direction[0],
-        size * math.sqrt(white[1] * white[1] + drive[1] * drive[1] / kept) * direction[1],
-        size * math.sqrt(white[2] * white[2] + drive[2] * drive[2] / kept) * direction[2],
+        size * math.sqrt(white[0] * white[0] + drive[0] * drive[0] / gained) * direction[0],
+        size * math.sqrt(white[1] * white[1] + drive[1] * drive[1] / gained) * direction[1],
+        size * math.sqrt(white[2] * white[2] + drive[2] * drive[2] / gained) * direction[2],
     )
 
 

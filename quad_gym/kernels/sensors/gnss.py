@@ -13,7 +13,7 @@ from quad_gym.kernels.filter.measurements import (
 )
 from quad_gym.kernels.filter.recovery import reset_drifted_velocity
 from quad_gym.kernels.filter.slow import stationary
-from quad_gym.kernels.numbers.elementary import exp, log, minimum
+from quad_gym.kernels.numbers.elementary import approached, exp, minimum
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
@@ -84,9 +84,9 @@ def drift_gnss(flight, p, mask, share):
     The first measurement comes a `share` of the period after the start.
     """
     n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
-    d, s, whole = load3(flight.gnss_drift), load3(p.drift_drive), p.drift_decay
-    decay = exp(share * log(whole))
-    root = math.sqrt((1.0 - decay) * (1.0 + decay) / ((1.0 - whole) * (1.0 + whole)))
+    d, s, x = load3(flight.gnss_drift), load3(p.drift_drive), p.drift_step
+    decay = exp(-share * x)
+    root = math.sqrt(approached(2.0 * share * x) / approached(2.0 * x))
     drive = vector(root * s[0] * n[0], root * s[1] * n[1], root * s[2] * n[2])
     keep(flight.gnss_drift, mask, decay * d + rounded(drive))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.numbers.blocks import numbers_of
-from quad_gym.kernels.numbers.elementary import clip, exp, log, minimum, sin_cos
+from quad_gym.kernels.numbers.elementary import approached, clip, exp, log, minimum, sin_cos
 from quad_gym.kernels.numbers.lanes import select
 from quad_gym.kernels.numbers.linalg import keep, load3, load33, norm, store, vector
 from quad_gym.kernels.numbers.random import stream_of, uniform_pair
@@ -123,11 +123,11 @@ def _derive_noise(own, nominal, settings):
     if kinds[_GYRO_TAU] != FIXED:
         own.gyro_bias_decay = exp(-nominal.dt / own.gyro_bias_tau)
     if kinds[_ACCEL_BIAS] != FIXED or kinds[_ACCEL_TAU] != FIXED:
-        a = own.accel_bias_decay
-        own.accel_bias_drive = own.accel_bias_sigma * math.sqrt((1.0 - a) * (1.0 + a))
+        gained = approached(2.0 * nominal.dt / own.accel_bias_tau)
+        own.accel_bias_drive = own.accel_bias_sigma * math.sqrt(gained)
     if kinds[_GYRO_BIAS] != FIXED or kinds[_GYRO_TAU] != FIXED:
-        g = own.gyro_bias_decay
-        own.gyro_bias_drive = own.gyro_bias_sigma * math.sqrt((1.0 - g) * (1.0 + g))
+        gained = approached(2.0 * nominal.dt / own.gyro_bias_tau)
+        own.gyro_bias_drive = own.gyro_bias_sigma * math.sqrt(gained)
     if kinds[_BASELINE_SIGMA] != FIXED:
         drawn, white = own.baseline_sigma, nominal.baseline_sigma
         own.baseline_noise = _all_noise(drawn, white, nominal.baseline_noise)

@@ -30,23 +30,19 @@ def _pass_gate(flight, settings, active):
 def _reward(flight, p, settings, work, active, R_BI, w_B):
     """Return (reward, position error, last gate passed, finite) of a step.
 
-    The reward is not the sum of its terms in `work`: it is computed from their factors, with fewer
-    roundings.
+    The reward is the sum of its terms, in the order of `RewardTerm`. They remain in `work`.
     """
     seconds, weight, term = p.dt * settings.ticks_per_step, settings.reward_weight, work.reward_term
     change, spin = zero_like(seconds), dot(w_B, w_B)
     for i in range(4):
         gap = flight.action[i] - flight.last_action[i]
         change = change + gap * gap
-    costs = weight[RewardTerm.ACTION_RATE] * change + weight[RewardTerm.BODY_RATES] * spin
     scale = settings.reward_scale
     finished = active & (change < 0.0)  # false in all lanes so far
     if settings.task == TaskKind.WAYPOINTS:
         passed, progress = _pass_gate(flight, settings, active)
         _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
         facing, bonus = dot(R_BI[0], x_ref), select(passed, weight[RewardTerm.GATE_PASSED], 0.0)
-        reward = weight[RewardTerm.PROGRESS] * progress + bonus
-        reward = reward + seconds * (weight[RewardTerm.HEADING] * facing - costs)
         finished = active & (flight.gate_next >= settings.gate_count)
         error = norm(load3(flight.ref_center) - load3(flight.r))
         term[RewardTerm.PROGRESS] = scale * weight[RewardTerm.PROGRESS] * progress
@@ -55,17 +51,17 @@ def _reward(flight, p, settings, work, active, R_BI, w_B):
         r_ref, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
         facing, error = dot(R_BI[0], x_ref), norm(r_ref - load3(flight.r))
         near, fine = exp(-settings.near_decay * error), exp(-settings.fine_decay * error)
-        closeness = weight[RewardTerm.NEAR] * near + weight[RewardTerm.FINE] * fine
-        reward = seconds * (closeness + weight[RewardTerm.HEADING] * facing - costs)
         term[RewardTerm.NEAR] = scale * weight[RewardTerm.NEAR] * seconds * near
         term[RewardTerm.FINE] = scale * weight[RewardTerm.FINE] * seconds * fine
     term[RewardTerm.HEADING] = scale * weight[RewardTerm.HEADING] * seconds * facing
     term[RewardTerm.ACTION_RATE] = -scale * weight[RewardTerm.ACTION_RATE] * seconds * change
     term[RewardTerm.BODY_RATES] = -scale * weight[RewardTerm.BODY_RATES] * seconds * spin
     sound = is_finite(error + spin + R_BI[2][2])
+    reward = zero_like(seconds)
     for k in range(_TERMS):
         term[k] = select(active & sound, term[k], 0.0)
-    return select(sound, scale * reward, 0.0), error, finished, sound
+        reward = reward + term[k]
+    return reward, error, finished, sound
 
 
 @stage

@@ -6,7 +6,7 @@ The air's velocity is held over a tick, as the motor voltages are.
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.numbers.elementary import TINY, clip, exp, log, maximum, minimum
+from quad_gym.kernels.numbers.elementary import TINY, approached, clip, exp, log, maximum, minimum
 from quad_gym.kernels.numbers.lanes import logical_not, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import dot, keep, load3, load4, load33, norm
 from quad_gym.kernels.numbers.random import normal_pair, stream_of
@@ -69,8 +69,7 @@ def sinh_less_argument(h):
 @kernel
 def first_order(x, h, n):
     """Carry `x' = -x + white noise` of unit variance over the time h, with a standard normal n."""
-    kept = exp(-h)
-    return kept * x + math.sqrt((1.0 - kept) * (1.0 + kept)) * n
+    return exp(-h) * x + math.sqrt(approached(2.0 * h)) * n
 
 
 @kernel
@@ -86,7 +85,7 @@ def second_order(x, y, h, n, m):
     sinh = h + excess
     variance = e * sinh
     deviation = math.sqrt(variance)
-    shared = 0.5 * e * (excess + h * (1.0 - e)) / select(h > 0.0, deviation, 1.0)
+    shared = 0.5 * e * (excess + h * approached(h)) / select(h > 0.0, deviation, 1.0)
     rest = 0.25 * e * excess * (sinh + h) / select(h > 0.0, sinh, 1.0)
     return e * x + deviation * n, e * (y + h * x) + shared * n + math.sqrt(rest) * m
 
