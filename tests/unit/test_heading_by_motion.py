@@ -94,11 +94,18 @@ def test_wrong_compass_is_left_out_and_the_heading_replaced(kind, how):
     assert np.abs(state_errors(batch)[:, 8]).max() < math.radians(15.0)
 
 
-@pytest.mark.parametrize("task", ["circle", "random_trajectory"])
-def test_wrong_compass_from_the_start_is_found(task):
-    batch, worst = flown("consumer", task, faults=MagnetometerDisturbance(angle=math.pi)), 0.0
-    for _ in range(40):
-        steps(batch, 0.25)
+@pytest.mark.parametrize(
+    ("suite", "task", "angle"),
+    [
+        ("consumer", "circle", math.pi),
+        ("consumer", "random_trajectory", math.pi),
+        ("field", "circle", 1.05),
+    ],
+)
+def test_wrong_compass_from_the_start_is_found(suite, task, angle):
+    batch, worst = flown(suite, task, faults=MagnetometerDisturbance(angle=angle)), 0.0
+    for k in range(58):
+        steps(batch, 0.05 if k < 20 else 0.25)
         worst = max(worst, tilts(batch).max())
     assert math.degrees(worst) < 10.0
     assert np.mean(nees(batch)) < 1.3

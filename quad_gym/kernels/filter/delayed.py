@@ -247,6 +247,8 @@ def update_by_sensor(flight, p, work, settings, stages, slow):
             _restore_estimate(flight, work, settings, arrived, good, slow)
     keep_fields(flight, work, True, "block_valid", "", "kept_")
     work.mask = select(mask, 1.0, 0.0)
+    if settings.by_motion:
+        call_stage(stages, Stage.HEADING, flight, p, p, settings, work, 0)
 
 
 late_update_stage, late_update_with_slow_stage = stages_of("late_update", update_by_sensor)

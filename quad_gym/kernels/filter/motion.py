@@ -113,12 +113,14 @@ _KNOWN = 0.26  #: standard deviation below which the heading by motion is known 
 _RESOLVED = 0.16  #: the same, below which it replaces a heading that is unknown [rad]
 _SHORT, _LONG = 0.6, 1.5  #: lengths of u beyond which the model does not hold
 _ROUGH = 0.35  #: the same, below which it may contradict the filter [rad]
-_AGAINST, _DOUBT = 16.0, 10.24
-"""Squares of the numbers of standard deviations that are a contradiction, and in a long row."""
+_AGAINST, _DOUBT, _AGREES = 16.0, 10.24, 4.0
+"""Squares of the numbers of standard deviations that are a contradiction, in a long row, and up to
+which headings agree."""
 _LEAST = 0.03  #: least square of one, and largest variance of the filter's heading [rad^2]
 _LEAN, _MOST_LEAN, _LARGE_LEAN = 0.087, 0.12, 0.14
 """Angles between the verticals beyond which a tilt is wrong [rad]: at least and at most without a
 confirmed heading, and with one."""
+_START = 0.06  #: standard deviation of a first tilt beyond which it may lean further [rad]
 _LEANS, _LEANS_IN_ROW = 12.0, 2.0
 """Ratio of its square and the variance of N's tilt between these, and times in a row."""
 _IN_ROW, _SERIES = 3.0, 10.0  #: contradictions in a row that reset the attitude, and smaller ones
@@ -189,7 +191,9 @@ def turn_level(flight, p, force, half):
     a, one = W.T @ (force - b_a), zero_like(p.dt) + 1.0
     W = half @ W
     b_g = load3(flight.b_g_hat)
-    more = p.dt * (b_g - _plausible(b_g, _GYRO_OFFSET))
+    # a wrong compass shows biases that are none until the motion has once confirmed the heading
+    most = select(flight.level_tick > -1e8, _GYRO_OFFSET, 5.0 * p.gyro_bias_sigma)
+    more = p.dt * (b_g - _plausible(b_g, most))
     if any_of(dot(more, more) > 0.0):
         W = vector_to_dcm(more) @ W
     store(flight.level_turn, W)
@@ -302,8 +306,19 @@ def _turn_of(c, s):
 
 
 @kernel
+def _first_tilt(flight, p, settings):
+    """Variance of the tilt with which N began, as leveling has left it, beyond the usual."""
+    drawn = load3(settings.start_tilt_variance)
+    first = p.initial_tilt_sigma * p.initial_tilt_sigma + maximum(drawn[0], drawn[1])
+    left = exp(-2.0 * _FIRST_LEVELING * flight.level_force[2])
+    return left * maximum(first - _START * _START, 0.0)
+
+
+@kernel
 def _judge_heading(flight, p, work, settings, stages, slow):
     """Compare the filter's attitude with that of the motion, and reset it where they contradict."""
+    if not any_of(flight.level_fresh > 0.0):
+        return
     fresh, W, R_BI = flight.level_fresh > 0.0, load33(flight.level_turn), load33(flight.R_hat)
     flight.level_fresh = zero_like(p.dt)
     x, M, k = flight.level_state, R_BI.T @ W, R_BI.T[2]
@@ -326,7 +341,7 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     both = variance + minimum(own, _LEAST)
     against = holds & (apart > maximum(_AGAINST * both, _LEAST))
     doubts = holds & (apart > maximum(_DOUBT * both, _LEAST))
-    agrees = known & ruled & logical_not(against)
+    agrees = known & ruled & (apart <= maximum(_AGREES * both, _LEAST))
     flight.level_tick = select(agrees, flight.tick, flight.level_tick)
     side = select(u[1] * c - u[0] * s > 0.0, 1.0, -1.0)
     flight.level_apart = select(fresh, side * math.sqrt(maximum(apart, 0.0)), flight.level_apart)
@@ -343,11 +358,14 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     lean = k - W.T[2]
     unconfirmed = (flight.tick - flight.level_tick) * p.dt > RECENT
     tilt = flight.level_P[2] / (2.0 * p.gravity * p.gravity)  # variance of that of N, per axis
+    first = _first_tilt(flight, p, settings)
     limit = clip(_LEANS * tilt, _LEAN * _LEAN, _MOST_LEAN * _MOST_LEAN)
-    limit = select(unconfirmed, limit, _LARGE_LEAN * _LARGE_LEAN)
+    limit = select(unconfirmed, limit, _LARGE_LEAN * _LARGE_LEAN) + _LEANS * first
     leans = fresh & (dot(lean, lean) > limit) & ruled
     leans = leans & (flight.level_phase > 1.0)
     row = select(fresh, select(leans, flight.level_lean + 1.0, 0.0), flight.level_lean)
+    far = maximum(limit, _LARGE_LEAN * _LARGE_LEAN)
+    row = select(leans & (dot(lean, lean) > far), _LEANS_IN_ROW, row)
     wrong = wrong | (leans & (row >= _LEANS_IN_ROW))
     flight.level_lean = select(wrong, 0.0, row)
     certain = known & sharp

@@ -36,7 +36,7 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import (
     BA,
     BG,
@@ -62,7 +62,7 @@ from quad_gym.kernels.filter.slow import (
 )
 from quad_gym.kernels.numbers.elementary import is_finite, minimum
 from quad_gym.kernels.numbers.factors import KNOWN, cholesky33, lower33, solve_right33
-from quad_gym.kernels.numbers.lanes import any_of, select, zero_like
+from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     add_to_diagonal,
     cross,
@@ -326,9 +326,6 @@ def predict(flight, p, work, settings, stages, slow):
     """
     dt, form = p.dt, settings.form
     midpoint = (form & FilterForm.MIDPOINT.value) != 0
-    if settings.by_motion:
-        if any_of(flight.level_fresh > 0.0):
-            call_stage(stages, Stage.HEADING, flight, p, p, settings, work, 0)
     w_B = load3(flight.gyro) - load3(flight.b_g_hat)
     f_B = load3(flight.accel) - load3(flight.b_a_hat)
     R_BI = load33(flight.R_hat)

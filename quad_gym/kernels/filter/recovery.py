@@ -301,7 +301,8 @@ def reset_states(flight, p, work, settings, stages, slow):
             moved = mask & (shifted(flight, 6, R, limit) | altered)
             moved = moved & logical_not(supported(flight, p, settings, POSITION_BLOCK))
     if settings.by_motion:  # N has turned, too
-        forget_heading(flight, mask & shifted(flight, 3, BG, SHIFTED))
+        turned = mask & shifted(flight, 3, BG, SHIFTED)
+        forget_heading(flight, turned & (flight.level_doubts <= 0.0))
     alarmed = alarmed | jumped | moved
     if not any_of(alarmed):
         return

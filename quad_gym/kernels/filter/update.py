@@ -168,6 +168,8 @@ def update(flight, p, work, settings, stages, slow):
         step += 1
     if settings.by_motion:
         call_stage(stages, Stage.MOTION, flight, p, p, settings, work, 1)
+        if settings.late == 0 or settings.rewinds == 0:  # otherwise at the present instant
+            call_stage(stages, Stage.HEADING, flight, p, p, settings, work, 0)
     if any_of(hidden):
         show_hidden(flight, work, settings, hidden)
     if gradual:
