@@ -7,7 +7,10 @@ from scipy import stats
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import SensorLoss
-from tests.field_flights import fly, nees, state_errors, steps
+from quad_gym.records import FEATURE_SLICE, GateDecision
+from quad_gym.rotations import euler_to_dcm
+from quad_gym.sensors import Camera
+from tests.field_flights import fly, nees, small_euler_angles, state_errors, steps
 from tests.filter_states import set_at_rest
 from tests.unit.alarms import ALARM
 
@@ -72,6 +75,62 @@ def test_ranges_of_a_wide_prior_agree_with_gauss_newton(kind, sigma):
     assert limits[0] < squares(truth - positions, covariances).mean() < limits[1]
     plain, believed = estimates(in_one_step(SUITE), kind, sigma, ranges)
     assert squares(truth - plain, believed).mean() > limits[1]
+
+
+RTK = quad_gym.sensor_suite("rtk").simplified()
+FEATURES, HOVER = np.array(RTK.camera.features_I), np.array([0.3, -0.2, 2.5])
+POSE_SIGMA = np.repeat([0.02, 0.15, 0.04], [3, 2, 1])  #: of position [m], tilt and heading [rad]
+
+
+def pixels_at(x, features):
+    """Pixels at the errors x of position and attitude (error Euler angles) about a level HOVER."""
+    camera = RTK.camera
+    rays_B = (features - HOVER - x[:3]) @ euler_to_dcm(x[3:]).T - camera.position_B
+    rays_C = rays_B @ euler_to_dcm(np.array(camera.attitude)).T
+    return (camera.focal_length * rays_C[:, :2] / rays_C[:, 2:]).ravel()
+
+
+def most_likely_pose(pixels, features):
+    """The most likely errors x with the prior POSE_SIGMA, and their information, by iteration."""
+    x, variance = np.zeros(6), RTK.camera.pixel_sigma**2
+    for _ in range(20):
+        H = np.empty((len(pixels), 6))
+        for j, d in enumerate(1e-6 * np.eye(6)):
+            H[:, j] = (pixels_at(x + d, features) - pixels_at(x - d, features)) / 2e-6
+        information = np.diag(POSE_SIGMA**-2) + H.T @ H / variance
+        gradient = H.T @ (pixels - pixels_at(x, features)) / variance - x / POSE_SIGMA**2
+        x = x + np.linalg.solve(information, gradient)
+    return x, information
+
+
+@pytest.mark.parametrize("gate", [0.0, 1e-4], ids=["without gate", "gate"])
+@pytest.mark.parametrize("kind", FILTERS)
+def test_images_at_a_vague_tilt_agree_with_gauss_newton(kind, gate):
+    """The sum of all variances of attitude exceeds the bound on a direction's, which has two."""
+    suite = RTK.replace(estimator=RTK.estimator.replace(false_alarm_probability=gate))
+    assert (POSE_SIGMA[3:] ** 2).sum() > RTK.estimator.max_direction_sigma**2
+    P = np.diag(np.concatenate([POSE_SIGMA[:3], [0.03] * 3, POSE_SIGMA[3:], [0.02] * 6]) ** 2)
+    rng, kalman, whole, best = np.random.default_rng(7), FILTERS[kind](suite), [], []
+    camera, pose = Camera(suite.camera, rng=rng), [0, 1, 2, 6, 7, 8]
+    for _ in range(80):
+        truth = POSE_SIGMA * rng.normal(size=6)
+        pixels = camera.measure(HOVER + truth[:3], euler_to_dcm(truth[3:]))
+        set_at_rest(kalman, P, position=HOVER)
+        kalman.update(pixels=pixels)
+        used = kalman.gate_decisions[FEATURE_SLICE][: len(pixels)] == GateDecision.ACCEPTED
+        if not used.any():
+            continue
+        x, information = most_likely_pose(pixels[used].ravel(), FEATURES[used])
+        turn = small_euler_angles(kalman.R_BI[np.newaxis])[0]
+        apart = np.concatenate([kalman.position - HOVER, turn]) - x
+        best.append(apart @ information @ apart)
+        left = small_euler_angles((euler_to_dcm(truth[3:]) @ kalman.R_BI.T)[np.newaxis])[0]
+        error = np.concatenate([HOVER + truth[:3] - kalman.position, left])
+        whole.append(error @ np.linalg.solve(kalman.covariance[np.ix_(pose, pose)], error))
+    assert len(whole) > 60
+    assert np.median(best) < 0.3
+    limits = stats.chi2.ppf([ALARM / 2, 1.0 - ALARM / 2], 6 * len(whole)) / len(whole)
+    assert limits[0] < np.mean(whole) < limits[1]
 
 
 @pytest.mark.parametrize("kind", FILTERS)

@@ -64,11 +64,7 @@ def test_tilt_limit_is_lower_with_magnetic_heading():
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SUITES)
-def test_the_largest_tilt_leaves_the_filter_consistent(name, kind, request):
-    if name == "rtk":
-        # first images at 15 degrees have a NEES of 140 after 0.5 s
-        reason = "first images at large tilts are inconsistent"
-        request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+def test_the_largest_tilt_leaves_the_filter_consistent(name, kind):
     suite = of_kind(quad_gym.sensor_suite(name), kind)
     (found,) = mean_nees(suite, (0.5,), 512, randomization=largest_tilt(name))
     assert BAND[0] < found < BAND[1]

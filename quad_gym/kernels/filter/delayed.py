@@ -162,7 +162,7 @@ def _carry(flight, p, work, form, back, ticks, slow):
         Lanes in which the covariance stays positive definite.
     """
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
-        take_up_corrections(flight, slow, load33(flight.R_hat))
+        take_up_corrections(flight, slow, load33(flight.R_hat), flight.tick == flight.tick)
     _load_columns(flight, work, slow)
     R_s, dR, dv, dr = take_mean(flight, p, work, back)
     put_noise(p, work, R_s, dR, dv)

@@ -12,8 +12,9 @@ accordingly. The report leaves the covariance unchanged.
 With FIRST_ESTIMATES (optical flow, neither GNSS nor camera) the heading is unobservable. The error
 e is then a rotation vector, R_BI = exp(-[e x]) R_hat, and keeps its direction in I when an update
 corrects the attitude; a correction dv of the velocity adds R_hat^T e x dv to the velocity's error
-in the next prediction. So an update gives no information about a rotation about the vertical
-(docs/filter-equations.md, "Unobservable heading"). As only motions in B are measured,
+in the next prediction, or the next step of a progressive update. So an update gives no information
+about a rotation about the vertical (docs/filter-equations.md, "Unobservable heading").
+As only motions in B are measured,
 a heading error psi moves position and velocity in I along arcs: across them to first order, which P
 contains, and along their radii in proportion to psi^2, which no update may change. `arc` has the
 standard deviations of the second part, by which covariances in I are larger than P.
@@ -31,13 +32,13 @@ from quad_gym.kernels.numbers.linalg import (
     diagonal,
     dot,
     keep,
+    keep_block,
     keep_lower,
     load3,
     load33,
     load_block,
     load_symmetric,
     outer,
-    store,
     store_block,
 )
 from quad_gym.records.states import BA as BA
@@ -73,26 +74,27 @@ def crossed(f):
 
 
 @kernel
-def take_up_corrections(flight, slow, R_BI):
+def take_up_corrections(flight, slow, R_BI, lanes):
     """Add to the velocity's error what changes of v_hat by updates add to it, and forget these.
 
-    With an error e, the error v becomes v + R_BI^T e x change, see above.
+    With an error e, the error v becomes v + R_BI^T e x change, in `lanes`, see above.
     """
     P, N = flight.P, crossed(load3(flight.v_corrected)) @ R_BI.T
     ee, ve, re = load_symmetric(P, E), load_block(P, V, E), load_block(P, R, E)
     moved = ve + N @ ee
     vv = load_symmetric(P, V) + moved @ N.T + N @ ve.T
-    store_block(P, V, E, moved)
-    store_block(P, V, R, load_block(P, V, R) + N @ re.T)
-    keep_lower(P, V, flight.tick == flight.tick, vv)
+    keep_block(P, V, E, lanes, moved)
+    keep_block(P, V, R, lanes, load_block(P, V, R) + N @ re.T)
+    keep_lower(P, V, lanes, vv)
     for i in (BA, BG):
-        store_block(P, i, V, load_block(P, i, V) + load_block(P, i, E) @ N.T)
+        keep_block(P, i, V, lanes, load_block(P, i, V) + load_block(P, i, E) @ N.T)
     if slow is not None:
         rows = flight.P_slow
         for i in range(0, slow.slow_states, 3):
-            store_block(rows, i, V, load_block(rows, i, V) + load_block(rows, i, E) @ N.T)
+            moved = load_block(rows, i, V) + load_block(rows, i, E) @ N.T
+            keep_block(rows, i, V, lanes, moved)
     zero = zero_like(flight.tick)
-    store(flight.v_corrected, (zero, zero, zero))
+    keep(flight.v_corrected, lanes, (zero, zero, zero))
 
 
 @kernel

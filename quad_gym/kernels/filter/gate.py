@@ -72,7 +72,7 @@ _MAX_FACTOR = 25.0  #: largest factor on the variance of a noise: five times its
 
 
 @kernel
-def _covariance(p, work, settings, k):
+def innovation_covariance(p, work, settings, k):
     """P_zz of the block that begins at row k of the stacked measurement."""
     A, E, mu = work.A, work.E, load3(work.mu[k : k + 3])
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
@@ -182,7 +182,7 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
     gating, none = (settings.form & FilterForm.GATE.value) != 0, no_lane(work.again)
     valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
     first, R = valid & (work.again <= 0.0), load_block(work.Rz, k, k)
-    P_suite, nu = _covariance(p, work, settings, k), load3(work.nu[k : k + 3])
+    P_suite, nu = innovation_covariance(p, work, settings, k), load3(work.nu[k : k + 3])
     more = zero_like(R)
     if gating:
         more = (flight.noise_factor[group] - 1.0) * R

@@ -338,7 +338,7 @@ def predict(flight, p, work, settings, stages, slow):
         halfway = half if midpoint else vector_to_dcm(0.5 * dt * w_B)
         turn_level(flight, p, f_B + load3(flight.b_a_hat), halfway)
     if (form & FilterForm.FIRST_ESTIMATES.value) != 0:
-        take_up_corrections(flight, slow, R_BI)
+        take_up_corrections(flight, slow, R_BI, flight.tick == flight.tick)
     f_start = f_B
     if midpoint:
         f_start = half.T @ f_B

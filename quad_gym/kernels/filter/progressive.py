@@ -24,8 +24,7 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.gate import MONITORED
+from quad_gym.kernels.filter.gate import MONITORED, innovation_covariance
 from quad_gym.kernels.filter.measurements import is_direction
 from quad_gym.kernels.numbers.lanes import any_of, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import dot, keep, load3
@@ -59,9 +58,16 @@ def factor_of(further, step):
 
 @kernel
 def count_steps(flight, p, work, settings, mask):
-    """Number of steps after the first that the present measurements need, in the lanes `mask`."""
+    """Number of steps after the first that the present measurements need, in the lanes `mask`.
+
+    Sets work.hidden for features too uncertain for a linear model even in steps. Steps are counted
+    for the others.
+    """
     square = _ratio_squared(flight, work, settings)
     tolerated = p.recursive_update_threshold * p.recursive_update_threshold
+    if settings.feature_count > 0 and any_of(square > tolerated):
+        _find_unsure(flight, p, work, settings, square > tolerated)
+        square = _ratio_squared(flight, work, settings)
     steps = select(square > tolerated, FEW, 0.0)
     for m in range(len(_LARGE)):
         steps = select(square > _LARGE[m] * _LARGE[m], FEW + 1.0 + m, steps)
@@ -70,7 +76,7 @@ def count_steps(flight, p, work, settings, mask):
 
 @kernel
 def _ratio_squared(flight, work, settings):
-    """rho^2, see above; features that are too uncertain do not count."""
+    """rho^2, see above; features in work.hidden do not count."""
     k, total, mu, R = 0, zero_like(work.spread), work.mu, work.Rz
     for sensor in range(SENSORS):
         first = FIRST_BLOCK[sensor]
@@ -90,21 +96,24 @@ def _ratio_squared(flight, work, settings):
 
 
 @kernel
-def find_unsure(flight, p, work, feature_count):
-    """Set work.hidden for visible features too uncertain for a linear model even in steps.
-
-    The error of a direction comes from attitude and position; the position's share grows as the
-    feature gets nearer.
-    """
-    P = flight.P
-    position = P[R, R] + P[R + 1, R + 1] + P[R + 2, R + 2]
-    attitude = P[E, E] + P[E + 1, E + 1] + P[E + 2, E + 2]
-    r = load3(flight.r_hat)
-    for i in range(feature_count):
-        offset = load3(p.features[i]) - r
-        square, seen = dot(offset, offset), flight.block_valid[FEATURE_BLOCKS + i] > 0.0
-        unsure = seen & (position > (p.gate_uncertainty - attitude) * square)
-        work.hidden[i] = select(unsure, 1.0, 0.0)
+def _find_unsure(flight, p, work, settings, lanes):
+    """Set work.hidden for features that a gate leaves out as too uncertain, in `lanes`."""
+    k = 0
+    for sensor in range(SENSORS):
+        first = FIRST_BLOCK[sensor]
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            valid = flight.block_valid[block] > 0.0
+            if any_of(valid):
+                if is_direction(block) and block >= FEATURE_BLOCKS:
+                    P_zz = innovation_covariance(p, work, settings, k)
+                    u = load3(work.z_hat[k : k + 3])
+                    across = P_zz[0][0] + P_zz[1][1] + P_zz[2][2] - dot(u, P_zz @ u)
+                    unsure, i = (
+                        lanes & valid & (across > p.gate_uncertainty),
+                        block - FEATURE_BLOCKS,
+                    )
+                    work.hidden[i] = select(unsure, 1.0, work.hidden[i])
+                k += 3
 
 
 @kernel

@@ -21,7 +21,15 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.columns import columns_of, factor_columns, keep_updated, row_of
-from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix
+from quad_gym.kernels.filter.error_state import (
+    BA,
+    BG,
+    E,
+    R,
+    V,
+    reset_matrix,
+    take_up_corrections,
+)
 from quad_gym.kernels.filter.gate import MONITORED
 from quad_gym.kernels.filter.measurements import (
     call_measured,
@@ -38,7 +46,6 @@ from quad_gym.kernels.filter.progressive import (
     count_steps,
     drop_even,
     factor_of,
-    find_unsure,
     hide_unsure,
     share_second_order,
     show_hidden,
@@ -142,18 +149,26 @@ def update(flight, p, work, settings, stages, slow):
     gradual, extended = (form & FilterForm.GRADUAL.value) != 0, (form & FilterForm.EKF.value) != 0
     curved = True  # the half-sums of sigma pairs count
     hidden, further = no_lane(p.sigma_spread), zero_like(p.sigma_spread)
-    if gradual and settings.feature_count > 0:
-        find_unsure(flight, p, work, settings.feature_count)
-        if (form & FilterForm.GATE.value) == 0:  # a gate leaves them out by itself
-            hidden = hide_unsure(flight, work, settings.feature_count, mask)
+    # a gate leaves out features that are too uncertain by itself
+    hiding = gradual and settings.feature_count > 0 and (form & FilterForm.GATE.value) == 0
+    if gradual:
+        for i in range(settings.feature_count):
+            work.hidden[i] = zero_like(p.sigma_spread)
     failures, step, last = flight.update_failures, 0, 0
     while step <= last:
+        if step > 0 and (form & FilterForm.FIRST_ESTIMATES.value) != 0:
+            take_up_corrections(flight, slow, load33(flight.R_hat), further >= 1.0 * step)
         n, pivot = _expect(flight, p, work, settings, stages, slow)
         if n > 0:
             if not extended or gradual:
                 _mean_even(work, n, work.spread, settings.motion_columns)
             if gradual and step == 0:
                 further = count_steps(flight, p, work, settings, mask)
+                if hiding:
+                    hiding = False
+                    hidden = hide_unsure(flight, work, settings.feature_count, mask)
+                    if any_of(hidden):
+                        continue  # without them
                 for m in range(1, MOST_STEPS + 1):
                     if any_of(further >= 1.0 * m):
                         last = m
