@@ -12,7 +12,8 @@ estimate is. Four known rules decide.
 * **Time limit.** Otherwise, after `reset_timeout`, the states that the sensor measures are reset
   to it: covariances with other states are cut, and variances are the square of the innovation, so
   that the next measurement determines them. If the error grew gradually, the IMU is to blame:
-  velocity, tilt and biases, too, get the variances of their start.
+  velocity, tilt and biases, too, get the variances of their start. If the heading is reset, the
+  gyro's bias may be as large as the turn since the last accepted measurement explains.
 
 Corrections that are not white show that a bias has jumped, or that noise is colored. The reset is
 as large as they explain, so that colored noise does no harm.
@@ -53,7 +54,14 @@ from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum, minimum
 from quad_gym.kernels.numbers.factors import eliminate
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, no_lane, select, zero_like
-from quad_gym.kernels.numbers.linalg import dot, load33, load_block, outer, store_block
+from quad_gym.kernels.numbers.linalg import (
+    dot,
+    load33,
+    load_block,
+    load_symmetric,
+    outer,
+    store_block,
+)
 from quad_gym.records import (
     AID_GROUPS,
     FIRST_GROUP,
@@ -193,6 +201,21 @@ def reset_drifted_velocity(flight, p, work, states, group, lanes, square):
     speed = 4.0 * square / (T * T)
     drifted = lanes & (work.drifted > 0.0) & (work.alone[VELOCITY_BLOCK] > 0.0)
     reset_variances(work.P, V, states, drifted, (speed, speed, speed))
+
+
+@kernel
+def reset_drifted_heading(flight, p, work, group, lanes, square):
+    """Make the gyro's bias uncertain about the vertical where the heading has drifted off.
+
+    It has turned by an angle with this square in the time since the last accepted measurement of
+    the group. The variance of a bias at the start may be too small to explain that, and would then
+    let the heading drift off again after each reset.
+    """
+    T = maximum(flight.tick - flight.accepted_tick[group], 1.0) * p.dt
+    rate = minimum(square / (T * T), _GYRO_OFFSET * _GYRO_OFFSET)
+    k, P_gg = load33(flight.R_hat).T[2], load_symmetric(work.P, BG)
+    more = select(lanes, maximum(rate - dot(k, P_gg @ k), 0.0), 0.0)
+    store_block(work.P, BG, BG, P_gg + outer(more * k, k))
 
 
 @kernel

@@ -11,7 +11,7 @@ from quad_gym.kernels.filter.measurements import (
     put_block,
     put_column,
 )
-from quad_gym.kernels.filter.recovery import reset_drifted_velocity
+from quad_gym.kernels.filter.recovery import reset_drifted_heading, reset_drifted_velocity
 from quad_gym.kernels.filter.slow import stationary
 from quad_gym.kernels.numbers.elementary import approached, exp, minimum
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
@@ -193,9 +193,11 @@ def expect_baseline(flight, p, work, settings, k, valid):
 
 
 @kernel
-def reset_baseline(flight, work, states, lanes, nu):
+def reset_baseline(flight, p, work, states, lanes, nu):
     """Reset the heading to the sideward innovation."""
-    reset_heading(work.P, load33(flight.R_hat), states, lanes, nu[0] * nu[0] + nu[1] * nu[1])
+    square = nu[0] * nu[0] + nu[1] * nu[1]
+    reset_heading(work.P, load33(flight.R_hat), states, lanes, square)
+    reset_drifted_heading(flight, p, work, BASELINE_BLOCK, lanes & (work.drifted > 0.0), square)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -349,7 +351,7 @@ def _reset(flight, p, work, settings):
         if block == POSITION_BLOCK:
             reset_position(flight, p, work, settings, states, lanes, nu)
         elif block == BASELINE_BLOCK:
-            reset_baseline(flight, work, states, lanes, nu)
+            reset_baseline(flight, p, work, states, lanes, nu)
         else:
             reset_velocity(work, states, lanes, nu)
 

@@ -37,6 +37,7 @@ from quad_gym.kernels.filter.error_state import (
     reset_variances,
 )
 from quad_gym.kernels.filter.measurements import by_derivative, put_block, put_three, with_pairs
+from quad_gym.kernels.filter.recovery import reset_drifted_heading
 from quad_gym.kernels.filter.starts import lever_of_attitude
 from quad_gym.kernels.numbers.elementary import maximum, sin_cos
 from quad_gym.kernels.numbers.lanes import select, zero_like
@@ -61,7 +62,7 @@ from quad_gym.kernels.numbers.random import normal_pair, stream_of
 from quad_gym.kernels.numbers.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.common import aid_stage, draw_matrix
 from quad_gym.kernels.sensors.faults import disturb_field
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
+from quad_gym.records import AID_GROUPS, AID_NUMBERS, AID_ROW, DRAW_AID, Aid
 
 _S = int(Aid["MAGNETOMETER"])
 _ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
@@ -186,6 +187,7 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
     reset_variances(work.P, D + first, states, lanes, (iron, iron, iron))
     variance = (square + own) / (m[0] * m[0] + m[1] * m[1])
     reset_heading(work.P, load33(flight.R_hat), states, lanes & alone, variance)
+    reset_drifted_heading(flight, p, work, AID_GROUPS + _S, lanes & alone, variance)
 
 
 magnetometer_stage = aid_stage(
