@@ -71,6 +71,23 @@ def test_gnss_that_drifts_or_jumps_makes_the_position_unusable(change):
     assert result.verdict.startswith("not usable, because position: ")
 
 
+@pytest.mark.parametrize(
+    ("wrong", "right"), [("positions", "velocities"), ("velocities", "positions")]
+)
+def test_the_imu_shows_which_of_positions_and_velocities_is_wrong_for_some_time(wrong, right):
+    def change(table, rng, suite):
+        name = "gnss_enu" if wrong == "positions" else "gnss_velocity_enu"
+        since = table["time"] - 20.0
+        inside = verdicts.rows(table, name) & (since > 0.0) & (since < 12.0)
+        gain = since[inside] if wrong == "positions" else np.ones(inside.sum())
+        table[name][inside] += np.outer(gain, [1.5, 1.0, 0.0])
+
+    result, error = verdicts.judged(NAME, change, *flight(), seed=0)
+    assert not result.problems
+    assert any(f"{right}, so that the {wrong} are left out" in f.text for f in result.findings)
+    assert error < 3.0
+
+
 def test_gnss_that_drifts_while_a_camera_holds_the_position_is_a_problem():
     log, truth = next(iter(verdicts.flown("rtk", 1, seed=7)))
     result, error = verdicts.judged("rtk", verdicts.ramp, log, truth, seed=0)

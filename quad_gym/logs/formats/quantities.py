@@ -7,7 +7,7 @@ never fused.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,7 @@ UNKNOWN = "wrong direction, unit or axes"  #: cause of velocities that contradic
 CORRELATED = 0.7  #: correlation of velocities and motion that belong together [-]
 SILENT = 0.25  #: ratio of velocities and motion below which a log has no velocities [-]
 SPAN = 1.0  #: time over which velocities are compared with positions [s]
+DISPUTE = 5.0  #: time for which they contradict each other before it is worth a judgment [s]
 FARTHEST = 1e6  #: distance from the origin of I [m]
 FAST = 100.0  #: speed of a jump away from a fix at zero [m/s]
 _LENGTHS = {
@@ -224,36 +225,84 @@ def _heights_of_gnss(log: Log, time: Floats, places: Floats) -> _Found:
     )
 
 
-def _velocities(log: Log, time: Floats, places: Floats) -> _Found:
-    """Velocities that differ from differenced positions in direction, unit or axes."""
+class _Motion(NamedTuple):
+    """Mean velocities over `SPAN` by two witnesses, at the ends of these times."""
+
+    time: Floats  #: (n,) [s]
+    moved: Floats  #: (n, 3) by positions, in I [m/s]
+    told: Floats  #: (n, 3) by velocities of the log, in I [m/s]
+    limit: float  #: difference that noise of positions does not explain [m/s]
+
+
+def _motion(log: Log, time: Floats, places: Floats) -> tuple[str, _Motion] | None:
+    """Return the name of the velocities of a log, and its motion; None: there are too few."""
     gnss = log.gnss
     if gnss is None:
-        return
+        return None
     name = next((n for n in ("velocity_I", "velocity_G") if n in gnss.values), None)
     if name is None or len(time) < ENOUGH:
-        return
+        return None
     told = gnss.values[name]
     rows = np.isfinite(told).all(axis=1)
     if rows.sum() < ENOUGH:
-        return
+        return None
     if name == "velocity_G":
         if (fixes := gnss.values.get("position_G")) is None:
-            return
+            return None
         told = told @ ecef_to_enu(fixes[np.isfinite(fixes).all(axis=1)][0]).T
-    moved, mean = _motions(time, places, gnss.time[rows], told[rows])
+    ends, moved, mean = _motions(time, places, gnss.time[rows], told[rows])
     bends = np.abs(np.diff(places[:, :2], 2, axis=0))
     noise = math.sqrt(2.0 / 6.0) * float(np.median(bends)) / 0.6745  # of a difference
-    rows = _contradiction(moved, mean, max(1.0, CERTAIN * noise / SPAN))
+    return name, _Motion(ends, moved, mean, max(1.0, CERTAIN * noise / SPAN))
+
+
+def _velocities(log: Log, time: Floats, places: Floats) -> _Found:
+    """Velocities that differ from differenced positions in direction, unit or axes."""
+    found = _motion(log, time, places)
+    if found is None or log.gnss is None:
+        return
+    name, motion = found
+    rows = _contradiction(motion.moved, motion.told, motion.limit)
     if rows is None:
         return
-    cause = _cause(moved[rows], mean[rows])
-    if cause == UNKNOWN and _agree_otherwise(moved, mean, max(1.0, CERTAIN * noise / SPAN)):
-        return  # for some time only: the filter judges by the IMU which of both is wrong
-    values = {k: v for k, v in gnss.values.items() if k not in (name, "velocity_sigma")}
+    cause = _cause(motion.moved[rows], motion.told[rows])
+    if cause == UNKNOWN and _agree_otherwise(motion.moved, motion.told, motion.limit):
+        return  # for some time only, see `disputed`
+    values = {k: v for k, v in log.gnss.values.items() if k not in (name, "velocity_sigma")}
     yield (
-        {"gnss": replace(gnss, values=values)},
+        {"gnss": replace(log.gnss, values=values)},
         f"GNSS velocities contradict the positions: {cause}; they are left out",
     )
+
+
+def disputed(log: Log, suite: SensorSuite) -> tuple[float, float] | None:
+    """Return the time in which positions and velocities of GNSS contradict each other.
+
+    None: in no part of the log, or not only in one.
+    """
+    if suite.gnss is None or suite.gnss.velocity_sigma is None:
+        return None
+    found = _motion(log, *_places(log, np.array(suite.gnss.reference_antenna_G)))
+    if found is None:
+        return None
+    _, (time, moved, told, limit) = found
+    apart = time[np.linalg.norm((moved - told)[:, :2], axis=1) >= limit]
+    if not len(apart) or np.ptp(apart) < DISPUTE or not _agree_otherwise(moved, told, limit):
+        return None
+    return float(apart[0] - SPAN), float(apart[-1])
+
+
+def without(log: Log, quantity: str, span: tuple[float, float]) -> Log:
+    """Return a log without a quantity of GNSS, "position" or "velocity", for some time."""
+    assert log.gnss is not None
+    inside = (log.gnss.time >= span[0]) & (log.gnss.time <= span[1])
+    values = {
+        name: np.where(inside[:, np.newaxis], np.nan, value)
+        if name in (f"{quantity}_G", f"{quantity}_I")
+        else value
+        for name, value in log.gnss.values.items()
+    }
+    return replace(log, gnss=replace(log.gnss, values=values))
 
 
 def _contradiction(moved: Floats, mean: Floats, limit: float) -> Any:
@@ -292,8 +341,10 @@ def _agree_otherwise(moved: Floats, mean: Floats, limit: float) -> bool:
     return bool(abs(1.0 - ratio) < OFF and alike > CORRELATED)
 
 
-def _motions(time: Floats, places: Floats, stamps: Floats, told: Floats) -> tuple[Floats, Floats]:
-    """Return mean velocities over a second by the positions, and by the velocities of a log.
+def _motions(
+    time: Floats, places: Floats, stamps: Floats, told: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return times, and mean velocities over the second before by positions and by velocities.
 
     Over a second, noise of the positions matters little.
     """
@@ -307,7 +358,7 @@ def _motions(time: Floats, places: Floats, stamps: Floats, told: Floats) -> tupl
     steps = np.diff(stamps)[:, np.newaxis]
     integral[1:] = np.cumsum(0.5 * (told[1:] + told[:-1]) * steps, axis=0)
     at = np.column_stack([np.interp(time, stamps, column) for column in integral.T])
-    return (places[use] - places[begin]) / length, (at[use] - at[begin]) / length
+    return time[use], (places[use] - places[begin]) / length, (at[use] - at[begin]) / length
 
 
 def _differs(moved: Floats, mean: Floats) -> float:

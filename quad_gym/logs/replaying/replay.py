@@ -13,11 +13,12 @@ from quad_gym.estimation.filters import UnscentedKalmanFilter
 from quad_gym.logs.formats import Floats, Log, Reading, read_log
 from quad_gym.logs.formats.clocks import naming, parts_of
 from quad_gym.logs.formats.earth_field import at_place
-from quad_gym.logs.formats.quantities import compared
+from quad_gym.logs.formats.quantities import compared, disputed, without
 from quad_gym.logs.replaying.measurements import FilterCalls
 from quad_gym.logs.replaying.player import ESTIMATORS, OwnPlayer, Player
-from quad_gym.logs.replaying.results import Estimates, Replay, joined
-from quad_gym.logs.replaying.verdict import with_verdict
+from quad_gym.logs.replaying.results import Estimates, Finding, Replay, joined
+from quad_gym.logs.replaying.rules import changes, uncertain
+from quad_gym.logs.replaying.verdict import during, with_verdict
 from quad_gym.params import checks as check
 from quad_gym.params.suites import SensorSuite, sensor_suite
 from quad_gym.rotations import quaternion_to_dcm
@@ -56,6 +57,11 @@ def suite_for(log: Log) -> tuple[str, str]:
 # --------------------------------------------------------------------------------------------------
 # Replay: a filter processes a log in the same way as in flight.
 # --------------------------------------------------------------------------------------------------
+
+CLEARLY = 1.5
+"""How many times more than the IMU explains an estimate changes with the wrong ones of positions
+and velocities, at least."""
+AROUND = 2.0  #: time before and after their contradiction that is compared [s]
 
 
 def replay(
@@ -125,11 +131,55 @@ def replay(
             rows.extend(calls.rows)
         return found
 
+    def attempt(log: Log) -> Replay:
+        def of_part(part: Log, begin: dict[str, Any]) -> Replay:
+            return Player(part, suite, estimator, begin, reported_noise, reach).play()
+
+        return in_parts(log, named_start(start), of_part)
+
     rows: list[str] = []
+    whole, found = _judged(whole, suite, attempt)
     result = in_parts(whole, named_start(start), fly)
     if samples is not None:
         Path(samples).write_text("".join(rows), encoding="utf-8")
-    return with_verdict(whole, reading.get("body", "flu"), suite, result, dict(start or {}))
+    return with_verdict(whole, reading.get("body", "flu"), suite, result, dict(start or {}), found)
+
+
+def _judged(
+    log: Log, suite: SensorSuite, attempt: Callable[[Log], Replay]
+) -> tuple[Log, tuple[Finding, ...]]:
+    """Return a log without wrong positions or velocities of GNSS, and a finding about them.
+
+    Where both contradict each other for some time, the IMU decides: without the wrong ones, an
+    estimate changes as its samples explain.
+
+    Args:
+        log: The log.
+        suite: The suite.
+        attempt: Replays a log.
+    """
+    span = disputed(log, suite)
+    if span is None:
+        return log, ()
+    ratios = {}
+    for quantity in ("position", "velocity"):
+        tried = without(log, quantity, span)
+        try:
+            result = during(attempt(tried), span[0] - AROUND, span[1] + AROUND)
+        except ValueError:
+            return log, ()  # too little is left to replay it
+        found, _ = changes(tried, result, float(result.time[0]))
+        ratios[quantity] = max((change.ratio for change in found), default=np.inf)
+    wrong = min(ratios, key=ratios.__getitem__)
+    right = {"position": "velocity", "velocity": "position"}[wrong]
+    many = {"position": "positions", "velocity": "velocities"}
+    text = (
+        f"GNSS positions and velocities contradict each other from {span[0]:.1f} to {span[1]:.1f} s"
+    )
+    if not ratios[wrong] < ratios[right] / CLEARLY:
+        return log, (uncertain("position", f"{text}, and the IMU does not show which are wrong"),)
+    text = f"{text}: the IMU agrees with the {many[right]}, so that the {many[wrong]} are left out"
+    return without(log, wrong, span), (uncertain("position", f"{text} for this time"),)
 
 
 _Found = TypeVar("_Found", bound=Estimates)

@@ -87,11 +87,17 @@ RULES = (
 
 
 def with_verdict(
-    log: Log, body: str, suite: SensorSuite, result: Replay, start: Mapping[str, Any]
+    log: Log,
+    body: str,
+    suite: SensorSuite,
+    result: Replay,
+    start: Mapping[str, Any],
+    known: tuple[Finding, ...] = (),
 ) -> Replay:
     """Return a replay with its findings, the worst first, and the verdict in a line.
 
-    If the log has commands of the motors, it ends for the verdict where they stop for good.
+    If the log has commands of the motors, it ends for the verdict where they stop for good. Some
+    findings may be `known` before.
     """
     flown = _until_landing(log, result)
     sensors = by_sensor(flown.measured)
@@ -101,7 +107,7 @@ def with_verdict(
         sensors = {**sensors, "magnetometer": own}
     fits = {name: fit for name, m in sensors.items() if (fit := fit_of(m))}
     case = Evidence(log, body, suite, flown, sensors, fits, start)
-    found = [finding for rule in RULES for finding in rule.find(case)]
+    found = [*known, *(finding for rule in RULES for finding in rule.find(case))]
     found.sort(key=lambda finding: -finding.severity)
     return replace(result, findings=tuple(found), verdict=in_one_line(found, fits))
 
@@ -113,16 +119,23 @@ def _until_landing(log: Log, result: Replay) -> Replay:
         return result
     assert log.motors is not None
     landing = float(log.motors.time[np.flatnonzero(running)[-1]])
-    rows = result.time <= landing
-    if rows.all() or rows.sum() < 2:
+    if (result.time <= landing).all() or (result.time <= landing).sum() < 2:
         return result
+    return during(result, -math.inf, landing)
+
+
+def during(result: Replay, since: float, until: float) -> Replay:
+    """Return the rows and measurements of a replay in some time."""
+    rows = (result.time >= since) & (result.time <= until)
     cut: dict[str, Any] = {
         name: value[rows]
         for name, value in vars(result).items()
         if isinstance(value, np.ndarray) and len(value) == len(rows)
     }
     measured = {
-        name: Measured(*(value[m.time <= landing] for value in vars(m).values()))
+        name: Measured(
+            *(value[(m.time >= since) & (m.time <= until)] for value in vars(m).values())
+        )
         for name, m in result.measured.items()
     }
     return replace(result, **cut, measured=measured)
