@@ -143,7 +143,7 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
             self.sensors.require_filter()
         if self.longest_delay > 0 and self.control is Control.PD:
             raise ValueError("action_delay needs actions: Control.PD flies without any")
-        check_draws(self.draws, self.flown_vehicle, self.world, self.clocks)
+        check_draws(self.draws, self.flown_vehicle, self.clocks)
 
     def _require_effect(self) -> None:
         """Refuse arguments of another controller, and of a filter that does not run."""

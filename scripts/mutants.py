@@ -41,6 +41,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quad_gym.commands.options import parse, require_at_least, usage_errors
+from quad_gym.params import checks as check
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("kernels", "packing", "params", "estimation", "tasks")
@@ -61,6 +62,13 @@ _COPIED = (
     "CITATION.cff",
 )
 _LEFT_OUT = {"tests/contract/test_golden.py", "tests/scripts/test_mutants.py"}
+_COSTLY = {
+    "tests/contract/test_browser_page.py",
+    "tests/unit/test_calibration.py",
+    "tests/unit/test_device.py",
+    "tests/unit/test_filter_library.py",
+}
+"""Files that take minutes, or compile for other processors: run for modules that they import."""
 _WORD = re.compile(r"[A-Za-z][a-z]{3,}|[A-Z]{4,}")
 _FIRST, _MOST = 10, 60
 """Number of tests that run first, and of all that run: the others in the order of their files."""
@@ -129,12 +137,19 @@ class MutantsArgs:
     """number of lines to break"""
     seed: int = 0
     """seed of their choice"""
+    only: tuple[str, ...] = FOLDERS
+    """folders whose mutants run, of the `count` chosen ones"""
     nearest: int = 6
     """number of test files that run for each"""
     limit: float = 900.0
     """time after which the tests of a mutant are stopped [s]; its result is then open"""
     output: Path = Path("results/mutants.csv")
     """table, which is continued"""
+
+
+def folder_of(mutant: Mutant) -> str:
+    """Return the folder, or the file, of the package in which a line is broken."""
+    return Path(mutant.file).parts[1].removesuffix(".py")
 
 
 def words_of(text: str) -> list[str]:
@@ -222,7 +237,8 @@ def chosen(count: int, seed: int) -> list[Mutant]:
     paths = sorted(
         path.relative_to(ROOT)
         for folder in FOLDERS
-        for path in (ROOT / "quad_gym" / folder).rglob("*.py")
+        for path in [*(ROOT / "quad_gym" / folder).rglob("*.py"), ROOT / f"quad_gym/{folder}.py"]
+        if path.exists()
     )
     every = [mutant for path in paths for mutant in mutants_of(path)]
     random.Random(seed).shuffle(every)
@@ -260,12 +276,16 @@ def nearest_tests(mutant: Mutant, count: int, texts: dict[str, str]) -> list[str
         for word, weight in mutant.weights
         if files[word]
     }
-    rank = {
-        name: nearness(weights, words[name])
-        + 8.0 * (re.search(rf"\b{re.escape(module)}\b", text) is not None)
+    direct = {
+        name: re.search(rf"\b{re.escape(module)}\b", text) is not None
         for name, text in texts.items()
     }
-    return sorted(texts, key=lambda name: (-rank[name], name))[:count]
+    rank = {
+        name: nearness(weights, words[name]) + 8.0 * direct[name]
+        for name in texts
+        if direct[name] or name not in _COSTLY
+    }
+    return sorted(rank, key=lambda name: (-rank[name], name))[:count]
 
 
 def pytest_collection_modifyitems(items: list[Any]) -> None:
@@ -289,6 +309,7 @@ def run(
     Without a mutant, all lines are as they were.
     """
     began, command = time.monotonic(), [sys.executable, "-m", "pytest", "-q", "-m", "not slow"]
+    command += ["-k", "not golden"]
     environment = {**os.environ, "PYTHONPATH": str(copy)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     if mutant is not None:
@@ -311,9 +332,11 @@ def run(
     try:
         printed, _ = running.communicate(timeout=limit)
         failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", printed, re.MULTILINE)
-        # 1: a test failed; 2, 4: a file cannot be imported
-        result = {0: "survived", 1: "caught", 2: "caught", 4: "caught"}.get(running.returncode)
-        return result or "not run", time.monotonic() - began, " ".join(failed)
+        # 1: a test failed; 2, 3, 4: a file cannot be imported; 5: there are no tests
+        if running.returncode in (2, 3, 4):
+            failed = failed or ["import"]
+        result = "survived" if running.returncode == 0 else "caught" if failed else "not run"
+        return result, time.monotonic() - began, " ".join(failed)
     except subprocess.TimeoutExpired:
         return "stopped", time.monotonic() - began, ""
     finally:
@@ -328,6 +351,8 @@ def main(args: MutantsArgs) -> None:
     """Run the campaign."""
     with usage_errors():
         require_at_least(args, count=1, seed=0, nearest=1)
+        for folder in args.only:
+            check.choice("only", folder, FOLDERS)
         args.output.parent.mkdir(parents=True, exist_ok=True)
         known, noticed = set(), set[str]()
         if args.output.exists():
@@ -348,7 +373,7 @@ def main(args: MutantsArgs) -> None:
         if not known and stream.tell() == 0:
             writer.writerow(COLUMNS)
         for mutant in chosen(args.count, args.seed):
-            if mutant.name in known:
+            if mutant.name in known or folder_of(mutant) not in args.only:
                 continue
             tests = nearest_tests(mutant, args.nearest, texts)
             result, seconds, failed = run(mutant, tests, copy, args.limit)

@@ -283,23 +283,24 @@ def check_hovering(table: Ranges, vehicle: VehicleParams, world: WorldParams) ->
         )
 
 
-def check_draws(table: Ranges, vehicle: VehicleParams, world: WorldParams, clocks: Clocks) -> None:
+def check_draws(table: Ranges, vehicle: VehicleParams, clocks: Clocks) -> None:
     """Refuse rotors that are too fast, or drag that is too large, for the integration."""
-    _check_drag(table, vehicle, world, clocks)
+    _check_drag(table, vehicle, clocks)
     name = label = "motor_time_constant"
     if name in table.names:
         label = f"randomization of {name!r} at its smallest draw"
     check_lag(label, table.least(name), clocks)
 
 
-def _check_drag(table: Ranges, vehicle: VehicleParams, world: WorldParams, clocks: Clocks) -> None:
+def _check_drag(table: Ranges, vehicle: VehicleParams, clocks: Clocks) -> None:
     """Refuse drag that slows the vehicle down within a Runge-Kutta step, which would diverge."""
 
     def most(name: str) -> float:
         return max(-table.least(name), table.most(name))
 
-    wind = sum(most(f"wind_{part}") for part in ("east", "north", "up", "speed"))
-    speed = FAST + wind + float(np.linalg.norm(world.wind_I)) + most("gust_wind_speed")
+    drawn = "wind_speed" in table.names
+    level = most("wind_speed") if drawn else math.hypot(most("wind_east"), most("wind_north"))
+    speed = FAST + math.hypot(level, most("wind_up")) + most("gust_wind_speed")
     disc = most("drag_coefficient") * vehicle.disc_area * vehicle.air_density * speed
     rotor_speeds = 4.0 * most("motor_speed_per_volt") * most("max_voltage")
     drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds

@@ -8,7 +8,7 @@ import pytest
 
 import quad_gym
 from baselines import PDPolicy
-from quad_gym import FlightBatch, Uniform, UnscentedKalmanFilter
+from quad_gym import FlightBatch, Uniform, UnscentedKalmanFilter, WorldParams
 from quad_gym.envs.single import QuadEnv
 from quad_gym.records import Ending, Source
 
@@ -52,6 +52,30 @@ def test_rotors_too_fast_for_the_integration_are_refused(substeps):
     top = VEHICLE.motor_speed_per_volt * VEHICLE.max_voltage
     assert (abs(batch.record("rotor_speeds")) < 2.0 * top).all()
     QuadEnv("hover", randomization={"motor_time_constant": Uniform(slow, 0.1)}, substeps=substeps)
+
+
+@pytest.mark.parametrize(
+    ("wind", "options"),
+    [
+        (0.0, {}),
+        (50.0, {"world": WorldParams(wind_I=(0.0, 30.0, 40.0))}),
+        (70.0, {"world": WorldParams(wind_I=(0.0, 30.0, 40.0), gust_wind_speed=20.0)}),
+        (50.0, {"randomization": {"wind_east": Uniform(-50.0, 20.0)}}),
+        (50.0, {"randomization": {"wind_speed": Uniform(0.0, 30.0), "wind_up": Uniform(0, 40)}}),
+        (25.0, {"randomization": {"gust_wind_speed": Uniform(0.0, 25.0)}}),
+    ],
+)
+def test_drag_too_large_for_the_integration_is_refused(wind, options):
+    """Drag F = c v^2 / 2 at v = 100 m/s and the wind: its decay c v / m must suit the step."""
+    decay = 2.78 / 0.005
+    largest = decay * VEHICLE.mass / (VEHICLE.disc_area * VEHICLE.air_density * (100.0 + wind))
+    for factor in (0.999, 1.001):
+        blunt = VEHICLE.replace(drag_coefficient=factor * largest)
+        keywords = {"true_vehicle": blunt, "source": Source.TRUTH, **options}
+        if factor < 1.0:
+            FlightBatch(1, **keywords)
+        else:
+            refused("drag must slow the vehicle down by less than", FlightBatch, 1, **keywords)
 
 
 @pytest.mark.parametrize(
