@@ -556,6 +556,9 @@ rad/s (TDK ICM-20948)."""
 WRONG = math.radians(20.0)  #: error of a heading at the start that matters [rad]
 CERTAIN = 4.0  #: standard deviations beyond which such an error is no chance
 BEYOND = 4.0  #: ratio of a bias and its standard deviation in the suite that is worth a note [-]
+RESET = 15.0
+"""The same ratio, beyond which a filter that was flagged as diverged before it estimated the bias
+has been wrong until then [-]: measurements correct a consistent one by a few."""
 
 
 def unexplained(case: Evidence) -> Iterator[Finding]:
@@ -659,4 +662,14 @@ def biases(case: Evidence) -> Iterator[Finding]:
                 "mounting and noise",
             )
         elif found > BEYOND * sigma:
-            yield note("attitude", f"{text}, {sigma:.2g} expected by the suite")
+            text = f"{text}, {sigma:.2g} expected by the suite"
+            size = np.linalg.norm(getattr(result, f"{name}_bias"), axis=1)
+            since = int(np.argmax(size > 0.5 * found))
+            if found > RESET * sigma and np.asarray(result.diverged)[: since + 1].any():
+                yield lost(
+                    "attitude",
+                    f"{text}, found by a reset at about {result.time[since]:.1f} s: the filter was "
+                    "wrong before",
+                )
+            else:
+                yield note("attitude", text)

@@ -80,7 +80,10 @@ RULES = (
     ),
     Rule(rules.unexplained, "the estimate changes as no sample of the IMU explains"),
     Rule(rules.flagged, "the filter is flagged as diverged at the end"),
-    Rule(rules.biases, "biases of the IMU that no sensor has"),
+    Rule(
+        rules.biases,
+        "biases of the IMU that no sensor has, or of 15 standard deviations, found by a reset",
+    ),
     Rule(rules.unknown_heading, "", "a heading that nothing shows until the end"),
 )
 """All rules, with the limits beyond which a quantity is unusable or uncertain."""
