@@ -15,13 +15,13 @@ from quad_gym.envs import (
     register_task,
 )
 from quad_gym.envs.keywords import EnvKeywords
-from quad_gym.params import aid_table
-from quad_gym.params.aid_table import *  # noqa: F403
+from quad_gym.params import sensor_table
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.randomization import LogUniform, Normal, Randomization, Uniform
+from quad_gym.params.sensor_table import *  # noqa: F403
 from quad_gym.params.suites import (
     InitialPoseParams,
     LogDelays,
@@ -141,5 +141,5 @@ __all__ = [
     "sensor_suite",
     "vehicle_params",
     "world_params",
-    *aid_table.__all__,
+    *sensor_table.__all__,
 ]

@@ -30,9 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.checks import Checked
 from quad_gym.params.portable import norm
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import FAULT_KINDS, Aid, FaultKind, FieldFault
 

@@ -17,19 +17,20 @@ from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import MIN_DRIFT
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomization, nominal_values
+from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import ActionParams, PDGains, VehicleParams
 from quad_gym.params.world import BatteryParams, GroundParams, Obstacle, WorldParams
 from quad_gym.records import (
-    AID_BLOCK,
     AID_NUMBERS,
     AIDS,
     COLUMNS,
-    FEATURE_BLOCKS,
     FIRST_AID,
+    FIRST_BLOCK,
     FOLLOWED,
+    GROUP_COUNT,
     GROUP_FREEDOMS,
     HEADING_GIVEN,
     HEADING_TOWARD,
@@ -107,11 +108,24 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
 
 def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
     """Return the blocks of innovations of a suite: position, baseline, velocity, features, aids."""
-    features = 0 if sensors.camera is None else len(sensors.camera.features_I)
-    found = list(range(FEATURE_BLOCKS + features))
-    for aid, params in sensors.aids.items():
-        found += range(AID_BLOCK[aid], AID_BLOCK[aid] + params.blocks)
-    return tuple(found)
+    counts = sensor_blocks(sensors)
+    return tuple(
+        first + k for first, count in zip(FIRST_BLOCK, counts, strict=True) for k in range(count)
+    )
+
+
+def sensor_blocks(sensors: SensorSuite) -> tuple[int, ...]:
+    """Return the number of blocks of each sensor.
+
+    A sensor of several readings has a block for each, also where it does not measure it: a mark
+    gives the first position and baseline where there is no GNSS.
+    """
+    counts = []
+    for name, count in zip(SENSOR_PARAMS, GROUP_COUNT, strict=True):
+        params = getattr(sensors, name)
+        alone = 0 if params is None else params.measured_blocks[0]
+        counts.append(count if count > 1 else alone)
+    return tuple(counts)
 
 
 def decay_and_drive(error: SlowError, time: float) -> tuple[float, float]:
@@ -155,7 +169,7 @@ def follows_motion(sensors: SensorSuite) -> int:
     heading that is unknown. Without GNSS velocities or a gate it is 0.
     """
     gnss = sensors.gnss
-    if gnss is None or gnss.velocity_sigma is None:
+    if gnss is None or not gnss.has_velocity:
         return 0
     if not sensors.estimator.false_alarm_probability > 0.0:
         return 0
@@ -167,18 +181,14 @@ def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
     states = slow_states(sensors)
     settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated
     settings["estimates_drift"] = states.drifts
-    velocity = sensors.gnss is not None and sensors.gnss.velocity_sigma is not None
-    velocity = velocity or any(params.reads_velocity for params in sensors.aids.values())
+    velocity = any(params.reads_velocity for params in sensors.sensors.values())
     settings["motion_columns"] = 9 if velocity else 6
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
     settings["by_motion"] = follows_motion(sensors)
     heading = sensors.heading_aid
     settings["heading_sensor"] = -1 if heading is None else FIRST_AID + heading
-    features = 0 if sensors.camera is None else len(sensors.camera.features_I)
-    settings["sensor_blocks"][: Sensor.CAMERA + 1] = FEATURE_BLOCKS, features
-    settings["feature_count"] = features
-    for aid, params in sensors.aids.items():
-        settings["sensor_blocks"][FIRST_AID + aid] = params.blocks
+    settings["sensor_blocks"] = sensor_blocks(sensors)
+    settings["feature_count"] = sensors.blocks_of("pixels")
 
 
 # --------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import FEATURE_SLICE, FLIGHT
+from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, FLIGHT, POSITION_BLOCK
 from quad_gym.rotations import dcm_to_quaternion
 from quad_gym.vehicle import State, checked_state
 
@@ -79,10 +79,9 @@ class GnssReceiver(_Sensor):
         entries.sense_gnss(self._flight, self._params, self._paired)
         if self._turns:
             entries.turn_gnss_baseline(self._flight, self._params)
-        baseline = self._flight["gnss_baseline"][0].copy()
-        return self._flight["gnss_position"][
-            0
-        ].copy(), baseline if self._paired else baseline * np.nan
+        measured = self._flight["measurement"][0].copy()
+        baseline = measured[BASELINE_BLOCK]
+        return measured[POSITION_BLOCK], baseline if self._paired else baseline * np.nan
 
 
 class Camera(_Sensor):
@@ -130,7 +129,8 @@ class Camera(_Sensor):
             limits = (self._blurs, self._hides, self._features)
             entries.limit_features(self._flight, self._params, *limits)
         seen = self._flight["block_valid"][0, FEATURE_SLICE][: self._features] > 0.0
-        return np.where(seen[:, np.newaxis], self._flight["pixels"][0, : self._features], np.nan)
+        pixels = self._flight["measurement"][0, FEATURE_SLICE, :2][: self._features]
+        return np.where(seen[:, np.newaxis], pixels, np.nan)
 
 
 class Imu(_Sensor):

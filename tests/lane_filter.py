@@ -11,9 +11,11 @@ from quad_gym.kernels.entries import (
 )
 from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.packing import form_of, pack_sensors, params_block, params_record
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
     BASELINE_BLOCK,
+    BLOCKS_OF,
     FEATURE_BLOCKS,
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
@@ -48,7 +50,11 @@ class LaneFilter:
         """Set fields of one flight."""
         block, lane = divmod(number, WIDTH)
         for name, value in values.items():
-            self.blocks[name][block, ..., lane] = value
+            if name in BLOCKS_OF:  # a reading
+                blocks, numbers = BLOCKS_OF[name], slice(READINGS[name].length)
+                self.blocks["measurement"][block, blocks, numbers, lane] = value
+            else:
+                self.blocks[name][block, ..., lane] = value
 
     def put_params(self, number, **values):
         """Set parameters of one flight."""
@@ -81,7 +87,8 @@ class LaneFilter:
         self.set_valid(number, BASELINE_BLOCK, baseline)
         self.set_valid(number, slice(FEATURE_BLOCKS, FEATURE_BLOCKS + self.features), seen)
         shown = np.where(seen[:, None], pixels, np.nan)
-        self.blocks["pixels"][block, : self.features, :, lane] = shown
+        features = slice(FEATURE_BLOCKS, FEATURE_BLOCKS + self.features)
+        self.blocks["measurement"][block, features, :2, lane] = shown
 
     def initialize(self, mask=(True,) * EIGHT):
         for block, params, settings, work in self._each(mask):

@@ -13,7 +13,7 @@ from quad_gym import FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.frames import ecef_to_enu, ecef_to_geodetic
 from quad_gym.logs.formats.log import LOG_COLUMNS
-from quad_gym.records import AID_BLOCKS, AID_ROW
+from quad_gym.records import AID_BLOCK, AID_BLOCKS
 from quad_gym.rotations import quaternion_to_dcm
 
 RTK = quad_gym.sensor_suite("rtk")
@@ -41,7 +41,9 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle", **options):
         batch = env.flights.batch
         fresh = (batch.record("block_fresh") + batch.record("block_valid"))[0, AID_BLOCKS:] > 0.0
         voltages.append(batch.record("voltages")[0].copy())
-        aids.append(np.where(fresh[:, np.newaxis], batch.record("aid_measurement")[0], np.nan))
+        aids.append(
+            np.where(fresh[:, np.newaxis], batch.record("measurement")[0, AID_BLOCKS:], np.nan)
+        )
 
     keep_aids()
     for _ in range(round(seconds * rate)):
@@ -86,7 +88,7 @@ class Recorded:
         )
         self.aids = []
         for aid, params in suite.aids.items():
-            found, latency, row = [], params.latency, AID_ROW[aid]
+            found, latency, row = [], params.latency, AID_BLOCK[aid] - AID_BLOCKS
             values = flight.about["aids"][:, row : row + params.blocks, : params.length]
             for k in np.flatnonzero(np.isfinite(values).any(axis=(1, 2))):
                 if k == 0 or rng.random() >= lost:

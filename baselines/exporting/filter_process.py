@@ -7,8 +7,7 @@ import multiprocessing
 import os
 import pickle
 import sys
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -30,23 +29,19 @@ from quad_gym.kernels.library import core_symbol, say
 from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.logs.formats.log import mounting_of
 from quad_gym.logs.replaying.results import COLUMNS
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import (
-    AID_BLOCK,
-    AID_ROW,
-    BASELINE_BLOCK,
-    FEATURE_BLOCKS,
+    BLOCKS_OF,
     FLIGHT_BLOCK,
     KEPT,
     MEASUREMENT,
     OPERATION,
     PARAMS_BLOCK,
     PARTS,
-    POSITION_BLOCK,
     SAMPLE,
     START,
     STEP_BLOCK,
-    VELOCITY_BLOCK,
     WORK_BLOCK,
     offset_of,
     room_of,
@@ -89,52 +84,6 @@ _OUTCOMES = {
 }
 
 
-class _Port(NamedTuple):
-    """A measurement of one sensor, as an exported filter takes it."""
-
-    name: str
-    numbers: int  #: of the measurement
-    block: int  #: block of innovations
-    place: str  #: field of MEASUREMENT
-    note: str  #: what it is, for a comment
-    sigma: str  #: name of its standard deviation
-    sigma_place: str  #: field of MEASUREMENT
-    sigma_note: str  #: unit, for a comment
-    blocks: int = 1  #: number of blocks
-
-
-_GNSS_PORTS = (
-    _Port(
-        "gnss_position",
-        3,
-        POSITION_BLOCK,
-        "gnss_position",
-        "primary antenna minus reference antenna, in G [m]",
-        "gnss_sigma",
-        "position_sigma_I",
-        "3 standard deviations of it: east, north, up [m]",
-    ),
-    _Port(
-        "gnss_baseline",
-        3,
-        BASELINE_BLOCK,
-        "gnss_baseline",
-        "primary to secondary antenna, in G [m]",
-        "baseline_sigma",
-        "baseline_sigma",
-        "of its direction [rad]",
-    ),
-    _Port(
-        "gnss_velocity",
-        3,
-        VELOCITY_BLOCK,
-        "gnss_velocity",
-        "of the primary antenna, in G [m/s]",
-        "velocity_sigma",
-        "velocity_sigma",
-        "[m/s]",
-    ),
-)
 _WINDOW = 0.5  #: longest delay of measurements beyond the suite's `log_delays` [s], as in a replay
 
 
@@ -161,8 +110,6 @@ class Sources:
         used = {"core", "filter", "watch"}
         if self.engine.slow_states:
             used.add("slow")
-        if suite.aids:
-            used.add("aids")
         self.room = room_of(frozenset(used))
         self.copied = self._copied(used)
 
@@ -245,9 +192,8 @@ class Sources:
 
     def _suite_values(self) -> dict[str, Any]:
         suite = self.suite
-        sensors = [s for s in (suite.gnss, suite.camera, *suite.aids.values()) if s is not None]
         window = _WINDOW + max(0.0, *vars(suite.log_delays).values())
-        rate = sum(sensor.rate for sensor in sensors)
+        rate = sum(sensor.rate for sensor in suite.sensors.values())
         events = math.ceil(1.25 * window * (max(suite.imu.rate, self.imu_rate) + rate)) + 24
         measurements = math.ceil(1.25 * window * rate) + 16
         copies = events // 8 + 2
@@ -280,78 +226,16 @@ class Sources:
             "REFERENCE": _numbers(suite.gnss.reference_antenna_G if suite.gnss else (0, 0, 0)),
         }
 
-    @property
-    def _ports(self) -> Iterator[_Port]:
-        """Measurements of the suite."""
-        suite, gnss = self.suite, self.suite.gnss
-        for aid, params in suite.aids.items():
-            name, unit = aid.name.lower(), f"[{params.unit}]"
-            place, sigma = f"aid_measurement[{AID_ROW[aid]}]", f"aid_sigma[{int(aid)}]"
-            missing = "; NAN: not measured" if params.most_blocks > 1 else ""
-            rest = f"{params.meaning} {unit}{missing}", f"{name}_sigma", sigma, unit
-            port = _Port(name, params.length * params.blocks, AID_BLOCK[aid], place, *rest)
-            yield port._replace(blocks=params.blocks)
-        if gnss is not None:
-            has = (True, gnss.has_baseline, gnss.velocity_sigma is not None)
-            yield from itertools.compress(_GNSS_PORTS, has)
-
     def _sensor_values(self) -> dict[str, Any]:
-        suite, ports = self.suite, list(self._ports)
+        suite = self.suite
         texts = dict.fromkeys(("MACROS", "FIELDS_OF_MEASUREMENTS", "TAKE", "API", "SOURCE"), "")
-        rows = {aid.name.lower(): f"m.{aid.name.lower()} = x + 1" for aid in suite.aids}
-        names = {aid.name.lower(): [aid.name.lower()] for aid in suite.aids}
-        for port in ports:
-            name, several = port.name, port.sigma == "gnss_sigma"
-            value = f"const double {name}[{port.numbers}]" if port.numbers > 1 else f"double {name}"
-            sigma = f"const double *{port.sigma}" if several else f"double {port.sigma}"
-            given = f", {sigma}" if name in ("gnss_position", "gnss_velocity") else ""
-            call = f"int qg_update_{name}(qg_filter *f, {value}{given}, double time)"
-            texts["MACROS"] += f"#define QG_{name.upper()} 1\n"
-            texts["FIELDS_OF_MEASUREMENTS"] += (
-                f"    const double *{name}; /* {port.numbers}: {port.note} */\n"
-                f"    {sigma}; /* {port.sigma_note} */\n"
-            )
-            texts["API"] += f"{call}; /* {port.note} */\n"
-            length = port.numbers // port.blocks
-            texts["TAKE"] += (
-                f"    r.valid[{port.block}] = qgi_put(r.{port.place}, m->{name}, {length});\n"
-            )
-            if port.blocks > 1:
-                one = f"(&r.{port.place})[i], m->{name} + {length} * i, {length}"
-                texts["TAKE"] += (
-                    f"    for (int i = 1; m->{name} && i < {port.blocks}; i++)\n"
-                    f"        r.valid[{port.block} + i] = qgi_put({one});\n"
-                )
-            texts["TAKE"] += (
-                f"    qgi_put(r.{port.sigma_place}, m->{port.sigma}, 3);\n"
-                if several
-                else f"    r.{port.sigma_place} = m->{port.sigma};\n"
-            )
-            values = {
-                "CALL": call,
-                "NAME": name,
-                "ADDRESS": name if port.numbers > 1 else f"&{name}",
-            }
-            values["SIGMA"] = f"    m.{port.sigma} = {port.sigma};\n" if given else ""
-            texts["SOURCE"] += filled("update.c", values)
-        if suite.camera is not None:
-            call = "int qg_update_pixels(qg_filter *f, const double *pixels, double time)"
-            values = {"CALL": call, "NAME": "pixels", "ADDRESS": "pixels", "SIGMA": ""}
-            texts["MACROS"] += f"#define QG_FEATURES {len(suite.camera.features_I)}\n"
-            texts["API"] += f"{call}; /* see qg_measurements */\n"
-            texts["SOURCE"] += filled("update.c", values)
-            rows["camera"], names["camera"] = "m.pixels = x + 1", ["pixels"]
-        gnss = [port.name for port in ports if port.name.startswith("gnss")]
-        if gnss:
-            names["gnss"] = gnss
-            parts = {"gnss_position": 1, "gnss_sigma": 4, "gnss_baseline": 7, "gnss_velocity": 10}
-            columns = [
-                f"m.{name} = given({k})"
-                for name, k in parts.items()
-                if name in (*gnss, "gnss_sigma")
-            ]
-            columns += ["m.velocity_sigma = number(13)"] if "gnss_velocity" in gnss else []
-            rows["gnss"] = ", ".join(columns)
+        names = {
+            sensor: [r.name for r in params.readings(sensor) if suite.blocks_of(r.name)]
+            for sensor, params in suite.sensors.items()
+        }
+        for name in itertools.chain(*names.values()):
+            for place, text in self._texts_of(name).items():
+                texts[place] += text
         ranks = (
             f"{' || '.join(f'm->{name}' for name in names[stream])} ? {rank} : "
             for rank, stream in enumerate(sorted(names), 1)
@@ -360,14 +244,66 @@ class Sources:
             **texts,
             "RANK": f"{''.join(ranks)}{len(names) + 1}",
             "ROWS": "".join(
-                f'    if (!strcmp(name, "{name}"))\n        {statement};\n    else\n'
-                for name, statement in rows.items()
+                f'    if (!strcmp(name, "{sensor}"))\n        {self._row_of(sensor)};\n    else\n'
+                for sensor in names
             ),
-            "CAMERA": suite.camera is not None,
             "GNSS": suite.gnss is not None,
             "BAROMETER": suite.barometer is not None,
-            "FEATURE_BLOCKS": FEATURE_BLOCKS,
         }
+
+    def _texts_of(self, name: str) -> dict[str, str]:
+        """Return what the templates have of a reading."""
+        reading, count, first = READINGS[name], self.suite.blocks_of(name), BLOCKS_OF[name].start
+        group, length = list(READINGS).index(name), reading.length
+        numbers, several = count * length, reading.sigmas > 1
+        frame = ", in G" if reading.in_G else ""
+        note = f"{reading.meaning}{frame} [{reading.unit}]"
+        note += "; NAN: not measured" if reading.most_blocks > 1 else ""
+        value = f"const double {name}[{numbers}]" if numbers > 1 else f"double {name}"
+        sigma = f"const double *{reading.sigma}" if several else f"double {reading.sigma}"
+        of_sigma = f"{reading.sigmas} standard deviations" if several else "standard deviation"
+        given = f", {sigma}" if reading.reported else ""
+        call = f"int qg_update_{name}(qg_filter *f, {value}{given}, double time)"
+        take = (
+            f"    for (int i = 0; m->{name} && i < {count}; i++)\n"
+            f"        r.valid[{first} + i] = qgi_put(r.measurement[{first} + i],\n"
+            f"{36 * ' '}m->{name} + {length} * i, {length});\n"
+        )
+        take += (
+            f"    qgi_put(r.sigma[{group}], m->{reading.sigma}, {reading.sigmas});\n"
+            if several
+            else f"    r.sigma[{group}][0] = m->{reading.sigma};\n"
+        )
+        values = {"CALL": call, "NAME": name, "ADDRESS": name if numbers > 1 else f"&{name}"}
+        values["SIGMA"] = f"    m.{reading.sigma} = {reading.sigma};\n" if given else ""
+        macros = f"#define QG_{name.upper()} 1\n"
+        if reading.block:
+            macros += f"#define QG_{reading.block.upper()}S {count}\n"
+        return {
+            "MACROS": macros,
+            "FIELDS_OF_MEASUREMENTS": (
+                f"    const double *{name}; /* {numbers}: {note} */\n"
+                f"    {sigma}; /* {of_sigma} [{reading.sigma_unit}] */\n"
+            ),
+            "TAKE": take,
+            "API": f"{call}; /* {note} */\n",
+            "SOURCE": filled("update.c", values),
+        }
+
+    def _row_of(self, sensor: str) -> str:
+        """Return the C code that takes the numbers of a row of the example's input."""
+        readings = self.suite.sensors[sensor].readings(sensor)
+        if len(readings) == 1:
+            return f"m.{readings[0].name} = x + 1"
+        taken, place = [], 1
+        for reading in readings:
+            if self.suite.blocks_of(reading.name):
+                taken.append(f"m.{reading.name} = given({place})")
+                if reading.reported:
+                    number = "given" if reading.sigmas > 1 else "number"
+                    taken.append(f"m.{reading.sigma} = {number}({place + reading.length})")
+            place += reading.length + reading.sigmas * reading.reported
+        return ", ".join(taken)
 
 
 def _numbers(values: Any) -> str:

@@ -36,7 +36,7 @@ from quad_gym.envs.config import (
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights import COLUMNS, FEATURES
 from quad_gym.logs.formats.log import LOG_COLUMNS, LogColumn
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES
 from quad_gym.tasks.view import VIEW_FIELDS

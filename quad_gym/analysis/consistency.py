@@ -33,6 +33,7 @@ from quad_gym.analysis.metrics import (
     state_error,
 )
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.task import TaskParams
 from quad_gym.rotations import quaternion_to_dcm
 
@@ -196,14 +197,8 @@ class NeesRecorder:
 
 
 SENSOR_BLOCKS = {
-    "position": (records.POSITION_BLOCK,),
-    "baseline": (records.BASELINE_BLOCK,),
-    "velocity": (records.VELOCITY_BLOCK,),
-    "feature": tuple(range(records.FEATURE_BLOCKS, records.AID_BLOCKS)),
-    **{
-        aid.name.lower(): tuple(range(first, first + most))
-        for aid, first, most in zip(records.Aid, records.AID_BLOCK, records.AID_MOST, strict=True)
-    },
+    (READINGS[name].block or name.removeprefix("gnss_")): tuple(range(blocks.start, blocks.stop))
+    for name, blocks in records.BLOCKS_OF.items()
 }
 """Blocks of the measurement by sensor. Errors of features in one image are correlated through
 attitude and position, so that only the first one is used: the values of an instant are independent.
@@ -428,7 +423,6 @@ def measure_consistency(
             squares.add(batch, step * dt)
             progress(step * dt)
     errors, claimed = squares.errors()
-    gnss = batch.sensors.gnss
     return Findings(
         nees=squares.nees(),
         nis={} if innovations is None else innovations.nis(),
@@ -439,7 +433,7 @@ def measure_consistency(
         tracking=tracking.result(),
         astray=astray,
         failed=int((batch.record("filter_status") != 0).sum()),
-        counted_as_noise=frozenset({"baseline"} if gnss and gnss.heading_errs else ()),
+        counted_as_noise=frozenset({"baseline"} if batch.sensors.heading_errs else ()),
     )
 
 

@@ -12,11 +12,13 @@ from quad_gym.faults import Fault, named_faults
 from quad_gym.kernels.entries import fly
 from quad_gym.params import checks as check
 from quad_gym.params.randomization import Randomization
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import Clocks, VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import (
+    BLOCKS_OF,
     COLUMNS,
     FLIGHT_BLOCK,
     WIDTH,
@@ -39,10 +41,18 @@ from quad_gym.records import (
 _UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis", "obstacle_distance")
 """Fields that are NaN until they are measured or given."""
 
-_PARTS_OF = {
-    "gnss_drift_hat": ("slow_hat", (slice(0, 3),)),
+
+def _place_of(reading: str) -> tuple[str, tuple[int | slice, ...]]:
+    """Return where a record has the numbers of a reading: field and indices."""
+    blocks, numbers = BLOCKS_OF[reading], slice(READINGS[reading].length)
+    return "measurement", (blocks if READINGS[reading].most_blocks > 1 else blocks.start, numbers)
+
+
+_PARTS_OF: dict[str, tuple[str, tuple[int | slice, ...]]] = {
+    "gnss_drift_hat": ("slow_hat", (slice(0, 3),)),  # in suites with this drift
+    **{name: _place_of(name) for name in READINGS},
 }
-"""Names of parts of fields, for suites with GNSS drift."""
+"""Names of parts of fields."""
 
 
 _FACTORS = {
@@ -166,15 +176,14 @@ class FlightMemory:
         found = {}
         for name in self.randomization.names:
             values = self._drawn(COLUMNS[name])
-            if name == "feature_offsets_I" and self.sensors.camera is not None:
-                count = len(self.sensors.camera.features_I)
+            if name == "feature_offsets_I" and (count := self.sensors.blocks_of("pixels")):
                 values = values[:, : 3 * count].reshape(-1, count, 3)
             found[name] = values[:, 0] if values.shape[1:] == (1,) else values
         return found
 
     def feature_places(self) -> NDArray[np.float64]:
         """Return the features of the camera as the filter assumes them, (count, m, 3) in I [m]."""
-        count = 0 if self.sensors.camera is None else len(self.sensors.camera.features_I)
+        count = self.sensors.blocks_of("pixels")
         if self._room.holds("feature_place"):
             return np.ascontiguousarray(self.record("feature_place")[:, :count])
         believed = self._world if self.randomization.known else self._model
@@ -231,24 +240,20 @@ class FlightMemory:
 
     # ---- switching ----------------------------------------------------------------------------
 
-    def switch_sensors(
-        self, *, gnss: bool | None = None, camera: bool | None = None, **aids: bool | None
-    ) -> None:
+    def switch_sensors(self, **sensors: bool | None) -> None:
         """Switch sensors of all flights off, or on again, from the next tick on.
 
         The filter continues without them. A new episode begins with all sensors on.
 
         Args:
-            gnss: True: GNSS measures; False: it is off; None: as at present.
-            camera: True: the camera measures; False: it is off; None: as at present.
-            aids: The same for other sensors of the suite, such as `barometer`.
+            sensors: By name, such as `gnss` or `barometer`: True: the sensor measures; False: it is
+                off; None: as at present.
 
         Raises:
-            ValueError: If an aiding sensor is unknown, or the suite lacks it.
+            ValueError: If a sensor is unknown, or the suite lacks it.
         """
-        for name in aids:
-            check.choice("switch_sensors", name, tuple(a.name.lower() for a in self.sensors.aids))
-        for name, measures in {"gnss": gnss, "camera": camera, **aids}.items():
+        for name, measures in sensors.items():
+            check.choice("switch_sensors", name, tuple(self.sensors.sensors))
             if measures is not None:
                 waits = self._blocks["wait"][:, Sensor[name.upper()]]
                 on = check.flag(name, measures)

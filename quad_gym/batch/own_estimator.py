@@ -11,21 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.memory import FlightMemory
 from quad_gym.params import checks as check
-from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.checks import did_you_mean
+from quad_gym.params.sensor_table import READINGS, SENSOR_OF
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
-    AID_BLOCK,
-    AID_MOST,
-    AID_ROW,
-    BASELINE_BLOCK,
+    BLOCKS_OF,
     EXCHANGE_BLOCK,
-    FEATURE_BLOCKS,
-    POSITION_BLOCK,
-    VELOCITY_BLOCK,
     WIDTH,
-    Aid,
     Autoreset,
     Command,
     Result,
@@ -250,7 +243,7 @@ class Measurements:
 
     Arrays have one row per flight, and are read when first used. Measurements are raw: with biases,
     noise, latency and faults. A sensor that the suite lacks is None. Each sensor of
-    `quad_gym.params.aid_table` is an attribute with its name.
+    `quad_gym.params.sensor_table` is an attribute with its name.
 
     Attributes:
         count: Number of flights, n.
@@ -299,64 +292,17 @@ class Measurements:
 
     # ---- readings -----------------------------------------------------------------------------
 
-    @cached_property
-    def gnss_position(self) -> SensorReading | None:
-        """Primary antenna, (n, 3) in I [m]."""
-        return self._gnss("gnss_position", POSITION_BLOCK, self.sensors.gnss is not None)
-
-    @cached_property
-    def gnss_baseline(self) -> SensorReading | None:
-        """Vector from the primary to the secondary antenna, (n, 3) in I [m]."""
-        gnss = self.sensors.gnss
-        return self._gnss("gnss_baseline", BASELINE_BLOCK, gnss is not None and gnss.has_baseline)
-
-    @cached_property
-    def gnss_velocity(self) -> SensorReading | None:
-        """Velocity of the primary antenna, (n, 3) in I [m/s]."""
-        gnss = self.sensors.gnss
-        has = gnss is not None and gnss.velocity_sigma is not None
-        return self._gnss("gnss_velocity", VELOCITY_BLOCK, has)
-
-    @cached_property
-    def pixels(self) -> SensorReading | None:
-        """Projections of the features, from the center of the image, (n, features, 2) [pixels]."""
-        if self.sensors.camera is None:
-            return None
-        count = len(self.sensors.camera.features_I)
-        new = self._new(FEATURE_BLOCKS, count)
-        return self._reading("pixels", new, Sensor.CAMERA, slice(None), slice(count))
-
     def __getattr__(self, name: str) -> SensorReading | None:
-        """Measurement of a sensor of `AID_PARAMS` by its name, (n, ...)."""
-        if name not in AID_PARAMS:
+        """Measurement of a reading of `READINGS` by its name, (n, ...)."""
+        if name not in READINGS:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        params = getattr(self.sensors, name)
-        found = None
-        if params is not None:
-            aid = Aid[name.upper()]
-            new, row = self._new(AID_BLOCK[aid], params.blocks), AID_ROW[aid]
-            found = self._reading(
-                "aid_measurement",
-                new,
-                Sensor[aid.name],
-                slice(None),
-                slice(row, row + params.blocks),
-            )
-            numbers = found.value[..., : params.length].reshape(self.count, *params.shape)
-            found = found._replace(value=numbers, new=new[:, 0] if AID_MOST[aid] == 1 else new)
+        count = self.sensors.blocks_of(name)
+        found = self._reading(name, count) if count else None
         self.__dict__[name] = found
         return found
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *AID_PARAMS]
-
-    def _gnss(self, name: str, block: int, has: bool) -> SensorReading | None:
-        if not has:
-            return None
-        found = self._reading(name, self._new(block, 1)[:, 0], Sensor.GNSS)
-        x, y, z = found.value.T[:, :, np.newaxis]
-        R = self._batch.R_IG
-        return found._replace(value=x * R[:, 0] + y * R[:, 1] + z * R[:, 2])  # as in any batch
+        return [*super().__dir__(), *READINGS]
 
     def _new(self, first: int, count: int) -> Truths:
         """True where one of some blocks arrives, (n, count)."""
@@ -364,13 +310,19 @@ class Measurements:
         rows = valid.transpose(0, 2, 1).reshape(len(valid) * WIDTH, count)
         return np.asarray(rows[: self.count] > 0.0)
 
-    def _reading(
-        self, field: str, new: Truths, sensor: Sensor, *part: int | slice
-    ) -> SensorReading:
+    def _reading(self, name: str, count: int) -> SensorReading:
+        """Measurement of the first blocks of a reading."""
+        sensor, first = Sensor[SENSOR_OF[name].upper()], BLOCKS_OF[name].start
         age = float(self._batch._settings["sensor_delay"][0, sensor] * self.dt)
-        values = self._batch.record(field)[part or slice(None)]
+        new, reading = self._new(first, count), READINGS[name]
+        values = self._batch.record("measurement")[:, first : first + count, : reading.length]
         values[~new] = np.nan
-        return SensorReading(values, new, age)
+        if reading.in_G:
+            x, y, z = values[:, 0].T[:, :, np.newaxis]
+            R = self._batch.R_IG
+            values = x * R[:, 0] + y * R[:, 1] + z * R[:, 2]  # as in any batch
+        values = values.reshape(self.count, *self.sensors.shape_of(name)).copy()
+        return SensorReading(values, new if reading.most_blocks > 1 else new[:, 0], age)
 
 
 class StartView(Measurements):

@@ -14,19 +14,12 @@ from numpy.typing import NDArray
 from quad_gym.batch.memory import FlightMemory
 from quad_gym.packing import blocks_of
 from quad_gym.params import checks as check
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.aids import Reading
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.records import (
-    AID_BLOCK,
-    AID_FREEDOMS,
-    AID_MOST,
-    AID_ROW,
-    BASELINE_BLOCK,
-    FEATURE_SLICE,
+    BLOCKS_OF,
     HEADING_ALONG,
     HEADING_VELOCITY,
-    POSITION_BLOCK,
-    VELOCITY_BLOCK,
-    Aid,
 )
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
@@ -152,45 +145,29 @@ def _measured(batch: FlightMemory, flights: Flights) -> NDArray[np.bool_]:
     return np.asarray(fresh > 0.0)
 
 
-def _gnss(field: str, block: int) -> Computed:
-    """A vector that GNSS measures, turned from G to I."""
+def _read(reading: Reading) -> Computed:
+    """The last measurement of a reading, vectors turned from G to I."""
 
     def of(batch: FlightMemory, flights: Flights) -> Floats:
-        x, y, z = batch.record(field, flights).T  # each sum in one order, in batches of any size
-        turned = [row[0] * x + row[1] * y + row[2] * z for row in batch.R_IG]
-        return np.where(_measured(batch, flights)[:, block], turned, np.nan).T
+        count, first = batch.sensors.blocks_of(reading.name), BLOCKS_OF[reading.name].start
+        if reading.block == "" and count == 0:  # no such sensor
+            count = reading.most_blocks
+        blocks = slice(first, first + count)
+        found = batch.record("measurement", flights)[:, blocks, : reading.length]
+        if reading.in_G:
+            x, y, z = found[:, 0].T  # each sum in one order, in batches of any size
+            turned = [row[0] * x + row[1] * y + row[2] * z for row in batch.R_IG]
+            found = np.stack(turned, axis=1)[:, np.newaxis]
+        found = np.where(_measured(batch, flights)[:, blocks, np.newaxis], found, np.nan)
+        several = (count,) * (reading.most_blocks > 1)
+        return found.reshape(len(found), *several, *(reading.length,) * (reading.length > 1))
 
     return of
 
 
-def _pixels(batch: FlightMemory, flights: Flights) -> Floats:
-    count = 0 if batch.sensors.camera is None else len(batch.sensors.camera.features_I)
-    measured = _measured(batch, flights)[:, FEATURE_SLICE][:, :count, np.newaxis]
-    return np.where(measured, batch.record("pixels", flights)[:, :count], np.nan)
-
-
-def _aid(aid: Aid) -> Computed:
-    """The measurement of a sensor other than GNSS and camera."""
-
-    def of(batch: FlightMemory, flights: Flights) -> Floats:
-        params = getattr(batch.sensors, aid.name.lower())
-        count = AID_MOST[aid] if params is None else params.blocks
-        blocks, rows = (slice(first[aid], first[aid] + count) for first in (AID_BLOCK, AID_ROW))
-        measured = _measured(batch, flights)[:, blocks, np.newaxis]
-        found = np.where(measured, batch.record("aid_measurement", flights)[:, rows], np.nan)
-        shape = (count,) * (AID_MOST[aid] > 1) + (AID_FREEDOMS[aid],) * (AID_FREEDOMS[aid] > 1)
-        return found[..., : AID_FREEDOMS[aid]].reshape(len(found), *shape)
-
-    return of
-
-
-def _of_aid(name: str) -> Quantity:
-    params, aid = AID_PARAMS[name], Aid[name.upper()]
-    shape: list[int | str] = ["blocks"] * (params.most_blocks > 1)
-    shape += [params.length] * (params.length > 1)
-    return Quantity(
-        _aid(aid), tuple(shape), params.unit, params.frame, params.meaning, filtered=True
-    )
+def _of_reading(reading: Reading) -> Quantity:
+    about = (reading.unit, reading.frame, reading.meaning)
+    return Quantity(_read(reading), reading.dimensions, *about, filtered=True)
 
 
 # fmt: off
@@ -232,11 +209,7 @@ QUANTITIES = {
     # the last measurements since the last step, NaN where there was none
     "gyro": Quantity("gyro", (3,), "rad/s", "B", "angular rate", filtered=True),
     "accel": Quantity("accel", (3,), "m/s^2", "B", "specific force", filtered=True),
-    "gnss_position": Quantity(_gnss("gnss_position", POSITION_BLOCK), (3,), "m", "I", "primary antenna", filtered=True),
-    "gnss_baseline": Quantity(_gnss("gnss_baseline", BASELINE_BLOCK), (3,), "m", "I", "primary to secondary antenna", filtered=True),
-    "gnss_velocity": Quantity(_gnss("gnss_velocity", VELOCITY_BLOCK), (3,), "m/s", "I", "velocity of the primary antenna, where the receiver measures it", filtered=True),
-    "pixels": Quantity(_pixels, ("features", 2), "pixels", "C", "features, from the image's center", filtered=True),
-    **{name: _of_aid(name) for name in AID_PARAMS},
+    **{name: _of_reading(reading) for name, reading in READINGS.items()},
     # the task
     "action": Quantity("action", (4,), "-", "-", "the present action, in [-1, 1]"),
     "last_action": Quantity("last_action", (4,), "-", "-", "the action before it"),

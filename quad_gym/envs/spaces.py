@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite, given_suite
 from quad_gym.records import COLUMNS, MAX_OBSERVATION, Control, Layout, Source
 
@@ -92,35 +93,21 @@ def _sensor_fields(suite: SensorSuite) -> tuple[Part, ...]:
         ("accel", 3, "m/s^2", "B", 1000.0),
         ("gyro_mean", 3, "rad/s", "B", 200.0),
         ("accel_mean", 3, "m/s^2", "B", 1000.0),
-        ("gnss_position", 3, "m", "I", 1000.0),
-        ("gnss_position_valid", 1, "0 or 1", "-", _FLAG),
-        ("gnss_baseline", 3, "-", "I", 1.0),
-        ("gnss_baseline_valid", 1, "0 or 1", "-", _FLAG),
     ]
-    if suite.gnss is not None and suite.gnss.velocity_sigma is not None:
-        fields.append(("gnss_velocity", 3, "m/s", "I", 200.0))
-        fields.append(("gnss_velocity_valid", 1, "0 or 1", "-", _FLAG))
-    for k in range(1, _feature_count(suite) + 1):
-        fields.append((f"feature_{k}", 2, "half images", "C", 2.0))
-        fields.append((f"feature_{k}_valid", 1, "0 or 1", "-", _FLAG))
-    for aid, params in suite.aids.items():
-        name = aid.name.lower()
-        several = [f"{name}_{k}" for k in range(params.blocks)]
-        for block in several if params.most_blocks > 1 else [name]:
-            fields.append((block, params.length, *params.raw))
+    for name, reading in READINGS.items():
+        count = suite.blocks_of(name) or int(reading.marked)
+        for k in range(count):
+            block = reading.name_of(k + reading.raw_first)
+            fields.append((block, reading.length, *reading.raw))
             fields.append((f"{block}_valid", 1, "0 or 1", "-", _FLAG))
     return (*fields, *_REFERENCE)
-
-
-def _feature_count(suite: SensorSuite) -> int:
-    return 0 if suite.camera is None else len(suite.camera.features_I)
 
 
 def _world_fields(drawn: Sequence[str], suite: SensorSuite) -> tuple[Part, ...]:
     for name in drawn:
         check.choice("drawn", name, tuple(COLUMNS))
     sizes = {name: columns.stop - columns.start for name, columns in COLUMNS.items()}
-    sizes["feature_offsets_I"] = 3 * _feature_count(suite)
+    sizes["feature_offsets_I"] = 3 * suite.blocks_of("pixels")
     drawn_sizes = ((name, size) for name, size in sizes.items() if name in drawn)
     parts = ((f"drawn_{name}", size, "of its spread", "-", 10.0) for name, size in drawn_sizes)
     return (("wind", 3, "m/s", "B", 100.0), *parts)

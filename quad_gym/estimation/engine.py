@@ -129,6 +129,10 @@ class Engine:
         """Write one value into a field of all lanes."""
         self.blocks[name] = value[..., np.newaxis]
 
+    def fill_block(self, block: int, value: NDArray[Any]) -> None:
+        """Write one value (3,) into a block of the measurement of all lanes."""
+        self.blocks["measurement"][:, block] = value[..., np.newaxis]
+
     @property
     def slow_states(self) -> int:
         """Number of time-correlated errors among the states."""

@@ -29,6 +29,7 @@ from quad_gym.estimation.starts import (
 from quad_gym.packing import blocks_of, follows_motion
 from quad_gym.params import checks as check
 from quad_gym.params.checks import takes
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import (
     KEPT,
@@ -257,6 +258,8 @@ class FilterEstimate:
 # Unscented and extended Kalman filters for one vehicle.
 # --------------------------------------------------------------------------------------------------
 
+_OTHERS = (*AID_PARAMS, *(reading.sigma for reading in READINGS.values()))
+"""Further keywords of `update`."""
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
 LONGEST_STEP = 1.0
@@ -439,9 +442,15 @@ class KalmanFilter(FilterEstimate):
             RuntimeError: Before `initialize` or `set_state`.
         """
         self._require_start()
-        measurement = checked_measurement(
-            self.sensors, gnss_position_G, gnss_baseline_G, pixels, gnss_velocity_G, others
-        )
+        check.keywords(others, _OTHERS, "update")
+        given = {
+            "gnss_position_G": gnss_position_G,
+            "gnss_baseline_G": gnss_baseline_G,
+            "pixels": pixels,
+            "gnss_velocity_G": gnss_velocity_G,
+            **others,
+        }
+        measurement = checked_measurement(self.sensors, given)
         now = self._history.time
         stamp = now if time is None else check.number("time", time)
         if stamp > now + SAME_TIME:
@@ -455,8 +464,8 @@ class KalmanFilter(FilterEstimate):
                 f"{self._history.window:g} s of data (window=) since its start, got "
                 f"{stamp:.6f} s"
             )
-        status, given = self.status, self._history.one
-        given["rank"], given["time"] = 1, stamp
+        status, one = self.status, self._history.one
+        one["rank"], one["time"] = 1, stamp
         self._take_one(measurement)
         self.warn_of_news(status)
 

@@ -2,7 +2,7 @@
 
 import math
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,21 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.kernels import entries
 from quad_gym.params import checks as check
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import (
-    AID_BLOCK,
-    AID_ROW,
-    BASELINE_BLOCK,
-    FEATURE_BLOCKS,
-    MEASUREMENT,
-    NOISE_FIELDS,
-    OPERATION,
-    POSITION_BLOCK,
-    SAMPLE,
-    VELOCITY_BLOCK,
-    Aid,
-    Operation,
-)
+from quad_gym.records import BLOCKS_OF, MEASUREMENT, OPERATION, SAMPLE, Operation
 from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW
 
 # --------------------------------------------------------------------------------------------------
@@ -39,91 +27,53 @@ HEADING_ALONE = 4.0
 """Value of the noise `baseline_sigma`, above the largest one of pi, with which a filter uses only
 the heading of a baseline; its noise is then the suite's [rad]."""
 
-SIGMA_KEYWORDS = (
-    "gnss_sigma",
-    "baseline_sigma",
-    "velocity_sigma",
-    "pixel_sigma",
-    *(f"{aid.name.lower()}_sigma" for aid in Aid),
-)
-"""Keywords of `update` for the noise of its measurements."""
+
+def known_blocks(values: Floats) -> NDArray[np.bool_]:
+    """Return True for the rows of `values` (blocks, length) that were measured."""
+    return np.asarray(~np.isnan(values).any(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measurements of one instant; None: not measured."""
+    """Measurements of one instant, by the names of their readings."""
 
-    position_G: Floats | None = None  #: (3,) antenna position [m]
-    baseline_G: Floats | None = None  #: (3,) baseline, scaled to a length near one [-]
-    velocity_G: Floats | None = None  #: (3,) antenna velocity [m/s]
-    pixels: Floats | None = None  #: (n_features, 2) image coordinates, NaN: not seen [pixels]
-    aids: dict[Aid, Floats] = field(default_factory=dict)
-    """(blocks, length) measurements of aiding sensors, NaN: a block was not measured"""
-    noise: dict[str, Any] = field(default_factory=dict)
-    """fields of the parameter record that replace the suite's for this measurement"""
+    values: dict[str, Floats] = field(default_factory=dict)
+    """(blocks, length) numbers as in records, NaN: a block was not measured"""
+    sigmas: dict[str, Floats] = field(default_factory=dict)
+    """(1,) or (3,) standard deviations that replace the suite's"""
 
     @property
     def empty(self) -> bool:
         """True if nothing was measured."""
-        values = (self.position_G, self.baseline_G, self.velocity_G, self.pixels)
-        return all(v is None for v in values) and not self.aids
+        return not self.values
 
     @property
     def blocks(self) -> list[int]:
         """Blocks of innovations of the measurement."""
-        triples = enumerate((self.position_G, self.baseline_G, self.velocity_G))
-        found = [POSITION_BLOCK + k for k, values in triples if values is not None]
-        if self.pixels is not None:
-            seen = ~np.isnan(self.pixels).any(axis=1)
-            found += [FEATURE_BLOCKS + int(i) for i in np.flatnonzero(seen)]
-        for aid, values in self.aids.items():
-            found += [AID_BLOCK[aid] + int(i) for i in np.flatnonzero(~np.isnan(values[:, 0]))]
-        return found
+        return [
+            blocks.start + int(i)
+            for name, blocks in BLOCKS_OF.items()
+            if name in self.values
+            for i in np.flatnonzero(known_blocks(self.values[name]))
+        ]
 
 
-def checked_measurement(
-    sensors: SensorSuite,
-    position_G: ArrayLike | None,
-    baseline_G: ArrayLike | None,
-    pixels: ArrayLike | None,
-    velocity_G: ArrayLike | None,
-    others: dict[str, Any],
-) -> Measurement:
-    """Check the arguments of `update`.
+def keyword_of(name: str) -> str:
+    """Return the keyword of a reading: names of vectors in G say so."""
+    return f"{name}_G" if READINGS[name].in_G else name
 
-    Args:
-        sensors: The filter's suite.
-        position_G: As in `update`.
-        baseline_G: As in `update`.
-        pixels: As in `update`.
-        velocity_G: As in `update`.
-        others: Measurements of aiding sensors by name, and noise by SIGMA_KEYWORDS.
-    """
-    aids = _checked_aids(sensors, others) if others else {}
-    if position_G is not None or baseline_G is not None:
-        require_gnss(sensors, "update")
-    position = baseline = velocity = image = None
-    if position_G is not None:
-        position = check.array("gnss_position_G", position_G, (3,))
-    if baseline_G is not None:
-        baseline = checked_baseline(sensors, baseline_G)
-    if pixels is not None:
-        count = 0 if sensors.camera is None else len(sensors.camera.features_I)
-        image = check.array("pixels", pixels, (count, 2), allow_nan=True)
-    if velocity_G is not None:
-        if sensors.gnss is None or sensors.gnss.velocity_sigma is None:
-            raise ValueError("the sensor suite has no GNSS velocity to update with")
-        velocity = check.array("gnss_velocity_G", velocity_G, (3,))
-    if not others:
-        return Measurement(position, baseline, velocity, image)
-    measured = {
-        "gnss_sigma": position is not None,
-        "baseline_sigma": baseline is not None,
-        "velocity_sigma": velocity is not None,
-        "pixel_sigma": image is not None,
-        **{f"{aid.name.lower()}_sigma": aid in aids for aid in Aid},
-    }
-    return Measurement(position, baseline, velocity, image, aids, _checked_noise(others, measured))
+
+def checked_measurement(sensors: SensorSuite, given: Mapping[str, Any]) -> Measurement:
+    """Check the arguments of `update` by their keywords; None: not measured."""
+    values, sigmas = {}, {}
+    for name, reading in READINGS.items():
+        if (value := given.get(keyword_of(name))) is not None:
+            values[name] = _checked_value(sensors, name, value)
+        if (sigma := given.get(reading.sigma)) is not None:
+            if name not in values:
+                raise ValueError(f"{reading.sigma} must come with its measurement")
+            sigmas[name] = checked_sigma(name, sigma)
+    return Measurement(values, sigmas)
 
 
 def require_gnss(sensors: SensorSuite, what: str) -> None:
@@ -132,8 +82,23 @@ def require_gnss(sensors: SensorSuite, what: str) -> None:
         raise ValueError(f"the sensor suite has no GNSS to {what}")
 
 
+def _checked_value(sensors: SensorSuite, name: str, value: Any) -> Floats:
+    """Return a measurement (blocks, length) of a reading."""
+    reading, count, keyword = READINGS[name], sensors.blocks_of(name), keyword_of(name)
+    if count == 0:
+        words = name.replace("gnss", "GNSS").replace("_", " ")
+        raise ValueError(f"the sensor suite has no {words} to update with")
+    if name == "gnss_baseline":
+        return checked_baseline(sensors, value)[np.newaxis]
+    several = reading.most_blocks > 1
+    if not several and reading.length == 1:
+        return np.array([[check.number(keyword, value)]])
+    found = check.array(keyword, value, sensors.shape_of(name), allow_nan=several)
+    return found.reshape(count, reading.length)
+
+
 def checked_baseline(sensors: SensorSuite, gnss_baseline_G: ArrayLike) -> Floats:
-    """Return a baseline, scaled by a power of two: its length is not used."""
+    """Return a baseline (3,), scaled by a power of two: its length is not used."""
     if sensors.gnss is not None and not sensors.gnss.has_baseline:
         raise ValueError("gnss_baseline_G must be None for GNSS with one antenna")
     baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))
@@ -144,55 +109,19 @@ def checked_baseline(sensors: SensorSuite, gnss_baseline_G: ArrayLike) -> Floats
     return np.ldexp(baseline, -int(np.frexp(largest)[1]))
 
 
-def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Floats]:
-    """Return the measurements of aiding sensors as arrays; None: not measured."""
-    names = tuple(aid.name.lower() for aid in Aid)
-    check.keywords(others, names + SIGMA_KEYWORDS, "update")
-    found = {}
-    for name in names:
-        aid, value = Aid[name.upper()], others.get(name)
-        if value is None:
-            continue
-        if aid not in sensors.aids:
-            raise ValueError(f"the sensor suite has no {name} to update with")
-        params = sensors.aids[aid]
-        alone, several = params.shape == (), params.most_blocks > 1
-        numbers = [check.number(name, value)] if alone else value
-        values = check.array(name, numbers, params.shape or (1,), allow_nan=several)
-        found[aid] = values.reshape(params.blocks, params.length)
-    return found
-
-
-def gnss_noise(name: str, value: Any) -> Floats:
-    """Return standard deviations (3,) in I [m] of a number or three."""
-    if np.ndim(value) == 0:
-        return np.full(3, check.positive(name, value, least=1e-9))
-    sigmas = check.array(name, value, (3,))
-    if not (sigmas >= 1e-9).all():
-        raise ValueError(f"{name} must be at least 1e-9, got {value!r}")
+def checked_sigma(name: str, value: Any) -> Floats:
+    """Return the standard deviations of a reading, of a number or as many."""
+    reading = READINGS[name]
+    least = reading.least_sigma
+    if np.ndim(value) == 0 or reading.sigmas == 1:
+        sigma = check.positive(reading.sigma, value, least=least)
+        if name == "gnss_baseline":
+            sigma = min(sigma, math.pi)
+        return np.full(reading.sigmas, sigma)
+    sigmas = check.array(reading.sigma, value, (reading.sigmas,))
+    if not (sigmas >= least).all():
+        raise ValueError(f"{reading.sigma} must be at least {least:g}, got {value!r}")
     return sigmas
-
-
-def _checked_noise(others: dict[str, Any], measured: dict[str, bool]) -> dict[str, Any]:
-    """Return noise by fields of the parameter record."""
-    noise: dict[str, Any] = {}
-    for name in SIGMA_KEYWORDS:
-        value = others.get(name)
-        if value is None:
-            continue
-        if not measured[name]:
-            raise ValueError(f"{name} must come with its measurement")
-        if name == "gnss_sigma":
-            noise["position_sigma_I"] = gnss_noise(name, value)
-            continue
-        sigma = check.positive(name, value, least=1e-12)
-        if name == "baseline_sigma":
-            noise["baseline_noise"] = noise["baseline_sigma"] = min(sigma, math.pi)
-        elif name.removesuffix("_sigma").upper() in Aid.__members__:
-            noise.setdefault("aid_sigma", {})[Aid[name.removesuffix("_sigma").upper()]] = sigma
-        else:
-            noise[name] = sigma
-    return noise
 
 
 # --------------------------------------------------------------------------------------------------
@@ -283,18 +212,12 @@ class InputHistory:
 # Tapes: the operations of a filter on a log, as a list that compiled code runs.
 # --------------------------------------------------------------------------------------------------
 
-_TRIPLES = (
-    ("position_G", "gnss_position", POSITION_BLOCK),
-    ("baseline_G", "gnss_baseline", BASELINE_BLOCK),
-    ("velocity_G", "gnss_velocity", VELOCITY_BLOCK),
-)
-_NOISE = (*NOISE_FIELDS, "aid_sigma")
 _PREDICT, _UPDATE = int(Operation.PREDICT), int(Operation.UPDATE)
 
+_GROUP = {name: group for group, name in enumerate(READINGS)}
 BLANK = np.zeros(1, MEASUREMENT)
 """Record of a measurement of nothing, with the noise of the parameters."""
-for _name in _NOISE:
-    BLANK[_name] = np.nan
+BLANK["sigma"] = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,27 +251,14 @@ class Tape:
 
 def write_measurement(row: Any, m: Measurement) -> None:
     """Write a measurement into a blank record."""
-    valid = row["valid"]
-    for name, place, block in _TRIPLES:
-        values = getattr(m, name)
-        if values is not None:
-            valid[block], row[place] = 1.0, values
-    if m.pixels is not None:
-        seen = np.asarray(~np.isnan(m.pixels).any(axis=1))
-        valid[FEATURE_BLOCKS : FEATURE_BLOCKS + len(seen)] = seen
-        row["pixels"][: len(seen)] = np.where(seen[:, np.newaxis], m.pixels, 0.0)
-    for aid, values in m.aids.items():
-        count, length = values.shape
-        known = ~np.isnan(values[:, 0])
-        valid[AID_BLOCK[aid] : AID_BLOCK[aid] + count] = known
-        place = row["aid_measurement"][AID_ROW[aid] : AID_ROW[aid] + count]
-        place[:, :length] = np.where(known[:, np.newaxis], values, 0.0)
-    for name, value in m.noise.items():
-        if name == "aid_sigma":
-            for aid, sigma in value.items():
-                row[name][aid] = sigma
-        else:
-            row[name] = value
+    for name, values in m.values.items():
+        first, (count, length) = BLOCKS_OF[name].start, values.shape
+        known = known_blocks(values)
+        row["valid"][first : first + count] = known
+        blocks = row["measurement"][first : first + count, :length]
+        blocks[...] = np.where(known[:, np.newaxis], values, 0.0)
+    for name, sigmas in m.sigmas.items():
+        row["sigma"][_GROUP[name], : len(sigmas)] = sigmas
 
 
 _AT_ONCE = 4096  #: operations of a piece of a tape

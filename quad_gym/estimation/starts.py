@@ -8,14 +8,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.estimation.engine import Engine
-from quad_gym.estimation.inputs import Measurement, checked_baseline, gnss_noise, require_gnss
+from quad_gym.estimation.inputs import (
+    Measurement,
+    checked_baseline,
+    checked_sigma,
+    require_gnss,
+)
 from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels import entries
 from quad_gym.packing import follows_motion, slow_states
 from quad_gym.params import checks as check
 from quad_gym.params.portable import turned
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import START, Aid, lower_factors, shown_rows
+from quad_gym.records import BASELINE_BLOCK, POSITION_BLOCK, START, Aid, lower_factors, shown_rows
 from quad_gym.records.inputs import FARTHEST_FIX, FIX, MIN_COURSE
 from quad_gym.records.states import V
 from quad_gym.rotations import dcm_to_euler, euler_to_dcm
@@ -420,8 +425,8 @@ class FilterStart:
 
     def write(self, engine: Engine) -> None:
         """Start the filters in an engine's memory."""
-        engine.fill("gnss_position", self.position_G)
-        engine.fill("gnss_baseline", self.baseline_G)
+        engine.fill_block(POSITION_BLOCK, self.position_G)
+        engine.fill_block(BASELINE_BLOCK, self.baseline_G)
         kept = engine.impose({"position_sigma_I": self.sigmas, **self.numbers})
         engine.start(self.x_I)
         engine.restore_noise(kept)
@@ -443,7 +448,7 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     _require_relative(position)
     sigmas = np.array(sensors.gnss.position_sigma_I)
     if fix.gnss_sigma is not None:
-        sigmas = gnss_noise("gnss_sigma", fix.gnss_sigma)
+        sigmas = checked_sigma("gnss_position", fix.gnss_sigma)
     velocity, speeds = _first_velocity(sensors, fix)
     baseline = fix.gnss_baseline_G
     if baseline is not None:

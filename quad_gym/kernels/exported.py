@@ -20,23 +20,21 @@ from quad_gym.kernels.stages import STAGE_TABLE
 from quad_gym.kernels.tape import keep_estimate, predict_sample, take_input, update_with
 from quad_gym.records import (
     AID_BLOCK,
-    AID_MOST,
-    AID_ROW,
-    AIDS,
     BASELINE_BLOCK,
-    FEATURE_BLOCKS,
     FLIGHT_BLOCK,
+    GROUP_BLOCK,
     KEPT,
-    MAX_FEATURES,
     MEASUREMENT,
+    MOST_BLOCKS,
     OPERATION,
     PARAMS_BLOCK,
     POSITION_BLOCK,
+    READINGS,
     SAMPLE,
+    SENSOR_GROUPS,
     SETTINGS,
     START,
     STEP_BLOCK,
-    VELOCITY_BLOCK,
     WORK_BLOCK,
     Aid,
     Operation,
@@ -71,8 +69,9 @@ _FLIGHT, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE, _MEASUREMENT, _START = map(
 _WINDOW, _INPUT, _FIX, _MEMORY, _ESTIMATE, _MOUNTING = map(
     from_dtype, (WINDOW, INPUT, FIX, MEMORY, ESTIMATE, MOUNTING)
 )
-_MAGNETOMETER = int(Aid["MAGNETOMETER"])
-_FIELD_ROW = AID_ROW[_MAGNETOMETER]
+_FIELD_BLOCK = AID_BLOCK[Aid["MAGNETOMETER"]]
+_POSITIONS, _BASELINES = READINGS.index("gnss_position"), READINGS.index("gnss_baseline")
+_LEAST, _LEAST_OF_POSITION = 1e-12, 1e-9  #: standard deviations
 _PREDICT, _UPDATE, _, _RESTORE, _ = map(int, Operation)
 _OK, _, _NOT_FINITE, _RANGE, _, _, _, _NO_HEADING, _CONTRADICTION = map(int, Outcome)
 _NOTHING = (0.0, 0.0, 0.0)
@@ -90,6 +89,14 @@ def _is_all_finite(values):
     found = True
     for i in range(len(values)):
         found &= math.isfinite(values[i])
+    return found
+
+
+@kernel
+def _has_nan(values):
+    found = False
+    for i in range(len(values)):
+        found |= math.isnan(values[i])
     return found
 
 
@@ -122,48 +129,39 @@ def _check_sigma(value, least, measured):
 
 
 @kernel
-def _check_triple(values, measured):
-    return _OK if measured <= 0.0 or _is_all_finite(values) else _NOT_FINITE
+def _check_block(block, values):
+    """Check the numbers of a measured block; a baseline is scaled."""
+    if block == BASELINE_BLOCK:
+        return scale_baseline(values)
+    return _OK if _is_all_finite(values) else _NOT_FINITE
+
+
+@kernel
+def _check_sigmas(m, group, measured):
+    """Check the standard deviations of a reading."""
+    outcome, sigma = _OK, m.sigma[group]
+    for i in range(3):
+        least = _LEAST_OF_POSITION if group == _POSITIONS else _LEAST
+        sigma[i], found = _check_sigma(sigma[i], least, measured)
+        outcome = outcome if outcome != _OK else found
+    if group == _BASELINES and sigma[0] > math.pi:
+        sigma[0] = math.pi
+    return outcome
 
 
 @kernel
 def check_measurement(m):
     """Check a MEASUREMENT, and complete it; return the first outcome that is not OK."""
-    valid, o = m.valid, _check_triple(m.gnss_position, m.valid[POSITION_BLOCK])
-    for i in range(3):
-        m.position_sigma_I[i], found = _check_sigma(
-            m.position_sigma_I[i], 1e-9, valid[POSITION_BLOCK]
-        )
-        o = o if o != _OK else found
-    if o == _OK and valid[BASELINE_BLOCK] > 0.0:
-        o = scale_baseline(m.gnss_baseline)
-    sigma, found = _check_sigma(m.baseline_sigma, 1e-12, valid[BASELINE_BLOCK])
-    o = o if o != _OK else found
-    m.baseline_sigma = min(sigma, math.pi) if sigma == sigma else sigma
-    m.baseline_noise = m.baseline_sigma
-    found = _check_triple(m.gnss_velocity, valid[VELOCITY_BLOCK])
-    o = o if o != _OK else found
-    m.velocity_sigma, found = _check_sigma(m.velocity_sigma, 1e-12, valid[VELOCITY_BLOCK])
-    o = o if o != _OK else found
-    seen = 0.0
-    for k in range(MAX_FEATURES):
-        if m.pixels[k, 0] != m.pixels[k, 0] or m.pixels[k, 1] != m.pixels[k, 1]:
-            valid[FEATURE_BLOCKS + k] = 0.0  # not seen
-        found = _check_triple(m.pixels[k], valid[FEATURE_BLOCKS + k])
-        o = o if o != _OK else found
-        seen = max(seen, valid[FEATURE_BLOCKS + k])
-    m.pixel_sigma, found = _check_sigma(m.pixel_sigma, 1e-12, seen)
-    o = o if o != _OK else found
-    for aid in range(AIDS):
-        measured = 0.0
-        for k in range(AID_MOST[aid]):
-            row, block = AID_ROW[aid] + k, AID_BLOCK[aid] + k
-            if AID_MOST[aid] > 1 and m.aid_measurement[row, 0] != m.aid_measurement[row, 0]:
+    valid, z, o = m.valid, m.measurement, _OK
+    for group in range(SENSOR_GROUPS):
+        several, measured, first = MOST_BLOCKS[group] > 1, 0.0, GROUP_BLOCK[group]
+        for block in range(first, first + MOST_BLOCKS[group]):
+            if several and _has_nan(z[block]):
                 valid[block] = 0.0  # one of several was not measured
-            found = _check_triple(m.aid_measurement[row], valid[block])
-            o = o if o != _OK else found
+            if valid[block] > 0.0 and o == _OK:
+                o = _check_block(block, z[block])
             measured = max(measured, valid[block])
-        m.aid_sigma[aid], found = _check_sigma(m.aid_sigma[aid], 1e-12, measured)
+        found = _check_sigmas(m, group, measured)
         o = o if o != _OK else found
     return o
 
@@ -206,7 +204,7 @@ def _correct(mounting, given, m):
     """Rotate a sample or the measurement m to B, as `Log.corrected` does."""
     if given.rank > 0:
         if mounting.compass_turns:
-            field = m.aid_measurement[_FIELD_ROW]
+            field = m.measurement[_FIELD_BLOCK]
             store(field, turned(mounting.R_compass, load3(field)))
     elif mounting.imu_turns:
         store(given.gyro, turned(mounting.R_imu, load3(given.gyro) - load3(mounting.gyro_bias)))
@@ -329,8 +327,8 @@ def start(block, params, settings, work, first, fix):
     )
     for i in range(3):
         flight.w_before[i] = math.nan
-        flight.gnss_position[i] = 0.0 if fix.rest else fix.position[i]
-        flight.gnss_baseline[i] = 0.0 if fix.rest else fix.baseline[i]
+        flight.measurement[POSITION_BLOCK, i] = 0.0 if fix.rest else fix.position[i]
+        flight.measurement[BASELINE_BLOCK, i] = 0.0 if fix.rest else fix.baseline[i]
         p.position_sigma_I[i] = fix.sigma[i]
     if fix.tilt_sigma > 0.0:
         p.initial_tilt_sigma = fix.tilt_sigma

@@ -18,7 +18,7 @@ def sources_digest(package: Path) -> str:
     """
     digest = hashlib.sha256()
     files = [file for folder in ("kernels", "records") for file in (package / folder).rglob("*.py")]
-    table = package / "params" / "aid_table.py"  # of sensors, from whose classes records follow
+    table = package / "params" / "sensor_table.py"  # of sensors, from whose classes records follow
     if table.is_file():
         names = re.findall(r"^from quad_gym\.params\.(\w+) import", table.read_text(), re.MULTILINE)
         files += [table, *(table.with_name(f"{name}.py") for name in names)]

@@ -154,7 +154,7 @@ def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
     return _filter_and(lambda s: s["sensor_blocks"][sensor])
 
 
-_camera = _sensor(Sensor.CAMERA)
+_camera = _sensor(Sensor["CAMERA"])
 
 
 def _keeps_start(s: Any) -> bool:

@@ -13,15 +13,10 @@ from quad_gym.kernels.numbers.blocks import lanes_of, store_lanes
 from quad_gym.kernels.numbers.elementary import approached, exp
 from quad_gym.kernels.numbers.lanes import select
 from quad_gym.records import (
-    AID_BLOCKS,
-    AID_ROW,
-    AID_ROWS,
+    AID_BLOCK,
+    AID_GROUPS,
     AIDS,
-    BASELINE_BLOCK,
-    FEATURE_BLOCKS,
     MAX_BLOCKS,
-    POSITION_BLOCK,
-    VELOCITY_BLOCK,
     WIDTH,
     Aid,
 )
@@ -34,7 +29,8 @@ from quad_gym.records.states import ROWS
 
 _PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
 _PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
-_HEIGHT = AID_ROW[Aid["BAROMETER"]]
+_POSITIONS, _BASELINES, _VELOCITIES, _IMAGES = range(AID_GROUPS)
+_HEIGHT = AID_BLOCK[Aid["BAROMETER"]]
 _LANES = 8 * WIDTH  #: bytes
 
 
@@ -93,54 +89,42 @@ def _write_sample(flight, tick, sample):
 
 
 @kernel
-def _take_triple(values, measured, valid):
-    """Write three numbers if they were measured."""
-    if valid > 0.0:
-        for i in range(3):
-            values[i] = measured[i]
-
-
-@kernel
-def _write_measurement(flight, step, m, features):
+def _write_measurement(flight, step, m):
     """Write the measurements of one instant into the record."""
     for k in range(MAX_BLOCKS):
         flight.block_valid[k] = m.valid[k]
-    _take_triple(flight.gnss_position, m.gnss_position, m.valid[POSITION_BLOCK])
-    _take_triple(flight.gnss_baseline, m.gnss_baseline, m.valid[BASELINE_BLOCK])
-    _take_triple(flight.gnss_velocity, m.gnss_velocity, m.valid[VELOCITY_BLOCK])
-    for k in range(features):
-        if m.valid[FEATURE_BLOCKS + k] > 0.0:
-            for i in range(2):
-                flight.pixels[k, i] = m.pixels[k, i]
-    for row in range(AID_ROWS):
-        _take_triple(flight.aid_measurement[row], m.aid_measurement[row], m.valid[AID_BLOCKS + row])
-    if m.valid[AID_BLOCKS + _HEIGHT] > 0.0:
-        height, level = m.aid_measurement[_HEIGHT, 0], step.level
+        if m.valid[k] > 0.0:
+            for i in range(3):
+                flight.measurement[k, i] = m.measurement[k, i]
+    if m.valid[_HEIGHT] > 0.0:
+        height, level = m.measurement[_HEIGHT, 0], step.level
         step.level = select(level == level, level, height - flight.r_hat[2])
-        flight.aid_measurement[_HEIGHT, 0] = height - step.level
+        flight.measurement[_HEIGHT, 0] = height - step.level
+
+
+@kernel
+def _chosen(sigma, own):
+    """The measurement's standard deviation, or the suite's where it has none."""
+    if sigma == sigma:
+        own = own * 0.0 + sigma
+    return own
 
 
 @kernel
 def _replace_noise(p, m, own):
     """Set the noise of a measurement where it has its own, or else the suite's."""
     for i in range(3):
-        p.position_sigma_I[i] = own.position_sigma_I[i]
-        if m.position_sigma_I[i] == m.position_sigma_I[i]:
-            p.position_sigma_I[i] = m.position_sigma_I[i]
+        p.position_sigma_I[i] = _chosen(m.sigma[_POSITIONS, i], own.position_sigma_I[i])
     p.baseline_noise, p.baseline_sigma = own.baseline_noise, own.baseline_sigma
-    if m.baseline_noise == m.baseline_noise:
-        p.baseline_noise = m.baseline_noise
-    if m.baseline_sigma == m.baseline_sigma:
-        p.baseline_sigma = m.baseline_sigma
-    p.velocity_sigma, p.pixel_sigma = own.velocity_sigma, own.pixel_sigma
-    if m.velocity_sigma == m.velocity_sigma:
-        p.velocity_sigma = m.velocity_sigma
-    if m.pixel_sigma == m.pixel_sigma:
-        p.pixel_sigma = m.pixel_sigma
+    sigma = m.sigma[_BASELINES, 0]
+    if sigma == sigma:
+        p.baseline_sigma = sigma
+        if sigma <= math.pi:  # otherwise only the heading is used, with the suite's noise
+            p.baseline_noise = sigma
+    p.velocity_sigma = _chosen(m.sigma[_VELOCITIES, 0], own.velocity_sigma)
+    p.pixel_sigma = _chosen(m.sigma[_IMAGES, 0], own.pixel_sigma)
     for aid in range(AIDS):
-        p.aid_sigma[aid] = own.aid_sigma[aid]
-        if m.aid_sigma[aid] == m.aid_sigma[aid]:
-            p.aid_sigma[aid] = m.aid_sigma[aid]
+        p.aid_sigma[aid] = _chosen(m.sigma[AID_GROUPS + aid, 0], own.aid_sigma[aid])
 
 
 @kernel
@@ -163,7 +147,7 @@ def update_with(flight, params, ticks, steps, settings, work, table, mask, measu
     p, tick, scratch = lanes_of(params), lanes_of(ticks), lanes_of(work)
     features = settings.feature_count
     _set_tick(p, tick, settings.slow_states)
-    _write_measurement(flight, lanes_of(steps), measurement, features)
+    _write_measurement(flight, lanes_of(steps), measurement)
     _replace_noise(p, measurement, tick)
     scratch.mask = mask
     call_stage(table, _UPDATE_STAGE, flight, p, p, settings, scratch, features)

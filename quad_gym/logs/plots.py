@@ -9,7 +9,7 @@ from quad_gym.analysis.metrics import chi_square_quantile
 from quad_gym.analysis.plots import BLUE, GREEN, GREY, ORANGE, PALE, VERMILLION, house_style, panels
 from quad_gym.logs.calibrating.calibration import Calibration
 from quad_gym.logs.replaying.results import Measured, Replay, by_sensor
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
 _MAX_POINTS = 4000  #: points of a curve

@@ -1,4 +1,4 @@
-"""Parameters that all aiding sensors share: rate, phase, latency, noise, time-correlated errors."""
+"""What all sensors share: readings, schedule, latency, noise, time-correlated errors."""
 
 import math
 from collections.abc import Mapping
@@ -21,12 +21,69 @@ class SlowError(NamedTuple):
     tau: float = math.inf  #: correlation time [s]; infinite: the error is constant during a flight
 
 
+class Reading(NamedTuple):
+    """What a sensor measures: one block of numbers, or several of one kind.
+
+    Each block may be missing, and the gate accepts or rejects it by itself.
+    """
+
+    name: str
+    length: int  #: numbers in a block, at most three
+    unit: str
+    frame: str  #: in which users read it
+    meaning: str  #: in a few words
+    observes: tuple[str, ...]
+    """OBSERVED states. Where other sensors in use observe all of them, the gate attributes an
+    implausible measurement to this reading; a replay assumes that it corrects them."""
+    raw: tuple[str, str, float]  #: unit, frame and bound in raw observations
+    sigma: str  #: keyword of a measurement's own standard deviation, per axis, in `sigma_unit`
+    sigma_unit: str
+    most_blocks: int = 1  #: largest number of blocks
+    raw_first: int = 0  #: number of the first of several blocks in raw observations
+    block: str = ""  #: word for one of several blocks; empty: the name
+    direction: bool = False
+    """True if filters compare unit vectors, which have three numbers and two degrees of freedom"""
+    in_G: bool = False  #: True if records have it in G, the frame of GNSS, in place of I
+    sigmas: int = 1  #: numbers of the standard deviation: one, or east, north and up
+    least_sigma: float = 1e-12  #: smallest standard deviation of a measurement
+    reported: bool = False  #: True if receivers report it with every measurement
+    marked: bool = False
+    """True if the mark from which a vehicle starts gives it where there is no such sensor"""
+
+    def name_of(self, k: int) -> str:
+        """Return the name of block k."""
+        return f"{self.block or self.name}_{k}" if self.most_blocks > 1 else self.name
+
+    @property
+    def dimensions(self) -> tuple[str | int, ...]:
+        """Dimensions of a measurement, several blocks in words."""
+        several = (f"{self.block or 'block'}s",) * (self.most_blocks > 1)
+        return several + (self.length,) * (self.length > 1)
+
+
 class SensorBase(Checked):
     """Base of the parameters of all sensors."""
 
+    measures: ClassVar[tuple[Reading, ...]] = ()
+    """Quantities of a sensor that has several, or more to say than `AidParams`."""
     _white_noise: ClassVar[tuple[str, ...]] = ()
     _ideal: ClassVar[Mapping[str, Any]] = {}
     """Values without latency and without errors that the filter does not model."""
+
+    @classmethod
+    def readings(cls, name: str) -> tuple[Reading, ...]:
+        """Return what the sensor measures; `name` is its field in `SensorTable`."""
+        return cls.measures
+
+    @property
+    def measured_blocks(self) -> tuple[int, ...]:
+        """Number of blocks of each of its readings; 0: this sensor does not measure it."""
+        raise NotImplementedError
+
+    @property
+    def reads_velocity(self) -> bool:
+        """False if measurements do not depend on the velocity, which makes updates faster."""
+        return True
 
     def simplified(self) -> Self:
         """Return a copy without latency and without errors that the filter does not model."""
@@ -43,11 +100,7 @@ class SensorBase(Checked):
 
 
 class AidParams(SensorBase):
-    """An aiding sensor other than IMU, GNSS and camera.
-
-    A measurement has one block of up to three numbers, or several blocks, each of which may be
-    missing and is accepted or rejected by itself.
-    """
+    """A sensor of one reading: one block of up to three numbers, or several blocks."""
 
     rate: check.Positive = 50.0
     """measurement rate [Hz]; the IMU rate must be a whole multiple of it"""
@@ -62,19 +115,37 @@ class AidParams(SensorBase):
 
     _white_noise = ("noise_sigma",)
     _ideal: ClassVar = {"latency": 0.0}
-    length: ClassVar[int] = 1  #: numbers in a block of the measurement, at most three
-    most_blocks: ClassVar[int] = 1  #: largest number of blocks
+    length: ClassVar[int] = 1
+    most_blocks: ClassVar[int] = 1
     rows: ClassVar[int] = 1  #: triples in `numbers`
-    observes: ClassVar[tuple[str, ...]]
-    """OBSERVED states. Where other sensors in use observe all of them, the gate attributes an
-    implausible measurement to this sensor; a replay assumes that it corrects them."""
-    reads_velocity: ClassVar[bool] = True
-    """False if the measurement does not depend on the velocity, which makes updates faster"""
-    unit: ClassVar[str]  #: of the measurement
-    frame: ClassVar[str]  #: of the measurement
-    meaning: ClassVar[str]  #: of the measurement, in a few words
+    observes: ClassVar[tuple[str, ...]]  #: these six as in `Reading`
+    unit: ClassVar[str]
+    frame: ClassVar[str]
+    meaning: ClassVar[str]
     raw: ClassVar[tuple[str, str, float]]
-    """unit, frame and bound of the measurement in raw observations"""
+
+    @classmethod
+    def readings(cls, name: str) -> tuple[Reading, ...]:
+        """Return the reading, which has the name of the sensor."""
+        return (
+            Reading(
+                name=name,
+                length=cls.length,
+                unit=cls.unit,
+                frame=cls.frame,
+                meaning=cls.meaning,
+                observes=cls.observes,
+                raw=cls.raw,
+                sigma=f"{name}_sigma",
+                sigma_unit=cls.unit,
+                most_blocks=cls.most_blocks,
+            ),
+        )
+
+    @property
+    def measured_blocks(self) -> tuple[int, ...]:
+        """Number of blocks."""
+        return (self.blocks,)
 
     @classmethod
     def measured(cls, values: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -7,9 +7,10 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.aids import SensorBase
+from quad_gym.params.aids import Reading, SensorBase
 from quad_gym.params.checks import Matrix, Vector
-from quad_gym.records import MAX_FEATURES
+
+MAX_FEATURES = 16  #: largest number of a camera's features
 
 Positive2 = Annotated[Vector, partial(check.vector, length=2, least=0.0, open_end=True)]
 
@@ -59,6 +60,23 @@ class CameraParams(SensorBase):
     """True: the ground (`WorldParams.ground_height`) occludes features below it, and all features
     if the camera is below it"""
 
+    measures: ClassVar = (
+        Reading(
+            name="pixels",
+            length=2,
+            unit="pixels",
+            frame="C",
+            meaning="features, from the image's center",
+            observes=("position", "height", "velocity", "heading"),
+            raw=("half images", "C", 2.0),
+            sigma="pixel_sigma",
+            sigma_unit="pixels",
+            most_blocks=MAX_FEATURES,
+            raw_first=1,
+            block="feature",
+            direction=True,
+        ),
+    )
     _white_noise = ("pixel_sigma",)
     _ideal: ClassVar = {
         "latency": 0.0,
@@ -66,6 +84,13 @@ class CameraParams(SensorBase):
         "exposure": 0.0,
         "ground_hides": False,
     }
+
+    reads_velocity = False
+
+    @property
+    def measured_blocks(self) -> tuple[int, ...]:
+        """Number of features."""
+        return (len(self.features_I),)
 
     @property
     def limited(self) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import SensorBase
+from quad_gym.params.aids import Reading, SensorBase
 
 MIN_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so
@@ -68,6 +68,51 @@ class GnssParams(SensorBase):
     [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods. Receivers take about 0.1
     s: the autopilot PX4 assumes 0.11 s (parameter EKF2_GPS_DELAY)"""
 
+    measures: ClassVar = (
+        Reading(
+            name="gnss_position",
+            length=3,
+            unit="m",
+            frame="I",
+            meaning="primary antenna, from the reference antenna",
+            observes=("position", "height", "velocity"),
+            raw=("m", "I", 1000.0),
+            sigma="gnss_sigma",
+            sigma_unit="m",
+            sigmas=3,
+            least_sigma=1e-9,
+            reported=True,
+            in_G=True,
+            marked=True,
+        ),
+        Reading(
+            name="gnss_baseline",
+            length=3,
+            unit="m",
+            frame="I",
+            meaning="primary to secondary antenna",
+            observes=("heading",),
+            raw=("-", "I", 1.0),
+            sigma="baseline_sigma",
+            sigma_unit="rad",
+            direction=True,
+            in_G=True,
+            marked=True,
+        ),
+        Reading(
+            name="gnss_velocity",
+            length=3,
+            unit="m/s",
+            frame="I",
+            meaning="velocity of the primary antenna, where the receiver measures it",
+            observes=("velocity",),
+            raw=("m/s", "I", 200.0),
+            sigma="velocity_sigma",
+            sigma_unit="m/s",
+            reported=True,
+            in_G=True,
+        ),
+    )
     _white_noise = ("position_sigma_I", "baseline_sigma", "velocity_sigma")
     _ideal: ClassVar = {"latency": 0.0, "heading_error_sigma": 0.0}
 
@@ -77,6 +122,21 @@ class GnssParams(SensorBase):
             check_baseline("GnssParams.secondary_antenna_B and primary_antenna_B", self.baseline_B)
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
             self._refuse("reference_antenna_G", "be a place on the Earth in ECEF meters")
+
+    @property
+    def measured_blocks(self) -> tuple[int, ...]:
+        """Number of blocks of position, baseline and velocity: 1, or 0 where not measured."""
+        return (1, int(self.has_baseline), int(self.has_velocity))
+
+    @property
+    def has_velocity(self) -> bool:
+        """True if the receiver measures its velocity."""
+        return self.velocity_sigma is not None
+
+    @property
+    def reads_velocity(self) -> bool:
+        """True if a measurement depends on the velocity."""
+        return self.has_velocity
 
     def require_filter(self) -> None:
         """Refuse positions with hardly any noise, by the square of which a filter divides."""

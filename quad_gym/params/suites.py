@@ -43,7 +43,6 @@ import numpy as np
 
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aid_table import AID_PARAMS, AidTable
 from quad_gym.params.aids import AidParams
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
@@ -55,6 +54,14 @@ from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
+from quad_gym.params.sensor_table import (
+    AID_PARAMS,
+    READINGS,
+    SENSOR_OF,
+    SENSOR_PARAMS,
+    SensorParams,
+    SensorTable,
+)
 from quad_gym.params.uwb_range import UwbRangeParams
 from quad_gym.records import FEATURE_BLOCKS, MAX_TOGETHER, MAX_UNDER_WAY, Aid
 
@@ -65,15 +72,6 @@ from quad_gym.records import FEATURE_BLOCKS, MAX_TOGETHER, MAX_UNDER_WAY, Aid
 # laboratory's numbers from the Aerial Robotics course (ASE 479W, The University of Texas at
 # Austin).
 # --------------------------------------------------------------------------------------------------
-
-SensorParams = GnssParams | CameraParams | AidParams  #: parameters of a sensor other than the IMU
-
-SENSOR_PARAMS: dict[str, type[SensorParams]] = {
-    "gnss": GnssParams,
-    "camera": CameraParams,
-    **AID_PARAMS,
-}
-"""Parameters of all sensors but the IMU by their fields in `SensorSuite`."""
 
 Delay = Annotated[float, check.between(-2.0, 2.0)]
 _WORDS = {"gnss": "GNSS"}  #: sensors in messages, where the name of the field is none
@@ -143,18 +141,7 @@ def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
     return ticks
 
 
-class MainSensors(Checked):
-    """IMU, GNSS and camera."""
-
-    imu: ImuParams = field(default_factory=ImuParams)
-    """IMU, whose samples are the ticks of the simulation"""
-    gnss: GnssParams | None = field(default_factory=GnssParams)
-    """GNSS; None: no GNSS, and the filter starts from `initial_pose`"""
-    camera: CameraParams | None = field(default_factory=CameraParams)
-    """camera; None: no camera"""
-
-
-class SensorSuite(AidTable, MainSensors, Saved):
+class SensorSuite(SensorTable, Saved):
     """All sensors of a vehicle and the filter that fuses them."""
 
     initial_pose: InitialPoseParams = field(default_factory=InitialPoseParams)
@@ -203,6 +190,19 @@ class SensorSuite(AidTable, MainSensors, Saved):
         found = {aid: getattr(self, aid.name.lower()) for aid in Aid}
         return {aid: params for aid, params in found.items() if params is not None}
 
+    def blocks_of(self, reading: str) -> int:
+        """Return the number of blocks that the suite measures of a reading; 0: none."""
+        sensor = getattr(self, SENSOR_OF[reading])
+        if sensor is None:
+            return 0
+        names = [each.name for each in sensor.readings(SENSOR_OF[reading])]
+        return int(sensor.measured_blocks[names.index(reading)])
+
+    def shape_of(self, reading: str) -> tuple[int, ...]:
+        """Return the shape of a reading: of a number, of a block, or of several."""
+        kind, count = READINGS[reading], self.blocks_of(reading)
+        return (count,) * (kind.most_blocks > 1) + (kind.length,) * (kind.length > 1)
+
     @property
     def heading_aid(self) -> Aid | None:
         """Aiding sensor that initializes the heading where no baseline does; None: none."""
@@ -221,6 +221,11 @@ class SensorSuite(AidTable, MainSensors, Saved):
     def drifts(self) -> bool:
         """True if GNSS positions have a time-correlated error, which the filter estimates."""
         return self.gnss is not None and self.gnss.drifts
+
+    @property
+    def heading_errs(self) -> bool:
+        """True if baselines have a constant error, which the filter models as white noise."""
+        return self.gnss is not None and self.gnss.heading_errs
 
     def require_filter(self) -> None:
         """Refuse a suite whose filter misinterprets the IMU samples, or would overflow."""

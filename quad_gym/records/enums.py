@@ -2,7 +2,7 @@
 
 from enum import IntEnum, IntFlag
 
-from quad_gym.params.aid_table import AID_SHAPES
+from quad_gym.params.sensor_table import SENSOR_SHAPES
 
 
 class FilterStatus(IntFlag):
@@ -70,32 +70,27 @@ class Sensor(IntEnum):
     Their rows in the stacked measurement, and delayed updates, are in this order.
     """
 
-    GNSS = 0
-    CAMERA = 1
-
     _ignore_ = "number word"
-    for number, word in enumerate(AID_SHAPES, 2):
+    for number, word in enumerate(SENSOR_SHAPES):
         vars()[word.upper()] = number
 
 
-class Block(IntEnum):
-    """Measurements of GNSS and camera, each a file in `kernels/sensors/` and a group of the gate.
-
-    Each feature of an image is a separate block of the measurement; features come last.
-    """
-
-    POSITION = 0
-    BASELINE = 1
-    VELOCITY = 2
-    FEATURES = 3
-
-
-BLOCK_FREEDOMS = (3, 2, 3, 2)
-"""Degrees of freedom of a block of each kind, in the order of `Block`: a direction has two."""
+_SENSOR_SHAPES = tuple(SENSOR_SHAPES.values())
+_SHAPES = [reading for sensor in _SENSOR_SHAPES for reading in sensor.readings]
+READINGS = tuple(shape.name for shape in _SHAPES)
+"""Names of the sensors' readings, in the order of the sensors. Each is a group of the gate."""
+LENGTHS = tuple(shape.length for shape in _SHAPES)  #: numbers in a block of each reading
+MOST_BLOCKS = tuple(shape.most_blocks for shape in _SHAPES)  #: largest numbers of their blocks
+DIRECTIONS = tuple(shape.direction for shape in _SHAPES)
+"""True for readings that filters compare as unit vectors, of three numbers."""
+GROUP_FREEDOMS = tuple(2 if shape.direction else shape.length for shape in _SHAPES)
+"""Degrees of freedom of a block of each reading: a direction has two."""
+GROUP_COUNT = tuple(len(sensor.readings) for sensor in _SENSOR_SHAPES)
+"""Number of readings of each sensor, each a group of the gate."""
 
 
 class Aid(IntEnum):
-    """Sensors of `params/aid_table.py`: the last members of `Sensor`, in this order.
+    """Sensors of one reading, with parameters in `aid_...`: the last of `Sensor`, in this order.
 
     The name in lower case is the field of `SensorSuite`. The fault that silences a sensor
     (`FaultKind`), its stage, its blocks of the measurement and its part of a raw observation are
@@ -103,15 +98,15 @@ class Aid(IntEnum):
     """
 
     _ignore_ = "number word"
-    for number, word in enumerate(AID_SHAPES):
+    for number, word in enumerate(name for name, shape in SENSOR_SHAPES.items() if shape.aid):
         vars()[word.upper()] = number
 
 
-_SHAPES = AID_SHAPES.values()
-AID_FREEDOMS = tuple(shape.length for shape in _SHAPES)
+AID_FREEDOMS = LENGTHS[-len(Aid) :]
 """Numbers in a block of each aiding sensor, in the order of `Aid`."""
-AID_MOST = tuple(shape.most_blocks for shape in _SHAPES)  #: largest numbers of their blocks
-AID_TRIPLES = tuple(shape.rows for shape in _SHAPES)  #: triples of their further parameters
+AID_MOST = MOST_BLOCKS[-len(Aid) :]  #: largest numbers of their blocks
+AID_TRIPLES = tuple(shape.rows for shape in _SENSOR_SHAPES if shape.aid)
+"""Triples of their further parameters."""
 
 
 class Observes(IntFlag):
@@ -123,17 +118,12 @@ class Observes(IntFlag):
     HEADING = 8
 
 
-_FIX = int(Observes.POSITION | Observes.HEIGHT | Observes.VELOCITY)
-GROUP_OBSERVES = (
-    _FIX,
-    int(Observes.HEADING),
-    int(Observes.VELOCITY),
-    int(_FIX | Observes.HEADING),
-    *(sum(int(Observes[word.upper()]) for word in shape.observes) for shape in _SHAPES),
+GROUP_OBSERVES = tuple(
+    sum(int(Observes[word.upper()]) for word in shape.observes) for shape in _SHAPES
 )
-"""The same of each group, in the order of `Block` and `Aid`, as numbers."""
+"""The same of each group, as numbers."""
 QUANTITIES = len(Observes)  #: number of the bits of `Observes`
-OWN_ERRORS = tuple(shape.own_error for shape in _SHAPES)
+OWN_ERRORS = tuple(shape.own_error for shape in _SENSOR_SHAPES if shape.aid)
 """True for aiding sensors with an error of their own among the states of a filter."""
 
 

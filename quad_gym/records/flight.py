@@ -147,10 +147,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("gyro", (3,), "rad/s", "sample for the filter: w_meas, or the mean over the last tick"),
         Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or the mean over the last tick"),
         Field("block_valid", (MAX_BLOCKS,), "0 or 1", "1 if a block of the measurement reaches the filter at the present instant"),
-        Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
-        Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
-        Field("gnss_velocity", (3,), "m/s", "velocity of the primary antenna, in G"),
-        Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
+        Field("measurement", (MAX_BLOCKS, 3), "mixed", "blocks of the measurement: antenna position, relative to the reference antenna, baseline and velocity in G, pixels, other sensors; beyond a block's own numbers zeros"),
         # the filter
         Field("r_hat", (3,), "m", "estimated position in I"),
         Field("v_hat", (3,), "m/s", "estimated velocity in I"),
@@ -230,8 +227,7 @@ PARTS: tuple[tuple[str, tuple[Field, ...]], ...] = (
         Field("P_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below P in the joint covariance"),
     )),
     ("aids", (
-        # sensors other than GNSS and camera, in the order of Aid
-        Field("aid_measurement", (AID_ROWS, 3), "mixed", "measurements, a row for each block; beyond a sensor's own numbers zeros"),
+        # errors of sensors other than GNSS and camera, in the order of Aid
         Field("aid_vector", (AIDS, 3), "T", "true slow error of three numbers in B: hard iron"),
         Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination minus the assumed one"),
         Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),

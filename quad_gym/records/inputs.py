@@ -8,12 +8,10 @@ from numpy.typing import NDArray
 
 from quad_gym.records.layout import block_dtype
 from quad_gym.records.sizes import (
-    AID_ROWS,
-    AIDS,
     MAX_BLOCKS,
-    MAX_FEATURES,
     MAX_SLOW,
     MAX_STATES,
+    SENSOR_GROUPS,
     Field,
 )
 
@@ -199,25 +197,12 @@ class SensorReading(NamedTuple):
 SAMPLE = np.dtype([("gyro", "f8", 3), ("accel", "f8", 3), ("dt", "f8"), ("gyro_before", "f8", 3)])
 """An IMU sample that propagates the estimate; `gyro_before` is the one before, for lever arms."""
 
-NOISE_FIELDS = (
-    "position_sigma_I",
-    "baseline_noise",
-    "baseline_sigma",
-    "velocity_sigma",
-    "pixel_sigma",
-)
-"""Parameters that a measurement may replace, in addition to `aid_sigma`."""
-
 MEASUREMENT = np.dtype(
     [
         ("valid", "f8", MAX_BLOCKS),  # 1 where a block is measured
-        *((name, "f8", 3) for name in ("gnss_position", "gnss_baseline", "gnss_velocity")),
-        ("pixels", "f8", (MAX_FEATURES, 2)),
-        ("aid_measurement", "f8", (AID_ROWS, 3)),
-        # noise; NaN: as in the parameters
-        ("position_sigma_I", "f8", 3),
-        *((name, "f8") for name in NOISE_FIELDS[1:]),
-        ("aid_sigma", "f8", AIDS),
+        ("measurement", "f8", (MAX_BLOCKS, 3)),  # as in a flight's record
+        # standard deviations of readings, NaN: as in the parameters; positions have three
+        ("sigma", "f8", (SENSOR_GROUPS, 3)),
     ]
 )
 """Measurements of one instant; see `quad_gym.estimation.inputs.Measurement`."""

@@ -157,11 +157,7 @@ _NOT_WRITTEN = {
     "gyro",
     "accel",
     "block_valid",
-    "gnss_position",
-    "gnss_baseline",
-    "gnss_velocity",
-    "pixels",
-    "aid_measurement",
+    "measurement",
     "imu_turn",
     "imu_velocity",
     "imu_position",
@@ -176,12 +172,12 @@ def words_of_update(settings: Any, used: frozenset[str]) -> tuple[NDArray[np.uin
     of a flight's record that are in use.
     """
     blocks = tuple(map(int, settings["sensor_blocks"]))
-    return _words(used, int(settings["feature_count"]), int(settings["slow_states"]), blocks)
+    return _words(used, int(settings["slow_states"]), blocks)
 
 
 @functools.cache
 def _words(
-    used: frozenset[str], features: int, slow: int, sensor_blocks: tuple[int, ...]
+    used: frozenset[str], slow: int, sensor_blocks: tuple[int, ...]
 ) -> tuple[NDArray[np.uint64], int]:
     written: list[NDArray[np.int64]] = []
     read: list[NDArray[np.int64]] = []
@@ -192,23 +188,21 @@ def _words(
                 first = offset_of(FLIGHT_BLOCK, name) // (REAL_BYTES * WIDTH)
                 words = first + np.arange(np.prod(shape, dtype=int)).reshape(shape)
                 (read if name in _NOT_WRITTEN else written).append(
-                    _in_use(name, words, features, slow, sensor_blocks)
+                    _in_use(name, words, slow, sensor_blocks)
                 )
     words = np.concatenate([*written, *read])
     return WIDTH * words.astype(np.uint64), sum(map(len, written))
 
 
 def _in_use(
-    name: str, words: NDArray[np.int64], features: int, slow: int, sensor_blocks: tuple[int, ...]
+    name: str, words: NDArray[np.int64], slow: int, sensor_blocks: tuple[int, ...]
 ) -> NDArray[np.int64]:
     """The words of a field that a configuration uses."""
     if name == "P":
         return words[np.tril_indices(len(words))]
     if name == "P_slow":
         return words[:slow][np.tri(slow, words.shape[1], 15, dtype=bool)]
-    if name == "pixels":
-        words = words[:features]
-    elif name == "slow_hat":
+    if name == "slow_hat":
         words = words[:slow]
     elif words.ndim > 0 and len(words) == MAX_BLOCKS:
         blocks = [

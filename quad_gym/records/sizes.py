@@ -4,13 +4,16 @@ import os
 from typing import NamedTuple
 
 from quad_gym.records.enums import (
-    AID_FREEDOMS,
     AID_MOST,
     AID_TRIPLES,
-    BLOCK_FREEDOMS,
+    DIRECTIONS,
+    GROUP_COUNT,
+    GROUP_FREEDOMS,
+    LENGTHS,
+    MOST_BLOCKS,
     OWN_ERRORS,
+    READINGS,
     Aid,
-    Block,
     FaultKind,
     Sensor,
 )
@@ -121,7 +124,6 @@ HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY, HEADING_GIVEN = 0.0, 1.0, 2.0, 
 """Rules of a reference's heading: toward a point, along a direction, along the velocity, by yaw."""
 MAX_GATES = 8  #: largest number of gates on a course
 MAX_START_VELOCITY, MAX_START_RATE = 1.5, 2.0  #: largest velocity and body rate of a moving start on each axis: [m/s], [rad/s]
-MAX_FEATURES = 16  #: largest number of a camera's features
 MAX_OBSTACLES = 32  #: largest number of obstacles in a world
 MAX_UNDER_WAY = 2  #: longest latency of a sensor in its periods, and so the most measurements in transit
 DELAY_SLOTS = MAX_UNDER_WAY + 1
@@ -132,35 +134,36 @@ SENSORS = len(Sensor)  #: number of sensors other than the IMU
 KINDS = 1 << SENSORS  #: number of sets of sensors that can measure at an instant, the empty set included
 AIDS = len(Aid)  #: number of sensors with parameters in the fields `aid_...`, which come last
 FIRST_AID = SENSORS - AIDS  #: first sensor with parameters in the fields `aid_...`
-POSITION_BLOCK = int(Block.POSITION)
-BASELINE_BLOCK = int(Block.BASELINE)
-VELOCITY_BLOCK = int(Block.VELOCITY)
-FEATURE_BLOCKS = int(Block.FEATURES)  #: indices of the blocks in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i
-AID_BLOCKS = FEATURE_BLOCKS + MAX_FEATURES  #: first block of the other sensors
-AID_ROW = tuple(sum(AID_MOST[:aid]) for aid in Aid)  #: first row of each aiding sensor in `aid_measurement`
-AID_ROWS = sum(AID_MOST)  #: number of these rows
-MAX_BLOCKS = AID_BLOCKS + AID_ROWS  #: number of blocks: antenna position, baseline, velocity, features, other sensors
-AID_BLOCK = tuple(AID_BLOCKS + row for row in AID_ROW)  #: first block of each aiding sensor
-FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *AID_BLOCK)  #: first block of each sensor
+SENSOR_GROUPS = len(READINGS)  #: number of groups of the gate: positions, baselines, velocities, images, other sensors
+FIRST_GROUP = tuple(sum(GROUP_COUNT[:sensor]) for sensor in Sensor)  #: first group of each sensor
+AID_GROUPS = FIRST_GROUP[FIRST_AID]  #: first group of the sensors with parameters in the fields `aid_...`
+GROUP_BLOCK = tuple(sum(MOST_BLOCKS[:group]) for group in range(SENSOR_GROUPS))  #: first block of each group in a flight's fields of measurements and innovations
+MAX_BLOCKS = sum(MOST_BLOCKS)  #: number of blocks: antenna position, baseline, velocity, features, other sensors
+FIRST_BLOCK = tuple(GROUP_BLOCK[group] for group in FIRST_GROUP)  #: first block of each sensor
+BLOCKS_OF = {name: slice(first, first + most) for name, first, most in zip(READINGS, GROUP_BLOCK, MOST_BLOCKS, strict=True)}
+"""Blocks by the names of readings."""
+POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK, FEATURE_BLOCKS = (
+    BLOCKS_OF[name].start for name in ("gnss_position", "gnss_baseline", "gnss_velocity", "pixels"))
+"""Blocks of GNSS, and the first of the camera; feature i is FEATURE_BLOCKS + i."""
+FEATURE_SLICE = BLOCKS_OF["pixels"]  #: blocks of the features
+MAX_FEATURES = FEATURE_SLICE.stop - FEATURE_SLICE.start  #: largest number of a camera's features
+AID_BLOCK = FIRST_BLOCK[FIRST_AID:]  #: first block of each aiding sensor
+AID_BLOCKS, AID_ROWS = AID_BLOCK[0], sum(AID_MOST)  #: first of their blocks, and number of these
 AID_NUMBERS = tuple(sum(AID_TRIPLES[:aid]) for aid in Aid)  #: first row of each aiding sensor in `aid_numbers`
-FEATURE_SLICE = slice(FEATURE_BLOCKS, AID_BLOCKS)  #: blocks of the features
 MAX_TOGETHER = max(AID_BLOCKS + 4, FEATURE_BLOCKS + AID_ROWS)
 """Largest number of blocks of an instant: all of GNSS and camera and four more, or all of the other
 sensors and GNSS."""
 MAX_MEASUREMENTS = 3 * MAX_TOGETHER  #: largest length of the stacked measurement; a direction has three numbers
-AID_GROUPS = len(Block)  #: first group of the other sensors
-SENSOR_GROUPS = AID_GROUPS + AIDS  #: number of groups of the gate: positions, baselines, velocities, images, other sensors
-FIRST_GROUP = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_GROUPS, SENSOR_GROUPS))  #: first group of each sensor
-GROUP_COUNT = (FEATURE_BLOCKS, *[1] * (SENSORS - 1))  #: number of groups of each sensor
-GROUP_FREEDOMS = (*BLOCK_FREEDOMS, *AID_FREEDOMS)  #: degrees of freedom of a block of each group
-SEVERAL = (FEATURE_BLOCKS, *(AID_GROUPS + aid for aid in Aid if AID_MOST[aid] > 1))
+SEVERAL = tuple(group for group in range(SENSOR_GROUPS) if MOST_BLOCKS[group] > 1)
 """Groups of several blocks, which support each other: images, for example."""
 WITH_OWN_ERROR = tuple(AID_GROUPS + aid for aid in Aid if OWN_ERRORS[aid])
 """Groups of sensors whose own error is among the states."""
-BLOCK_NUMBERS = (3, 3, *AID_FREEDOMS)  #: length of a block of each sensor: a direction is a unit vector
-FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1),
-            *(freedoms for freedoms, most in zip(AID_FREEDOMS, AID_MOST, strict=True) for _ in range(most)))
-"""Degrees of freedom of the blocks: a direction has two."""
+_GROUP_OF = tuple(group for group in range(SENSOR_GROUPS) for _ in range(MOST_BLOCKS[group]))
+FREEDOMS = tuple(GROUP_FREEDOMS[group] for group in _GROUP_OF)  #: degrees of freedom of the blocks: a direction has two
+BLOCK_NUMBERS = tuple(3 if DIRECTIONS[group] else LENGTHS[group] for group in FIRST_GROUP)
+"""Numbers of a block of each sensor in the stacked measurement: a direction is a unit vector."""
+DIRECTION_BLOCKS = tuple((GROUP_BLOCK[g], GROUP_BLOCK[g] + MOST_BLOCKS[g]) for g in range(SENSOR_GROUPS) if DIRECTIONS[g])
+"""First and end of each range of blocks that are directions."""
 MAX_OBSERVATION = 512  #: largest length of an observation
 WARM_DRAWS = 21  #: standard normals for the errors of a warm start: 15 for the states, 6 for the true biases
 MAX_SLOW = 9

@@ -142,19 +142,19 @@ class SuiteModel:
             return np.flatnonzero(valid[:, block])
 
         if gnss is not None and (rows := seen(POSITION_BLOCK)).size:
-            R_IB, w = transposed(at(Sensor.GNSS).R_BI[rows]), at(Sensor.GNSS).w[rows]
+            R_IB, w = transposed(at(Sensor["GNSS"]).R_BI[rows]), at(Sensor["GNSS"]).w[rows]
             lever = np.array(gnss.primary_antenna_B)
             H = jacobian(rows, 3, r=EYE, e=-R_IB @ cross(lever), drift=EYE)
-            yield rows, H, np.square(gnss.position_sigma_I), Sensor.GNSS
+            yield rows, H, np.square(gnss.position_sigma_I), Sensor["GNSS"]
             if gnss.velocity_sigma is not None:
                 H = jacobian(rows, 3, v=EYE, e=-R_IB @ cross(np.cross(w, lever)))
-                yield rows, H, [gnss.velocity_sigma**2] * 3, Sensor.GNSS
+                yield rows, H, [gnss.velocity_sigma**2] * 3, Sensor["GNSS"]
         if gnss is not None and gnss.has_baseline and (rows := seen(BASELINE_BLOCK)).size:
-            R_IB = transposed(at(Sensor.GNSS).R_BI[rows])
+            R_IB = transposed(at(Sensor["GNSS"]).R_BI[rows])
             b = gnss.baseline_B / np.linalg.norm(gnss.baseline_B)
             heading = (R_IB @ np.cross([0.0, 0.0, 1.0], b))[..., np.newaxis]
             H = jacobian(rows, 3, e=-R_IB @ cross(b), heading=heading)
-            yield rows, H, [gnss.baseline_sigma**2] * 3, Sensor.GNSS
+            yield rows, H, [gnss.baseline_sigma**2] * 3, Sensor["GNSS"]
         barometer, magnetometer = self.sensors.barometer, self.sensors.magnetometer
         if barometer is not None and (rows := seen(AID_BLOCK[Aid["BAROMETER"]])).size:
             H = jacobian(rows, 1, r=EYE[2:], barometer=1.0)
@@ -175,7 +175,7 @@ class SuiteModel:
                 yield rows, H, variance, Sensor[aid.name]
         new = valid[:, FEATURE_SLICE]
         if camera is not None and (rows := np.flatnonzero(new.any(axis=1))).size:
-            truth, X_I = at(Sensor.CAMERA), features[rows]
+            truth, X_I = at(Sensor["CAMERA"]), features[rows]
             R_BI = truth.R_BI[rows][:, np.newaxis]
             X_B = apply(R_BI, X_I - truth.r[rows][:, np.newaxis])
             J = projection(camera, X_B)
@@ -185,7 +185,7 @@ class SuiteModel:
             variance = camera.pixel_sigma**2 + blur**2
             variance = np.where(new[rows][:, : X_I.shape[1]], variance, np.inf)
             H = jacobian(rows, 2 * X_I.shape[1], r=r, e=e)
-            yield rows, H, np.repeat(variance, 2, axis=1), Sensor.CAMERA
+            yield rows, H, np.repeat(variance, 2, axis=1), Sensor["CAMERA"]
 
     def _derivatives(self, aid: Aid, truth: Truth) -> tuple[Floats, Floats]:
         """Derivatives (n, m, 9) of all blocks of a sensor, and variances (n, m), of its kernel."""

@@ -117,7 +117,7 @@ def bound_over_time(
         batch.step()
         past.append(_truth(batch))
         F, Q = model.transition(past[-2], past[-1], batch.vehicle.gravity)
-        if tick <= delays[Sensor.GNSS] and "drift" in model.parts:
+        if tick <= delays[Sensor["GNSS"]] and "drift" in model.parts:
             Q[:, model.parts["drift"]] = 0.0  # a fix of the start arrives, without drift
         recursion.predict(F, Q)
         valid = batch.record("block_valid") > 0.0

@@ -63,7 +63,7 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
 
     Stages then have their mean cost, even if sensors do not measure in every tick.
     """
-    clocks = batch._settings["sensor_ticks"][0][[Sensor.GNSS, Sensor.CAMERA]]
+    clocks = batch._settings["sensor_ticks"][0][[Sensor["GNSS"], Sensor["CAMERA"]]]
     period = math.lcm(*(int(clock) for clock in clocks if clock > 0))
     blocks = batch.snapshot()
     for instant in range(period):

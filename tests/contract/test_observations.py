@@ -6,7 +6,7 @@ import pytest
 import quad_gym
 from quad_gym.envs.spaces import layout_bounds
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.params.suites import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.records import (
     COLUMNS,
     FEATURE_BLOCKS,

@@ -15,7 +15,7 @@ import numpy as np
 import quad_gym
 from quad_gym import Uniform
 from quad_gym.faults import PRESETS
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import ALL_SUITES, SUITES
 from quad_gym.records import COLUMNS
 

@@ -20,7 +20,7 @@ import quad_gym
 from quad_gym.estimation import calibrate, read_log
 from quad_gym.logs.calibrating.calibration import _prior_of
 from quad_gym.logs.calibrating.search import numbers_in
-from quad_gym.params.suites import SENSOR_PARAMS
+from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.logged_flights import Recorded, flown
 

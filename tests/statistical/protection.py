@@ -15,7 +15,8 @@ import numpy as np
 from quad_gym import Trajectory
 from quad_gym.estimation import read_log, replay
 from quad_gym.logs.replaying.rules import changes
-from quad_gym.params.suites import ALL_SUITES, SENSOR_PARAMS, sensor_suite
+from quad_gym.params.sensor_table import SENSOR_PARAMS
+from quad_gym.params.suites import ALL_SUITES, sensor_suite
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.many_logs import logs_of
 from tests.statistical.verdicts import position_errors, rows, start_of

@@ -33,7 +33,7 @@ def test_a_barometer_measures_height_bias_and_white_noise():
     batch = fly(AIDED, 2000, task="hover")
     steps(batch, 0.02)
     assert batch.record("block_valid")[:, AIDED_BLOCKS].all()
-    z = batch.record("aid_measurement")[:, BAROMETER]
+    z = batch.record("measurement")[:, AID_BLOCKS:][:, BAROMETER]
     bias = batch.record("aid_scalar")[:, BAROMETER]
     noise = z[:, 0] - batch.record("r")[:, 2] - bias
     assert noise.std() == pytest.approx(AIDED.barometer.noise_sigma, rel=0.07)
@@ -70,7 +70,7 @@ def test_a_magnetometer_measures_the_field_with_its_errors():
     hard_iron = batch.record("aid_vector")[:, MAGNETOMETER]
     soft_iron = batch.record("aid_matrix")[:, MAGNETOMETER]
     expected = field_B(batch, magnetometer, declination, soft_iron) + hard_iron
-    noise = batch.record("aid_measurement")[:, MAGNETOMETER] - expected
+    noise = batch.record("measurement")[:, AID_BLOCKS:][:, MAGNETOMETER] - expected
     assert noise.std() == pytest.approx(magnetometer.noise_sigma, rel=0.05)
     assert (abs(noise.mean(axis=0)) < 5.0 * magnetometer.noise_sigma / np.sqrt(2000)).all()
     assert hard_iron.std() == pytest.approx(magnetometer.hard_iron_sigma, rel=0.05)
@@ -115,12 +115,16 @@ def test_late_measurements_arrive_with_values_of_their_measurement_time(periods)
     delay, noise, truth = 4 * periods, [], []
     for tick in range(60):
         # both fly on estimates, which differ: only the noise is common to both
-        noise.append(prompt.record("aid_measurement")[:, BAROMETER, 0] - undisturbed(prompt))
+        noise.append(
+            prompt.record("measurement")[:, AID_BLOCKS:][:, BAROMETER, 0] - undisturbed(prompt)
+        )
         truth.append(undisturbed(delayed))
         if tick % 4 == 0:
             assert (delayed.record("block_valid")[:, AIDED_BLOCKS] == (tick >= delay)).all()
         if tick % 4 == 0 and tick >= delay:
-            arrived = delayed.record("aid_measurement")[:, BAROMETER, 0] - truth[tick - delay]
+            arrived = (
+                delayed.record("measurement")[:, AID_BLOCKS:][:, BAROMETER, 0] - truth[tick - delay]
+            )
             np.testing.assert_allclose(arrived, noise[tick - delay], atol=1e-9)
         prompt.step()
         delayed.step()
@@ -173,7 +177,7 @@ def test_observation_and_info_contain_aid_measurements():
     table = {field.name: field.slice for field in flights.table}
     for _ in range(3):
         observation, _, _, _, info = env.step(np.zeros(4, np.float32))
-        measured = flights.batch.record("aid_measurement")[0]
+        measured = flights.batch.record("measurement")[0, AID_BLOCKS:]
         np.testing.assert_allclose(observation[table["barometer"]], measured[0, :1], rtol=1e-6)
         scaled = measured[1] / AIDED.magnetometer.strength
         np.testing.assert_allclose(observation[table["magnetometer"]], scaled, rtol=1e-6)

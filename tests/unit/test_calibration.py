@@ -32,9 +32,9 @@ from quad_gym.logs.calibrating.search import (
 )
 from quad_gym.logs.formats import Log, Stream
 from quad_gym.logs.replaying.results import Finding, Severity, correlation_time
-from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.range_finder import RangeFinderParams
-from quad_gym.params.suites import CONSUMER, SENSOR_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_PARAMS
+from quad_gym.params.suites import CONSUMER
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.console_commands import run
 from tests.logged_flights import Recorded, flown

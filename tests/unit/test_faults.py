@@ -27,8 +27,9 @@ from quad_gym.faults import (
     faults_of,
 )
 from quad_gym.frames import ecef_to_enu
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.records import (
+    AID_BLOCKS,
     BASELINE_BLOCK,
     FEATURE_SLICE,
     POSITION_BLOCK,
@@ -359,7 +360,7 @@ def test_disturbed_magnetometer_is_turned_near_iron_or_frozen(latency):
         fields = []
         for _ in range(200):
             step(calm, faulty)
-            measured = (batch.record("aid_measurement") for batch in (calm, faulty))
+            measured = (batch.record("measurement")[:, AID_BLOCKS:] for batch in (calm, faulty))
             fields.append([rows[:, Aid.MAGNETOMETER] for rows in measured])
         found[how] = np.array(fields)
     t = DT * np.arange(1, 201)

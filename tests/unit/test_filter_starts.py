@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
-from quad_gym.records import Aid, joint_covariance
+from quad_gym.records import joint_covariance
 from tests.field_flights import fly
 from tests.filter_states import set_at_rest
 from tests.level_flights import MAGNETIC, R_IG, LevelFlight
@@ -77,11 +77,11 @@ def test_batch_and_filter_class_start_with_same_heading_from_magnetometer(suite)
     batch, kf = fly(suite, 4, task="hover", seed=3), UnscentedKalmanFilter(suite)
     read = {
         name: batch.record(name)
-        for name in ("R_hat", "r_hat", "v_hat", "P", "P_slow", "gnss_position", "aid_measurement")
+        for name in ("R_hat", "r_hat", "v_hat", "P", "P_slow", "gnss_position", "magnetometer")
     }
     states = int(kf._engine.settings["slow_states"][0])
     for n in range(4):
-        field = read["aid_measurement"][n, Aid.MAGNETOMETER]
+        field = read["magnetometer"][n]
         kf.initialize(read["gnss_position"][n], magnetometer=field)
         np.testing.assert_allclose(kf.R_BI, read["R_hat"][n], atol=1e-12)
         np.testing.assert_allclose(kf.position, read["r_hat"][n], atol=1e-12)

@@ -39,7 +39,7 @@ def test_measurements_have_the_closed_form_and_their_noise():
         R_BI = quaternion_to_dcm(batch.record("q"))
         rows = zip(*states, R_BI, strict=True)
         truth = np.array([expected(r, v, R, w)[:3] for r, v, w, R in rows])
-        measured = batch.record("aid_measurement")
+        measured = batch.record("measurement")[:, AID_BLOCKS:]
         valid = batch.record("block_valid")[:, AID_BLOCKS + FLOW : AID_BLOCKS + RANGE + 1].all(
             axis=1
         )  # flow in range

@@ -8,7 +8,7 @@ import quad_gym
 from quad_gym import FlightBatch, TaskParams, sensor_suite
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.flights import COLUMNS
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.records import Source
 from quad_gym.tasks.view import VIEW_FIELDS
 from tests import builders

@@ -20,6 +20,7 @@ from quad_gym.params.task import TaskParams
 from quad_gym.records import (
     AID_MOST,
     AIDS,
+    BASELINE_BLOCK,
     DRAW_FAULTS,
     DRAW_RANGES,
     DRAWS_OF_FAULT,
@@ -29,6 +30,7 @@ from quad_gym.records import (
     MAX_FEATURES,
     MAX_OBSTACLES,
     MAX_SLOW,
+    POSITION_BLOCK,
     FaultKind,
     streams,
 )
@@ -259,8 +261,10 @@ def readings():
         sense_gnss(flight, params, True)
         sense_features(flight, params, len(features))
         step_biases(flight, params)
-        names = ("accel", "gyro", "gnss_position", "gnss_baseline", "b_a", "b_g", "pixels")
-        rows.append(np.concatenate([flight[name][0].ravel() for name in names]))
+        z = flight["measurement"][0]
+        fix = [z[POSITION_BLOCK], z[BASELINE_BLOCK]]
+        numbers = [*(flight[name][0] for name in ("accel", "gyro", "b_a", "b_g")), *fix]
+        rows.append(np.concatenate([*numbers, z[FEATURE_SLICE, :2].ravel()]))
     assert flight["block_valid"][:, FEATURE_SLICE].sum() == len(features)
     noise = np.array(rows)
     return (noise - noise.mean(axis=0)) / noise.std(axis=0)
@@ -270,7 +274,7 @@ def test_different_noises_are_independent(readings):
     correlation = readings.T @ readings / INSTANTS
     # components of one GNSS vector are correlated in G, where its covariance is not diagonal
     same = np.eye(len(correlation), dtype=bool)
-    same[6:9, 6:9] = same[9:12, 9:12] = True
+    same[12:15, 12:15] = same[15:18, 15:18] = True
     scores = correlation[~same] * np.sqrt(INSTANTS)
     assert np.abs(scores).max() < alarm_score(scores.size)
 

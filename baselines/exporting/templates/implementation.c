@@ -69,12 +69,7 @@ int qg_update(qg_filter *f, const qg_measurements *m, double time)
 {
     qg_measurement_record r = {0};
     qg_input_record input = {0};
-@TAKE@@IF CAMERA@
-    for (int i = 0; m->pixels && i < QG_FEATURES; i++)
-        r.valid[@FEATURE_BLOCKS@ + i] = qgi_put(r.pixels[i], m->pixels + 2 * i, 2);
-    r.pixel_sigma = m->pixel_sigma;
-@END@
-    input.time = time;
+@TAKE@    input.time = time;
     input.rank = @RANK@; /* as in a replay */
     return qgi_take(f, &input, &r);
 }

@@ -88,11 +88,7 @@ int qg_predict(qg_filter *filter, const double gyro[3], const double accel[3], d
 /* Measurements of one instant, for one joint update. NULL: not measured. Standard deviations are
  * per axis; 0 or NULL: the suite's. */
 typedef struct {
-@FIELDS_OF_MEASUREMENTS@@IF CAMERA@
-    const double *pixels; /* [QG_FEATURES][2] from the image's center; NaN: not seen */
-    double pixel_sigma;   /* [pixels] */
-@END@
-} qg_measurements;
+@FIELDS_OF_MEASUREMENTS@} qg_measurements;
 
 /* Update the estimate. A time stamp may be late, back to qg_oldest_time: everything since then is
  * filtered again, with bitwise the result of timely arrival. It may also be later than the filter:

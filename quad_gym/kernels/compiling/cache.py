@@ -52,8 +52,8 @@ _IMPORTED: dict[str, tuple[int, float]] = {}
 """Modules with kernels: the identity of their names, and when the first kernel was made [s]."""
 _FILES: dict[str, Path] = {}
 """Files of the modules of which there are digests."""
-_TABLE = f"{PACKAGE}.params.aid_table"
-"""Module of parameters of which code depends on the values `AID_SHAPES` only."""
+_TABLE = f"{PACKAGE}.params.sensor_table"
+"""Module of parameters of which code depends on the values `SENSOR_SHAPES` only."""
 
 
 def digest_of(module: str) -> str:
@@ -84,7 +84,7 @@ def _read(name: str) -> tuple[str, list[str]]:
     if name in _NO_CODE or module is None or module.__file__ is None:
         return "", []
     if name == _TABLE:
-        return hashlib.sha256(repr(module.AID_SHAPES).encode()).hexdigest(), []
+        return hashlib.sha256(repr(module.SENSOR_SHAPES).encode()).hexdigest(), []
     _FILES[name] = Path(module.__file__)
     return _parsed(Path(module.__file__).read_bytes(), module.__package__ or "")
 

@@ -29,10 +29,9 @@ from quad_gym.kernels.numbers.linalg import (
     store,
 )
 from quad_gym.records import (
-    AID_BLOCKS,
     BASELINE_BLOCK,
     BLOCK_NUMBERS,
-    FEATURE_BLOCKS,
+    DIRECTION_BLOCKS,
     FIRST_BLOCK,
     MAX_BLOCKS,
     MAX_STATES,
@@ -351,7 +350,10 @@ def without_directions(flight, p, work, settings):
 @kernel
 def is_direction(block):
     """True if a block is a unit vector: a baseline or a feature."""
-    return block == BASELINE_BLOCK or FEATURE_BLOCKS <= block < AID_BLOCKS
+    found = False
+    for first, end in DIRECTION_BLOCKS:
+        found = found | (first <= block < end)
+    return found
 
 
 @kernel

@@ -80,9 +80,8 @@ from quad_gym.kernels.numbers.linalg import (
 )
 from quad_gym.kernels.numbers.rotation import level_attitude, vector_to_dcm
 from quad_gym.records import (
-    AID_BLOCKS,
+    AID_BLOCK,
     AID_NUMBERS,
-    AID_ROW,
     BASELINE_BLOCK,
     SENSOR_GROUPS,
     VELOCITY_BLOCK,
@@ -91,8 +90,7 @@ from quad_gym.records import (
 )
 
 _MAGNETOMETER = int(Aid["MAGNETOMETER"])
-_FIELD, _FIELD_ROW = AID_NUMBERS[_MAGNETOMETER], AID_ROW[_MAGNETOMETER]
-_FIELD_BLOCK = AID_BLOCKS + _FIELD_ROW
+_FIELD, _FIELD_BLOCK = AID_NUMBERS[_MAGNETOMETER], AID_BLOCK[_MAGNETOMETER]
 
 # the model
 _LEVELING, _FIRST_LEVELING = 0.1, 0.06
@@ -230,7 +228,7 @@ def _measure_motion(flight, p, work, mask):
     fix = mask & (flight.block_valid[VELOCITY_BLOCK] > 0.0) & (flight.level_phase > 0.0)
     if not any_of(fix):
         return
-    z, zero = load33(p.R_IG) @ load3(flight.gnss_velocity), zero_like(p.dt)
+    z, zero = load33(p.R_IG) @ load3(flight.measurement[VELOCITY_BLOCK]), zero_like(p.dt)
     sums, last, x, P = (
         load3(work.since_level),
         flight.level_last,
@@ -508,12 +506,12 @@ def _hold_attitude(flight, p, work, settings, slow, mask, pushed):
     turn = _turn_of(zero + 1.0, zero)
     paired = lanes & (flight.block_valid[BASELINE_BLOCK] > 0.0)
     if any_of(paired):
-        b_B, b_I = load3(p.baseline), load33(p.R_IG) @ load3(flight.gnss_baseline)
+        b_B, b_I = load3(p.baseline), load33(p.R_IG) @ load3(flight.measurement[BASELINE_BLOCK])
         turn, shown = select(paired, level_attitude(R_BI.T @ b_B, b_I), turn), paired
     if iron >= 0:
         field = lanes & (flight.block_valid[_FIELD_BLOCK] > 0.0) & (flight.compass_out <= 0.0)
         level = level_attitude(
-            R_BI.T @ load3(flight.aid_measurement[_FIELD_ROW]), load3(p.aid_numbers[_FIELD])
+            R_BI.T @ load3(flight.measurement[_FIELD_BLOCK]), load3(p.aid_numbers[_FIELD])
         )
         turn, shown = select(field, level, turn), shown | field
     sigma = select(shown, _ALIGNED, MAX_ANGLE)

@@ -35,11 +35,13 @@ from quad_gym.kernels.numbers.random import normal_pair, six_normals, stream_of
 from quad_gym.kernels.numbers.rotation import euler_to_dcm, level_attitude, quaternion_to_dcm
 from quad_gym.records import (
     AIDS,
+    BASELINE_BLOCK,
     DRAW_FIRST_BIASES,
     DRAW_MARK,
     DRAW_SLOW,
     DRAW_WARM,
     DRAW_WARM_DRIFT,
+    POSITION_BLOCK,
     WARM_DRAWS,
 )
 from quad_gym.records.inputs import MIN_COURSE, Outcome
@@ -191,7 +193,7 @@ def initialize(flight, p, mask, x_I, v_I=_NOTHING, v_variance=_NOTHING, tilt_var
     heading = select(placed, inflation * p.heading_sigma, heading)
 
     R_IG = load33(p.R_IG)
-    baseline_I = unit_or(R_IG @ load3(flight.gnss_baseline), (0.0, 0.0, 1.0))
+    baseline_I = unit_or(R_IG @ load3(flight.measurement[BASELINE_BLOCK]), (0.0, 0.0, 1.0))
     nothing = zero_like(x_I)
     x_B = (nothing[0] + 1.0, nothing[1], nothing[2])
     ahead = outer(x_B, select(placed, x_I, nothing))
@@ -201,7 +203,7 @@ def initialize(flight, p, mask, x_I, v_I=_NOTHING, v_variance=_NOTHING, tilt_var
     level = p.initial_tilt_sigma > 0.0
     ahead_B, ahead_I = select(placed, x_B, baseline_B), select(placed, x_I, baseline_I)
     R_BI = select(level, level_attitude(ahead_B, ahead_I), R_BI)
-    antenna_I = R_IG @ load3(flight.gnss_position)
+    antenna_I = R_IG @ load3(flight.measurement[POSITION_BLOCK])
     keep(flight.R_hat, mask, R_BI)
     keep(flight.r_hat, mask, antenna_I - R_BI.T @ load3(p.antenna))
     keep(flight.v_hat, mask, v_I)

@@ -14,10 +14,10 @@ from quad_gym.kernels.numbers.lanes import select, zero_like
 from quad_gym.kernels.numbers.linalg import diagonal, load3
 from quad_gym.kernels.numbers.random import normal_pair, stream_of
 from quad_gym.kernels.sensors.common import aid_stage
-from quad_gym.records import AID_ROW, DRAW_AID, Aid
+from quad_gym.records import AID_BLOCK, DRAW_AID, Aid
 
 _S = int(Aid["BAROMETER"])
-_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
+_BLOCK, _DRAW = AID_BLOCK[_S], DRAW_AID[_S]
 
 
 @kernel
@@ -32,7 +32,7 @@ def _expect(flight, p, work, settings, i, k, valid):
     first, sigma, last = settings.aid_scalar[_S], p.aid_sigma[_S], columns_of(settings) - 1
     altitude, zero = flight.r_hat[2] + flight.slow_hat[first], zero_like(sigma)
     noise = diagonal((sigma * sigma, zero + 1.0, zero + 1.0))
-    z = load3(flight.aid_measurement[_ROW])
+    z = load3(flight.measurement[_BLOCK])
     put_block(work, settings, k, valid, z, (altitude, zero, zero), noise)
     for j in range(last + 1):
         value = work.L[settings.motion_columns + first, j]

@@ -58,7 +58,7 @@ from quad_gym.records import (
     Sensor,
 )
 
-_CAMERA = int(Sensor.CAMERA)
+_CAMERA = int(Sensor["CAMERA"])
 _PIXEL = 2e-6  #: [m]; it cancels, so it is no parameter: the report writes rays in meters
 
 
@@ -83,8 +83,9 @@ def measure(flight, p, feature_count, mask):
         seen = seen & mask
         if any_of(seen):
             n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
-            flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
-            flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
+            pixel = flight.measurement[FEATURE_BLOCKS + i]
+            pixel[0] = select(seen, x + p.pixel_sigma * n_x, pixel[0])
+            pixel[1] = select(seen, y + p.pixel_sigma * n_y, pixel[1])
         before = flight.block_valid[FEATURE_BLOCKS + i]
         flight.block_valid[FEATURE_BLOCKS + i] = select(mask, select(seen, 1.0, 0.0), before)
 
@@ -99,14 +100,14 @@ def _begin(flight, p, settings, mask):
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Take an image when due, with limits of range, blur, ground, obstacles, and faults."""
     due = tick_clock(flight, settings, _CAMERA, mask)
-    begin_sample(flight, work, settings, _CAMERA, flight.pixels, 2, mask)
+    begin_sample(flight, work, settings, _CAMERA, mask)
     if any_of(due):
         measure(flight, p, settings.feature_count, due)
         work.mask = select(due, 1.0, 0.0)
         call_stage(stages, Stage.LIMIT_CAMERA, flight, p, p, settings, work, 0)
         call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
         call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
-    deliver(flight, work, settings, _CAMERA, flight.pixels, 2, mask, due)
+    deliver(flight, work, settings, _CAMERA, mask, due)
 
 
 @kernel
@@ -118,7 +119,7 @@ def _center(flight, p, work, settings, k, i, R_BI, pixel_sigma):
     per_distance = 1.0 / norm(to_feature)
     store(work.X_B[i], X_B)
     work.inverse_distance[i] = per_distance
-    x, y = flight.pixels[i, 0], flight.pixels[i, 1]
+    x, y = flight.measurement[FEATURE_BLOCKS + i, 0], flight.measurement[FEATURE_BLOCKS + i, 1]
     ray_C = (_PIXEL * x, _PIXEL * y, _PIXEL * p.focal_length)
     length, z_hat = norm(ray_C), per_distance * to_feature
     z = R_CB.T @ ((1.0 / length) * ray_C)
@@ -200,4 +201,4 @@ def _reset(flight, p, work, settings):
     reset_variances(P, E, states, lanes, (angle, angle, angle))
 
 
-camera_stage = sensor_stage(Sensor.CAMERA, _begin, _sample, _expect, _reset)
+camera_stage = sensor_stage(Sensor["CAMERA"], _begin, _sample, _expect, _reset)

@@ -15,7 +15,6 @@ from quad_gym.records import (
     AID_BLOCK,
     AID_GROUPS,
     AID_MOST,
-    AID_ROW,
     DELAY_SLOTS,
     DRAW_AID_DRIFT,
     DRAW_AID_MATRIX,
@@ -122,33 +121,32 @@ def stamp(flight, settings, sensor, mask):
 
 
 @kernel
-def exchange(flight, work, block, values, numbers, under_way, mask, taken):
+def exchange(flight, work, block, under_way, mask, taken):
     """Hold back the block that has just been measured, and deliver the one that arrives.
 
     Args:
         flight: Record.
         work: Workspace; reads the results of `begin_sample` and `find_arrivals`.
         block: Number of the block.
-        values: Its numbers in the record.
-        numbers: Count of these numbers.
         under_way: Largest number of measurements in transit.
         mask: Lanes to work on.
         taken: Lanes in which the sensor has measured.
     """
     waiting, flags = flight.waiting[block], flight.waiting_valid[block]
+    values = flight.measurement[block]
     valid, arrived = flight.block_valid[block], zero_like(flight.tick)
     for slot in range(under_way):
         here = work.arrives[slot] > 0.0
-        for i in range(numbers):
+        for i in range(3):
             kept = work.arrived[block, i]
             work.arrived[block, i] = select(here, waiting[slot, i], kept)
         arrived = select(here, flags[slot], arrived)
     if any_of(taken):
         for slot in range(under_way - 1, 0, -1):
-            for i in range(numbers):
+            for i in range(3):
                 waiting[slot, i] = select(taken, waiting[slot - 1, i], waiting[slot, i])
             flags[slot] = select(taken, flags[slot - 1], flags[slot])
-        for i in range(numbers):
+        for i in range(3):
             waiting[0, i] = select(taken, values[i], waiting[0, i])
         flags[0] = select(taken, valid, flags[0])
     flight.block_valid[block] = select(mask, arrived, valid)
@@ -157,28 +155,26 @@ def exchange(flight, work, block, values, numbers, under_way, mask, taken):
 
 
 @kernel
-def deliver_arrived(work, block, values, numbers, mask):
+def deliver_arrived(flight, work, block, mask):
     """Replace the numbers that have just been measured by those that arrived last."""
-    for i in range(numbers):
+    values = flight.measurement[block]
+    for i in range(3):
         values[i] = select(mask, work.arrived[block, i], values[i])
 
 
 @kernel
-def begin_sample(flight, work, settings, sensor, values, numbers, mask):
-    """Invalidate the blocks of the last sample, and keep their numbers if there are delays.
-
-    `values` (blocks, numbers): those of the sensor in the record.
-    """
+def begin_sample(flight, work, settings, sensor, mask):
+    """Invalidate the blocks of the last sample, and keep their numbers if there are delays."""
     first = FIRST_BLOCK[sensor]
     for i in range(settings.sensor_blocks[sensor]):
         flight.block_valid[first + i] = select(mask, 0.0, flight.block_valid[first + i])
         if settings.sensor_delay[sensor] > 0:
-            for n in range(numbers):
-                work.arrived[first + i, n] = values[i][n]
+            for n in range(3):
+                work.arrived[first + i, n] = flight.measurement[first + i, n]
 
 
 @kernel
-def deliver(flight, work, settings, sensor, values, numbers, mask, due):
+def deliver(flight, work, settings, sensor, mask, due):
     """Deliver the measurement of a sensor in the lanes `due`, now or after its latency."""
     first, count = FIRST_BLOCK[sensor], settings.sensor_blocks[sensor]
     if settings.sensor_delay[sensor] == 0:
@@ -188,8 +184,8 @@ def deliver(flight, work, settings, sensor, values, numbers, mask, due):
     elif any_of(due | find_arrivals(flight, work, settings, sensor, mask)):
         taken, under_way = stamp(flight, settings, sensor, mask), settings.under_way[sensor]
         for i in range(count):
-            exchange(flight, work, first + i, values[i], numbers, under_way, mask, taken)
-            deliver_arrived(work, first + i, values[i], numbers, mask)
+            exchange(flight, work, first + i, under_way, mask, taken)
+            deliver_arrived(flight, work, first + i, mask)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -324,7 +320,7 @@ def aid_stage(
             wrong numbers, `numbers` without it; optional.
     """
     s, group, sensor = int(aid), AID_GROUPS + aid, FIRST_AID + int(aid)
-    first, row, several = AID_BLOCK[s], AID_ROW[s], AID_MOST[aid] > 1
+    first, several = AID_BLOCK[s], AID_MOST[aid] > 1
     draw, *align = others or (_draw_nothing,)
     disturbs, disturbed = disturb is not None, disturb or _disturb_nothing
 
@@ -339,22 +335,21 @@ def aid_stage(
         if starting and settings.heading_sensor == sensor and settings.warm == 0:
             # it initializes the filter, which uses it only once
             (x, y, z), _ = measure(flight, p, 0)
-            keep(flight.aid_measurement[row], mask, (x, y, z))
+            keep(flight.measurement[first], mask, (x, y, z))
             flight.block_fresh[first] = select(mask, 1.0, flight.block_fresh[first])
             return
         if settings.faults:
             due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
-        values = flight.aid_measurement[row : row + AID_MOST[s]]
-        begin_sample(flight, work, settings, sensor, values, 3, mask)
+        begin_sample(flight, work, settings, sensor, mask)
         if any_of(due):
             for i in range(settings.sensor_blocks[sensor]):
                 (x, y, z), within = measure(flight, p, i)
                 taken = due & within
                 if disturbs and settings.faults:
                     x, y, z = disturbed(flight, settings, (x, y, z), taken)
-                keep(values[i], taken, (x, y, z))
+                keep(flight.measurement[first + i], taken, (x, y, z))
                 flight.block_valid[first + i] = select(taken, 1.0, flight.block_valid[first + i])
-        deliver(flight, work, settings, sensor, values, 3, mask, due)
+        deliver(flight, work, settings, sensor, mask, due)
 
     @kernel
     def expect_valid(flight, p, work, settings, k):  # type: ignore[no-untyped-def]

@@ -23,6 +23,7 @@ from quad_gym.records import (
     FAULT_KINDS,
     FEATURE_BLOCKS,
     NEVER,
+    POSITION_BLOCK,
     FaultKind,
     FieldFault,
 )
@@ -230,7 +231,7 @@ def _mistake_features(flight, settings, mask):
     for i in range(count):
         valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
         here, there = valid & (rank == first), valid & (rank == second)
-        x, y = flight.pixels[i, 0], flight.pixels[i, 1]
+        x, y = flight.measurement[FEATURE_BLOCKS + i, 0], flight.measurement[FEATURE_BLOCKS + i, 1]
         x_first, y_first = select(here, x, x_first), select(here, y, y_first)
         x_second, y_second = select(there, x, x_second), select(there, y, y_second)
         rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
@@ -240,10 +241,10 @@ def _mistake_features(flight, settings, mask):
     for i in range(count):
         valid = struck & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
         here, there = valid & (rank == first) & swaps, valid & (rank == second)
-        x, y = flight.pixels[i, 0], flight.pixels[i, 1]
+        x, y = flight.measurement[FEATURE_BLOCKS + i, 0], flight.measurement[FEATURE_BLOCKS + i, 1]
         x, y = select(here, x_second, x), select(here, y_second, y)
-        flight.pixels[i, 0] = select(there, x_first, x)
-        flight.pixels[i, 1] = select(there, y_first, y)
+        flight.measurement[FEATURE_BLOCKS + i, 0] = select(there, x_first, x)
+        flight.measurement[FEATURE_BLOCKS + i, 1] = select(there, y_first, y)
         mistaken = select(here | there, 1.0, 0.0)
         flight.feature_mistaken[i] = select(mask, mistaken, flight.feature_mistaken[i])
         rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
@@ -327,7 +328,8 @@ def corrupt_gnss_stage(flight, world, model, settings, work, stages, flag):
     if settings.fault_on[FaultKind.GNSS_OUTLIERS]:
         offset_I = offset_I + _draw_outlier(flight, world, settings, mask)
     offset_G = load33(world.R_IG).T @ offset_I
-    keep(flight.gnss_position, mask, load3(flight.gnss_position) + offset_G)
+    position = flight.measurement[POSITION_BLOCK]
+    keep(position, mask, load3(position) + offset_G)
 
 
 @stage

@@ -74,7 +74,7 @@ def measure_position(flight, p, R_BI, normals, mask):
     antenna_I = load3(flight.r) + R_BI.T @ load3(p.antenna)
     noise_I = vector(s[0] * normals[0], s[1] * normals[1], s[2] * normals[2])
     noise_I = noise_I + load3(flight.gnss_drift)
-    keep(flight.gnss_position, mask, load33(p.R_IG).T @ (antenna_I + noise_I))
+    keep(flight.measurement[POSITION_BLOCK], mask, load33(p.R_IG).T @ (antenna_I + noise_I))
 
 
 @kernel
@@ -98,7 +98,7 @@ def expect_position(flight, p, work, settings, k, valid):
     antenna_I = load3(flight.r_hat) + R_BI.T @ l_B
     if settings.estimates_drift:
         antenna_I = antenna_I + load3(flight.slow_hat)
-    z = load33(p.R_IG) @ load3(flight.gnss_position)
+    z = load33(p.R_IG) @ load3(flight.measurement[POSITION_BLOCK])
     noise = diagonal((s[0] * s[0], s[1] * s[1], s[2] * s[2]))
     put_block(work, settings, k, valid, z, antenna_I, noise)
     for j in range(settings.motion_columns):
@@ -169,14 +169,15 @@ def measure_baseline(flight, p, R_BI, normals, mask):
     """Measure the baseline in G, in the lanes `mask`."""
     r_b = load33(p.R_IG).T @ (R_BI.T @ load3(p.baseline))
     sigma, floor, length = p.baseline_sigma, p.direction_floor, p.baseline_length
-    keep(flight.gnss_baseline, mask, noisy_baseline(r_b, normals, sigma, floor, length))
+    found = noisy_baseline(r_b, normals, sigma, floor, length)
+    keep(flight.measurement[BASELINE_BLOCK], mask, found)
 
 
 @kernel
 def expect_baseline(flight, p, work, settings, k, valid):
     """Fill rows k to k + 2."""
     R_BI, u_B = load33(flight.R_hat), (1.0 / p.baseline_length) * load3(p.baseline)
-    u_I, z = R_BI.T @ u_B, load33(p.R_IG) @ load3(flight.gnss_baseline)
+    u_I, z = R_BI.T @ u_B, load33(p.R_IG) @ load3(flight.measurement[BASELINE_BLOCK])
     noise = direction_noise(u_I, p.baseline_noise * p.baseline_noise, p.direction_floor)
     white = p.baseline_sigma * p.baseline_sigma
     along = select(p.baseline_sigma > _COARSE, 2.0 * white * white, 0.0)
@@ -217,7 +218,7 @@ def measure_velocity(flight, p, mask):
     R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
     n, _ = six_normals(stream_of(flight), DRAW_VELOCITY)
     v_I = load3(flight.v) + R_BI.T @ cross(load3(flight.w), load3(p.antenna))
-    keep(flight.gnss_velocity, mask, R_IG.T @ (p.velocity_sigma * n + v_I))
+    keep(flight.measurement[VELOCITY_BLOCK], mask, R_IG.T @ (p.velocity_sigma * n + v_I))
 
 
 @kernel
@@ -225,7 +226,8 @@ def expect_velocity(flight, p, work, settings, k, valid):
     """Fill rows k to k + 2."""
     R_BI, variance = load33(flight.R_hat), p.velocity_sigma * p.velocity_sigma
     lever_B = cross(load3(flight.w_meas) - load3(flight.b_g_hat), load3(p.antenna))
-    z, z_hat = load33(p.R_IG) @ load3(flight.gnss_velocity), load3(flight.v_hat) + R_BI.T @ lever_B
+    z = load33(p.R_IG) @ load3(flight.measurement[VELOCITY_BLOCK])
+    z_hat = load3(flight.v_hat) + R_BI.T @ lever_B
     put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
     for j in range(settings.motion_columns):
         dv = load_column3(work.L, V, j)
@@ -247,7 +249,7 @@ def reset_velocity(work, states, lanes, nu):
 # The GNSS receiver: one clock and latency for position, baseline and velocity.
 # --------------------------------------------------------------------------------------------------
 
-_GNSS = int(Sensor.GNSS)
+_GNSS = int(Sensor["GNSS"])
 _BLOCKS = (POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK)
 
 
@@ -294,8 +296,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     """Measure when due, and at the start for the initialization of the filter."""
     due = tick_clock(flight, settings, _GNSS, mask)
     delayed, period = settings.sensor_delay[_GNSS] > 0, settings.sensor_ticks[_GNSS]
-    values = (flight.gnss_position, flight.gnss_baseline, flight.gnss_velocity)
-    begin_sample(flight, work, settings, _GNSS, values, 3, mask)
+    begin_sample(flight, work, settings, _GNSS, mask)
     arrives = find_arrivals(flight, work, settings, _GNSS, mask)
     if not starting and not any_of(due | arrives):
         return
@@ -323,9 +324,9 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     if delayed:
         taken, n = stamp(flight, settings, _GNSS, mask), settings.under_way[_GNSS]
         for block in _BLOCKS:
-            exchange(flight, work, block, values[block], 3, n, mask, taken)
+            exchange(flight, work, block, n, mask, taken)
             if not starting:  # there, it stays in the record, for the initialization of the filter
-                deliver_arrived(work, block, values[block], 3, mask)
+                deliver_arrived(flight, work, block, mask)
 
 
 @kernel
@@ -356,4 +357,4 @@ def _reset(flight, p, work, settings):
             reset_velocity(work, states, lanes, nu)
 
 
-gnss_stage = sensor_stage(Sensor.GNSS, _begin, _sample, _expect, _reset)
+gnss_stage = sensor_stage(Sensor["GNSS"], _begin, _sample, _expect, _reset)

@@ -22,6 +22,7 @@ from quad_gym.kernels.numbers.linalg import (
 from quad_gym.kernels.numbers.random import normal_pair, six_normals, stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.records import (
+    BASELINE_BLOCK,
     DRAW_BLUR,
     DRAW_HEADING,
     DRAW_IMU_ERRORS,
@@ -95,9 +96,9 @@ def turn_baseline(flight, p, mask):
     """Turn a measured baseline about the body z axis by its constant error, where `mask`."""
     z_G = load33(p.R_IG).T @ quaternion_to_dcm(load4(flight.q))[2]
     s, c = sin_cos(flight.heading_error)
-    b = load3(flight.gnss_baseline)
+    b = load3(flight.measurement[BASELINE_BLOCK])
     turned = c * b + rounded(s * cross(z_G, b))
-    keep(flight.gnss_baseline, mask, (1.0 - c) * dot(z_G, b) * z_G + turned)
+    keep(flight.measurement[BASELINE_BLOCK], mask, (1.0 - c) * dot(z_G, b) * z_G + turned)
 
 
 @kernel
@@ -120,8 +121,8 @@ def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
             u, v = uniform_pair(stream, DRAW_BLUR + i)
             for axis in range(2):
                 shift = reach * (2.0 * (u if axis == 0 else v) - 1.0)
-                pixel = flight.pixels[i, axis]
-                flight.pixels[i, axis] = select(seen, pixel + shift, pixel)
+                pixel = flight.measurement[FEATURE_BLOCKS + i, axis]
+                flight.measurement[FEATURE_BLOCKS + i, axis] = select(seen, pixel + shift, pixel)
 
 
 @stage

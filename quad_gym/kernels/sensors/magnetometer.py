@@ -62,10 +62,10 @@ from quad_gym.kernels.numbers.random import normal_pair, stream_of
 from quad_gym.kernels.numbers.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.common import aid_stage, draw_matrix
 from quad_gym.kernels.sensors.faults import disturb_field
-from quad_gym.records import AID_GROUPS, AID_NUMBERS, AID_ROW, DRAW_AID, Aid
+from quad_gym.records import AID_BLOCK, AID_GROUPS, AID_NUMBERS, DRAW_AID, POSITION_BLOCK, Aid
 
 _S = int(Aid["MAGNETOMETER"])
-_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
+_BLOCK, _DRAW = AID_BLOCK[_S], DRAW_AID[_S]
 _N = AID_NUMBERS[_S]
 
 
@@ -91,7 +91,7 @@ def _measure(flight, p, i):
 def _align(flight, p, work, settings, mask):
     """Initialize the heading with the direction of the field, and the covariance to match."""
     P, R_BI = work.P, load33(flight.R_hat)
-    m, z = load3(p.aid_numbers[_N]), load3(flight.aid_measurement[_ROW])
+    m, z = load3(p.aid_numbers[_N]), load3(flight.measurement[_BLOCK])
     R_BI = R_BI @ level_attitude(R_BI.T @ z, m)
     load_covariance(P, flight, None)
     for i in range(settings.slow_states):
@@ -102,7 +102,7 @@ def _align(flight, p, work, settings, mask):
     _tie_heading(p, P, m, R_BI, iron, delta)
     _tie_position(p, P, R_BI, iron, delta)
     keep_covariance(flight, settings, P, mask)
-    antenna_I = load33(p.R_IG) @ load3(flight.gnss_position)
+    antenna_I = load33(p.R_IG) @ load3(flight.measurement[POSITION_BLOCK])
     keep(flight.R_hat, mask, R_BI)
     keep(flight.r_hat, mask, antenna_I - R_BI.T @ load3(p.antenna))
 
@@ -158,7 +158,7 @@ def _expect(flight, p, work, settings, i, k, valid):
     L, inverse_c, last = work.L, work.inverse_spread, columns_of(settings) - 1
     first, delta = settings.aid_vector[_S], settings.aid_scalar[_S]
     f_B, g_B = _expected_field(flight, p, settings)
-    z, variance = load3(flight.aid_measurement[_ROW]), p.aid_sigma[_S] * p.aid_sigma[_S]
+    z, variance = load3(flight.measurement[_BLOCK]), p.aid_sigma[_S] * p.aid_sigma[_S]
     z_hat = f_B + load3(flight.slow_hat[first : first + 3])
     put_block(work, settings, k, valid, z, z_hat, diagonal((variance, variance, variance)))
     iron, declination = settings.motion_columns + first, settings.motion_columns + delta

@@ -41,10 +41,10 @@ from quad_gym.kernels.numbers.random import normal_pair, stream_of
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.common import aid_stage
 from quad_gym.kernels.sensors.range_finder import MIN_COSINE, ground_range
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
+from quad_gym.records import AID_BLOCK, AID_NUMBERS, DRAW_AID, Aid
 
 _S = int(Aid["OPTICAL_FLOW"])
-_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
+_BLOCK, _DRAW = AID_BLOCK[_S], DRAW_AID[_S]
 _N = AID_NUMBERS[_S]
 
 
@@ -78,7 +78,7 @@ def _expect(flight, p, work, settings, i, k, valid):
     z_hat = vector(-w[1], w[0], zero) + _flow(G, W)
     variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
     noise = diagonal((variance, variance, zero + 1.0))
-    put_block(work, settings, k, valid, load3(flight.aid_measurement[_ROW]), z_hat, noise)
+    put_block(work, settings, k, valid, load3(flight.measurement[_BLOCK]), z_hat, noise)
     for j in range(settings.motion_columns):
         dV, dh = R_BI @ load_column3(L, V, j), L[R + 2, j] if j <= R + 2 else zero
         a, s = (zero, zero, zero), (zero, zero, zero)

@@ -23,10 +23,10 @@ from quad_gym.kernels.numbers.linalg import cross, diagonal, load3, load4, load3
 from quad_gym.kernels.numbers.random import normal_pair, stream_of
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.common import aid_stage
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
+from quad_gym.records import AID_BLOCK, AID_NUMBERS, DRAW_AID, Aid
 
 _S = int(Aid["RANGE_FINDER"])
-_ROW, _DRAW = AID_ROW[_S], DRAW_AID[_S]
+_BLOCK, _DRAW = AID_BLOCK[_S], DRAW_AID[_S]
 _N = AID_NUMBERS[_S]
 MIN_COSINE = 0.5  #: cosine of the tilt below which it does not measure: 60 degrees
 
@@ -55,7 +55,7 @@ def _expect(flight, p, work, settings, i, k, valid):
     h, u = ground_range(p, flight.r_hat, R_BI)
     zero, sigma = zero_like(u), p.aid_sigma[_S]
     u = maximum(u, MIN_COSINE)
-    z, noise = load3(flight.aid_measurement[_ROW]), (sigma * sigma, zero + 1.0, zero + 1.0)
+    z, noise = load3(flight.measurement[_BLOCK]), (sigma * sigma, zero + 1.0, zero + 1.0)
     put_block(work, settings, k, valid, z, (h / u, zero, zero), diagonal(noise))
     z_B = R_BI.T[2]
     for j in range(settings.motion_columns):

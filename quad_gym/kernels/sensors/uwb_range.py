@@ -28,10 +28,10 @@ from quad_gym.kernels.numbers.linalg import diagonal, dot, load3, load4, load33,
 from quad_gym.kernels.numbers.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.common import aid_stage
-from quad_gym.records import AID_NUMBERS, AID_ROW, DRAW_AID, Aid
+from quad_gym.records import AID_BLOCK, AID_NUMBERS, DRAW_AID, Aid
 
 _S = int(Aid["UWB_RANGE"])
-_ROW, _DRAW, _TAG = AID_ROW[_S], DRAW_AID[_S], AID_NUMBERS[_S]
+_BLOCK, _DRAW, _TAG = AID_BLOCK[_S], DRAW_AID[_S], AID_NUMBERS[_S]
 _LIMITS, _ANCHORS = _TAG + 1, _TAG + 2
 _NEAR = 1e-3  #: distance of an anchor within which its direction is not defined [m]
 
@@ -59,7 +59,7 @@ def _expect(flight, p, work, settings, i, k, valid):
     L, R_BI, c, inverse_c = work.L, load33(flight.R_hat), work.spread, work.inverse_spread
     d, l_B = _to_antenna(p, i, load3(flight.r_hat), R_BI), load3(p.aid_numbers[_TAG])
     D, zero, sigma = maximum(norm(d), _NEAR), zero_like(c), p.aid_sigma[_S]
-    noise, z = (sigma * sigma, zero + 1.0, zero + 1.0), load3(flight.aid_measurement[_ROW + i])
+    noise, z = (sigma * sigma, zero + 1.0, zero + 1.0), load3(flight.measurement[_BLOCK + i])
     put_block(work, settings, k, valid, z, (D, zero, zero), diagonal(noise))
     for j in range(settings.motion_columns):
         o, e = lever_column(work, settings, j, R_BI, l_B)

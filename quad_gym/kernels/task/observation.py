@@ -12,7 +12,6 @@ from quad_gym.kernels.task.reference import evaluate_reference, position_on_refe
 from quad_gym.records import (
     AID_BLOCK,
     AID_FREEDOMS,
-    AID_ROW,
     AIDS,
     BASELINE_BLOCK,
     DRAW_NOISY,
@@ -192,7 +191,7 @@ def _put_aids(flight, p, settings, row, k):
             fresh = flight.block_fresh[AID_BLOCK[s] + block]
             scaled = fresh / p.aid_scale[s]
             for i in range(AID_FREEDOMS[s]):
-                row[k + i] = scaled * flight.aid_measurement[AID_ROW[s] + block, i]
+                row[k + i] = scaled * flight.measurement[AID_BLOCK[s] + block, i]
             row[k + AID_FREEDOMS[s]] = fresh
             k += AID_FREEDOMS[s] + 1
     return k
@@ -213,22 +212,22 @@ def _put_sensors(flight, p, settings, row):
     k = _put3(row, k, select(starts, gyro, share * load3(flight.gyro_sum)))
     k = _put3(row, k, select(starts, accel, share * load3(flight.accel_sum)))
     fresh = flight.block_fresh[POSITION_BLOCK]
-    k = _put3(row, k, fresh * (R_IG @ load3(flight.gnss_position)))
+    k = _put3(row, k, fresh * (R_IG @ load3(flight.measurement[POSITION_BLOCK])))
     row[k] = fresh
     measured = flight.block_fresh[BASELINE_BLOCK]
     fresh = measured / p.baseline_length
-    k = _put3(row, k + 1, fresh * (R_IG @ load3(flight.gnss_baseline)))
+    k = _put3(row, k + 1, fresh * (R_IG @ load3(flight.measurement[BASELINE_BLOCK])))
     row[k] = measured
     k += 1
     if settings.gnss_velocity > 0:  # measured with every position
         fresh = flight.block_fresh[VELOCITY_BLOCK]
-        k = _put3(row, k, fresh * (R_IG @ load3(flight.gnss_velocity)))
+        k = _put3(row, k, fresh * (R_IG @ load3(flight.measurement[VELOCITY_BLOCK])))
         row[k] = fresh
         k += 1
     for i in range(settings.feature_count):
         fresh = flight.block_fresh[FEATURE_BLOCKS + i]
-        row[k] = fresh * flight.pixels[i, 0] / p.half_image[0]
-        row[k + 1] = fresh * flight.pixels[i, 1] / p.half_image[1]
+        row[k] = fresh * flight.measurement[FEATURE_BLOCKS + i, 0] / p.half_image[0]
+        row[k + 1] = fresh * flight.measurement[FEATURE_BLOCKS + i, 1] / p.half_image[1]
         row[k + 2] = fresh
         k += 3
     k = _put_aids(flight, p, settings, row, k)

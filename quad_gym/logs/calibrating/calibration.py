@@ -22,7 +22,8 @@ from quad_gym.logs.replaying.measurements import implausible
 from quad_gym.logs.replaying.replay import origin_of, replay
 from quad_gym.logs.replaying.rules import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
-from quad_gym.params.suites import SENSOR_PARAMS, SensorSuite, sensor_suite
+from quad_gym.params.sensor_table import SENSOR_PARAMS
+from quad_gym.params.suites import SensorSuite, sensor_suite
 
 _IRON_TAU = 30.0
 """Prior correlation time of hard iron that is constant in the suite [s]: currents of motors change

@@ -21,7 +21,7 @@ from quad_gym.logs.formats import Log
 from quad_gym.logs.formats.clocks import naming
 from quad_gym.logs.replaying.replay import replay
 from quad_gym.logs.replaying.results import correlation_time
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import LogDelays, SensorSuite
 
 # --------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.logs.formats.log import COMMANDS, Floats, Log, LogSource, RawLog
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 
 # --------------------------------------------------------------------------------------------------
 # Rows that are no measurements of their own: repeated values, and batches of stamps.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from quad_gym.frames import geodetic_to_ecef
 from quad_gym.params import checks as check
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records.inputs import MOUNTING
 from quad_gym.rotations import euler_to_dcm
@@ -144,7 +144,7 @@ _AidStreams: Any = make_dataclass(
 class Log(_AidStreams):
     """Measurements of the sensors in a flight, each sensor at its own times.
 
-    Each sensor of `quad_gym.params.aid_table` has a field with its name: a stream of (n, ...)
+    Each sensor of `quad_gym.params.sensor_table` has a field with its name: a stream of (n, ...)
     measurements under this name, or None.
 
     Frames are the package's: B with x forward, y left, z up; I with east, north, up.

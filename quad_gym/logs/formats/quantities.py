@@ -13,7 +13,7 @@ import numpy as np
 
 from quad_gym.frames import ecef_to_enu
 from quad_gym.logs.formats.log import Floats, Log, LogSource, RawLog, positive
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import SensorSuite
 
 ENOUGH, LONG = 20, 2.0  #: number of rows, and their duration [s], from which a constant is dead

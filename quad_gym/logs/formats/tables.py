@@ -12,7 +12,7 @@ import numpy as np
 
 from quad_gym.logs.formats.log import LOG_COLUMNS, Floats, LogSource, RawLog, ecef_of
 from quad_gym.params import checks as check
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 
 # --------------------------------------------------------------------------------------------------
 # Logs from tables: data frames, mappings of columns, comma-separated files.

@@ -19,9 +19,9 @@ from quad_gym.estimation.starts import level
 from quad_gym.frames import ecef_to_enu
 from quad_gym.logs.formats import Floats, Log, Stream
 from quad_gym.params import checks as check
-from quad_gym.params.aid_table import AID_PARAMS
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.portable import turned
+from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_OF, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import Aid
 from quad_gym.records.inputs import SAME_TIME, Outcome
@@ -153,7 +153,6 @@ def held(log: Log, suite: SensorSuite, place: Any) -> tuple[Log, SensorSuite]:
 # Measurements of a log, as the filter of a suite receives them.
 # --------------------------------------------------------------------------------------------------
 
-_OF_GNSS = ("gnss_position_G", "gnss_baseline_G", "gnss_velocity_G")
 
 UNMEASURED = 1e4  #: standard deviation along an axis that was not measured [m]
 
@@ -228,20 +227,18 @@ class LogMeasurements:
     def at(self, name: str, k: int) -> Measurement | None:
         """Return measurement k of a stream; None: nothing was measured."""
         if name == "gnss":
-            given = self.fix(k)
-            position, baseline, velocity = (given.pop(key, None) for key in _OF_GNSS)
-            if position is None and baseline is None and velocity is None:
-                return None
-            return checked_measurement(self.suite, position, baseline, None, velocity, given)
+            found = checked_measurement(self.suite, self.fix(k))
+            return None if found.empty else found
         if name == "camera":
-            return Measurement(pixels=self.streams[name].values["pixels"][k])
+            return Measurement({"pixels": self.streams[name].values["pixels"][k]})
         if name == "attitude":
             assert self.suite.gnss is not None
             baseline_I = turned(self._attitude(k).T, self.suite.gnss.baseline_B)
             alone = "heading" in self.streams[name].values
+            baseline = checked_baseline(self.suite, turned(self.R_GI, baseline_I))
             return Measurement(
-                baseline_G=checked_baseline(self.suite, turned(self.R_GI, baseline_I)),
-                noise={"baseline_sigma": HEADING_ALONE} if alone else {},
+                {"gnss_baseline": baseline[np.newaxis]},
+                {"gnss_baseline": np.array([HEADING_ALONE])} if alone else {},
             )
         aid = Aid[name.upper()]
         params, value = self.suite.aids[aid], self.streams[name].values[name][k]
@@ -249,7 +246,7 @@ class LogMeasurements:
         known = np.asarray(np.isfinite(values).all(axis=1))
         if not known.any():
             return None
-        return Measurement(aids={aid: np.where(known[:, np.newaxis], values, np.nan)})
+        return Measurement({name: np.where(known[:, np.newaxis], values, np.nan)})
 
     def fix(self, k: int) -> dict[str, Any]:
         """Return the GNSS measurements of one instant as keywords of `update`."""
@@ -417,26 +414,22 @@ class FilterCalls:
 
     def _update(self, name: str, time: float, row: int, given: Measurement) -> None:
         """Add the measurement of a stream with its time stamp."""
-        if given.noise.get("baseline_sigma") == HEADING_ALONE:
+        if given.sigmas.get("gnss_baseline") == HEADING_ALONE:
             raise ValueError(
                 "a log for an exported filter must have attitudes or baselines, got headings alone"
             )
-        if name in ("gnss", "attitude"):
-            vectors = (
-                given.position_G,
-                given.noise.get("position_sigma_I"),
-                given.baseline_G,
-                given.velocity_G,
-            )
-            numbers = [number for vector in vectors for number in _three(vector)]
-            self._add("gnss", time, *numbers, given.noise.get("velocity_sigma", math.nan))
-        elif given.pixels is not None:
-            self._add(name, time, *given.pixels.ravel())
-        elif name in self._sensed:
+        if name in self._sensed:
             self._add(name, time, *self._sensed[name][name][row])
-        else:
-            (value,) = given.aids.values()
-            self._add(name, time, *value.ravel())
+            return
+        sensor = SENSOR_OF[next(iter(given.values))]
+        numbers: list[float] = []
+        for reading in SENSOR_PARAMS[sensor].readings(sensor):
+            missing = np.full(reading.length, np.nan)
+            numbers += given.values.get(reading.name, missing).ravel().tolist()
+            if reading.reported:
+                missing = np.full(reading.sigmas, np.nan)
+                numbers += given.sigmas.get(reading.name, missing).tolist()
+        self._add(sensor, time, *numbers)
 
     def keep(self) -> None:
         """Add the output of the estimate."""

@@ -14,7 +14,7 @@ from quad_gym.estimation.filters import (
     UnscentedKalmanFilter,
     run_filter,
 )
-from quad_gym.estimation.inputs import InputHistory, Measurement, TapeWriter
+from quad_gym.estimation.inputs import InputHistory, Measurement, TapeWriter, known_blocks
 from quad_gym.logs.formats import Floats, Log
 from quad_gym.logs.replaying.log_start import LogStart
 from quad_gym.logs.replaying.measurements import (
@@ -28,9 +28,10 @@ from quad_gym.logs.replaying.measurements import (
 )
 from quad_gym.logs.replaying.results import Measured, Replay, collected, name_of
 from quad_gym.packing import blocks_of
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import AID_MOST, FREEDOMS, POSITION_BLOCK, Aid, FilterStatus
+from quad_gym.records import FREEDOMS, POSITION_BLOCK, FilterStatus
 from quad_gym.records.inputs import INPUT, SAME_TIME, Outcome, SensorReading
 from quad_gym.records.state import State
 from quad_gym.rotations import dcm_to_quaternion
@@ -247,12 +248,6 @@ class Player:
 # --------------------------------------------------------------------------------------------------
 
 EVERYONE = np.ones(1, bool)
-_OF_GNSS = {
-    "gnss_position": "position_G",
-    "gnss_baseline": "baseline_G",
-    "gnss_velocity": "velocity_G",
-}
-"""Readings of GNSS, and their values in a `Measurement`."""
 
 
 class OwnPlayer:
@@ -273,12 +268,7 @@ class OwnPlayer:
         self._estimator.state = State(1, estimator.state)
         self._estimator.state.lock(False)
         self._arrived: dict[int, list[tuple[float, float]]] = {}  # stamps and arrivals by block
-        self._has = dict.fromkeys(("pixels", *(aid.name.lower() for aid in Aid)), False)
-        suite, gnss = player.suite, player.suite.gnss
-        self._has |= {aid.name.lower(): True for aid in suite.aids}
-        self._has |= {"pixels": suite.camera is not None, "gnss_position": gnss is not None}
-        self._has["gnss_baseline"] = gnss is not None and gnss.has_baseline
-        self._has["gnss_velocity"] = player.measured.takes_velocity
+        suite = player.suite
         self._vehicle = VehicleParams(gravity=suite.estimator.gravity)
         features = () if suite.camera is None else suite.camera.features_I
         self._features = np.array(features, np.float64).reshape(1, -1, 3)
@@ -353,23 +343,17 @@ class OwnPlayer:
     def _by_name(self, given: Measurement, age: float) -> dict[str, SensorReading]:
         """Return a measurement as readings, by their names."""
         found, R_IG = {}, self._player.measured.R_GI.T
-        for name, key in _OF_GNSS.items():
-            value = getattr(given, key)
-            if value is not None:
-                if name == "gnss_baseline":  # has any length
-                    assert self._suite.gnss is not None
-                    length = np.linalg.norm(self._suite.gnss.baseline_B)
-                    value = value * (length / np.linalg.norm(value))
-                found[name] = SensorReading((R_IG @ value)[np.newaxis], EVERYONE, age)
-        if given.pixels is not None:
-            seen = np.asarray(~np.isnan(given.pixels).any(axis=1))
-            found["pixels"] = SensorReading(given.pixels[np.newaxis], seen[np.newaxis], age)
-        for aid, value in given.aids.items():
-            new = (
-                ~np.isnan(value[:, 0]) if AID_MOST[aid] == 1 else ~np.isnan(value[np.newaxis, :, 0])
-            )
-            one = np.reshape(value, (1, *self._suite.aids[aid].shape))
-            found[aid.name.lower()] = SensorReading(one.copy(), new, age)
+        for name, value in given.values.items():
+            new = known_blocks(value)
+            if name == "gnss_baseline":  # has any length
+                assert self._suite.gnss is not None
+                length = np.linalg.norm(self._suite.gnss.baseline_B)
+                value = value * (length / np.linalg.norm(value))
+            if READINGS[name].in_G:
+                value = (R_IG @ value[0])[np.newaxis]
+            several = READINGS[name].most_blocks > 1
+            one = value.reshape(1, *self._suite.shape_of(name)).copy()
+            found[name] = SensorReading(one, new[np.newaxis] if several else new, age)
         return found
 
     def _at(
@@ -382,21 +366,12 @@ class OwnPlayer:
         **start: Any,
     ) -> Any:
         """Return the `Measurements`, or the `StartView`, of an instant."""
-        count = self._features.shape[1]
-        shapes: dict[str, tuple[int, ...]] = {"pixels": (1, count, 2)}
-        shapes |= dict.fromkeys(_OF_GNSS, (1, 3))
-        several = {"pixels": count}
-        for aid in Aid:
-            name, params = aid.name.lower(), self._suite.aids.get(aid)
-            shapes[name] = (1,) if params is None else (1, *params.shape)
-            if params is not None and params.most_blocks > 1:
-                several[name] = params.blocks
-        for name, shape in shapes.items():
+        for name, reading in READINGS.items():
             if name not in readings:
-                new = np.zeros((1, several[name]) if name in several else 1, bool)
-                start[name] = (
-                    SensorReading(np.full(shape, np.nan), new, 0.0) if self._has[name] else None
-                )
+                count = self._suite.blocks_of(name)
+                new = np.zeros((1, count) if reading.most_blocks > 1 else 1, bool)
+                nothing = np.full((1, *self._suite.shape_of(name)), np.nan)
+                start[name] = SensorReading(nothing, new, 0.0) if count else None
         return SimpleNamespace(
             count=1,
             dt=self._suite.imu.dt,

@@ -12,15 +12,11 @@ import numpy as np
 
 from quad_gym.estimation.filters import Results
 from quad_gym.logs.formats import Floats
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import (
-    AID_BLOCK,
-    AID_BLOCKS,
-    AID_MOST,
-    FEATURE_BLOCKS,
     FREEDOMS,
-    Aid,
+    GROUP_BLOCK,
     FilterStatus,
     GateDecision,
 )
@@ -512,10 +508,6 @@ def _measured(table: Floats, d: int) -> Measured:
 
 def name_of(block: int) -> str:
     """Return the name of a block of innovations."""
-    if block < FEATURE_BLOCKS:
-        return ("gnss_position", "gnss_baseline", "gnss_velocity")[block]
-    if block >= AID_BLOCKS:
-        aid = Aid(bisect.bisect(AID_BLOCK, block) - 1)
-        number = f"_{block - AID_BLOCK[aid]}" if AID_MOST[aid] > 1 else ""
-        return f"{aid.name.lower()}{number}"
-    return f"feature_{block - FEATURE_BLOCKS}"
+    group = bisect.bisect(GROUP_BLOCK, block) - 1
+    reading = tuple(READINGS.values())[group]
+    return reading.name_of(block - GROUP_BLOCK[group])

@@ -22,7 +22,7 @@ from quad_gym.logs.replaying.results import (
     larger,
     runs_beyond_chance,
 )
-from quad_gym.params.aid_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.rotations import quaternion_to_dcm
 

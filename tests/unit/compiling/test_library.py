@@ -96,7 +96,7 @@ def test_digest_depends_on_the_sources_of_kernels_and_records(tmp_path):
     (tmp_path / "records/b.py").write_text("x = 2\n")
     assert sources_digest(tmp_path) != before
     before = sources_digest(tmp_path)
-    (tmp_path / "params/aid_table.py").write_text("from quad_gym.params.c import CParams\n")
+    (tmp_path / "params/sensor_table.py").write_text("from quad_gym.params.c import CParams\n")
     table = sources_digest(tmp_path)
     (tmp_path / "params/c.py").write_text("x = 3\n")
     assert len({before, table, sources_digest(tmp_path)}) == 3

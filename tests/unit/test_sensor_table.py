@@ -8,8 +8,8 @@ import pytest
 import quad_gym
 from quad_gym.logs.replaying.measurements import lacks_position
 from quad_gym.packing import pack_aids, slow_states
-from quad_gym.params.aid_table import _shape_of
 from quad_gym.params.aids import AidParams, SlowError
+from quad_gym.params.sensor_table import _shape_of
 from quad_gym.records import PARAMS
 
 UWB = quad_gym.sensor_suite("uwb")
@@ -29,8 +29,8 @@ COMPLETE |= {"raw": ("m", "-", 10.0)}
 def test_class_of_a_sensor_that_is_wrong_is_refused_by_its_member(change, message):
     members = {name: value for name, value in (COMPLETE | change).items() if value is not None}
     with pytest.raises(ValueError, match=message):
-        _shape_of(type("Depth", (AidParams,), members))
-    assert _shape_of(type("Depth", (AidParams,), COMPLETE)).length == 1
+        _shape_of("depth", type("Depth", (AidParams,), members))
+    assert _shape_of("depth", type("Depth", (AidParams,), COMPLETE)).readings[0].length == 1
 
 
 def test_numbers_beyond_the_rows_of_a_sensor_are_refused(monkeypatch):
