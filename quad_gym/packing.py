@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from quad_gym.configuration import FlightConfiguration
 from quad_gym.faults import Fault, Span, ends
-from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
 from quad_gym.params import portable
 from quad_gym.params.aids import SlowError
-from quad_gym.params.gnss import MIN_DRIFT
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomization, nominal_values
-from quad_gym.params.sensor_table import SENSOR_PARAMS
+from quad_gym.params.sensor_table import READINGS, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.params.trajectories import Trajectory
@@ -85,9 +83,8 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
     """Return the slow errors that a filter estimates if it assumes these sensors."""
     errors: list[SlowError] = []
     vectors, scalars = [-1] * AIDS, [-1] * AIDS
-    if sensors.gnss is not None and sensors.drifts:
-        tau = sensors.gnss.drift_tau
-        errors = [SlowError(max(s, MIN_DRIFT), tau) for s in sensors.gnss.drift_sigma_I]
+    for sensor in sensors.sensors.values():
+        errors += sensor.drift
     for aid, params in sensors.aids.items():
         if params.assumed_vector is not None:
             vectors[aid] = len(errors)
@@ -128,12 +125,6 @@ def sensor_blocks(sensors: SensorSuite) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def decay_and_drive(error: SlowError, time: float) -> tuple[float, float]:
-    """Return the decay of a slow error over a time [s], and its driving noise's sigma."""
-    drive = error.sigma * math.sqrt(portable.approached(2.0 * time / error.tau))
-    return portable.exp(-time / error.tau), drive
-
-
 def gate_limit(freedoms: int, false_alarm: float) -> float:
     """Return the NIS above which a measurement is rejected, a quantile of chi-square."""
     return portable.chi_square_limit(freedoms, false_alarm) if false_alarm else math.inf
@@ -150,7 +141,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
         for name in ("vector", "scalar"):
             slow = getattr(params, f"slow_{name}")
             if slow is not None:
-                decay, drive = decay_and_drive(slow, 1.0 / params.rate)
+                decay, drive = slow.over(1.0 / params.rate)
                 p[f"aid_{name}_sigma"][aid] = slow.sigma
                 p[f"aid_{name}_decay"][aid], p[f"aid_{name}_drive"][aid] = decay, drive
         if len(params.numbers) > params.rows:
@@ -168,12 +159,12 @@ def follows_motion(sensors: SensorSuite) -> int:
     With a baseline or a camera, which measure the heading better, it is 2: the motion only shows a
     heading that is unknown. Without GNSS velocities or a gate it is 0.
     """
-    gnss = sensors.gnss
-    if gnss is None or not gnss.has_velocity:
+    if not sensors.blocks_of("gnss_velocity"):
         return 0
     if not sensors.estimator.false_alarm_probability > 0.0:
         return 0
-    return 2 if gnss.has_baseline or sensors.camera is not None else 1
+    directions = (name for name, reading in READINGS.items() if reading.direction)
+    return 2 if any(map(sensors.blocks_of, directions)) else 1
 
 
 def pack_sensors(settings: Any, sensors: SensorSuite) -> None:
@@ -228,14 +219,13 @@ def params_record(
     np.copyto(first, drawable, where=~np.isnan(drawable))
     _pack_vehicle(p, vehicle)
     _pack_imu(p, sensors, vehicle)
-    _pack_gnss(p, sensors)
-    if sensors.camera is not None:
-        camera = sensors.camera
-        _copy(p, camera)
-        p["camera"] = camera.position_B
-        p["R_CB"] = portable.euler_dcm(camera.attitude)
-        p["half_image"], p["blur"] = np.array(camera.image_size) / 2, camera.blur
-        p["features"][: len(camera.features_I)] = camera.features_I
+    for sensor in sensors.sensors.values():
+        for name, value in sensor.packed.items():
+            if np.ndim(value) == 2:  # as many rows as the sensor has
+                p[name][: len(value)] = value
+            else:
+                p[name] = value
+    _pack_mark(p, sensors)
     pack_aids(p, sensors)
     pack_tick(p, sensors)
     _pack_filter(p, sensors)
@@ -274,9 +264,9 @@ def pack_tick(p: Any, sensors: SensorSuite) -> None:
         p[f"{sensor}_noise"] = getattr(imu, f"{sensor}_noise")
         # the vibration is given for rotors in hover, whose specific force is g
         p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / p["gravity"]
-        p[f"{sensor}_bias_decay"], p[f"{sensor}_bias_drive"] = decay_and_drive(error, dt)
+        p[f"{sensor}_bias_decay"], p[f"{sensor}_bias_drive"] = error.over(dt)
     for k, error in enumerate(biases[2:]):
-        p["slow_decay"][k], p["slow_drive"][k] = decay_and_drive(error, dt)
+        p["slow_decay"][k], p["slow_drive"][k] = error.over(dt)
         p["slow_rate"][k], p["slow_stationary"][k] = 1.0 / error.tau, error.sigma
 
 
@@ -290,25 +280,14 @@ def slow_errors_of(sensors: SensorSuite) -> list[SlowError]:
     return [*biases, *slow_states(sensors).errors]
 
 
-def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
-    """Write the GNSS; without one, write the initial pose as if GNSS had measured it."""
-    gnss, pose = sensors.gnss, sensors.initial_pose
-    if gnss is None:  # the antenna is at the center, the baseline along the x axis
+def _pack_mark(p: Any, sensors: SensorSuite) -> None:
+    """Write what the mark of the start gives, as if it had been measured."""
+    pose, fixed = sensors.initial_pose, sensors.blocks_of("gnss_position") > 0
+    if not fixed:  # the antenna is at the center, the baseline along the x axis
         p["R_IG"], p["position_sigma_I"] = np.eye(3), pose.position_sigma
-    else:
-        _copy(p, gnss)
-        p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
-        p["antenna"] = gnss.primary_antenna_B
-        drift = SlowError(1.0, gnss.rate * gnss.drift_tau)  # in measurements
-        p["drift_step"] = 1.0 / drift.tau
-        p["drift_decay"], drive = decay_and_drive(drift, 1.0)
-        p["drift_drive"] = np.array(gnss.drift_sigma_I) * drive
-    if gnss is not None and gnss.has_baseline:
-        p["baseline"], p["baseline_length"] = gnss.baseline_B, portable.norm(gnss.baseline_B)
-        p["first_baseline_sigma"] = gnss.first_baseline_sigma
-        p["baseline_noise"] = gnss.baseline_noise
-    else:  # with GNSS a vertical one, which does not observe the heading either
-        p["baseline"] = (1.0, 0.0, 0.0) if gnss is None else (0.0, 0.0, 1.0)
+    if not sensors.blocks_of("gnss_baseline"):
+        # with positions a vertical one, which does not observe the heading either
+        p["baseline"] = (0.0, 0.0, 1.0) if fixed else (1.0, 0.0, 0.0)
         p["baseline_length"] = 1.0
         for name in ("baseline_sigma", "first_baseline_sigma", "baseline_noise"):
             p[name] = pose.heading_sigma
@@ -325,7 +304,8 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
     p["noise_pinhole"] = estimator.bearing_noise_at == "pinhole"
     alarm = estimator.false_alarm_probability
     p["gate"] = [gate_limit(freedoms, alarm) for freedoms in GROUP_FREEDOMS]
-    sigma = math.inf if sensors.gnss is None else estimator.max_direction_sigma
+    fixed = sensors.blocks_of("gnss_position") > 0
+    sigma = estimator.max_direction_sigma if fixed else math.inf
     p["gate_uncertainty"] = sigma * sigma
 
 
@@ -412,8 +392,8 @@ def pack_places(
     if s["features_drawn"]:
         believed = true_sensors if s["known"] else sensors
         for k, suite in enumerate((true_sensors, believed)):
-            assert suite.camera is not None
-            s["feature_places"][k, : len(suite.camera.features_I)] = suite.camera.features_I
+            features = suite.sensors["camera"].packed["features"]
+            s["feature_places"][k, : len(features)] = features
 
 
 def pack_obstacles(s: Any, obstacles: Sequence[Obstacle]) -> None:
@@ -581,10 +561,8 @@ def _pack_sensors(s: Any, c: FlightConfiguration) -> None:
     """
     assumed, true = c.sensors, c.flown_sensors
     s["imu_averages"] = assumed.imu.samples == "average"
-    if assumed.gnss is not None:
-        s["gnss_velocity"] = assumed.gnss.velocity_sigma is not None
-    s["gnss_baseline"] = assumed.gnss is None or assumed.gnss.has_baseline
-    s["gnss_drifts"] = true.drifts
+    s["gnss_velocity"] = assumed.gives("gnss_velocity")
+    s["gnss_baseline"] = assumed.gives("gnss_baseline")
     pack_sensors(s, assumed)
     for name, sensor in true.sensors.items():
         place, label = Sensor[name.upper()], type(sensor).__name__
@@ -597,10 +575,7 @@ def _pack_sensors(s: Any, c: FlightConfiguration) -> None:
     s["late"] = s["sensor_delay"].max() > 0
     s["rewinds"] = assumed.estimator.delay_compensation == "retrodict"
     # the errors that the true sensors have
-    imu, gnss, camera = true.imu, true.gnss, true.camera
-    s["imu_errs"], s["imu_vibrates"] = imu.errs, imu.vibrates
-    s["heading_errs"] = gnss is not None and gnss.heading_errs
-    if camera is not None:
-        s["camera_limited"] = camera.limited
-        s["camera_blurs"] = camera.exposure > 0.0
-        s["ground_hides"] = camera.ground_hides
+    s["imu_errs"], s["imu_vibrates"] = true.imu.errs, true.imu.vibrates
+    for sensor in true.sensors.values():
+        for name, on in sensor.options.items():
+            s[name] = on

@@ -13,7 +13,8 @@ from quad_gym.kernels.filter.gate import forget_innovations
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.starts import initialize, set_heading, start_still, wahba
 from quad_gym.kernels.numbers.blocks import lanes_at, lanes_of
-from quad_gym.kernels.numbers.linalg import diagonal, load3, load4, load33, outer, store
+from quad_gym.kernels.numbers.lanes import select
+from quad_gym.kernels.numbers.linalg import diagonal, keep, load3, load4, load33, outer, store
 from quad_gym.kernels.obstacles import crosses, distance_from
 from quad_gym.kernels.sensors import camera
 from quad_gym.kernels.sensors.gnss import drift_gnss, measure_gnss
@@ -28,7 +29,7 @@ from quad_gym.kernels.sensors.imperfect import (
 from quad_gym.kernels.sensors.imu import drift_biases, measure_imu, measure_imu_average
 from quad_gym.kernels.vehicle.air import accelerations_in_air
 from quad_gym.kernels.vehicle.dynamics import accelerations, integrate, load_state
-from quad_gym.records import FLIGHT_BLOCK
+from quad_gym.records import FEATURE_BLOCKS, FLIGHT_BLOCK
 
 _flight_at = lanes_at(FLIGHT_BLOCK)
 
@@ -135,7 +136,12 @@ def step_gnss_drift(flights, params):
 @_entry
 def sense_features(flights, params, feature_count):
     """Measure the features that the camera of flights[0] sees."""
-    camera.measure(flights[0], params[0], feature_count, True)
+    flight = flights[0]
+    for i in range(feature_count):
+        block = FEATURE_BLOCKS + i
+        (x, y, z), seen = camera.measure(flight, params[0], i)
+        keep(flight.measurement[block], seen, (x, y, z))
+        flight.block_valid[block] = select(seen, 1.0, 0.0)
 
 
 @_entry

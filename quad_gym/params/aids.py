@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.checks import Checked
 
 OBSERVED = ("position", "height", "velocity", "heading")
@@ -19,6 +20,11 @@ class SlowError(NamedTuple):
 
     sigma: float  #: stationary standard deviation, in the unit of the measurement
     tau: float = math.inf  #: correlation time [s]; infinite: the error is constant during a flight
+
+    def over(self, time: float) -> tuple[float, float]:
+        """Return its decay over a time [s], and the standard deviation of its driving noise."""
+        drive = self.sigma * math.sqrt(portable.approached(2.0 * time / self.tau))
+        return portable.exp(-time / self.tau), drive
 
 
 class Reading(NamedTuple):
@@ -84,6 +90,21 @@ class SensorBase(Checked):
     def reads_velocity(self) -> bool:
         """False if measurements do not depend on the velocity, which makes updates faster."""
         return True
+
+    @property
+    def drift(self) -> tuple[SlowError, ...]:
+        """Slow errors that are zero at the start, and come first among the states of a filter."""
+        return ()
+
+    @property
+    def packed(self) -> dict[str, Any]:
+        """Numbers for the kernels, by fields of their parameters; others are in `numbers`."""
+        return {}
+
+    @property
+    def options(self) -> dict[str, bool]:
+        """Errors and limits of the true sensor, by fields of the kernels' settings."""
+        return {}
 
     def simplified(self) -> Self:
         """Return a copy without latency and without errors that the filter does not model."""

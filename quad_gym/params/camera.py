@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.aids import Reading, SensorBase
 from quad_gym.params.checks import Matrix, Vector
 
@@ -91,6 +92,29 @@ class CameraParams(SensorBase):
     def measured_blocks(self) -> tuple[int, ...]:
         """Number of features."""
         return (len(self.features_I),)
+
+    @property
+    def packed(self) -> dict[str, Any]:
+        """Mounting, image, motion blur and features."""
+        return {
+            "focal_length": self.focal_length,
+            "pixel_sigma": self.pixel_sigma,
+            "max_range": self.max_range,
+            "camera": self.position_B,
+            "R_CB": portable.euler_dcm(self.attitude),
+            "half_image": np.array(self.image_size) / 2,
+            "blur": self.blur,
+            "features": self.features_I,
+        }
+
+    @property
+    def options(self) -> dict[str, bool]:
+        """Limits of images."""
+        return {
+            "camera_limited": self.limited,
+            "camera_blurs": self.exposure > 0.0,
+            "ground_hides": self.ground_hides,
+        }
 
     @property
     def limited(self) -> bool:

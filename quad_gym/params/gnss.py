@@ -1,13 +1,14 @@
 """GNSS: positions, velocities, the baseline between two antennas, and their errors."""
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
+from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import Reading, SensorBase
+from quad_gym.params.aids import Reading, SensorBase, SlowError
 
 MIN_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so
@@ -163,6 +164,42 @@ class GnssParams(SensorBase):
     def drifts(self) -> bool:
         """True if positions have a time-correlated error."""
         return any(self.drift_sigma_I)
+
+    @property
+    def drift(self) -> tuple[SlowError, ...]:
+        """The drift of positions, as a filter assumes it."""
+        if not self.drifts:
+            return ()
+        return tuple(SlowError(max(s, MIN_DRIFT), self.drift_tau) for s in self.drift_sigma_I)
+
+    @property
+    def packed(self) -> dict[str, Any]:
+        """Antennas, drift between two measurements, and noise of baselines."""
+        drift = SlowError(1.0, self.rate * self.drift_tau)  # in measurements
+        decay, drive = drift.over(1.0)
+        found: dict[str, Any] = {
+            "R_IG": ecef_to_enu(self.reference_antenna_G),
+            "primary_antenna_B": self.primary_antenna_B,
+            "antenna": self.primary_antenna_B,
+            "position_sigma_I": self.position_sigma_I,
+            "baseline_sigma": self.baseline_sigma,
+            "heading_error_sigma": self.heading_error_sigma,
+            "velocity_sigma": self.velocity_sigma or 0.0,
+            "drift_step": 1.0 / drift.tau,
+            "drift_decay": decay,
+            "drift_drive": np.array(self.drift_sigma_I) * drive,
+        }
+        if self.has_baseline:
+            found["baseline"] = self.baseline_B
+            found["baseline_length"] = portable.norm(self.baseline_B)
+            found["first_baseline_sigma"] = self.first_baseline_sigma
+            found["baseline_noise"] = self.baseline_noise
+        return found
+
+    @property
+    def options(self) -> dict[str, bool]:
+        """Drift of positions, and constant errors of baselines."""
+        return {"gnss_drifts": self.drifts, "heading_errs": self.heading_errs}
 
     @property
     def heading_errs(self) -> bool:

@@ -198,6 +198,11 @@ class SensorSuite(SensorTable, Saved):
         names = [each.name for each in sensor.readings(SENSOR_OF[reading])]
         return int(sensor.measured_blocks[names.index(reading)])
 
+    def gives(self, reading: str) -> bool:
+        """Return True if a reading is measured, or the mark of the start gives it in its place."""
+        lacks = getattr(self, SENSOR_OF[reading]) is None
+        return self.blocks_of(reading) > 0 or (lacks and READINGS[reading].marked)
+
     def shape_of(self, reading: str) -> tuple[int, ...]:
         """Return the shape of a reading: of a number, of a block, or of several."""
         kind, count = READINGS[reading], self.blocks_of(reading)

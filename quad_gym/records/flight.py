@@ -254,8 +254,6 @@ WORK_FIELDS = (
     Field("P", (MAX_STATES, MAX_STATES), "mixed", "lower triangle of a covariance, for resets and starts"),
     # update; the columns of L that matter, first those of e, r, v and the slow errors
     Field("L", (MAX_STATES, MAX_STATES), "mixed", "these columns, and behind them the covariance that they leave"),
-    Field("X_B", (MAX_FEATURES, 3), "m", "features relative to the center of mass, in B"),
-    Field("inverse_distance", (MAX_FEATURES,), "1/m", "of the features from the camera"),
     Field("z_hat", (MAX_MEASUREMENTS,), "mixed", "measurement predicted at the center"),
     Field("z", (MAX_MEASUREMENTS,), "mixed", "measurement"),
     Field("nu", (MAX_MEASUREMENTS,), "mixed", "innovation; then whitened"),

@@ -121,7 +121,11 @@ def draws_of_call(name, function, call):
         assert len(values) == 1  # one set of draws for each kind of fault
     elif ".sensors." in name:  # sensor s, block i, or slow state k
         names = {node.id for node in ast.walk(call.args[1]) if isinstance(node, ast.Name)}
-        values |= {"i": range(AID_MOST[scope["_S"]])} if "i" in names - set(values) else {}
+        values |= (
+            {"i": range(AID_MOST[scope["_S"]] if "_S" in scope else MAX_FEATURES)}
+            if "i" in names - set(values)
+            else {}
+        )
         values |= {"s": range(AIDS)} if "s" in names else {}
         values |= {"k": range(0, MAX_SLOW, 3)} if "k" in names else {}
     assert len(values) < 3

@@ -18,7 +18,7 @@ import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.columns import columns_of
-from quad_gym.kernels.filter.error_state import MAX_ANGLE, D, E, R, reset_variances
+from quad_gym.kernels.filter.error_state import MAX_ANGLE, E, R, reset_variances
 from quad_gym.kernels.filter.measurements import (
     by_derivative,
     direction_noise,
@@ -40,14 +40,13 @@ from quad_gym.kernels.numbers.linalg import (
     load_column3,
     norm,
     outer,
-    store,
 )
 from quad_gym.kernels.numbers.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm, turn_pair
 from quad_gym.kernels.sensors.common import (
+    Reading,
     begin_clock,
-    begin_sample,
-    deliver,
+    sample_of,
     sensor_stage,
     tick_clock,
 )
@@ -74,20 +73,14 @@ def project(X_I, r_I, R_BI, p):
 
 
 @kernel
-def measure(flight, p, feature_count, mask):
-    """Project the features and flag the visible ones, in the lanes `mask`."""
-    stream = stream_of(flight)
+def measure(flight, p, i):
+    """The projection of feature i, and the lanes in which it is visible."""
     R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
-    for i in range(feature_count):
-        x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
-        seen = seen & mask
-        if any_of(seen):
-            n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
-            pixel = flight.measurement[FEATURE_BLOCKS + i]
-            pixel[0] = select(seen, x + p.pixel_sigma * n_x, pixel[0])
-            pixel[1] = select(seen, y + p.pixel_sigma * n_y, pixel[1])
-        before = flight.block_valid[FEATURE_BLOCKS + i]
-        flight.block_valid[FEATURE_BLOCKS + i] = select(mask, select(seen, 1.0, 0.0), before)
+    x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
+    if any_of(seen):
+        n_x, n_y = normal_pair(stream_of(flight), DRAW_FEATURE + i)
+        x, y = x + p.pixel_sigma * n_x, y + p.pixel_sigma * n_y
+    return (x, y, 0.0), seen
 
 
 @kernel
@@ -97,31 +90,43 @@ def _begin(flight, p, settings, mask):
 
 
 @kernel
-def _sample(flight, p, settings, work, stages, mask, starting):
-    """Take an image when due, with limits of range, blur, ground, obstacles, and faults."""
-    due = tick_clock(flight, settings, _CAMERA, mask)
-    begin_sample(flight, work, settings, _CAMERA, mask)
-    if any_of(due):
-        measure(flight, p, settings.feature_count, due)
-        work.mask = select(due, 1.0, 0.0)
-        call_stage(stages, Stage.LIMIT_CAMERA, flight, p, p, settings, work, 0)
-        call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
-        call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
-    deliver(flight, work, settings, _CAMERA, mask, due)
+def _when(flight, p, settings, mask, starting):
+    return tick_clock(flight, settings, _CAMERA, mask)
 
 
 @kernel
-def _center(flight, p, work, settings, k, i, R_BI, pixel_sigma):
-    """Fill the rows of measurement, prediction and noise of feature i."""
-    R_CB = load33(p.R_CB)
+def _change(flight, p, settings, work, stages, due):
+    """Apply limits of range, blur, ground, obstacles, and faults to the image just taken."""
+    work.mask = select(due, 1.0, 0.0)
+    call_stage(stages, Stage.LIMIT_CAMERA, flight, p, p, settings, work, 0)
+    call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
+    call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
+
+
+@kernel
+def _expect(flight, p, work, settings, i, k, valid):
+    """Fill rows k to k + 2: the direction of feature i."""
+    R_BI, w_B = load33(flight.R_hat), load3(flight.w_meas) - load3(flight.b_g_hat)
+    pixel_sigma = math.sqrt(p.pixel_sigma * p.pixel_sigma + p.blur * p.blur * dot(w_B, w_B))
     X_B = R_BI @ (load3(p.features[i]) - load3(flight.r_hat))
     to_feature = X_B - load3(p.camera)
     per_distance = 1.0 / norm(to_feature)
-    store(work.X_B[i], X_B)
-    work.inverse_distance[i] = per_distance
-    x, y = flight.measurement[FEATURE_BLOCKS + i, 0], flight.measurement[FEATURE_BLOCKS + i, 1]
+    z_hat = per_distance * to_feature
+    _center(flight, p, work, settings, i, k, valid, z_hat, pixel_sigma)
+    last = columns_of(settings) - 1
+    for j in range(settings.motion_columns):
+        a, s = _column(p, work, settings, j, R_BI, X_B, per_distance, z_hat)
+        put_three(work.A[last - j], k, valid, a)
+        put_three(work.E[j], k, valid, s)
+
+
+@kernel
+def _center(flight, p, work, settings, i, k, valid, z_hat, pixel_sigma):
+    """Fill the rows of measurement, prediction and noise of feature i."""
+    R_CB, pixel = load33(p.R_CB), flight.measurement[FEATURE_BLOCKS + i]
+    x, y = pixel[0], pixel[1]
     ray_C = (_PIXEL * x, _PIXEL * y, _PIXEL * p.focal_length)
-    length, z_hat = norm(ray_C), per_distance * to_feature
+    length = norm(ray_C)
     z = R_CB.T @ ((1.0 / length) * ray_C)
     sigma = pixel_sigma * _PIXEL / length
     u_B = select(p.noise_at_prediction > 0.0, z_hat, z)
@@ -129,12 +134,12 @@ def _center(flight, p, work, settings, k, i, R_BI, pixel_sigma):
     # a pixel does not move along the optical axis c: minus c c^T, across u
     across = R_CB[2] + -dot(R_CB[2], u_B) * u_B
     noise = noise + outer(-p.noise_pinhole * sigma * sigma * across, across)
-    put_block(work, settings, k, flight.block_valid[FEATURE_BLOCKS + i] > 0.0, z, z_hat, noise)
+    put_block(work, settings, k, valid, z, z_hat, noise)
 
 
 @kernel
-def _column(flight, p, work, settings, k, j, A, S, R_BI):
-    """Fill the rows of all features in column j, with a derivative or a pair of sigma points.
+def _column(p, work, settings, j, R_BI, X_B, per_distance, u_B):
+    """Half-difference and half-sum of a feature in column j, or its derivative and zero.
 
     Columns from the fourth on do not change the attitude.
     """
@@ -142,56 +147,34 @@ def _column(flight, p, work, settings, k, j, A, S, R_BI):
     d, dr_B = load_column3(L, E, j), load_column3(L, R, j)
     dr_B = R_BI @ dr_B if by_derivative(settings) else R_BI @ (c * dr_B)
     odd, even = load33(work.odd[min(j, 2)]), load33(work.even[min(j, 2)])
-    for i in range(settings.feature_count):
-        valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
-        if any_of(valid):
-            X_B, per_distance = load3(work.X_B[i]), work.inverse_distance[i]
-            a, s = zero_like(X_B), zero_like(X_B)
-            if with_pairs(settings):
-                # (I + even +- odd) (X_B -+ dr_B) - l_c
-                shift = c * dr_B if by_derivative(settings) else dr_B
-                if j >= 3:
-                    a, s = direction_shift(X_B - camera, per_distance, -shift)
-                else:
-                    v_odd, v_even = turn_pair(even, odd, X_B, shift)
-                    a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
-                a, s = inverse_c * a, inverse_c * s
-            if by_derivative(settings):
-                u_B = load3(work.z_hat[k : k + 3])
-                v = per_distance * (cross(X_B, d) - dr_B)
-                a = v + -dot(u_B, v) * u_B
-            put_three(A, k, valid, a)
-            put_three(S, k, valid, s)
-            k += 3
+    a, s = zero_like(X_B), zero_like(X_B)
+    if with_pairs(settings):
+        # (I + even +- odd) (X_B -+ dr_B) - l_c
+        shift = c * dr_B if by_derivative(settings) else dr_B
+        if j >= 3:
+            a, s = direction_shift(X_B - camera, per_distance, -shift)
+        else:
+            v_odd, v_even = turn_pair(even, odd, X_B, shift)
+            a, s = direction_pair(X_B - camera, per_distance, v_even, v_odd)
+        a, s = inverse_c * a, inverse_c * s
+    if by_derivative(settings):
+        v = per_distance * (cross(X_B, d) - dr_B)
+        a = v + -dot(u_B, v) * u_B
+    return a, s
 
 
 @kernel
-def _expect(flight, p, work, settings, k):
-    """Fill the rows from k on, three for each feature that any lane sees."""
-    R_BI, w_B, end = load33(flight.R_hat), load3(flight.w_meas) - load3(flight.b_g_hat), k
-    pixel_sigma = math.sqrt(p.pixel_sigma * p.pixel_sigma + p.blur * p.blur * dot(w_B, w_B))
-    for i in range(settings.feature_count):
-        if any_of(flight.block_valid[FEATURE_BLOCKS + i] > 0.0):
-            _center(flight, p, work, settings, end, i, R_BI, pixel_sigma)
-            end += 3
-    last = columns_of(settings) - 1
-    for j in range(settings.motion_columns):
-        _column(flight, p, work, settings, k, j, work.A[last - j], work.E[j], R_BI)
-
-
-@kernel
-def _reset(flight, p, work, settings):
+def _reset(flight, p, work, settings, states, lanes, alone, nu):
     """Reset attitude and position.
 
     The variance of the attitude is the square of the largest innovation, the variance of the
     position that of the corresponding offset at the feature's distance.
     """
     angle, offset, P = zero_like(flight.tick), zero_like(flight.tick), work.P
-    lanes, states = work.reset[FEATURE_BLOCKS] > 0.0, D + settings.slow_states
     for i in range(settings.feature_count):
-        nu = flight.innovation[FEATURE_BLOCKS + i]
+        innovation = flight.innovation[FEATURE_BLOCKS + i]
         seen = lanes & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
-        square = select(seen, nu[0] * nu[0] + nu[1] * nu[1], 0.0)
+        square = select(seen, innovation[0] * innovation[0] + innovation[1] * innovation[1], 0.0)
         distance = minimum(norm(load3(p.features[i]) - load3(flight.r_hat)), p.max_range)
         angle = maximum(angle, square)
         offset = maximum(offset, square * distance * distance)
@@ -201,4 +184,9 @@ def _reset(flight, p, work, settings):
     reset_variances(P, E, states, lanes, (angle, angle, angle))
 
 
-camera_stage = sensor_stage(Sensor["CAMERA"], _begin, _sample, _expect, _reset)
+camera_stage = sensor_stage(
+    Sensor["CAMERA"],
+    _begin,
+    sample_of(Sensor["CAMERA"], measure, _when, change=_change),
+    Reading(_expect, _reset),
+)

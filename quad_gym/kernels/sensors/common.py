@@ -1,6 +1,7 @@
 """The parts that sensors share: clock, latency, delivery, errors, and the stage itself."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +14,6 @@ from quad_gym.kernels.numbers.linalg import keep, load3
 from quad_gym.kernels.numbers.random import normal_pair, stream_of, uniform_pair
 from quad_gym.records import (
     AID_BLOCK,
-    AID_GROUPS,
-    AID_MOST,
     DELAY_SLOTS,
     DRAW_AID_DRIFT,
     DRAW_AID_MATRIX,
@@ -23,6 +22,10 @@ from quad_gym.records import (
     DRAW_SLOW,
     FIRST_AID,
     FIRST_BLOCK,
+    FIRST_GROUP,
+    GROUP_BLOCK,
+    GROUP_COUNT,
+    MOST_BLOCKS,
     STAMP,
     Act,
     Aid,
@@ -193,18 +196,93 @@ def deliver(flight, work, settings, sensor, mask, due):
 # --------------------------------------------------------------------------------------------------
 
 
+class Reading(NamedTuple):
+    """How a filter uses a reading of a sensor."""
+
+    expect: Any
+    """`(flight, p, work, settings, i, k, valid)`: fill the rows of block i, from k on, in these
+    lanes"""
+    reset: Any
+    """`(flight, p, work, settings, states, lanes, alone, nu)`: reset states to the reading in
+    `lanes`, those of the vehicle where it is `alone`, by the innovation nu; of several blocks, by
+    the largest ones"""
+
+
 @kernel
 def _cannot_align(flight, p, work, settings, mask):
     """Placeholder for sensors that observe no heading; never called."""
 
 
+@kernel
+def _expect_nothing(flight, p, work, settings, k):
+    """End of a sensor's readings."""
+
+
+@kernel
+def _reset_nothing(flight, p, work, settings):
+    """End of a sensor's readings."""
+
+
+def _of_readings(sensor: int, readings: Sequence[Reading]) -> tuple[Any, Any]:
+    """Return kernels that fill the rows of all readings, and that reset states to them."""
+    expect_rest, reset_rest = _expect_nothing, _reset_nothing
+    for number, reading in reversed(list(enumerate(readings))):
+        group = FIRST_GROUP[sensor] + number
+        expect_rest = _expecting(sensor, group, reading.expect, expect_rest)
+        reset_rest = _resetting(sensor, group, reading.reset, reset_rest)
+    return expect_rest, reset_rest
+
+
+def _expecting(sensor: int, group: int, expect: Any, rest: Any) -> Any:
+    """Return a kernel that fills the rows of a reading and of the rest, from k on."""
+    first, alone = GROUP_BLOCK[group], GROUP_COUNT[sensor] == 1
+
+    @kernel
+    def expect_valid(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
+        for i in range(settings.sensor_blocks[sensor] if alone else 1):
+            valid = flight.block_valid[first + i] > 0.0
+            if any_of(valid):
+                expect(flight, p, work, settings, i, k, valid)
+                k += 3
+        rest(flight, p, work, settings, k)
+
+    return expect_valid
+
+
+def _resetting(sensor: int, group: int, reset: Any, rest: Any) -> Any:
+    """Return a kernel that resets states to a reading and to the rest."""
+    first, several = GROUP_BLOCK[group], MOST_BLOCKS[group] > 1
+
+    @kernel
+    def reset_states(flight, p, work, settings):  # type: ignore[no-untyped-def]
+        lanes, alone, states = work.reset[group], work.alone[group], D + settings.slow_states
+        nu = load3(flight.innovation[first])
+        if several:
+            nu = _largest(flight, first, settings.sensor_blocks[sensor])
+        reset(flight, p, work, settings, states, lanes > 0.0, alone > 0.0, nu)
+        rest(flight, p, work, settings)
+
+    return reset_states
+
+
+@kernel
+def _largest(flight, first, count):
+    """Magnitudes of the largest innovations among the valid blocks of a sensor."""
+    zero = zero_like(flight.tick)
+    largest = (zero, zero, zero)
+    for block in range(first, first + count):
+        nu, valid = load3(flight.innovation[block]), flight.block_valid[block] > 0.0
+        size = (abs(nu[0]), abs(nu[1]), abs(nu[2]))
+        largest = (
+            maximum(largest[0], select(valid, size[0], zero)),
+            maximum(largest[1], select(valid, size[1], zero)),
+            maximum(largest[2], select(valid, size[2], zero)),
+        )
+    return largest
+
+
 def sensor_stage(
-    sensor: Sensor,
-    begin: Any,
-    sample: Any,
-    expect: Any,
-    reset: Any,
-    align: Any = _cannot_align,
+    sensor: Sensor, begin: Any, sample: Any, *readings: Reading, align: Any = _cannot_align
 ) -> Any:
     """Make the stage of a sensor; its flag is an `Act`, and an argument times `ACTS`.
 
@@ -212,11 +290,11 @@ def sensor_stage(
         sensor: The sensor.
         begin: `(flight, p, settings, mask)`: begin an episode: clock and constant errors.
         sample: `(flight, world, settings, work, stages, mask, starting)`: measure when due, and
-            deliver.
-        expect: `(flight, p, work, settings, k)`: fill the sensor's rows, from k on.
-        reset: `(flight, p, work, settings)`: reset states where `work.reset`.
+            deliver; see `sample_of`.
+        readings: What the filter does with its readings, in their order.
         align: `(flight, p, work, settings, mask)`: initialize the heading.
     """
+    expect, reset = _of_readings(int(sensor), readings)
 
     def call(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
         act, argument, mask = flag % ACTS, flag // ACTS, work.mask > 0.0
@@ -236,8 +314,69 @@ def sensor_stage(
     return stage(call)
 
 
+@kernel
+def _never_first(flight, p, settings, mask):
+    """Sensors that do not initialize a filter: return False."""
+    return False
+
+
+@kernel
+def _change_nothing(flight, p, settings, work, stages, due):
+    """Sensors without further limits and faults."""
+
+
+@kernel
+def _disturb_nothing(flight, settings, numbers, due):
+    """Sensors without a fault of their numbers."""
+    return numbers
+
+
+def sample_of(
+    sensor: Sensor,
+    measure: Any,
+    when: Any,
+    first: Any = _never_first,
+    change: Any = _change_nothing,
+    disturb: Any = _disturb_nothing,
+) -> Any:
+    """Return the kernel of a sensor of one reading that measures when due, and delivers.
+
+    Args:
+        sensor: The sensor.
+        measure: `(flight, p, i) -> numbers, within`: three numbers that block i measures now, zero
+            beyond its own, and the lanes in which it can measure.
+        when: `(flight, p, settings, mask, starting) -> due`: advance clock and errors; return the
+            lanes in which it measures now.
+        first: `(flight, p, settings, mask) -> bool`: measure for a filter's start; return False if
+            the filter does not start with this sensor.
+        change: `(flight, p, settings, work, stages, due)`: limits and faults of what was measured.
+        disturb: `(flight, settings, numbers, due) -> numbers`: a fault of the numbers.
+    """
+    number, block = int(sensor), FIRST_BLOCK[sensor]
+
+    @kernel
+    def sample(flight, p, settings, work, stages, mask, starting):  # type: ignore[no-untyped-def]
+        due = when(flight, p, settings, mask, starting)
+        if starting and first(flight, p, settings, mask):
+            return
+        begin_sample(flight, work, settings, number, mask)
+        if any_of(due):
+            for i in range(settings.sensor_blocks[number]):
+                (x, y, z), within = measure(flight, p, i)
+                taken = due & within
+                if settings.faults:
+                    x, y, z = disturb(flight, settings, (x, y, z), taken)
+                valid = flight.block_valid[block + i]
+                keep(flight.measurement[block + i], taken, (x, y, z))
+                flight.block_valid[block + i] = select(taken, 1.0, valid)
+            change(flight, p, settings, work, stages, due)
+        deliver(flight, work, settings, number, mask, due)
+
+    return sample
+
+
 # --------------------------------------------------------------------------------------------------
-# Errors, delivery and gate shared by the sensors with parameters in the fields `aid_...`.
+# Errors and stages of the sensors with parameters in the fields `aid_...`.
 #
 # A sensor has one block of up to three numbers, or several. It may have Gauss-Markov errors of
 # three numbers and of one, and constant errors of scale and alignment.
@@ -301,28 +440,27 @@ def _due(flight, p, settings, s, mask, starting):
 
 
 def aid_stage(
-    aid: Aid, measure: Any, expect: Any, reset: Any, *others: Any, disturb: Any = None
+    aid: Aid,
+    measure: Any,
+    expect: Any,
+    reset: Any,
+    draw: Any = None,
+    align: Any = _cannot_align,
+    disturb: Any = None,
 ) -> Any:
-    """Make the stage of an aiding sensor.
+    """Make the stage of a sensor with parameters in the fields `aid_...`.
 
     Args:
         aid: The sensor.
-        measure: `(flight, p, i) -> numbers, within`: three numbers that block i measures now, zero
-            beyond its own, and the lanes in which it can measure.
-        expect: `(flight, p, work, settings, i, k, valid)`: fill the rows of block i, from k on, in
-            these lanes.
-        reset: `(flight, p, work, settings, states, lanes, alone, nu)`: reset states to the sensor
-            in `lanes`, those of the vehicle where it is `alone`, by the innovation nu; of several
-            blocks, by the largest ones.
-        others: `(flight, p, mask)`, draw further constant errors of an episode, and `align` of
-            `sensor_stage`; optional.
-        disturb: `(flight, settings, numbers, due) -> numbers`: the fault of a sensor that measures
-            wrong numbers, `numbers` without it; optional.
+        measure: As in `sample_of`.
+        expect: As in `Reading`.
+        reset: As in `Reading`.
+        draw: `(flight, p, mask)`: draw further constant errors of an episode; optional.
+        align: As in `sensor_stage`; optional.
+        disturb: As in `sample_of`; optional.
     """
-    s, group, sensor = int(aid), AID_GROUPS + aid, FIRST_AID + int(aid)
-    first, several = AID_BLOCK[s], AID_MOST[aid] > 1
-    draw, *align = others or (_draw_nothing,)
-    disturbs, disturbed = disturb is not None, disturb or _disturb_nothing
+    s, sensor = int(aid), FIRST_AID + int(aid)
+    first, draw, disturb = AID_BLOCK[s], draw or _draw_nothing, disturb or _disturb_nothing
 
     @kernel
     def begin(flight, p, settings, mask):  # type: ignore[no-untyped-def]
@@ -330,66 +468,24 @@ def aid_stage(
         draw(flight, p, mask)
 
     @kernel
-    def sample(flight, p, settings, work, stages, mask, starting):  # type: ignore[no-untyped-def]
+    def when(flight, p, settings, mask, starting):  # type: ignore[no-untyped-def]
         due = _due(flight, p, settings, s, mask, starting)
-        if starting and settings.heading_sensor == sensor and settings.warm == 0:
-            # it initializes the filter, which uses it only once
-            (x, y, z), _ = measure(flight, p, 0)
-            keep(flight.measurement[first], mask, (x, y, z))
-            flight.block_fresh[first] = select(mask, 1.0, flight.block_fresh[first])
-            return
         if settings.faults:
             due = due & (flight.fault_active[AID_LOSS + s] <= 0.0)
-        begin_sample(flight, work, settings, sensor, mask)
-        if any_of(due):
-            for i in range(settings.sensor_blocks[sensor]):
-                (x, y, z), within = measure(flight, p, i)
-                taken = due & within
-                if disturbs and settings.faults:
-                    x, y, z = disturbed(flight, settings, (x, y, z), taken)
-                keep(flight.measurement[first + i], taken, (x, y, z))
-                flight.block_valid[first + i] = select(taken, 1.0, flight.block_valid[first + i])
-        deliver(flight, work, settings, sensor, mask, due)
+        return due
 
     @kernel
-    def expect_valid(flight, p, work, settings, k):  # type: ignore[no-untyped-def]
-        for i in range(settings.sensor_blocks[sensor]):
-            valid = flight.block_valid[first + i] > 0.0
-            if any_of(valid):
-                expect(flight, p, work, settings, i, k, valid)
-                k += 3
+    def measure_first(flight, p, settings, mask):  # type: ignore[no-untyped-def]
+        if settings.heading_sensor != sensor or settings.warm != 0:
+            return False
+        # it initializes the filter, which uses it only once
+        (x, y, z), _ = measure(flight, p, 0)
+        keep(flight.measurement[first], mask, (x, y, z))
+        flight.block_fresh[first] = select(mask, 1.0, flight.block_fresh[first])
+        return True
 
-    @kernel
-    def reset_states(flight, p, work, settings):  # type: ignore[no-untyped-def]
-        lanes, alone, states = work.reset[group], work.alone[group], D + settings.slow_states
-        nu = load3(flight.innovation[first])
-        if several:
-            nu = _largest(flight, first, settings.sensor_blocks[sensor])
-        reset(flight, p, work, settings, states, lanes > 0.0, alone > 0.0, nu)
-
-    return sensor_stage(Sensor[aid.name], begin, sample, expect_valid, reset_states, *align)
-
-
-@kernel
-def _largest(flight, first, count):
-    """Magnitudes of the largest innovations among the valid blocks of a sensor."""
-    zero = zero_like(flight.tick)
-    largest = (zero, zero, zero)
-    for block in range(first, first + count):
-        nu, valid = load3(flight.innovation[block]), flight.block_valid[block] > 0.0
-        size = (abs(nu[0]), abs(nu[1]), abs(nu[2]))
-        largest = (
-            maximum(largest[0], select(valid, size[0], zero)),
-            maximum(largest[1], select(valid, size[1], zero)),
-            maximum(largest[2], select(valid, size[2], zero)),
-        )
-    return largest
-
-
-@kernel
-def _disturb_nothing(flight, settings, numbers, due):
-    """Placeholder for sensors without such a fault."""
-    return numbers
+    sample = sample_of(Sensor[aid.name], measure, when, first=measure_first, disturb=disturb)
+    return sensor_stage(Sensor[aid.name], begin, sample, Reading(expect, reset), align=align)
 
 
 @kernel

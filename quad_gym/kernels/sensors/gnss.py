@@ -33,6 +33,7 @@ from quad_gym.kernels.numbers.linalg import (
 from quad_gym.kernels.numbers.random import six_normals, stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.common import (
+    Reading,
     begin_clock,
     begin_sample,
     deliver_arrived,
@@ -92,7 +93,7 @@ def drift_gnss(flight, p, mask, share):
 
 
 @kernel
-def expect_position(flight, p, work, settings, k, valid):
+def expect_position(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2."""
     R_BI, l_B, s = load33(flight.R_hat), load3(p.antenna), load3(p.position_sigma_I)
     antenna_I = load3(flight.r_hat) + R_BI.T @ l_B
@@ -113,7 +114,7 @@ def expect_position(flight, p, work, settings, k, valid):
 
 
 @kernel
-def reset_position(flight, p, work, settings, states, lanes, nu):
+def reset_position(flight, p, work, settings, states, lanes, alone, nu):
     """Reset the position, and its slow error to the stationary one.
 
     Where the estimate has drifted off, the velocity is reset, too.
@@ -174,7 +175,7 @@ def measure_baseline(flight, p, R_BI, normals, mask):
 
 
 @kernel
-def expect_baseline(flight, p, work, settings, k, valid):
+def expect_baseline(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2."""
     R_BI, u_B = load33(flight.R_hat), (1.0 / p.baseline_length) * load3(p.baseline)
     u_I, z = R_BI.T @ u_B, load33(p.R_IG) @ load3(flight.measurement[BASELINE_BLOCK])
@@ -194,7 +195,7 @@ def expect_baseline(flight, p, work, settings, k, valid):
 
 
 @kernel
-def reset_baseline(flight, p, work, states, lanes, nu):
+def reset_baseline(flight, p, work, settings, states, lanes, alone, nu):
     """Reset the heading to the sideward innovation."""
     square = nu[0] * nu[0] + nu[1] * nu[1]
     reset_heading(work.P, load33(flight.R_hat), states, lanes, square)
@@ -222,7 +223,7 @@ def measure_velocity(flight, p, mask):
 
 
 @kernel
-def expect_velocity(flight, p, work, settings, k, valid):
+def expect_velocity(flight, p, work, settings, i, k, valid):
     """Fill rows k to k + 2."""
     R_BI, variance = load33(flight.R_hat), p.velocity_sigma * p.velocity_sigma
     lever_B = cross(load3(flight.w_meas) - load3(flight.b_g_hat), load3(p.antenna))
@@ -239,7 +240,7 @@ def expect_velocity(flight, p, work, settings, k, valid):
 
 
 @kernel
-def reset_velocity(work, states, lanes, nu):
+def reset_velocity(flight, p, work, settings, states, lanes, alone, nu):
     """Reset the velocity."""
     squares = (nu[0] * nu[0], nu[1] * nu[1], nu[2] * nu[2])
     reset_variances(work.P, V, states, lanes, squares)
@@ -329,32 +330,11 @@ def _sample(flight, p, settings, work, stages, mask, starting):
                 deliver_arrived(flight, work, block, mask)
 
 
-@kernel
-def _expect(flight, p, work, settings, k):
-    """Fill three rows for each block that any lane has, from k on."""
-    for block in _BLOCKS:
-        valid = flight.block_valid[block] > 0.0
-        if any_of(valid):
-            if block == POSITION_BLOCK:
-                expect_position(flight, p, work, settings, k, valid)
-            elif block == BASELINE_BLOCK:
-                expect_baseline(flight, p, work, settings, k, valid)
-            else:
-                expect_velocity(flight, p, work, settings, k, valid)
-            k += 3
-
-
-@kernel
-def _reset(flight, p, work, settings):
-    states = D + settings.slow_states
-    for block in _BLOCKS:
-        nu, lanes = load3(flight.innovation[block]), work.reset[block] > 0.0
-        if block == POSITION_BLOCK:
-            reset_position(flight, p, work, settings, states, lanes, nu)
-        elif block == BASELINE_BLOCK:
-            reset_baseline(flight, p, work, states, lanes, nu)
-        else:
-            reset_velocity(work, states, lanes, nu)
-
-
-gnss_stage = sensor_stage(Sensor["GNSS"], _begin, _sample, _expect, _reset)
+gnss_stage = sensor_stage(
+    Sensor["GNSS"],
+    _begin,
+    _sample,
+    Reading(expect_position, reset_position),
+    Reading(expect_baseline, reset_baseline),
+    Reading(expect_velocity, reset_velocity),
+)
