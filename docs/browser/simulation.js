@@ -117,14 +117,15 @@ class Simulation {
     const steps = Math.round(Number(flights.settings("sensor_delay")[GNSS]) / flights.info.ticksPerStep);
     const stamp = Math.max(trail.length - 1 - steps, 0);
     const arm = turnedBack(turns[stamp], Array.from(flights.params("model", "antenna")));
-    const place = sum(turned(east, flights.field(k, "gnss_position")), scaled(-1, arm));
+    const place = sum(turned(east, flights.field(k, "measurement").subarray(0, 3)), scaled(-1, arm));
     return { time, place, real: trail[stamp] };
   }
 
   keepImage(k, time, fresh) {
-    const { image } = this.pilots[k], pixels = this.flights.field(k, "pixels"), seen = [];
+    const { image } = this.pilots[k], z = this.flights.field(k, "measurement"), seen = [];
     for (let i = 0; i < this.flights.info.features; i++) {
-      if (fresh[FEATURES + i] > 0) seen.push({ feature: i, x: pixels[2 * i], y: pixels[2 * i + 1] });
+      const block = FEATURES + i;
+      if (fresh[block] > 0) seen.push({ feature: i, x: z[3 * block], y: z[3 * block + 1] });
     }
     if (seen.length) this.pilots[k].image = { time, pixels: seen, count: image.count + 1 };
   }

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.estimation.inputs import (
-    BLANK,
     ONE_PREDICTION,
     ONE_UPDATE,
     Measurement,
     Tape,
-    write_measurement,
 )
 from quad_gym.kernels import entries
 from quad_gym.kernels.entries import linked_table
@@ -193,8 +191,7 @@ class Engine:
 
     def update(self, measurement: Measurement) -> None:
         """Update the estimate with measurements."""
-        self._measurement[:] = BLANK
-        write_measurement(self._measurement[0], measurement)
+        self._measurement[:] = measurement
         self._run_one(ONE_UPDATE)
 
     def _run_one(self, operation: NDArray[Any]) -> None:

@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.estimation.engine import Engine, Floats
 from quad_gym.estimation.inputs import (
+    NOTHING,
     InputHistory,
     Measurement,
     Tape,
     TapeWriter,
     checked_measurement,
+    measured_blocks,
 )
 from quad_gym.estimation.starts import (
     RESOLVED,
@@ -205,7 +207,7 @@ class FilterEstimate:
         """Innovations of the last call of `update`, also of a delayed one; NaN: not measured."""
         self._require_start()
         if self._report is None:  # it came in time: its innovations are still in memory
-            self._report = self._innovations(self._reported.blocks)
+            self._report = self._innovations(measured_blocks(self._reported))
         return self._report
 
     def _innovations(self, measured: list[int]) -> Innovations:
@@ -284,7 +286,7 @@ class KalmanFilter(FilterEstimate):
         self._measurements: dict[int, Measurement] = {}
         self._copies: dict[int, Any] = {}
         self._log_weights, self._moments = None, None
-        self._report, self._reported = None, Measurement()
+        self._report, self._reported = None, NOTHING
         self._running = False
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -450,7 +452,8 @@ class KalmanFilter(FilterEstimate):
             "gnss_velocity_G": gnss_velocity_G,
             **others,
         }
-        measurement = checked_measurement(self.sensors, given)
+        measured = any(value is not None for value in given.values())
+        measurement = checked_measurement(self.sensors, given) if measured else NOTHING
         now = self._history.time
         stamp = now if time is None else check.number("time", time)
         if stamp > now + SAME_TIME:
@@ -484,7 +487,7 @@ class KalmanFilter(FilterEstimate):
     def _begin(self, time: float, flights: int = 1) -> None:
         """Clear all memory, and make room for flights."""
         self._log_weights, self._moments = None, None
-        self._report, self._reported = None, Measurement()
+        self._report, self._reported = None, NOTHING
         self._measurements, self._copies = {}, {}
         self._choose_form()
         if flights > 1 or len(self._engine.blocks) > 1:
@@ -504,7 +507,7 @@ class KalmanFilter(FilterEstimate):
                 if given is not None and target >= 0:
                     self._report, self._reported = None, given
                     if k + 1 < len(operations):  # what follows overwrites its innovations
-                        self._report = self._innovations(given.blocks)
+                        self._report = self._innovations(measured_blocks(given))
 
     def _operate(
         self,
@@ -528,7 +531,7 @@ class KalmanFilter(FilterEstimate):
                 self._engine.predict(samples[index])
             case Operation.UPDATE:
                 assert measurement is not None
-                if not measurement.empty:
+                if measurement is not NOTHING:
                     self._condition(measurement)
             case Operation.COPY:
                 copies[number] = self._engine.copy(), self._log_weights
@@ -690,7 +693,7 @@ def run_while_unknown(
 
 def _innovations(kf: KalmanFilter, measurement: Measurement) -> Floats:
     """Return innovations (blocks, REPORTED)."""
-    innovation, sigma, nis, gate = kf._innovations(measurement.blocks)
+    innovation, sigma, nis, gate = kf._innovations(measured_blocks(measurement))
     return np.column_stack([innovation, sigma, nis, gate])
 
 

@@ -5,17 +5,17 @@ from array import array
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from quad_gym.kernels import entries
 from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import BLOCKS_OF, MEASUREMENT, OPERATION, SAMPLE, Operation
-from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW
+from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW, Outcome
 
 # --------------------------------------------------------------------------------------------------
 # Inputs of a filter, checked: IMU samples, and measurements of one instant.
@@ -24,38 +24,14 @@ from quad_gym.records.inputs import EVENT, INPUT, PENDING, WINDOW
 Floats = NDArray[np.float64]
 
 HEADING_ALONE = 4.0
-"""Value of the noise `baseline_sigma`, above the largest one of pi, with which a filter uses only
-the heading of a baseline; its noise is then the suite's [rad]."""
+"""Standard deviation of a baseline, above the largest one of pi, with which a filter uses only its
+heading; its noise is then the suite's [rad]."""
 
+Measurement = NDArray[Any]
+"""Measurements of one instant, (1,) MEASUREMENT."""
 
-def known_blocks(values: Floats) -> NDArray[np.bool_]:
-    """Return True for the rows of `values` (blocks, length) that were measured."""
-    return np.asarray(~np.isnan(values).any(axis=1))
-
-
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """Measurements of one instant, by the names of their readings."""
-
-    values: dict[str, Floats] = field(default_factory=dict)
-    """(blocks, length) numbers as in records, NaN: a block was not measured"""
-    sigmas: dict[str, Floats] = field(default_factory=dict)
-    """(1,) or (3,) standard deviations that replace the suite's"""
-
-    @property
-    def empty(self) -> bool:
-        """True if nothing was measured."""
-        return not self.values
-
-    @property
-    def blocks(self) -> list[int]:
-        """Blocks of innovations of the measurement."""
-        return [
-            blocks.start + int(i)
-            for name, blocks in BLOCKS_OF.items()
-            if name in self.values
-            for i in np.flatnonzero(known_blocks(self.values[name]))
-        ]
+GROUP = {name: group for group, name in enumerate(READINGS)}
+"""Numbers of the readings, as groups of the gate."""
 
 
 def keyword_of(name: str) -> str:
@@ -64,64 +40,78 @@ def keyword_of(name: str) -> str:
 
 
 def checked_measurement(sensors: SensorSuite, given: Mapping[str, Any]) -> Measurement:
-    """Check the arguments of `update` by their keywords; None: not measured."""
-    values, sigmas = {}, {}
+    """Return the measurements given by the keywords of `update`; None: not measured."""
+    found = np.zeros(1, MEASUREMENT)
+    row = found[0]
     for name, reading in READINGS.items():
         if (value := given.get(keyword_of(name))) is not None:
-            values[name] = _checked_value(sensors, name, value)
+            _put(row, sensors, name, value)
         if (sigma := given.get(reading.sigma)) is not None:
-            if name not in values:
-                raise ValueError(f"{reading.sigma} must come with its measurement")
-            sigmas[name] = checked_sigma(name, sigma)
-    return Measurement(values, sigmas)
+            shape = () if reading.sigmas == 1 or np.ndim(sigma) == 0 else (reading.sigmas,)
+            numbers = check.shaped(reading.sigma, sigma, shape)
+            # a record with 0 has none
+            row["sigma"][GROUP[name], : reading.sigmas] = np.where(numbers == 0.0, -1.0, numbers)
+    entries.check_measurement(found)
+    if row["outcome"] != Outcome.OK:
+        _refuse(row, given)
+    return found
+
+
+def _put(row: Any, sensors: SensorSuite, name: str, value: Any) -> None:
+    """Write a measurement into a record."""
+    count, keyword, first = sensors.blocks_of(name), keyword_of(name), BLOCKS_OF[name].start
+    if count == 0:
+        words = name.replace("gnss", "GNSS").replace("_", " ")
+        raise ValueError(f"{keyword} must be None: the sensor suite has no {words}")
+    numbers = check.shaped(keyword, value, sensors.shape_of(name)).reshape(count, -1)
+    row["valid"][first : first + count] = 1.0
+    row["measurement"][first : first + count, : numbers.shape[1]] = numbers
+
+
+def _refuse(row: Any, given: Mapping[str, Any]) -> NoReturn:
+    """Raise the error of a measurement that the check refuses."""
+    culprit = int(row["culprit"])
+    name = list(READINGS)[culprit % len(READINGS)]
+    of_sigma, reading = culprit >= len(READINGS), READINGS[name]
+    keyword = reading.sigma if of_sigma else keyword_of(name)
+    value, outcome = given[keyword], row["outcome"]
+    if outcome == Outcome.CONTRADICTION:
+        raise ValueError(f"{keyword} must come with its measurement, {keyword_of(name)}")
+    if outcome == Outcome.NOT_FINITE:
+        raise ValueError(f"{keyword} must be finite, got {value!r}")
+    if of_sigma:
+        raise ValueError(
+            f"{keyword} must be at least {reading.least_sigma:g}, and at most {check.LARGEST:g}, "
+            f"got {value!r}"
+        )
+    if name == "gnss_baseline" and not np.any(value):
+        raise ValueError(f"{keyword} must have a direction, got zeros")
+    raise ValueError(f"{keyword} must be within ±{check.LARGEST:g}, got {value!r}")
+
+
+def measured_blocks(measurement: Measurement) -> list[int]:
+    """Return the blocks of innovations of a measurement."""
+    return [int(block) for block in np.flatnonzero(measurement["valid"][0])]
+
+
+def values_of(measurement: Measurement, name: str, count: int) -> Floats:
+    """Return the first blocks of a reading, (count, length); NaN: not measured."""
+    blocks = slice(BLOCKS_OF[name].start, BLOCKS_OF[name].start + count)
+    values: Floats = measurement["measurement"][0, blocks, : READINGS[name].length].copy()
+    values[measurement["valid"][0, blocks] == 0.0] = np.nan
+    return values
+
+
+def sigmas_of(measurement: Measurement, name: str) -> Floats:
+    """Return a measurement's own standard deviations of a reading; NaN: the suite's."""
+    sigmas: Floats = measurement["sigma"][0, GROUP[name], : READINGS[name].sigmas]
+    return sigmas
 
 
 def require_gnss(sensors: SensorSuite, what: str) -> None:
     """Refuse an operation that requires GNSS."""
     if sensors.gnss is None:
         raise ValueError(f"the sensor suite has no GNSS to {what}")
-
-
-def _checked_value(sensors: SensorSuite, name: str, value: Any) -> Floats:
-    """Return a measurement (blocks, length) of a reading."""
-    reading, count, keyword = READINGS[name], sensors.blocks_of(name), keyword_of(name)
-    if count == 0:
-        words = name.replace("gnss", "GNSS").replace("_", " ")
-        raise ValueError(f"the sensor suite has no {words} to update with")
-    if name == "gnss_baseline":
-        return checked_baseline(sensors, value)[np.newaxis]
-    several = reading.most_blocks > 1
-    if not several and reading.length == 1:
-        return np.array([[check.number(keyword, value)]])
-    found = check.array(keyword, value, sensors.shape_of(name), allow_nan=several)
-    return found.reshape(count, reading.length)
-
-
-def checked_baseline(sensors: SensorSuite, gnss_baseline_G: ArrayLike) -> Floats:
-    """Return a baseline (3,), scaled by a power of two: its length is not used."""
-    if sensors.gnss is not None and not sensors.gnss.has_baseline:
-        raise ValueError("gnss_baseline_G must be None for GNSS with one antenna")
-    baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))
-    largest = np.abs(baseline).max()
-    if largest == 0.0:
-        raise ValueError("gnss_baseline_G must have a direction, got zeros")
-    # a power of two brings it near one without rounding
-    return np.ldexp(baseline, -int(np.frexp(largest)[1]))
-
-
-def checked_sigma(name: str, value: Any) -> Floats:
-    """Return the standard deviations of a reading, of a number or as many."""
-    reading = READINGS[name]
-    least = reading.least_sigma
-    if np.ndim(value) == 0 or reading.sigmas == 1:
-        sigma = check.positive(reading.sigma, value, least=least)
-        if name == "gnss_baseline":
-            sigma = min(sigma, math.pi)
-        return np.full(reading.sigmas, sigma)
-    sigmas = check.array(reading.sigma, value, (reading.sigmas,))
-    if not (sigmas >= least).all():
-        raise ValueError(f"{reading.sigma} must be at least {least:g}, got {value!r}")
-    return sigmas
 
 
 # --------------------------------------------------------------------------------------------------
@@ -214,10 +204,9 @@ class InputHistory:
 
 _PREDICT, _UPDATE = int(Operation.PREDICT), int(Operation.UPDATE)
 
-_GROUP = {name: group for group, name in enumerate(READINGS)}
-BLANK = np.zeros(1, MEASUREMENT)
-"""Record of a measurement of nothing, with the noise of the parameters."""
-BLANK["sigma"] = np.nan
+NOTHING = np.zeros(1, MEASUREMENT)
+"""A measurement of nothing, with the noise of the parameters."""
+NOTHING["sigma"] = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,18 +236,6 @@ class Tape:
     def after(self, first: int) -> "Tape":
         """Return the tape without its first operations."""
         return replace(self, operations=self.operations[first:])
-
-
-def write_measurement(row: Any, m: Measurement) -> None:
-    """Write a measurement into a blank record."""
-    for name, values in m.values.items():
-        first, (count, length) = BLOCKS_OF[name].start, values.shape
-        known = known_blocks(values)
-        row["valid"][first : first + count] = known
-        blocks = row["measurement"][first : first + count, :length]
-        blocks[...] = np.where(known[:, np.newaxis], values, 0.0)
-    for name, sigmas in m.sigmas.items():
-        row["sigma"][_GROUP[name], : len(sigmas)] = sigmas
 
 
 _AT_ONCE = 4096  #: operations of a piece of a tape
@@ -335,9 +312,9 @@ class TapeWriter:
         reported = _from_zero(targets, updates & (targets >= 0))
         samples = _from_zero(indices, codes == Operation.PREDICT)
         measured = _from_zero(indices, updates)
-        records = np.repeat(BLANK, measured[1] - measured[0])
-        for row, index in zip(records, range(*measured), strict=True):
-            write_measurement(row, self.measurement(index))
+        records = np.repeat(NOTHING, measured[1] - measured[0])
+        for k, index in enumerate(range(*measured)):
+            records[k : k + 1] = self.measurement(index)
         return Tape(
             self.history.samples[slice(*samples)].copy(),
             records,

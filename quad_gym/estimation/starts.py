@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.inputs import (
     Measurement,
-    checked_baseline,
-    checked_sigma,
+    checked_measurement,
+    measured_blocks,
     require_gnss,
+    sigmas_of,
+    values_of,
 )
 from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels import entries
@@ -298,11 +300,11 @@ def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floa
     engine.update(measurement)
     after = _log_determinant(engine.covariances())
     nis, dimension = engine.read("nis"), engine.read("nis_dimension")
-    if not dimension.any() or not measurement.blocks:
+    if not dimension.any() or not measured_blocks(measurement):
         return log_weights
     in_steps = np.isnan(nis)
     if in_steps.any():  # an image processed in steps: block by block
-        blocks = engine.read("block_nis")[:, measurement.blocks]
+        blocks = engine.read("block_nis")[:, measured_blocks(measurement)]
         nis = np.where(in_steps, np.nansum(blocks, axis=1), nis)
     weights = log_weights - 0.5 * (nis + before - after)
     weights[engine.read("update_failures") > failures] = -np.inf
@@ -444,15 +446,17 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     """Return the start that follows from a first fix."""
     require_gnss(sensors, "initialize: start with set_state() instead")
     assert sensors.gnss is not None
-    position = check.array("gnss_position_G", fix.gnss_position_G, (3,))
+    names = ("gnss_position_G", "gnss_baseline_G", "gnss_sigma")
+    measured = checked_measurement(sensors, {name: getattr(fix, name) for name in names})
+    position = values_of(measured, "gnss_position", 1)[0]
     _require_relative(position)
     sigmas = np.array(sensors.gnss.position_sigma_I)
     if fix.gnss_sigma is not None:
-        sigmas = checked_sigma("gnss_position", fix.gnss_sigma)
+        sigmas = sigmas_of(measured, "gnss_position").copy()
     velocity, speeds = _first_velocity(sensors, fix)
     baseline = fix.gnss_baseline_G
     if baseline is not None:
-        baseline = checked_baseline(sensors, baseline)
+        baseline = values_of(measured, "gnss_baseline", 1)[0]
     if baseline is not None and fix.accel is None:
         others = ("heading_sigma", "magnetometer", "magnetometer_sigma", "accel_sigma", "course")
         fix.refuse("not be given with gnss_baseline_G", *others)

@@ -139,6 +139,7 @@ run_tape = Entry(
 take_inputs = Entry(
     "tape:take_inputs", *map(Rows, (WINDOW, EVENT, SAMPLE, PENDING, OPERATION, INPUT))
 )
+check_measurement = Entry("tape:check_measurement", Rows(MEASUREMENT))
 start_filter = Entry("single:start_filter", _BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
 run_stage = Entry(
     "single:run_stage",
@@ -192,7 +193,12 @@ FILTER_STAGES = (
     *(Stage[sensor.name] for sensor in Sensor),
 )
 """Stages that a filter runs, as far as it needs them."""
-FILTER_ENTRIES = (start_filter.name, run_tape.name, take_inputs.name)
+FILTER_ENTRIES = (
+    start_filter.name,
+    run_tape.name,
+    take_inputs.name,
+    check_measurement.name,
+)
 """Names of the entries that a filter calls, the slowest to compile first."""
 _SENSORS_AND_VEHICLE = (
     sense_features,
@@ -216,7 +222,15 @@ _SENSORS_AND_VEHICLE = (
 )
 SENSORS_AND_VEHICLE = tuple(entry.name for entry in _SENSORS_AND_VEHICLE)
 """Names of the entries for sensors and vehicles, the slowest to compile first."""
-_ENTRIES = (fly, run_tape, start_filter, take_inputs, run_stage, *_SENSORS_AND_VEHICLE)
+_ENTRIES = (
+    fly,
+    run_tape,
+    start_filter,
+    take_inputs,
+    check_measurement,
+    run_stage,
+    *_SENSORS_AND_VEHICLE,
+)
 ENTRIES = {entry.name: entry for entry in _ENTRIES}
 """All entries by their names."""
 

@@ -17,21 +17,25 @@ from quad_gym.kernels.numbers.elementary import sin_cos
 from quad_gym.kernels.numbers.linalg import load3, store
 from quad_gym.kernels.single import begin_filter
 from quad_gym.kernels.stages import STAGE_TABLE
-from quad_gym.kernels.tape import keep_estimate, predict_sample, take_input, update_with
+from quad_gym.kernels.tape import (
+    check,
+    is_all_finite,
+    keep_estimate,
+    predict_sample,
+    scale_baseline,
+    take_input,
+    update_with,
+)
 from quad_gym.records import (
     AID_BLOCK,
     BASELINE_BLOCK,
     FLIGHT_BLOCK,
-    GROUP_BLOCK,
     KEPT,
     MEASUREMENT,
-    MOST_BLOCKS,
     OPERATION,
     PARAMS_BLOCK,
     POSITION_BLOCK,
-    READINGS,
     SAMPLE,
-    SENSOR_GROUPS,
     SETTINGS,
     START,
     STEP_BLOCK,
@@ -70,8 +74,6 @@ _WINDOW, _INPUT, _FIX, _MEMORY, _ESTIMATE, _MOUNTING = map(
     from_dtype, (WINDOW, INPUT, FIX, MEMORY, ESTIMATE, MOUNTING)
 )
 _FIELD_BLOCK = AID_BLOCK[Aid["MAGNETOMETER"]]
-_POSITIONS, _BASELINES = READINGS.index("gnss_position"), READINGS.index("gnss_baseline")
-_LEAST, _LEAST_OF_POSITION = 1e-12, 1e-9  #: standard deviations
 _PREDICT, _UPDATE, _, _RESTORE, _ = map(int, Operation)
 _OK, _, _NOT_FINITE, _RANGE, _, _, _, _NO_HEADING, _CONTRADICTION = map(int, Outcome)
 _NOTHING = (0.0, 0.0, 0.0)
@@ -82,88 +84,6 @@ _words_at, _numbers_at, _reals_at, _singles_at = map(
     array_at, (np.uint64, np.int64, np.float64, np.float32)
 )
 _NUMBERS = (_FLIGHT, _PARAMS, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE)
-
-
-@kernel
-def _is_all_finite(values):
-    found = True
-    for i in range(len(values)):
-        found &= math.isfinite(values[i])
-    return found
-
-
-@kernel
-def _has_nan(values):
-    found = False
-    for i in range(len(values)):
-        found |= math.isnan(values[i])
-    return found
-
-
-@kernel
-def scale_baseline(v):
-    """Scale a baseline by a power of two: its length is not used; return the outcome."""
-    if not _is_all_finite(v):
-        return _NOT_FINITE
-    largest = max(abs(v[0]), abs(v[1]), abs(v[2]))
-    if largest == 0.0:
-        return _RANGE
-    while largest >= 1.0 or largest < 0.5:
-        factor = 0.5 if largest >= 1.0 else 2.0
-        largest = factor * largest
-        for i in range(3):
-            v[i] = factor * v[i]
-    return _OK
-
-
-@kernel
-def _check_sigma(value, least, measured):
-    """Check a standard deviation, 0: the parameters' one; return it, or NaN, and the outcome."""
-    if value == 0.0:
-        return math.nan, _OK
-    if not measured > 0.0:
-        return math.nan, _CONTRADICTION
-    if not math.isfinite(value):
-        return math.nan, _NOT_FINITE
-    return value, _OK if value >= least else _RANGE
-
-
-@kernel
-def _check_block(block, values):
-    """Check the numbers of a measured block; a baseline is scaled."""
-    if block == BASELINE_BLOCK:
-        return scale_baseline(values)
-    return _OK if _is_all_finite(values) else _NOT_FINITE
-
-
-@kernel
-def _check_sigmas(m, group, measured):
-    """Check the standard deviations of a reading."""
-    outcome, sigma = _OK, m.sigma[group]
-    for i in range(3):
-        least = _LEAST_OF_POSITION if group == _POSITIONS else _LEAST
-        sigma[i], found = _check_sigma(sigma[i], least, measured)
-        outcome = outcome if outcome != _OK else found
-    if group == _BASELINES and sigma[0] > math.pi:
-        sigma[0] = math.pi
-    return outcome
-
-
-@kernel
-def check_measurement(m):
-    """Check a MEASUREMENT, and complete it; return the first outcome that is not OK."""
-    valid, z, o = m.valid, m.measurement, _OK
-    for group in range(SENSOR_GROUPS):
-        several, measured, first = MOST_BLOCKS[group] > 1, 0.0, GROUP_BLOCK[group]
-        for block in range(first, first + MOST_BLOCKS[group]):
-            if several and _has_nan(z[block]):
-                valid[block] = 0.0  # one of several was not measured
-            if valid[block] > 0.0 and o == _OK:
-                o = _check_block(block, z[block])
-            measured = max(measured, valid[block])
-        found = _check_sigmas(m, group, measured)
-        o = o if o != _OK else found
-    return o
 
 
 @kernel
@@ -224,10 +144,11 @@ def take(
     """
     _correct(mounting, given, m)
     known = math.isfinite(given.time) and math.isfinite(given.dt)
-    if not (known and _is_all_finite(given.gyro) and _is_all_finite(given.accel)):
+    if not (known and is_all_finite(given.gyro) and is_all_finite(given.accel)):
         given.outcome = _NOT_FINITE
     elif given.rank > 0:
-        given.outcome = check_measurement(m)
+        check(m)
+        given.outcome = m.outcome
     if given.outcome == _OK:
         given.outcome = take_input(
             window,
@@ -248,11 +169,11 @@ def take(
 @kernel
 def _check_fix(fix):
     """Check the numbers of a FIX, and scale its baseline; return the outcome."""
-    if not (fix.has_position and _is_all_finite(fix.position) and math.isfinite(fix.time)):
+    if not (fix.has_position and is_all_finite(fix.position) and math.isfinite(fix.time)):
         return _NOT_FINITE
-    if (fix.has_heading and not math.isfinite(fix.heading)) or not _is_all_finite(fix.sigma):
+    if (fix.has_heading and not math.isfinite(fix.heading)) or not is_all_finite(fix.sigma):
         return _NOT_FINITE
-    if not (_is_all_finite(fix.velocity) and _is_all_finite(fix.field_B)):
+    if not (is_all_finite(fix.velocity) and is_all_finite(fix.field_B)):
         return _NOT_FINITE
     for i in range(3):
         if abs(fix.position[i]) > FARTHEST_FIX and not fix.rest:

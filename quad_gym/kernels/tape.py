@@ -16,7 +16,12 @@ from quad_gym.records import (
     AID_BLOCK,
     AID_GROUPS,
     AIDS,
+    BASELINE_BLOCK,
+    GROUP_BLOCK,
+    LEAST_SIGMA,
     MAX_BLOCKS,
+    MOST_BLOCKS,
+    SENSOR_GROUPS,
     WIDTH,
     Aid,
 )
@@ -24,12 +29,99 @@ from quad_gym.records.inputs import KEPT, REPORTED, SAME_TIME, Kept, Operation, 
 from quad_gym.records.states import ROWS
 
 # --------------------------------------------------------------------------------------------------
+# Checks of the numbers of a measurement, for Python and for exported filters.
+# --------------------------------------------------------------------------------------------------
+
+_OK, _NOT_FINITE, _RANGE = int(Outcome.OK), int(Outcome.NOT_FINITE), int(Outcome.OUT_OF_RANGE)
+_CONTRADICTION = int(Outcome.CONTRADICTION)
+_POSITIONS, _BASELINES, _VELOCITIES, _IMAGES = range(AID_GROUPS)
+_LARGEST = 1e15  #: largest magnitude of a measured number
+
+
+@kernel
+def is_all_finite(values):
+    """True if all numbers are finite."""
+    found = True
+    for i in range(len(values)):
+        found &= math.isfinite(values[i])
+    return found
+
+
+@kernel
+def scale_baseline(v):
+    """Scale a baseline by a power of two: its length is not used; return the outcome."""
+    if not is_all_finite(v):
+        return _NOT_FINITE
+    largest = max(abs(v[0]), abs(v[1]), abs(v[2]))
+    if largest == 0.0:
+        return _RANGE
+    while largest >= 1.0 or largest < 0.5:
+        factor = 0.5 if largest >= 1.0 else 2.0
+        largest = factor * largest
+        for i in range(3):
+            v[i] = factor * v[i]
+    return _OK
+
+
+@kernel
+def _check_block(block, z):
+    """Check the numbers of a measured block; a baseline is scaled."""
+    if block == BASELINE_BLOCK:
+        return scale_baseline(z)
+    if not is_all_finite(z):
+        return _NOT_FINITE
+    return _OK if max(abs(z[0]), abs(z[1]), abs(z[2])) <= _LARGEST else _RANGE
+
+
+@kernel
+def _check_sigmas(sigma, group, measured):
+    """Check the standard deviations of a reading; 0, for those of the parameters, becomes NaN."""
+    outcome = _OK
+    for i in range(3):
+        if sigma[i] == 0.0:
+            sigma[i] = math.nan
+        elif not measured:
+            outcome = _CONTRADICTION
+        elif not math.isfinite(sigma[i]):
+            outcome = _NOT_FINITE
+        elif not LEAST_SIGMA[group] <= sigma[i] <= _LARGEST:
+            outcome = _RANGE
+    if group == _BASELINES and sigma[0] > math.pi:
+        sigma[0] = math.pi
+    return outcome
+
+
+@kernel
+def check(m):
+    """Check a MEASUREMENT, and complete it; the outcome is the first one that is not OK."""
+    m.outcome, m.culprit = _OK, 0
+    for group in range(SENSOR_GROUPS):
+        measured, first = False, GROUP_BLOCK[group]
+        for block in range(first, first + MOST_BLOCKS[group]):
+            z = m.measurement[block]
+            if MOST_BLOCKS[group] > 1 and (z[0] != z[0] or z[1] != z[1] or z[2] != z[2]):
+                m.valid[block] = 0.0  # one of several was not measured
+            if m.valid[block] > 0.0:
+                measured, found = True, _check_block(block, z)
+                if found != _OK and m.outcome == _OK:
+                    m.outcome, m.culprit = found, group
+        found = _check_sigmas(m.sigma[group], group, measured)
+        if found != _OK and m.outcome == _OK:
+            m.outcome, m.culprit = found, group + SENSOR_GROUPS
+
+
+@entry(signature=signature_of(entries.check_measurement))
+def check_measurement(measurements):
+    """Check measurements[0], see `check`."""
+    check(measurements[0])
+
+
+# --------------------------------------------------------------------------------------------------
 # Entry that runs a filter over a tape: predictions, updates and copies, in their order.
 # --------------------------------------------------------------------------------------------------
 
 _PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
 _PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
-_POSITIONS, _BASELINES, _VELOCITIES, _IMAGES = range(AID_GROUPS)
 _HEIGHT = AID_BLOCK[Aid["BAROMETER"]]
 _LANES = 8 * WIDTH  #: bytes
 

@@ -253,21 +253,29 @@ def array(
     name: str, value: ArrayLike, shape: tuple[int | None, ...], *, allow_nan: bool = False
 ) -> NDArray[np.float64]:
     """`value` as a new float64 array in C order, of `shape` (None: any length), finite or NaN."""
+    result = shaped(name, value, shape)
+    bad = np.isinf(result) if allow_nan else ~np.isfinite(result)
+    if bad.any():
+        raise ValueError(f"{name} must be finite, got {result[bad].flat[0]} among its values")
+    return result
+
+
+def shaped(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    """`value` as a new float64 array in C order, of `shape` (None: any length)."""
     try:
         if holds_no_numbers(value):
             raise TypeError
         result = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} must be an array of numbers, got {value!r}") from None
+        numbers = "an array of numbers" if shape else "a number"
+        raise ValueError(f"{name} must be {numbers}, got {value!r}") from None
     fits = result.ndim == len(shape) and all(
         want is None or have == want for have, want in zip(result.shape, shape, strict=False)
     )
     if not fits:
         wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
-        raise ValueError(f"{name} must have shape {wanted}, got {result.shape}")
-    bad = np.isinf(result) if allow_nan else ~np.isfinite(result)
-    if bad.any():
-        raise ValueError(f"{name} must be finite, got {result[bad].flat[0]} among its values")
+        what = f"have shape {wanted}" if shape else "be a number"
+        raise ValueError(f"{name} must {what}, got {result.shape}")
     return result
 
 

@@ -80,6 +80,7 @@ class ReadingShape(NamedTuple):
     most_blocks: int
     observes: tuple[str, ...]
     direction: bool
+    least_sigma: float
 
 
 class SensorShape(NamedTuple):

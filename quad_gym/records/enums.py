@@ -81,6 +81,8 @@ READINGS = tuple(shape.name for shape in _SHAPES)
 """Names of the sensors' readings, in the order of the sensors. Each is a group of the gate."""
 LENGTHS = tuple(shape.length for shape in _SHAPES)  #: numbers in a block of each reading
 MOST_BLOCKS = tuple(shape.most_blocks for shape in _SHAPES)  #: largest numbers of their blocks
+LEAST_SIGMA = tuple(shape.least_sigma for shape in _SHAPES)
+"""Smallest standard deviations of a measurement of each reading."""
 DIRECTIONS = tuple(shape.direction for shape in _SHAPES)
 """True for readings that filters compare as unit vectors, of three numbers."""
 GROUP_FREEDOMS = tuple(2 if shape.direction else shape.length for shape in _SHAPES)

@@ -201,11 +201,15 @@ MEASUREMENT = np.dtype(
     [
         ("valid", "f8", MAX_BLOCKS),  # 1 where a block is measured
         ("measurement", "f8", (MAX_BLOCKS, 3)),  # as in a flight's record
-        # standard deviations of readings, NaN: as in the parameters; positions have three
+        # standard deviations of readings, of positions three; 0: not given, and after the check
+        # NaN: as in the parameters
         ("sigma", "f8", (SENSOR_GROUPS, 3)),
+        # results of the check
+        ("outcome", "i8"),
+        ("culprit", "i8"),  # number of the reading at fault; plus SENSOR_GROUPS: its deviations
     ]
 )
-"""Measurements of one instant; see `quad_gym.estimation.inputs.Measurement`."""
+"""Measurements of one instant, by blocks, from a log or a caller to the filter."""
 
 
 class Operation(IntEnum):

@@ -12,8 +12,9 @@ from quad_gym.estimation.filters import LONGEST_STEP
 from quad_gym.estimation.inputs import (
     HEADING_ALONE,
     Measurement,
-    checked_baseline,
     checked_measurement,
+    sigmas_of,
+    values_of,
 )
 from quad_gym.estimation.starts import level
 from quad_gym.frames import ecef_to_enu
@@ -21,7 +22,7 @@ from quad_gym.logs.formats import Floats, Log, Stream
 from quad_gym.params import checks as check
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.portable import turned
-from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_OF, SENSOR_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import Aid
 from quad_gym.records.inputs import SAME_TIME, Outcome
@@ -228,25 +229,28 @@ class LogMeasurements:
         """Return measurement k of a stream; None: nothing was measured."""
         if name == "gnss":
             found = checked_measurement(self.suite, self.fix(k))
-            return None if found.empty else found
+            return found if found["valid"].any() else None
         if name == "camera":
-            return Measurement({"pixels": self.streams[name].values["pixels"][k]})
+            return checked_measurement(
+                self.suite, {"pixels": self.streams[name].values["pixels"][k]}
+            )
         if name == "attitude":
             assert self.suite.gnss is not None
             baseline_I = turned(self._attitude(k).T, self.suite.gnss.baseline_B)
             alone = "heading" in self.streams[name].values
-            baseline = checked_baseline(self.suite, turned(self.R_GI, baseline_I))
-            return Measurement(
-                {"gnss_baseline": baseline[np.newaxis]},
-                {"gnss_baseline": np.array([HEADING_ALONE])} if alone else {},
-            )
+            baseline = {"gnss_baseline_G": turned(self.R_GI, baseline_I)}
+            found = checked_measurement(self.suite, baseline)
+            if alone:
+                sigmas_of(found, "gnss_baseline")[:] = HEADING_ALONE
+            return found
         aid = Aid[name.upper()]
         params, value = self.suite.aids[aid], self.streams[name].values[name][k]
         values = np.reshape(value, (-1, params.length))[: params.blocks]
         known = np.asarray(np.isfinite(values).all(axis=1))
         if not known.any():
             return None
-        return Measurement({name: np.where(known[:, np.newaxis], values, np.nan)})
+        shape = self.suite.shape_of(name)
+        return checked_measurement(self.suite, {name: values.reshape(shape)})
 
     def fix(self, k: int) -> dict[str, Any]:
         """Return the GNSS measurements of one instant as keywords of `update`."""
@@ -414,21 +418,20 @@ class FilterCalls:
 
     def _update(self, name: str, time: float, row: int, given: Measurement) -> None:
         """Add the measurement of a stream with its time stamp."""
-        if given.sigmas.get("gnss_baseline") == HEADING_ALONE:
+        if sigmas_of(given, "gnss_baseline")[0] == HEADING_ALONE:
             raise ValueError(
                 "a log for an exported filter must have attitudes or baselines, got headings alone"
             )
         if name in self._sensed:
             self._add(name, time, *self._sensed[name][name][row])
             return
-        sensor = SENSOR_OF[next(iter(given.values))]
+        sensor = "gnss" if name == "attitude" else name
         numbers: list[float] = []
         for reading in SENSOR_PARAMS[sensor].readings(sensor):
-            missing = np.full(reading.length, np.nan)
-            numbers += given.values.get(reading.name, missing).ravel().tolist()
+            count = max(self._suite.blocks_of(reading.name), 1)
+            numbers += values_of(given, reading.name, count).ravel().tolist()
             if reading.reported:
-                missing = np.full(reading.sigmas, np.nan)
-                numbers += given.sigmas.get(reading.name, missing).tolist()
+                numbers += sigmas_of(given, reading.name).tolist()
         self._add(sensor, time, *numbers)
 
     def keep(self) -> None:

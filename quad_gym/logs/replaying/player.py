@@ -14,7 +14,13 @@ from quad_gym.estimation.filters import (
     UnscentedKalmanFilter,
     run_filter,
 )
-from quad_gym.estimation.inputs import InputHistory, Measurement, TapeWriter, known_blocks
+from quad_gym.estimation.inputs import (
+    InputHistory,
+    Measurement,
+    TapeWriter,
+    measured_blocks,
+    values_of,
+)
 from quad_gym.logs.formats import Floats, Log
 from quad_gym.logs.replaying.log_start import LogStart
 from quad_gym.logs.replaying.measurements import (
@@ -335,7 +341,7 @@ class OwnPlayer:
             measurement = player.measured.at(name, k)
             if measurement is not None and age <= player.window + self._suite.imu.dt:
                 found |= self._by_name(measurement, age)
-                for block in measurement.blocks:
+                for block in measured_blocks(measurement):
                     self._arrived.setdefault(block, []).append((stamp, received))
         waiting.extendleft(reversed(later))
         return found
@@ -343,15 +349,18 @@ class OwnPlayer:
     def _by_name(self, given: Measurement, age: float) -> dict[str, SensorReading]:
         """Return a measurement as readings, by their names."""
         found, R_IG = {}, self._player.measured.R_GI.T
-        for name, value in given.values.items():
-            new = known_blocks(value)
+        for name, reading in READINGS.items():
+            value = values_of(given, name, self._suite.blocks_of(name))
+            new = np.asarray(np.isfinite(value).all(axis=1))
+            if not new.any():
+                continue
             if name == "gnss_baseline":  # has any length
                 assert self._suite.gnss is not None
                 length = np.linalg.norm(self._suite.gnss.baseline_B)
                 value = value * (length / np.linalg.norm(value))
-            if READINGS[name].in_G:
+            if reading.in_G:
                 value = (R_IG @ value[0])[np.newaxis]
-            several = READINGS[name].most_blocks > 1
+            several = reading.most_blocks > 1
             one = value.reshape(1, *self._suite.shape_of(name)).copy()
             found[name] = SensorReading(one, new[np.newaxis] if several else new, age)
         return found
