@@ -17,16 +17,20 @@ from quad_gym.kernels.numbers.lanes import select
 from quad_gym.kernels.numbers.linalg import diagonal, keep, load3, load4, load33, outer, store
 from quad_gym.kernels.obstacles import crosses, distance_from
 from quad_gym.kernels.sensors import camera
-from quad_gym.kernels.sensors.gnss import drift_gnss, measure_gnss
-from quad_gym.kernels.sensors.imperfect import (
+from quad_gym.kernels.sensors.gnss import (
     draw_heading_error,
-    draw_imu_errors,
-    err_imu,
-    limit_camera,
+    drift_gnss,
+    measure_gnss,
     turn_baseline,
+)
+from quad_gym.kernels.sensors.imu import (
+    draw_imu_errors,
+    drift_biases,
+    err_imu,
+    measure_imu,
+    measure_imu_average,
     vibrate_imu,
 )
-from quad_gym.kernels.sensors.imu import drift_biases, measure_imu, measure_imu_average
 from quad_gym.kernels.vehicle.air import accelerations_in_air
 from quad_gym.kernels.vehicle.dynamics import accelerations, integrate, load_state
 from quad_gym.records import FEATURE_BLOCKS, FLIGHT_BLOCK
@@ -124,7 +128,7 @@ def turn_gnss_baseline(flights, params):
 @_entry
 def limit_features(flights, params, blurs, ground_hides, feature_count):
     """Blur the last image of flights[0], and drop features out of range or behind the ground."""
-    limit_camera(flights[0], params[0], blurs, ground_hides, feature_count, True)
+    camera.limit_camera(flights[0], params[0], blurs, ground_hides, feature_count, True)
 
 
 @_entry

@@ -18,6 +18,7 @@ from quad_gym.params import checks as check
 from quad_gym.params import portable
 from quad_gym.params.checks import Checked
 from quad_gym.params.gnss import check_baseline
+from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import (
     RK4_LIMIT,
@@ -443,8 +444,8 @@ class DrawingTable(Ranges):
         self.center, self.spread = np.zeros(DRAWN_SIZE), np.ones(DRAWN_SIZE)
         for drawable in self.drawables:
             parts = randomization.distributions(drawable.name)
-            if drawable.name == "feature_offsets_I" and sensors.camera is not None:
-                parts = parts * len(sensors.camera.features_I)
+            if drawable.name == "feature_offsets_I":
+                parts = parts * max(sensors.blocks_of("pixels"), 1)
             for column, part in enumerate(parts, drawable.columns.start):
                 self._fill(drawable, column, part, nominal[column])
         check_bounds(self, parts_of(vehicle, sensors, world))
@@ -518,10 +519,10 @@ _MISSING = {
 
 def parts_of(vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams) -> dict[str, Any]:
     """Return the parts with nominal values of drawn parameters, by `Drawable.of`; None: missing."""
-    gnss = sensors.gnss
-    paired = gnss if gnss is not None and gnss.has_baseline else None
     parts = {"vehicle": vehicle, "world": world, "battery": world.battery, "imu": sensors.imu}
-    return parts | {"gnss": gnss, "antennas": paired, "camera": sensors.camera}
+    paired = sensors.blocks_of("gnss_baseline") > 0
+    every = {name: getattr(sensors, name) for name in SENSOR_PARAMS}
+    return parts | every | {"antennas": every["gnss"] if paired else None}
 
 
 def nominal_values(

@@ -74,7 +74,7 @@ DRAWS_OF = {
     "uniform_pair": 1,
     "normal_pair": 1,
     "six_normals": 3,
-    "_any_direction": 1,
+    "any_direction": 1,
     "_signed_pair": 1,
 }
 """Number of draws that a function takes, starting with the draw in its second argument."""
@@ -111,12 +111,12 @@ def draws_of_kernels():
 def draws_of_call(name, function, call):
     """Return the set of draws of a call for each value of the variables around it."""
     scope = dict(vars(importlib.import_module(name)))
-    if "_draw_of" in scope:
-        scope["_draw_of"] = scope["_draw_of"].py_func
+    if "draw_of" in scope:
+        scope["draw_of"] = scope["draw_of"].py_func
     source, values = ast.unparse(call.args[1]), {}
     for variable, end in loops_around(function, call):
         values[variable] = range(LARGEST.get(end) or eval(end, scope))
-    if "_draw_of(k" in source:
+    if "draw_of(k" in source:
         values["k"] = FAULTS
         assert len(values) == 1  # one set of draws for each kind of fault
     elif ".sensors." in name:  # sensor s, block i, or slow state k

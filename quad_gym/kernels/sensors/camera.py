@@ -16,7 +16,7 @@ so it would pass any gate, and its update would be wrong and overconfident.
 
 import math
 
-from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.filter.columns import columns_of
 from quad_gym.kernels.filter.error_state import MAX_ANGLE, E, R, reset_variances
 from quad_gym.kernels.filter.measurements import (
@@ -30,7 +30,7 @@ from quad_gym.kernels.filter.measurements import (
 )
 from quad_gym.kernels.filter.recovery import reset_drifted_velocity
 from quad_gym.kernels.numbers.elementary import maximum, minimum
-from quad_gym.kernels.numbers.lanes import any_of, select, zero_like
+from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
     dot,
@@ -50,10 +50,13 @@ from quad_gym.kernels.sensors.common import (
     sensor_stage,
     tick_clock,
 )
+from quad_gym.kernels.sensors.faults import draw_of
 from quad_gym.records import (
+    DRAW_BLUR,
     DRAW_FEATURE,
     DRAW_PHASE,
     FEATURE_BLOCKS,
+    FaultKind,
     Sensor,
 )
 
@@ -190,3 +193,109 @@ camera_stage = sensor_stage(
     sample_of(Sensor["CAMERA"], measure, _when, change=_change),
     Reading(_expect, _reset),
 )
+
+
+# --------------------------------------------------------------------------------------------------
+# Limits of images, and their faults.
+# --------------------------------------------------------------------------------------------------
+
+HIDDEN_BELOW = 1e-3
+"""Depth below the ground at which a feature is hidden [m]: one on the ground is visible."""
+
+
+@kernel
+def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
+    """Blur the image just taken; drop features too far or behind the ground, where `mask`."""
+    stream, r_I = stream_of(flight), load3(flight.r)
+    camera_I = r_I + quaternion_to_dcm(load4(flight.q)).T @ load3(p.camera)
+    # uniform over the smear in both directions: sqrt(3) standard deviations
+    reach = 1.7320508075688772 * p.blur * norm(load3(flight.w))
+    for i in range(feature_count):
+        X_I, valid = load3(p.features[i]), flight.block_valid[FEATURE_BLOCKS + i]
+        lost = norm(X_I - camera_I) > p.max_range
+        if ground_hides:
+            below = logical_not(camera_I[2] >= p.ground_height)
+            lost = lost | below | (X_I[2] < p.ground_height - HIDDEN_BELOW)
+        kept = select(lost, 0.0, valid)
+        flight.block_valid[FEATURE_BLOCKS + i] = select(mask, kept, valid)
+        seen = mask & (kept > 0.0)
+        if blurs and any_of(seen):
+            u, v = uniform_pair(stream, DRAW_BLUR + i)
+            for axis in range(2):
+                shift = reach * (2.0 * (u if axis == 0 else v) - 1.0)
+                pixel = flight.measurement[FEATURE_BLOCKS + i, axis]
+                flight.measurement[FEATURE_BLOCKS + i, axis] = select(seen, pixel + shift, pixel)
+
+
+@stage
+def limit_camera_stage(flight, world, model, settings, work, stages, flag):
+    """Blur the image just taken; drop features too far or behind the ground."""
+    count, mask = settings.feature_count, work.mask > 0.0
+    limit_camera(flight, world, settings.camera_blurs, settings.ground_hides, count, mask)
+
+
+@kernel
+def _nth(count, share, total):
+    """The whole number below `total` at a share of it, at most `count` - 1."""
+    place, number = total * share, zero_like(share)
+    for i in range(1, count):
+        number = select(place >= 1.0 * i, 1.0 * i, number)
+    return number
+
+
+@kernel
+def _mistake_features(flight, settings, mask):
+    """Confuse two visible features in the image just taken, at random in the lanes `mask`.
+
+    The two are the `first`-th and the `second`-th visible ones, counted from zero.
+    """
+    k, stream, count = FaultKind.WRONG_ASSOCIATIONS, stream_of(flight), settings.feature_count
+    zero = zero_like(flight.tick)
+    seen = zero
+    for i in range(count):
+        seen = seen + flight.block_valid[FEATURE_BLOCKS + i]
+    chance, u = uniform_pair(stream, draw_of(k, 4))
+    w, _ = uniform_pair(stream, draw_of(k, 5))
+    struck = mask & (flight.fault_active[k] > 0.0) & (chance < settings.fault_share[k])
+    struck = struck & (seen > 1.0)
+    first, second = _nth(count, u, seen), _nth(count, w, seen - 1.0)
+    second = select(second >= first, second + 1.0, second)
+
+    rank, x_first, y_first, x_second, y_second = zero, zero, zero, zero, zero
+    for i in range(count):
+        valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
+        here, there = valid & (rank == first), valid & (rank == second)
+        x, y = flight.measurement[FEATURE_BLOCKS + i, 0], flight.measurement[FEATURE_BLOCKS + i, 1]
+        x_first, y_first = select(here, x, x_first), select(here, y, y_first)
+        x_second, y_second = select(there, x, x_second), select(there, y, y_second)
+        rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
+
+    swaps = settings.fault_swaps > 0
+    rank = zero
+    for i in range(count):
+        valid = struck & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
+        here, there = valid & (rank == first) & swaps, valid & (rank == second)
+        x, y = flight.measurement[FEATURE_BLOCKS + i, 0], flight.measurement[FEATURE_BLOCKS + i, 1]
+        x, y = select(here, x_second, x), select(here, y_second, y)
+        flight.measurement[FEATURE_BLOCKS + i, 0] = select(there, x_first, x)
+        flight.measurement[FEATURE_BLOCKS + i, 1] = select(there, y_first, y)
+        mistaken = select(here | there, 1.0, 0.0)
+        flight.feature_mistaken[i] = select(mask, mistaken, flight.feature_mistaken[i])
+        rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
+
+
+@stage
+def corrupt_features_stage(flight, world, model, settings, work, stages, flag):
+    """Hide features of the image just taken and confuse some with others.
+
+    A feature hidden now counts as not visible in the whole step.
+    """
+    mask = work.mask > 0.0
+    if settings.fault_on[FaultKind.CAMERA_OCCLUSION]:
+        covered = mask & (flight.fault_active[FaultKind.CAMERA_OCCLUSION] > 0.0)
+        for i in range(settings.feature_count):
+            hidden, block = covered & (flight.feature_hidden[i] > 0.0), FEATURE_BLOCKS + i
+            flight.block_valid[block] = select(hidden, 0.0, flight.block_valid[block])
+            flight.block_fresh[block] = select(hidden, 0.0, flight.block_fresh[block])
+    if settings.fault_on[FaultKind.WRONG_ASSOCIATIONS]:
+        _mistake_features(flight, settings, mask)

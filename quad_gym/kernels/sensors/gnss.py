@@ -2,7 +2,7 @@
 
 import math
 
-from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.filter.columns import columns_of
 from quad_gym.kernels.filter.error_state import D, R, V, reset_heading, reset_variances
 from quad_gym.kernels.filter.measurements import (
@@ -13,7 +13,7 @@ from quad_gym.kernels.filter.measurements import (
 )
 from quad_gym.kernels.filter.recovery import reset_drifted_heading, reset_drifted_velocity
 from quad_gym.kernels.filter.slow import stationary
-from quad_gym.kernels.numbers.elementary import approached, exp, minimum
+from quad_gym.kernels.numbers.elementary import approached, exp, minimum, sin_cos
 from quad_gym.kernels.numbers.lanes import any_of, logical_not, select, zero_like
 from quad_gym.kernels.numbers.linalg import (
     cross,
@@ -30,7 +30,7 @@ from quad_gym.kernels.numbers.linalg import (
     unit_or,
     vector,
 )
-from quad_gym.kernels.numbers.random import six_normals, stream_of, uniform_pair
+from quad_gym.kernels.numbers.random import normal_pair, six_normals, stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.common import (
     Reading,
@@ -43,15 +43,17 @@ from quad_gym.kernels.sensors.common import (
     stamp,
     tick_clock,
 )
-from quad_gym.kernels.sensors.faults import gnss_heard
+from quad_gym.kernels.sensors.faults import any_direction, draw_of
 from quad_gym.records import (
     BASELINE_BLOCK,
     DRAW_DRIFT,
     DRAW_GNSS,
+    DRAW_HEADING,
     DRAW_PHASE,
     DRAW_VELOCITY,
     POSITION_BLOCK,
     VELOCITY_BLOCK,
+    FaultKind,
     Sensor,
 )
 
@@ -247,6 +249,88 @@ def reset_velocity(flight, p, work, settings, states, lanes, alone, nu):
 
 
 # --------------------------------------------------------------------------------------------------
+# Errors besides noise: constant errors of the heading that baselines show, and faults.
+# --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def draw_heading_error(flight, p, mask):
+    """Draw the constant error of an episode's baselines, where `mask`."""
+    n, _ = normal_pair(stream_of(flight), DRAW_HEADING)
+    flight.heading_error = select(mask, p.heading_error_sigma * n, flight.heading_error)
+
+
+@kernel
+def turn_baseline(flight, p, mask):
+    """Turn a measured baseline about the body z axis by its constant error, where `mask`."""
+    z_G = load33(p.R_IG).T @ quaternion_to_dcm(load4(flight.q))[2]
+    s, c = sin_cos(flight.heading_error)
+    b = load3(flight.measurement[BASELINE_BLOCK])
+    turned = c * b + rounded(s * cross(z_G, b))
+    keep(flight.measurement[BASELINE_BLOCK], mask, (1.0 - c) * dot(z_G, b) * z_G + turned)
+
+
+@stage
+def turn_baseline_stage(flight, world, model, settings, work, stages, flag):
+    """Apply the constant error to the baseline just measured."""
+    turn_baseline(flight, world, work.mask > 0.0)
+
+
+@kernel
+def _heard(flight, settings, due):
+    """Lanes in which GNSS has a position, and lanes in which it has a baseline, among those due."""
+    heard = due
+    if settings.fault_on[FaultKind.GNSS_OUTAGE]:
+        heard = heard & (flight.fault_active[FaultKind.GNSS_OUTAGE] <= 0.0)
+    paired = heard
+    if settings.fault_on[FaultKind.BASELINE_LOSS]:
+        paired = paired & (flight.fault_active[FaultKind.BASELINE_LOSS] <= 0.0)
+    return heard, paired
+
+
+@kernel
+def _draw_outlier(flight, p, settings, mask):
+    """Offset of an outlier in I; zero where this fix is not an outlier.
+
+    Its size is measured in standard deviations of a fix. These include the slow error, which has
+    the variance drive^2 / (1 - decay^2).
+    """
+    k, stream = FaultKind.GNSS_OUTLIERS, stream_of(flight)
+    chance, u = uniform_pair(stream, draw_of(k, 4))
+    struck = mask & (flight.fault_active[k] > 0.0) & (chance < settings.fault_share[k])
+    size = settings.fault_size[k, 0] + settings.fault_size[k, 1] * u
+    size, direction = select(struck, size, 0.0), any_direction(stream, draw_of(k, 5))
+    white, drive = load3(p.position_sigma_I), load3(p.drift_drive)
+    gained = approached(2.0 * p.drift_step)
+    flight.outlier = select(mask, select(struck, 1.0, 0.0), flight.outlier)
+    return (
+        size * math.sqrt(white[0] * white[0] + drive[0] * drive[0] / gained) * direction[0],
+        size * math.sqrt(white[1] * white[1] + drive[1] * drive[1] / gained) * direction[1],
+        size * math.sqrt(white[2] * white[2] + drive[2] * drive[2] / gained) * direction[2],
+    )
+
+
+@stage
+def corrupt_gnss_stage(flight, world, model, settings, work, stages, flag):
+    """Add ramp, jump and outliers to the GNSS position that has just been measured."""
+    active, mask = flight.fault_active, work.mask > 0.0
+    zero = zero_like(flight.tick)
+    offset_I = (zero, zero, zero)
+    if settings.fault_on[FaultKind.GNSS_RAMP]:
+        seconds = (flight.tick - flight.fault_from[FaultKind.GNSS_RAMP]) * world.dt
+        seconds = select(active[FaultKind.GNSS_RAMP] > 0.0, seconds, 0.0)
+        offset_I = seconds * load3(flight.fault_vector[FaultKind.GNSS_RAMP]) + offset_I
+    if settings.fault_on[FaultKind.GNSS_JUMP]:
+        jump_I = load3(flight.fault_vector[FaultKind.GNSS_JUMP])
+        offset_I = active[FaultKind.GNSS_JUMP] * jump_I + offset_I
+    if settings.fault_on[FaultKind.GNSS_OUTLIERS]:
+        offset_I = offset_I + _draw_outlier(flight, world, settings, mask)
+    offset_G = load33(world.R_IG).T @ offset_I
+    position = flight.measurement[POSITION_BLOCK]
+    keep(position, mask, load3(position) + offset_G)
+
+
+# --------------------------------------------------------------------------------------------------
 # The GNSS receiver: one clock and latency for position, baseline and velocity.
 # --------------------------------------------------------------------------------------------------
 
@@ -259,6 +343,8 @@ def _begin(flight, p, settings, mask):
     share, _ = uniform_pair(stream_of(flight), DRAW_PHASE)
     begin_clock(flight, settings, _GNSS, share, mask)
     keep(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
+    if settings.heading_errs:
+        draw_heading_error(flight, p, mask)
 
 
 @kernel
@@ -308,7 +394,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
     paired = measured
     initializes = starting and not settings.warm  # this fix has no faults
     if settings.faults and not initializes:
-        measured, paired = gnss_heard(flight, settings, due)
+        measured, paired = _heard(flight, settings, due)
     if any_of(measured):
         _measure(flight, p, settings, work, stages, measured, not initializes)
     if settings.gnss_baseline == 0:

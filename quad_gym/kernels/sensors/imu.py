@@ -4,9 +4,12 @@ Every draw has a fixed number within its instant, so that a measurement does not
 measurements.
 """
 
+import math
+
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.numbers.elementary import clip
 from quad_gym.kernels.numbers.lanes import select
-from quad_gym.kernels.numbers.linalg import keep, load3, load4, store
+from quad_gym.kernels.numbers.linalg import keep, load3, load4, load33, store
 from quad_gym.kernels.numbers.random import six_normals, stream_of
 from quad_gym.kernels.numbers.rotation import (
     mean_quaternion,
@@ -19,7 +22,7 @@ from quad_gym.kernels.vehicle.dynamics import (
     imu_point_acceleration,
     load_start,
 )
-from quad_gym.records import DRAW_BIAS, DRAW_IMU
+from quad_gym.records import DRAW_BIAS, DRAW_IMU, DRAW_IMU_ERRORS, DRAW_VIBRATION, FaultKind
 
 
 @kernel
@@ -116,3 +119,88 @@ def sum_imu_stage(flight, world, model, settings, work, stages, flag):
     """Add the newest IMU sample to the sum since the last step."""
     store(flight.gyro_sum, load3(flight.gyro_sum) + load3(flight.gyro))
     store(flight.accel_sum, load3(flight.accel_sum) + load3(flight.accel))
+
+
+# --------------------------------------------------------------------------------------------------
+# Imperfections besides noise and bias: constant errors, vibration, and limited ranges.
+#
+# Each acts on a sample that has just been taken and has its own draws, so that it changes nothing
+# else.
+# --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def _errors(on, off, n, m, k):
+    """Error matrix D of a sensor: scale errors on the diagonal, alignment errors off it."""
+    return (
+        (on * n[0], off * n[1], off * n[2]),
+        (off * m[0], on * m[1], off * m[2]),
+        (off * k[0], off * k[1], on * k[2]),
+    )
+
+
+@kernel
+def draw_imu_errors(flight, p, mask):
+    """Draw the errors of scale and alignment of an episode, where `mask`."""
+    stream = stream_of(flight)
+    a, b = six_normals(stream, DRAW_IMU_ERRORS)
+    c, d = six_normals(stream, DRAW_IMU_ERRORS + 3)
+    e, f = six_normals(stream, DRAW_IMU_ERRORS + 6)
+    accel = _errors(p.accel_scale_sigma, p.accel_misalignment_sigma, a, b, c)
+    gyro = _errors(p.gyro_scale_sigma, p.gyro_misalignment_sigma, d, e, f)
+    keep(flight.accel_error, mask, accel)
+    keep(flight.gyro_error, mask, gyro)
+
+
+@kernel
+def err_imu(flight, p, mask):
+    """Add D (f - g e3) and D w to the IMU's sample, where `mask`."""
+    D_a, D_g = load33(flight.accel_error), load33(flight.gyro_error)
+    f, w, w_now = load3(flight.accel), load3(flight.gyro), load3(flight.w_meas)
+    keep(flight.accel, mask, f + D_a @ (f[0], f[1], f[2] - p.gravity))
+    keep(flight.gyro, mask, w + D_g @ w)
+    keep(flight.w_meas, mask, w_now + D_g @ w_now)
+
+
+@kernel
+def vibrate_imu(flight, p, mask):
+    """Add the rotors' vibration to the IMU's sample, where `mask`.
+
+    Each rotor's imbalance shakes with a force that grows with the square of its speed, and the four
+    are independent: a standard deviation of `c sqrt(sum W_i^4 / 4)`.
+    """
+    W = load4(flight.rotor_speeds)
+    a, b, c, d = W[0] * W[0], W[1] * W[1], W[2] * W[2], W[3] * W[3]
+    size = 0.5 * math.sqrt(a * a + b * b + c * c + d * d)
+    n_a, n_g = six_normals(stream_of(flight), DRAW_VIBRATION)
+    n_a, n_g = p.accel_vibration * size * n_a, p.gyro_vibration * size * n_g
+    keep(flight.accel, mask, n_a + load3(flight.accel))
+    keep(flight.gyro, mask, n_g + load3(flight.gyro))
+    keep(flight.w_meas, mask, n_g + load3(flight.w_meas))
+
+
+@stage
+def begin_imperfect_stage(flight, world, model, settings, work, stages, flag):
+    """Draw the errors that last an episode."""
+    draw_imu_errors(flight, world, work.mask > 0.0)
+
+
+@stage
+def disturb_imu_stage(flight, world, model, settings, work, stages, flag):
+    """Add the IMU's constant errors and vibration to its sample."""
+    if settings.imu_errs:
+        err_imu(flight, world, work.mask > 0.0)
+    if settings.imu_vibrates:
+        vibrate_imu(flight, world, work.mask > 0.0)
+
+
+@stage
+def saturate_imu_stage(flight, world, model, settings, work, stages, flag):
+    """Limit the IMU's samples to its ranges, where the fault is active."""
+    if settings.fault_on[FaultKind.IMU_SATURATION]:
+        full = (work.mask > 0.0) & (flight.fault_active[FaultKind.IMU_SATURATION] > 0.0)
+        a, w = settings.imu_range[0], settings.imu_range[1]
+        for i in range(3):
+            flight.accel[i] = select(full, clip(flight.accel[i], -a, a), flight.accel[i])
+            flight.gyro[i] = select(full, clip(flight.gyro[i], -w, w), flight.gyro[i])
+            flight.w_meas[i] = select(full, clip(flight.w_meas[i], -w, w), flight.w_meas[i])

@@ -61,8 +61,16 @@ from quad_gym.kernels.numbers.linalg import (
 from quad_gym.kernels.numbers.random import normal_pair, stream_of
 from quad_gym.kernels.numbers.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.sensors.common import aid_stage, draw_matrix
-from quad_gym.kernels.sensors.faults import disturb_field
-from quad_gym.records import AID_BLOCK, AID_GROUPS, AID_NUMBERS, DRAW_AID, POSITION_BLOCK, Aid
+from quad_gym.records import (
+    AID_BLOCK,
+    AID_GROUPS,
+    AID_NUMBERS,
+    DRAW_AID,
+    POSITION_BLOCK,
+    Aid,
+    FaultKind,
+    FieldFault,
+)
 
 _S = int(Aid["MAGNETOMETER"])
 _BLOCK, _DRAW = AID_BLOCK[_S], DRAW_AID[_S]
@@ -188,6 +196,26 @@ def _reset(flight, p, work, settings, states, lanes, alone, nu):
     variance = (square + own) / (m[0] * m[0] + m[1] * m[1])
     reset_heading(work.P, load33(flight.R_hat), states, lanes & alone, variance)
     reset_drifted_heading(flight, p, work, AID_GROUPS + _S, lanes & alone, variance)
+
+
+@kernel
+def disturb_field(flight, settings, field_B, due):
+    """The field in B that a disturbed magnetometer measures, in the lanes `due`.
+
+    The sign of an angle is that of the vertical part of the fault's direction.
+    """
+    k = FaultKind.MAGNETOMETER_DISTURBANCE
+    active, vector = due & (flight.fault_active[k] > 0.0), load3(flight.fault_vector[k])
+    disturbed = load3(flight.field_frozen)
+    if settings.fault_field == FieldFault.IRON:
+        disturbed = field_B + vector
+    elif settings.fault_field == FieldFault.TURNED:
+        s, c = sin_cos(select(vector[2] > 0.0, flight.fault_size[k], -flight.fault_size[k]))
+        x, y, z = field_B
+        disturbed = (c * x - s * y, s * x + c * y, z)
+    field_B = select(active, disturbed, field_B)
+    keep(flight.field_frozen, due, field_B)
+    return field_B
 
 
 magnetometer_stage = aid_stage(
