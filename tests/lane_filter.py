@@ -68,7 +68,10 @@ class LaneFilter:
         self.blocks["block_valid"][block, measured, lane] = valid
 
     def get(self, name):
-        """A field of all flights, (EIGHT, ...)."""
+        """A field or reading of all flights, (EIGHT, ...)."""
+        if name in BLOCKS_OF:
+            blocks, numbers = BLOCKS_OF[name], slice(READINGS[name].length)
+            return field_of_flights(self.blocks, "measurement", EIGHT)[:, blocks, numbers]
         return field_of_flights(self.blocks, name, EIGHT)
 
     def measure(self, number, recording, k, *, position=True, baseline=True, camera=True):
