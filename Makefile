@@ -49,7 +49,7 @@ demo: $(VENV)/.viewer  ## LookAround on truth and estimate, then the circle as t
 	@echo "   estimate is expected to make no difference. Three seeds are trained on each for a few seconds,"
 	@echo "   so PD control with tuned gains is expected to be better than both:"
 	@$(BIN)/quad-gym compare circle --engine compiled --train-on truth estimate --seeds 3 \
-		--steps 250000 --n-envs 128 --set n_steps=16 batch_size=64 n_epochs=2 --evaluations 2 \
+		--steps 250000 --n-envs 128 --set n_steps=16 batch_size=64 n_epochs=2 --evaluations 5 \
 		--episodes 30 --jobs 2 --output results/demo/control
 	@echo
 	@echo "Open:"

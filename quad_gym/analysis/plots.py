@@ -250,7 +250,10 @@ def save_figure(figure: Any, stem: Path | str) -> list[Path]:
 
 def logarithmic(axes: Any, **options: Any) -> None:
     """Scale the ordinate logarithmically, labeled with numbers such as 0.1, not powers of ten."""
+    from matplotlib.ticker import LogLocator
+
     axes.set_yscale("log", **options)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("")
 
@@ -346,9 +349,10 @@ def learning_figure(
         axes.plot(seeds[0][0][:shortest] / 1e6, middle, linewidth=2.0, label=label, **style)
         if tests:
             end = 1.04 * max(steps[-1] for steps, _ in seeds) / 1e6
-            words = "test on the estimate" if k == len(curves) else "_"
             dot: dict[str, Any] = {"markeredgecolor": INK, "linestyle": "none"}
-            axes.plot(end, tests[label], "o", color=style["color"], label=words, **dot)
+            axes.plot(end, tests[label], "o", color=style["color"], label="_", **dot)
+    if tests:  # the dots have the colors of the lines; their explanation has none
+        axes.plot([], [], "o", color="none", label="dots: test on the estimate", **dot)
     for k, (label, level) in enumerate(levels.items()):
         dashes = _LEVELS[k % len(_LEVELS)]
         axes.axhline(level, color=INK, linewidth=1.0, linestyle=dashes, label=label)

@@ -30,7 +30,7 @@ from quad_gym.envs.config import with_effect
 from quad_gym.evaluation import Episodes, Policy
 from quad_gym.experiments import Flown, flight_of_episode, fly
 from quad_gym.params.suites import contents_of_suite_files
-from quad_gym.rendering.video import Side, checked_video_path, save_side_by_side
+from quad_gym.rendering.video import Side, checked_video_path, end_of, save_side_by_side
 
 # --------------------------------------------------------------------------------------------------
 # Evaluation of policies on observations: flights, a table, numbers and figures.
@@ -336,7 +336,7 @@ def write_video(
         sides,
         folder / f"video.{args.video}",
         fps=VIDEO_RATE,
-        speed=max(1.0, max(side.end for side in sides) / VIDEO_SECONDS),
+        speed=max(1.0, end_of(sides) / VIDEO_SECONDS),
         progress=lambda times: tqdm(times, desc="rendering", unit=" frames"),
     )
 

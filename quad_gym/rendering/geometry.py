@@ -162,6 +162,25 @@ def chase_view(flight: Flight, width: float, height: float) -> Perspective:
     return look_at(eye, target, 1.15 * width, np.array([0.5 * width, 0.5 * height]))
 
 
+def follow_view(flight: Flight, width: float, height: float) -> Perspective:
+    """View from the east and above that moves with the vehicle and does not turn.
+
+    It is as far away as the true and the estimated position require, and looks between them.
+    """
+    here = np.array(flight["position"][-1])
+    between = np.zeros(3)
+    if flight.estimated:
+        between = 0.5 * np.nan_to_num(flight["estimated_position"][-1] - here)
+    distance = 5.5 + 2.5 * float(np.linalg.norm(between))
+    azimuth, elevation = np.radians(-25.0), np.radians(24.0)
+    backward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) * np.cos(elevation)
+    backward[2] = np.sin(elevation)
+    target = here + between
+    return look_at(
+        target + distance * backward, target, 1.15 * width, np.array([0.5 * width, 0.6 * height])
+    )
+
+
 def course_view(flight: Flight, width: float, height: float) -> Perspective:
     """View along a course of obstacles, from behind and above the vehicle.
 

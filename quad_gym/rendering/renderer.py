@@ -16,7 +16,13 @@ from quad_gym.params import checks as check
 from quad_gym.records import FaultKind, FilterStatus, GateDecision
 from quad_gym.rendering import canvas as colors
 from quad_gym.rendering.canvas import Canvas, Mark, load_pygame
-from quad_gym.rendering.geometry import Perspective, chase_view, course_view, fixed_view
+from quad_gym.rendering.geometry import (
+    Perspective,
+    chase_view,
+    course_view,
+    fixed_view,
+    follow_view,
+)
 from quad_gym.rendering.scene import Inset, Scene, ellipsoid_scale, inset_box
 
 # --------------------------------------------------------------------------------------------------
@@ -24,12 +30,12 @@ from quad_gym.rendering.scene import Inset, Scene, ellipsoid_scale, inset_box
 # --------------------------------------------------------------------------------------------------
 
 VIEWS = ("fixed", "chase")  #: names of the views of a flight
-MOVING_VIEWS = {"chase": chase_view, "course": course_view}
+MOVING_VIEWS = {"chase": chase_view, "follow": follow_view, "course": course_view}
 MIN_WIDTH, MIN_HEIGHT = 320, 240
 STALE_FIX = 0.5  #: time without a fix after which a warning is shown [s]
 _SEEN = {
-    "truth": "the truth",
-    "estimate": "the estimate",
+    "truth": "truth",
+    "estimate": "estimate",
     "noisy": "noisy truth",
     "measurements": "raw measurements",
 }
@@ -39,8 +45,9 @@ class Renderer:
     """Renderer of recorded flights.
 
     Args:
-        view: "fixed" (the whole reference from outside), "chase" (from behind the vehicle) or
-            "course" (from above and behind, along a course of obstacles).
+        view: "fixed" (the whole reference from outside), "chase" (from behind the vehicle),
+            "follow" (from the east, moving with the vehicle) or "course" (from above and behind,
+            along a course of obstacles, without the reference).
         size: Width and height [pixels].
         legend: True to show task, time, legend and errors, and the image of the camera.
 
@@ -62,18 +69,20 @@ class Renderer:
         """Scene of the flight to which the stored view and background belong."""
         self._fixed: Perspective
 
-    def draw(self, flight: Flight) -> NDArray[np.uint8]:
+    def draw(self, flight: Flight, stamp: str = "") -> NDArray[np.uint8]:
         """Draw the last instant of a flight; `flight.until(t)` ends at a time t.
 
         Args:
             flight: Flight to draw.
+            stamp: Words to write in large letters across the picture.
 
         Returns:
             Picture in red, green, blue, (height, width, 3).
         """
         canvas, (width, height), small = self._canvas, self.size, self._text - 2
         spacing = 4.0 if self.view == "course" else 1.0
-        scene = Scene(canvas, flight, self._view_of(flight), self.view != "fixed", spacing)
+        view, moving, on_course = self._view_of(flight), self.view != "fixed", self.view == "course"
+        scene = Scene(canvas, flight, view, moving, spacing, shows_reference=not on_course)
         self._draw_background(flight, scene)
         labels = scene.draw()
         inset = None
@@ -88,6 +97,10 @@ class Renderer:
             inset.write()
         if self._legend:
             self._write_legend(flight)
+        if stamp:
+            large = 2 * self._text
+            top = 0.16 * height
+            canvas.text(stamp, 0.5 * width, top, large, colors.VERMILLION, 0.5)
         return canvas.pixels()
 
     def __reduce__(self) -> Any:
@@ -113,11 +126,12 @@ class Renderer:
     def _write_legend(self, flight: Flight) -> None:
         """Write task, time, legend and warnings in the upper left corner."""
         canvas, large, small = self._canvas, self._text + 2, self._text - 1
-        name = str(flight.about.get("task", flight.scene.task)).replace("_", " ")
-        title, clock = f"{name} on {_SEEN[flight.scene.observation]}", f"{flight['time'][-1]:.2f} s"
+        name = str(flight.about.get("task", flight.scene.task)).replace("_", " ").title()
+        title = f"{name.replace(' ', '')}, {_SEEN[flight.scene.observation]}"
+        clock = f"{flight['time'][-1]:.2f} s"
         policy = flight.about.get("policy")
         lines: list[tuple[str, Mark | None]] = []
-        lines += [(f"controller: {short_name(str(policy))}", None)] if policy else []
+        lines += [(_controller(str(policy)), None)] if policy else []
         lines += [*legend_of(flight), (errors_of(flight), None)]
         lines += [(words, None) for words in _warnings(flight)]
         width = max(26 + canvas.width_of(words, small) for words, _ in lines)
@@ -134,18 +148,27 @@ class Renderer:
             y += step
 
 
+def _controller(policy: str) -> str:
+    """Name of a controller for readers."""
+    known = {"pd": "PD control", "pretrained": "included policy"}
+    return known.get(policy, f"controller: {short_name(policy)}")
+
+
 def legend_of(flight: Flight) -> list[tuple[str, Mark]]:
     """Names and marks of the parts of a picture."""
     scene = flight.scene
     found: list[tuple[str, Mark]] = []
     found += [("next gate" if len(scene.gates_I) else "reference", ("line", colors.GREEN))]
     if scene.reference_period and not len(scene.gates_I):
-        found = [("reference", ("line", colors.GREY)), ("its next second", ("line", colors.GREEN))]
+        found = [
+            ("reference", ("line", colors.GREY)),
+            ("reference, next 1 s", ("line", colors.GREEN)),
+        ]
     found += [("truth", ("line", colors.BLUE))]
     if flight.estimated:
         scale = ellipsoid_scale(flight)
-        size = "3-sigma ellipsoid, true size"
-        size = size if scale == 1.0 else f"3-sigma ellipsoid, error, drawn x {scale:g}"
+        size = "3σ ellipsoid, to scale"
+        size = size if scale == 1.0 else f"3σ ellipsoid and error, {scale:g} times as large"
         found += [(words, ("line", colors.VERMILLION)) for words in ("estimate", size)]
         if scene.has_gnss:
             refused = (flight.rows["gnss_decision"][:, 0] == GateDecision.REJECTED).any()

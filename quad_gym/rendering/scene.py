@@ -90,7 +90,7 @@ class Inset:
         """Write a title and the numbers of the features."""
         canvas, box, image = self._canvas, self._box, self._image
         seen = np.isfinite(image["pixels"]).all(axis=1)
-        wordings = ["camera"] if seen.any() else ["camera: no feature in view", "no feature"]
+        wordings = ["camera"] if seen.any() else ["camera: no marker in view", "no marker"]
         if (count := self._refused.sum()) > 0:
             wordings = [f"camera: {count} rejected (gray)", f"{count} rejected"]
         top, size = box.top + box.height + 2.0, self._size
@@ -168,9 +168,16 @@ class Scene:
     """
 
     def __init__(
-        self, canvas: Canvas, flight: Flight, view: Perspective, moving: bool, spacing: float
+        self,
+        canvas: Canvas,
+        flight: Flight,
+        view: Perspective,
+        moving: bool,
+        spacing: float,
+        shows_reference: bool = True,
     ) -> None:
         self._canvas, self._flight, self._view, self._moving = canvas, flight, view, moving
+        self._shows_reference = shows_reference
         self._spacing = spacing
         self._scene, self._now = flight.scene, flight.rows[-1]
         self._R_BI = self._attitude("quaternion")
@@ -187,7 +194,8 @@ class Scene:
         """Draw the rest from back to front; return the labels to write when all is drawn."""
         for tip, name in ((1.15, 0.0, 0.0), "E"), ((0.0, 1.15, 0.0), "N"):
             self.labels.append((name, self._view.project(np.array(tip))[0], colors.GREY))
-        self._reference()
+        if self._shows_reference:
+            self._reference()
         self._gates()
         self._fence()
         self._obstacles(before_vehicle=False)

@@ -208,9 +208,15 @@ def _write_animation(
 # --------------------------------------------------------------------------------------------------
 
 SIDE = (480, 470)  #: width and height of one flight [pixels]
-HOLD = 1.5  #: duration of the last picture, to read how the flights ended [s]
+HOLD = 2.5  #: duration of the last picture, to read how the flights ended [s]
+AFTER = 4.0  #: time for which other flights are shown after the last crash [s]
 BAND, LEGEND = 64, 34  #: heights of the label above a flight, and of the legend below [pixels]
 _LARGE, _SMALL = 24, 20  #: sizes of text
+
+
+def ending_for_readers(ending: str) -> str:
+    """Words for an ending, such as "below minimum height" for "below_min_height"."""
+    return ending.replace("_min_", "_minimum_").replace("_", " ")
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,11 +242,16 @@ class Side:
         """Time at which the flight ended [s]."""
         return float(self.flight["time"][-1])
 
+    @property
+    def outcome(self) -> str:
+        """How the flight ended, and when."""
+        how = "crashed" if self.crashed else "ended"
+        return f"{how} at {self.end:.1f} s: {ending_for_readers(self.ending)}"
+
     def status(self, time: float) -> str:
         """Errors or progress on the course at a time [s]; after the end, how the flight ended."""
         if time > self.end - 1e-9:
-            how = "crashed" if self.crashed else "ended"
-            return f"{how} at {self.end:.1f} s: {self.ending.replace('_', ' ')}"
+            return self.outcome
         if self.course is None:
             return errors_of(self.flight.until(time))
         now, (what, total) = self.flight.until(time).rows[-1], self.course
@@ -251,22 +262,23 @@ class Side:
 class SideBySide:
     """Renderer of flights of one episode, side by side; ended flights stay at their last instant.
 
+    If some flights crash and others do not, the film ends `AFTER` seconds after the last crash, and
+    its last picture has the outcome of the others.
+
     Args:
         sides: Flights, from left to right.
+        speed: Seconds of flight per second of video, for the legend.
 
     Raises:
         ValueError: If there is no flight.
         ImportError: If pygame is not installed.
     """
 
-    def __init__(self, sides: Sequence[Side]) -> None:
-        if not sides:
-            raise ValueError("sides must be at least one, got none")
-        self.sides = tuple(sides)
-        self.end = max(side.end for side in sides)
+    def __init__(self, sides: Sequence[Side], speed: float = 1.0) -> None:
+        self.sides, self.end, self._speed = tuple(sides), end_of(sides), speed
         width, height = SIDE
-        # a course of obstacles is too long for one picture
-        views = ["course" if len(side.flight.scene.obstacles) else "fixed" for side in sides]
+        views = [_view_of(side.flight) for side in sides]
+        self._on_course = "course" in views
         size = (width, height - BAND - LEGEND)
         self._renderers = [Renderer(view, size, legend=False) for view in views]
         self._band = Canvas(width, BAND)
@@ -276,22 +288,24 @@ class SideBySide:
         """Draw a picture (height, width, 3) of red, green, blue at a time [s]."""
         parts = []
         for side, renderer in zip(self.sides, self._renderers, strict=True):
-            picture = renderer.draw(side.flight.until(time))
-            if side.crashed and time > side.end - 1e-9:  # pale
-                picture = (picture // 2 + 127).astype(np.uint8)
+            over = side.crashed and time > side.end - 1e-9
+            picture = renderer.draw(side.flight.until(time), "crashed" if over else "")
             parts.append(np.concatenate([self._label(side, time), picture]))
             parts[-1][:, -2:] = colors.GREY
         return np.concatenate([np.concatenate(parts, axis=1), self._footer(time)])
 
     def _label(self, side: Side, time: float) -> NDArray[np.uint8]:
         """Draw the band above a flight: its label, and its status below."""
-        band, over = self._band, time > side.end - 1e-9
+        band, over = self._band, time > min(side.end, self.end) - 1e-9
         ending = colors.VERMILLION if side.crashed else colors.GREEN
         band.clear(ending if over else colors.PALE)
         band.finish()
         ink = colors.WHITE if over else colors.INK
         band.text(band.fitting([side.label], _LARGE, band.width), 12.0, 8.0, _LARGE, ink)
-        band.text(side.status(time), 12.0, 14.0 + band.line_height(_LARGE), _SMALL, ink)
+        status = side.outcome if over else side.status(time)
+        if side.end > self.end + 1e-9 and over:
+            status = f"flew on, and {status}"
+        band.text(status, 12.0, 14.0 + band.line_height(_LARGE), _SMALL, ink)
         return band.pixels()
 
     def _footer(self, time: float) -> NDArray[np.uint8]:
@@ -299,13 +313,31 @@ class SideBySide:
         canvas, flight = self._legend, self.sides[0].flight
         canvas.clear(colors.WHITE)
         canvas.finish()
-        x = 12.0 + canvas.text(f"{time:4.1f} s", 12.0, 9.0, _SMALL) + 20.0
+        clock = f"{time:4.1f} s" + ("" if self._speed == 1.0 else f", {self._speed:.2g}x speed")
+        x = 12.0 + canvas.text(clock, 12.0, 9.0, _SMALL) + 20.0
         legend = legend_of(flight.until(min(time, self.sides[0].end)))
-        legend += [("marker in view", ("box", colors.INK))] if flight.scene.has_camera else []
+        legend = legend[1:] if self._on_course else legend  # a course has no reference
+        legend += [("marker", ("box", colors.INK))] if flight.scene.has_camera else []
         for words, mark in legend:
             canvas.mark(mark, x, 9.0, _SMALL)
             x += 34.0 + canvas.text(words, x + 16.0, 9.0, _SMALL)
         return canvas.pixels()
+
+
+def end_of(sides: Sequence[Side]) -> float:
+    """Time at which a video of some flights ends [s]."""
+    if not sides:
+        raise ValueError("sides must be at least one, got none")
+    last = max(side.end for side in sides)
+    crashes = [side.end for side in sides if side.crashed]
+    return min(last, max(crashes) + AFTER) if crashes else last
+
+
+def _view_of(flight: Flight) -> str:
+    """View of a flight: a course of obstacles is too long for one picture, gates fit into one."""
+    if len(flight.scene.obstacles):
+        return "course"
+    return "fixed" if len(flight.scene.gates_I) else "follow"
 
 
 def save_side_by_side(
@@ -316,7 +348,7 @@ def save_side_by_side(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write flights of one episode as a video, from left to right; it ends with the longest flight.
+    """Write flights of one episode as a video, from left to right.
 
     Other arguments and the result are as in `save_video`.
 
@@ -325,7 +357,7 @@ def save_side_by_side(
         ImportError: If a library for drawing or writing is not installed.
     """
     target = checked_video_path(path)
-    film = SideBySide(sides)
+    film = SideBySide(sides, speed)
     times = times_of(film.end, fps, speed, progress)
 
     def frames() -> Iterator[NDArray[np.uint8]]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from quad_gym.analysis import plots
 
 Floats = NDArray[np.float64]
+RESET_RATIO = 3.0  #: growth of the standard deviation in one step that only a reset explains
 Episode = Mapping[str, Any]
 
 
@@ -66,9 +67,9 @@ def _grid(episodes: Mapping[str, Episode], height: float, **options: Any) -> tup
 
 
 def _finish(grid: Any, episodes: Mapping[str, Episode], column: str) -> None:
-    """Set limits up to the last end of a trace, labels, and legends."""
-    last = max(float(e["time"][np.isfinite(e[column])][-1]) for e in episodes.values())
-    grid[0, 0].set_xlim(0.0, last)
+    """Set limits beyond the last end of a trace, labels, and legends."""
+    last = max(_end_of(e["time"], e[column]) for e in episodes.values())
+    grid[0, 0].set_xlim(0.0, 1.02 * last)
     grid[1, 0].set_ylabel("error, 3 sigma [m]")
     for row in grid:
         row[0].yaxis.set_tick_params(labelleft=True)
@@ -92,9 +93,15 @@ def _draw_angles(axes: Any, episode: Episode, half_view: float) -> None:
 def _draw_uncertainty(axes: Any, episode: Episode) -> None:
     """Draw the filter's standard deviation and the estimation error."""
     time, bound = episode["time"], 3.0 * episode["sigma"]
-    axes.plot(time, bound, color=plots.PALE, label="_")
-    area: dict[str, Any] = {"color": plots.GREEN, "alpha": 0.2, "linewidth": 0}
+    area: dict[str, Any] = {"facecolor": plots.GREEN, "alpha": 0.2, "linewidth": 0}
     axes.fill_between(time, 1e-3, bound, label="filter: 3 sigma", **area)
+    axes.plot(time, bound, color=plots.GREEN, linewidth=0.8, label="_")
+    with np.errstate(invalid="ignore"):
+        resets = time[1:][bound[1:] > RESET_RATIO * bound[:-1]]
+    if resets.size:
+        at_top: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "clip_on": False}
+        mark: dict[str, Any] = {"linestyle": "none", "color": plots.INK, "markersize": 5.0}
+        axes.plot(resets, np.full(resets.size, 1.03), "v", label="filter reset", **mark, **at_top)
     axes.plot(time, episode["estimation_error"], color=plots.GREEN, label="estimation error")
     axes.set_yscale("log")
     axes.set_ylim(3e-3, 10.0)
@@ -102,14 +109,22 @@ def _draw_uncertainty(axes: Any, episode: Episode) -> None:
 
 
 def _mark_end(axes: Any, time: Floats, values: Floats, what: str) -> None:
-    """Draw a line where an episode has ended early."""
+    """Draw a line where an episode has ended early, with the reason next to it."""
+    if np.isfinite(values).all():
+        return
+    end = _end_of(time, values)
+    axes.axvline(end, color=plots.INK, linewidth=1.0)
+    early = end < 0.5 * float(time[-1])  # then there is room to the right of the line
+    style: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+    words = axes.annotate(what, (end, 0.03), (4 if early else -4, 0), color=plots.INK, **style)
+    words.set_horizontalalignment("left" if early else "right")
+    words.set_in_layout(False)  # a long reason does not push the panels apart
+
+
+def _end_of(time: Floats, values: Floats) -> float:
+    """Time at which a trace ends, the first without a value, or the last [s]."""
     over = ~np.isfinite(values)
-    if over.any():
-        end, place = time[int(np.argmax(over))], ("data", "axes fraction")
-        axes.axvline(end, color=plots.INK, linewidth=1.0)
-        axes.annotate(
-            what, (end, 0.03), (4, 0), xycoords=place, textcoords="offset points", color=plots.INK
-        )
+    return float(time[int(np.argmax(over))] if over.any() else time[-1])
 
 
 def _unbroken(degrees: Floats) -> Floats:

@@ -12,6 +12,7 @@ from quad_gym.analysis.metrics import Estimated, in_brackets
 from quad_gym.analysis.plots import learning_figure
 from quad_gym.analysis.reports import Report, stacked, text_table, versions, write_csv, write_json
 from quad_gym.envs.config import BENCHMARKS
+from quad_gym.rendering.video import ending_for_readers
 from scripts.studies.films import CHOICES, label_of, pair_of
 from scripts.studies.plots import glance_figure, pace_figure
 from scripts.studies.scores import difference
@@ -222,7 +223,7 @@ def _add_figures(report: Report, results: StudyResults) -> None:
         traces = {trace: recorded[trace][:, pair.episode] for trace in study.about.traced}
         label = label_of(results, name).replace(", ", ",\n")
         flown = results.flown[name][k].episodes
-        ending = str(flown.ending[pair.episode]).replace("_", " ")
+        ending = ending_for_readers(str(flown.ending[pair.episode]))
         ending = f"crash: {ending}" if flown.crashed[pair.episode] else "finish"
         episodes[label] = {"time": recorded["time"], "ending": ending, **traces}
     if kind == "glance":

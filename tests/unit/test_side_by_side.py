@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from quad_gym.rendering import Side, SideBySide, record_flight, save_side_by_side
+from quad_gym.rendering import Side, SideBySide, record_flight, save_side_by_side, video
+from quad_gym.rendering.canvas import GREEN, VERMILLION
 from quad_gym.rendering.video import LEGEND, SIDE
 from tests.builders import Still
 
@@ -29,6 +30,16 @@ def test_flight_that_has_ended_keeps_its_last_frame(sides):
     assert (first_end[:, width:] != last_end[:, width:]).any()
     assert (early[:, :width] != first_end[:, :width]).any()
     assert film.draw(film.end).shape == (SIDE[1], 2 * width, 3)
+
+
+def test_film_ends_soon_after_the_last_crash(sides, monkeypatch):
+    monkeypatch.setattr(video, "AFTER", 0.1)
+    film = SideBySide(sides, speed=2.0)
+    assert film.end == pytest.approx(sides[0].end + 0.1)
+    band = film.draw(film.end)[2, [5, SIDE[0] + 5]]
+    np.testing.assert_array_equal(band, [VERMILLION, GREEN])  # crashed; flew on to its end
+    unhurt = [side_of("LookAround", 10), sides[1]]
+    assert SideBySide(unhurt).end == sides[1].end
 
 
 def test_wrong_arguments_are_refused(sides, tmp_path):
