@@ -173,6 +173,13 @@ CATALOG = {
             figures={"0/video.webp": "docs/images/look_around_film.webp"},
         ),
         Result(
+            name="tutorial",
+            commands=["docs/examples/tutorial.py --output OUT"],
+            flights=("LookAround", "LookAround, truth"),
+            texts=texts.tutorial,
+            figures={"0/crashed.png": "docs/images/tutorial.png"},
+        ),
+        Result(
             name="miscalibrated",
             commands=[
                 "scripts.studies look_around --arms-file scripts/studies/arms_miscalibrated.py "

@@ -56,6 +56,13 @@ def console(name: str) -> Texts:
     return lambda _, printed: {name: block(_body(printed[0]))}
 
 
+def tutorial(_: Path, printed: Sequence[str]) -> dict[str, str]:
+    """The output of two blocks of the tutorial."""
+    lines = [line for line in printed[0].splitlines() if "crashed" in line or "minus" in line]
+    problem, result = "\n".join(lines[:2]), "\n".join(lines[2:])
+    return {"tutorial.problem": block(problem), "tutorial.result": block(result)}
+
+
 def policies(folder: Path, _: Sequence[str]) -> dict[str, str]:
     rows, ids = [], (*TRACKING, "Waypoints")
     for k, task in enumerate(ids):
