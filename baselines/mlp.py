@@ -109,7 +109,7 @@ class MlpPolicy:
         """Read a policy; a ValueError if the file does not exist or is no policy in this format."""
         file = Path(file)
         if not file.exists():
-            raise ValueError(f"there is no policy {file}")
+            raise ValueError(f"policy file not found: {file}")
         try:
             arrays, about = _contents(file)
             count = range(len(about["activations"]))

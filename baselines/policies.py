@@ -173,7 +173,7 @@ def _flights_of(env: Any) -> Any:
 
 def _stable_baselines_policy(file: Path, env: Any, normalization: Any) -> Policy:
     if not file.exists():
-        raise ValueError(f"there is no policy {file}")
+        raise ValueError(f"policy file not found: {file}")
     try:
         with zipfile.ZipFile(file) as archive:
             module = json.loads(archive.read("data"))["policy_class"]["__module__"]

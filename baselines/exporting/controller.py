@@ -153,7 +153,7 @@ def controller_of(
     file = pretrained_file(env_id, policy) if is_included(policy) and env_id else Path(policy)
     if not file.exists():
         meant = check.did_you_mean(policy, ("pretrained", "filter"))
-        raise ValueError(f"there is no policy {file}{meant}")
+        raise ValueError(f"policy file not found: {file}{meant}")
     if file.suffix not in (".npz", ".zip"):
         raise ValueError(f"policy must be pretrained, or a .npz or .zip file, got {policy!r}")
     record: dict[str, Any] = {}  # in a .npz, or next to a .zip

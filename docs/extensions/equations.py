@@ -4,6 +4,7 @@ Ziamath draws LaTeX as SVG, in the color of the text around it. Widths are in `e
 grow with the text.
 """
 
+import re
 from typing import Any
 from xml.etree import ElementTree
 
@@ -17,8 +18,12 @@ SIZE, SCALE = 18.0, 1.08
 """Size at which equations are drawn [pixels], and their scale relative to the text."""
 
 
+NUMBER = re.compile(r"\\tag\{(\d+)\}\s*$")
+"""The number of an equation, at its end; repositories' web pages show it, too."""
+
+
 def _picture(node: nodes.Element, *, inline: bool) -> str:
-    tex = " ".join(node.astext().split())
+    tex = NUMBER.sub("", " ".join(node.astext().split()))
     try:
         drawn = ziamath.Latex(tex, size=SIZE, inline=inline, color="currentColor")
         svg = drawn.svgxml()
@@ -39,7 +44,10 @@ def _inline(self: Any, node: nodes.math) -> None:
 
 
 def _display(self: Any, node: nodes.math_block) -> None:
-    self.body.append(f'<div class="math" tabindex="0">{_picture(node, inline=False)}</div>\n')
+    number = NUMBER.search(node.astext())
+    shown = f'<span class="eqno" id="equation-{number[1]}">({number[1]})</span>' if number else ""
+    picture = _picture(node, inline=False)
+    self.body.append(f'<div class="math" tabindex="0">{picture}{shown}</div>\n')
     raise nodes.SkipNode
 
 

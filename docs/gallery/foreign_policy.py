@@ -1,6 +1,6 @@
 """
-Someone else's policy
-=====================
+A third-party policy
+====================
 
 RAPTOR is a policy for quadrotors that it has never seen: a network of 2,084 parameters with memory,
 trained by its authors on a thousand vehicles, which adapts to another one within a second

@@ -18,7 +18,7 @@ FLIGHTS, SECONDS = 200, 20
 
 
 def fly(*faults):
-    """Errors and claimed standard deviations (steps, flights), and the share of lost filters."""
+    """Errors and standard deviations (steps, flights), and the share of diverged filters."""
     envs = gymnasium.make_vec(
         "QuadGym/Hover-v0",
         num_envs=FLIGHTS,
@@ -63,7 +63,8 @@ axes.set(xlabel="time [s]", ylabel="error of the position, east [m]", title="An 
 axes.legend(loc="upper left")
 
 inside = (np.abs(errors) < 3 * claimed).mean()
-print(f"within 3 sigma: {100 * inside:.1f} % of all errors; lost filters: {100 * lost.max():.0f} %")
+print(f"within 3 sigma: {100 * inside:.1f} % of all errors")
+print(f"diverged filters: {100 * lost.max():.0f} %")
 
 # %%
 # A bias step during the outage
@@ -85,14 +86,14 @@ for axes in (above, below):
     axes.axvspan(4, 8, color="0.9")
 above.semilogy(time, np.median(sizes, axis=1), color="C0", label="error, median")
 above.semilogy(time, np.percentile(sizes, 95, axis=1), "C0:", label="error, 95th percentile")
-above.semilogy(time, np.median(claimed, axis=1), color="C1", label="claimed deviation")
+above.semilogy(time, np.median(claimed, axis=1), color="C1", label="reported standard deviation")
 above.set(ylabel="east [m]", ylim=(2e-3, 30), title="A bias step during the outage")
 above.legend(ncols=3, loc="upper right")
 below.fill_between(time, 100 * lost, color="C3", alpha=0.5)
-below.set(xlabel="time [s]", ylabel="lost filters [%]", ylim=(0, 105))
+below.set(xlabel="time [s]", ylabel="diverged filters [%]", ylim=(0, 105))
 
 far = (sizes[-1] > 0.1).mean()
-print(f"lost filters: at most {100 * lost.max():.0f} %, at the end {100 * lost[-1]:.0f} %")
+print(f"diverged filters: at most {100 * lost.max():.0f} %, at the end {100 * lost[-1]:.0f} %")
 print(f"farther than 10 cm at the end: {100 * far:.1f} % of the flights")
 
 # %%
@@ -100,4 +101,4 @@ print(f"farther than 10 cm at the end: {100 * far:.1f} % of the flights")
 # again, as the 95th percentile shows, until the filter resets its biases once more.
 #
 # ``truncate_when_diverged=True`` truncates an episode when its filter is flagged as diverged. See
-# :doc:`/filter-equations` for tests, thresholds and actions.
+# :doc:`/sensors-and-filter` for tests, thresholds and actions.

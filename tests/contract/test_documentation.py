@@ -185,7 +185,7 @@ def test_no_line_begins_with_a_mark_and_goes_on(page):
 
 
 def test_functions_named_on_equation_pages_exist():
-    pages = ("filter-equations", "sensors-and-filter")
+    pages = ("filter-equations", "filter-measurements", "filter-heading", "sensors-and-filter")
     text = " ".join((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in pages)
     text = " ".join(text.split())
     found = re.findall(r"((?:`\w+`(?:, | and )?)+) in `(quad_gym/[\w/]+\.py)`", text)

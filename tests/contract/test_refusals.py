@@ -77,7 +77,7 @@ REFUSED = [
     ("evaluate QuadGym/Square-v0", "ENV_ID must be one of"),
     ("evaluate --policy nobody", "policy must be pd"),
     ("evaluate --policy", "--policy must have at least one value"),
-    ("evaluate --policy missing.zip", "there is no policy"),
+    ("evaluate --policy missing.zip", "policy file not found"),
     ("evaluate trajectory --policy pretrained", "no policy is included for QuadGym/Trajectory-v0"),
     ("evaluate --observation measurements", "select a --policy that was trained on measurements"),
     ("evaluate --observation estimat", "did you mean estimate?"),

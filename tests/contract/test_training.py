@@ -229,7 +229,7 @@ def test_policies_that_do_not_fit_are_refused(trained, tmp_path):
         load_policy(best, env(action="motor"))
     with pytest.raises(ValueError, match="trained with observation"):
         load_policy(best, env(layout="absolute"))
-    with pytest.raises(ValueError, match="there is no policy"):
+    with pytest.raises(ValueError, match="policy file not found"):
         load_policy(str(tmp_path / "none.zip"), env())
     (tmp_path / "broken.zip").write_bytes(b"PK nonsense")
     with pytest.raises(ValueError, match="is not a policy of Stable-Baselines3"):

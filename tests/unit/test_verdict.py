@@ -67,7 +67,7 @@ def test_a_heading_that_nothing_shows_is_uncertain():
 def test_gnss_that_drifts_or_jumps_makes_the_position_unusable(change):
     result = judged(change)
     worst = [f.text for f in of(result, "position") if f.severity == Severity.LOST]
-    assert any("which the IMU does not explain" in text or "in a row" in text for text in worst)
+    assert any("which the IMU does not explain" in text or "rejected for" in text for text in worst)
     assert result.verdict.startswith("not usable, because position: ")
 
 
@@ -92,7 +92,7 @@ def test_gnss_that_drifts_while_a_camera_holds_the_position_is_a_problem():
     log, truth = next(iter(verdicts.flown("rtk", 1, seed=7)))
     result, error = verdicts.judged("rtk", verdicts.ramp, log, truth, seed=0)
     assert error < 0.1
-    assert any("GNSS position refused for" in problem for problem in result.problems)
+    assert any("GNSS position rejected for" in problem for problem in result.problems)
 
 
 @pytest.mark.parametrize(("stop", "usable"), [(35.0, True), (60.0, False)])
@@ -153,7 +153,7 @@ def test_a_receiver_that_is_refused_to_the_end_or_for_a_tenth_of_a_log_is_lost(b
 
     result = judged(change)
     assert result.verdict.startswith("not usable, because position: ")
-    assert any("GNSS position refused for" in problem for problem in result.problems)
+    assert any("GNSS position rejected for" in problem for problem in result.problems)
 
 
 @pytest.mark.parametrize("pause", [False, True])

@@ -164,17 +164,17 @@ def _searched(
 ) -> tuple[Calibrated, ...]:
     """Return the numbers that a search finds, from its beginning or after one in fewer logs."""
     if before is not None:
-        report("Search in all logs")
+        report("Fitting to all logs")
         search.take(before)
         search.fit()
     else:
-        report(f"Search for {len(search.numbers)} numbers in a part of the flight")
+        report(f"Fitting {len(search.numbers)} parameters to part of the flight")
         search.begin()
-        report("Search in all that is not for validation")
+        report("Fitting to all training data")
         search.fit()
-        report("Search with the tails and correlations of the innovations")
+        report("Refitting with heavy tails and autocorrelation")
         search.adapt()
-    report("Intervals")
+    report("Computing intervals")
     found = search.intervals()
     return search.intervals() if search.keep_priors(found) else found
 

@@ -129,7 +129,7 @@ def _left_out(result: Replay, out: np.ndarray, first: int) -> str:
     back = np.flatnonzero(~out[first:])
     last = first + int(back[0]) if len(back) else len(out) - 1
     time = float(result.time[last] - result.time[first])
-    return f"was left out for {time:.0f} s" + ("" if len(back) else ", until the end")
+    return f"was rejected for {time:.0f} s" + ("" if len(back) else ", until the end")
 
 
 def _runs(rows: np.ndarray) -> list[tuple[int, int]]:

@@ -228,7 +228,7 @@ MAX_CORRELATED = 0.8  #: correlation of successive innovations of GNSS that nois
 PESSIMISTIC = 0.3
 """NIS per degree of freedom below which noise is assumed much too large: innovations of such a
 filter are correlated, as it follows the measurements slowly."""
-PATIENCE = 10.0  #: time for which GNSS may be refused [s]
+PATIENCE = 10.0  #: time for which GNSS may be rejected [s]
 
 
 def misfits(case: Evidence) -> Iterator[Finding]:
@@ -274,13 +274,13 @@ def _size(case: Evidence, name: str, m: Measured, fit: Fit) -> Iterator[Finding]
         factor = math.sqrt(max(fit.median_nis, 1.0))
         yield uncertain(
             quantity,
-            f"{_nis(name, fit)}, {rejected}: errors about {factor:.1f} times as large as the suite "
-            "has them",
+            f"{_nis(name, fit)}, {rejected}: errors {factor:.1f} times the suite's standard "
+            "deviations",
         )
     if longest is None:
         return
     since, until = m.time[rows][list(longest)]
-    text = f"{NAMES[name]} refused for {until - since:.1f} s in a row from {since:.1f} s on"
+    text = f"{NAMES[name]} rejected for {until - since:.1f} s from {since:.1f} s on"
     long = quantity == "position" and until - since >= PATIENCE
     if not shared and (long or share > LONG_RUN):
         yield lost(quantity, f"{text}: it drifts or jumps, or others do")
@@ -313,8 +313,8 @@ def _correlated(name: str, m: Measured, quantity: str) -> Iterator[Finding]:
         sure = math.tanh(math.atanh(min(rho[worst], 0.999)) - 3.0 / math.sqrt(len(scaled) - 3))
         if sure > MAX_CORRELATED and size[worst] > PESSIMISTIC:
             text = (
-                f"{NAMES[name]}: successive innovations have a correlation of {rho[worst]:.2f}, 0 "
-                "expected: check the suite's time stamps and noise"
+                f"{NAMES[name]}: autocorrelation of innovations {rho[worst]:.2f} (expected 0): "
+                "check the suite's time stamps and noise"
             )
             severity = Severity.UNCERTAIN if part == "height" else Severity.LOST
             yield Finding(quantity=part, severity=severity, text=text)
@@ -474,7 +474,7 @@ def gaps(case: Evidence) -> Iterator[Finding]:
         text = f"nothing corrects it for {length:.0f} s"
         inside = [n for n in MEASURED_BY[quantity] if _refused(sensors, n, since, until)]
         if inside:
-            text = f"{NAMES[inside[0]]} refused for {length:.0f} s in a row"
+            text = f"{NAMES[inside[0]]} rejected for {length:.0f} s"
         axes = slice(0, 2) if quantity == "position" else slice(2, 3)
         during = (result.time >= since) & (result.time <= until)
         sigma = float(np.linalg.norm(result.sigma[during, axes], axis=1).max())
@@ -486,7 +486,7 @@ def gaps(case: Evidence) -> Iterator[Finding]:
 
 
 def _refused(sensors: Mapping[str, Measured], name: str, since: float, until: float) -> bool:
-    """Return True if a sensor was refused between two times."""
+    """Return True if a sensor was rejected between two times."""
     m = sensors.get(name)
     return m is not None and bool((m.gated & (m.time > since) & (m.time < until)).any())
 
@@ -531,7 +531,7 @@ def flagged(case: Evidence) -> Iterator[Finding]:
         quantities = [OF_SENSOR.get(name, "position") for name in names]
         quantity = "position" if "position" in quantities else quantities[0]
         where = "at the end" if row == ends[-1] else f"at {time:.1f} s, before a pause"
-        yield lost(quantity, f"the filter is flagged as diverged {where}, as it refuses {refused}")
+        yield lost(quantity, f"the filter is flagged as diverged {where}, as it rejects {refused}")
         return
 
 
