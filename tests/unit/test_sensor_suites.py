@@ -222,3 +222,26 @@ def test_field_suites_have_latency_and_sensor_errors_by_default(name):
     assert lab.simplified() == lab == quad_gym.SensorSuite()
     env = quad_gym.QuadEnv("hover", sensors="lab")
     assert env.flights.batch.sensors == lab  # by name and by object
+
+
+def test_anchors_are_corners_of_a_hall_and_markers_spread_over_its_walls():
+    """Both are low and high in turn, and no marker is in a corner."""
+    anchors = np.array(quad_gym.UwbRangeParams().anchors_I)
+    markers = np.array(quad_gym.sensor_suite("indoor").camera.features_I)
+    np.testing.assert_array_equal(np.abs(anchors[:, :2]), 5.0)
+    for places in (anchors, markers):
+        around = np.unwrap(np.arctan2(places[:, 1], places[:, 0]))
+        np.testing.assert_allclose(np.diff(around), 2.0 * np.pi / len(places))
+        low, high = places[:2, 2]
+        assert low < high
+        np.testing.assert_array_equal(places[:, 2], [low, high] * (len(places) // 2))
+    walls = np.sort(np.abs(markers[:, :2]))
+    np.testing.assert_allclose(walls[:, 1], walls[0, 1])
+    assert (walls[:, 0] < 0.9 * walls[:, 1]).all()
+
+
+def test_logs_are_read_as_they_are_unless_a_suite_says_otherwise():
+    suite = quad_gym.SensorSuite()
+    for name in ("rotation", "compass_rotation", "accel_bias", "gyro_bias"):
+        assert getattr(suite, f"log_{name}") == (0.0, 0.0, 0.0)
+    assert set(vars(suite.log_delays).values()) == {0.0}
