@@ -7,7 +7,9 @@ broken: an operator, a comparison, a number, a branch. A copy of the checkout ha
 and runs the test files that are nearest to it: those that import its module, or share rare words
 with its line, its function and their docstrings. Of the tests in these files, the nearest ones run,
 in this order, and the first failure ends the run. Golden flights, which notice any change of a
-flight, are left out. The table has one row for each mutant:
+flight, are left out, as are a few files of which a test takes minutes.
+
+The table has one row for each mutant:
 
 - `caught`: a test failed, which the table names. At the end, all these tests run once with
   unbroken lines, where they must pass.
@@ -68,7 +70,7 @@ _COSTLY = {
     "tests/unit/test_device.py",
     "tests/unit/test_filter_library.py",
 }
-"""Files that take minutes, or compile for other processors: run for modules that they import."""
+"""Files of which a test takes minutes, or compiles for another processor: left out, too."""
 _WORD = re.compile(r"[A-Za-z][a-z]{3,}|[A-Z]{4,}")
 _FIRST, _MOST = 10, 60
 """Number of tests that run first, and of all that run: the others in the order of their files."""
@@ -276,14 +278,10 @@ def nearest_tests(mutant: Mutant, count: int, texts: dict[str, str]) -> list[str
         for word, weight in mutant.weights
         if files[word]
     }
-    direct = {
-        name: re.search(rf"\b{re.escape(module)}\b", text) is not None
-        for name, text in texts.items()
-    }
     rank = {
-        name: nearness(weights, words[name]) + 8.0 * direct[name]
-        for name in texts
-        if direct[name] or name not in _COSTLY
+        name: nearness(weights, words[name])
+        + 8.0 * (re.search(rf"\b{re.escape(module)}\b", text) is not None)
+        for name, text in texts.items()
     }
     return sorted(rank, key=lambda name: (-rank[name], name))[:count]
 
@@ -363,7 +361,7 @@ def main(args: MutantsArgs) -> None:
     texts = {
         str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
         for path in sorted((ROOT / "tests").rglob("test_*.py"))
-        if "clients" not in path.parts and str(path.relative_to(ROOT)) not in _LEFT_OUT
+        if "clients" not in path.parts and str(path.relative_to(ROOT)) not in _LEFT_OUT | _COSTLY
     }
     with tempfile.TemporaryDirectory() as folder, args.output.open("a", newline="") as stream:
         copy, writer = Path(folder), csv.writer(stream, lineterminator="\n")

@@ -236,6 +236,29 @@ def test_known_draws_are_used_by_filter_and_controller(name):
     assert_alike(drawing, telling, flight=1)
 
 
+HOVER = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0)
+LONG = LAB.replace(rotor_positions_B=np.array(LAB.rotor_positions_B) * (1.3, 0.8, 1.0))
+
+
+@pytest.mark.parametrize("control", [control for control in Control if control is not Control.PD])
+def test_known_draws_scale_the_actions(control):
+    """Actions are shares of the weight and of what the rotors can do, of the drawn vehicle."""
+    actions = np.random.default_rng(7).uniform(-0.3, 0.3, (12, 1, 4))
+    for name in ("mass", "thrust_coefficient", "torque_coefficient", "motor_speed_per_volt"):
+        given = Randomization({name: some_distribution(name)}, known=True)
+        keywords = {"control": control, "source": Source.TRUTH, "task": HOVER}
+        drawing = batch(1, 3, **keywords, vehicle=LONG, randomization=given)
+        vehicle = LONG.replace(**{name: float(drawing.read(name)[0])})
+        telling, nominal = (batch(1, 3, **keywords, vehicle=one) for one in (vehicle, LONG))
+        for action in actions:
+            for flight in (drawing, telling, nominal):
+                flight.step(action)
+        for field, tolerance in (("voltages", 0.0), ("w", 1e-9)):
+            found, expected = drawing.record(field), telling.record(field)
+            np.testing.assert_allclose(found, expected, rtol=1e-8, atol=tolerance, err_msg=name)
+        assert (drawing.record("w") != nominal.record("w")).any(), name
+
+
 def test_each_rotor_has_its_efficiency():
     """Body rates and velocity after a tick follow from the rotors' forces."""
     task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0)
