@@ -36,7 +36,7 @@ from quad_gym.envs.config import (
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights import COLUMNS, FEATURES
 from quad_gym.logs.formats.log import LOG_COLUMNS, LogColumn
-from quad_gym.params.sensor_table import AID_PARAMS
+from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES
 from quad_gym.tasks.view import VIEW_FIELDS
@@ -313,16 +313,14 @@ def _suites_page() -> str:
     text += "`quad_gym/params/`.\n"
     for part, kind in {
         "imu": quad_gym.ImuParams,
-        "gnss": quad_gym.GnssParams,
-        "camera": quad_gym.CameraParams,
-        **AID_PARAMS,
+        **SENSOR_PARAMS,
         "initial_pose": quad_gym.InitialPoseParams,
         "estimator": quad_gym.FilterParams,
         "noisy": quad_gym.NoisyObservationParams,
         "log_delays": quad_gym.LogDelays,
     }.items():
         rows = []
-        of_aids = dict.fromkeys(AID_PARAMS, "[s]") if kind is quad_gym.LogDelays else {}
+        of_aids = dict.fromkeys(SENSOR_PARAMS, "[s]") if kind is quad_gym.LogDelays else {}
         said = _field_docs(kind, of_aids)
         for name in (field.name for field in dataclasses.fields(kind)):
             of = (getattr(suite, part) for suite in suites.values())

@@ -14,7 +14,7 @@ from quad_gym.kernels import entries
 from quad_gym.packing import pack_obstacles, slow_states
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.gnss import MIN_DRIFT, GnssParams
+from quad_gym.params.gnss import MIN_DRIFT
 from quad_gym.params.randomization import DrawingTable
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.task import TaskParams
@@ -584,7 +584,7 @@ def pack_warm_start(settings: Any, make: Callable[..., Any], c: FlightConfigurat
     settings["warm_root"][:states, :draws] = W[order]
     settings["warm_covariance"][:states, :states] = portable.product(W[order], W[order].T)
     if c.flown_sensors.gnss is not None:
-        settings["warm_drift_sigma"] = drift_sigma(c.flown_sensors.gnss)
+        settings["warm_drift_sigma"] = c.flown_sensors.gnss.drift_after(WARM_UP)
 
 
 @functools.lru_cache(maxsize=64)
@@ -666,12 +666,6 @@ def _turned_east(q: Floats, sensors: SensorSuite) -> Floats:
     return turn
 
 
-def drift_sigma(gnss: GnssParams) -> Floats:
-    """Return the standard deviation (3,) of the GNSS drift `WARM_UP` after it was zero [m]."""
-    share = portable.approached(2.0 * WARM_UP / gnss.drift_tau)
-    return np.array(gnss.drift_sigma_I) * math.sqrt(share)
-
-
 def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
     """Return W with W W^T = P, some of whose columns belong to the true biases and drifts.
 
@@ -687,7 +681,7 @@ def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
     slow = np.array([error.sigma for error in slow_states(sensors).errors])
     if sensors.gnss is not None and sensors.drifts:
-        slow[:3] = np.maximum(drift_sigma(sensors.gnss), MIN_DRIFT)
+        slow[:3] = np.maximum(sensors.gnss.drift_after(WARM_UP), MIN_DRIFT)
     sigma = np.concatenate([sigma, slow])
     W = np.zeros((len(P), WARM_DRAWS + 2 * len(slow)))
     with_truth = P[:, 9:] / sigma

@@ -172,6 +172,11 @@ class GnssParams(SensorBase):
             return ()
         return tuple(SlowError(max(s, MIN_DRIFT), self.drift_tau) for s in self.drift_sigma_I)
 
+    def drift_after(self, time: float) -> np.ndarray:
+        """Standard deviation (3,) of the drift a time [s] after it was zero [m]."""
+        share = portable.approached(2.0 * time / self.drift_tau)
+        return np.array(self.drift_sigma_I) * math.sqrt(share)
+
     @property
     def packed(self) -> dict[str, Any]:
         """Antennas, drift between two measurements, and noise of baselines."""

@@ -55,7 +55,6 @@ from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
 from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.sensor_table import (
-    AID_PARAMS,
     READINGS,
     SENSOR_OF,
     SENSOR_PARAMS,
@@ -110,22 +109,17 @@ class NoisyObservationParams(Checked):
     """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
 
 
-class LogDelays(Checked, more=dict.fromkeys(AID_PARAMS, (Delay, 0.0))):
+class LogDelays(Checked, more=dict.fromkeys(SENSOR_PARAMS, (Delay, 0.0))):
     """Times by which the stamps of a vehicle's logs are later than the measurements themselves.
 
     Autopilots often stamp a measurement when they receive it. A replay subtracts these delays; in
-    simulated flights time stamps are exact. Each other sensor of a suite has a field with its name,
-    such as `barometer` [s].
+    simulated flights time stamps are exact. Each sensor of a suite has a field with its name, such
+    as `barometer`, relative to the IMU [s].
     """
-
-    gnss: Delay = 0.0
-    """of GNSS, relative to the IMU [s]"""
-    camera: Delay = 0.0
-    """of images [s]"""
 
     if TYPE_CHECKING:  # of the fields that follow from the table
 
-        def __init__(self, *, gnss: float = 0.0, camera: float = 0.0, **aids: float) -> None: ...
+        def __init__(self, **sensors: float) -> None: ...
 
         def __getattr__(self, name: str) -> float: ...
 
@@ -281,14 +275,7 @@ class SensorSuite(SensorTable, Saved):
             found["number of camera features"] = len(self.camera.features_I)
         return found
 
-    def with_rates(
-        self,
-        *,
-        imu: float | None = None,
-        gnss: float | None = None,
-        camera: float | None = None,
-        **aids: float | None,
-    ) -> "SensorSuite":
+    def with_rates(self, *, imu: float | None = None, **sensors: float | None) -> "SensorSuite":
         """Return a copy whose sensors run at other rates [Hz]; None keeps a rate.
 
         A new IMU rate changes the tick: sensors that measured at every tick continue to do so.
@@ -297,11 +284,10 @@ class SensorSuite(SensorTable, Saved):
             ValueError: If a rate is not positive or does not divide the IMU rate, or if the suite
                 lacks the sensor whose rate is given.
         """
-        check.keywords(aids, tuple(AID_PARAMS), "with_rates")
+        check.keywords(sensors, ("imu", *SENSOR_PARAMS), "with_rates")
         imu_rate = self.imu.rate if imu is None else imu
         check.positive("imu_rate", imu_rate, least=1.0, most=1e6)
-        given = {"gnss": gnss, "camera": camera, **aids}
-        rates = {name: rate for name, rate in given.items() if rate is not None}
+        rates = {name: rate for name, rate in sensors.items() if rate is not None}
         for name, rate in rates.items():
             if getattr(self, name) is None:
                 lacking = _WORDS.get(name, f"a {name}")

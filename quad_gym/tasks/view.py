@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any, Generic, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.batch.starts import hidden_points, nearest_obstacle
 from quad_gym.configuration import FlightConfiguration
 from quad_gym.kernels.stages import needed_stages
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.world import WorldParams
 from quad_gym.records import (
     SHOWN,
@@ -407,8 +408,11 @@ class MeasuredView(Group):
             )
 
     gyro, accel = quantity("gyro"), quantity("accel")
-    gnss_position, gnss_baseline = quantity("gnss_position"), quantity("gnss_baseline")
-    gnss_velocity, pixels = quantity("gnss_velocity"), quantity("pixels")
+    vars().update({reading: quantity(reading) for reading in READINGS})
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Floats: ...
 
 
 class BuiltinView(Group):

@@ -35,7 +35,7 @@ def value_of(view, name):
 def test_fields_have_the_shape_and_type_of_the_table(task):
     batch, view = view_of(task, sensors="rtk", randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
     lengths = {"n": FLIGHTS, "m": len(batch.sensors.camera.features_I), "k": 28}
-    lengths["o"] = 0
+    lengths["o"], lengths["blocks"] = 0, quad_gym.UwbRangeParams.most_blocks  # without the sensor
     lengths["gates"] = 5 if task == "waypoints" else 0
     for field in VIEW_FIELDS:
         value = value_of(view, field.name)
@@ -173,6 +173,7 @@ def test_measurements_not_taken_are_nan():
     pixels = batch.record("pixels")[:, :2]
     np.testing.assert_array_equal(view.measured.pixels[seen], pixels[seen])
     assert np.isnan(view.measured.pixels[~seen]).all()
+    assert np.isnan(view.measured.barometer).all()  # the suite has none
 
 
 def test_gates_and_progress_of_a_course_match_the_positions():
