@@ -245,3 +245,18 @@ def test_logs_are_read_as_they_are_unless_a_suite_says_otherwise():
     for name in ("rotation", "compass_rotation", "accel_bias", "gyro_bias"):
         assert getattr(suite, f"log_{name}") == (0.0, 0.0, 0.0)
     assert set(vars(suite.log_delays).values()) == {0.0}
+
+
+def test_heading_is_unobservable_where_nothing_but_optical_flow_measures_motion():
+    crazyflie = quad_gym.sensor_suite("crazyflie")
+    report = crazyflie.estimator.replace(attitude_reset=False)
+    assert crazyflie.flow_alone
+    for other in (
+        crazyflie.replace(optical_flow=None),
+        crazyflie.replace(gnss=quad_gym.sensor_suite("consumer").gnss),
+        crazyflie.replace(camera=quad_gym.sensor_suite("indoor").camera),
+        crazyflie.replace(uwb_range=quad_gym.UwbRangeParams()),
+        crazyflie.replace(estimator=report),
+        quad_gym.sensor_suite("rtk"),
+    ):
+        assert not other.flow_alone
