@@ -64,7 +64,7 @@ sphinx_gallery_conf = {
     "min_reported_time": 1e9,
     "remove_config_comments": True,
     "reset_modules": ("matplotlib", "extensions.gallery.reset"),
-    "thumbnail_size": (400, 280),
+    "thumbnail_size": (640, 400),
     "write_computation_times": False,
 }
 

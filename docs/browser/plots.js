@@ -38,11 +38,13 @@ class Plot {
     }
     simulation.pilots.forEach((pilot, k) => {
       Object.assign(context, { strokeStyle: colors.pilots[k], lineWidth: 1.6 });
+      context.setLineDash(k === 1 ? [6, 4] : []); // two lines that coincide are both visible
       context.beginPath();
       pilot.times.forEach((time, i) => {
         if (time >= end - SPAN) context.lineTo(x(time), y(pilot[this.quantity][i]));
       });
       context.stroke();
     });
+    context.setLineDash([]);
   }
 }

@@ -9,12 +9,12 @@ class Eye {
   }
 
   // Look at a point (x, y, z) from the present direction, in a picture of this size.
-  aim(target, width, height) {
+  aim(target, width, height, distance = this.distance) {
     const { azimuth, elevation } = this;
     const ahead = [-Math.cos(elevation) * Math.cos(azimuth), -Math.cos(elevation) * Math.sin(azimuth), -Math.sin(elevation)];
     const right = unit(cross(ahead, [0, 0, 1]));
     Object.assign(this, { ahead, right, up: cross(right, ahead), width, height, focal: 1.1 * Math.min(width, 1.4 * height) });
-    this.place = sum(target, scaled(-this.distance, ahead));
+    this.place = sum(target, scaled(-distance, ahead));
   }
 
   // Picture of a point, [x, y, pixels per meter], or null if it is behind the eye.
@@ -51,8 +51,11 @@ class Picture {
     Object.assign(this, { colors, width, height });
     const r = pilot.trail[pilot.trail.length - 1], guess = pilot.guess[pilot.guess.length - 1];
     const near = (point, real) => sum(real, scaled(magnified, sum(point, scaled(-1, real))));
-    this.eye.aim(this.eye.follows ? r : [0, 0, 1], width, height);
-    this.ground();
+    // after a crash, between the vehicle and its estimate, from where both are in the picture
+    const gap = sum(near(guess, r), scaled(-1, r)), apart = pilot.over ? Math.hypot(...gap) : 0;
+    const target = this.eye.follows ? sum(r, scaled(pilot.over ? 0.5 : 0, gap)) : [0, 0, 1];
+    this.eye.aim(target, width, height, Math.min(Math.max(this.eye.distance, 1.5 * apart), 60));
+    this.ground(target);
     const R = pilot.turns[pilot.turns.length - 1];
     this.line(simulation.path, colors.faint, 1.5, [6, 5]);
     this.dot(simulation.reference(pilot.times[pilot.times.length - 1]), 3, colors.faint);
@@ -65,8 +68,8 @@ class Picture {
     }
     if (!pilot.over) {
       this.ellipsoid(near(guess, r), simulation.positionRoot(k).map((row) => scaled(3 * magnified, row)));
-      this.vehicle(flights, near(guess, r), flights.field(k, "R_hat"), colors.estimate, false);
     }
+    this.vehicle(flights, near(guess, r), pilot.over ? R : flights.field(k, "R_hat"), colors.estimate, false);
     this.vehicle(flights, r, R, pilot.over ? colors.faint : colors.truth, true);
     if (flights.info.features) this.image(simulation, k);
   }
@@ -115,11 +118,13 @@ class Picture {
     context.globalAlpha = 1;
   }
 
-  ground() {
+  // A grid around the point that the eye looks at.
+  ground(target) {
+    const [x, y] = target.slice(0, 2).map((value) => 2 * Math.round(value / 2));
     for (let i = -8; i <= 8; i += 2) {
       const steps = Array.from({ length: 17 }, (_, j) => j - 8);
-      this.line(steps.map((j) => [i, j, 0]), this.colors.grid, 1);
-      this.line(steps.map((j) => [j, i, 0]), this.colors.grid, 1);
+      this.line(steps.map((j) => [x + i, y + j, 0]), this.colors.grid, 1);
+      this.line(steps.map((j) => [x + j, y + i, 0]), this.colors.grid, 1);
     }
   }
 
@@ -164,7 +169,7 @@ class Picture {
     }
   }
 
-  // Features, and the rays to those in the last image.
+  // Markers, and the rays to those in the last image.
   markers(simulation, k, r, R) {
     const { image } = simulation.pilots[k], { flights } = simulation, { context } = this;
     const fresh = flights.time - image.time < SIGHT ? image.pixels.map(({ feature }) => feature) : [];
