@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
-.PHONY: setup demo circle results test test-oldest test-clients test-arm test-slow soak golden lint benchmark docs reference kernels wheel wheel-arm clean
+.PHONY: setup demo circle results test test-oldest test-clients test-arm test-single test-slow soak golden lint benchmark docs reference kernels wheel wheel-arm clean
 
 setup: $(VENV)/.developer
 
@@ -86,6 +86,10 @@ test-clients:  ## each client of docs/libraries.md in an environment of its own;
 test-arm: setup  ## golden flights on AArch64, emulated: needs gcc-aarch64-linux-gnu and qemu-user-static
 	$(BIN)/python -m tests.golden.aarch64
 
+test-single: setup  ## golden flights in single precision, with each number of lanes
+	for lanes in 16 8 4 2; do QUAD_GYM_PRECISION=single QUAD_GYM_LANES=$$lanes \
+		$(BIN)/python -m tests.golden.flights || exit 1; done
+
 test-slow: setup  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
@@ -94,6 +98,7 @@ soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates ove
 
 golden: setup  ## after flights have changed on purpose: compute their digests again
 	$(BIN)/python -m tests.golden.flights --renew
+	QUAD_GYM_PRECISION=single $(BIN)/python -m tests.golden.flights --renew
 
 lint: setup  ## style, types, import rules and words
 	$(BIN)/ruff format --check .

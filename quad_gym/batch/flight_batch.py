@@ -2,6 +2,7 @@
 
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,12 +34,12 @@ from quad_gym.records import (
     EXCHANGE_BLOCK,
     FLIGHT_BLOCK,
     RESULTS,
+    SINGLE,
     WIDTH,
     WORK_BLOCK,
     Call,
     Command,
     aligned_zeros,
-    require_double,
     room_of,
     words_of_update,
 )
@@ -48,6 +49,10 @@ _GROUP_MEMORY = 1 << 23
 leaves gathered blocks half empty, more leaves the caches. A batch up to twice as large is one
 group."""
 _NO_BOUNDS = np.zeros(0)
+_SINGLE_REACH = 1000.0
+"""Distance from the origin up to which float32 resolves positions [m]: its spacing is 0.06 mm."""
+_SINGLE_TICKS = 2.0**24  #: ticks of an episode that float32 counts exactly
+_CALLS_OF_CHECK = 256  #: calls between two checks of these limits
 _WORTH_NO_COPY = 1 << 16  #: size of observations [bytes] above which a step allocates its own
 
 
@@ -98,9 +103,6 @@ class FlightBatch(FlightMemory):
         self._stages = needed_stages(self._settings[0])
         mode = np.array((c.compiled_autoreset,), [("autoreset", np.int64)])
         digest = configuration_digest(self._settings, mode, model, true, *self._paths)
-        if self._settings["run_filter"][0] and self._settings["late"][0]:
-            # its sums of IMU samples since the start lose digits as they grow
-            require_double("a filter with late measurements")
         used = used_parts(self._settings[0])
         self._allocate(room_of(used), c.draws.low, digest)
         self._words, self._written = words_of_update(self._settings[0], used)
@@ -116,6 +118,7 @@ class FlightBatch(FlightMemory):
         own = self._own_filter is not None
         self._exchange = aligned_zeros(len(self._blocks) if own else 0, EXCHANGE_BLOCK)
         self._crew: Crew | None = None
+        self._calls_until_check, self._beyond_single = 0, ""
 
     def _allocate_for_threads(self) -> None:
         """Allocate the memory that each thread has for itself."""
@@ -249,6 +252,8 @@ class FlightBatch(FlightMemory):
             self._calls = self._calls_of_threads()
             self._crew = Crew(self._calls, len(self._blocks), self.threads, self._group)
         self._crew.gather()
+        if SINGLE:
+            self._warn_beyond_single()
         if command >= Command.TICK or self._observations.nbytes < _WORTH_NO_COPY:
             self._crew.run(int(command))
             return self._observations.copy()
@@ -256,6 +261,25 @@ class FlightBatch(FlightMemory):
         self._calls.observe_into(self._observations)
         self._crew.run(int(command))
         return self._observations
+
+    def _warn_beyond_single(self) -> None:
+        """Warn once about positions and times that float32 cannot resolve, checked now and then."""
+        self._calls_until_check -= 1
+        if self._calls_until_check > 0 or self._beyond_single:
+            return
+        self._calls_until_check = _CALLS_OF_CHECK
+        reach, ticks = np.abs(self._blocks["r"]).max(), self._blocks["tick"].max()
+        if reach > _SINGLE_REACH:
+            self._beyond_single = f"{reach:.0f} m from the origin, beyond {_SINGLE_REACH:g} m"
+        elif ticks >= _SINGLE_TICKS:
+            self._beyond_single = f"{ticks:.0f} ticks old, beyond {_SINGLE_TICKS:.0f}"
+        if self._beyond_single:
+            warnings.warn(
+                f"a flight is {self._beyond_single}: in single precision slow motions freeze there "
+                "and ticks are lost; use QUAD_GYM_PRECISION=double",
+                UserWarning,
+                stacklevel=5,
+            )
 
     def _calls_of_threads(self) -> Calls:
         """Return the arguments with which the threads call the compiled code."""

@@ -31,6 +31,7 @@ from quad_gym.records import (
     in_double,
     joint_covariance,
     lower_factors,
+    parts_of,
     places_of_lanes,
 )
 
@@ -224,7 +225,7 @@ class FlightMemory:
     def copied_record(self, flight: int) -> NDArray[np.uint32]:
         """Return the whole record of one flight at the present instant, for `with_records`."""
         block, lane = divmod(flight, WIDTH)
-        return _parts(self._blocks)[block, places_of_lanes(self._room.dtype)[:, lane]]
+        return parts_of(self._blocks)[block, places_of_lanes(self._room.dtype)[:, lane]]
 
     def with_records(self, records: Sequence[NDArray[np.uint32]]) -> Self:
         """Return flights with copied records, to `read` from: not to be stepped or reset."""
@@ -232,7 +233,7 @@ class FlightMemory:
         found.__dict__.update(self.__dict__)
         found.count = len(records)
         found._blocks = aligned_zeros(-(-found.count // WIDTH), self._room.dtype)
-        parts, places = _parts(found._blocks), places_of_lanes(self._room.dtype)
+        parts, places = parts_of(found._blocks), places_of_lanes(self._room.dtype)
         for flight, record in enumerate(records):
             block, lane = divmod(flight, WIDTH)
             parts[block, places[:, lane]] = record
@@ -275,11 +276,6 @@ class FlightMemory:
             self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
 
 
-def _parts(blocks: NDArray[Any]) -> NDArray[np.uint32]:
-    """Return the memory of blocks in parts of 4 bytes, (blocks, n): see `places_of_lanes`."""
-    return blocks.view(np.uint32).reshape(len(blocks), -1)
-
-
 # --------------------------------------------------------------------------------------------------
 # Calls of the compiled code that flies: addresses of a batch's memory, in words.
 #
@@ -311,6 +307,7 @@ class Calls:
             else:
                 self._words[:, word] = value if isinstance(value, int) else address_of(value)
         self._rows = [address_of(row) for row in self._words]
+        self._board: tuple[NDArray[np.int64] | None, int, int] = (None, 0, 0)
 
     def observe_into(self, observations: NDArray[np.float32]) -> None:
         """Set the array into which the next step writes its observations."""
@@ -325,8 +322,11 @@ class Calls:
 
     def __call__(self, board: NDArray[np.int64], number: int, command: int, serving: bool) -> bool:
         """Fly blocks of a board, as the thread of this number; see `fly`."""
-        row, posted = self._rows[number], address_of(board)
-        return bool(fly(row, posted, board.size, number, command, serving))
+        kept, posted, size = self._board
+        if board is not kept:  # its address takes longer than the rest of this call
+            posted, size = address_of(board), board.size
+            self._board = board, posted, size
+        return bool(fly(self._rows[number], posted, size, number, command, serving))
 
 
 def address_of(array: NDArray[Any]) -> int:

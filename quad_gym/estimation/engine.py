@@ -42,9 +42,12 @@ from quad_gym.records import (
     WORK_BLOCK,
     FilterForm,
     aligned_zeros,
+    field_of_flights,
+    in_double,
     joint_covariance,
     lower_triangle,
-    require_double,
+    parts_of,
+    places_of_lanes,
     room_of,
 )
 
@@ -66,13 +69,9 @@ class Engine:
     Args:
         sensors: The suite that the filter assumes.
         kind: "ukf" or "ekf".
-
-    Raises:
-        ValueError: If the process computes in single precision.
     """
 
     def __init__(self, sensors: SensorSuite, kind: str) -> None:
-        require_double("a filter outside of a simulated flight, and so a replay of a log,")
         self.sensors = sensors
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         params = params_record(VehicleParams(), sensors)
@@ -115,8 +114,7 @@ class Engine:
 
     def read(self, name: str) -> NDArray[Any]:
         """Return a copy of a field of all lanes, (lanes, ...)."""
-        values = np.moveaxis(self.blocks[name], -1, 1)
-        return values.reshape(-1, *values.shape[2:]).copy()
+        return field_of_flights(self.blocks, name, self.lanes)
 
     def write(self, name: str, values: NDArray[Any]) -> None:
         """Write a field of all lanes, from (lanes, ...)."""
@@ -149,30 +147,54 @@ class Engine:
             rows[:, :n, : 15 + n] = lower[:, 15:]
             self.write("P_slow", rows)
 
-    def copy(self) -> NDArray[Any]:
-        """Return a copy of the filter's memory for `restore`: one lane if all are equal."""
-        words = self.words
-        return words[:, :, :1].copy() if len(words) == 1 else words.copy()
+    def copy(self) -> NDArray[np.uint32]:
+        """Return a copy of the filter's memory for `restore`: (n,) of one lane if all are equal.
 
-    def restore(self, words: NDArray[Any]) -> None:
-        """Restore a copy."""
-        if len(words) != len(self.blocks):
-            self.allocate(len(words) * WIDTH)
-        self.words[...] = words
+        Otherwise it is (blocks, n) of all lanes.
+        """
+        return self.record(0) if len(self.blocks) == 1 else self._parts.copy()
+
+    def record(self, lane: int) -> NDArray[np.uint32]:
+        """Return a copy of the memory of one lane, (n,), for `restore`."""
+        block, lane = divmod(lane, WIDTH)
+        return self._parts[block, places_of_lanes(self._room.dtype)[:, lane]]
+
+    def restore(self, copied: NDArray[np.uint32]) -> None:
+        """Restore a copy; one of a single lane becomes all lanes of one block."""
+        count = len(copied) if copied.ndim == 2 else 1
+        if count != len(self.blocks):
+            self.allocate(count * WIDTH)
+        for parts, own in zip(self._parts, copied if copied.ndim == 2 else [copied], strict=True):
+            self._put(parts, own)
+
+    def put_in_slot(self, slot: NDArray[np.uint64], copied: NDArray[np.uint32]) -> None:
+        """Write the first block of a copy into a slot (words,) of a tape."""
+        self._put(slot.view(np.uint32), copied[0] if copied.ndim == 2 else copied)
+
+    def _put(self, parts: NDArray[np.uint32], copied: NDArray[np.uint32]) -> None:
+        """Write a block, or one lane for all lanes, into the memory of a block."""
+        if len(copied) == len(parts):
+            parts[:] = copied
+        else:
+            parts[places_of_lanes(self._room.dtype)] = copied[:, np.newaxis]
 
     @property
-    def words(self) -> NDArray[Any]:
-        """The memory of the parts that the filter uses, (blocks, words, WIDTH)."""
-        return self._words_of(self.blocks)
+    def memory(self) -> NDArray[np.uint64]:
+        """The memory of the parts that the filter uses, (blocks, words)."""
+        return self._memory_of(self.blocks)
 
-    def _words_of(self, blocks: NDArray[Any]) -> NDArray[Any]:
-        raw = blocks.view(np.uint64).reshape(len(blocks), -1, WIDTH)
-        first = self._room.skipped // (8 * WIDTH)
-        return raw[:, first : first + self._room.dtype.itemsize // (8 * WIDTH)]
+    @property
+    def _parts(self) -> NDArray[np.uint32]:
+        first, size = self._room.skipped // 4, self._room.dtype.itemsize // 4
+        return parts_of(self.blocks)[:, first : first + size]
 
-    def of_copies(self, slots: NDArray[Any], name: str) -> NDArray[Any]:
+    def _memory_of(self, blocks: NDArray[Any]) -> NDArray[np.uint64]:
+        first, size = self._room.skipped // 8, self._room.dtype.itemsize // 8
+        return blocks.view(np.uint64).reshape(len(blocks), -1)[:, first : first + size]
+
+    def of_copies(self, slots: NDArray[np.uint64], name: str) -> NDArray[Any]:
         """Return a field of the first lane in the copies (n, words) of a tape, (n, ...)."""
-        return slots.view(self._room.dtype)[name][:, 0, ..., 0]
+        return in_double(slots.view(self._room.dtype)[name][:, 0, ..., 0])
 
     # ---- operations ---------------------------------------------------------------------------
 
@@ -240,7 +262,7 @@ class Engine:
 
     def empty_slots(self, tape: Tape) -> NDArray[Any]:
         """Return room for the copies of a tape."""
-        return np.empty((tape.slots, self.words[0].size), np.uint64)
+        return np.empty((tape.slots, self.memory.shape[1]), np.uint64)
 
     def run_block(
         self,
@@ -267,7 +289,7 @@ class Engine:
             tape.measurements,
             tape.operations,
             measured,
-            self._words_of(block)[0].reshape(-1),
+            self._memory_of(block)[0],
             slots,
             kept.ctypes.data,
             reported.ctypes.data,

@@ -35,7 +35,6 @@ from quad_gym.params.sensor_table import AID_PARAMS, READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import (
     KEPT,
-    WIDTH,
     FilterForm,
     FilterStatus,
     Operation,
@@ -536,8 +535,8 @@ class KalmanFilter(FilterEstimate):
             case Operation.COPY:
                 copies[number] = self._engine.copy(), self._log_weights
             case Operation.RESTORE:
-                words, self._log_weights = copies[number]
-                self._engine.restore(words)
+                copied, self._log_weights = copies[number]
+                self._engine.restore(copied)
                 self._choose_form()
 
     def _condition(self, measurement: Measurement) -> None:
@@ -644,9 +643,9 @@ def run_filter(kf: KalmanFilter, writer: TapeWriter) -> Iterator[Results]:
             innovations = np.array(reports)
         if first < len(piece.operations):
             if slots is None:
-                slots = np.zeros((piece.slots, kf._engine.words[0].size), np.uint64)
-                for k, (words, _) in copies.items():
-                    slots[k].reshape(-1, WIDTH)[:] = words[0]
+                slots = kf._engine.empty_slots(piece)
+                for k, (copied, _) in copies.items():
+                    kf._engine.put_in_slot(slots[k], copied)
             kept, reported = (rows[0, ..., 0] for rows in kf._engine.run(piece.after(first), slots))
             kept = np.column_stack([kept, np.ones(len(kept))])
             kept[: len(estimates)] = estimates

@@ -335,10 +335,7 @@ def moments(engine: Engine, log_weights: Floats) -> Moments:
 
 def collapse(engine: Engine, log_weights: Floats, m: Moments) -> None:
     """Continue with one Gaussian with these moments; other memory comes from the likeliest lane."""
-    words = engine.copy()
-    best = int(np.argmax(log_weights))
-    width = words.shape[2]
-    engine.restore(words[best // width, :, best % width][np.newaxis, :, np.newaxis])
+    engine.restore(engine.record(int(np.argmax(log_weights))))
     n = engine.slow_states
     for name in _VECTORS:
         engine.fill(name, m.vectors[name])

@@ -5,6 +5,8 @@ Every lane is a filter of its own, with its own parameters, on the same measurem
 
 import math
 
+import numpy as np
+
 from quad_gym.kernels import entries
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel, routine
 from quad_gym.kernels.compiling.signatures import signature_of
@@ -21,6 +23,7 @@ from quad_gym.records import (
     LEAST_SIGMA,
     MAX_BLOCKS,
     MOST_BLOCKS,
+    REAL,
     SENSOR_GROUPS,
     WIDTH,
     Aid,
@@ -122,6 +125,7 @@ _PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
 _PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
 _HEIGHT = AID_BLOCK[Aid["BAROMETER"]]
 _LANES = 8 * WIDTH  #: bytes
+_in_precision = np.dtype(REAL).type  #: the number in the precision of lanes
 
 
 @kernel
@@ -221,7 +225,7 @@ def _replace_noise(p, m, own):
 def predict_sample(flight, params, ticks, steps, settings, work, table, mask, sample):
     """Propagate the filters of a block over the time of a sample; see `run_tape`."""
     p, tick, scratch = lanes_of(params), lanes_of(ticks), lanes_of(work)
-    if sample.dt == ticks.dt[0]:
+    if _in_precision(sample.dt) == ticks.dt[0]:
         _set_tick(p, tick, settings.slow_states)
     else:
         _set_step(p, tick, lanes_of(steps), settings.slow_states, sample.dt)

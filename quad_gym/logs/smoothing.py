@@ -35,7 +35,7 @@ from quad_gym.logs.replaying.replay import in_parts, named_start, prepared
 from quad_gym.logs.replaying.results import Smoothed
 from quad_gym.params import checks as check
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import OPERATION, Operation, joint_covariance
+from quad_gym.records import OPERATION, Operation, joint_covariance, require_double
 from quad_gym.rotations import dcm_to_euler, dcm_to_quaternion, euler_to_dcm
 
 _AT_ONCE = 256  #: operations between two readings of the filter's memory
@@ -68,8 +68,10 @@ def smooth(
         **reading: Keywords of `read_log`: `body`, `instance`, `topic`, `columns`, `from_`, `until`.
 
     Raises:
-        ValueError: As `replay`, or if the heading is never known.
+        ValueError: As `replay`, if the heading is never known, or if the process computes in single
+            precision.
     """
+    require_double("smoothing, which inverts covariances,")
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, reading)
@@ -164,7 +166,7 @@ def _filter_forward(player: Player) -> _Forward:
 def _run_and_copy(kf: KalmanFilter, tape: Tape, operations: Any) -> tuple[Floats, ...]:
     """Run operations; return x, R_BI, P and v_corrected after each, or the present ones."""
     engine, count = kf._engine, len(operations)
-    slots = engine.words[0].reshape(1, -1)
+    slots = engine.memory[:1]
     if count:
         both = np.empty((count, 2), OPERATION)
         both[:, 0] = operations

@@ -124,6 +124,11 @@ def places_of_lanes(dtype: np.dtype) -> NDArray[np.intp]:
     return np.concatenate(places)
 
 
+def parts_of(blocks: NDArray[Any]) -> NDArray[np.uint32]:
+    """Return the memory of blocks in parts of 4 bytes, (blocks, n): see `places_of_lanes`."""
+    return blocks.view(np.uint32).reshape(len(blocks), -1)
+
+
 def put_in_flights(blocks: NDArray[Any], name: str, values: NDArray[Any]) -> None:
     """Write one field of the first flights from an array (count, ...)."""
     target, whole, shape = blocks[name], len(values) // WIDTH, values.shape[1:]

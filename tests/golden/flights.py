@@ -1,7 +1,10 @@
 """The golden flights and their digests.
 
 python -m tests.golden.flights            # compare with the digests in flights.json
+python -m tests.golden.flights late ekf   # compare these cases
 python -m tests.golden.flights --renew    # renew the digests
+
+Flights in single precision have their own digests: `QUAD_GYM_PRECISION=single` chooses them.
 """
 
 import argparse
@@ -17,9 +20,9 @@ from quad_gym import Uniform
 from quad_gym.faults import PRESETS
 from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.params.suites import ALL_SUITES, SUITES
-from quad_gym.records import COLUMNS
+from quad_gym.records import COLUMNS, SINGLE
 
-DIGESTS = Path(__file__).with_name("flights.json")
+DIGESTS = Path(__file__).with_name("flights_single.json" if SINGLE else "flights.json")
 FLIGHTS, STEPS, SEED = 8, 300, 2026
 FIRST = COLUMNS["action_delay"].stop
 STATES = (
@@ -253,22 +256,27 @@ def fly(case, flights=FLIGHTS, threads=None):
     return digest.hexdigest()[:16]
 
 
-def differing():
-    """Return the names of cases whose flights differ from the golden flights."""
-    golden = json.loads(DIGESTS.read_text())
-    return [name for name, case in cases().items() if fly(case) != golden.get(name)]
+def differing(names):
+    """Return those of some cases whose flights differ from the golden flights."""
+    golden, known = json.loads(DIGESTS.read_text()), cases()
+    return [name for name in names if fly(known[name]) != golden.get(name)]
 
 
 def main():
     parser = argparse.ArgumentParser(description="Compare flights with the golden ones.")
     parser.add_argument("--renew", action="store_true", help="renew the digests instead")
-    if parser.parse_args().renew:
+    parser.add_argument("cases", nargs="*", help="compare only these")
+    args = parser.parse_args()
+    names = args.cases or list(cases())
+    if unknown := set(names) - cases().keys():
+        parser.error(f"unknown cases: {', '.join(sorted(unknown))}")
+    if args.renew:
         digests = {name: fly(case) for name, case in cases().items()}
         DIGESTS.write_text(json.dumps(digests, indent=1) + "\n")
-    elif changed := differing():
+    elif changed := differing(names):
         raise SystemExit(f"these flights have changed: {', '.join(changed)}")
     else:
-        print(f"{len(cases())} golden flights are as they were")
+        print(f"{len(names)} golden flights are as they were")
 
 
 if __name__ == "__main__":

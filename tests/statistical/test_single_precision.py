@@ -8,38 +8,80 @@ import json
 import numpy as np
 import pytest
 
+from quad_gym.records.sizes import SINGLE_WIDTHS
 from tests.builders import run_python
+from tests.precision_flights import cases
 
 pytestmark = pytest.mark.slow
 
 
-def flown(suite, kind, flights, seconds, **environment):
-    """Results of `tests.precision_flights` in a process with these variables."""
-    words = ("-m", "tests.precision_flights", suite, kind, flights, seconds)
-    done = run_python(*words, **environment)
+def flown(*arguments, module="tests.precision_flights", **environment):
+    """Return the output of a module in a process with these variables."""
+    done = run_python("-m", module, *arguments, **environment)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return done.stdout
 
 
-@pytest.mark.parametrize("kind", ["ukf", "ekf"])
-@pytest.mark.parametrize("suite", ["standard"])
-def test_filters_in_single_precision_have_the_errors_of_double(suite, kind):
-    double, single = (
-        flown(suite, kind, 64, 60, QUAD_GYM_PRECISION=precision)
+@pytest.fixture(scope="module")
+def both():
+    """Results of all cases over 64 flights of 20 s, in double and single precision."""
+    return [
+        json.loads(flown(64, 20, QUAD_GYM_PRECISION=precision))
         for precision in ("double", "single")
-    )
-    assert single["precision"] == "single"
+    ]
+
+
+@pytest.mark.parametrize("case", cases())
+def test_filters_in_single_precision_have_the_errors_of_double(both, case):
+    assert [found["precision"] for found in both] == ["double", "single"]
+    double, single = (found[case] for found in both)
+    for count in ("failures", "failed_predictions", "resets"):
+        assert single[count] == double[count], count
     assert single["failures"] == single["failed_predictions"] == 0
     assert single["nees"] == pytest.approx(double["nees"], rel=5e-3)
     assert single["nis"] == pytest.approx(double["nis"], rel=5e-3)
-    apart = np.abs(np.subtract(single["r_hat"], double["r_hat"])).max()
-    assert 0.0 < apart < 5e-4
+    assert single["from_rotations"] < 5e-6
+    assert double["from_rotations"] < 1e-12
+    assert not np.array_equal(single["r_hat"], double["r_hat"])
 
 
-@pytest.mark.parametrize("suite", ["standard"])
-def test_flights_in_single_precision_do_not_depend_on_number_of_lanes(suite):
-    digests = {
-        flown(suite, "ukf", 20, 2, QUAD_GYM_PRECISION="single", QUAD_GYM_LANES=str(lanes))["digest"]
-        for lanes in (2, 4, 8, 16)
-    }
-    assert len(digests) == 1
+REPLAY = """
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from quad_gym.estimation import replay
+from tests.logged_flights import RTK, Recorded, flown
+
+log = Path(sys.argv[1])
+if not log.exists():
+    Recorded(flown(seconds=20.0)).write_csv(log)
+found = replay(log, sensors=RTK)
+print(json.dumps({
+    "position": found.position.tolist(),
+    "velocity": found.velocity.tolist(),
+    "sigma": found.sigma.tolist(),
+    "verdict": found.verdict.partition(":")[0],
+}))
+"""
+
+
+def test_replay_in_single_precision_agree_with_double(tmp_path):
+    results = []
+    for precision in ("double", "single"):  # the first one writes the log
+        words = ("-c", REPLAY, str(tmp_path / "log.csv"))
+        done = run_python(*words, QUAD_GYM_PRECISION=precision)
+        assert done.returncode == 0, done.stderr
+        results.append(json.loads(done.stdout))
+    double, single = results
+    np.testing.assert_allclose(single["position"], double["position"], atol=1e-3)
+    np.testing.assert_allclose(single["velocity"], double["velocity"], atol=1e-3)
+    np.testing.assert_allclose(single["sigma"], double["sigma"], rtol=1e-2)
+    assert single["verdict"] == double["verdict"]
+
+
+@pytest.mark.parametrize("lanes", SINGLE_WIDTHS)
+def test_golden_flights_in_single_precision_do_not_depend_on_number_of_lanes(lanes):
+    environment = {"QUAD_GYM_PRECISION": "single", "QUAD_GYM_LANES": str(lanes)}
+    flown(module="tests.golden.flights", **environment)

@@ -6,10 +6,14 @@ from quad_gym.records import FLIGHT_BLOCK, WIDTH, places_of_lanes
 from tests.builders import run_python
 
 RECORDS = """
+import warnings
+
 import numpy as np
+from baselines.exporting import export_filter
 from quad_gym import UnscentedKalmanFilter, sensor_suite
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.main import main
+from quad_gym.estimation import calibrate, smooth
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH
 
 assert FLIGHT["r"].base == np.float64 and FLIGHT_BLOCK["r"].base == np.float32
@@ -22,8 +26,32 @@ copied = batch.with_records([batch.copied_record(k) for k in chosen])
 for name in ("r", "key", "P", "needs_reset"):
     np.testing.assert_array_equal(copied.record(name), batch.record(name)[chosen])
 assert batch.record("r").dtype == batch.covariance().dtype == np.float64
+ukf = UnscentedKalmanFilter(sensor_suite("rtk"))
+ukf._engine.write("r_hat", np.tile([1.0, 2.0, 1.0 / 3.0], (WIDTH, 1)))
+copied = ukf._engine.copy()
+ukf._engine.write("r_hat", np.zeros((WIDTH, 3)))
+ukf._engine.restore(copied)
+np.testing.assert_allclose(ukf._engine.read("r_hat"), [[1.0, 2.0, 1.0 / 3.0]] * WIDTH, rtol=1e-7)
+
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    for reach in (999.0, 1001.0, 1002.0):
+        batch.write(flights, r=np.full((len(flights), 3), reach))
+        batch._calls_until_check = 0
+        batch._warn_beyond_single()
+assert [str(w.message).split(":")[0] for w in caught] == [
+    "a flight is 1001 m from the origin, beyond 1000 m"
+]
 main(["version"])
-UnscentedKalmanFilter(sensor_suite("standard"))
+for refused in (
+    lambda: export_filter(sensor_suite("standard"), "filter", "x86-64", "."),
+    lambda: calibrate({}, sensors="rtk"),
+    lambda: smooth({}, sensors="rtk"),
+):
+    try:
+        refused()
+    except ValueError as error:
+        print(error)
 """
 
 
@@ -48,7 +76,14 @@ def test_unknown_precision_or_lanes_are_refused(variables, message):
     assert message in done.stderr
 
 
-def test_single_precision_has_its_own_records_and_refuses_single_filters():
+def test_flights_in_single_precision_equal_golden_flights():
+    """Others, and other numbers of lanes: `make test-single`."""
+    words = ("-m", "tests.golden.flights", "late", "observation truth, consumer")
+    done = run_python(*words, QUAD_GYM_PRECISION="single")
+    assert done.returncode == 0, done.stderr
+
+
+def test_single_precision_has_its_own_records_warns_of_distance_and_refuses_exports():
     done = run_python("-c", RECORDS, QUAD_GYM_PRECISION="single")
     assert "(single precision)" in done.stdout, done.stderr
-    assert "needs double precision, got QUAD_GYM_PRECISION=single" in done.stderr
+    assert done.stdout.count("needs double precision, got QUAD_GYM_PRECISION=single") == 3

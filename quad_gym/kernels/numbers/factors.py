@@ -15,9 +15,8 @@ from quad_gym.kernels.numbers.linalg import (
 )
 
 KNOWN = 1e-30
-
-
-"""Variance of a state that is exactly known, added to the others, too, which it does not change."""
+"""Variance of a state that is exactly known, added to the others, too, which it does not change.
+Float32 holds it and its inverse, too."""
 
 
 @kernel

@@ -45,6 +45,7 @@ from quad_gym.kernels.numbers.lanes import (
     vector_of,
     zero_like,
 )
+from quad_gym.records import SINGLE
 
 # ---- types -----------------------------------------------------------------------------------
 
@@ -389,11 +390,15 @@ def norm(a):
     return math.sqrt(dot(a, a))
 
 
+_SHORTEST_SQUARE = 1e-30 if SINGLE else 1e-60
+"""Square of the length of the shortest vector whose direction is known to all digits."""
+
+
 @kernel
 def unit_or(a, fallback):
     """The unit vector a / |a|, or `fallback` where a is too short to have a direction."""
     square = dot(a, a)
-    usable = square > 1e-60
+    usable = square > _SHORTEST_SQUARE
     return select(usable, 1.0 / math.sqrt(select(usable, square, 1.0)) * a, fallback)
 
 

@@ -24,6 +24,7 @@ from quad_gym.logs.replaying.rules import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite, sensor_suite
+from quad_gym.records import require_double
 
 _IRON_TAU = 30.0
 """Prior correlation time of hard iron that is constant in the suite [s]: currents of motors change
@@ -107,8 +108,9 @@ def calibrate(
 
     Raises:
         ValueError: If a log or an argument is invalid, units or axes of the log are implausible,
-            or the heading at the start is unknown.
+            the heading at the start is unknown, or the process computes in single precision.
     """
+    require_double("a calibration, which takes differences of likelihoods,")
     suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
     check.instance("sensors", suite, SensorSuite)
     check.number("share", share, least=0.05, most=0.95)

@@ -28,7 +28,7 @@ from quad_gym.logs.replaying.results import (
 from quad_gym.logs.replaying.verdict import in_one_line
 from quad_gym.packing import blocks_of
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import FREEDOMS, WIDTH, aligned_zeros
+from quad_gym.records import FREEDOMS, WIDTH, aligned_zeros, parts_of, places_of_lanes
 from quad_gym.records.inputs import SAME_TIME
 
 # --------------------------------------------------------------------------------------------------
@@ -61,9 +61,9 @@ def innovations_of_sets(player: Player, tape: Tape, suites: Sequence[SensorSuite
 def _side_by_side(blocks: Sequence[Any]) -> Any:
     """Return one block with a lane of each of WIDTH blocks."""
     found = aligned_zeros(1, blocks[0].dtype)
-    raw = found.view(np.uint64).reshape(-1, WIDTH)
+    parts, places = parts_of(found)[0], places_of_lanes(found.dtype)
     for lane, block in enumerate(blocks):
-        raw[:, lane] = block.view(np.uint64).reshape(-1, WIDTH)[:, 0]
+        parts[places[:, lane]] = parts_of(block)[0, places[:, 0]]
     return found
 
 
