@@ -133,8 +133,38 @@ def test_unknown_heading_without_motion_stays_unknown():
     assert not kf.heading_known
     assert math.sqrt(kf.covariance[8, 8]) > 1.0
     np.testing.assert_allclose(kf.R_BI @ kf.R_BI.T, np.eye(3), atol=1e-12)
+    drift = kf.gnss_drift_covariance  # of a Gauss-Markov process that began with zero
+    gauss = 1.0 - math.exp(-2.0 * 0.02 * 50 / MAGNETIC.gnss.drift_tau)
+    assert drift.shape == (3, 3)
+    most = np.square(MAGNETIC.gnss.drift_sigma_I) * gauss
+    np.testing.assert_allclose(np.diag(drift), most, rtol=0.1)
     kf.initialize(flight.gnss(0.0)[0], heading=0.3)  # a new start
     assert kf.heading_known
+
+
+def test_weights_of_headings_are_the_likelihoods_of_a_measurement():
+    """N(z - r, P + R) of a position z, for lanes with other means r and covariances P."""
+    gnss = MAGNETIC.gnss.replace(
+        primary_antenna_B=(0.0, 0.0, 0.0),
+        secondary_antenna_B=None,
+        velocity_sigma=None,
+        drift_sigma_I=(0.0, 0.0, 0.0),
+    )
+    kf = UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
+    kf.initialize(np.zeros(3))
+    engine, rng = kf._engine, np.random.default_rng(3)
+    lanes = len(kf._log_weights)
+    places, widths = rng.normal(size=(lanes, 3)), rng.uniform(0.5, 2.0, (lanes, 3))
+    others = engine.covariances().shape[-1] - 3
+    covariances = np.array([np.diag([*w**2, *[1e-4] * others]) for w in widths])
+    engine.write("r_hat", places)
+    engine.write_covariances(covariances)
+    z, before = np.array([0.4, -0.2, 0.3]), kf._log_weights.copy()
+    kf.update(R_IG.T @ z)
+    variances = widths**2 + np.square(gnss.position_sigma_I)
+    logs = before - 0.5 * ((z - places) ** 2 / variances + np.log(variances)).sum(axis=1)
+    logs -= np.log(np.exp(logs).sum())
+    np.testing.assert_allclose(kf._log_weights, logs, rtol=0.0, atol=1e-6)
 
 
 def test_late_measurements_resolve_the_heading_as_those_in_time():

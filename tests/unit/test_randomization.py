@@ -261,14 +261,15 @@ def test_known_draws_scale_the_actions(control):
 
 def test_mean_squares_of_draws_are_those_of_their_distributions():
     """By their integrals; a component that is not drawn keeps its value."""
-    antenna = (Uniform(-0.03, 0.06), None, Normal(0.02, 0.05))
+    antenna = (Uniform(-0.03, 0.06), None, Normal(0.02, 0.05, low=0.0))
     drawn = {"primary_antenna_B": antenna, "battery_resistance": LogUniform(0.01, 0.05)}
     table = batch(1, 3, source=Source.TRUTH, sensors=SUITE, world=WORLD, randomization=drawn)
     draws = table.configuration.draws
     found = [*draws.mean_square("primary_antenna_B"), *draws.mean_square("battery_resistance")]
     logarithmic = (0.05**2 - 0.01**2) / (2.0 * math.log(5.0))
     kept = SUITE.gnss.primary_antenna_B[1] ** 2
-    expected = [(0.03**2 - 0.03 * 0.06 + 0.06**2) / 3.0, kept, 0.02**2 + 0.05**2, logarithmic]
+    normal = stats.truncnorm(-0.4, math.inf, 0.02, 0.05).moment(2)
+    expected = [(0.03**2 - 0.03 * 0.06 + 0.06**2) / 3.0, kept, normal, logarithmic]
     np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
