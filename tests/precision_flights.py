@@ -26,6 +26,8 @@ def cases():
     found = {
         f"{suite}, {kind}": (suite, kind, {}) for suite in ALL_SUITES for kind in ("ukf", "ekf")
     }
+    for kind in ("ukf", "ekf"):  # in front of its wall, as it has no other sensor
+        found[f"one_wall, {kind}"] = ("one_wall", kind, {"start": "hover"})
     for suite in ("rtk", "consumer", "crazyflie"):
         found[f"{suite}, warm"] = (suite, "ukf", {"filter_start": "warm"})
     found["consumer, from the ground"] = ("consumer", "ukf", {"start": "ground"})

@@ -18,6 +18,7 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
     BLOCKS_OF,
     EXCHANGE_BLOCK,
+    REAL,
     WIDTH,
     Autoreset,
     Command,
@@ -470,7 +471,8 @@ class OwnFilter:
             raise ValueError(f'include_std=True needs a "covariance", and {method} returns none')
         everyone, exchange = bool(mask.all()), batch._exchange
         if not everyone and "body_rates" not in found:
-            found["body_rates"] = measurements.gyro_now - found.get("gyro_bias", 0.0)
+            bias = found.get("gyro_bias", 0.0)  # in the precision of the blocks below
+            found["body_rates"] = np.subtract(measurements.gyro_now, bias, dtype=REAL)
         for name, field in _FIELDS.items():
             values = found.get(name)
             if values is None and everyone:

@@ -38,7 +38,9 @@ def test_filters_in_single_precision_have_the_errors_of_double(both, case):
     for count in ("failures", "failed_predictions", "resets"):
         assert single[count] == double[count], count
     assert single["failures"] == single["failed_predictions"] == 0
-    assert single["nees"] == pytest.approx(double["nees"], rel=5e-3)
+    # squares of errors far beyond the standard deviations that the filter of `lab` reports
+    tolerance = 2e-2 if case.startswith("lab") else 5e-3
+    assert single["nees"] == pytest.approx(double["nees"], rel=tolerance)
     assert single["nis"] == pytest.approx(double["nis"], rel=5e-3)
     assert single["from_rotations"] < 5e-6
     assert double["from_rotations"] < 1e-12
