@@ -28,6 +28,7 @@ from quad_gym.logs.replaying.results import (
 from quad_gym.logs.replaying.rules import HORIZONS, changes
 from quad_gym.logs.replaying.verdict import in_one_line
 from quad_gym.records import GateDecision
+from quad_gym.rotations import euler_to_dcm
 from tests import foreign_logs
 from tests.statistical import verdicts
 
@@ -167,6 +168,23 @@ def test_a_log_without_a_position_is_not_usable_however_short_its_parts_are(paus
     (text,) = (f.text for f in of(result, "position") if f.severity == Severity.LOST)
     flown = 15 if pause else 7
     assert re.fullmatch(rf"nothing corrects it for {flown} s, the whole log: .*", text)
+
+
+def test_a_start_that_the_flight_contradicts_is_said():
+    """A given place that is off by 10 m, and IMU and compass that lean by 20 degrees."""
+    log, truth = flight()
+    place = truth["position"][0] + [8.0, -6.0, 0.0]
+    start = {"position": place, "heading": math.pi / 2.0}
+    result = replay(log, sensors=NAME, start=start)
+    assert any(
+        re.search(r"given position at the start contradicts .* by about (9|1[01])\.?\d* m:", text)
+        for text in result.problems
+    )
+    lean = euler_to_dcm((0.35, 0.0, 0.0))
+    leaning = {n: log[n] @ lean.T for n in ("gyro", "accel", "magnetometer")}
+    result = replay(log | leaning, sensors=NAME)
+    (text,) = (f.text for f in of(result, "attitude") if "roll and pitch at the start" in f.text)
+    assert 17 <= int(re.search(r"about (\d+) degrees", text)[1]) <= 23
 
 
 def test_an_outage_of_twelve_seconds_is_dead_reckoning_and_one_of_six_is_not():

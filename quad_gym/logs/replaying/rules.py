@@ -555,6 +555,9 @@ MAX_BIAS = {"accel": 2.0, "gyro": 0.2}
 rad/s (TDK ICM-20948)."""
 WRONG = math.radians(20.0)  #: error of a heading at the start that matters [rad]
 CERTAIN = 4.0  #: standard deviations beyond which such an error is no chance
+TILTED = math.radians(10.0)  #: error of roll and pitch at the start that matters [rad]
+OFFSET, FIRST_ONES = 1.0, 3
+"""Error of a given position or velocity that matters [m], [m/s]; measurements that show it."""
 BEYOND = 4.0  #: ratio of a bias and its standard deviation in the suite that is worth a note [-]
 RESET = 15.0
 """The same ratio, beyond which a filter that was flagged as diverged before it estimated the bias
@@ -595,33 +598,60 @@ def unexplained(case: Evidence) -> Iterator[Finding]:
         )
 
 
+class _FirstPart(NamedTuple):
+    """Rows of a replay until the first pause."""
+
+    time: Floats  #: (n,) time since the start [s]
+    R_BI: Floats  #: (n, 3, 3) attitudes
+    turns: Floats  #: (n - 1, 3) turns by the gyro between the rows [rad]
+    white: Floats  #: (n,) variance of their sum by the gyro's noise [rad^2]
+    sigma: Floats  #: (n, 15) standard deviations of the estimates
+
+
+def _first_part(case: Evidence) -> _FirstPart | None:
+    """Return the first part of a replay; None: it is too short, or its uncertainty is unknown."""
+    result = case.result
+    pause = np.flatnonzero(np.diff(result.time) > PAUSE)
+    count = int(pause[0]) + 1 if len(pause) else len(result)
+    time, sigma = result.time[:count], result.sigma[:count]
+    if count < 3 or time[-1] - time[0] < SETTLED or not np.isfinite(sigma).all():
+        return None
+    T = time - time[0]
+    turns = increments(case.log, result, "gyro")[: count - 1]
+    white = result.sensors.imu.gyro_noise_density**2 * T
+    return _FirstPart(T, quaternion_to_dcm(result.quaternion[:count]), turns, white, sigma)
+
+
+def _turned_back(case: Evidence, part: _FirstPart, k: int) -> Floats:
+    """Return the attitude (3, 3) at the start from row k, by the gyro with the bias of then."""
+    steps = np.diff(part.time[: k + 1])[:, np.newaxis]
+    turns = part.turns[:k] - case.result.gyro_bias[k] * steps
+    back = part.R_BI[k]
+    for step in small_rotations(turns[::-1]):
+        back = step @ back
+    return np.asarray(back)
+
+
 def first_heading(case: Evidence) -> Iterator[Finding]:
     """A heading at the start that the flight contradicts.
 
     The gyro, with the bias of a later estimate, turns that estimate back to the start. The heading
     there has the error of the estimate, and of the turn.
     """
-    result = case.result
-    pause = np.flatnonzero(np.diff(result.time) > PAUSE)
-    rows = slice(0, int(pause[0]) + 1 if len(pause) else len(result))
-    time, known = result.time[rows], np.asarray(result.heading_known, bool)[rows]
-    if not known[0] or len(time) < 3 or not np.isfinite(result.sigma[rows]).all():
+    part = _first_part(case)
+    if part is None or not case.result.heading_known[0]:
         return
-    T = time - time[0]
-    white = result.sensors.imu.gyro_noise_density**2 * T
-    spread = np.sqrt(result.sigma[rows, 8] ** 2 + (T * result.sigma[rows, 14]) ** 2 + white)
-    last = len(T) - 1  # an estimate that was thrown by a wrong start has recovered by then
-    if T[last] < SETTLED or spread[last] > WRONG:
+    sigma, last = part.sigma, len(part.time) - 1
+    # an estimate that was thrown by a wrong start has recovered at the end
+    spread = math.sqrt(
+        sigma[last, 8] ** 2 + (part.time[last] * sigma[last, 14]) ** 2 + part.white[last]
+    )
+    if spread > WRONG:
         return
-    turns = increments(case.log, result, "gyro")[:last]
-    turns = turns - result.gyro_bias[last] * np.diff(time[: last + 1])[:, np.newaxis]
-    R_BI = quaternion_to_dcm(result.quaternion[[0, last]])
-    back = R_BI[1]
-    for step in small_rotations(turns[::-1]):
-        back = step @ back
-    headings = [math.atan2(R[0, 1], R[0, 0]) for R in (R_BI[0], back)]
+    both = part.R_BI[0], _turned_back(case, part, last)
+    headings = [math.atan2(R[0, 1], R[0, 0]) for R in both]
     off = math.remainder(headings[0] - headings[1], 2.0 * math.pi)
-    if abs(off) < max(WRONG, CERTAIN * math.hypot(spread[last], float(result.sigma[0, 8]))):
+    if abs(off) < max(WRONG, CERTAIN * math.hypot(spread, float(sigma[0, 8]))):
         return
     text = f"the heading at the start is off by about {math.degrees(abs(off)):.0f} degrees"
     given = case.start.get("heading")
@@ -634,6 +664,50 @@ def first_heading(case: Evidence) -> Iterator[Finding]:
         if abs(other) < WRONG:
             text += ": it counts from east toward north, not from north (--heading-from-north)"
     yield lost("heading", text)
+
+
+def first_tilt(case: Evidence) -> Iterator[Finding]:
+    """Roll and pitch at the start that the flight contradicts, in the same way."""
+    part = _first_part(case)
+    if part is None:
+        return
+    tilt, drift = part.sigma[:, 6:8].max(axis=1), part.sigma[:, 12:14].max(axis=1)
+    spread = np.sqrt(tilt**2 + (part.time * drift) ** 2 + part.white)
+    later = np.flatnonzero(part.time >= SETTLED)
+    k = int(later[np.argmin(spread[later])])
+    back = _turned_back(case, part, k)
+    off = 2.0 * math.asin(0.5 * float(np.linalg.norm(part.R_BI[0][:, 2] - back[:, 2])))
+    if off > max(TILTED, CERTAIN * math.hypot(spread[k], float(tilt[0]))):
+        yield uncertain(
+            "attitude",
+            f"roll and pitch at the start are off by about {math.degrees(off):.0f} degrees: the "
+            "vehicle stood on a slope or moved; give the specific force of a slope (accel), or "
+            "begin at rest (--from)",
+        )
+
+
+def first_place(case: Evidence) -> Iterator[Finding]:
+    """A given position or velocity at the start that the first measurements contradict."""
+    if "position" not in case.start:
+        return
+    for name, quantity, unit in (
+        ("gnss_position", "position", "m"),
+        ("gnss_velocity", "velocity", "m/s"),
+    ):
+        m = case.sensors.get(name)
+        if m is None or len(m.time) < FIRST_ONES or m.innovation.shape[1] != 3:
+            continue
+        off = np.median(m.innovation[:FIRST_ONES], axis=0)
+        sigma = np.median(m.sigma[:FIRST_ONES], axis=0)
+        size = float(np.linalg.norm(off))
+        if size < OFFSET or not (np.abs(off) > CERTAIN * sigma).any():
+            continue
+        which = "given position" if quantity == "position" else "velocity"
+        text = f"the {which} at the start contradicts the first measurements of GNSS by about"
+        remedy = "leave it out (--start-position): GNSS then shows the start"
+        if quantity == "velocity":
+            remedy = "the vehicle is not at rest: begin at rest (--from), or give its velocity"
+        yield lost("position", f"{text} {size:.3g} {unit}: {remedy}")
 
 
 def unknown_heading(case: Evidence) -> Iterator[Finding]:

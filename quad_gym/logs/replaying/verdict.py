@@ -72,6 +72,8 @@ RULES = (
     Rule(heading_rules.jumps, "", "the magnetic field jumps by a fifth, as no turn explains"),
     Rule(heading_rules.strength, "", "the strength of the magnetic field changes by 10 % for 2 s"),
     Rule(rules.first_heading, "the motion contradicts the heading at the start"),
+    Rule(rules.first_tilt, "", "the motion contradicts roll and pitch at the start"),
+    Rule(rules.first_place, "GNSS contradicts a given position or velocity at the start"),
     Rule(rules.lost_samples, "", "the IMU pauses for 0.3 s"),
     Rule(
         heading_rules.contradicted,
