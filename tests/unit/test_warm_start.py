@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import quad_gym
 from quad_gym import Uniform
@@ -12,7 +13,7 @@ from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params.suites import SUITES
 from quad_gym.records import FLIGHT_FIELDS, POSITION_BLOCK
 from tests.field_flights import attitudes, fly, nees, state_errors, steps
-from tests.unit.alarms import assert_normal
+from tests.unit.alarms import ALARM, assert_normal
 
 BIASES = slice(9, 15)
 ESTIMATES = (
@@ -178,9 +179,23 @@ def test_warm_start_without_heading_source_raises_value_error():
     with pytest.raises(ValueError, match=r"filter_start must be 'cold'"):
         FlightBatch(1, sensors=blind.replace(**unknown), filter_start="warm")
     FlightBatch(1, sensors=blind.replace(**unknown))  # a cold start is allowed
-    # features show it; beyond 1 rad, one of 200 filters converges to a wrong attitude
-    vague = {"initial_pose": quad_gym.InitialPoseParams(heading_sigma=1.0)}
+    # features show it; at 2 rad, one UKF of 200 converges to a wrong attitude
+    vague = {"initial_pose": quad_gym.InitialPoseParams(heading_sigma=1.5)}
     FlightBatch(1, sensors=seeing.replace(**vague), filter_start="warm")
+
+
+def test_warm_start_with_optical_flow_needs_a_sensor_of_the_height():
+    """Without it, 128 flights have a mean NEES of 100 after 0.5 s."""
+    flow = quad_gym.sensor_suite("indoor").replace(
+        camera=None, optical_flow=quad_gym.OpticalFlowParams()
+    )
+    with pytest.raises(ValueError, match=r"must be 'cold' .* deviation of the height is \d"):
+        QuadVectorEnv(1, "hover", sensors=flow, filter_start="warm")
+    FlightBatch(1, sensors=flow)  # a cold start is allowed
+    barometer = quad_gym.BarometerParams(bias_sigma=2.0)
+    batch = fly(flow.replace(barometer=barometer), 64, start="hover", filter_start="warm")
+    steps(batch, 0.5)
+    assert nees(batch).mean() < stats.chi2(15 * 64).ppf(1.0 - ALARM) / 64
 
 
 def test_each_episode_draws_new_warm_start():
