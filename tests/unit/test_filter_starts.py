@@ -11,7 +11,7 @@ from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.records import joint_covariance
 from tests.field_flights import fly
 from tests.filter_states import set_at_rest
-from tests.level_flights import MAGNETIC, R_IG, LevelFlight
+from tests.level_flights import GRAVITY, MAGNETIC, R_IG, LevelFlight
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
 DRAWS = 300
@@ -133,13 +133,26 @@ def test_unknown_heading_without_motion_stays_unknown():
     assert not kf.heading_known
     assert math.sqrt(kf.covariance[8, 8]) > 1.0
     np.testing.assert_allclose(kf.R_BI @ kf.R_BI.T, np.eye(3), atol=1e-12)
-    drift = kf.gnss_drift_covariance  # of a Gauss-Markov process that began with zero
-    gauss = 1.0 - math.exp(-2.0 * 0.02 * 50 / MAGNETIC.gnss.drift_tau)
-    assert drift.shape == (3, 3)
-    most = np.square(MAGNETIC.gnss.drift_sigma_I) * gauss
-    np.testing.assert_allclose(np.diag(drift), most, rtol=0.1)
     kf.initialize(flight.gnss(0.0)[0], heading=0.3)  # a new start
     assert kf.heading_known
+
+
+def test_drift_of_gnss_grows_while_the_heading_is_unknown():
+    """As a Gauss-Markov process that begins with zero: s^2 (1 - exp(-2 t / tau)) on each axis."""
+    gnss = MAGNETIC.gnss.replace(
+        secondary_antenna_B=None,
+        velocity_sigma=None,
+        drift_sigma_I=(0.5, 0.6, 0.9),
+        drift_tau=20.0,
+    )
+    kf = UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss))
+    kf.initialize(np.zeros(3))
+    for _ in range(50):
+        kf.predict(np.zeros(3), [0.0, 0.0, GRAVITY], dt=0.02)
+        kf.update()
+    assert not kf.is_single
+    expected = np.square(gnss.drift_sigma_I) * (1.0 - math.exp(-2.0 / 20.0))
+    np.testing.assert_allclose(kf.gnss_drift_covariance, np.diag(expected), rtol=1e-9, atol=1e-9)
 
 
 def test_weights_of_headings_are_the_likelihoods_of_a_measurement():
