@@ -39,34 +39,43 @@ def keyword_of(name: str) -> str:
     return f"{name}_G" if READINGS[name].in_G else name
 
 
+_OK = int(Outcome.OK)
+_KEYWORDS = tuple(
+    (keyword_of(name), reading.sigma, name, GROUP[name]) for name, reading in READINGS.items()
+)
+"""Keywords of a reading and of its standard deviation, its name and its number."""
+
+
 def checked_measurement(sensors: SensorSuite, given: Mapping[str, Any]) -> Measurement:
     """Return the measurements given by the keywords of `update`; None: not measured."""
     found = np.zeros(1, MEASUREMENT)
-    row = found[0]
-    for name, reading in READINGS.items():
-        if (value := given.get(keyword_of(name))) is not None:
-            _put(row, sensors, name, value)
-        if (sigma := given.get(reading.sigma)) is not None:
-            shape = () if reading.sigmas == 1 or np.ndim(sigma) == 0 else (reading.sigmas,)
-            numbers = check.shaped(reading.sigma, sigma, shape)
+    for keyword, of_sigma, name, group in _KEYWORDS:
+        if (value := given.get(keyword)) is not None:
+            _put(found, sensors, name, keyword, value)
+        if (sigma := given.get(of_sigma)) is not None:
+            count = READINGS[name].sigmas
+            shape = () if count == 1 or np.ndim(sigma) == 0 else (count,)
+            numbers = check.shaped(of_sigma, sigma, shape)
             # a record with 0 has none
-            row["sigma"][GROUP[name], : reading.sigmas] = np.where(numbers == 0.0, -1.0, numbers)
+            found["sigma"][0, group, :count] = np.where(numbers == 0.0, -1.0, numbers)
     entries.check_measurement(found)
-    if row["outcome"] != Outcome.OK:
-        _refuse(row, given)
+    if found["outcome"][0] != _OK:
+        _refuse(found[0], given)
     return found
 
 
-def _put(row: Any, sensors: SensorSuite, name: str, value: Any) -> None:
-    """Write a measurement into a record."""
-    count, keyword, first = sensors.blocks_of(name), keyword_of(name), BLOCKS_OF[name].start
+def _put(
+    measurement: Measurement, sensors: SensorSuite, name: str, keyword: str, value: Any
+) -> None:
+    """Write the value of a reading into a measurement."""
+    count, first = sensors.blocks_of(name), BLOCKS_OF[name].start
     if count == 0 and np.size(value):
         words = name.replace("gnss", "GNSS").replace("_", " ")
         raise ValueError(f"{keyword} must be None: the sensor suite has no {words}")
-    numbers = check.shaped(keyword, value, sensors.shape_of(name))
-    row["valid"][first : first + count] = 1.0
-    length = READINGS[name].length
-    row["measurement"][first : first + count, :length] = numbers.reshape(count, length)
+    numbers, length = check.shaped(keyword, value, sensors.shape_of(name)), READINGS[name].length
+    measurement["valid"][0, first : first + count] = 1.0
+    blocks = measurement["measurement"][0, first : first + count, :length]
+    blocks[...] = numbers.reshape(count, length)
 
 
 def _refuse(row: Any, given: Mapping[str, Any]) -> NoReturn:

@@ -443,6 +443,8 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
     """Return the start that follows from a first fix."""
     require_gnss(sensors, "initialize: start with set_state() instead")
     assert sensors.gnss is not None
+    if fix.gnss_position_G is None:
+        raise ValueError("gnss_position_G must be given, got None")
     names = ("gnss_position_G", "gnss_baseline_G", "gnss_sigma")
     measured = checked_measurement(sensors, {name: getattr(fix, name) for name in names})
     position = values_of(measured, "gnss_position", 1)[0]

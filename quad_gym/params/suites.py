@@ -36,6 +36,7 @@ in 256 flights of the circle under control on the estimate (hovering start, tune
 
 import math
 from dataclasses import field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -186,11 +187,16 @@ class SensorSuite(SensorTable, Saved):
 
     def blocks_of(self, reading: str) -> int:
         """Return the number of blocks that the suite measures of a reading; 0: none."""
-        sensor = getattr(self, SENSOR_OF[reading])
-        if sensor is None:
-            return 0
-        names = [each.name for each in sensor.readings(SENSOR_OF[reading])]
-        return int(sensor.measured_blocks[names.index(reading)])
+        return self._counts[reading]
+
+    @cached_property
+    def _counts(self) -> dict[str, int]:
+        """Numbers of blocks by reading."""
+        found = dict.fromkeys(READINGS, 0)
+        for name, sensor in self.sensors.items():
+            readings = (reading.name for reading in sensor.readings(name))
+            found |= zip(readings, sensor.measured_blocks, strict=True)
+        return found
 
     def gives(self, reading: str) -> bool:
         """Return True if a reading is measured, or the mark of the start gives it in its place."""
