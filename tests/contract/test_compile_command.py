@@ -88,7 +88,7 @@ def test_compile_fails_if_code_cannot_be_written_to_cache(monkeypatch, capsys):
         ("wrong_type", r"_range, .*: offset = r_I - anchor_I", r"sub\(vector, number\)"),
         ("record", r"_vertical, .*: return R_BI\.T\[2\]", "'T'"),
         ("missing_name", "missing_name_stage, .*metres", "name 'metres' is not defined"),
-        ("barometer", r"sample, .*\(x, y, z\), _ = measure", "number of values: expected 3, got 2"),
+        ("barometer", r"measure_first, .*\(x, y, z\), _ = measure", "values: expected 3, got 2"),
     ],
 )
 def test_wrong_stage_is_reported_by_kernel_line_and_reason(stage, kernel, reason, capsys):

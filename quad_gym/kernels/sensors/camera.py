@@ -44,7 +44,7 @@ from quad_gym.kernels.numbers.linalg import (
 from quad_gym.kernels.numbers.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm, turn_pair
 from quad_gym.kernels.sensors.common import (
-    Reading,
+    ReadingModel,
     begin_clock,
     sample_of,
     sensor_stage,
@@ -191,7 +191,7 @@ camera_stage = sensor_stage(
     Sensor["CAMERA"],
     _begin,
     sample_of(Sensor["CAMERA"], measure, _when, change=_change),
-    Reading(_expect, _reset),
+    ReadingModel(_expect, _reset),
 )
 
 

@@ -196,7 +196,7 @@ def deliver(flight, work, settings, sensor, mask, due):
 # --------------------------------------------------------------------------------------------------
 
 
-class Reading(NamedTuple):
+class ReadingModel(NamedTuple):
     """How a filter uses a reading of a sensor."""
 
     expect: Any
@@ -223,7 +223,7 @@ def _reset_nothing(flight, p, work, settings):
     """End of a sensor's readings."""
 
 
-def _of_readings(sensor: int, readings: Sequence[Reading]) -> tuple[Any, Any]:
+def _of_readings(sensor: int, readings: Sequence[ReadingModel]) -> tuple[Any, Any]:
     """Return kernels that fill the rows of all readings, and that reset states to them."""
     expect_rest, reset_rest = _expect_nothing, _reset_nothing
     for number, reading in reversed(list(enumerate(readings))):
@@ -282,7 +282,7 @@ def _largest(flight, first, count):
 
 
 def sensor_stage(
-    sensor: Sensor, begin: Any, sample: Any, *readings: Reading, align: Any = _cannot_align
+    sensor: Sensor, begin: Any, sample: Any, *readings: ReadingModel, align: Any = _cannot_align
 ) -> Any:
     """Make the stage of a sensor; its flag is an `Act`, and an argument times `ACTS`.
 
@@ -453,8 +453,8 @@ def aid_stage(
     Args:
         aid: The sensor.
         measure: As in `sample_of`.
-        expect: As in `Reading`.
-        reset: As in `Reading`.
+        expect: As in `ReadingModel`.
+        reset: As in `ReadingModel`.
         draw: `(flight, p, mask)`: draw further constant errors of an episode; optional.
         align: As in `sensor_stage`; optional.
         disturb: As in `sample_of`; optional.
@@ -485,7 +485,7 @@ def aid_stage(
         return True
 
     sample = sample_of(Sensor[aid.name], measure, when, first=measure_first, disturb=disturb)
-    return sensor_stage(Sensor[aid.name], begin, sample, Reading(expect, reset), align=align)
+    return sensor_stage(Sensor[aid.name], begin, sample, ReadingModel(expect, reset), align=align)
 
 
 @kernel

@@ -33,7 +33,7 @@ from quad_gym.kernels.numbers.linalg import (
 from quad_gym.kernels.numbers.random import normal_pair, six_normals, stream_of, uniform_pair
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.sensors.common import (
-    Reading,
+    ReadingModel,
     begin_clock,
     begin_sample,
     deliver_arrived,
@@ -420,7 +420,7 @@ gnss_stage = sensor_stage(
     Sensor["GNSS"],
     _begin,
     _sample,
-    Reading(expect_position, reset_position),
-    Reading(expect_baseline, reset_baseline),
-    Reading(expect_velocity, reset_velocity),
+    ReadingModel(expect_position, reset_position),
+    ReadingModel(expect_baseline, reset_baseline),
+    ReadingModel(expect_velocity, reset_velocity),
 )
