@@ -231,8 +231,8 @@ def test_zeros_hover_in_every_action(action):
     [
         ("pd:lab", CIRCLE, None, "must be a trained network"),
         ("pretrained", CIRCLE, {"action": "motor"}, "was trained with action ctbr"),
-        ("nothing.zip", None, None, "there is no policy"),
-        ("nothing.txt", CIRCLE, None, "there is no policy"),
+        ("nothing.zip", None, None, "policy file not found"),
+        ("nothing.txt", CIRCLE, None, "policy file not found"),
     ],
 )
 def test_export_of_unsuitable_policy_raises_value_error(policy, env_id, keywords, message):

@@ -195,7 +195,7 @@ def test_verdict_says_which_heading_the_motion_contradicts():
     (turned,) = found_by_the_verdict(True, 92.0, 5.0, True)
     assert turned.severity == Severity.LOST
     for part in ("by 92 degrees (18 standard deviations) from 10.0 to 14.0 s", "about 90 degrees",
-                 "reset to that of the motion", "left out for 16 s"):  # fmt: skip
+                 "reset to that of the motion", "rejected for 16 s"):  # fmt: skip
         assert part in turned.text
     (given,) = found_by_the_verdict(False, -30.0, 5.0, False)
     assert given.severity == Severity.LOST
@@ -215,7 +215,7 @@ def test_verdict_blames_the_heading_before_where_the_compass_agrees_with_the_lat
     assert start.severity == Severity.UNCERTAIN
     assert "wrong until 14.0 s, and unknown until 17.0 s. The magnetometer agrees" in start.text
     (left_out,) = found_by_the_verdict(True, 5.0, 1.0, True, fields=20)
-    assert "left out for 16 s: the heading was wrong until 14.0 s" in left_out.text
+    assert "rejected for 16 s: the heading was wrong until 14.0 s" in left_out.text
     (compass,) = found_by_the_verdict(True, 5.0, 1.0, True, unknown=3.0, fields=2)
     assert compass.severity == Severity.LOST
     assert "the heading of the magnetometer contradicts" in compass.text
