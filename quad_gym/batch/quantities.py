@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from quad_gym.batch.memory import FlightMemory
 from quad_gym.packing import blocks_of
 from quad_gym.params import checks as check
-from quad_gym.params.aids import SensorReading
+from quad_gym.params.aids import ReadingDefinition
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.records import (
     BLOCKS_OF,
@@ -145,7 +145,7 @@ def _measured(batch: FlightMemory, flights: Flights) -> NDArray[np.bool_]:
     return np.asarray(fresh > 0.0)
 
 
-def _read(reading: SensorReading) -> Computed:
+def _read(reading: ReadingDefinition) -> Computed:
     """The last measurement of a reading, vectors turned from G to I."""
 
     def of(batch: FlightMemory, flights: Flights) -> Floats:
@@ -165,7 +165,7 @@ def _read(reading: SensorReading) -> Computed:
     return of
 
 
-def _of_reading(reading: SensorReading) -> Quantity:
+def _of_reading(reading: ReadingDefinition) -> Quantity:
     about = (reading.unit, reading.frame, reading.meaning)
     return Quantity(_read(reading), reading.dimensions, *about, filtered=True)
 

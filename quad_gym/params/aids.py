@@ -27,7 +27,7 @@ class SlowError(NamedTuple):
         return portable.exp(-time / self.tau), drive
 
 
-class SensorReading(NamedTuple):
+class ReadingDefinition(NamedTuple):
     """What a sensor measures: one block of numbers, or several of one kind.
 
     Each block may be missing, and the gate accepts or rejects it by itself.
@@ -70,14 +70,14 @@ class SensorReading(NamedTuple):
 class SensorBase(Checked):
     """Base of the parameters of all sensors."""
 
-    measures: ClassVar[tuple[SensorReading, ...]] = ()
+    measures: ClassVar[tuple[ReadingDefinition, ...]] = ()
     """Quantities of a sensor that has several, or more to say than `AidParams`."""
     _white_noise: ClassVar[tuple[str, ...]] = ()
     _ideal: ClassVar[Mapping[str, Any]] = {}
     """Values without latency and without errors that the filter does not model."""
 
     @classmethod
-    def readings(cls, name: str) -> tuple[SensorReading, ...]:
+    def readings(cls, name: str) -> tuple[ReadingDefinition, ...]:
         """Return what the sensor measures; `name` is its field in `SensorTable`."""
         return cls.measures
 
@@ -139,17 +139,17 @@ class AidParams(SensorBase):
     length: ClassVar[int] = 1
     most_blocks: ClassVar[int] = 1
     rows: ClassVar[int] = 1  #: triples in `numbers`
-    observes: ClassVar[tuple[str, ...]]  #: these six as in `SensorReading`
+    observes: ClassVar[tuple[str, ...]]  #: these six as in `ReadingDefinition`
     unit: ClassVar[str]
     frame: ClassVar[str]
     meaning: ClassVar[str]
     raw: ClassVar[tuple[str, str, float]]
 
     @classmethod
-    def readings(cls, name: str) -> tuple[SensorReading, ...]:
+    def readings(cls, name: str) -> tuple[ReadingDefinition, ...]:
         """Return the reading, which has the name of the sensor."""
         return (
-            SensorReading(
+            ReadingDefinition(
                 name=name,
                 length=cls.length,
                 unit=cls.unit,

@@ -8,7 +8,7 @@ import numpy as np
 
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import SensorBase, SensorReading
+from quad_gym.params.aids import ReadingDefinition, SensorBase
 from quad_gym.params.checks import Matrix, Vector
 
 MAX_FEATURES = 16  #: largest number of a camera's features
@@ -62,7 +62,7 @@ class CameraParams(SensorBase):
     if the camera is below it"""
 
     measures: ClassVar = (
-        SensorReading(
+        ReadingDefinition(
             name="pixels",
             length=2,
             unit="pixels",

@@ -8,7 +8,7 @@ import numpy as np
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
 from quad_gym.params import portable
-from quad_gym.params.aids import SensorBase, SensorReading, SlowError
+from quad_gym.params.aids import ReadingDefinition, SensorBase, SlowError
 
 MIN_DRIFT = 1e-6
 """Position drift that a filter assumes in an axis without drift if another axis has some [m], so
@@ -70,7 +70,7 @@ class GnssParams(SensorBase):
     s: the autopilot PX4 assumes 0.11 s (parameter EKF2_GPS_DELAY)"""
 
     measures: ClassVar = (
-        SensorReading(
+        ReadingDefinition(
             name="gnss_position",
             length=3,
             unit="m",
@@ -86,7 +86,7 @@ class GnssParams(SensorBase):
             in_G=True,
             marked=True,
         ),
-        SensorReading(
+        ReadingDefinition(
             name="gnss_baseline",
             length=3,
             unit="m",
@@ -100,7 +100,7 @@ class GnssParams(SensorBase):
             in_G=True,
             marked=True,
         ),
-        SensorReading(
+        ReadingDefinition(
             name="gnss_velocity",
             length=3,
             unit="m/s",

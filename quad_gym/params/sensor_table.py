@@ -12,7 +12,7 @@ from dataclasses import field
 from typing import NamedTuple, get_args
 
 from quad_gym.params import checks as check
-from quad_gym.params.aids import OBSERVED, AidParams, SensorBase, SensorReading
+from quad_gym.params.aids import OBSERVED, AidParams, ReadingDefinition, SensorBase
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.checks import Checked
@@ -57,7 +57,7 @@ AID_PARAMS: dict[str, type[AidParams]] = {
 }
 """The same of sensors of one reading, which has their name."""
 
-READINGS: dict[str, SensorReading] = {
+READINGS: dict[str, ReadingDefinition] = {
     reading.name: reading
     for sensor, kind in SENSOR_PARAMS.items()
     for reading in kind.readings(sensor)
@@ -73,7 +73,7 @@ SENSOR_OF: dict[str, str] = {
 
 
 class ReadingShape(NamedTuple):
-    """Properties of a reading for which records and kernels are made; see `SensorReading`."""
+    """Properties of a reading for which records and kernels are made; see `ReadingDefinition`."""
 
     name: str
     length: int
