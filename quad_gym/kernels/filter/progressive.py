@@ -108,10 +108,8 @@ def _find_unsure(flight, p, work, settings, lanes):
                     P_zz = innovation_covariance(p, work, settings, k)
                     u = load3(work.z_hat[k : k + 3])
                     across = P_zz[0][0] + P_zz[1][1] + P_zz[2][2] - dot(u, P_zz @ u)
-                    unsure, i = (
-                        lanes & valid & (across > p.gate_uncertainty),
-                        block - FEATURE_BLOCKS,
-                    )
+                    unsure = lanes & valid & (across > p.gate_uncertainty)
+                    i = block - FEATURE_BLOCKS
                     work.hidden[i] = select(unsure, 1.0, work.hidden[i])
                 k += 3
 
