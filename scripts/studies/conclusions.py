@@ -76,9 +76,9 @@ def look_around_control(rows: Rows) -> str:
     crashes = arms.against(*pair, "crashed")
     return (
         f"LookAround, trained on the estimate instead of the truth, with standard deviation and "
-        f"reward for certainty in both arms ({arms.budget(*pair)}): {arms.named(pair[0])} "
-        f"succeeds more often than {arms.named(pair[1])} by {arms.against(*pair)}, and crashes "
-        f"differ by {crashes}."
+        f"reward for certainty in both arms ({arms.budget(*pair)}): {arms.named(pair[0])} and "
+        f"{arms.named(pair[1])} differ in success by {arms.against(*pair)}, and in crashes by "
+        f"{crashes}."
     )
 
 
