@@ -2,7 +2,7 @@
 
     python docs/examples/tutorial.py --output results/tutorial
 
-The figure and the film are written into the folder. It takes five minutes on two cores.
+The figure and the film are written into the folder. It takes about three minutes on two cores.
 """
 
 import os
