@@ -57,7 +57,12 @@ def is_built() -> bool:
     return (cache_folder() / "firmware").exists()
 
 
-def built(report: Callable[[str], None] = print) -> Path:
+def _progress(text: str) -> None:
+    """Print progress, which is no result of a program."""
+    print(text, file=sys.stderr)
+
+
+def built(report: Callable[[str], None] = _progress) -> Path:
     """Return the executable; fetch the source and build it if there is none.
 
     Raises:
