@@ -7,10 +7,11 @@ import numpy as np
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.threads import board_of
 from quad_gym.kernels.stages import STAGE_TABLE
-from quad_gym.records import PARAMS_BLOCK, SETTINGS, Call
+from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, Call
+from quad_gym.records.layout import offset_of
 
 _LINE = 64
-_FLIGHT = (
+FLIGHT_FIELDS = (
     "r",
     "v",
     "q",
@@ -47,14 +48,14 @@ _FLIGHT = (
     "b_g_hat",
     "nis",
     "nis_dimension",
-    "L",
+    "P",
     "stamps",
     "fault_active",
     "fault_from",
     "fault_until",
     "action",
 )
-_PARAMS = (
+PARAMS_FIELDS = (
     "mass",
     "gravity",
     "rotor_positions_B",
@@ -73,8 +74,8 @@ _PARAMS = (
     "pixel_sigma",
     "aid_sigma",
 )
-_SETTINGS = ("sensor_delay", "sensor_ticks", "under_way", "max_steps")
-"""Fields that the page reads or writes."""
+SETTINGS_FIELDS = ("sensor_delay", "sensor_ticks", "under_way", "max_steps")
+"""Fields that the page reads or writes; of a flight, those of parts that a scene has."""
 
 
 class Image:
@@ -131,18 +132,17 @@ def put_batch(image: Image, batch: FlightBatch, stages: list[str]) -> dict[str, 
         "resultPitch": int(words[Call.RESULT_PITCH]),
         "observationSize": int(words[Call.SIZE]),
         "stages": [[int(slot), stages.index(name)] for slot, name in batch._stages.items()],
-        "flight": _offsets(room.dtype, _FLIGHT),
-        "params": _offsets(PARAMS_BLOCK, _PARAMS),
-        "settings": _offsets(SETTINGS, _SETTINGS),
+        "flight": {
+            name: place_of(FLIGHT_BLOCK, name, room.skipped)
+            for name in FLIGHT_FIELDS
+            if room.holds(name)
+        },
+        "params": {name: place_of(PARAMS_BLOCK, name) for name in PARAMS_FIELDS},
+        "settings": {name: place_of(SETTINGS, name) for name in SETTINGS_FIELDS},
     }
 
 
-def _offsets(dtype: np.dtype, names: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    """Return offset [bytes] and length [words of 8 bytes] of fields that a record has."""
-    assert dtype.fields is not None
-    found = {}
-    for name in names:
-        if name in dtype.fields:
-            kind, offset = dtype.fields[name][:2]
-            found[name] = (int(offset), kind.itemsize // 8)
-    return found
+def place_of(dtype: np.dtype, name: str, skipped: int = 0) -> tuple[int, int]:
+    """Return offset [bytes], behind skipped ones, and length [words of 8 bytes] of a field."""
+    kind = dtype[name]
+    return offset_of(dtype, name) - skipped, kind.itemsize // 8

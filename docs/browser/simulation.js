@@ -8,6 +8,20 @@ const GUST_FORCE = 3; // [N], to the east
 const GNSS = 0, CAMERA = 1;
 const FEATURES = 3; // first block of the camera
 const SCALED = ["position_sigma_I", "velocity_sigma", "baseline_sigma", "baseline_noise", "pixel_sigma", "aid_sigma"];
+const ROWS = [3, 4, 5, 6, 7, 8, 0, 1, 2, 9, 10, 11, 12, 13, 14]; // in memory, of r, v, e, b_a, b_g
+
+// L, lower triangular, of P = L L^T for a positive definite matrix.
+function lowerFactor(P) {
+  const L = P.map((row) => row.map(() => 0));
+  P.forEach((row, i) => {
+    for (let j = 0; j <= i; j++) {
+      let rest = row[j];
+      for (let m = 0; m < j; m++) rest -= L[i][m] * L[j][m];
+      L[i][j] = i === j ? Math.sqrt(rest) : rest / L[j][j];
+    }
+  });
+  return L;
+}
 
 class Simulation {
   constructor(scenes, policies) {
@@ -67,7 +81,7 @@ class Simulation {
       inputs.set(turned(R, unit(sum(center, scaled(-1, flights.field(k, "r_seen"))))), builtin.length);
     }
     if (size > builtin.length + 3) {
-      const sigma = Math.sqrt(Math.max(...[0, 1, 2].map((i) => this.positionCovariance(k)[i][i])));
+      const sigma = Math.sqrt(Math.max(...this.covariance(k).slice(0, 3).map((row, i) => row[i])));
       inputs[size - 1] = clip(Math.log10(Math.max(sigma, 1e-9) / 0.03), -1, 6);
     }
     return inputs;
@@ -78,14 +92,15 @@ class Simulation {
     return Array.from({ length: this.flights.info.features }, (_, i) => Array.from(all.subarray(3 * i, 3 * i + 3)));
   }
 
+  // The lower factor of the covariance of the position, in I.
   positionRoot(k) {
-    const L = this.flights.field(k, "L");
-    return [0, 1, 2].map((i) => [0, 1, 2].map((j) => L[15 * i + j]));
+    return lowerFactor(this.covariance(k).slice(0, 3).map((row) => row.slice(0, 3)));
   }
 
-  positionCovariance(k) {
-    const A = this.positionRoot(k);
-    return [0, 1, 2].map((i) => [0, 1, 2].map((j) => dot(A[i], A[j])));
+  // The covariance of the 15 states in the order r, v, e, b_a, b_g, from its lower triangle in memory.
+  covariance(k) {
+    const P = this.flights.field(k, "P");
+    return ROWS.map((a) => ROWS.map((b) => P[15 * Math.max(a, b) + Math.min(a, b)]));
   }
 
   // ---- results ---------------------------------------------------------------------------------
@@ -137,17 +152,18 @@ class Simulation {
     const R = attitude(f("q")), R_hat = f("R_hat");
     const row = (M, i) => [M[3 * i], M[3 * i + 1], M[3 * i + 2]];
     const E = (i, j) => dot(row(R, i), row(R_hat, j));
-    const axis = [E(1, 2) - E(2, 1), E(2, 0) - E(0, 2), E(0, 1) - E(1, 0)], sine = Math.hypot(...axis);
-    const angle = Math.atan2(sine, E(0, 0) + E(1, 1) + E(2, 2) - 1), angles = scaled(sine ? angle / sine : 1, axis);
+    const angles = [
+      Math.atan2(E(1, 2), Math.hypot(E(1, 0), E(1, 1))), Math.atan2(-E(0, 2), E(2, 2)), Math.atan2(-E(1, 0), E(1, 1)),
+    ];
     const e = [
       ...difference("r", "r_hat"), ...difference("v", "v_hat"), ...angles,
       ...difference("b_a", "b_a_hat"), ...difference("b_g", "b_g_hat"),
     ];
-    const L = f("L"), x = [];
+    const L = lowerFactor(this.covariance(k)), x = [];
     for (let i = 0; i < 15; i++) {
       let rest = e[i];
-      for (let j = 0; j < i; j++) rest -= L[15 * i + j] * x[j];
-      x.push(rest / L[16 * i]);
+      for (let j = 0; j < i; j++) rest -= L[i][j] * x[j];
+      x.push(rest / L[i][i]);
     }
     return x.reduce((total, number) => total + number * number, 0);
   }

@@ -21,7 +21,7 @@ from docs.extensions import browser_page
 from quad_gym.analysis.metrics import nees, state_error
 
 KEY, STEPS, EVERY = 7, 500, 25
-FIELDS = ("r", "v", "q", "w", "rotor_speeds", "b_g", "r_hat", "v_hat", "R_hat", "b_a_hat", "L")
+FIELDS = ("r", "v", "q", "w", "rotor_speeds", "b_g", "r_hat", "v_hat", "R_hat", "b_a_hat", "P")
 BUTTONS = {100: "gnss", 150: "gust", 250: "bias", 375: "camera", 450: "bias"}
 NOISE_AT, LATENCY_AT = 300, 350
 """Steps before which the sliders change: noise times 2, and latency times 1.5."""
