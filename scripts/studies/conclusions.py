@@ -1,9 +1,9 @@
 """Conclusions of the studies, each computed from rows per seed.
 
 A conclusion is a function of the rows of a table. It names arms, seeds, budget and intervals, and
-its verdict follows from the interval: a difference is significant if its 95 % interval excludes
-zero. Where a row is missing, or of other flights, it is `NOT_MEASURED`. `docs.renewal` writes the
-texts into the pages, and a test compares these with the rows.
+its verdict follows from a permutation test over the trainings (`Effect.significant`). Where a row
+is missing, or of other flights, it is `NOT_MEASURED`. `docs.renewal` writes the texts into the
+pages, and a test compares these with the rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ from scripts.studies.parts import (
     TRACKING_STEPS,
 )
 from scripts.studies.report import number, share
-from scripts.studies.rows import Rows, effect, mean_effect
+from scripts.studies.rows import Effect, Rows, effect, mean_effect
 
 NOT_MEASURED = "Not yet measured with the present flights (`python -m scripts.studies run --all`)."
 """Text of a conclusion or table whose rows are missing or of other flights."""
@@ -32,14 +32,17 @@ class MissingRowsError(ValueError):
     """Error raised if an arm has not been measured."""
 
 
-def points(found: Estimated) -> str:
+def points(found: Effect) -> str:
     """Difference of rates in percentage points, with its interval and verdict."""
-    scaled = Estimated(*(100.0 * value for value in found))
-    return f"{number(scaled, 0)} percentage points ({_verdict(found)})"
+    return f"{number(found.scaled(100.0).size, 0)} percentage points ({verdict(found)})"
 
 
-def _verdict(found: Estimated) -> str:
-    return "not significant" if found.holds(0.0) else "significant"
+def verdict(found: Effect) -> str:
+    """P value and verdict of a difference."""
+    word = "significant" if found.significant else "not significant"
+    if found.p is None:
+        return word
+    return f"p < 0.001, {word}" if found.p < 0.001 else f"p = {found.p:.2g}, {word}"
 
 
 class Arms:
@@ -213,7 +216,7 @@ def when_to_train(rows: Rows) -> str:
             )
             cost, gain = effect(truth, ideal, column), effect(truth, estimate, column)
             if column == "success":
-                cost, gain = _negative(cost), _negative(gain)
+                cost, gain = cost.scaled(-1.0), gain.scaled(-1.0)
             rule = arms["pd"].estimated(column)
             body.append(
                 [
@@ -221,8 +224,8 @@ def when_to_train(rows: Rows) -> str:
                     f"`{suite}`",
                     _shown(rule, column),
                     _shown(ideal.estimated(column), column),
-                    _shown(cost, column),
-                    f"{_shown(gain, column)}, {_verdict(gain)}",
+                    _shown(cost.size, column),
+                    f"{_shown(gain.size, column)} ({verdict(gain)})",
                     f"{truth.seeds}",
                 ]
             )
@@ -249,10 +252,10 @@ def when_to_train_summary(rows: Rows) -> str:
             arms = Arms(rows.where(task=task, suite=suite), steps)
             column = "success" if task == "Waypoints" else "error"
             gain = effect(arms["truth"], arms["estimate"], column)
-            gain = _negative(gain) if column == "success" else gain
+            gain = gain.scaled(-1.0) if column == "success" else gain
             cases += 1
-            if not gain.holds(0.0):
-                (wins if gain.value > 0.0 else losses).append(f"{task} with `{suite}`")
+            if gain.significant:
+                (wins if gain.size.value > 0.0 else losses).append(f"{task} with `{suite}`")
     seeds = Arms(rows.where(task="Circle", suite="standard"), TRACKING_STEPS["Circle"])
     return (
         f"Training on the estimate is significantly better in {len(wins)} of {cases} cases"
@@ -263,10 +266,6 @@ def when_to_train_summary(rows: Rows) -> str:
 
 def _listed(names: list[str]) -> str:
     return f" ({', '.join(names)})" if names else ""
-
-
-def _negative(found: Estimated) -> Estimated:
-    return Estimated(-found.value, -found.high, -found.low)
 
 
 def _shown(found: Estimated, column: str) -> str:
@@ -287,11 +286,10 @@ def arms_table(table: str, steps: int) -> Conclusion:
                 found = arms[name]
             except MissingRowsError:
                 continue  # of a part that is not complete
-            trained = found.rows[0]["seed"] is not None
             body.append(
                 [
                     found.label,
-                    str(found.seeds) if trained else "rule",
+                    str(found.seeds) if found.trained else "rule",
                     share(found.estimated("success")),
                     share(found.estimated("crashed")),
                     number(found.estimated("return"), 1),

@@ -15,7 +15,7 @@ from quad_gym.envs.config import BENCHMARKS
 from quad_gym.rendering.video import ending_for_readers
 from scripts.studies.films import CHOICES, label_of, pair_of
 from scripts.studies.plots import glance_figure, pace_figure
-from scripts.studies.scores import difference
+from scripts.studies.scores import SIGNIFICANT, difference, permutation_p
 from scripts.studies.study import StudyResults
 
 FEW = 5  #: number of seeds below which intervals over trainings are wide
@@ -33,11 +33,12 @@ def share(found: Estimated) -> str:
 
 
 def conclusions(results: StudyResults) -> list[str]:
-    """Conclusions that the intervals allow.
+    """Conclusions that intervals and permutation tests allow.
 
-    Two arms differ significantly if the 95 % interval of their difference excludes zero. For equal
-    arms the probability of this is 1 % with three trainings each, 2 % with five, and at most 5 %
-    with many; it is larger for an arm that was selected as the best of several by these numbers.
+    Two trained arms differ significantly if the p value of a permutation test over their trainings
+    is below `SIGNIFICANT`, which needs five trainings each. A trained arm and a fixed rule differ
+    significantly if the 95 % interval of their difference excludes zero. For equal arms both are
+    rarer than said here; they are less rare for an arm that was selected as the best of several.
     """
     found, seeds, trained = [], len(results.study.seeds), results.trained()
     learned = [name for name in trained if name != "truth"]
@@ -68,9 +69,9 @@ def _against_truth(results: StudyResults, best: str) -> list[str]:
     ours, truth = results.rows[best], results.rows["truth"]
     change = difference(ours["success"], truth["success"])
     points = number(Estimated(*(100.0 * value for value in change)), 0)
-    verdict = f"a difference of {points} percentage points"
-    if change.holds(0.0):
-        verdict = f"no significant difference ({points} percentage points)"
+    p = permutation_p([(results.mean_success(best), results.mean_success("truth"))])
+    word = "a significant" if p < SIGNIFICANT else "no significant"
+    verdict = f"{word} difference ({points} percentage points, p = {p:.2g})"
     success = [
         f"On the estimate, {label} succeeds in {share(ours['success'])} of the episodes, and "
         f"{_label(results, 'truth')} in {share(truth['success'])}: {verdict}."

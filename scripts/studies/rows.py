@@ -6,10 +6,10 @@ interval and conclusion can be computed again. A fixed rule has one row without 
 
 import csv
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from quad_gym.analysis.metrics import (
     rate_over_trainings,
     variance_of,
 )
-from scripts.studies.scores import difference
+from scripts.studies.scores import SIGNIFICANT, difference, permutation_p
 
 RATES = ("success", "crashed")  #: columns that are shares of episodes
 
@@ -90,6 +90,11 @@ class Rows:
         return len(self.rows)
 
     @property
+    def trained(self) -> bool:
+        """True for an arm with trainings, False for a fixed rule."""
+        return self.rows[0]["seed"] is not None
+
+    @property
     def label(self) -> str:
         """Label of the arm."""
         return str(self.rows[0]["label"])
@@ -125,19 +130,39 @@ class Rows:
         return Estimated(value, value - half, value + half)
 
 
-def effect(first: Rows, second: Rows, column: str = "success") -> Estimated:
-    """Difference of a column between two arms, first minus second, with its 95 % interval."""
-    return difference(first.estimated(column), second.estimated(column))
+class Effect(NamedTuple):
+    """Difference between arms, first less second, with its interval and p value."""
+
+    size: Estimated
+    p: float | None
+    """of the permutation test over trainings; None where an arm is a fixed rule"""
+
+    @property
+    def significant(self) -> bool:
+        """True if p is below `SIGNIFICANT`; of a fixed rule, if the interval excludes zero."""
+        return not self.size.holds(0.0) if self.p is None else self.p < SIGNIFICANT
+
+    def scaled(self, factor: float) -> "Effect":
+        """Effect in another unit, or with the other sign."""
+        value, *ends = (factor * number for number in self.size)
+        return Effect(Estimated(value, min(ends), max(ends)), self.p)
 
 
-def mean_effect(pairs: Iterable[tuple[Rows, Rows]], column: str = "success") -> Estimated:
-    """Mean of the effects of several independent pairs, with its 95 % interval (MOVER)."""
-    found = [effect(first, second, column) for first, second in pairs]
-    n = len(found)
+def effect(first: Rows, second: Rows, column: str = "success") -> Effect:
+    """Difference of a column between two arms, first less second."""
+    return mean_effect([(first, second)], column)
+
+
+def mean_effect(pairs: Sequence[tuple[Rows, Rows]], column: str = "success") -> Effect:
+    """Mean of the effects of several independent pairs; the interval is the MOVER."""
+    found = [difference(a.estimated(column), b.estimated(column)) for a, b in pairs]
+    n, p = len(found), None
     value = sum(each.value for each in found) / n
     below = math.hypot(*(each.value - each.low for each in found)) / n
     above = math.hypot(*(each.high - each.value for each in found)) / n
-    return Estimated(value, value - below, value + above)
+    if all(each.trained for pair in pairs for each in pair):
+        p = permutation_p([(a.values(column), b.values(column)) for a, b in pairs])
+    return Effect(Estimated(value, value - below, value + above), p)
 
 
 _TEXTS, _WHOLE = ("arm", "label", "task", "suite", "flights"), ("seed", "steps", "episodes")

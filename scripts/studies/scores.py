@@ -6,7 +6,7 @@ of scores that vary smoothly, and up to 99 % of equal ones.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,8 @@ from quad_gym.analysis.metrics import TAIL, Estimated, center_of, half_width, va
 
 Floats = NDArray[np.float64]
 Score = Callable[[Floats], Floats]  #: from numbers (..., e) of episodes to one number (...)
+SIGNIFICANT = 0.01  #: p value below which a difference of trained arms is called significant
+_EXCHANGES = 19_999  #: number of random exchanges of a permutation test
 
 
 def mean(values: Floats) -> Floats:
@@ -66,6 +68,33 @@ def difference(first: Estimated, second: Estimated) -> Estimated:
     below = math.hypot(first.value - first.low, second.high - second.value)
     above = math.hypot(first.high - first.value, second.value - second.low)
     return Estimated(value, value - below, value + above)
+
+
+def permutation_p(pairs: Sequence[tuple[ArrayLike, ArrayLike]], seed: int = 0) -> float:
+    """Two-sided p value of the mean difference between paired arms, by a permutation test.
+
+    If the trainings of both arms of each pair have the same distribution, whatever it is, then the
+    arms of the trainings may be exchanged at random within each pair, and the difference exceeds
+    the observed one with this probability. The test is exact for any number of trainings.
+
+    Args:
+        pairs: Of two arms each, with one finite number per training, (s,) and (t,).
+        seed: Of the random exchanges.
+
+    Source: B. Phipson and G. K. Smyth, Statistical Applications in Genetics and Molecular Biology
+    9, 2010, for the count of the observed difference among the exchanged ones.
+    """
+    rng, observed, exchanged = np.random.default_rng(seed), 0.0, np.zeros(_EXCHANGES)
+    for first, second in pairs:
+        a, b = (np.asarray(values, np.float64).reshape(-1) for values in (first, second))
+        if not (a.size and b.size and np.isfinite(a).all() and np.isfinite(b).all()):
+            raise ValueError(f"pairs must have finite numbers, got {a.size} and {b.size} of them")
+        both = np.tile(np.concatenate([a, b]), (_EXCHANGES, 1))
+        mixed = rng.permuted(both, axis=1)
+        observed += a.mean() - b.mean()
+        exchanged += mixed[:, : a.size].mean(axis=1) - mixed[:, a.size :].mean(axis=1)
+    as_large = np.abs(exchanged) >= abs(observed) * (1.0 - 1e-9) - 1e-12
+    return float((1 + as_large.sum()) / (1 + _EXCHANGES))
 
 
 def probability_of_improvement(first: ArrayLike, second: ArrayLike) -> Estimated:

@@ -129,6 +129,10 @@ class StudyResults:
         """Mean return of each training of an arm."""
         return [float(flown.episodes.returns.mean()) for flown in self.flown[name]]
 
+    def mean_success(self, name: str) -> list[float]:
+        """Share of successful episodes of each training of an arm."""
+        return [float(self.study.about.success(flown).mean()) for flown in self.flown[name]]
+
     def improvement(self, first: str, second: str) -> Estimated:
         """Probability that a training of one arm returns more than one of another."""
         return probability_of_improvement(self.mean_returns(first), self.mean_returns(second))

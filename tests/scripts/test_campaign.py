@@ -1,15 +1,18 @@
 """The campaign of studies: cells, their rows, resumption, and remaining work."""
 
 import dataclasses
+from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.stats import fisher_exact
 
 from quad_gym.analysis.metrics import mean_interval, rate_over_trainings
 from scripts.studies import campaign, conclusions, run
 from scripts.studies.campaign import Part, is_complete
 from scripts.studies.parts import PARTS
 from scripts.studies.rows import Rows, effect, mean_effect
+from scripts.studies.scores import permutation_p
 
 SMALL = Part(
     table="small",
@@ -103,11 +106,27 @@ def test_intervals_and_effects_follow_from_rows():
     assert a.estimated("success") == rate_over_trainings(rates, 100)
     np.testing.assert_allclose(a.estimated("error")[1:], mean_interval(rates), rtol=1e-12)
     np.testing.assert_allclose(a.estimated("return")[1:], 10.0 * np.array(mean_interval(rates)))
-    assert effect(a, b).value == pytest.approx(0.5)
-    same = mean_effect([(a, b), (a, b)])
-    assert same.value == pytest.approx(0.5)
-    narrower = (same.high - same.low) / (effect(a, b).high - effect(a, b).low)
+    one, same = effect(a, b), mean_effect([(a, b), (a, b)])
+    assert one.size.value == same.size.value == pytest.approx(0.5)
+    narrower = (same.size.high - same.size.low) / (one.size.high - one.size.low)
     assert narrower == pytest.approx(np.sqrt(0.5))
+    # the share of the 20 ways to divide six trainings whose difference is at least as large
+    values = np.array([0.0, 0.25, 0.5, 0.5, 0.75, 1.0])
+    sums = [values[list(own)].sum() for own in combinations(range(6), 3)]
+    p = np.mean(np.abs(np.array(sums) - 1.5) >= 0.75)
+    assert one.p == pytest.approx(p, abs=0.015)
+    rule = Rows([dict(b.rows[0], seed=None)])
+    assert effect(a, rule).p is None
+    assert effect(rule, a).scaled(-1.0).size == pytest.approx(effect(a, rule).size)
+
+
+@pytest.mark.parametrize(("first", "second"), [(20, 13), (20, 16), (3, 3)])
+def test_permutation_test_of_successes_and_failures_equals_fishers_exact_test(first, second):
+    a, b = (np.arange(20) < count for count in (first, second))
+    exact = fisher_exact([[first, 20 - first], [second, 20 - second]]).pvalue
+    assert permutation_p([(a, b)]) == pytest.approx(exact, abs=0.015)
+    with pytest.raises(ValueError, match="pairs must have finite numbers, got 20 and 0"):
+        permutation_p([(a, [])])
 
 
 def test_files_without_seeds_are_refused(tmp_path):
@@ -161,7 +180,7 @@ def test_conclusions_follow_from_rows_and_name_arms_seeds_budget_and_interval(tm
     assert '"truth + standard deviation, reward for certainty" (50 [' in control
     assert "(20 seeds, 2,000,000 steps)" in control
     assert "by 30 [" in control
-    assert "percentage points (significant)" in control
+    assert "percentage points (p < 0.001, significant)" in control
     factors = found["look_around.factors"]
     for words in ("estimate 30 [", "standard deviation 20 [", "certainty 10 ["):
         assert words in factors
