@@ -3,10 +3,12 @@
 import csv
 import io
 import os
+import pickle
 import signal
 import socket
 import threading
 import time
+import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -54,6 +56,21 @@ def has_checkpoint(folder: Path) -> bool:
     """True if a run can be resumed from the folder."""
     kept = any((folder / f"last{suffix}").exists() for suffix in SUFFIXES.values())
     return kept and (folder / "training.json").exists()
+
+
+@contextmanager
+def reading_checkpoint(folder: Path) -> Iterator[None]:
+    """Context that reads a checkpoint, in which errors become a `RunError` that says what to do."""
+    try:
+        yield
+    except (zipfile.BadZipFile, pickle.UnpicklingError, EOFError) as error:
+        raise RunError(f"the checkpoint in {folder} is damaged: {error}") from None
+    except (ImportError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise RunError(
+            f"the training in {folder} must be resumed with the version of quad_gym, the packages, "
+            "the precision and the number of lanes that stopped it, or begun in another folder; "
+            f"its best policy can be used in any case ({type(error).__name__}: {error})"
+        ) from None
 
 
 def score(summary: dict[str, float], duration: float) -> float:

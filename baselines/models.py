@@ -18,7 +18,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from baselines.keeping import STATE, RunError, RunKeeper, best_file, replace_file
+from baselines.keeping import STATE, RunKeeper, best_file, reading_checkpoint, replace_file
 from baselines.recipes import Linear, Plan, Recipe, first_seed
 from quad_gym.params import checks as check
 
@@ -181,7 +181,7 @@ def save_model(folder: Path, model: BaseAlgorithm, keeper: Keeper) -> None:
 
 def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) -> BaseAlgorithm:
     """Load the model of `last.zip` into an untrained one, and restore flights, keeper and draws."""
-    try:
+    with reading_checkpoint(folder):
         with zipfile.ZipFile(folder / LAST) as archive:
             state = pickle.loads(archive.read(STATE))
         found = type(model).load(
@@ -191,16 +191,14 @@ def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) 
             force_reset=False,
             custom_objects={"tensorboard_log": model.tensorboard_log},
         )
-    except (zipfile.BadZipFile, KeyError, pickle.UnpicklingError) as error:
-        raise RunError(f"the checkpoint in {folder} is damaged: {error}") from None
-    if state["replay"]:
-        found.load_replay_buffer(folder / state["replay"])  # type: ignore[attr-defined]
-    env.reset()
-    env.unwrapped.flights.batch.restore(state["flights"])  # type: ignore[attr-defined]
-    torch.set_rng_state(state["torch"])
-    np.random.set_state(state["numpy"])  # noqa: NPY002
-    found.action_space.np_random.bit_generator.state = state["actions"]
-    keeper.restore(state["keeper"], found.num_timesteps)
+        if state["replay"]:
+            found.load_replay_buffer(folder / state["replay"])  # type: ignore[attr-defined]
+        env.reset()
+        env.unwrapped.flights.batch.restore(state["flights"])  # type: ignore[attr-defined]
+        torch.set_rng_state(state["torch"])
+        np.random.set_state(state["numpy"])  # noqa: NPY002
+        found.action_space.np_random.bit_generator.state = state["actions"]
+        keeper.restore(state["keeper"], found.num_timesteps)
     return found
 
 

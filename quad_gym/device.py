@@ -1,5 +1,8 @@
 """Flights on a GPU: their memory as torch tensors, and the launches of their kernel."""
 
+from __future__ import annotations
+
+import contextlib
 import hashlib
 import os
 import pickle
@@ -13,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
@@ -40,6 +42,9 @@ from quad_gym.records import (
 )
 from quad_gym.records.sizes import RESIDENT
 from quad_gym.tasks.batch import TaskBatch
+
+with contextlib.suppress(ImportError):  # plans and PTX for wheels need no torch
+    import torch
 
 # --------------------------------------------------------------------------------------------------
 # `DevicePlan`: a configuration for a GPU, flown where only NumPy and torch are needed.
@@ -274,8 +279,8 @@ class DeviceBatch:
     def _put(self, array: Any) -> torch.Tensor:
         return torch.from_numpy(np.array(array)).to(self.device)
 
-    def _zeros(self, *shape: int, kind: torch.dtype = torch.float64) -> torch.Tensor:
-        return torch.zeros(shape, dtype=kind, device=self.device)
+    def _zeros(self, *shape: int, kind: torch.dtype | None = None) -> torch.Tensor:
+        return torch.zeros(shape, dtype=kind or torch.float64, device=self.device)
 
     def _repeated(self, words: Words, times: int) -> torch.Tensor:
         """Return a record for all flights of so many blocks, (times, words, WARP)."""

@@ -1,13 +1,17 @@
 """Conversion of parameters to numbers in the records that kernels read."""
 
+import functools
+import hashlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
+from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym import records
 from quad_gym.configuration import FlightConfiguration
 from quad_gym.faults import Fault, Span, ends
 from quad_gym.params import checks as check
@@ -52,6 +56,38 @@ from quad_gym.records import (
     TaskKind,
     aligned_zeros,
 )
+
+# --------------------------------------------------------------------------------------------------
+# The form of all records, which pickled flights and filters must share with the kernels.
+# --------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def form_of_records() -> str:
+    """Return a digest of the fields of all records, and of the members of all enumerations."""
+    named = {
+        name: [(member.name, repr(member.value)) for member in thing]
+        if isinstance(thing, type) and issubclass(thing, Enum)
+        else repr(thing)
+        for name, thing in vars(records).items()
+        if isinstance(thing, np.dtype) or (isinstance(thing, type) and issubclass(thing, Enum))
+    }
+    return hashlib.sha256(repr(sorted(named.items())).encode()).hexdigest()[:16]
+
+
+def require_same_form(form: str | None, *, fits: bool = True) -> None:
+    """Refuse the memory of a pickled object whose records the kernels would misread.
+
+    Raises:
+        ValueError: If its form differs from `form_of_records`, or it does not fit otherwise.
+    """
+    if form != form_of_records() or not fits:
+        raise ValueError(
+            "an environment, batch or filter must be unpickled with the version of quad_gym, the "
+            "precision and the number of lanes with which it was pickled: make it again, for "
+            "example with gymnasium.make"
+        )
+
 
 # --------------------------------------------------------------------------------------------------
 # Aiding sensors and slow errors as numbers in the records that kernels read.

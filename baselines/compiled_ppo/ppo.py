@@ -22,6 +22,7 @@ from quad_gym.batch.threads import (
     board_of,
     resolve_threads,
 )
+from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params import checks as check
 
 # --------------------------------------------------------------------------------------------------
@@ -348,16 +349,33 @@ class CompiledPPO:
         return float(np.mean(self._finished)) if self._finished else float("nan")
 
     def state(self) -> bytes:
-        """Serialize the state of the training and the environment, to resume exactly."""
+        """Serialize the state of the training and the environment, to resume exactly.
+
+        The flights of an environment of quad_gym are kept as a snapshot, which contains no names of
+        classes and modules; another environment is pickled.
+        """
         kept = {name: getattr(self, name) for name in _STATE}
         arrays = (self.networks.params, self.learner.moments, self.learner.steps)
-        return pickle.dumps((kept, arrays))
+        if isinstance(self.env, QuadVectorEnv):
+            return pickle.dumps((kept, arrays, {"flights": self.env.flights.batch.snapshot()}))
+        return pickle.dumps((kept, arrays, {"env": self.env}))
 
     def restore(self, state: bytes) -> None:
-        """Restore a `state` with the same recipe; unpickling can run code, so trust its source."""
-        kept, (params, moments, self.learner.steps) = pickle.loads(state)
+        """Restore a `state` with the same recipe; unpickling can run code, so trust its source.
+
+        Raises:
+            ValueError: If the state is from another configuration or version; nothing has changed
+                then, except for the environment's reset.
+        """
+        kept, (params, moments, steps), flown = pickle.loads(state)
+        if isinstance(self.env, QuadVectorEnv):
+            self.env.reset(seed=self._env_seed)
+            self.env.flights.batch.restore(flown["flights"])
+        else:
+            self.env = flown["env"]
         self.networks.params[:], self.learner.moments[:] = params, moments
-        self.__dict__.update(kept)
+        self.learner.steps = steps
+        self.__dict__.update({name: kept[name] for name in _STATE})
 
     # ---- a rollout ------------------------------------------------------------------------------
 
@@ -396,8 +414,8 @@ class CompiledPPO:
         self._targets[:] = self._advantages + self._values
 
 
-_STATE = ("env", "num_timesteps", "losses", "_rng", "_seen", "_returns", "_finished")
-"""Attributes of the state of a training, in addition to the networks."""
+_STATE = ("num_timesteps", "losses", "_rng", "_seen", "_returns", "_finished")
+"""Attributes of the state of a training, in addition to networks and environment."""
 
 
 def advantages(

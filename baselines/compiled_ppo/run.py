@@ -11,7 +11,14 @@ from typing import Any
 import gymnasium
 
 from baselines.compiled_ppo.ppo import CompiledPPO
-from baselines.keeping import STATE, RunError, RunKeeper, best_file, last_file, replace_file
+from baselines.keeping import (
+    STATE,
+    RunKeeper,
+    best_file,
+    last_file,
+    reading_checkpoint,
+    replace_file,
+)
 from baselines.policies import interface_of
 from baselines.recipes import Plan, description, first_seed
 
@@ -98,13 +105,11 @@ def run(
     """Train, or resume from the folder's checkpoint; see `baselines.training.train`."""
     model, keeper = make_compiled(plan), CompiledKeeper(plan, folder, judge, quiet=quiet)
     if (file := last_file(plan, folder)).exists():
-        try:
+        with reading_checkpoint(folder):
             with zipfile.ZipFile(file) as archive:
                 kept, state = pickle.loads(archive.read(STATE))
-        except (zipfile.BadZipFile, KeyError, pickle.UnpicklingError, EOFError) as error:
-            raise RunError(f"the checkpoint in {folder} is damaged: {error}") from None
-        model.restore(state)
-        keeper.restore(kept, model.num_timesteps)
+            model.restore(state)
+            keeper.restore(kept, model.num_timesteps)
 
     if tensorboard:
         keeper.events = Events(folder / "tensorboard" / "run")

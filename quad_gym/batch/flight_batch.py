@@ -25,7 +25,14 @@ from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.configuration import FlightConfiguration
 from quad_gym.kernels.entries import linked_table
 from quad_gym.kernels.stages import needed_stages, used_parts
-from quad_gym.packing import pack_paths, params_block, params_record, settings_record
+from quad_gym.packing import (
+    form_of_records,
+    pack_paths,
+    params_block,
+    params_record,
+    require_same_form,
+    settings_record,
+)
 from quad_gym.params import checks as check
 from quad_gym.params.checks import takes
 from quad_gym.params.trajectories import Trajectory
@@ -317,8 +324,22 @@ class FlightBatch(FlightMemory):
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the threads, which a copy starts again."""
-        return self.__dict__ | {"_crew": None, "_calls": None}
+        """Return the state without the threads, which a copy starts again, and without stages."""
+        kept = self.__dict__ | {"_crew": None, "_calls": None, "form": form_of_records()}
+        del kept["_stages"]
+        return kept
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a pickled or copied state, with the stages that this version has.
+
+        Raises:
+            ValueError: If the records of the state have another form.
+        """
+        require_same_form(state.pop("form", None))
+        settings = state["_settings"][0]
+        fits = state["_room"] == room_of(used_parts(settings))
+        require_same_form(form_of_records(), fits=fits)
+        self.__dict__.update(state, _stages=needed_stages(settings))
 
     def trajectory(self, flight: int) -> tuple[Trajectory, float] | None:
         """Return the trajectory of a flight's present episode, as rotated for it, and its phase.

@@ -217,7 +217,8 @@ class FlightMemory:
         if not fits:
             raise ValueError(
                 f"snapshot must be from a batch of {self.count} flights with the same task, "
-                "vehicle, sensors, filter, world, randomization, faults, rates and observation"
+                "vehicle, sensors, filter, world, randomization, faults, rates and observation, "
+                "and with the same version, precision and number of lanes"
             )
         self._blocks[:] = snapshot
         self._begun = False  # it may have been taken before a reset

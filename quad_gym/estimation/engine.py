@@ -22,10 +22,12 @@ from quad_gym.kernels.stages import needed_stages
 from quad_gym.packing import (
     blocks_of,
     form_of,
+    form_of_records,
     pack_sensors,
     pack_tick,
     params_block,
     params_record,
+    require_same_form,
     slow_errors_of,
 )
 from quad_gym.params.suites import SensorSuite
@@ -90,8 +92,7 @@ class Engine:
         self.settings["run_filter"] = True
         self.settings["form"] = int(self.form)
         pack_sensors(self.settings[0], sensors)
-        needed = needed_stages(self.settings[0])
-        self._stages = {stage: needed[stage] for stage in entries.FILTER_STAGES if stage in needed}
+        self._choose_stages()
         self._room = room_of(_PARTS)
         self._work = aligned_zeros(1, WORK_BLOCK)
         self._work["mask"] = 1.0
@@ -99,6 +100,11 @@ class Engine:
         self._linked: NDArray[Any] | None = None
         self._calls: dict[tuple[int, int], Callable[[], Any]] = {}
         self._sample, self._measurement = np.zeros(1, SAMPLE), np.zeros(1, MEASUREMENT)
+
+    def _choose_stages(self) -> None:
+        """Choose the stages that the filter needs."""
+        needed = needed_stages(self.settings[0])
+        self._stages = {stage: needed[stage] for stage in entries.FILTER_STAGES if stage in needed}
 
     # ---- memory -------------------------------------------------------------------------------
 
@@ -239,7 +245,19 @@ class Engine:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without addresses, which another process or copy does not share."""
-        return self.__dict__ | {"_calls": {}, "_linked": None}
+        kept = self.__dict__ | {"_calls": {}, "_linked": None, "form_of_records": form_of_records()}
+        del kept["_stages"]
+        return kept
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a pickled or copied state, with the stages that this version has.
+
+        Raises:
+            ValueError: If the records of the state have another form.
+        """
+        require_same_form(state.pop("form_of_records", None))
+        self.__dict__.update(state)
+        self._choose_stages()
 
     def run(self, tape: Tape, slots: NDArray[Any] | None = None) -> tuple[Floats, Floats]:
         """Run the operations of a tape.

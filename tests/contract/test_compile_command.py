@@ -71,6 +71,17 @@ def test_kinds_are_sets_of_stages_and_entries():
     assert not filters & truth
 
 
+def test_libraries_and_modules_for_gpus_are_built_without_torch():
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from quad_gym.commands.compile import _default_plans\n"
+        "from quad_gym.kernels.compiling.building import build\n"
+        "assert next(_default_plans()).stages"
+    )
+    done = run_python("-c", code)
+    assert done.returncode == 0, done.stderr
+
+
 def test_compile_fails_if_code_cannot_be_written_to_cache(monkeypatch, capsys):
     monkeypatch.setattr(EntryDispatcher, "is_cached", lambda self: False)
     monkeypatch.setattr(workers, "prepare", lambda names, processes: None)

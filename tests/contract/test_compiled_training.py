@@ -1,6 +1,7 @@
 """Trainings with the compiled engine are repeatable, resume after a kill, and need no torch."""
 
 import json
+import pickle
 import signal
 import zipfile
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from baselines.compiled_ppo import CompiledPPO
-from baselines.keeping import STATE
+from baselines.keeping import STATE, RunError
 from baselines.mlp import MlpPolicy
 from baselines.policies import PRETRAINED, load_policy
 from baselines.recipes import Plan, recipe
@@ -71,6 +72,10 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path, monkeypatch, rollouts):
     assert run(plan, tmp_path / "cut", resume=True).finished
     assert_same_policy(tmp_path / "whole", tmp_path / "cut")
     assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "cut")
+    with zipfile.ZipFile(tmp_path / "cut" / "last.npz") as archive:
+        kept = archive.read(STATE)  # survives a move of any module or class
+    assert b"quad_gym" not in kept
+    assert b"baselines" not in kept
 
 
 def evaluations(folder):
@@ -221,12 +226,29 @@ def test_training_with_the_same_draws_equals_stable_baselines(activation, normal
     assert ours.training_return == pytest.approx(np.mean(episodes), rel=1e-3)
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path):
+def test_checkpoint_that_is_damaged_or_of_another_version_is_refused(tmp_path):
     run(small_plan(), tmp_path)
     record = json.loads((tmp_path / "training.json").read_text())
     (tmp_path / "training.json").write_text(json.dumps(record | {"finished": False}))
     with zipfile.ZipFile(tmp_path / "last.npz") as archive:
-        assert STATE in archive.namelist()
+        kept, state = pickle.loads(archive.read(STATE))
+    part, arrays, flown = pickle.loads(state)
+    others = (
+        (b"cquad_gym.kernels.moved\nStage\n.", "ModuleNotFoundError: .*moved"),
+        (b"cquad_gym.envs.vector\nRenamed\n.", "AttributeError: .*Renamed"),
+        (pickle.dumps((part, arrays)), "ValueError"),
+        (pickle.dumps((part, arrays, {"env": None})), "KeyError: 'flights'"),
+        (
+            pickle.dumps((part, arrays, {"flights": flown["flights"][["r", "v"]]})),
+            "ValueError: snapshot must be from a batch of 16 flights .* same version",
+        ),
+    )
+    for other, reason in others:
+        with zipfile.ZipFile(tmp_path / "last.npz", "w") as archive:
+            archive.writestr(STATE, pickle.dumps((kept, other)))
+        message = f"must be resumed with the version of quad_gym.*{reason}"
+        with pytest.raises(RunError, match=message):
+            run(small_plan(), tmp_path, resume=True)
     (tmp_path / "last.npz").write_bytes(b"PK nonsense")
     with pytest.raises(ValueError, match="damaged"):
         run(small_plan(), tmp_path, resume=True)

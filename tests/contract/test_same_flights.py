@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym import packing
 from tests.builders import SHORT, actions_for, flat, run_python, vec_env
 from tests.contract.comparing import assert_same, state_of
 from tests.contract.configurations import CONFIGURATIONS
@@ -110,6 +111,22 @@ def test_copied_environment_has_the_same_future(kind, pickled):
     past, mine = state_of(twin), [*onward(env, slice(4, 60)), env.reset()]
     assert state_of(twin) == past
     assert_same([*onward(twin, slice(4, 60)), twin.reset()], mine)
+
+
+@pytest.mark.parametrize("kind", ["environment", "filter"])
+def test_pickle_of_another_version_is_refused(kind, monkeypatch):
+    """A pickle names no compiled stage, and is refused where records have another form."""
+    if kind == "environment":
+        thing = gymnasium.make("QuadGym/Hover-v0").unwrapped
+        thing.reset(seed=1)
+    else:
+        thing = quad_gym.UnscentedKalmanFilter(quad_gym.sensor_suite("lab"))
+    pickled = pickle.dumps(thing)
+    assert b"quad_gym.kernels" not in pickled
+    assert pickle.loads(pickled)
+    monkeypatch.setattr(packing, "form_of_records", lambda: "that of a later version")
+    with pytest.raises(ValueError, match="must be unpickled with the version of quad_gym"):
+        pickle.loads(pickled)
 
 
 def test_snapshot_of_another_batch_is_refused():

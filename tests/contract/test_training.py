@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import time
+import zipfile
 
 import gymnasium
 import numpy as np
@@ -15,6 +16,7 @@ import quad_gym
 torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
+from baselines.keeping import STATE  # noqa: E402
 from baselines.mlp import MlpPolicy, mlp_of  # noqa: E402
 from baselines.models import _checked_parameters, algorithm_class, make_model  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
@@ -205,6 +207,10 @@ def test_a_folder_with_a_run_is_not_overwritten(trained):
     assert record["finished"]
     assert record["plan"]["recipe"]["flights"] == {"start": "mixed", "randomize_reference": True}
     assert os.path.getsize(trained / "evaluations.csv") > 0
+    with zipfile.ZipFile(trained / "last.zip") as archive:
+        kept = archive.read(STATE)  # survives a move of any module or class
+    assert b"quad_gym" not in kept
+    assert b"baselines" not in kept
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3", "tqc"])
