@@ -12,6 +12,7 @@ from quad_gym.faults import MagnetometerDisturbance
 from quad_gym.logs.replaying.heading_rules import contradicted
 from quad_gym.logs.replaying.results import Severity
 from quad_gym.records import Source
+from quad_gym.rotations import euler_to_dcm
 from tests.field_flights import fly, state_errors, steps
 from tests.level_flights import MAGNETIC, LevelFlight
 
@@ -161,6 +162,53 @@ def test_heading_is_less_certain_after_a_long_loss_of_gnss_and_none_is_reset(kin
     assert (np.diff(sigmas[500:2000]) >= 0.0).all()
     assert sigmas[1999] > 1.2 * sigmas[499]
     assert kf._engine.read("compass_out")[0] == 0.0
+
+
+@pytest.mark.parametrize("step", [0.1, -0.3])
+def test_gyro_whose_bias_changes_at_rest_is_corrected_by_the_compass(step):
+    """N turns with the gyro, so that agreement without motion is no witness for both."""
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(0), amplitude=1.0), 0.02
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf, rest = UnscentedKalmanFilter(MAGNETIC.replace(gnss=gnss)), 5.0
+    kf.initialize(flight.gnss(0.0)[0], magnetometer=flight.field())
+    at_rest = flight.truth(rest)
+    swing = flight.truth
+    flight.truth = lambda t: swing(t) if t < rest else at_rest
+    flight.speed = flight.speed - at_rest["velocity"]  # so that it stands after the swing
+    at_rest = swing(rest)
+    errors = []
+    for k in range(1, 1251):
+        gyro, accel = flight.sample((k - 1) * dt, dt)
+        changed = k * dt > 12.0
+        kf.predict(gyro + np.array([0.0, 0.0, step * changed]), accel, dt=dt)
+        if k % 5 == 0:
+            position, velocity = flight.gnss(k * dt)
+            kf.update(position, gnss_velocity_G=velocity, magnetometer=flight.field())
+            assert kf._engine.read("compass_out")[0] == 0.0
+            assert kf.heading_known
+            errors.append(abs(flight.error(kf, k * dt)[8]))
+    assert max(errors) < math.radians(40.0)
+    assert max(errors[-50:]) < math.radians(8.0)
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_start_with_a_large_tilt_leaves_a_right_compass_in_use(kind):
+    """The vehicle leans by 25 degrees, and the filter begins level."""
+    flight, dt = LevelFlight(MAGNETIC, np.random.default_rng(2), amplitude=1.0), 0.02
+    flight.R = euler_to_dcm([0.35, -0.27, 0.8])
+    gnss = MAGNETIC.gnss.replace(secondary_antenna_B=None)
+    kf = kind(MAGNETIC.replace(gnss=gnss))
+    position, velocity = flight.gnss(0.0)
+    kf.initialize(position, gnss_velocity_G=velocity, tilt_sigma=0.3)
+    for k in range(1, 501):
+        kf.predict(*flight.sample((k - 1) * dt, dt), dt=dt)
+        if k % 5 == 0:
+            position, velocity = flight.gnss(k * dt)
+            kf.update(position, gnss_velocity_G=velocity, magnetometer=flight.field())
+            assert kf._engine.read("compass_out")[0] == 0.0
+    error = np.abs(flight.error(kf, 500 * dt)[6:9])
+    assert np.hypot(*error[:2]) < math.radians(3.0)
+    assert error[2] < math.radians(8.0)
 
 
 def found_by_the_verdict(compass, apart, sigma, out, unknown=0.0, fields=None):

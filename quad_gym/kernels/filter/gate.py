@@ -205,7 +205,7 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
     if gating:
         beyond = first & logical_not(unsure) & (nis > limit_of(flight, group, limit))
         if group == _COMPASS:
-            beyond = beyond | watch_compass(flight, p, first, nis < limit)
+            beyond = beyond | watch_compass(flight, p, first, nis < limit, nis > OUTLIER * limit)
         rejected = _weigh(flight, p, settings, group, beyond, nis, limit)
     weakened = beyond & logical_not(rejected)
     _store_decision(flight, s, first, rejected, unsure, weakened)

@@ -22,13 +22,17 @@ starts from u = 0 with P_uu = 1, so nothing is invented: without motion the head
 Its angle has the variance P_uu / (2 |u|^2), and |u| far from one shows that the model does not
 hold.
 
+N begins with the filter's tilt. Where that is uncertain, the vertical of N is corrected by d as
+soon as u is known, and variances and limits are larger until then.
+
 N is leveled by the force that the change of velocity does not explain. Leveling by the whole force
 would follow a steady turn with a lag that looks like a heading. What leveling leaves is d.
 
 Where no baseline and no camera measures the heading, too, three rules compare the filter with it:
 
 * **Support.** Where the headings agree, the heading counts as measured: a refused compass stays
-  out.
+  out. Both turn with the gyro. If the fields have left the gate gradually, its bias may have
+  changed, so that u has the variance of a gyro that drifts: only fixes in motion confirm it then.
 * **Contradiction.** Where they differ by more than four standard deviations in three fixes in a
   row, attitude and heading become those of the motion. The compass is left out until it agrees.
 * **Lean.** Where no motion has confirmed the heading, and the filter's vertical leaves that of N, a
@@ -81,6 +85,7 @@ from quad_gym.kernels.numbers.linalg import (
 from quad_gym.kernels.numbers.rotation import level_attitude, vector_to_dcm
 from quad_gym.records import (
     AID_BLOCK,
+    AID_GROUPS,
     AID_NUMBERS,
     BASELINE_BLOCK,
     SENSOR_GROUPS,
@@ -90,6 +95,7 @@ from quad_gym.records import (
 )
 
 _MAGNETOMETER = int(Aid["MAGNETOMETER"])
+_COMPASS = AID_GROUPS + _MAGNETOMETER
 _FIELD, _FIELD_BLOCK = AID_NUMBERS[_MAGNETOMETER], AID_BLOCK[_MAGNETOMETER]
 
 # the model
@@ -98,6 +104,7 @@ _LEVELING, _FIRST_LEVELING = 0.1, 0.06
 _TILT, _TILT_TIME = 0.3, 5.0  #: standard deviation of d per axis [m/s^2], its correlation time [s]
 _GYRO_OFFSET = 0.12  #: largest bias of a gyro that N takes from the filter [rad/s]
 _WALK = 0.01  #: random walk of the heading of N [rad/sqrt(s)]
+_LOOSE = 0.1  #: the same, if the gyro's bias may have changed [rad/sqrt(s)]
 _VIBRATION = 0.05  #: of the velocity [m/s/sqrt(s)]
 _GATE, _MISSES = (
     20.0,
@@ -124,7 +131,8 @@ _LEANS, _LEANS_IN_ROW = 12.0, 2.0
 _IN_ROW, _SERIES = 3.0, 10.0  #: contradictions in a row that reset the attitude, and smaller ones
 _TILT_RESET, _SPEED_RESET, _PLACE_RESET = 0.05, 1.0, 1.0  #: [rad], [m/s], [m]
 _VAGUE = 0.7  #: standard deviation above which a heading counts as unknown [rad]
-_ALIGNED = 0.35  #: standard deviation of an unknown heading turned to a sensor's [rad]
+_ALIGNED, _MOST_ALIGNED = 0.35, 0.6
+"""Standard deviation of an unknown heading turned to a sensor's, and with a large tilt [rad]."""
 _PROBATION, _TURNED, _LONG_PROBATION = 10.0, 0.87, 60.0
 """A compass is used again when it has agreed for this time [s] while the cosine of the heading's
 change fell below that, or for the longer time [s]."""
@@ -142,7 +150,7 @@ def begin_motion(flight, mask):
         0.0,
         "level_against level_doubts level_lean compass_out compass_agrees heading_lost",
     )
-    reset(flight, mask, 0.0, "level_apart level_sigma")
+    reset(flight, mask, 0.0, "level_apart level_sigma level_first level_loose compass_leapt")
     flight.level_tick = select(mask, -1e9, flight.level_tick)
 
 
@@ -150,6 +158,13 @@ def begin_motion(flight, mask):
 def forget_heading(flight, lanes):
     """Begin v, u and d again at the next fix, in these lanes; N keeps its vertical."""
     flight.level_misses = select(lanes, _MISSES, flight.level_misses)
+
+
+@kernel
+def loosen_heading(flight, lanes):
+    """Give u the variance that it has if the gyro's bias has changed, in these lanes."""
+    P = flight.level_P
+    P[1] = select(lanes, maximum(P[1], flight.level_loose), P[1])
 
 
 @kernel
@@ -195,6 +210,8 @@ def turn_level(flight, p, force, half):
     if any_of(dot(more, more) > 0.0):
         W = vector_to_dcm(more) @ W
     store(flight.level_turn, W)
+    first = 0.5 * _tilt_of(flight) - _START * _START
+    flight.level_first = select(begins, maximum(first, 0.0), flight.level_first)
     sums = load3(flight.level_force) + p.dt * vector(a[0], a[1], one)
     store(flight.level_force, sums)
     arm = W.T @ cross(load3(flight.w_meas) - load3(flight.b_g_hat), load3(p.antenna))
@@ -212,12 +229,24 @@ def _is_known(uu, square):
 
 
 @kernel
-def _lean_of(flight, p):
-    """Variance of d at the beginning: that of the filter's tilt times g, as W begins with it."""
+def _tilt_of(flight):
+    """Sum of the variances of the filter's roll and pitch."""
     k = load33(flight.R_hat).T[2]
     P_ee = load_symmetric(flight.P, E)
     whole = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
-    tilt = maximum(whole - dot(k, P_ee @ k), 0.0)
+    return maximum(whole - dot(k, P_ee @ k), 0.0)
+
+
+@kernel
+def _first_tilt(flight):
+    """Variance of the tilt with which N began, as leveling has left it, beyond the usual."""
+    return exp(-2.0 * _FIRST_LEVELING * flight.level_force[2]) * flight.level_first
+
+
+@kernel
+def _lean_of(flight, p):
+    """Variance of d at the beginning: by the filter's tilt, or by N's."""
+    tilt = maximum(_tilt_of(flight), 2.0 * _first_tilt(flight))
     bias = maximum(p.accel_bias_sigma, _TILT)
     return p.gravity * p.gravity * tilt + 2.0 * bias * bias
 
@@ -243,7 +272,7 @@ def _measure_motion(flight, p, work, mask):
     flight.level_phase = select(fix, 2.0, flight.level_phase)
     # predict
     v, u, d = (x[0], x[1]), (x[2], x[3]), (x[4], x[5])
-    before = v
+    before, row = v, flight.rejected_in_row[_COMPASS]
     vv, uu, dd, vu, vd, ud = P[0], P[1], P[2], (P[3], P[4]), (P[5], P[6]), (P[7], P[8])
     keeps = exp(-T / _TILT_TIME)
     moved, Aud = _times(A, u), _times(A, ud)
@@ -255,6 +284,11 @@ def _measure_motion(flight, p, work, mask):
     vd = (keeps * (vd[0] + Aud[0] + T * dd), keeps * (vd[1] + Aud[1]))
     ud, d = (keeps * ud[0], keeps * ud[1]), (keeps * d[0], keeps * d[1])
     uu = uu + 2.0 * _WALK * _WALK * T
+    # either the compass is wrong, or the gyro's bias has changed: then only later fixes count
+    loose = minimum(flight.level_loose + 2.0 * _LOOSE * _LOOSE * T, 1.0)
+    either = (row >= 2.0) & (flight.compass_out <= 0.0) & (flight.compass_leapt <= 0.0)
+    either = either & (flight.tick - flight.level_tick < RECENT / p.dt)
+    uu = select(either, maximum(uu, loose), uu)
     dd = keeps * keeps * dd + 2.0 * _TILT * _TILT * approached(2.0 * T / _TILT_TIME)
     # update
     nu, S = (z[0] - v[0], z[1] - v[1]), vv + r
@@ -270,6 +304,8 @@ def _measure_motion(flight, p, work, mask):
     _keep_all(x, used, (v[0], v[1], turned[0], turned[1], leaned[0], leaned[1]))
     others = (share * vu[0], share * vu[1], share * vd[0], share * vd[1])
     crossed = (ud[0] - g * both[0], ud[1] - g * both[1])
+    loose = loose / (1.0 + loose * (uu - gained) / (uu * gained))
+    flight.level_loose = select(used, loose, select(begins | gap, 1.0, flight.level_loose))
     own = dd - g * (vd[0] * vd[0] + vd[1] * vd[1])
     _keep_all(P, used, (share * vv, gained, own, *others, *crossed))
     # begin again: all of it, or after a gap the velocity alone
@@ -304,12 +340,31 @@ def _turn_of(c, s):
 
 
 @kernel
-def _first_tilt(flight, p, settings):
-    """Variance of the tilt with which N began, as leveling has left it, beyond the usual."""
-    drawn = load3(settings.start_tilt_variance)
-    first = p.initial_tilt_sigma * p.initial_tilt_sigma + maximum(drawn[0], drawn[1])
-    left = exp(-2.0 * _FIRST_LEVELING * flight.level_force[2])
-    return left * maximum(first - _START * _START, 0.0)
+def _uprighted(flight, p):
+    """N, and the variance of its tilt beyond the usual one.
+
+    N may have begun with a large tilt. Once the motion shows u, it shows d, and so the tilt, too.
+    """
+    W, x, first = load33(flight.level_turn), flight.level_state, _first_tilt(flight)
+    square = maximum(x[2] * x[2] + x[3] * x[3], 1e-9)
+    shown = (first > 0.0) & _is_known(flight.level_P[1], square)
+    if any_of(shown):
+        force, n = _times_conjugate((x[4], x[5]), (x[2], x[3])), 1.0 / (p.gravity * square)
+        turn = vector_to_dcm((-n * force[1], n * force[0], zero_like(n)))
+        upright = W @ turn
+        W = (
+            _chosen(shown, upright[0], W[0]),
+            _chosen(shown, upright[1], W[1]),
+            _chosen(shown, upright[2], W[2]),
+        )
+        first = select(shown, 0.0, first)
+    return W, first
+
+
+@kernel
+def _chosen(lanes, a, b):
+    """A vector, or another in the other lanes."""
+    return (select(lanes, a[0], b[0]), select(lanes, a[1], b[1]), select(lanes, a[2], b[2]))
 
 
 @kernel
@@ -317,7 +372,8 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     """Compare the filter's attitude with that of the motion, and reset it where they contradict."""
     if not any_of(flight.level_fresh > 0.0):
         return
-    fresh, W, R_BI = flight.level_fresh > 0.0, load33(flight.level_turn), load33(flight.R_hat)
+    fresh, R_BI = flight.level_fresh > 0.0, load33(flight.R_hat)
+    W, first = _uprighted(flight, p)
     flight.level_fresh = zero_like(p.dt)
     x, M, k = flight.level_state, R_BI.T @ W, R_BI.T[2]
     u, square = (x[2], x[3]), maximum(x[2] * x[2] + x[3] * x[3], 1e-9)
@@ -341,6 +397,10 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     doubts = holds & (apart > maximum(_DOUBT * both, _LEAST))
     agrees = known & ruled & (apart <= maximum(_AGREES * both, _LEAST))
     flight.level_tick = select(agrees, flight.tick, flight.level_tick)
+    either = fresh & ruled & logical_not(known) & (flight.rejected_in_row[_COMPASS] >= 2.0)
+    either = either & (flight.compass_out <= 0.0) & (flight.compass_leapt <= 0.0)
+    old = minimum(flight.level_tick, flight.tick - RECENT / p.dt)
+    flight.level_tick = select(either, old, flight.level_tick)
     side = select(u[1] * c - u[0] * s > 0.0, 1.0, -1.0)
     flight.level_apart = select(fresh, side * math.sqrt(maximum(apart, 0.0)), flight.level_apart)
     sigma = select(_is_known(flight.level_P[1], square), math.sqrt(variance), MAX_ANGLE)
@@ -356,7 +416,6 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     lean = k - W.T[2]
     unconfirmed = (flight.tick - flight.level_tick) * p.dt > RECENT
     tilt = flight.level_P[2] / (2.0 * p.gravity * p.gravity)  # variance of that of N, per axis
-    first = _first_tilt(flight, p, settings)
     limit = clip(_LEANS * tilt, _LEAN * _LEAN, _MOST_LEAN * _MOST_LEAN)
     limit = select(unconfirmed, limit, _LARGE_LEAN * _LARGE_LEAN) + _LEANS * first
     leans = fresh & (dot(lean, lean) > limit) & ruled
@@ -370,12 +429,12 @@ def _judge_heading(flight, p, work, settings, stages, slow):
     loses, wrong = wrong & logical_not(certain), wrong & certain
     if any_of(wrong | found):
         turn = _turn_of(u[0] / length, u[1] / length)
-        _reset_attitude(flight, p, work, slow, wrong | found, W @ turn, variance, True)
+        _reset_attitude(flight, p, work, slow, wrong | found, W @ turn, variance, first, True)
         flight.heading_lost = select(wrong | found, 0.0, flight.heading_lost)
         flight.level_tick = select(wrong | found, flight.tick, flight.level_tick)
     if any_of(loses):
         unknown = MAX_ANGLE * MAX_ANGLE + zero_like(variance)
-        _reset_attitude(flight, p, work, slow, loses, W @ _turn_of(c, s), unknown, False)
+        _reset_attitude(flight, p, work, slow, loses, W @ _turn_of(c, s), unknown, first, False)
         flight.heading_lost = select(loses, 1.0, flight.heading_lost)
     out = wrong | loses
     flight.compass_out = select(out, 1.0, flight.compass_out)
@@ -385,16 +444,19 @@ def _judge_heading(flight, p, work, settings, stages, slow):
 
 
 @kernel
-def _put_attitude(P, k, states, lanes, variance):
-    """Give the attitude the tilt's variance of N and this one about the vertical k, alone."""
-    tilt = _TILT_RESET * _TILT_RESET + zero_like(variance)
+def _put_attitude(P, k, states, lanes, variance, first):
+    """Give the attitude the tilt's variance of N and this one about the vertical k, alone.
+
+    The tilt's is larger by the variance `first`.
+    """
+    tilt = _TILT_RESET * _TILT_RESET + first
     reset_variances(P, E, states, lanes, (tilt, tilt, tilt))
     own = diagonal((tilt, tilt, tilt)) + outer((variance - tilt) * k, k)
     store_block(P, E, E, select(lanes, own, load_block(P, E, E)))
 
 
 @kernel
-def _reset_attitude(flight, p, work, slow, lanes, R_BI, variance, moves):
+def _reset_attitude(flight, p, work, slow, lanes, R_BI, variance, first, moves):
     """Replace the attitude, with this variance of its heading, and widen what it has spoiled.
 
     Where it `moves`, the velocity becomes that of the motion, too.
@@ -416,7 +478,7 @@ def _reset_attitude(flight, p, work, slow, lanes, R_BI, variance, moves):
     ba, bg = p.accel_bias_sigma, p.gyro_bias_sigma
     reset_variances(P, R, states, lanes, (place, place, place))
     reset_variances(P, V, states, lanes, (speed, speed, speed))
-    _put_attitude(P, k, states, lanes, variance)
+    _put_attitude(P, k, states, lanes, variance, first)
     reset_variances(P, BA, states, lanes, (ba * ba, ba * ba, ba * ba))
     reset_variances(P, BG, states, lanes, (bg * bg, bg * bg, bg * bg))
     for i in range(3):
@@ -446,8 +508,10 @@ def _reset_attitude(flight, p, work, slow, lanes, R_BI, variance, moves):
 
 
 @kernel
-def watch_compass(flight, p, first, agrees):
+def watch_compass(flight, p, first, agrees, far):
     """Follow a compass that is left out; return the lanes in which its fields are refused.
+
+    The first one of a series of refused ones may be `far` beyond the gate.
 
     It is used again when it has agreed for long with a heading that the motion confirms.
     """
@@ -467,6 +531,8 @@ def watch_compass(flight, p, first, agrees):
     back = (time > _PROBATION) & (flight.compass_least < _TURNED)
     back = good & (back | (time > _LONG_PROBATION))
     flight.compass_out = select(back, zero, flight.compass_out)
+    begins = first & (flight.rejected_in_row[_COMPASS] < 1.0)
+    flight.compass_leapt = select(begins, select(far, 1.0, 0.0), flight.compass_leapt)
     return first & (flight.compass_out > 0.0)
 
 
@@ -502,7 +568,7 @@ def _hold_attitude(flight, p, work, settings, slow, mask, pushed):
         square = select(lanes, pushed[0] * pushed[0] + pushed[1] * pushed[1], 0.0)
         for i in range(2):
             P[V + i, V + i] = P[V + i, V + i] + square
-    R_BI, shown = load33(flight.R_hat), no_lane(p.dt)
+    R_BI, shown, steep = load33(flight.R_hat), no_lane(p.dt), zero
     turn = _turn_of(zero + 1.0, zero)
     paired = lanes & (flight.block_valid[BASELINE_BLOCK] > 0.0)
     if any_of(paired):
@@ -514,8 +580,12 @@ def _hold_attitude(flight, p, work, settings, slow, mask, pushed):
             R_BI.T @ load3(flight.measurement[_FIELD_BLOCK]), load3(p.aid_numbers[_FIELD])
         )
         turn, shown = select(field, level, turn), shown | field
-    sigma = select(shown, _ALIGNED, MAX_ANGLE)
-    _put_attitude(P, k, states, lanes, sigma * sigma)
+        m = load3(p.aid_numbers[_FIELD])
+        steep = m[2] * m[2] / (m[0] * m[0] + m[1] * m[1])
+    _, first = _uprighted(flight, p)
+    variance = minimum(_ALIGNED * _ALIGNED + steep * first, _MOST_ALIGNED * _MOST_ALIGNED)
+    variance = select(shown, variance, MAX_ANGLE * MAX_ANGLE)
+    _put_attitude(P, k, states, lanes, variance, first)
     ok = lanes & (eliminate(P, work.L, states, states) >= 0.0)
     keep_covariance(flight, slow, P, ok)
     keep(flight.R_hat, ok & shown, R_BI @ turn)
@@ -542,7 +612,9 @@ def _release_attitude(flight, p, work, slow):
         states = 15 + slow.slow_states
     keep(flight.R_hat, lanes, load33(work.held_attitude))
     k = load33(flight.R_hat).T[2]
-    _put_attitude(P, k, states, lanes, MAX_ANGLE * MAX_ANGLE + zero_like(work.held))
+    _, first = _uprighted(flight, p)
+    unknown = MAX_ANGLE * MAX_ANGLE + zero_like(work.held)
+    _put_attitude(P, k, states, lanes, unknown, first)
     arm = load3(p.antenna)
     for i in range(R, R + 2):
         P[i, i] = P[i, i] + select(lanes, dot(arm, arm), 0.0)

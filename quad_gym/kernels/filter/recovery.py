@@ -48,7 +48,7 @@ from quad_gym.kernels.filter.measurements import (
     largest_square,
     shifted,
 )
-from quad_gym.kernels.filter.motion import begin_motion, forget_heading
+from quad_gym.kernels.filter.motion import begin_motion, forget_heading, loosen_heading
 from quad_gym.kernels.filter.slow import stages_of, stationary
 from quad_gym.kernels.numbers.blocks import reset
 from quad_gym.kernels.numbers.elementary import maximum, minimum
@@ -326,6 +326,8 @@ def reset_states(flight, p, work, settings, stages, slow):
     if settings.by_motion:  # N has turned, too
         turned = mask & shifted(flight, 3, BG, SHIFTED)
         forget_heading(flight, turned & (flight.level_doubts <= 0.0))
+        blamed = (work.reset[_COMPASS] > 0.0) & (work.alone[_COMPASS] > 0.0)
+        loosen_heading(flight, mask & blamed & (flight.level_doubts <= 0.0))
     alarmed = alarmed | jumped | moved
     if not any_of(alarmed):
         return
