@@ -7,11 +7,13 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 import quad_gym  # noqa: E402
+from docs.renewal.release import facts  # noqa: E402
 
 project = "quad_gym"
 author = "The quad_gym developers"
 copyright = author
 version = release = quad_gym.__version__
+html_baseurl = facts()["site"]
 
 extensions = [
     "myst_nb",

@@ -53,7 +53,7 @@ if TYPE_CHECKING:  # _LAZY imports them on first use
     from quad_gym.tasks import ObservationSpec, Task, TaskError, rewards
     from quad_gym.tasks.view import View
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 register_all()
 

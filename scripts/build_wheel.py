@@ -1,12 +1,14 @@
 """Build hooks: the metadata of wheel and sdist, and the compiled kernels that wheels may hold.
 
 QUAD_GYM_WHEEL: family of processors whose libraries the wheel holds, as `make wheel` sets it; it
-then does not depend on Numba. QUAD_GYM_URL: address of the repository, as a release sets it.
+then does not depend on Numba. QUAD_GYM_URL: address of the repository, in place of
+the one in pyproject.toml.
 """
 
 import os
 import re
 import runpy
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,10 @@ class MetadataHook(MetadataHookInterface):
         compiling = metadata["optional-dependencies"]["compile"]
         needed = [] if os.environ.get(FAMILY) else compiling
         metadata["dependencies"] = [*self.config["dependencies"], *needed]
-        url, tag = os.environ.get("QUAD_GYM_URL", "").rstrip("/"), f"v{metadata['version']}"
+        project = tomllib.loads(Path(self.root, "pyproject.toml").read_text(encoding="utf-8"))
+        repository = project["tool"]["quad_gym"]["release"]["repository"]
+        url = (os.environ.get("QUAD_GYM_URL") or repository).rstrip("/")
+        tag = f"v{metadata['version']}"
         pages = {"Issues": "issues", "Changelog": f"blob/{tag}/CHANGELOG.md"}
         pages["Documentation"] = f"tree/{tag}/docs"
         named = {name: f"{url}/{page}" for name, page in pages.items()}

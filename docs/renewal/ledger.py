@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from docs.renewal import release
 from docs.renewal.catalog import Result
 from scripts.estimate_bench.table import table as bench_table
 from scripts.studies import conclusions
@@ -56,7 +57,8 @@ def texts(entries: dict[str, Any]) -> dict[str, str]:
     minutes = [entry["minutes"] for entry in entries.values()]
     hours = "several" if None in minutes else f"{sum(minutes) / 60.0:.0f}"
     found = {name: text for entry in entries.values() for name, text in entry["texts"].items()}
-    return found | measured_per_seed() | {"total.hours": hours}
+    facts = release.texts(release.facts())
+    return found | measured_per_seed() | facts | {"total.hours": hours}
 
 
 def measured_per_seed() -> dict[str, str]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+import quad_gym
 from quad_gym.analysis.plots import save_figure
 
 # --------------------------------------------------------------------------------------------------
@@ -30,7 +31,7 @@ def versions(*packages: str) -> dict[str, str | None]:
     for package in packages:
         with suppress(PackageNotFoundError):
             found[package] = version(package)
-    return {"python": platform.python_version(), "quad_gym": version("quad-gym"), **found}
+    return {"python": platform.python_version(), "quad_gym": quad_gym.__version__, **found}
 
 
 def short_name(policy: str) -> str:

@@ -25,7 +25,7 @@ COMMANDS = {
     "export policy": "export a trained policy to an autopilot: C or ONNX",
     "export filter": "export a filter to an autopilot: a C library with the same estimates",
     "compile": "compile the kernels before their first use, or build libraries of them",
-    "version": "print the version",
+    "version": "print the version, and a report on this machine for bug reports",
 }
 """Commands, of one or two words, and their descriptions."""
 
