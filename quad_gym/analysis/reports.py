@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import platform
+import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -17,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-import quad_gym
 from quad_gym.analysis.plots import save_figure
 
 # --------------------------------------------------------------------------------------------------
@@ -31,7 +31,9 @@ def versions(*packages: str) -> dict[str, str | None]:
     for package in packages:
         with suppress(PackageNotFoundError):
             found[package] = version(package)
-    return {"python": platform.python_version(), "quad_gym": quad_gym.__version__, **found}
+    # metadata of an editable installation may be of an earlier commit; the package is loaded
+    ours = sys.modules["quad_gym"].__version__
+    return {"python": platform.python_version(), "quad_gym": ours, **found}
 
 
 def short_name(policy: str) -> str:
