@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.faults import Fault, FaultsGiven, faults_of
+from quad_gym.faults import Fault, FaultsGiven, faults_of, needs_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 from quad_gym.params.filter import FilterParams
@@ -28,11 +28,17 @@ from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import COLUMNS, MAX_ACTION_DELAY, Autoreset, Control, Layout, Source
 
 MAX_FLIGHTS = 10**7  #: largest number of flights in a batch
-_WITHOUT = {
+_CONTROLS_WITHOUT = {
     "gains": tuple(control for control in Control if control is not Control.PD),
     "action_params": (Control.PD, Control.MOTOR, Control.WRENCH),
 }
 """Arguments of controllers, and the meanings of an action with which they have no effect."""
+FILTER_ARGUMENTS = ("estimator", "filter_start", "truncate_when_diverged")
+"""Arguments that have an effect only where a filter runs."""
+_UNFILTERED = (
+    'where no filter runs, as with observation="truth" or "noisy" unless run_filter, include_std '
+    "or innovations ask for it"
+)
 
 
 def _vehicle(name: str, given: Any) -> VehicleParams:
@@ -138,53 +144,49 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
                 "run_filter must not be False where the observation, include_std or innovations "
                 "need the filter"
             )
-        self._require_effect()
+        given = {**self.changed, **self.task.changed}
+        if self.estimator is not None:
+            given |= self._chosen_of_filter
+        check.effect(given, self.without_effect)
         if self.filters:
             self.sensors.require_filter()
         if self.longest_delay > 0 and self.control is Control.PD:
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(self.draws, self.flown_vehicle, self.clocks)
 
-    def _require_effect(self) -> None:
-        """Refuse arguments of another controller, and of a filter that does not run."""
-        for name, without in _WITHOUT.items():
-            if getattr(self, name) is not None and self.control in without:
-                raise ValueError(
-                    f"{name} must not be given with Control.{self.control.name}: it uses none"
-                )
-        if self.filters:
-            if self.estimator is not None:
-                self._require_effect_on_own()
-            return
-        for name, value, idle in (
-            ("estimator", self.estimator, None),
-            ("include_std", self.include_std, False),
-            ("innovations", self.innovations, False),
-            ("truncate_when_diverged", self.task.truncate_when_diverged, False),
-            ("filter_start", self.filter_start, "cold"),
-        ):
-            if value != idle:
-                raise ValueError(f"{name} needs a filter, and none runs here, got {value!r}")
+    @property
+    def without_effect(self) -> dict[str, str]:
+        """Arguments that have no effect with the others, each with the reason.
 
-    def _require_effect_on_own(self) -> None:
-        """Refuse arguments that have an effect on the built-in filter only."""
-        for name, value in (
-            ("innovations", self.innovations),
-            ("truncate_when_diverged", self.task.truncate_when_diverged),
-        ):
-            if value:
-                raise ValueError(
-                    f"{name} has no effect with an own estimator, and must not be given"
-                )
+        Here they are refused if they differ from their defaults. An environment, which knows the
+        keywords that were given, refuses each of them.
+        """
+        found = {
+            name: f"with Control.{self.control.name}, which uses none"
+            for name, controls in _CONTROLS_WITHOUT.items()
+            if self.control in controls
+        }
+        if not self.filters:
+            found |= dict.fromkeys(FILTER_ARGUMENTS, _UNFILTERED)
+            of_sensors = [type(f).__name__ for f in self.possible_faults if needs_sensors(f)]
+            if of_sensors:
+                found["faults"] = f"on sensors ({of_sensors[0]}) {_UNFILTERED}"
+        if self.estimator is not None:
+            of_filter = ("innovations", "truncate_when_diverged", *self._chosen_of_filter)
+            found |= dict.fromkeys(of_filter, "with an own estimator")
+        return found
+
+    @cached_property
+    def _chosen_of_filter(self) -> dict[str, Any]:
+        """Parameters of the built-in filter that no preset has, but those of its start."""
+        form, found = self.sensors.estimator, {}
         presets = [sensor_suite(name).estimator for name in ALL_SUITES]
-        for field in fields(FilterParams):
-            value = getattr(self.sensors.estimator, field.name)
-            chosen = all(value != getattr(preset, field.name) for preset in presets)
-            if chosen and not field.name.startswith("initial") and field.name != "reuse_first_fix":
-                raise ValueError(
-                    f"SensorSuite.estimator.{field.name} has no effect with an own estimator, and "
-                    f"must have the value of a preset, got {value!r}"
-                )
+        for name in (field.name for field in fields(FilterParams)):
+            of_start = name.startswith("initial") or name == "reuse_first_fix"
+            value = getattr(form, name)
+            if not of_start and all(value != getattr(preset, name) for preset in presets):
+                found[f"SensorSuite.estimator.{name}"] = value
+        return found
 
     @cached_property
     def pd_gains(self) -> PDGains:

@@ -28,8 +28,6 @@ from docs.renewal.pages import TABLES
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.envs.config import (
     BENCHMARKS,
-    KEYWORDS_WITHOUT_EFFECT,
-    ONE_TASK_KEYWORDS,
     TASK_DEFAULTS,
     TASK_KEYWORDS,
 )
@@ -38,6 +36,7 @@ from quad_gym.flights import COLUMNS, FEATURES
 from quad_gym.logs.formats.log import LOG_COLUMNS, LogColumn
 from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import ALL_SUITES
+from quad_gym.params.task import FIELDS_WITHOUT_EFFECT, ONE_TASK_FIELDS
 from quad_gym.records import DRAWABLES
 from quad_gym.tasks.view import VIEW_FIELDS
 
@@ -185,9 +184,9 @@ def _keywords_page() -> str:
 
 def _only(keyword: str) -> str:
     """A sentence on the tasks that accept a keyword, if not all do."""
-    if keyword in ONE_TASK_KEYWORDS:
-        return f". Only with `{ONE_TASK_KEYWORDS[keyword]}`"
-    without = [kind for kind, keywords in KEYWORDS_WITHOUT_EFFECT.items() if keyword in keywords]
+    if keyword in ONE_TASK_FIELDS:
+        return f". Only with `{ONE_TASK_FIELDS[keyword]}`"
+    without = [kind for kind, keywords in FIELDS_WITHOUT_EFFECT.items() if keyword in keywords]
     return f". Not with {' and '.join(f'`{kind}`' for kind in without)}" if without else ""
 
 
@@ -278,8 +277,8 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
 
 def _has_effect(keyword: str, kind: str) -> bool:
     """Return True if a kind of task accepts a keyword."""
-    without = KEYWORDS_WITHOUT_EFFECT.get(kind, ())
-    return ONE_TASK_KEYWORDS.get(keyword, kind) == kind and keyword not in without
+    without = FIELDS_WITHOUT_EFFECT.get(kind, ())
+    return ONE_TASK_FIELDS.get(keyword, kind) == kind and keyword not in without
 
 
 def _keyword(name: str, default: str, meaning: str) -> str:

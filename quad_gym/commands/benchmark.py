@@ -30,7 +30,7 @@ from quad_gym import sensor_suite
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import require_at_least, usage_errors
-from quad_gym.envs.config import TASK_DEFAULTS
+from quad_gym.envs.config import DEFAULTS, TASK_DEFAULTS
 from quad_gym.kernels.library import available_cores
 from quad_gym.records import Source
 
@@ -260,11 +260,11 @@ def _row(
     options: dict[str, Any],
 ) -> Row:
     """Row of an interface of this package."""
-    observation, rate = options.get("observation", "estimate"), options.get("control_rate", 50)
-    suite = options.get("sensors", "standard")
+    names = ("observation", "control_rate", "sensors")
+    observation, rate, suite = (options.get(name, DEFAULTS[name]) for name in names)
     suite = "standard, GNSS 10 Hz, camera 25 Hz" if suite is SLOW else suite
     return report(
-        f"{interface}, {observation}, {rate} Hz, {suite}",
+        f"{interface}, {observation}, {rate:g} Hz, {suite}",
         timed,
         interface=interface,
         envs=count,

@@ -358,7 +358,7 @@ class CompareArgs:
     """Options of the comparison."""
 
     env_id: options.TrackingId = "QuadGym/Circle-v0"
-    sensors: options.SuiteNames = ("standard",)
+    sensors: options.SuiteNames = (options.SENSORS,)
     train_on: tuple[Source, ...] = SOURCES
     """observations in training"""
     seeds: int = 5

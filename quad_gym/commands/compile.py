@@ -75,6 +75,7 @@ class CompileArgs:
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     """Names of the compiled functions of some kinds, slowest to compile first."""
+    from quad_gym.envs.config import EnvConfig
     from quad_gym.envs.flights import Flights
     from quad_gym.kernels.entries import (
         FILTER_ENTRIES,
@@ -88,7 +89,7 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     needed: set[str] = set()
     for kind, observation in (("plain", "estimate"), ("truth", "truth")):
         if kind in kinds:
-            flights = Flights("circle", 1, Autoreset.NEXT_STEP, observation=observation)
+            flights = Flights(EnvConfig.of({"observation": observation}), 1, Autoreset.NEXT_STEP)
             needed |= set(needed_stages(flights.batch._settings[0]).values())
     if "all" in kinds:
         needed = {source.name for source in SOURCES}
@@ -164,13 +165,15 @@ def _build(args: CompileArgs) -> int:
 def _default_plans() -> Iterator[Any]:
     """Yield the plans of the tasks with default options, on the truth and on the estimate."""
     from quad_gym.device import plan_of
-    from quad_gym.envs.config import TASK_DEFAULTS
+    from quad_gym.envs.config import TASK_DEFAULTS, EnvConfig
     from quad_gym.envs.flights import Flights
     from quad_gym.records import Autoreset
 
     for task in TASK_DEFAULTS:
         for observation in ("truth", "estimate"):
-            flights = Flights(task, 1, Autoreset.NEXT_STEP, observation=observation)
+            flights = Flights(
+                EnvConfig.of({"observation": observation}, task), 1, Autoreset.NEXT_STEP
+            )
             yield plan_of(flights.batch)
 
 

@@ -241,7 +241,7 @@ class ConsistencyArgs:
     """seed of the first flight; the others have consecutive seeds"""
     duration: float = 10.0
     """length of a flight [s]"""
-    observation: Literal["estimate", "truth"] = "estimate"
+    observation: Literal["estimate", "truth"] = options.OBSERVATION
     """observation of the controller"""
     filter_start: Literal["cold", "warm"] = "cold"
     """start of the filter: cold (from its first fix), or warm (after some seconds of hovering)"""
@@ -251,13 +251,13 @@ class ConsistencyArgs:
     """folder for figures and numbers"""
     threads: options.Threads = None
 
-    sensors: options.SuiteName = "standard"
+    sensors: options.SuiteName = options.SENSORS
     form: Literal["suite", "report", "corrected"] = "suite"
     """form of filter and IMU: the suite's, the report's, or the one with all corrections"""
     estimator: options.EstimatorName = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
-    world: str = "calm"
+    world: str = options.WORLD
     """air, ground and battery: calm, breeze or fresh_breeze"""
     faults: str | None = None
     """faults of sensors and rotors: presets joined by +, such as gnss_outage+rotor_loss"""

@@ -304,14 +304,9 @@ def make_flights(args: EvaluateArgs, observation: str, count: int, policy: str) 
 
 def keywords_of_flights(args: EvaluateArgs, observation: str, policy: str) -> dict[str, Any]:
     """Keywords of the environment with an observation, for a policy."""
-    given = options.leave(args.env, "observation", "sensors", "threads")
-    keywords = {
-        **keywords_of_policy(policy, args.env_id),
-        **options.with_estimator(given, args.estimator),
-        "observation": observation,
-        "sensors": options.sensors_of(args.env_id, args.sensors),
-    }
-    return with_effect(keywords)
+    sensors = options.sensors_of(args.env_id, args.sensors)
+    given = options.environment_of(args, observation=observation, sensors=sensors)
+    return with_effect({**keywords_of_policy(policy, args.env_id), **given})
 
 
 def write_video(

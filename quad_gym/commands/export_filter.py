@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from quad_gym.commands.options import (
+    SENSORS,
     Normalized,
     SuiteName,
     full_id,
@@ -29,7 +30,7 @@ from quad_gym.commands.options import (
 class ExportFilterArgs:
     """Options of the export."""
 
-    sensors: SuiteName = "standard"
+    sensors: SuiteName = SENSORS
     target: Literal["x86-64", "aarch64", "cortex-m7", "wasm32"] = "x86-64"
     """processor: x86-64 (with AVX2) or aarch64 with Linux, cortex-m7, or WebAssembly"""
     policy: str | None = None

@@ -27,6 +27,7 @@ from baselines.policies import keywords_of_policy, load_policy
 from quad_gym import IDS, Flight, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
+from quad_gym.envs.keywords import Observation
 from quad_gym.evaluation import Policy
 from quad_gym.faults import PRESETS, faults_of
 from quad_gym.params import checks as check
@@ -46,7 +47,7 @@ class FlyArgs:
     policy: str = "pd"
     """policy: pd (tuned gains), pd:lab (gains of the report), pretrained (the included policy for
     the task), or a file of quad-gym train (.zip or .npz)"""
-    observation: Literal["estimate", "truth", "noisy", "measurements"] = "estimate"
+    observation: Observation = options.OBSERVATION
     """observation of the controller"""
     seed: int = 0
     """seed of the episode; in the window, the next episodes have consecutive seeds"""
@@ -112,11 +113,9 @@ def check_options(args: FlyArgs) -> None:
 def make_env(args: FlyArgs) -> Any:
     """Make an environment with one flight."""
     args = options.with_full_id(args)
-    options.leave(args.env, "observation", "sensors", "camera", "duration", "faults")
-    given = options.with_estimator(args.env, args.estimator)
     suite = sensor_suite(options.sensors_of(args.env_id, args.sensors))
-    keywords: dict[str, Any] = {**keywords_of_policy(args.policy, args.env_id), **given}
-    keywords |= {} if args.camera else {"camera": False}
+    keywords = keywords_of_policy(args.policy, args.env_id)
+    keywords |= options.environment_of(args, sensors=suite)
     if args.faults:
         faults = faults_of(args.faults, suite if args.camera else suite.replace(camera=None))
         if args.fault_time is not None:
@@ -124,15 +123,7 @@ def make_env(args: FlyArgs) -> Any:
             timed = {"start": start, "duration": end - start, "rate": 0.0}
             faults = tuple(fault.replace(**timed) for fault in faults)
         keywords["faults"] = faults
-    return gymnasium.make_vec(
-        args.env_id,
-        num_envs=1,
-        autoreset_mode="Disabled",
-        observation=args.observation,
-        sensors=suite,
-        duration=args.duration,
-        **keywords,
-    )
+    return gymnasium.make_vec(args.env_id, num_envs=1, autoreset_mode="Disabled", **keywords)
 
 
 def fly(env: Any, policy: Policy, seed: int, about: Any) -> Iterator[Flight]:

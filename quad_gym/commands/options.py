@@ -26,7 +26,7 @@ from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from quad_gym.envs import IDS
-from quad_gym.envs.config import BENCHMARKS, TASK_DEFAULTS
+from quad_gym.envs.config import DEFAULTS, TASK_DEFAULTS, TASK_KEYWORDS, EnvConfig
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from baselines.recipes import Recipe
 
 _Args = TypeVar("_Args")
+
+OBSERVATION, SENSORS, WORLD = (DEFAULTS[name] for name in ("observation", "sensors", "world"))
+"""Defaults of options that are keywords of environments."""
 
 USAGE_ERROR = 2  #: exit code of a program that was called with invalid options
 
@@ -192,11 +195,17 @@ def leave(keywords: Mapping[str, Any], *names: str, **others: str) -> Mapping[st
     return keywords
 
 
-def with_estimator(keywords: Mapping[str, Any], estimator: str | None) -> dict[str, Any]:
-    """Add the option `--estimator` to the keywords of an environment."""
-    if estimator is None:
-        return dict(keywords)
-    return {**leave(keywords, "estimator"), "estimator": estimator}
+def environment_of(args: Any, **given: Any) -> dict[str, Any]:
+    """Keywords of the environment that the options of a command define.
+
+    These are `--env`, and each option with the name of a keyword that differs from its default.
+    `given` has the values of keywords that a command makes of its options.
+    """
+    every = {field.name: field.default for field in dataclasses.fields(args)}
+    own = [name for name in (*DEFAULTS, *TASK_KEYWORDS) if name in every]
+    leave(args.env, *own, *(name for name in ("threads",) if name in every))
+    changed = {name: getattr(args, name) for name in own if getattr(args, name) != every[name]}
+    return {**args.env, **changed, **given}
 
 
 def refuse_overwriting(file: Path, overwrite: bool) -> None:
@@ -207,8 +216,8 @@ def refuse_overwriting(file: Path, overwrite: bool) -> None:
 
 def sensors_of(env_id: str, given: str | None) -> str:
     """Name of the sensor suite: the one given, or else the task's default."""
-    own = BENCHMARKS.get(IDS[env_id])
-    return given or ("standard" if own is None else own.keywords["sensors"])
+    sensors: str = given or EnvConfig.of({}, IDS[env_id]).sensors.sensors
+    return sensors
 
 
 def free_folder(folder: Path, result: str) -> Path:
@@ -221,7 +230,7 @@ def free_folder(folder: Path, result: str) -> Path:
 def flying_options(keywords: Mapping[str, Any]) -> str:
     """Format keywords of an environment as options of `quad-gym evaluate`, each after a space."""
     rest = dict(keywords)
-    words = [f"--{k} {rest.pop(k)}" for k in ("observation", "sensors") if k in rest]
+    words = [f"--{k} {rest.pop(k)}" for k in ("observation", "sensors", "estimator") if k in rest]
     if rest:
         words.append("--env " + " ".join(shlex.quote(f"{k}={v}") for k, v in rest.items()))
     return "".join(" " + word for word in words)

@@ -68,11 +68,7 @@ def configure(args: TrainArgs) -> tuple[Any, Path]:
     from quad_gym.analysis.reports import require_writable
 
     args = options.with_full_id(args)
-    environment = options.with_estimator(args.env, args.estimator)
-    if args.sensors is not None:
-        if "sensors" in environment:
-            raise ValueError("--sensors must not be given with --env sensors=...")
-        environment["sensors"] = args.sensors
+    environment = options.environment_of(args)
     options.require_at_least(args, steps=1, n_envs=1, evaluations=1, episodes=1, threads=1, seed=0)
     same = ("env_id", "seed", "threads", "engine", "evaluations", "episodes")
     values = {name: getattr(args, name) for name in same}

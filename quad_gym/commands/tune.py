@@ -150,8 +150,6 @@ def compare_gains(
 # Tune the gains of PD control on its observations: the estimate or the truth, with any sensors.
 # --------------------------------------------------------------------------------------------------
 
-SEPARATE = ("observation", "sensors", "threads")  #: keywords of environments with separate options
-
 
 @dataclass(frozen=True)
 class TuneArgs:
@@ -164,9 +162,9 @@ class TuneArgs:
             help_behavior_hint="",
         ),
     ] = options.TRACKING
-    observation: Literal["estimate", "truth", "noisy"] = "estimate"
+    observation: Literal["estimate", "truth", "noisy"] = options.OBSERVATION
     """observation of the controller"""
-    sensors: options.SuiteName = "standard"
+    sensors: options.SuiteName = options.SENSORS
     env: options.Keywords = field(default_factory=dict)
     """further keywords of the environment, such as action=wrench control_rate=200"""
     gains: Literal["lab", "tuned"] = "lab"
@@ -188,9 +186,9 @@ class TuneArgs:
 
 def make_envs(args: TuneArgs, episodes: int) -> dict[str, Any]:
     """Environment of each task."""
-    given: dict[str, Any] = {name: getattr(args, name) for name in SEPARATE}
+    keywords = options.environment_of(args)
     return {
-        env_id: gymnasium.make_vec(env_id, num_envs=episodes, **given, **args.env)
+        env_id: gymnasium.make_vec(env_id, num_envs=episodes, threads=args.threads, **keywords)
         for env_id in map(options.full_id, args.env_ids)
     }
 
@@ -200,7 +198,6 @@ def configure(args: TuneArgs) -> Search:
     for env_id in args.env_ids:
         options.known_id("--env-ids", env_id, options.TRACKING)
     options.require_at_least(args, candidates=1, episodes=1, held_out_episodes=2, seed=0, threads=1)
-    options.leave(args.env, *SEPARATE)
     options.refuse_overwriting(args.output / "gains.json", args.overwrite)
     first_seed("test", args.seed, args.held_out_episodes)  # rejects seeds that are too large
     envs = make_envs(args, args.episodes)

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from gymnasium.envs.registration import register, registry
 
-from quad_gym.envs.config import BENCHMARKS
-from quad_gym.envs.keywords import EnvKeywords, VectorKeywords, checked, shows
+from quad_gym.envs.config import BENCHMARKS, require_known
+from quad_gym.envs.keywords import EnvKeywords, VectorKeywords, shows
 from quad_gym.params import checks as check
 from quad_gym.params.task import TASKS
 
@@ -51,7 +51,7 @@ def register_task(
         TypeError: If a keyword is unknown; the exception is also a ValueError.
         ValueError: If the id is one of `IDS`, or `base` is not one of them.
     """
-    checked(keywords)
+    require_known(keywords)
     check.choice("base", base, tuple(IDS))
     if env_id in IDS:
         raise ValueError(f"env_id must be a new one, got {env_id!r}")

@@ -1,18 +1,18 @@
 """`EnvConfig`: all that the keywords of an environment say, checked, nested by subject.
 
 A keyword is a field of one of its parts, under the same name, or a field of `TaskParams`. A keyword
-that is not given has the value of the id's task, otherwise the default here. Keywords that have no
-effect with the others are refused here, and nowhere else in `envs`.
+that is not given has the value of the id's task, otherwise the default here. What has no effect
+with the others, `TaskParams` and `FlightConfiguration` know.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, TypeAlias, TypeVar
 
-from quad_gym.configuration import FlightConfiguration
+from quad_gym.configuration import FILTER_ARGUMENTS, FlightConfiguration
 from quad_gym.envs.spaces import ACTIONS, LAYOUTS, OBSERVATIONS
-from quad_gym.faults import GnssOutage, felt_without_sensors, needs_sensors
+from quad_gym.faults import GnssOutage, felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 from quad_gym.params.suites import SensorSuite, given_suite, sensor_suite
@@ -115,22 +115,6 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
 TASK_KEYWORDS = tuple(field.name for field in fields(TaskParams) if field.name != "kind")
 """Names of the keywords that are fields of `TaskParams`."""
 
-ONE_TASK_KEYWORDS = {
-    "max_speed": "random_trajectory",
-    "max_acceleration": "random_trajectory",
-    "gate_count": "waypoints",
-    "gate_radius": "waypoints",
-    "trajectory": "trajectory",
-}
-"""Keywords that have an effect with a single task, and that task."""
-
-KEYWORDS_WITHOUT_EFFECT = {
-    "hover": ("period",),
-    "waypoints": ("period", "preview"),
-    "trajectory": ("radius", "period", "height"),
-}
-"""Keywords that have an effect with most tasks, by the tasks with which they have none."""
-
 SLOWEST = 1.0  #: least control rate [Hz]: smaller ones are periods
 MAX_STEPS = 10**9  #: longest time limit in steps; a duration of 0 has none
 
@@ -175,7 +159,7 @@ class SensorsConfig(Checked, bare=True):
 
 
 class FilterConfig(Checked, bare=True):
-    """The filter; these have an effect only where one runs."""
+    """The filter."""
 
     estimator: Any = None
     filter_start: Any = _BATCH["filter_start"]
@@ -189,13 +173,24 @@ class WorldConfig(Checked, bare=True):
     faults: Any = _BATCH["faults"]
 
 
-_PARTS = (ObservationConfig, SensorsConfig, FilterConfig, VehicleConfig, WorldConfig)
+class RenderingConfig(Checked, bare=True):
+    """Frames; these need a `render_mode`."""
+
+    render_view: Any = None
+    render_size: Any = None
+
+
+_PARTS = (
+    ObservationConfig,
+    SensorsConfig,
+    FilterConfig,
+    VehicleConfig,
+    WorldConfig,
+    RenderingConfig,
+)
 
 DEFAULTS: dict[str, Any] = {field.name: field.default for part in _PARTS for field in fields(part)}
 """Defaults of keywords that the id's task does not set; None for all others."""
-
-FILTER_KEYWORDS = tuple(field.name for field in fields(FilterConfig))
-"""Names of the keywords that have an effect only where a filter runs."""
 
 
 class EnvConfig(Checked, eq=False, bare=True):
@@ -215,23 +210,41 @@ class EnvConfig(Checked, eq=False, bare=True):
     filter: FilterConfig
     vehicle: VehicleConfig
     world: WorldConfig
+    rendering: RenderingConfig
     max_steps: int | None
     """time limit in steps, in addition to the task's duration; None: none"""
-    asked: frozenset[str]
-    """names of the given keywords, except the task's"""
+    asked: Mapping[str, Any]
+    """the given keywords, except those of the task and None"""
 
     @classmethod
-    def of(cls, task: "Own | None", base: "Base | None", keywords: Mapping[str, Any]) -> Self:
-        """Return the configuration of keywords, of which `QuadEnv` explains each."""
+    def of(
+        cls,
+        keywords: Mapping[str, Any],
+        task: "Own | None" = None,
+        base: "Base | None" = None,
+        others: Sequence[str] = (),
+    ) -> Self:
+        """Return the configuration of keywords, of which `QuadEnv` explains each.
+
+        Args:
+            keywords: Keywords of an environment.
+            task: A kind of task, or a task in Python.
+            base: Kind of task of the id, or, for an id of `register_task`, that kind and its task.
+            others: Further arguments of the environment, for which an unknown keyword may stand.
+
+        Raises:
+            TypeError: If a keyword is unknown; the exception is also a ValueError.
+            ValueError: If a value is invalid, or has no effect with the others.
+        """
+        require_known(keywords, others)
         name, tasks = kind_and_tasks(task, base)
         defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})
         of_task = {n: keywords[n] for n in TASK_KEYWORDS if keywords.get(n) is not None}
-        _require_own_task(of_task, name, defaults.kind, own_reward=bool(own))
         params = defaults.replace(**of_task)
-        if "pad" in of_task and not params.may_start_on_ground:
-            raise ValueError(
-                f'pad has no effect with start="{params.start}", and must not be given'
-            )
+        without = params.without_effect
+        if own:
+            without["reward_params"] = f"on the task {name}, whose class has weights of its own"
+        check.effect(of_task, without)
         if "trajectory" in of_task and "duration" not in of_task:  # all of it, or a round
             longest = max(path.duration for path in params.trajectories)
             params = params.replace(duration=longest)
@@ -242,7 +255,6 @@ class EnvConfig(Checked, eq=False, bare=True):
             tasks = (given.pop("task"), *tasks)
         if "faults" in own and given["faults"] is own["faults"] and runs_no_sensor(given):
             given["faults"] = None  # the task's own, which would have no effect
-        check.keywords(given, tuple(DEFAULTS), "environments")
         vehicle = _part(VehicleConfig, given)
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
@@ -257,36 +269,14 @@ class EnvConfig(Checked, eq=False, bare=True):
             filter=_part(FilterConfig, given),
             vehicle=vehicle,
             world=_part(WorldConfig, given),
+            rendering=_part(RenderingConfig, given),
             max_steps=steps,
-            asked=frozenset(rest),
+            asked={n: value for n, value in rest.items() if value is not None},
         )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require_effect()
         check_limit(self.task, self.vehicle.control_rate, "control_rate")
-
-    def _require_effect(self) -> None:
-        """Refuse keywords that were asked for and have no effect with the others."""
-        seen = self.observation
-        if "layout" in self.asked and seen.observation == "measurements":
-            raise ValueError(
-                'layout must not be given with observation="measurements", which has its own '
-                f"layout, got {seen.layout!r}"
-            )
-        for name in FILTER_KEYWORDS:
-            value = getattr(self.filter, name)
-            if name in self.asked and value is not None and self.runs_no_sensor:
-                raise ValueError(
-                    f'{name} must not be given with observation="{seen.observation}", where no '
-                    "filter runs unless run_filter, include_std or innovations ask for it, got "
-                    f"{value!r}"
-                )
-
-    @property
-    def runs_no_sensor(self) -> bool:
-        """True if no sensor is simulated."""
-        return runs_no_sensor({**vars(self.observation), **vars(self.sensors)})
 
     @cached_property
     def suite(self) -> SensorSuite:
@@ -306,7 +296,7 @@ class EnvConfig(Checked, eq=False, bare=True):
         """Return the configuration of a batch of such flights.
 
         Raises:
-            ValueError: If a value is invalid, or faults concern sensors where none runs.
+            ValueError: If a value is invalid, or a given keyword has no effect.
         """
         seen, raw = self.observation, self.observation.observation == "measurements"
         vehicle = {n: value for n, value in vars(self.vehicle).items() if n != "action"}
@@ -329,14 +319,20 @@ class EnvConfig(Checked, eq=False, bare=True):
             **vehicle,
             **vars(self.world),
         )
-        of_sensors = [fault for fault in found.possible_faults if needs_sensors(fault)]
-        if of_sensors and self.runs_no_sensor:
-            raise ValueError(
-                f"faults must concern simulated parts: {type(of_sensors[0]).__name__} concerns "
-                f'sensors, and none runs with observation="{seen.observation}" (unless '
-                "run_filter, include_std or innovations ask for the filter)"
-            )
+        check.effect(self.asked, found.without_effect)
         return found
+
+
+def require_known(given: Mapping[str, Any], others: Sequence[str] = ()) -> None:
+    """Refuse unknown keywords; one of them may stand for one of `others`, too."""
+    known = (*DEFAULTS, "max_episode_steps", *TASK_KEYWORDS, "task", "base", *others)
+    for name in ("threads", "render_flights"):
+        if name in given and name not in known:
+            raise check.UnknownKeywordError(
+                f"{name} is not a keyword of a single environment, which has one (unexpected "
+                f"keyword argument '{name}'); gymnasium.make_vec takes it"
+            )
+    check.keywords(given, known, "environments")
 
 
 Part = TypeVar("Part", bound=Checked)
@@ -369,23 +365,6 @@ def kind_and_tasks(task: "Own | None", base: "Base | None") -> "tuple[str, tuple
     )
 
 
-def _require_own_task(given: Collection[str], name: str, kind: str, *, own_reward: bool) -> None:
-    """Refuse fields of `TaskParams` that belong to other tasks, or have no effect."""
-    if own_reward and "reward_params" in given:
-        raise ValueError(
-            f"reward_params has no effect on the task {name}, and must not be given: its class has "
-            "weights of its own"
-        )
-    for keyword in given:
-        if ONE_TASK_KEYWORDS.get(keyword, kind) != kind:
-            raise ValueError(
-                f"{keyword} belongs to the task {ONE_TASK_KEYWORDS[keyword]}, and must not be "
-                f"given for {name}"
-            )
-        if keyword in KEYWORDS_WITHOUT_EFFECT.get(kind, ()):
-            raise ValueError(f"{keyword} has no effect on the task {name}, and must not be given")
-
-
 def runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
     """Return True if an environment with these keywords simulates no sensor."""
     asked = any(keywords.get(name) is True for name in ("run_filter", "include_std", "innovations"))
@@ -398,7 +377,7 @@ def with_effect(keywords: Mapping[str, Any]) -> dict[str, Any]:
     Comparisons use the same keywords for several observations, but environments reject keywords
     that have no effect.
     """
-    idle = FILTER_KEYWORDS if runs_no_sensor(keywords) else ()
+    idle = FILTER_ARGUMENTS if runs_no_sensor(keywords) else ()
     kept = {name: value for name, value in keywords.items() if name not in idle}
     if keywords.get("observation") in ("truth", "noisy") and {"faults", "sensors"} <= set(kept):
         kept["faults"] = felt_without_sensors(kept["faults"], sensor_suite(kept["sensors"]))

@@ -1,7 +1,7 @@
 """From the keywords of an environment to its flights: the same for all three interfaces."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import innovations_of
 from quad_gym.batch.starts import check_in_bounds, check_pad, checked_start
 from quad_gym.configuration import MAX_FLIGHTS
-from quad_gym.envs.config import Base, EnvConfig, Own
-from quad_gym.envs.keywords import RENDERING_KEYWORDS
+from quad_gym.envs.config import EnvConfig
 from quad_gym.envs.spaces import (
     ObservationField,
     layout_bounds,
@@ -26,7 +25,7 @@ from quad_gym.envs.spaces import (
 from quad_gym.faults import named_faults
 from quad_gym.params import checks as check
 from quad_gym.params.world import WorldParams
-from quad_gym.records import Autoreset, Layout
+from quad_gym.records import Autoreset
 
 if TYPE_CHECKING:
     from quad_gym.rendering.renderer import Rendering
@@ -36,17 +35,10 @@ class Flights:
     """The flights behind an environment, with its observation's table; see `QuadEnv`."""
 
     def __init__(
-        self,
-        task: "Own | None",
-        count: int,
-        autoreset: Autoreset,
-        *,
-        base: "Base | None" = None,
-        threads: int | None = None,
-        **keywords: Any,
+        self, config: EnvConfig, count: int, autoreset: Autoreset, threads: int | None = None
     ) -> None:
         check.whole("num_envs", count, most=MAX_FLIGHTS)
-        self.config = config = EnvConfig.of(task, base, keywords)
+        self.config = config
         seen = config.observation
         self.name, self.task, self.observation = config.name, config.task, seen.observation
         self.action, self.layout = config.vehicle.action, seen.layout
@@ -57,7 +49,7 @@ class Flights:
             check_pad(c.task)  # a user-defined task may set where vehicles start
         self.table: tuple[ObservationField, ...] = observation_layout(
             seen.observation,
-            None if c.layout is Layout.MEASUREMENTS else seen.layout,
+            config.asked.get("layout"),
             sensors=c.sensors,
             include_std=c.include_std,
             privileged=c.privileged,
@@ -221,11 +213,6 @@ RENDERING_METADATA: dict[str, Any] = {
 """Gymnasium's metadata; an environment's own has its control rate as the frame rate."""
 
 
-def rendering_options(keywords: dict[str, Any]) -> dict[str, Any]:
-    """Remove the rendering keywords from the keywords of an environment, and return them."""
-    return {name: keywords.pop(name) for name in RENDERING_KEYWORDS if name in keywords}
-
-
 class Rendered:
     """Flights with a renderer and Gymnasium's description, as the interfaces have them."""
 
@@ -235,10 +222,13 @@ class Rendered:
     _spec: EnvSpec | None = None
     _seeded = False
 
-    def _open(self, flights: Flights, mode: str | None, keywords: Mapping[str, Any]) -> None:
+    def _open(
+        self, flights: Flights, mode: str | None, render_flights: Sequence[int] | None = None
+    ) -> None:
         """Set flights, and a renderer if there is a `render_mode`, which other keywords need."""
         self.flights, self.render_mode, self.rendering = flights, mode, None
-        given = {name: value for name, value in keywords.items() if value is not None}
+        options = {**vars(flights.config.rendering), "render_flights": render_flights}
+        given = {name: value for name, value in options.items() if value is not None}
         if mode is None and given:
             raise ValueError(f"{next(iter(given))} needs a render_mode, got None")
         if mode is not None:

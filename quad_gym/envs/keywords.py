@@ -8,11 +8,10 @@ explains each keyword.
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar
 
 from quad_gym.envs.config import DEFAULTS, TASK_KEYWORDS
 from quad_gym.faults import FaultsGiven
-from quad_gym.params import checks as check
 from quad_gym.params.checks import show
 from quad_gym.params.randomization import Given, Randomization
 from quad_gym.params.suites import SensorSuite
@@ -24,6 +23,9 @@ from quad_gym.params.world import WorldParams
 if TYPE_CHECKING:
     from quad_gym.batch.own_estimator import Estimator
     from quad_gym.tasks import Task
+
+
+Observation: TypeAlias = Literal["estimate", "truth", "noisy", "measurements"]
 
 
 class TaskKeywords(TypedDict, total=False):
@@ -53,7 +55,7 @@ class TaskKeywords(TypedDict, total=False):
 class EnvKeywords(TaskKeywords, total=False):
     """Keywords of every environment, which `quad_gym.QuadEnv` explains."""
 
-    observation: Literal["estimate", "truth", "noisy", "measurements"]
+    observation: Observation
     action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"]
     layout: Literal["relative", "absolute"]
     include_std: bool
@@ -89,26 +91,10 @@ class VectorKeywords(EnvKeywords, total=False):
     render_flights: Sequence[int] | None
 
 
-RENDERING_KEYWORDS = ("render_view", "render_size")  #: names of the keywords that concern pictures
-
-
 def types_of(keywords: type) -> dict[str, Any]:
     """Return the types of the keywords of a TypedDict by name, the most general ones first."""
     types = dict(inspect.get_annotations(keywords))
     return {name: types[name] for name in sorted(types, key=lambda name: name in TASK_KEYWORDS)}
-
-
-def checked(given: Mapping[str, Any], *others: str) -> dict[str, Any]:
-    """Return a copy of keywords; an unknown one may stand for one of `others`, too."""
-    known = (*types_of(EnvKeywords), "task", "base", *others)
-    for name in ("threads", "render_flights"):
-        if name in given and name not in known:
-            raise check.UnknownKeywordError(
-                f"{name} is not a keyword of a single environment, which has one (unexpected "
-                f"keyword argument '{name}'); gymnasium.make_vec takes it"
-            )
-    check.keywords(given, known, "environments")
-    return dict(given)
 
 
 F = TypeVar("F", bound=Callable[..., Any])

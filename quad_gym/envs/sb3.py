@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from quad_gym.batch.starts import stream_keys
-from quad_gym.envs.config import Base
+from quad_gym.envs.config import Base, EnvConfig
 from quad_gym.envs.flights import (
     Flights,
     Rendered,
@@ -18,11 +18,10 @@ from quad_gym.envs.flights import (
     drawn_info,
     flight_info,
     info_of_flight,
-    rendering_options,
     start_info,
     start_options,
 )
-from quad_gym.envs.keywords import EnvKeywords, checked, shows
+from quad_gym.envs.keywords import EnvKeywords, shows
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result
@@ -67,10 +66,11 @@ class QuadSB3VecEnv(Rendered, VecEnv):
     ) -> None:
         if render_mode not in (None, "human", "rgb_array"):
             raise ValueError(f"render_mode must be human or rgb_array, got {render_mode!r}")
-        given = checked(keywords, "threads", "render_mode", "render_flights")
-        look = rendering_options(given)
-        flights = Flights(task, num_envs, Autoreset.SAME_STEP, base=base, threads=threads, **given)
-        self._open(flights, render_mode, look | {"render_flights": render_flights})
+        others = ("threads", "render_mode", "render_flights")
+        config = EnvConfig.of(keywords, task, base, others)
+        self._open(
+            Flights(config, num_envs, Autoreset.SAME_STEP, threads), render_mode, render_flights
+        )
         self._began = time.monotonic()
         self._pending: np.ndarray | None = None
         super().__init__(num_envs, self.flights.space, action_space())

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from quad_gym.batch.starts import stream_key
-from quad_gym.envs.config import Base
+from quad_gym.envs.config import Base, EnvConfig
 from quad_gym.envs.flights import (
     RENDERING_METADATA,
     Flights,
@@ -15,10 +15,9 @@ from quad_gym.envs.flights import (
     drawn_info,
     flight_info,
     info_of_flight,
-    rendering_options,
     start_info,
 )
-from quad_gym.envs.keywords import EnvKeywords, checked, shows
+from quad_gym.envs.keywords import EnvKeywords, shows
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result
@@ -225,10 +224,8 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
         render_mode: str | None = None,
         **keywords: Unpack[EnvKeywords],
     ) -> None:
-        given = checked(keywords, "render_mode")
-        look = rendering_options(given)
-        flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **given)
-        self._open(flights, render_mode, look)
+        config = EnvConfig.of(keywords, task, base, ("render_mode",))
+        self._open(Flights(config, 1, Autoreset.DISABLED, threads=1), render_mode)
         self.metadata = self.metadata | {"render_fps": round(self.flights.control_rate)}
         self.observation_space = self.flights.space
         self.action_space = action_space()

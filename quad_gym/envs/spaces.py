@@ -148,12 +148,11 @@ def observation_layout(
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
     if raw:
         parts = _sensor_fields(suite)
-    for name, value, counts in (("layout", layout, not raw), ("drawn", drawn, privileged)):
-        if value is not None and not counts:
-            raise ValueError(
-                f"{name} must not be given with observation={observation!r} and "
-                f"privileged={privileged}, where it has no effect, got {value!r}"
-            )
+    without = {"layout": 'with observation="measurements", which has its own'} if raw else {}
+    if not privileged:
+        without["drawn"] = "with privileged=False"
+    given = {"layout": layout, "drawn": drawn}
+    check.effect({name: value for name, value in given.items() if value is not None}, without)
     parts = (*parts, _LAST_ACTION)
     if include_std:
         units = ("m", "m/s", "rad", "m/s^2", "rad/s")

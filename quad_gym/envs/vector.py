@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from quad_gym.batch.starts import stream_keys
-from quad_gym.envs.config import Base
+from quad_gym.envs.config import Base, EnvConfig
 from quad_gym.envs.flights import (
     RENDERING_METADATA,
     Flights,
@@ -19,11 +19,10 @@ from quad_gym.envs.flights import (
     final_parts,
     flight_info,
     named_options,
-    rendering_options,
     replace_faults,
     start_info,
 )
-from quad_gym.envs.keywords import EnvKeywords, checked, shows
+from quad_gym.envs.keywords import EnvKeywords, shows
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Result
@@ -81,12 +80,10 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
         render_flights: Sequence[int] | None = None,
         **keywords: Unpack[EnvKeywords],
     ) -> None:
-        given = checked(keywords, *_OTHERS)
-        look = rendering_options(given)
+        config = EnvConfig.of(keywords, task, base, _OTHERS)
         self.autoreset_mode = _mode_of(autoreset_mode)
-        mode = _MODES[self.autoreset_mode]
-        flights = Flights(task, num_envs, mode, base=base, threads=threads, **given)
-        self._open(flights, render_mode, look | {"render_flights": render_flights})
+        flights = Flights(config, num_envs, _MODES[self.autoreset_mode], threads)
+        self._open(flights, render_mode, render_flights)
         self.num_envs = self.flights.batch.count
         self.metadata = RENDERING_METADATA | {
             "render_fps": round(self.flights.control_rate),

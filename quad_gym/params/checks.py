@@ -70,6 +70,20 @@ def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
         raise UnknownKeywordError(f"{name} is not a keyword of {of} ({words}); {meant}")
 
 
+def effect(given: Mapping[str, Any], without: Mapping[str, str]) -> None:
+    """Refuse the first argument that has no effect.
+
+    Args:
+        given: Arguments that were given, or that differ from their defaults.
+        without: Arguments that have no effect with the others, each with the reason.
+    """
+    for name, reason in without.items():
+        if name in given:
+            raise ValueError(
+                f"{name} has no effect {reason}, and must not be given, got {given[name]!r}"
+            )
+
+
 def closest(name: Any, known: Iterable[str]) -> str | None:
     """Return the one of `known` that a misspelt name may stand for, ignoring case; None: none.
 
@@ -443,6 +457,13 @@ class Checked:
         """Raise a ValueError for a field that must be otherwise."""
         value = getattr(self, name) if got is ... else got
         raise ValueError(f"{self._prefix}{name} must {must}, got {value}")
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """Fields that differ from their defaults."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        return {name: value for name, value in values.items() if value != defaults[name]}
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; all values are checked again."""

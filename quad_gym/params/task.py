@@ -56,13 +56,11 @@ class RewardParams(Checked):
         """Return the terms of the reward of a kind of task."""
         return _COURSE if kind == "waypoints" else _TRACKING
 
-    def require_effect(self, kind: str) -> None:
-        """Refuse changed weights of terms that the reward of a kind of task does not have."""
+    def without_effect(self, kind: str) -> list[str]:
+        """Return the weights of terms that the reward of a kind of task does not have."""
         used = {term.name.lower() for term in self.terms(kind)}
-        for weight in fields(self):
-            changed = getattr(self, weight.name) != weight.default
-            if changed and weight.name.removesuffix("_decay") not in used:
-                raise ValueError(f"RewardParams.{weight.name} has no effect on the task {kind}")
+        names = (weight.name for weight in fields(self))
+        return [f"RewardParams.{n}" for n in names if n.removesuffix("_decay") not in used]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -74,6 +72,22 @@ STARTS = tuple(start.name.lower() for start in Start)  #: names of the ways in w
 
 FARTHEST = 1000.0
 """Largest distance of a reference from the origin, along an axis, in observations [m]."""
+
+ONE_TASK_FIELDS = {
+    "max_speed": "random_trajectory",
+    "max_acceleration": "random_trajectory",
+    "gate_count": "waypoints",
+    "gate_radius": "waypoints",
+    "trajectory": "trajectory",
+}
+"""Fields that have an effect with a single task, and that task."""
+
+FIELDS_WITHOUT_EFFECT = {
+    "hover": ("period",),
+    "waypoints": ("period", "preview"),
+    "trajectory": ("radius", "period", "height"),
+}
+"""Fields that have an effect with most tasks, by the tasks with which they have none."""
 
 MIN_PERIOD = 0.01  #: period of the fastest reference [s]; no vehicle can follow a faster one
 
@@ -143,8 +157,9 @@ class TaskParams(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
-        self.reward_params.require_effect(self.kind)
+        self._set("trajectory", checked_trajectories(self.trajectory))
+        weights = {f"RewardParams.{name}": w for name, w in self.reward_params.changed.items()}
+        check.effect({**self.changed, **weights}, self.without_effect)
         lowest, of = (
             (0.0, "of starts") if self.may_start_on_ground else (self.height, "of the task")
         )
@@ -152,6 +167,26 @@ class TaskParams(Checked):
             self._refuse("min_height", f"be at most {lowest:g} m, the height {of}")
         if not 0.0 < self.max_tilt <= math.pi:
             self._refuse("max_tilt", "be in (0, pi]")
+
+    @property
+    def without_effect(self) -> dict[str, str]:
+        """Fields that have no effect on this task, each with the reason.
+
+        Those that differ from their defaults are refused here. An environment, which knows the
+        keywords that were given, refuses each of them.
+        """
+        on_task = f"on the task {self.kind}"
+        found = {
+            name: f"{on_task} (only on {kind})"
+            for name, kind in ONE_TASK_FIELDS.items()
+            if kind != self.kind
+        }
+        weights = self.reward_params.without_effect(self.kind)
+        others = (*FIELDS_WITHOUT_EFFECT.get(self.kind, ()), *weights)
+        found |= dict.fromkeys(others, on_task)
+        if not self.may_start_on_ground:
+            found["pad"] = f'with start="{self.start}"'
+        return found
 
     @property
     def may_start_on_ground(self) -> bool:
@@ -174,12 +209,10 @@ def figure_of_eight() -> Trajectory:
     return Trajectory.through(points, closed=True, yaw="along")
 
 
-def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None:
+def checked_trajectories(given: Any) -> tuple[Trajectory, ...] | None:
     """Return the trajectories of a task as a tuple, or None; files are read."""
     if given is None:
         return None
-    if kind != "trajectory":
-        raise ValueError(f"TaskParams.trajectory must not be given for the task {kind}")
     several = [given] if isinstance(given, (Trajectory, str, Path)) else given
     if not isinstance(several, Sequence) or not several:
         raise ValueError(

@@ -15,9 +15,9 @@ import baselines
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands import evaluate
-from quad_gym.envs.config import DEFAULTS, TASK_KEYWORDS, with_effect
+from quad_gym.envs.config import DEFAULTS, TASK_KEYWORDS, EnvConfig, RenderingConfig, with_effect
 from quad_gym.envs.flights import Flights
-from quad_gym.envs.keywords import RENDERING_KEYWORDS, EnvKeywords, TaskKeywords, VectorKeywords
+from quad_gym.envs.keywords import EnvKeywords, TaskKeywords, VectorKeywords
 from quad_gym.records import Autoreset
 
 ROOT = Path(__file__).parents[2]
@@ -71,14 +71,16 @@ def test_declared_keywords_match_task_params_and_flight_batch():
     fields = {field.name for field in dataclasses.fields(quad_gym.TaskParams)} - {"kind"}
     assert set(inspect.get_annotations(TaskKeywords)) == fields == set(TASK_KEYWORDS)
     of_flights = set(inspect.signature(FlightBatch).parameters)
-    assert set(DEFAULTS) - of_flights == {"observation", "action", "camera", "reward_terms"}
-    others = {"max_episode_steps", *RENDERING_KEYWORDS, *TASK_KEYWORDS}
+    pictures = {field.name for field in dataclasses.fields(RenderingConfig)}
+    own = {"observation", "action", "camera", "reward_terms"}
+    assert set(DEFAULTS) - of_flights == own | pictures
+    others = {"max_episode_steps", *TASK_KEYWORDS}
     assert set(inspect.get_annotations(EnvKeywords)) == set(DEFAULTS) | others
 
 
 def test_declared_defaults_equal_defaults_of_flights():
-    given = Flights("hover", 1, Autoreset.DISABLED, **DEFAULTS).batch
-    plain = Flights("hover", 1, Autoreset.DISABLED).batch
+    given = Flights(EnvConfig.of(DEFAULTS, "hover"), 1, Autoreset.DISABLED).batch
+    plain = Flights(EnvConfig.of({}, "hover"), 1, Autoreset.DISABLED).batch
     assert given._settings.tobytes() == plain._settings.tobytes()
 
 
@@ -111,10 +113,11 @@ def test_a_type_checker_refuses_wrong_keywords(tmp_path):
 
 
 def test_evaluate_passes_filter_keywords_only_to_flights_with_filter(tmp_path):
-    args = evaluate.EvaluateArgs(env={"filter_start": "warm", "estimator": "ekf"}, output=tmp_path)
+    env = {"filter_start": "warm"}
+    args = evaluate.EvaluateArgs(env=env, estimator="ekf", output=tmp_path)
     for observation in ("truth", "noisy", "estimate"):
         evaluate.make_flights(args, observation, 1, "pd").close()
-    given = {**args.env, "sensors": "rtk"}
+    given = {**env, "estimator": "ekf", "sensors": "rtk"}
     truth, estimate = ({"observation": name} for name in ("truth", "estimate"))
     assert with_effect(given | truth) == truth | {"sensors": "rtk"}
     assert with_effect(given | estimate) == estimate | given

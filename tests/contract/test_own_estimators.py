@@ -378,7 +378,7 @@ def test_flights_must_be_reset_after_a_failed_update():
 REFUSED = [
     ({"innovations": True}, "innovations has no effect with an own estimator"),
     ({"truncate_when_diverged": True}, "truncate_when_diverged has no effect"),
-    ({"observation": "truth"}, 'estimator must not be given with observation="truth"'),
+    ({"observation": "truth"}, "estimator has no effect where no filter runs"),
     (
         {
             "sensors": quad_gym.SensorSuite(

@@ -283,7 +283,7 @@ def examples():
         quad_gym.Normal(0.0, 1.0),
         PATH,
         FLOWN,
-        EnvConfig.of(None, "hover", {}),
+        EnvConfig.of({}, "hover"),
     ):
         collect(other)
     return found.values()
@@ -436,9 +436,9 @@ def test_draw_of_one_value_is_accepted_where_the_value_itself_is(drawable):
 
 def test_limit_in_steps_is_a_whole_number_up_to_a_billion():
     for good, bad in wholes(1, 10**9):
-        EnvConfig.of(None, "hover", {"max_episode_steps": good})
+        EnvConfig.of({"max_episode_steps": good}, "hover")
         with pytest.raises(ValueError, match="max_episode_steps must be"):
-            EnvConfig.of(None, "hover", {"max_episode_steps": bad})
+            EnvConfig.of({"max_episode_steps": bad}, "hover")
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

@@ -12,6 +12,7 @@ from quad_gym.commands.options import (
     EnvId,
     Keywords,
     SuiteNames,
+    environment_of,
     flying_options,
     known_id,
     leave,
@@ -106,6 +107,19 @@ def test_env_keywords_with_a_dedicated_option_are_refused():
     assert leave(keywords, faults="--fault") == keywords
     with pytest.raises(ValueError, match=r"^--env must not contain sensors: use --sensors"):
         leave(keywords, "sensors", faults="--fault")
+
+
+def test_options_with_names_of_keywords_are_keywords_of_environment():
+    given = {"action": "motor"}
+    assert environment_of(train.TrainArgs(env=given)) == given
+    args = fly.FlyArgs(env=given, sensors="rtk", camera=False, observation="truth", seed=3)
+    of_options = {"sensors": "rtk", "camera": False, "observation": "truth"}
+    assert environment_of(args) == given | of_options
+    assert environment_of(args, sensors="lab") == given | of_options | {"sensors": "lab"}
+    with pytest.raises(ValueError, match=r"^--env must not contain duration: use --duration"):
+        environment_of(fly.FlyArgs(env={"duration": 3.0}))
+    with pytest.raises(ValueError, match=r"^--env must not contain threads: use --threads"):
+        environment_of(train.TrainArgs(env={"threads": 2}))
 
 
 def test_keywords_are_formatted_as_command_line_options():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from quad_gym import CameraParams
+from quad_gym.envs.config import EnvConfig
 from quad_gym.envs.flights import Flights
 from quad_gym.flights import FlightRecorder
 from quad_gym.records import Autoreset
@@ -23,7 +24,7 @@ CENTER = np.array([320.0, 180.0])
 
 
 def a_flight(task="circle", seed=0, steps=5, **keywords):
-    flights = Flights(task, 1, Autoreset.DISABLED, threads=1, **keywords)
+    flights = Flights(EnvConfig.of(keywords, task), 1, Autoreset.DISABLED, threads=1)
     recorder = FlightRecorder(flights.batch)
     flights.batch.reset(seeds=[seed])
     recorder.keep()

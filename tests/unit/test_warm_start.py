@@ -160,7 +160,7 @@ def test_first_fix_is_a_measurement_unless_it_starts_the_filter():
 
 
 def test_invalid_filter_start_and_warm_start_without_filter_are_refused():
-    with pytest.raises(ValueError, match="filter_start needs a filter, and none runs here"):
+    with pytest.raises(ValueError, match="filter_start has no effect where no filter runs"):
         FlightBatch(4, filter_start="warm", source=quad_gym.records.Source.TRUTH)
     with pytest.raises(ValueError, match="filter_start must be one of cold, warm, got 'hot'"):
         FlightBatch(1, filter_start="hot")
