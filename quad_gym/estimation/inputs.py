@@ -34,14 +34,9 @@ GROUP = {name: group for group, name in enumerate(READINGS)}
 """Numbers of the readings, as groups of the gate."""
 
 
-def keyword_of(name: str) -> str:
-    """Return the keyword of a reading: names of vectors in G say so."""
-    return f"{name}_G" if READINGS[name].in_G else name
-
-
 _OK = int(Outcome.OK)
 _KEYWORDS = tuple(
-    (keyword_of(name), reading.sigma, name, GROUP[name]) for name, reading in READINGS.items()
+    (reading.keyword, reading.sigma, name, GROUP[name]) for name, reading in READINGS.items()
 )
 """Keywords of a reading and of its standard deviation, its name and its number."""
 
@@ -83,10 +78,10 @@ def _refuse(row: Any, given: Mapping[str, Any]) -> NoReturn:
     culprit = int(row["culprit"])
     name = list(READINGS)[culprit % len(READINGS)]
     of_sigma, reading = culprit >= len(READINGS), READINGS[name]
-    keyword = reading.sigma if of_sigma else keyword_of(name)
+    keyword = reading.sigma if of_sigma else reading.keyword
     value, outcome = given[keyword], row["outcome"]
     if outcome == Outcome.CONTRADICTION:
-        raise ValueError(f"{keyword} must come with its measurement, {keyword_of(name)}")
+        raise ValueError(f"{keyword} must come with its measurement, {reading.keyword}")
     if outcome == Outcome.NOT_FINITE:
         raise ValueError(f"{keyword} must be finite, got {value!r}")
     if of_sigma:

@@ -53,12 +53,32 @@ class ReadingDefinition(NamedTuple):
     sigmas: int = 1  #: numbers of the standard deviation: one, or east, north and up
     least_sigma: float = 1e-12  #: smallest standard deviation of a measurement
     reported: bool = False  #: True if receivers report it with every measurement
+    noise: str = "noise_sigma"  #: field of the parameters with the white noise
+    from_center: bool = False  #: True for a place that logs have from the center of the Earth
     marked: bool = False
     """True if the mark from which a vehicle starts gives it where there is no such sensor"""
 
     def name_of(self, k: int) -> str:
         """Return the name of block k."""
         return f"{self.block or self.name}_{k}" if self.most_blocks > 1 else self.name
+
+    @property
+    def keyword(self) -> str:
+        """Keyword of a filter's `update`: names of vectors in G say so."""
+        return f"{self.name}_G" if self.in_G else self.name
+
+    @property
+    def in_logs(self) -> tuple[str, ...]:
+        """Names in a log: the keyword, and of vectors in G also the name in I."""
+        return (self.keyword, f"{self.name}_I") if self.in_G else (self.name,)
+
+    def known(self, values: NDArray[np.float64], blocks: int | None = None) -> NDArray[np.bool_]:
+        """Return True for the rows of `values` (n, ...) in which one of its blocks has no NaN.
+
+        `blocks`: number of the blocks that count; None: all.
+        """
+        known = np.isfinite(values.reshape(len(values), -1, self.length))[:, :blocks]
+        return np.asarray(np.any(np.all(known, axis=2), axis=1))
 
     @property
     def dimensions(self) -> tuple[str | int, ...]:
@@ -72,7 +92,6 @@ class SensorBase(Checked):
 
     measures: ClassVar[tuple[ReadingDefinition, ...]] = ()
     """Quantities of a sensor that has several, or more to say than `AidParams`."""
-    _white_noise: ClassVar[tuple[str, ...]] = ()
     _ideal: ClassVar[Mapping[str, Any]] = {}
     """Values without latency and without errors that the filter does not model."""
 
@@ -110,10 +129,14 @@ class SensorBase(Checked):
         """Return a copy without latency and without errors that the filter does not model."""
         return self.replace(**self._ideal)
 
+    def _white_noise(self) -> tuple[str, ...]:
+        """Return the names of the standard deviations of white noise."""
+        return tuple(reading.noise for reading in self.readings(""))
+
     def scaled_noise(self, factor: float) -> Self:
         """Return a copy with the white noise multiplied by `factor`."""
         scaled: dict[str, Any] = {}
-        for name in self._white_noise:
+        for name in self._white_noise():
             sigma = getattr(self, name)
             each = tuple(factor * s for s in sigma) if isinstance(sigma, tuple) else None
             scaled[name] = each or (sigma and factor * sigma)
@@ -134,7 +157,6 @@ class AidParams(SensorBase):
     noise_sigma: float
     """standard deviation of the white noise, per component"""
 
-    _white_noise = ("noise_sigma",)
     _ideal: ClassVar = {"latency": 0.0}
     length: ClassVar[int] = 1
     most_blocks: ClassVar[int] = 1
@@ -167,12 +189,6 @@ class AidParams(SensorBase):
     def measured_blocks(self) -> tuple[int, ...]:
         """Number of blocks."""
         return (self.blocks,)
-
-    @classmethod
-    def measured(cls, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return True for the rows of `values` (n, ...) with a block without a NaN."""
-        known = np.isfinite(values.reshape(len(values), -1, cls.length))
-        return np.asarray(np.any(np.all(known, axis=2), axis=1))
 
     @property
     def blocks(self) -> int:

@@ -71,6 +71,7 @@ class CameraParams(SensorBase):
             observes=("position", "height", "velocity", "heading"),
             raw=("half images", "C", 2.0),
             sigma="pixel_sigma",
+            noise="pixel_sigma",
             sigma_unit="pixels",
             most_blocks=MAX_FEATURES,
             raw_first=1,
@@ -78,7 +79,6 @@ class CameraParams(SensorBase):
             direction=True,
         ),
     )
-    _white_noise = ("pixel_sigma",)
     _ideal: ClassVar = {
         "latency": 0.0,
         "max_range": math.inf,

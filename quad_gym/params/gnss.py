@@ -79,6 +79,8 @@ class GnssParams(SensorBase):
             observes=("position", "height", "velocity"),
             raw=("m", "I", 1000.0),
             sigma="gnss_sigma",
+            noise="position_sigma_I",
+            from_center=True,
             sigma_unit="m",
             sigmas=3,
             least_sigma=1e-9,
@@ -95,6 +97,7 @@ class GnssParams(SensorBase):
             observes=("heading",),
             raw=("-", "I", 1.0),
             sigma="baseline_sigma",
+            noise="baseline_sigma",
             sigma_unit="rad",
             direction=True,
             in_G=True,
@@ -109,12 +112,12 @@ class GnssParams(SensorBase):
             observes=("velocity",),
             raw=("m/s", "I", 200.0),
             sigma="velocity_sigma",
+            noise="velocity_sigma",
             sigma_unit="m/s",
             reported=True,
             in_G=True,
         ),
     )
-    _white_noise = ("position_sigma_I", "baseline_sigma", "velocity_sigma")
     _ideal: ClassVar = {"latency": 0.0, "heading_error_sigma": 0.0}
 
     def __post_init__(self) -> None:

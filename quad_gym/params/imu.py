@@ -65,8 +65,10 @@ class ImuParams(SensorBase):
     gyro_vibration: check.NonNegative = 0.0
     """standard deviation of this noise in a gyro sample [rad/s]"""
 
-    _white_noise = ("accel_noise_density", "gyro_noise_density")
     _ideal = dict.fromkeys((*_ERRORS, "accel_vibration", "gyro_vibration"), 0.0)
+
+    def _white_noise(self) -> tuple[str, ...]:
+        return ("accel_noise_density", "gyro_noise_density")
 
     @property
     def dt(self) -> float:

@@ -651,7 +651,7 @@ seed = 3
     np.testing.assert_allclose(log.imu.values["gyro"], flight.gyro, atol=1e-9)
     np.testing.assert_allclose(log.imu.values["accel"], flight.accel, atol=1e-9)
     np.testing.assert_allclose(np.diff(log.gnss.time), 0.2, atol=1e-9)
-    noise = log.gnss.values["position_I"] - flight.position[::10]
+    noise = log.gnss.values["gnss_position_I"] - flight.position[::10]
     assert 0.08 < noise.std() < 0.12
     suite = CONSUMER.replace(gnss=CONSUMER.gnss.replace(velocity_sigma=None))
     arrives(flight, tmp_path / "flight.csv.gz", 0.0, suite, {"heading": 0.3}, columns=file)
@@ -679,4 +679,4 @@ def test_map_for_nanobench_reads_its_columns(flight):
     np.testing.assert_allclose(log.imu.values["accel"], flight.accel, atol=1e-9)
     np.testing.assert_allclose(np.diff(log.gnss.time), 0.1, atol=1e-9)
     np.testing.assert_allclose(log.motors.values["commands"], 0.25)
-    assert np.abs(log.gnss.values["position_I"] - flight.position[::5]).max() < 0.05
+    assert np.abs(log.gnss.values["gnss_position_I"] - flight.position[::5]).max() < 0.05

@@ -21,11 +21,11 @@ def check(log, flight, boot, *, imu, places, speeds):
     for name in ("gyro", "accel"):
         np.testing.assert_allclose(log.imu.values[name], getattr(flight, name), atol=imu)
     values = log.gnss.values
-    found = values["position_G"] if "position_G" in values else values["position_I"]
+    found = values["gnss_position_G"] if "gnss_position_G" in values else values["gnss_position_I"]
     fixes = np.isfinite(found).all(axis=1)  # differences in ECEF and in I have equal norms
     norms = (np.linalg.norm(p - p[0], axis=1) for p in (found[fixes], flight.fixes))
     np.testing.assert_allclose(*norms, atol=places)
-    velocities = values["velocity_I"]
+    velocities = values["gnss_velocity_I"]
     known = np.isfinite(velocities).all(axis=1)
     np.testing.assert_allclose(velocities[known], flight.velocities, atol=speeds)
 
@@ -55,7 +55,7 @@ def test_ardupilot_log_has_the_numbers_of_the_flight(flight, tmp_path):
     check(log, flight, BOOT, imu=2e-6, places=0.03, speeds=1e-4)
     check_aids(log, flight, BOOT, 1e-4, 1e-7)
     np.testing.assert_allclose(log.gnss.received - log.gnss.time, 0.1)
-    np.testing.assert_allclose(log.gnss.values["position_sigma_I"][0], [0.3, 0.3, 0.6], rtol=1e-6)
+    np.testing.assert_allclose(log.gnss.values["gnss_sigma"][0], [0.3, 0.3, 0.6], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("version", "name"), [(1, "flight.bag"), (2, "flight")])
@@ -70,7 +70,7 @@ def test_ros_bag_has_the_numbers_of_the_flight(flight, tmp_path, version, name):
     log = read_log(bag.write(tmp_path / name))
     check(log, flight, EPOCH, imu=1e-12, places=1e-6, speeds=1e-12)
     check_aids(log, flight, EPOCH, 0.01, 1e-12, above=HEIGHT)
-    sigma = log.gnss.values["position_sigma_I"]
+    sigma = log.gnss.values["gnss_sigma"]
     np.testing.assert_allclose(sigma[np.isfinite(sigma).all(axis=1)][0], [0.2, 0.2, 0.4])
 
 
@@ -121,4 +121,4 @@ def test_euroc_folder_has_the_numbers_of_the_flight(flight, tmp_path, up):
     np.testing.assert_allclose(log.imu.time - 1000.0, flight.time, atol=2e-6)
     for name in ("gyro", "accel"):
         np.testing.assert_allclose(log.imu.values[name], getattr(flight, name), atol=1e-12)
-    np.testing.assert_array_equal(log.gnss.values["position_I"], flight.fixes)
+    np.testing.assert_array_equal(log.gnss.values["gnss_position_I"], flight.fixes)

@@ -82,12 +82,12 @@ def test_replay_of_a_px4_log_has_the_errors_of_the_flight(tmp_path):
     assert log.barometer_from_start
     np.testing.assert_allclose(log.imu.values["accel"], [s[2][3:] for s in recorded.imu], atol=1e-5)
     origin = np.array(PX4.gnss.reference_antenna_G)
-    there = log.gnss.values["position_G"] - origin
+    there = log.gnss.values["gnss_position_G"] - origin
     here = [s[2]["gnss_position"] for s in recorded.gnss]
     lengths = (np.linalg.norm(places, axis=1) for places in (there, here))
     np.testing.assert_allclose(*lengths, atol=1e-5)
     speeds = [s[2]["gnss_velocity"] for s in recorded.gnss]
-    np.testing.assert_allclose(log.gnss.values["velocity_I"], speeds, atol=1e-5)
+    np.testing.assert_allclose(log.gnss.values["gnss_velocity_I"], speeds, atol=1e-5)
 
 
 @pytest.mark.slow  # three flights of 5 s, each replayed
@@ -102,7 +102,7 @@ def test_baselines_added_to_a_px4_log_give_the_attitude(tmp_path):
         recorded.write_ulog(tmp_path / "flight.ulg", boot=0.0)
         log = read_log(tmp_path / "flight.ulg")
         baselines = np.array([values["gnss_baseline"] for _, _, values in recorded.gnss])
-        values = {**log.gnss.values, "baseline_G": baselines @ R_GI.T}
+        values = {**log.gnss.values, "gnss_baseline_G": baselines @ R_GI.T}
         told = Stream(log.gnss.time, log.gnss.received, values)
         result = replay(dataclasses.replace(log, gnss=told), sensors=PX4)
         k = np.rint(result.time * PX4.imu.rate).astype(int)[result.time > 1.0]

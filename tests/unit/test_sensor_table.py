@@ -8,7 +8,6 @@ import pytest
 import quad_gym
 from quad_gym.estimation.inputs import (
     checked_measurement,
-    keyword_of,
     measured_blocks,
     sigmas_of,
 )
@@ -67,7 +66,7 @@ EVERY = quad_gym.sensor_suite("rtk").replace(**{name: kind() for name, kind in A
 @pytest.mark.parametrize("name", READINGS)
 def test_wrong_measurement_of_any_reading_is_refused_by_its_keyword(name):
     """The compiled check finds the number, and Python names the argument."""
-    keyword, sigma = keyword_of(name), READINGS[name].sigma
+    keyword, sigma = READINGS[name].keyword, READINGS[name].sigma
     right = np.ones(EVERY.shape_of(name))
     wrong = right.copy()
     wrong[(0,) * wrong.ndim] = np.inf

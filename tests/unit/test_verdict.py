@@ -124,7 +124,7 @@ def test_clocks_that_run_apart_are_named_with_their_ratio(skew):
     imu = Stream(log["time"][own], log["time"][own], {n: log[n][own] for n in ("gyro", "accel")})
     fixes = np.isfinite(log["gnss_velocity_enu"][:, 0])
     stamps = log["time"][fixes] / (1.0 - skew)
-    gnss = Stream(stamps, stamps, {"velocity_I": log["gnss_velocity_enu"][fixes]})
+    gnss = Stream(stamps, stamps, {"gnss_velocity_I": log["gnss_velocity_enu"][fixes]})
     case = SimpleNamespace(log=SimpleNamespace(imu=imu, gnss=gnss), result=result)
     found = [*rules.clocks(case)]
     assert bool(found) == (skew > 0.0)

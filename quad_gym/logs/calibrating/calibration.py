@@ -202,7 +202,7 @@ def _checked(log: Log, placed: SensorSuite, body: str) -> Log:
 
 def _reported(log: Log) -> Any:
     """Return the standard deviations (n, 3) of positions that a receiver reports, or None."""
-    sigmas = None if log.gnss is None else log.gnss.values.get("position_sigma_I")
+    sigmas = None if log.gnss is None else log.gnss.values.get("gnss_sigma")
     if sigmas is None:
         return None
     known = np.where(np.isfinite(sigmas) & (sigmas > 0.0), sigmas, np.nan)

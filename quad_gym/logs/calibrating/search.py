@@ -21,7 +21,7 @@ from quad_gym.logs.formats import Log
 from quad_gym.logs.formats.clocks import naming
 from quad_gym.logs.replaying.replay import replay
 from quad_gym.logs.replaying.results import correlation_time
-from quad_gym.params.sensor_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS
 from quad_gym.params.suites import LogDelays, SensorSuite
 
 # --------------------------------------------------------------------------------------------------
@@ -218,7 +218,7 @@ def has_heading(log: Log) -> bool:
 def has(log: Log, quantity: str) -> bool:
     """Return True if a log has a quantity of GNSS, such as "baseline"."""
     given = {} if log.gnss is None else log.gnss.values
-    values = [given[name] for name in (f"{quantity}_G", f"{quantity}_I") if name in given]
+    values = [given[name] for name in READINGS[f"gnss_{quantity}"].in_logs if name in given]
     return any(np.isfinite(value).any() for value in values)
 
 

@@ -228,11 +228,11 @@ def _gnss(tables: _Tables, parameters: Mapping[str, float]) -> Iterator[LogSourc
         fixed &= (table["Lat"] != 0.0) | (table["Lng"] != 0.0)
         place_lla = np.where(fixed, np.stack([table["Lat"], table["Lng"], table["Alt"]]), np.nan)
         values = {
-            "position_G": ecef_of(*place_lla),
-            "velocity_I": np.column_stack(
+            "gnss_position_G": ecef_of(*place_lla),
+            "gnss_velocity_I": np.column_stack(
                 [speed * np.sin(course), speed * np.cos(course), -table["VZ"]]
             ),
-            "position_sigma_I": positive(np.column_stack([h, h, v])),
+            "gnss_sigma": positive(np.column_stack([h, h, v])),
             "velocity_sigma": positive(s),
         }
         used = float(np.nanmean(table["U"])) if np.isfinite(table["U"]).any() else 0.0

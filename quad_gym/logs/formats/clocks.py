@@ -82,7 +82,7 @@ def without_repeats(recording: RawLog, source: LogSource) -> LogSource:
     kept = dict(source.values)
     for name, rows in frozen.items():
         if rows.any():
-            word = source.sensor if source.sensor != "gnss" else f"{name.split('_')[0]} of GNSS"
+            word = source.sensor if source.sensor != "gnss" else f"{name.split('_')[1]} of GNSS"
             recording.notes.append(_sentence(word, source, rows))
             kept[name] = values[name].copy()
             kept[name][rows] = np.nan

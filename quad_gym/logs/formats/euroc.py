@@ -61,7 +61,7 @@ def _places(root: Path, turn: Floats) -> Iterator[LogSource]:
         if "estimate" in name or not (known or _POSITION.search(heading)):
             continue
         time, numbers = _table(file, 8 if _QUATERNION.search(heading) else 4)
-        values = {"position_I": numbers[:, :3]}
+        values = {"gnss_position_I": numbers[:, :3]}
         yield LogSource(sensor="gnss", topic=name, time=time, values=values)
         if numbers.shape[1] >= 7:
             known_rows = np.linalg.norm(numbers[:, 3:7], axis=1) > 0.5

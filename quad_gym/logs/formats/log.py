@@ -97,8 +97,8 @@ LOG_COLUMNS = {
     "gnss_baseline": LogColumn(_xyz("gnss_baseline"), "m", "ECEF", "primary to secondary antenna"),
     "gnss_baseline_enu": LogColumn(_enu("gnss_baseline"), "m", "I", "between the antennas"),
     **{name: _of_aid(name) for name in AID_PARAMS},
-    "heading": LogColumn(("heading",), "rad", "I", "of the body x axis, from east toward north"),
     "attitude": LogColumn(tuple(f"attitude_{a}" for a in "wxyz"), "-", "B to I", "quaternion"),
+    "heading": LogColumn(("heading",), "rad", "I", "of the body x axis, from east toward north"),
     "motors": LogColumn(_MOTORS, "V", "-", "voltages of the motors, up to the next row with them"),
     "commands": LogColumn(_COMMANDS, "-", "-", "commands of the motors from 0 to 1, as `motors`"),
     "battery": LogColumn(("battery",), "V", "-", "voltage of the battery"),
@@ -152,9 +152,10 @@ class Log(_AidStreams):
 
     imu: Stream  #: IMU samples: gyro [rad/s] and accel [m/s^2], (n, 3) each, in B
     gnss: Stream | None = None
-    """GNSS measurements: position_G (n, 3) from the center of the Earth, or position_I from the
-    origin [m]; velocity_G or velocity_I [m/s]; baseline_G or baseline_I [m]; reported standard
-    deviations position_sigma_I (n, 3) [m], infinite along an axis that was not measured, and
+    """GNSS measurements, under the keywords of a filter's `update` or, in I, with this ending:
+    gnss_position_G (n, 3) from the center of the Earth, or gnss_position_I from the origin [m];
+    gnss_velocity_G or gnss_velocity_I [m/s]; gnss_baseline_G or gnss_baseline_I [m]; reported
+    standard deviations gnss_sigma (n, 3) [m], infinite along an axis that was not measured, and
     velocity_sigma (n,) [m/s]"""
     camera: Stream | None = None  #: images: pixels (n, features, 2) from the image's center
     attitude: Stream | None = None
@@ -256,9 +257,9 @@ class Log(_AidStreams):
 
         None, which also means `near_G`, if no position is relative to the center of the Earth.
         """
-        if self.gnss is None or "position_G" not in self.gnss.values:
+        if self.gnss is None or "gnss_position_G" not in self.gnss.values:
             return None
-        fixes = self.gnss.values["position_G"]
+        fixes = self.gnss.values["gnss_position_G"]
         known = fixes[np.isfinite(fixes).all(axis=1)]
         if not len(known):
             return None

@@ -146,9 +146,9 @@ def _gnss(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[LogSource]
         velocity = stack(topic, ["vel_e_m_s", "vel_n_m_s", "vel_d_m_s"]) * [1.0, 1.0, -1.0]
         valid = np.asarray(topic.get("vel_ned_valid", np.ones(len(fixed))), bool) & fixed
         values = {
-            "position_G": ecef_of(*place),
-            "velocity_I": np.where(valid[:, np.newaxis], velocity, np.nan),
-            "position_sigma_I": positive(stack(topic, ["eph", "eph", "epv"])),
+            "gnss_position_G": ecef_of(*place),
+            "gnss_velocity_I": np.where(valid[:, np.newaxis], velocity, np.nan),
+            "gnss_sigma": positive(stack(topic, ["eph", "eph", "epv"])),
             "velocity_sigma": positive(stack(topic, ["s_variance_m_s"])[:, 0]),
         }
         source = _source("gnss", name, topic, delay, instance=instance, tier=tier, values=values)
@@ -238,7 +238,7 @@ def _aids(topics: _Topics, parameters: Mapping[str, Any]) -> Iterator[LogSource]
         if np.any(np.asarray(topic.get("pose_frame", _NED)) != _NED):
             continue  # of unknown heading
         names = [f"position[{k}]" for k in (1, 0, 2)] if "position[0]" in topic else ["y", "x", "z"]
-        values = {"position_I": stack(topic, names) * [1.0, 1.0, -1.0]}
+        values = {"gnss_position_I": stack(topic, names) * [1.0, 1.0, -1.0]}
         yield _source("gnss", name, topic, instance=i, tier=2 + tier, values=values)
         values = {"quaternion": _to_enu(stack(topic, [f"q[{k}]" for k in range(4)]))}
         yield _source("attitude", name, topic, instance=i, tier=tier, values=values)

@@ -13,7 +13,7 @@ import numpy as np
 
 from quad_gym.frames import ecef_to_enu
 from quad_gym.logs.formats.log import Floats, Log, LogSource, RawLog, positive
-from quad_gym.params.sensor_table import AID_PARAMS
+from quad_gym.params.sensor_table import READINGS, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
 
 ENOUGH, LONG = 20, 2.0  #: number of rows, and their duration [s], from which a constant is dead
@@ -99,31 +99,31 @@ def _finite(source: LogSource) -> Any:
     """Return True for the rows in which all of a vector, or of one of several, was measured."""
     if not len(source):
         return np.ones(0, bool)
-    rows = [
-        np.isfinite(value.reshape(len(source), -1))
-        for name, value in source.values.items()
-        if "sigma" not in name
+    values, kind = source.values, SENSOR_PARAMS.get(source.sensor)
+    known = [
+        reading.known(values[key])
+        for reading in (() if kind is None else kind.readings(source.sensor))
+        for key in reading.in_logs
+        if key in values
     ]
-    if source.sensor == "camera":
-        return rows[0].any(axis=1)
-    if source.sensor in source.values and source.sensor in AID_PARAMS:
-        return AID_PARAMS[source.sensor].measured(source.values[source.sensor])
-    whole = [row.all(axis=1) for row in rows]
-    return np.any(whole, axis=0) if source.sensor == "gnss" else np.all(whole, axis=0)
+    if known:
+        return np.any(known, axis=0)
+    whole = [np.isfinite(value.reshape(len(source), -1)).all(axis=1) for value in values.values()]
+    return np.all(whole, axis=0)
 
 
 def _with_fix(source: LogSource) -> LogSource:
     """Return GNSS measurements without positions that no receiver has."""
-    if (places := source.values.get("position_G")) is not None:
+    if (places := source.values.get("gnss_position_G")) is not None:
         away = np.linalg.norm(places, axis=1)
         null = np.linalg.norm(places - [6378137.0, 0.0, 0.0], axis=1) < NULL_ISLAND
         ok = ~np.isfinite(away) | ((away > EARTH[0]) & (away < EARTH[1]) & ~null)
         return source.keep(ok, "no place on the Earth, or 0, 0")
-    if (places := source.values.get("position_I")) is None:
+    if (places := source.values.get("gnss_position_I")) is None:
         return source
     far = np.linalg.norm(places, axis=1) > FARTHEST
     source = source.keep(~far, "farther than 1000 km")
-    places = source.values["position_I"]
+    places = source.values["gnss_position_I"]
     away, time = np.linalg.norm(places, axis=1), source.time
     real = np.flatnonzero(away > 0.0)
     if not 0 < len(real) < len(away):
@@ -195,13 +195,13 @@ def compared(log: Log, suite: SensorSuite) -> Log:
 
 def _places(log: Log, origin_G: Floats | None) -> tuple[Floats, Floats]:
     """Return times (n,) and places (n, 3) of fixes in I."""
-    for name in ("position_I", "position_G"):
+    for name in ("gnss_position_I", "gnss_position_G"):
         places = None if log.gnss is None else log.gnss.values.get(name)
         if log.gnss is None or places is None:
             continue
         rows = np.isfinite(places).all(axis=1)
         time, places = log.gnss.time[rows], places[rows]
-        if name == "position_G" and len(places):
+        if name == "gnss_position_G" and len(places):
             origin = places[0] if origin_G is None else origin_G
             places = (places - origin) @ ecef_to_enu(origin).T
         return time, places
@@ -216,11 +216,11 @@ def _heights_of_gnss(log: Log, time: Floats, places: Floats) -> _Found:
     level = places[:, 2] + (places[:, :2] ** 2).sum(axis=1) / (2.0 * EARTH[0])
     if np.ptp(level) > 2e-3:
         return
-    sigma = gnss.values.get("position_sigma_I")
+    sigma = gnss.values.get("gnss_sigma")
     sigma = np.full((len(gnss), 3), np.nan) if sigma is None else sigma.copy()
     sigma[:, 2] = np.inf
     yield (
-        {"gnss": replace(gnss, values={**gnss.values, "position_sigma_I": sigma})},
+        {"gnss": replace(gnss, values={**gnss.values, "gnss_sigma": sigma})},
         "heights of GNSS are constant while the vehicle moves: they are not filled, and left out",
     )
 
@@ -239,15 +239,15 @@ def _motion(log: Log, time: Floats, places: Floats) -> tuple[str, _Motion] | Non
     gnss = log.gnss
     if gnss is None:
         return None
-    name = next((n for n in ("velocity_I", "velocity_G") if n in gnss.values), None)
+    name = next((n for n in ("gnss_velocity_I", "gnss_velocity_G") if n in gnss.values), None)
     if name is None or len(time) < ENOUGH:
         return None
     told = gnss.values[name]
     rows = np.isfinite(told).all(axis=1)
     if rows.sum() < ENOUGH:
         return None
-    if name == "velocity_G":
-        if (fixes := gnss.values.get("position_G")) is None:
+    if name == "gnss_velocity_G":
+        if (fixes := gnss.values.get("gnss_position_G")) is None:
             return None
         told = told @ ecef_to_enu(fixes[np.isfinite(fixes).all(axis=1)][0]).T
     ends, moved, mean = _motions(time, places, gnss.time[rows], told[rows])
@@ -298,7 +298,7 @@ def without(log: Log, quantity: str, span: tuple[float, float]) -> Log:
     inside = (log.gnss.time >= span[0]) & (log.gnss.time <= span[1])
     values = {
         name: np.where(inside[:, np.newaxis], np.nan, value)
-        if name in (f"{quantity}_G", f"{quantity}_I")
+        if name in READINGS[f"gnss_{quantity}"].in_logs
         else value
         for name, value in log.gnss.values.items()
     }

@@ -109,7 +109,7 @@ def _field_fits(
 ) -> dict[int, _FieldFit]:
     """Return a comparison with the Earth's field by compass, its `id`; empty: no place is known."""
     gnss, imu = chosen.get("gnss"), chosen.get("imu") or chosen.get("accel")
-    places = None if gnss is None else gnss.values.get("position_G")
+    places = None if gnss is None else gnss.values.get("gnss_position_G")
     if places is None or not np.isfinite(places).all(axis=1).any():
         return {}
     place = np.median(places[np.isfinite(places).all(axis=1)], axis=0)
@@ -359,20 +359,15 @@ def _stacked(positions: Stream | None, velocities: Stream) -> Stream:
         return velocities
     count = len(positions), len(velocities)
     values = {}
-    for name in {**positions.values, **velocities.values}:
+    for name, example in {**positions.values, **velocities.values}.items():
         parts = [
-            s.values[name] if name in s.values else np.full((n, *_shape(name)), np.nan)
+            s.values[name] if name in s.values else np.full((n, *example.shape[1:]), np.nan)
             for s, n in zip((positions, velocities), count, strict=True)
         ]
         values[name] = np.concatenate(parts)
     time = np.concatenate([positions.time, velocities.time])
     received = np.concatenate([positions.received, velocities.received])
     return Stream(time, received, values).rows(np.argsort(received, kind="stable"))
-
-
-def _shape(name: str) -> tuple[int, ...]:
-    """Return the shape of a value of GNSS."""
-    return () if name == "velocity_sigma" else (3,)
 
 
 def _report(chosen: Mapping[str, LogSource], sources: Sequence[LogSource]) -> dict[str, Any]:

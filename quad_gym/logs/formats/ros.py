@@ -203,7 +203,7 @@ def _sources(topic: str, kind: str, rows: Floats) -> Iterator[LogSource]:
             place = ecef_of(*np.where(fixed, numbers.T[:3], np.nan))
             sigma = np.sqrt(np.maximum(numbers[:, 5:], 0.0))
             sigma[(told == 0.0) | ~(sigma > 0.0).all(axis=1)] = np.nan
-            values = {"position_G": place, "position_sigma_I": positive(sigma)}
+            values = {"gnss_position_G": place, "gnss_sigma": positive(sigma)}
             yield LogSource(sensor=sensor, values=values, **some).keep(fixed, "no fix")
         case "FluidPressure":
             yield LogSource(sensor=sensor, values={"pressure": numbers[:, 0]}, **some)
@@ -215,9 +215,11 @@ def _sources(topic: str, kind: str, rows: Floats) -> Iterator[LogSource]:
         case "MagneticField":
             yield LogSource(sensor=sensor, values={"magnetometer": numbers}, **some)
         case _ if sensor == "gnss_velocity":
-            yield LogSource(sensor=sensor, values={"velocity_I": numbers}, **some)
+            yield LogSource(sensor=sensor, values={"gnss_velocity_I": numbers}, **some)
         case _ if sensor == "pose":
-            yield LogSource(sensor="gnss", values={"position_I": numbers[:, :3]}, tier=2, **some)
+            yield LogSource(
+                sensor="gnss", values={"gnss_position_I": numbers[:, :3]}, tier=2, **some
+            )
             yield LogSource(sensor="attitude", values={"quaternion": numbers[:, 3:]}, **some)
 
 

@@ -12,18 +12,35 @@ import numpy as np
 
 from quad_gym.logs.formats.log import LOG_COLUMNS, Floats, LogSource, RawLog, ecef_of
 from quad_gym.params import checks as check
-from quad_gym.params.sensor_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS
 
 # --------------------------------------------------------------------------------------------------
 # Logs from tables: data frames, mappings of columns, comma-separated files.
 # --------------------------------------------------------------------------------------------------
 
-_FORMS = {
-    "gnss": ("", "_lla", "_enu"),
-    "gnss_velocity": ("", "_enu"),
-    "gnss_baseline": ("", "_enu"),
+_SENSOR_AND_NAME = {
+    "gyro": ("imu", "gyro"),
+    "accel": ("imu", "accel"),
+    "gnss": ("gnss", "gnss_position_G"),
+    "gnss_lla": ("gnss", "gnss_position_G"),
+    "gnss_enu": ("gnss", "gnss_position_I"),
+    "gnss_sigma": ("gnss", "gnss_sigma"),
+    "gnss_velocity": ("gnss", "gnss_velocity_G"),
+    "gnss_velocity_enu": ("gnss", "gnss_velocity_I"),
+    "gnss_velocity_sigma": ("gnss", "velocity_sigma"),
+    "gnss_baseline": ("gnss", "gnss_baseline_G"),
+    "gnss_baseline_enu": ("gnss", "gnss_baseline_I"),
+    "heading": ("attitude", "heading"),
+    "attitude": ("attitude", "quaternion"),
+    "motors": ("motors", "motors"),
+    "commands": ("motors", "commands"),
 }
-"""Forms in which quantities may be given."""
+"""Sensors of quantities, and names of their values in a source; of others, both are the key."""
+
+_TIMES = ("time", "received")  #: columns that no sensor measures
+
+_TOGETHER = ("imu", "gnss")
+"""Sensors with several quantities in a source; of others, each quantity is a source by itself."""
 
 DISORDER = 0.1  #: share of steps back in time, of the IMU, that no recorder writes
 
@@ -183,55 +200,60 @@ def _together(columns: Columns, key: str) -> Floats | None:
 
 def sources_of(columns: Columns, body: str) -> Iterator[LogSource]:
     """Yield a source for each sensor with columns."""
-    axes = np.array([1.0, 1.0, 1.0] if body == "flu" else [1.0, -1.0, -1.0])
-
-    def source(sensor: str, **values: Floats | None) -> Iterator[LogSource]:
-        """The rows in which something was measured."""
-        given = {name: v for name, v in values.items() if v is not None}
-        rows = np.zeros(len(columns["time"]), bool)
-        for name, value in given.items():
-            if "sigma" not in name:
-                known = np.isfinite(value).reshape(len(rows), -1)
-                rows |= known.all(axis=1) if sensor == "imu" else known.any(axis=1)
-        if rows.any():
-            received = columns.get("received")
-            yield LogSource(
-                sensor=sensor,
-                topic="table",
-                time=columns["time"][rows],
-                received=None if received is None else received[rows],
-                row=np.flatnonzero(rows),
-                values={name: v[rows] for name, v in given.items()},
-            )
-
-    vectors = [name for name, kind in AID_PARAMS.items() if (kind.length, kind.frame) == (3, "B")]
-    turned = {key: _together(columns, key) for key in ("gyro", "accel", *vectors)}
-    turned = {key: None if v is None else v * axes for key, v in turned.items()}
-    halves = {name: turned[name] for name in ("gyro", "accel") if turned[name] is not None}
-    if len(halves) == 2:
-        yield from source("imu", **halves)
-    for name, values in halves.items() if len(halves) < 2 else ():
-        yield from source(name, **{name: values})
-    gnss: dict[str, Floats | None] = {
-        "position_sigma_I": _together(columns, "gnss_sigma"),
-        "velocity_sigma": _together(columns, "gnss_velocity_sigma"),
-    }
-    for key, quantity in zip(_FORMS, ("position", "velocity", "baseline"), strict=True):
-        forms = {form: _together(columns, key + form) for form in _FORMS[key]}
-        given = [key + form for form, values in forms.items() if values is not None]
+    found = _quantities(columns, body)
+    for reading in READINGS.values():
+        given = [key for key in found if _named(key)[1] in reading.in_logs]
         if len(given) > 1:
             raise ValueError(f"a log must have one of {', '.join(given)}, not both")
-        gnss[f"{quantity}_G"], gnss[f"{quantity}_I"] = forms[""], forms.get("_enu")
-        if (places := forms.get("_lla")) is not None:
-            gnss[f"{quantity}_G"] = ecef_of(*places.T)
-    yield from source("gnss", **gnss)
-    yield from source("camera", pixels=_image(columns))
-    for name in (*AID_PARAMS, "battery"):
-        yield from source(name, **{name: turned.get(name, _together(columns, name))})
-    yield from source("attitude", quaternion=_together(columns, "attitude"))
-    yield from source("attitude", heading=_together(columns, "heading"))
-    yield from source("motors", motors=_together(columns, "motors"))
-    yield from source("motors", commands=_together(columns, "commands"))
+    sources: dict[str, dict[str, Floats]] = {}
+    for key, numbers in found.items():
+        sensor, name = _named(key)
+        sources.setdefault(sensor if sensor in _TOGETHER else key, {})[name] = numbers
+    if len(sources.get("imu", {})) == 1:  # the half of one
+        sources |= {name: {name: half} for name, half in sources.pop("imu").items()}
+    if (pixels := _image(columns)) is not None:
+        sources["camera"] = {"pixels": pixels}
+    for key, values in sources.items():
+        half = key in ("gyro", "accel")
+        yield from _source(columns, key if half else _named(key)[0], values)
+
+
+def _named(key: str) -> tuple[str, str]:
+    """Return the sensor of a quantity, and the name of its values in a source."""
+    return _SENSOR_AND_NAME.get(key, (key, key))
+
+
+def _quantities(columns: Columns, body: str) -> dict[str, Floats]:
+    """Return the numbers (n, ...) of all quantities of sensors, vectors in the axes of B."""
+    axes = np.array([1.0, 1.0, 1.0] if body == "flu" else [1.0, -1.0, -1.0])
+    found = {}
+    for key, column in LOG_COLUMNS.items():
+        numbers = None if key in _TIMES else _together(columns, key)
+        if numbers is not None:
+            if key == "gnss_lla":
+                numbers = ecef_of(*numbers.T)
+            in_B = column.frame == "B" and numbers.shape[1:] == (3,)
+            found[key] = numbers * axes if in_B else numbers
+    return found
+
+
+def _source(columns: Columns, sensor: str, values: dict[str, Floats]) -> Iterator[LogSource]:
+    """Yield the rows in which something was measured, if there are any."""
+    rows = np.zeros(len(columns["time"]), bool)
+    for name, value in values.items():
+        if "sigma" not in name:
+            known = np.isfinite(value).reshape(len(rows), -1)
+            rows |= known.all(axis=1) if sensor == "imu" else known.any(axis=1)
+    if rows.any():
+        received = columns.get("received")
+        yield LogSource(
+            sensor=sensor,
+            topic="table",
+            time=columns["time"][rows],
+            received=None if received is None else received[rows],
+            row=np.flatnonzero(rows),
+            values={name: value[rows] for name, value in values.items()},
+        )
 
 
 def _image(columns: Columns) -> Floats | None:

@@ -46,7 +46,7 @@ def _first_speed(log: Log, suite: SensorSuite) -> float | None:
     gnss = log.gnss
     if gnss is None or suite.gnss is None:
         return None
-    known = (gnss.values[n] for n in ("position_G", "position_I") if n in gnss.values)
+    known = (gnss.values[n] for n in ("gnss_position_G", "gnss_position_I") if n in gnss.values)
     positions = next(known, np.empty((len(gnss), 0)))
     rows = np.isfinite(positions).all(axis=1) & (positions.shape[1] > 0)
     if not rows.any():
@@ -111,7 +111,7 @@ class LogStart:
         if name != "gnss":
             return False
         stream, log = self._measured.streams["gnss"], self._measured.log
-        fix, time = self._measured.fix(k), float(stream.time[k])
+        fix, time = self._measured.keywords("gnss", k), float(stream.time[k])
         averages = self._measured.suite.imu.samples == "average"
         first = float(log.imu.time[0 if averages else 1])  # an instant needs the sample before
         if "gnss_position_G" not in fix or time < first - LONGEST_STEP:
@@ -131,7 +131,7 @@ class LogStart:
                 fix["magnetometer"], self.field_row = fields[self._field], self._field
         if self.given.get("course") and "gnss_velocity_G" not in {**fix, **self.given}:
             why = "the first fix of the log has none"
-            if not self._measured.takes_velocity:
+            if not self._measured.suite.blocks_of("gnss_velocity"):
                 why = "the sensors take none: GnssParams.velocity_sigma is None"
             raise ValueError(f"a start by its course must have a GNSS velocity, but {why}")
         self.from_fix = self._widened({**fix, **self.given, "time": time}, self._measured.suite)

@@ -20,11 +20,11 @@ from quad_gym.estimation.starts import level
 from quad_gym.frames import ecef_to_enu
 from quad_gym.logs.formats import Floats, Log, Stream
 from quad_gym.params import checks as check
+from quad_gym.params.aids import ReadingDefinition
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.portable import turned
-from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import Aid
 from quad_gym.records.inputs import SAME_TIME, Outcome
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 
@@ -146,7 +146,7 @@ def held(log: Log, suite: SensorSuite, place: Any) -> tuple[Log, SensorSuite]:
         reference_antenna_G=reference.reference_antenna_G,
         position_sigma_I=(SIGMA, SIGMA, SIGMA),
     )
-    values = {"position_I": places, "position_sigma_I": sigma}
+    values = {"gnss_position_I": places, "gnss_sigma": sigma}
     return replace(log, gnss=Stream(time, time, values)), suite.replace(gnss=gnss)
 
 
@@ -164,7 +164,6 @@ class LogMeasurements:
     Attributes:
         streams: Streams that the suite uses, by name; the IMU first.
         unused: Names of the others.
-        takes_velocity: True if the suite uses velocities of GNSS.
         R_GI: (3, 3) axes of I in G.
     """
 
@@ -174,11 +173,17 @@ class LogMeasurements:
         used = {name: stream for name, stream in given.items() if self._uses(name)}
         self.streams = {"imu": log.imu, **used}
         self._names = list(self.streams)
-        self.takes_velocity = suite.gnss is not None and suite.gnss.velocity_sigma is not None
-        self.unused = tuple(name for name in given if name not in used)
-        if "gnss" in used and not self.takes_velocity:
-            velocities = {"velocity_G", "velocity_I"} & set(used["gnss"].values)
-            self.unused += ("gnss_velocity",) if velocities else ()
+        self._taken: dict[str, list[tuple[ReadingDefinition, str]]] = {}
+        left_out = [name for name in given if name not in used]
+        for name in (name for name in used if name in SENSOR_PARAMS):
+            self._taken[name] = []
+            for reading in SENSOR_PARAMS[name].readings(name):
+                keys = [key for key in reading.in_logs if key in used[name].values]
+                if suite.blocks_of(reading.name):
+                    self._taken[name] += [(reading, key) for key in keys]
+                elif keys:
+                    left_out.append(reading.name)
+        self.unused = tuple(left_out)
         if "camera" in used:
             assert suite.camera is not None
             have = used["camera"].values["pixels"].shape[1]
@@ -197,7 +202,7 @@ class LogMeasurements:
         if name != "attitude":
             return getattr(self.suite, name) is not None
         gnss, given = self.suite.gnss, self.log.gnss
-        told = given is not None and {"baseline_G", "baseline_I"} & set(given.values)
+        told = given is not None and {*READINGS["gnss_baseline"].in_logs} & set(given.values)
         return gnss is not None and gnss.has_baseline and not told
 
     def number(self, name: str) -> int:
@@ -213,57 +218,38 @@ class LogMeasurements:
     def present(self, number: int, rows: Any) -> NDArray[np.bool_]:
         """Return True for the rows of a stream, by its number, in which something was measured."""
         name = self._names[number]
-        found = np.full(len(rows), name in ("camera", "attitude"))
-        values, wanted = self.streams[name].values, [name]
-        if name == "gnss":
-            quantities = ("position", "baseline", "velocity")[: 3 if self.takes_velocity else 2]
-            wanted = [f"{quantity}_{frame}" for quantity in quantities for frame in "GI"]
-        for key in wanted:
-            if key in AID_PARAMS:
-                found |= AID_PARAMS[key].measured(values[key][rows])
-            elif key in values and not found.all():
-                found |= np.isfinite(values[key][rows]).reshape(len(rows), -1).all(axis=1)
+        found = np.full(len(rows), name == "attitude")
+        for reading, key in self._taken.get(name, ()):
+            values = self.streams[name].values[key][rows]
+            found |= reading.known(values, self.suite.blocks_of(reading.name))
         return found
 
     def at(self, name: str, k: int) -> Measurement | None:
         """Return measurement k of a stream; None: nothing was measured."""
-        if name == "gnss":
-            found = checked_measurement(self.suite, self.fix(k))
-            return found if found["valid"].any() else None
-        if name == "camera":
-            return checked_measurement(
-                self.suite, {"pixels": self.streams[name].values["pixels"][k]}
-            )
+        found = checked_measurement(self.suite, self.keywords(name, k))
+        if name == "attitude" and "heading" in self.streams[name].values:
+            sigmas_of(found, "gnss_baseline")[:] = HEADING_ALONE
+        return found if found["valid"].any() else None
+
+    def keywords(self, name: str, k: int) -> dict[str, Any]:
+        """Return measurement k of a stream as keywords of `update`; of an attitude, a baseline."""
         if name == "attitude":
             assert self.suite.gnss is not None
             baseline_I = turned(self._attitude(k).T, self.suite.gnss.baseline_B)
-            alone = "heading" in self.streams[name].values
-            baseline = {"gnss_baseline_G": turned(self.R_GI, baseline_I)}
-            found = checked_measurement(self.suite, baseline)
-            if alone:
-                sigmas_of(found, "gnss_baseline")[:] = HEADING_ALONE
-            return found
-        aid = Aid[name.upper()]
-        params, value = self.suite.aids[aid], self.streams[name].values[name][k]
-        values = np.reshape(value, (-1, params.length))[: params.blocks]
-        known = np.asarray(np.isfinite(values).all(axis=1))
-        if not known.any():
-            return None
-        shape = self.suite.shape_of(name)
-        return checked_measurement(self.suite, {name: values.reshape(shape)})
-
-    def fix(self, k: int) -> dict[str, Any]:
-        """Return the GNSS measurements of one instant as keywords of `update`."""
-        found: dict[str, Any] = {}
-        if (position := self._vector_G("position", k)) is not None:
-            found["gnss_position_G"] = position
-            self._add_noise(found, "gnss_sigma", "position_sigma_I", k)
-        if (baseline := self._vector_G("baseline", k)) is not None:
-            found["gnss_baseline_G"] = baseline
-        velocity = self._vector_G("velocity", k) if self.takes_velocity else None
-        if velocity is not None:
-            found["gnss_velocity_G"] = velocity
-            self._add_noise(found, "velocity_sigma", "velocity_sigma", k)
+            return {"gnss_baseline_G": turned(self.R_GI, baseline_I)}
+        values, found = self.streams[name].values, dict[str, Any]()
+        for reading, key in self._taken[name]:
+            count = self.suite.blocks_of(reading.name)
+            if reading.keyword in found or not reading.known(values[key][k : k + 1], count)[0]:
+                continue
+            value = np.reshape(values[key][k], (-1, reading.length))[:count]
+            value = value.reshape(self.suite.shape_of(reading.name))
+            if reading.in_G and key != reading.keyword:
+                value = turned(self.R_GI, value)
+            elif reading.from_center:
+                value = value - self._origin
+            found[reading.keyword] = value
+            self._add_noise(found, name, reading, k)
         return found
 
     def heading(self, time: float) -> float | None:
@@ -284,28 +270,21 @@ class LogMeasurements:
             return quaternion_to_dcm(values["quaternion"][k])
         return level(float(values["heading"][k]))
 
-    def _vector_G(self, quantity: str, k: int) -> Floats | None:
-        """Return a vector in G, positions relative to the origin; None: not measured."""
-        for frame in "GI":
-            values = self.streams["gnss"].values.get(f"{quantity}_{frame}")
-            if values is not None and np.isfinite(values[k]).all():
-                vector = values[k] if frame == "G" else turned(self.R_GI, values[k])
-                from_center = frame == "G" and quantity == "position"
-                return vector - self._origin if from_center else vector
-        return None
-
-    def _add_noise(self, found: dict[str, Any], keyword: str, name: str, k: int) -> None:
-        """Add the accuracy that a receiver reports."""
-        values = self.streams["gnss"].values.get(name)
+    def _add_noise(
+        self, found: dict[str, Any], sensor: str, reading: ReadingDefinition, k: int
+    ) -> None:
+        """Add the accuracy that a receiver reports: infinity for an axis that was not measured."""
+        values = self.streams[sensor].values.get(reading.sigma) if reading.reported else None
         if values is None:
             return
-        sigma, suites = values[k], self.suite.gnss
-        if name == "position_sigma_I" and np.isinf(sigma).any() and suites is not None:
-            known = sigma if self._reported else np.full(3, np.nan)
-            known = np.where(np.isnan(known), suites.position_sigma_I, known)
-            found[keyword] = np.where(np.isinf(sigma), UNMEASURED, known)
+        sigma = values[k]
+        if np.isinf(sigma).any():
+            known = sigma if self._reported else np.full_like(sigma, np.nan)
+            own = getattr(getattr(self.suite, sensor), reading.noise)
+            known = np.where(np.isnan(known), own, known)
+            found[reading.sigma] = np.where(np.isinf(sigma), UNMEASURED, known)
         elif self._reported and np.isfinite(sigma).all():
-            found[keyword] = sigma if values.ndim > 1 else float(sigma)
+            found[reading.sigma] = sigma if values.ndim > 1 else float(sigma)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def suite_for(log: Log) -> tuple[str, str]:
     the suite that uses most of the log's sensors, as far as they measure position or velocity.
     """
     values = {} if log.gnss is None else log.gnss.values
-    if {"baseline_G", "baseline_I"} & set(values):
+    if {"gnss_baseline_G", "gnss_baseline_I"} & set(values):
         return "rtk", "the log has a receiver with two antennas"
     if log.gnss is not None and log.attitude is not None:
         return "mocap", "the log has positions and attitudes of motion capture"

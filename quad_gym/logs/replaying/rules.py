@@ -408,10 +408,10 @@ def _clock_lags(case: Evidence) -> Floats:
     gnss = log.gnss
     if gnss is None or result.sensors.gnss is None or len(result) < BLOCK:
         return none
-    velocity = gnss.values.get("velocity_I")
-    if velocity is None and "velocity_G" in gnss.values:
+    velocity = gnss.values.get("gnss_velocity_I")
+    if velocity is None and "gnss_velocity_G" in gnss.values:
         origin = np.array(result.sensors.gnss.reference_antenna_G)
-        velocity = gnss.values["velocity_G"] @ ecef_to_enu(origin).T
+        velocity = gnss.values["gnss_velocity_G"] @ ecef_to_enu(origin).T
     if velocity is None:
         return none
     rows = np.flatnonzero(np.isfinite(velocity).all(axis=1))
