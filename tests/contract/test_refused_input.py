@@ -263,6 +263,8 @@ OTHERS = [
         for mode in ("Sometimes", None, 1, "same", "NEXT_STEP")
     ),
     (partial(QuadEnv, estimator=quad_gym.Estimator), "estimator must define update"),
+    (partial(TaskParams, kind="hover", gate_count=3), "gate_count has no effect on the task hover"),
+    (partial(TaskParams, start="hover", pad=False), 'pad has no effect with start="hover"'),
     (partial(QuadEnv, "hover", min_height=1.01), "min_height must be at most 1 m"),
     (partial(QuadEnv, start="ground", min_height=0.01), "min_height must be at most 0 m"),
     # ---- others

@@ -22,6 +22,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.camera import _features
 from quad_gym.params.checks import Checked, _unless_none
 from quad_gym.params.suites import given_suite
+from quad_gym.params.task import ONE_TASK_FIELDS
 from quad_gym.params.uwb_range import _anchors
 from quad_gym.params.vehicle import Clocks
 from quad_gym.params.world import Obstacle
@@ -304,7 +305,9 @@ def table():
                 cases = NARROWER.get(key) or KINDS[rule](**given)
             if optional:
                 cases = [*cases, (None, "none")]
-            rows += [(nominal, name, good, bad) for good, bad in cases]
+            one_task = type(nominal) is TaskParams and ONE_TASK_FIELDS.get(name)
+            one = nominal.replace(kind=one_task) if one_task else nominal
+            rows += [(one, name, good, bad) for good, bad in cases]
     return rows
 
 

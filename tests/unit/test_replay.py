@@ -112,6 +112,23 @@ def test_baselines_added_to_a_px4_log_give_the_attitude(tmp_path):
     assert abs(math.sqrt(sums[0] / sums[1]) - 1.0) < 0.1
 
 
+def test_baselines_of_a_log_are_left_out_with_one_antenna():
+    count, rng = 400, np.random.default_rng(0)
+    fixes = np.arange(0, count, 40)
+    columns = {
+        "time": np.arange(count) / 200.0,
+        "gyro": 1e-3 * rng.normal(size=(count, 3)),
+        "accel": [0.0, 0.0, 9.81] + 0.05 * rng.normal(size=(count, 3)),
+        "gnss_enu": np.full((count, 3), np.nan),
+        "gnss_baseline_enu": np.full((count, 3), np.nan),
+    }
+    columns["gnss_enu"][fixes] = 0.5 * rng.normal(size=(len(fixes), 3))
+    columns["gnss_baseline_enu"][fixes] = [0.19, 0.0, 0.0]
+    result = replay(columns, sensors="consumer", start={"heading": 0.0})
+    assert result.unused == ("gnss_baseline",)
+    assert list(result.measured) == ["gnss_position"]
+
+
 def test_late_aiding_sensors_find_an_unknown_heading(tmp_path):
     """Barometer and magnetometer arrive late, and the first magnetic field comes after 3 s."""
     pytest.importorskip("pyulog")
