@@ -16,11 +16,46 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+import quad_gym
 from baselines.keeping import STATE, RunKeeper, best_file, reading_checkpoint, replace_file
 from baselines.recipes import Linear, Plan, Recipe, first_seed
 from quad_gym.params import checks as check
+
+# --------------------------------------------------------------------------------------------------
+# The flights of a training with Stable-Baselines3.
+# --------------------------------------------------------------------------------------------------
+
+
+class ScaledReward(VecEnvWrapper):
+    """Wrapper that multiplies the reward; returns in episode records are not scaled."""
+
+    def __init__(self, venv: VecEnv, scale: float) -> None:
+        super().__init__(venv)
+        self.scale = np.float32(scale)
+
+    def reset(self) -> Any:
+        """Begin an episode in each flight."""
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        """Return the results of the step, with scaled rewards."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, rewards * self.scale, dones, infos
+
+
+def make_flights(plan: Plan) -> ScaledReward:
+    """Make the environment to train in, seeded."""
+    env = quad_gym.make_sb3_vec_env(
+        plan.env_id,
+        n_envs=plan.recipe.n_envs,
+        seed=first_seed("training", plan.seed, plan.recipe.n_envs),
+        threads=plan.threads,
+        **plan.training_keywords,
+    )
+    return ScaledReward(env, plan.recipe.reward_scale)
+
 
 # --------------------------------------------------------------------------------------------------
 # Untrained models of Stable-Baselines3 for a plan.
@@ -212,7 +247,7 @@ def run(
 ) -> Keeper:
     """Train with Stable-Baselines3, or resume from the last checkpoint; see `training.train`."""
     torch.set_num_threads(1)  # networks of this size do not benefit from more
-    env = plan.make_flights()
+    env = make_flights(plan)
     model = make_model(plan, env, folder / "tensorboard" if tensorboard else None)
     keeper = Keeper(plan, folder, judge, quiet=quiet)
     resuming = (folder / LAST).exists()

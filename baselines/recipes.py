@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import gymnasium
 
@@ -19,10 +19,6 @@ from quad_gym.analysis.reports import as_json
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 from quad_gym.params.suites import contents_of_suite_files
-
-if TYPE_CHECKING:
-    from baselines.scaled_reward import ScaledReward
-
 
 # --------------------------------------------------------------------------------------------------
 # Disjoint blocks of seeds for flights in training, validation and test.
@@ -266,18 +262,10 @@ class Plan(Checked):
         """Support pickling, to send plans to other processes."""
         return unfreeze(self)
 
-    def make_flights(self) -> "ScaledReward":
-        """Make the environment to train in with Stable-Baselines3."""
-        from baselines.scaled_reward import ScaledReward
-
-        env = quad_gym.make_sb3_vec_env(
-            self.env_id,
-            n_envs=self.recipe.n_envs,
-            seed=first_seed("training", self.seed, self.recipe.n_envs),
-            threads=self.threads,
-            **{**self.recipe.flights, **self.environment, **self.learning},
-        )
-        return ScaledReward(env, self.recipe.reward_scale)
+    @property
+    def training_keywords(self) -> dict[str, Any]:
+        """Keywords of the environment in training."""
+        return {**self.recipe.flights, **self.environment, **self.learning}
 
     def make_vector_flights(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
         """Make the environment to train in with the compiled engine; it is not seeded."""
@@ -285,8 +273,8 @@ class Plan(Checked):
             self.env_id,
             num_envs=self.recipe.n_envs,
             threads=self.threads,
-            **{**self.recipe.flights, **self.environment, **self.learning},
             autoreset_mode="SameStep",
+            **self.training_keywords,
         )
 
     def make_judge(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:

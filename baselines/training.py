@@ -6,7 +6,8 @@ The folder contains
   Stable-Baselines3; `last.zip` also contains the state for resuming: flights, random number
   generators and counters (and `replay_*.pickle` in addition, for algorithms with a replay buffer);
 - or, from the compiled engine, `last.npz` and `best.npz`, in the format of `MlpPolicy`;
-- `training.json`: plan, versions, seeds, wall time; `evaluations.csv`: errors during training;
+- `training.json`: plan, every keyword of the evaluations, versions, seeds, wall time;
+- `evaluations.csv`: errors during training;
 - `training.lock`, and `training.process`: the process that trains in the folder, or did last;
 - files for TensorBoard.
 
@@ -85,10 +86,10 @@ def require_model(plan: Plan) -> None:
         make_compiled(plan).env.close()
         return
     try:
-        from baselines.models import make_model
+        from baselines.models import make_flights, make_model
     except ImportError as error:
         raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
-    make_model(plan, plan.make_flights())
+    make_model(plan, make_flights(plan))
 
 
 def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
@@ -120,9 +121,13 @@ def _train(plan: Plan, folder: Path, resume: bool, options: Mapping[str, bool]) 
     if before is not None and before["finished"]:
         return _result(plan, folder, before)
     judge = plan.make_judge()
+    flown = {
+        "plan": described,
+        "interface": interface_of(judge),
+        "configuration": judge.unwrapped.flights.config.described,  # type: ignore[attr-defined]
+    }
     if before is None:
-        begun = {"plan": described, "interface": interface_of(judge), "finished": False}
-        _write_record(folder, begun)
+        _write_record(folder, {**flown, "finished": False})
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import run as run_compiled
 
@@ -132,8 +137,7 @@ def _train(plan: Plan, folder: Path, resume: bool, options: Mapping[str, bool]) 
 
         keeper = run(plan, folder, judge, **options)
     record = {
-        "plan": described,
-        "interface": interface_of(judge),
+        **flown,
         **{name: getattr(keeper, name) for name in ("finished", "steps", "best", "last")},
         "training_seconds": keeper.seconds,
         "steps_per_second": keeper.steps / max(keeper.seconds, 1e-9),

@@ -278,6 +278,17 @@ class EnvConfig(Checked, eq=False, bare=True):
         super().__post_init__()
         check_limit(self.task, self.vehicle.control_rate, "control_rate")
 
+    @property
+    def described(self) -> dict[str, Any]:
+        """Every keyword with its value, by parts, for records of what was flown."""
+        parts = {name: vars(part) for name, part in vars(self).items() if isinstance(part, Checked)}
+        return {
+            "name": self.name,
+            "tasks": self.tasks,
+            "max_episode_steps": self.max_steps,
+            **parts,
+        }
+
     @cached_property
     def suite(self) -> SensorSuite:
         """The sensor suite that `sensors`, `camera` and `estimator` select."""

@@ -193,14 +193,14 @@ def test_training_with_the_same_draws_equals_stable_baselines(activation, normal
     torch = pytest.importorskip("torch")
     pytest.importorskip("stable_baselines3")
     from baselines.compiled_ppo.run import make_compiled
-    from baselines.models import make_model
+    from baselines.models import make_flights, make_model
 
     parameters = {**recipe(CIRCLE).parameters, "n_steps": 64, "batch_size": 256}
     parameters |= {"normalize_advantage": normalize, "ent_coef": 0.02, "vf_coef": 0.7}
     changes = {"activation": activation, "parameters": parameters, "n_envs": 16}
     steps = 3 * 16 * 64
     plan = small_plan(recipe=recipe(CIRCLE).replace(steps=steps, **changes))
-    ours, theirs = make_compiled(plan), make_model(plan, plan.make_flights())
+    ours, theirs = make_compiled(plan), make_model(plan, make_flights(plan))
     nets, networks = theirs.policy.mlp_extractor, ours.networks
     pairs = [(theirs.policy.log_std, networks.log_std)]
     for table, layers in (

@@ -68,14 +68,14 @@ def test_refuses_seeds_out_of_their_block(purpose, seed, count, message):
 def test_trainings_are_evaluated_on_seeds_of_validation_block():
     """The algorithm also seeds its environment, which must not change the flights."""
     pytest.importorskip("stable_baselines3")
-    from baselines.models import Keeper, make_model
+    from baselines.models import Keeper, make_flights, make_model
     from baselines.recipes import Plan, recipe
 
     flown = []
     for seed in (0, 4):
         small = {"environment": {"duration": 0.1}, "threads": 1, "episodes": 8}
         plan = Plan(recipe=recipe("QuadGym/Circle-v0").replace(n_envs=16), seed=seed, **small)
-        env, judge = plan.make_flights(), plan.make_judge()
+        env, judge = make_flights(plan), plan.make_judge()
         model = make_model(plan, env)
         env.reset()
         trained = keys_flown(env.unwrapped.flights.batch)

@@ -18,7 +18,7 @@ pytest.importorskip("stable_baselines3")
 
 from baselines.keeping import STATE  # noqa: E402
 from baselines.mlp import MlpPolicy, mlp_of  # noqa: E402
-from baselines.models import _checked_parameters, algorithm_class, make_model  # noqa: E402
+from baselines.models import _checked_parameters, algorithm_class, make_flights, make_model  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
 from baselines.recipes import (  # noqa: E402
     ALGORITHMS,
@@ -84,9 +84,9 @@ def test_equal_seeds_give_equal_policies_and_others_do_not(trained, tmp_path):
 
 def test_keywords_of_the_environment_hold_in_training_too():
     plan = small_plan()
-    assert plan.make_flights().unwrapped.flights.batch.task.start == "mixed"  # from the recipe
+    assert make_flights(plan).unwrapped.flights.batch.task.start == "mixed"  # from the recipe
     given = {"start": "ground", "randomize_reference": False, "sensors": "rtk"}
-    batch = small_plan(environment=given).make_flights().unwrapped.flights.batch
+    batch = make_flights(small_plan(environment=given)).unwrapped.flights.batch
     assert (batch.task.start, batch.task.randomize_reference) == ("ground", False)
     assert batch.sensors == quad_gym.sensor_suite("rtk")
 
@@ -94,7 +94,7 @@ def test_keywords_of_the_environment_hold_in_training_too():
 def test_td3_explores_with_action_noise():
     """TD3's policy is deterministic, so exploration needs action noise."""
     plan = small_plan("td3")
-    model = make_model(plan, plan.make_flights())
+    model = make_model(plan, make_flights(plan))
     model.learn(800)
     noise = model.action_noise
     drawn = np.concatenate([noise() for _ in range(200)])
@@ -206,6 +206,9 @@ def test_a_folder_with_a_run_is_not_overwritten(trained):
     record = json.loads((trained / "training.json").read_text())
     assert record["finished"]
     assert record["plan"]["recipe"]["flights"] == {"start": "mixed", "randomize_reference": True}
+    flown = record["configuration"]  # defaults, too
+    assert (flown["name"], flown["task"]["radius"]) == ("circle", 4.0)
+    assert (flown["sensors"]["sensors"], flown["vehicle"]["control_rate"]) == ("standard", 50.0)
     assert os.path.getsize(trained / "evaluations.csv") > 0
     with zipfile.ZipFile(trained / "last.zip") as archive:
         kept = archive.read(STATE)  # survives a move of any module or class
@@ -216,7 +219,7 @@ def test_a_folder_with_a_run_is_not_overwritten(trained):
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3", "tqc"])
 def test_plain_weights_act_as_the_model_does(tmp_path, algorithm):
     plan = small_plan(algorithm)
-    model = make_model(plan, plan.make_flights())
+    model = make_model(plan, make_flights(plan))
     policy = mlp_of(model, {"interface": {}})
     policy.save(tmp_path / "p.npz")
     loaded = MlpPolicy.load(tmp_path / "p.npz")

@@ -75,7 +75,7 @@ def observations_in_flight(controller, count):
 def stable_baselines_file(folder, algorithm, keywords=None):
     """Save an untrained policy of Stable-Baselines3."""
     pytest.importorskip("stable_baselines3")
-    from baselines.models import make_model
+    from baselines.models import make_flights, make_model
     from baselines.recipes import Plan, recipe
 
     chosen = recipe(CIRCLE, algorithm).replace(n_envs=2)
@@ -84,7 +84,7 @@ def stable_baselines_file(folder, algorithm, keywords=None):
             activation="tanh", parameters={**chosen.parameters, "batch_size": 64}
         )
     plan = Plan(recipe=chosen, environment=keywords or {}, threads=1)
-    model = make_model(plan, plan.make_flights())
+    model = make_model(plan, make_flights(plan))
     let_act(model)
     model.save(folder / "policy.zip")
     return folder / "policy.zip"
