@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # _LAZY imports them on first use
     from quad_gym.logs.calibrating.vehicle_fit import FittedNumber, FittedVehicle, fit_vehicle
     from quad_gym.logs.formats import LOG_COLUMNS, Log, LogColumn, Reading, Stream, read_log
     from quad_gym.logs.replaying.replay import replay
-    from quad_gym.logs.replaying.results import Measured, Replay, Smoothed
+    from quad_gym.logs.replaying.results import InnovationSeries, Replay, Smoothed
     from quad_gym.logs.smoothing import smooth
 
 
@@ -29,7 +29,7 @@ _LAZY = {  # of the wing of logs, which imports this package
     "LOG_COLUMNS": "quad_gym.logs.formats",
     "Log": "quad_gym.logs.formats",
     "LogColumn": "quad_gym.logs.formats",
-    "Measured": "quad_gym.logs.replaying.results",
+    "InnovationSeries": "quad_gym.logs.replaying.results",
     "Reading": "quad_gym.logs.formats",
     "Replay": "quad_gym.logs.replaying.results",
     "Smoothed": "quad_gym.logs.replaying.results",
@@ -51,10 +51,10 @@ __all__ = [
     "FirstFix",
     "FittedNumber",
     "FittedVehicle",
+    "InnovationSeries",
     "Innovations",
     "Log",
     "LogColumn",
-    "Measured",
     "Reading",
     "Replay",
     "Smoothed",

@@ -8,7 +8,7 @@ import numpy as np
 from quad_gym.analysis.metrics import chi_square_quantile
 from quad_gym.analysis.plots import BLUE, GREEN, GREY, ORANGE, PALE, VERMILLION, house_style, panels
 from quad_gym.logs.calibrating.calibration import Calibration
-from quad_gym.logs.replaying.results import Measured, Replay, by_sensor
+from quad_gym.logs.replaying.results import InnovationSeries, Replay, by_sensor
 from quad_gym.params.sensor_table import AID_PARAMS
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
@@ -47,7 +47,7 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3)
 
 
-def draw_nis(axes: Any, measured: Measured, title: str) -> None:
+def draw_nis(axes: Any, measured: InnovationSeries, title: str) -> None:
     """Draw the NIS per degree of freedom (DOF), rejected measurements, and the 99 % quantile."""
     freedoms = measured.innovation.shape[1]
     bound = chi_square_quantile(freedoms, 0.99) / freedoms
@@ -86,7 +86,7 @@ def replay_figure(result: Replay, title: str) -> Any:
     return figure
 
 
-def sensors_of(result: Replay) -> dict[str, Measured]:
+def sensors_of(result: Replay) -> dict[str, InnovationSeries]:
     """Innovations by sensor; the innovations of all features are combined."""
     kinds = by_sensor(result.measured)
     return {name: kinds[name] for name in _SENSORS if name in kinds}

@@ -16,7 +16,7 @@ from quad_gym.logs.replaying import rules
 from quad_gym.logs.replaying.results import (
     QUANTITIES,
     Finding,
-    Measured,
+    InnovationSeries,
     Severity,
     by_quantity,
     exceeds,
@@ -263,7 +263,7 @@ def measured(innovation, rejected):
     gate = np.where(rejected, GateDecision.REJECTED, GateDecision.ACCEPTED)
     time = np.arange(len(innovation), dtype=float)
     nis = (innovation**2).sum(axis=1)
-    return Measured(time, time, innovation, np.ones_like(innovation), nis, gate)
+    return InnovationSeries(time, time, innovation, np.ones_like(innovation), nis, gate)
 
 
 def test_mean_nis_is_per_degree_of_freedom_and_includes_rejected_measurements():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from quad_gym.frames import geodetic_to_ecef
 from quad_gym.params import checks as check
-from quad_gym.params.sensor_table import AID_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records.inputs import MOUNTING
 from quad_gym.rotations import euler_to_dcm
@@ -128,7 +128,7 @@ class Stream:
         return Stream(self.time[chosen], self.received[chosen], values)
 
 
-MEASURED = ("imu", "gnss", "camera", *AID_PARAMS, "attitude")
+MEASURED = ("imu", *SENSOR_PARAMS, "attitude")
 """Sensors of a log, in the order in which measurements that arrive together are processed."""
 
 

@@ -23,7 +23,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.aids import ReadingDefinition
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.portable import turned
-from quad_gym.params.sensor_table import AID_PARAMS, READINGS, SENSOR_PARAMS
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS, SENSOR_OF, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records.inputs import SAME_TIME, Outcome
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
@@ -118,10 +118,11 @@ SENTENCE = (
 
 def lacks_position(log: Log, suite: SensorSuite) -> bool:
     """Return True if no sensor of a filter measures position or velocity in a log."""
-    moving = [n for n, kind in AID_PARAMS.items() if {"position", "velocity"} & {*kind.observes}]
+    moving = {"position", "velocity"}
     return not any(
-        getattr(suite, name) is not None and name in log.streams
-        for name in ("gnss", "camera", *moving)
+        getattr(suite, SENSOR_OF[name]) is not None and SENSOR_OF[name] in log.streams
+        for name, reading in READINGS.items()
+        if moving & {*reading.observes}
     )
 
 

@@ -32,7 +32,7 @@ from quad_gym.logs.replaying.measurements import (
     lacks_position,
     nothing_in_common,
 )
-from quad_gym.logs.replaying.results import Measured, Replay, collected, name_of
+from quad_gym.logs.replaying.results import InnovationSeries, Replay, collected, name_of
 from quad_gym.packing import blocks_of
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
@@ -433,7 +433,7 @@ class OwnPlayer:
             unused=self._player.unused,
         )
 
-    def _measured(self) -> dict[str, Measured]:
+    def _measured(self) -> dict[str, InnovationSeries]:
         """Return times of the measurements, by kind; their innovations are unknown."""
         found = {}
         for block in blocks_of(self._suite):
@@ -442,5 +442,7 @@ class OwnPlayer:
                 unknown = np.full((len(stamps), FREEDOMS[block]), np.nan)
                 none = np.zeros(len(stamps))
                 times = stamps[:, 0], stamps[:, 1]
-                found[name_of(block)] = Measured(*times, unknown, unknown, unknown[:, 0], none)
+                found[name_of(block)] = InnovationSeries(
+                    *times, unknown, unknown, unknown[:, 0], none
+                )
         return found

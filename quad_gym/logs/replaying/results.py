@@ -89,8 +89,8 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """Innovations of one kind of measurement."""
+class InnovationSeries:
+    """Innovations of one kind of measurement in a replay."""
 
     time: Floats  #: (m,) time stamps [s]
     received: Floats  #: (m,) times of arrival [s]
@@ -167,7 +167,7 @@ class Replay(Estimates):
     """(n,) standard deviation of the heading by motion [rad]; infinite without GNSS velocities"""
     compass_out: Any
     """(n,) True where the magnetometer was left out, because it contradicted the motion"""
-    measured: dict[str, Measured]
+    measured: dict[str, InnovationSeries]
     """innovations by measurement: "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0",
     ..., "barometer" and "magnetometer\""""
     late: dict[str, Floats]
@@ -259,7 +259,7 @@ class Smoothed(Estimates):
         return dict(zip(names, shares.tolist(), strict=True))
 
 
-def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
+def by_sensor(measured: Mapping[str, InnovationSeries]) -> dict[str, InnovationSeries]:
     """Return the innovations of a replay by sensor, with all blocks of a sensor together."""
     found = dict(measured)
     several = {name: name for name, kind in AID_PARAMS.items() if kind.most_blocks > 1}
@@ -270,7 +270,7 @@ def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
     return found
 
 
-def rejected_for_their_size(m: Measured, probability: float) -> Measured:
+def rejected_for_their_size(m: InnovationSeries, probability: float) -> InnovationSeries:
     """Return innovations of which those within the gate do not count as rejected.
 
     A filter also leaves out measurements of a sensor on probation, whatever they are.
@@ -309,17 +309,21 @@ def joined(parts: Sequence[_Found]) -> _Found:
     return replace(first, **changes)
 
 
-def _joined_innovations(parts: Sequence[Mapping[str, Measured]]) -> dict[str, Measured]:
+def _joined_innovations(
+    parts: Sequence[Mapping[str, InnovationSeries]],
+) -> dict[str, InnovationSeries]:
     """Return the innovations of all parts by kind of measurement."""
     names = dict.fromkeys(name for part in parts for name in part)
     return {name: stacked([part[name] for part in parts if name in part]) for name in names}
 
 
-def stacked(parts: Sequence[Measured]) -> Measured:
+def stacked(parts: Sequence[InnovationSeries]) -> InnovationSeries:
     """Return innovations in the order of time."""
     order = np.argsort(np.concatenate([m.time for m in parts]), kind="stable")
-    columns = [f.name for f in fields(Measured)]
-    return Measured(*(np.concatenate([getattr(m, name) for m in parts])[order] for name in columns))
+    columns = [f.name for f in fields(InnovationSeries)]
+    return InnovationSeries(
+        *(np.concatenate([getattr(m, name) for m in parts])[order] for name in columns)
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -350,7 +354,7 @@ class Fit(NamedTuple):
     """correlation of successive innovations, the largest of all axes; 0 for a consistent filter"""
 
 
-def fit_of(measured: Measured, rows: Any = slice(None)) -> Fit | None:
+def fit_of(measured: InnovationSeries, rows: Any = slice(None)) -> Fit | None:
     """Return the statistics of some innovations; None: fewer than three are known."""
     from scipy.stats import chi2
 
@@ -441,7 +445,7 @@ def runs_beyond_chance(rejected: Any, probability: float) -> list[tuple[int, int
 
 def collected(
     pieces: Iterable[Results], blocks: Iterable[int], count: int, stamps: Floats
-) -> tuple[dict[str, Any], dict[int, Measured]]:
+) -> tuple[dict[str, Any], dict[int, InnovationSeries]]:
     """Return columns of `Replay` by name, and innovations by block.
 
     Args:
@@ -491,12 +495,12 @@ def _columns_of(kept: Floats) -> dict[str, Any]:
     }
 
 
-def _measured(table: Floats, d: int) -> Measured:
+def _measured(table: Floats, d: int) -> InnovationSeries:
     """Return innovations from rows of two times and REPORTED numbers."""
     values = table[:, 2:]
     if d == 2 and (values[:, 4] > math.pi).all():
         d = 1  # headings alone: nothing was measured upward
-    return Measured(
+    return InnovationSeries(
         table[:, 0],
         table[:, 1],
         values[:, :d],

@@ -14,7 +14,7 @@ from quad_gym.logs.replaying.results import (
     MIN_COUNT,
     Finding,
     Fit,
-    Measured,
+    InnovationSeries,
     Replay,
     Severity,
     correlations,
@@ -68,7 +68,7 @@ class Evidence:
     body: str  #: axes of the IMU in a table, "flu" or "frd"
     suite: SensorSuite
     result: Replay  #: its rows until the motors stop for good
-    sensors: Mapping[str, Measured]  #: innovations, of all blocks of a sensor together
+    sensors: Mapping[str, InnovationSeries]  #: innovations, of all blocks of a sensor together
     fits: Mapping[str, Fit]  #: their statistics
     start: Mapping[str, Any] = field(default_factory=dict)  #: that the caller has given
 
@@ -251,7 +251,7 @@ def _nis(name: str, fit: Fit) -> str:
     return f"{NAMES[name]}: NIS per degree of freedom {fit.mean_nis:.3g}, 1 expected"
 
 
-def _size(case: Evidence, name: str, m: Measured, fit: Fit) -> Iterator[Finding]:
+def _size(case: Evidence, name: str, m: InnovationSeries, fit: Fit) -> Iterator[Finding]:
     """Innovations of a sensor that are too large, or rejected for long."""
     quantity = OF_SENSOR.get(name, "position")
     known = np.isfinite(m.nis)
@@ -289,7 +289,7 @@ def _size(case: Evidence, name: str, m: Measured, fit: Fit) -> Iterator[Finding]
 
 
 def _mean_with_runs(
-    m: Measured, known: np.ndarray, rows: np.ndarray, runs: list[tuple[int, int]]
+    m: InnovationSeries, known: np.ndarray, rows: np.ndarray, runs: list[tuple[int, int]]
 ) -> float:
     """Return the mean NIS without the rejections that chance explains."""
     counts = known & ~m.rejected
@@ -299,7 +299,7 @@ def _mean_with_runs(
     return float(m.nis[counts].mean()) if counts.any() else math.inf
 
 
-def _correlated(name: str, m: Measured, quantity: str) -> Iterator[Finding]:
+def _correlated(name: str, m: InnovationSeries, quantity: str) -> Iterator[Finding]:
     """Innovations whose successive values are correlated, in the worst axis of each quantity."""
     scaled = (m.innovation / m.sigma)[np.isfinite(m.nis) & ~m.gated]
     scaled = scaled[len(scaled) // 5 :]
@@ -485,7 +485,9 @@ def gaps(case: Evidence) -> Iterator[Finding]:
             return  # which the height shares
 
 
-def _refused(sensors: Mapping[str, Measured], name: str, since: float, until: float) -> bool:
+def _refused(
+    sensors: Mapping[str, InnovationSeries], name: str, since: float, until: float
+) -> bool:
     """Return True if a sensor was rejected between two times."""
     m = sensors.get(name)
     return m is not None and bool((m.gated & (m.time > since) & (m.time < until)).any())
@@ -535,7 +537,7 @@ def flagged(case: Evidence) -> Iterator[Finding]:
         return
 
 
-def _ends_refused(m: Measured, time: float) -> Any:
+def _ends_refused(m: InnovationSeries, time: float) -> Any:
     """Return True if the last two measurements before a time were rejected."""
     last = m.rejected[m.time <= time][-2:]
     return len(last) == 2 and last.all()

@@ -22,7 +22,7 @@ from quad_gym.logs.replaying.results import (
     QUANTITIES,
     Finding,
     Fit,
-    Measured,
+    InnovationSeries,
     Replay,
     Severity,
     by_sensor,
@@ -138,7 +138,7 @@ def during(result: Replay, since: float, until: float) -> Replay:
         if isinstance(value, np.ndarray) and len(value) == len(rows)
     }
     measured = {
-        name: Measured(
+        name: InnovationSeries(
             *(value[(m.time >= since) & (m.time <= until)] for value in vars(m).values())
         )
         for name, m in result.measured.items()
