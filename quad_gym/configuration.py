@@ -144,49 +144,15 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
                 "run_filter must not be False where the observation, include_std or innovations "
                 "need the filter"
             )
-        given = {**self.changed, **self.task.changed}
+        given = {**check.changed(self), **check.changed(self.task)}
         if self.estimator is not None:
-            given |= self._chosen_of_filter
-        check.effect(given, self.without_effect)
+            given |= _chosen_of_filter(self)
+        check.effect(given, arguments_without_effect(self))
         if self.filters:
             self.sensors.require_filter()
         if self.longest_delay > 0 and self.control is Control.PD:
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(self.draws, self.flown_vehicle, self.clocks)
-
-    @property
-    def without_effect(self) -> dict[str, str]:
-        """Arguments that have no effect with the others, each with the reason.
-
-        Here they are refused if they differ from their defaults. An environment, which knows the
-        keywords that were given, refuses each of them.
-        """
-        found = {
-            name: f"with Control.{self.control.name}, which uses none"
-            for name, controls in _CONTROLS_WITHOUT.items()
-            if self.control in controls
-        }
-        if not self.filters:
-            found |= dict.fromkeys(FILTER_ARGUMENTS, _UNFILTERED)
-            of_sensors = [type(f).__name__ for f in self.possible_faults if needs_sensors(f)]
-            if of_sensors:
-                found["faults"] = f"on sensors ({of_sensors[0]}) {_UNFILTERED}"
-        if self.estimator is not None:
-            of_filter = ("innovations", "truncate_when_diverged", *self._chosen_of_filter)
-            found |= dict.fromkeys(of_filter, "with an own estimator")
-        return found
-
-    @cached_property
-    def _chosen_of_filter(self) -> dict[str, Any]:
-        """Parameters of the built-in filter that no preset has, but those of its start."""
-        form, found = self.sensors.estimator, {}
-        presets = [sensor_suite(name).estimator for name in ALL_SUITES]
-        for name in (field.name for field in fields(FilterParams)):
-            of_start = name.startswith("initial") or name == "reuse_first_fix"
-            value = getattr(form, name)
-            if not of_start and all(value != getattr(preset, name) for preset in presets):
-                found[f"SensorSuite.estimator.{name}"] = value
-        return found
 
     @cached_property
     def pd_gains(self) -> PDGains:
@@ -261,3 +227,37 @@ class FlightConfiguration(Checked, kw_only=False, eq=False, bare=True):
     def longest_delay(self) -> int:
         """Longest delay of an action, drawn or not [control steps]."""
         return math.ceil(self.draws.high[COLUMNS["action_delay"]][0])
+
+
+def arguments_without_effect(c: FlightConfiguration) -> dict[str, str]:
+    """Return the arguments that have no effect with the others, each with the reason.
+
+    `FlightConfiguration` refuses those that differ from their defaults. An environment, which knows
+    the keywords that were given, refuses each of them.
+    """
+    found = {
+        name: f"with Control.{c.control.name}, which uses none"
+        for name, controls in _CONTROLS_WITHOUT.items()
+        if c.control in controls
+    }
+    if not c.filters:
+        found |= dict.fromkeys(FILTER_ARGUMENTS, _UNFILTERED)
+        of_sensors = [type(f).__name__ for f in c.possible_faults if needs_sensors(f)]
+        if of_sensors:
+            found["faults"] = f"on sensors ({of_sensors[0]}) {_UNFILTERED}"
+    if c.estimator is not None:
+        of_filter = ("innovations", "truncate_when_diverged", *_chosen_of_filter(c))
+        found |= dict.fromkeys(of_filter, "with an own estimator")
+    return found
+
+
+def _chosen_of_filter(c: FlightConfiguration) -> dict[str, Any]:
+    """Return parameters of the built-in filter that no preset has, but those of its start."""
+    presets = [sensor_suite(name).estimator for name in ALL_SUITES]
+    found = {}
+    for name in (field.name for field in fields(FilterParams)):
+        of_start = name.startswith("initial") or name == "reuse_first_fix"
+        value = getattr(c.sensors.estimator, name)
+        if not of_start and all(value != getattr(preset, name) for preset in presets):
+            found[f"SensorSuite.estimator.{name}"] = value
+    return found

@@ -2,7 +2,7 @@
 
 A keyword is a field of one of its parts, under the same name, or a field of `TaskParams`. A keyword
 that is not given has the value of the id's task, otherwise the default here. What has no effect
-with the others, `TaskParams` and `FlightConfiguration` know.
+with the others, `params/task.py` and `configuration.py` know.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,13 +10,13 @@ from dataclasses import fields
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, TypeAlias, TypeVar
 
-from quad_gym.configuration import FILTER_ARGUMENTS, FlightConfiguration
+from quad_gym.configuration import FILTER_ARGUMENTS, FlightConfiguration, arguments_without_effect
 from quad_gym.envs.spaces import ACTIONS, LAYOUTS, OBSERVATIONS
 from quad_gym.faults import GnssOutage, felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 from quad_gym.params.suites import SensorSuite, given_suite, sensor_suite
-from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.task import TaskParams, check_limit, fields_without_effect
 from quad_gym.records import Autoreset, Layout
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ class EnvConfig(Checked, eq=False, bare=True):
         defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})
         of_task = {n: keywords[n] for n in TASK_KEYWORDS if keywords.get(n) is not None}
         params = defaults.replace(**of_task)
-        without = params.without_effect
+        without = fields_without_effect(params)
         if own:
             without["reward_params"] = f"on the task {name}, whose class has weights of its own"
         check.effect(of_task, without)
@@ -330,7 +330,7 @@ class EnvConfig(Checked, eq=False, bare=True):
             **vehicle,
             **vars(self.world),
         )
-        check.effect(self.asked, found.without_effect)
+        check.effect(self.asked, arguments_without_effect(found))
         return found
 
 

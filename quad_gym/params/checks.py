@@ -458,16 +458,15 @@ class Checked:
         value = getattr(self, name) if got is ... else got
         raise ValueError(f"{self._prefix}{name} must {must}, got {value}")
 
-    @property
-    def changed(self) -> dict[str, Any]:
-        """Fields that differ from their defaults."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        defaults = {field.name: field.default for field in dataclasses.fields(self)}
-        return {name: value for name, value in values.items() if value != defaults[name]}
-
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; all values are checked again."""
         return dataclasses.replace(self, **changes)
+
+
+def changed(parameters: Checked) -> dict[str, Any]:
+    """Return the fields that differ from their defaults."""
+    given = {field: getattr(parameters, field.name) for field in dataclasses.fields(parameters)}
+    return {field.name: value for field, value in given.items() if value != field.default}
 
 
 # --------------------------------------------------------------------------------------------------

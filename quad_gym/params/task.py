@@ -56,12 +56,6 @@ class RewardParams(Checked):
         """Return the terms of the reward of a kind of task."""
         return _COURSE if kind == "waypoints" else _TRACKING
 
-    def without_effect(self, kind: str) -> list[str]:
-        """Return the weights of terms that the reward of a kind of task does not have."""
-        used = {term.name.lower() for term in self.terms(kind)}
-        names = (weight.name for weight in fields(self))
-        return [f"RewardParams.{n}" for n in names if n.removesuffix("_decay") not in used]
-
 
 # --------------------------------------------------------------------------------------------------
 # The task: its reference, and the start and the end of its episodes.
@@ -158,8 +152,9 @@ class TaskParams(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._set("trajectory", checked_trajectories(self.trajectory))
-        weights = {f"RewardParams.{name}": w for name, w in self.reward_params.changed.items()}
-        check.effect({**self.changed, **weights}, self.without_effect)
+        weights = check.changed(self.reward_params)
+        own = {f"RewardParams.{name}": weight for name, weight in weights.items()}
+        check.effect({**check.changed(self), **own}, fields_without_effect(self))
         lowest, of = (
             (0.0, "of starts") if self.may_start_on_ground else (self.height, "of the task")
         )
@@ -167,26 +162,6 @@ class TaskParams(Checked):
             self._refuse("min_height", f"be at most {lowest:g} m, the height {of}")
         if not 0.0 < self.max_tilt <= math.pi:
             self._refuse("max_tilt", "be in (0, pi]")
-
-    @property
-    def without_effect(self) -> dict[str, str]:
-        """Fields that have no effect on this task, each with the reason.
-
-        Those that differ from their defaults are refused here. An environment, which knows the
-        keywords that were given, refuses each of them.
-        """
-        on_task = f"on the task {self.kind}"
-        found = {
-            name: f"{on_task} (only on {kind})"
-            for name, kind in ONE_TASK_FIELDS.items()
-            if kind != self.kind
-        }
-        weights = self.reward_params.without_effect(self.kind)
-        others = (*FIELDS_WITHOUT_EFFECT.get(self.kind, ()), *weights)
-        found |= dict.fromkeys(others, on_task)
-        if not self.may_start_on_ground:
-            found["pad"] = f'with start="{self.start}"'
-        return found
 
     @property
     def may_start_on_ground(self) -> bool:
@@ -200,6 +175,28 @@ class TaskParams(Checked):
             return ()
         given: Any = self.trajectory
         return given or (figure_of_eight(),)
+
+
+def fields_without_effect(task: TaskParams) -> dict[str, str]:
+    """Return the fields and weights that have no effect on a task, each with the reason.
+
+    `TaskParams` refuses those that differ from their defaults. An environment, which knows the
+    keywords that were given, refuses each of them.
+    """
+    on_task = f"on the task {task.kind}"
+    found = {
+        name: f"{on_task} (only on {kind})"
+        for name, kind in ONE_TASK_FIELDS.items()
+        if kind != task.kind
+    }
+    found |= dict.fromkeys(FIELDS_WITHOUT_EFFECT.get(task.kind, ()), on_task)
+    used = {term.name.lower() for term in RewardParams.terms(task.kind)}
+    for weight in fields(RewardParams):
+        if weight.name.removesuffix("_decay") not in used:
+            found[f"RewardParams.{weight.name}"] = on_task
+    if not task.may_start_on_ground:
+        found["pad"] = f'with start="{task.start}"'
+    return found
 
 
 @functools.cache
