@@ -90,7 +90,16 @@ def _duration(name: str, value: Any) -> Span:
     return value if endless else span(name, value, open_end=True)
 
 
+def _angle_span(name: str, value: Any) -> Span:
+    """Return `value` as an angle above 0, or as a range of such angles, of at most a turn [rad]."""
+    found = span(name, value, open_end=True)
+    for end in found if isinstance(found, tuple) else (found,):
+        check.angle(name, end)
+    return found
+
+
 Size = Annotated[Span, partial(span, open_end=True)]
+Angle = Annotated[Span, _angle_span]
 
 
 class Fault(Checked):
@@ -359,7 +368,7 @@ class MagnetometerDisturbance(DirectedFault):
     how: Literal["turned", "iron", "frozen"] = "turned"
     """form of the disturbance: "turned" by an `angle` about body z, to either side; "iron", a
     constant field in B with the strength `iron`; "frozen", which repeats the last reading"""
-    angle: Size = (math.radians(30.0), math.radians(180.0))
+    angle: Angle = (math.radians(30.0), math.radians(180.0))
     """angle, with "turned" [rad]; the orientations in an autopilot's parameters are multiples of 45
     degrees"""
     iron: Size = (10e-6, 40e-6)

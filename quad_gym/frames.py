@@ -47,8 +47,8 @@ def geodetic_to_ecef(latitude: float, longitude: float, height: float) -> NDArra
         ValueError: If an argument is not finite, the latitude is beyond a pole, or the point lies
             within 1,000 km of the Earth's center.
     """
-    lat = check.number("latitude", latitude, least=-0.5 * math.pi, most=0.5 * math.pi)
-    lon, h = check.number("longitude", longitude), check.number("height", height, least=-5.3e6)
+    lat = check.angle("latitude", latitude, most=0.5 * math.pi)
+    lon, h = check.angle("longitude", longitude), check.number("height", height, least=-5.3e6)
     eccentricity2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING)
     sin_lat, cos_lat = math.sin(lat), math.cos(lat)
     radius = WGS84_SEMI_MAJOR_AXIS / math.sqrt(1.0 - eccentricity2 * sin_lat**2)

@@ -53,13 +53,43 @@ def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     kind = with_plain_help(kind)
-    with usage_errors((ValueError,)), _wrapped_help(words):
+    refusals = usage_errors((ValueError, _RefusedError))
+    with refusals, _wrapped_help(words), _without_name_of_class(kind):
         args = tyro.cli(kind, args=words, registry=_REGISTRY, **options)
         for field in dataclasses.fields(args):
             name = option_name(field.name)
             if name in words and getattr(args, field.name) in ((), {}):
                 raise ValueError(f"{name} must have at least one value, got none")
     return args
+
+
+class _RefusedError(Exception):
+    """A ValueError of a dataclass's own checks, which tyro does not catch."""
+
+
+@contextmanager
+def _without_name_of_class(kind: Any) -> Iterator[None]:
+    """Report errors of the checks in `__post_init__` without the name of the dataclass."""
+    check_fields = getattr(kind, "__post_init__", None)
+    if check_fields is None:
+        yield
+        return
+
+    def checked(self: Any) -> None:
+        try:
+            check_fields(self)
+        except ValueError as error:
+            raise _RefusedError(str(error)) from None
+
+    own = "__post_init__" in vars(kind)
+    kind.__post_init__ = checked
+    try:
+        yield
+    finally:
+        if own:
+            kind.__post_init__ = check_fields
+        else:
+            del kind.__post_init__
 
 
 def with_plain_help(kind: Any) -> Any:

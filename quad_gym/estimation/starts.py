@@ -202,7 +202,7 @@ def state_at_rest(
     return {
         "position": check.array("position", position, (3,)),
         "velocity": np.zeros(3),
-        "R_BI": level(check.number("heading", heading)),
+        "R_BI": level(check.angle("heading", heading)),
         "accel_bias": np.zeros(3),
         "gyro_bias": np.zeros(3),
         "covariance": np.diag(variances),
@@ -464,7 +464,7 @@ def filter_start(sensors: SensorSuite, fix: FirstFix) -> FilterStart:
             fix.refuse(reason, "tilt_sigma")
         x_I = np.zeros(3)
         if fix.heading is not None:
-            x_I = level(check.number("heading", fix.heading))[0]
+            x_I = level(check.angle("heading", fix.heading))[0]
         numbers = {}
         if fix.rest_sigma is not None:
             numbers["initial_velocity_variance"] = speeds[0] * speeds[0]
@@ -575,10 +575,10 @@ def _first_headings(
     if fix.heading is None and not fix.course:
         fix.refuse("come with heading or course", "heading_sigma")
     if fix.heading_sigma is not None:
-        start["heading_sigma"] = check.positive("heading_sigma", fix.heading_sigma, most=math.pi)
+        start["heading_sigma"] = check.angle_size("heading_sigma", fix.heading_sigma)
     known, failure = empty_fix(sensors), ""
     if fix.heading is not None:
-        known["heading"] = check.number("heading", fix.heading)
+        known["heading"] = check.angle("heading", fix.heading)
     elif fix.magnetometer is not None:
         if Aid["MAGNETOMETER"] not in sensors.aids:
             raise ValueError("the sensor suite has no magnetometer to initialize with")

@@ -33,7 +33,7 @@ class CameraParams(SensorBase):
     """frame rate [Hz], which must divide the IMU rate; laboratory: an image at every tick"""
     position_B: check.Place = (0.1159, -0.0004, -0.0435)
     """(3,) projection center in B [m]; laboratory vehicle"""
-    attitude: check.Vector3 = (math.radians(120.0), 0.0, math.radians(90.0))
+    attitude: check.Angles3 = (math.radians(120.0), 0.0, math.radians(90.0))
     """(3,) Euler angles of R_CB (roll, pitch and yaw in the 3-1-2 sequence), with the camera's z
     axis along the optical axis [rad]; laboratory"""
     focal_length: check.Positive = 1657.72

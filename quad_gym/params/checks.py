@@ -186,13 +186,27 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def angle(name: str, value: Any) -> float:
-    """`value` as an angle within ± one turn [rad]; larger ones are in degrees."""
+_TURNS = {2.0 * math.pi: "2 pi", math.pi: "pi", 0.5 * math.pi: "pi/2"}
+"""Limits of angles [rad] as messages write them."""
+
+
+def angle(name: str, value: Any, *, most: float = 2.0 * math.pi) -> float:
+    """`value` as an angle within ± `most`, a turn by default [rad]; larger ones are in degrees."""
     result = number(name, value)
-    if abs(result) > 2.0 * math.pi:
+    if abs(result) > most:
         meant = f"; did you mean {math.radians(result):.4g}?" if abs(result) <= 360.0 else ""
-        raise ValueError(f"{name} must be in rad, within ±2 pi, got {result:g}{meant}")
+        raise ValueError(f"{name} must be in rad, within ±{_TURNS[most]}, got {result:g}{meant}")
     return result
+
+
+def angles(name: str, value: Any) -> Vector:
+    """`value` as three angles (3,) within ± one turn [rad]; larger ones are in degrees."""
+    return tuple(angle(name, component) for component in vector(name, value, 3))
+
+
+def angle_size(name: str, value: Any) -> float:
+    """`value` as the size of an angle, or its standard deviation, in (0, pi] [rad]."""
+    return positive(name, angle(name, value, most=math.pi))
 
 
 def phase(name: str, value: Any) -> float | None:
@@ -354,6 +368,9 @@ def ticks(name: str, rate: float, tick_rate: float) -> int:
 Positive = Annotated[float, positive]
 NonNegative = Annotated[float, partial(number, least=0.0)]
 UpToOne = Annotated[float, partial(positive, most=1.0)]
+Angle = Annotated[float, angle]
+Angles3 = Annotated[Vector, angles]
+AngleSize = Annotated[float, angle_size]
 Phase = Annotated[float | None, phase]
 Place = Annotated[Vector, place]
 Vector3 = Annotated[Vector, partial(vector, length=3)]

@@ -1,6 +1,5 @@
 """Parameters of the Kalman filter."""
 
-import math
 from functools import partial
 from typing import Annotated, Literal
 
@@ -43,7 +42,7 @@ class FilterParams(Checked):
     """initial variance of each velocity component [m^2/s^2]; laboratory"""
     initial_covariance_scale: check.Positive = 2.0
     """factor on the covariance of the first fix, from which the filter starts; laboratory"""
-    initial_tilt_sigma: Annotated[float, partial(check.positive, most=math.pi)] | None = None
+    initial_tilt_sigma: check.AngleSize | None = None
     """initial standard deviation of roll and pitch of a filter that starts level [rad]; None: the
     initial attitude solves Wahba's problem for the baseline and the vertical (laboratory)"""
     reuse_first_fix: bool = True
@@ -70,7 +69,7 @@ class FilterParams(Checked):
     glitch_timeout: check.Positive = 25.0
     """the same if its innovations have begun with a step, which an IMU does not make [s]; ArduPilot
     NavEKF3 waits for 10 s (`posRetryTimeUseVel_ms`), and dead reckoning bridges faults of 20 s"""
-    max_direction_sigma: check.Positive = 0.2
+    max_direction_sigma: check.AngleSize = 0.2
     """standard deviation of a feature's predicted direction above which a filter with an innovation
     gate ignores the feature [rad]; half the square of this angle, which a linear model neglects, is
     then ten times the noise of a good camera. A filter without GNSS uses all features"""

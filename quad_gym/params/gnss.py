@@ -47,7 +47,7 @@ class GnssParams(SensorBase):
     laboratory"""
     position_sigma_I: check.Positive3 = (0.006, 0.006, 0.012)
     """(3,) standard deviation of the white position noise east, north, up [m]; laboratory (RTK)"""
-    baseline_sigma: check.Positive = 0.05
+    baseline_sigma: check.AngleSize = 0.05
     """standard deviation of the white noise of the baseline's direction [rad]; laboratory"""
     heading_error_sigma: Annotated[float, check.between(0.0, 1.0)] = 0.0
     """standard deviation of the heading error that all baselines of an episode have in common, due

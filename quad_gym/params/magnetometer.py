@@ -1,6 +1,7 @@
 """The magnetometer: the Earth's magnetic field in body axes, and its errors."""
 
 import math
+from functools import partial
 from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
@@ -33,9 +34,9 @@ class MagnetometerParams(AidParams):
     estimate D, but assumes hard iron larger by its effect on the field"""
     strength: check.UpToOne = 46.28 * MICROTESLA
     """strength of the Earth's field [T]"""
-    declination: Annotated[float, check.between(-math.pi, math.pi)] = math.radians(3.13)
+    declination: Annotated[float, partial(check.angle, most=math.pi)] = math.radians(3.13)
     """declination of the Earth's field, from true north toward east [rad]"""
-    inclination: Annotated[float, check.between(-math.pi / 2, math.pi / 2)] = math.radians(58.67)
+    inclination: Annotated[float, partial(check.angle, most=0.5 * math.pi)] = math.radians(58.67)
     """inclination of the Earth's field below the horizon [rad]"""
     declination_sigma: check.UpToOne = math.radians(0.35)
     """standard deviation of the error of the model's declination, constant in a flight [rad]; the

@@ -488,6 +488,9 @@ class DrawingTable(Ranges):
                 f"randomization of {name!r} must stay {_range_in_words(drawable)}, got "
                 f"{part!r}, which reaches from {low:g} to {high:g}"
             )
+        if drawable.unit == "rad":
+            for end in (low, high):
+                check.angle(f"randomization of {name!r}", end)
         self.kind[column], self.a[column], self.b[column], self.c[column], self.d[column] = (
             part.placed(factor, shift)
         )

@@ -214,7 +214,7 @@ def through(
     if callable(angles):
         raise ValueError("yaw must be angles at the points, not a function; see Trajectory.of")
     if np.ndim(angles) > 0:
-        angles = check.array("yaw", angles, (len(places),))
+        angles = _headings(angles, len(places))
     if closed:
         places = np.concatenate([places, places[:1]])
 
@@ -277,6 +277,21 @@ def _places(points: ArrayLike, fewest: int) -> Floats:
             f"{len(places)}"
         )
     return places
+
+
+def _headings(yaw: ArrayLike, count: int) -> Floats:
+    """Return the headings (count,) at the points, of which no two neighbors are a turn apart."""
+    found = check.array("yaw", yaw, (count,))
+    if count:
+        check.angle("yaw", found[0])
+    far = np.flatnonzero(np.abs(np.diff(found)) > 2.0 * np.pi)
+    if far.size:
+        first, second = found[far[0] : far[0] + 2]
+        raise ValueError(
+            "yaw must be in rad, with steps within ±2 pi from point to point, got "
+            f"{first:g} and then {second:g}: in degrees?"
+        )
+    return found
 
 
 def _given_times(times: Any, count: int, closed: bool) -> Floats:

@@ -89,7 +89,7 @@ class InitialPoseParams(Checked):
     position_sigma: check.Positive = 0.05
     """standard deviation of the initial position, per axis [m]; a vehicle put on its mark by
     hand"""
-    heading_sigma: check.Positive = 0.05
+    heading_sigma: check.AngleSize = 0.05
     """standard deviation of the initial heading [rad]; a vehicle lined up by eye, some 3 degrees"""
 
 
@@ -104,7 +104,7 @@ class NoisyObservationParams(Checked):
     """standard deviation of the position, per axis [m]; measured on the laboratory's circle"""
     velocity: check.NonNegative = 0.012
     """standard deviation of the velocity, per axis [m/s]; measured on the laboratory's circle"""
-    attitude: check.NonNegative = 0.006
+    attitude: Annotated[float, check.between(0.0, math.pi)] = 0.006
     """standard deviation of the attitude, per axis [rad]; measured on the laboratory's circle"""
     body_rates: check.NonNegative = 0.0123
     """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
@@ -147,10 +147,10 @@ class SensorSuite(SensorTable, Saved):
     """noise of `observation="noisy"`"""
     log_delays: LogDelays = field(default_factory=LogDelays)
     """delays of time stamps in this vehicle's logs, which a replay subtracts"""
-    log_rotation: check.Vector3 = (0.0, 0.0, 0.0)
+    log_rotation: check.Angles3 = (0.0, 0.0, 0.0)
     """roll, pitch and yaw from the axes of the IMU in this vehicle's logs to B [rad], by which a
     replay rotates the samples; 3-1-2 Euler angles"""
-    log_compass_rotation: check.Vector3 = (0.0, 0.0, 0.0)
+    log_compass_rotation: check.Angles3 = (0.0, 0.0, 0.0)
     """the same of the magnetometer [rad]"""
     log_accel_bias: check.Vector3 = (0.0, 0.0, 0.0)
     """mean bias of the accelerometer in this vehicle's logs, in the axes of the IMU, which a replay

@@ -531,7 +531,7 @@ class Trajectory(Checked, eq=False):
         Args:
             angle: Angle of the rotation, from east toward north [rad].
         """
-        turn = checks.number("angle", angle)
+        turn = checks.angle("angle", angle)
         if turn == 0.0:
             return self
         c, s = portable.cos(turn), portable.sin(turn)

@@ -286,7 +286,7 @@ class ActionParams(Checked):
 
     rate_scale: check.Positive3 = (6.0, 6.0, 3.0)
     """(3,) body rates at full action [rad/s]"""
-    tilt_scale: check.Positive = math.radians(45.0)
+    tilt_scale: check.AngleSize = math.radians(45.0)
     """roll and pitch angles at full action [rad]"""
     velocity_scale: check.Positive = 5.0
     """velocity along each axis at full action [m/s]"""

@@ -55,7 +55,7 @@ class GroundParams(Checked):
     max_touchdown_speed: Annotated[float, partial(check.positive, least=0.2)] = 1.5
     """speed of the center of mass toward the ground above which a touchdown is a crash [m/s]; a
     free fall from 0.11 m ends at the default"""
-    max_touchdown_tilt: Annotated[float, partial(check.positive, most=math.pi)] = math.radians(30.0)
+    max_touchdown_tilt: check.AngleSize = math.radians(30.0)
     """angle between the body z axis and the vertical above which touching the ground is a crash
     [rad]; touching it with a rotor always is"""
 
@@ -121,7 +121,7 @@ class Wall(Obstacle):
 
     size: check.Vector3 = (4.0, 0.2, 3.0)
     """(3,) length, thickness and height [m]"""
-    yaw: Annotated[float, check.between(-FARTHEST_OBSTACLE, FARTHEST_OBSTACLE)] = 0.0
+    yaw: check.Angle = 0.0
     """direction of the length, from east toward north [rad]"""
 
     shape = Shape.WALL

@@ -159,6 +159,8 @@ def test_features_behind_obstacles_are_not_seen():
         ({"features_yaw": Uniform(-1.0, 1.0)}, {"sensors": INDOOR.replace(camera=None)}, "camera"),
         ({"feature_offsets_I": (Uniform(0, 1), None)}, {}, "feature_offsets_I.*3 of them"),
         ({"features_shift_I": Uniform(0.0, 1e6)}, {}, "features_shift_I.*at most"),
+        ({"features_yaw": Uniform(-90.0, 90.0)}, {}, "features_yaw' must be in rad"),
+        ({"start_yaw": Uniform(0.0, 45.0)}, {}, r"start_yaw' must be in rad.*mean 0\.7854"),
         ({"features_yaw": Uniform(0.5, 1.0, relative=True)}, {}, "features_yaw.*relative"),
     ],
 )

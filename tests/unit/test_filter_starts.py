@@ -238,6 +238,9 @@ FIX, SPEED = np.zeros(3), np.array([1.0, 0.0, 0.0])
         ({"time": math.inf}, "time"),
         ({"gnss_baseline_G": SPEED, "magnetometer": SPEED}, "magnetometer must not be given with"),
         ({"gnss_baseline_G": SPEED, "gnss_sigma": np.eye(3)}, "gnss_sigma"),
+        ({"heading": 90.0}, r"heading must be in rad, .*, got 90; did you mean 1\.571\?"),
+        ({"heading": -7.0, "gnss_baseline_G": SPEED}, "heading must be in rad"),
+        ({"heading": 0.0, "heading_sigma": 10.0}, "heading_sigma must be in rad"),
     ],
 )
 @pytest.mark.parametrize("running", [False, True])

@@ -17,7 +17,7 @@ from baselines import crazyflie_pid, recipes
 from quad_gym import TaskParams, configuration, faults
 from quad_gym.configuration import FlightConfiguration
 from quad_gym.envs.config import EnvConfig
-from quad_gym.faults import Fault, SensorLoss, _duration, span
+from quad_gym.faults import Fault, SensorLoss, _angle_span, _duration, span
 from quad_gym.params import checks as check
 from quad_gym.params.camera import _features
 from quad_gym.params.checks import Checked, _unless_none
@@ -46,6 +46,14 @@ def numbers(least=-math.inf, most=LARGEST, open_end=False):
     else:
         low = (above(least), least) if open_end else (least, below(least))
     return [low, (most, above(most)), (most, math.nan), (most, "1")]
+
+
+TURN = 2.0 * math.pi
+
+
+def angles(most):
+    """Pairs of the last good angle and the first bad one, of which one is in degrees."""
+    return [(most, above(most)), (-most, below(-most)), (most, 90.0), (most, math.nan)]
 
 
 def positives(least=SMALLEST, most=LARGEST):
@@ -94,6 +102,15 @@ KINDS = {
     check.matrix: matrices,
     check.positive_or_infinite: lambda: [(math.inf, math.nan), *positives()],
     check.place: lambda: [((0.0, 0.0, -100.0), (0.0, 0.0, below(-100.0)))],
+    check.angle: lambda most=TURN: angles(most),
+    check.angle_size: lambda: [(SMALLEST, 0.0), *angles(math.pi)[:1], (math.pi, 30.0)],
+    check.angles: lambda: [((0.1, 0.2, a), (0.1, 0.2, b)) for a, b in angles(TURN)],
+    _angle_span: lambda: [
+        *spans(open_end=True)[:1],
+        *angles(TURN)[:1],
+        ((0.5, TURN), (0.5, above(TURN))),
+        ((0.5, 0.5), (above(0.5), 0.5)),
+    ],
     check.phase: lambda: [(0.0, below(0.0)), (below(1.0), 1.0), (None, "soon")],
     check.flag: lambda: [(True, 1), (False, "no"), (False, 0.0)],
     span: spans,

@@ -8,6 +8,7 @@ from typing import Literal
 import pytest
 
 from quad_gym.commands import consistency, evaluate, fly, train
+from quad_gym.commands.compile import CompileArgs
 from quad_gym.commands.options import (
     EnvId,
     Keywords,
@@ -100,6 +101,15 @@ def test_usage_errors_end_with_one_line(error, capsys):
         raise error
     assert end.value.code == 2
     assert capsys.readouterr().err == "error: why\n"
+
+
+def test_checks_of_options_are_reported_without_the_name_of_their_class(capsys):
+    with pytest.raises(SystemExit) as end:
+        parse(CompileArgs, ["--jobs", "0"])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == "error: --jobs must be at least 1, got 0\n"
+    with pytest.raises(ValueError, match="--jobs must be at least 1"):
+        CompileArgs(jobs=0)
 
 
 def test_env_keywords_with_a_dedicated_option_are_refused():

@@ -260,6 +260,8 @@ def test_bad_tables_are_refused(tmp_path, text, message):
         ((FIVE,), {"minimize": "crackle"}, "minimize must be one of snap, jerk"),
         ((FIVE,), {"yaw": "north"}, "yaw must be one of along"),
         ((FIVE,), {"yaw": 90}, r"yaw must be in rad, .*, got 90; did you mean 1\.571\?"),
+        ((FIVE,), {"yaw": [0, 90, 180, 270, 360]}, "yaw must be in rad, .*got 0 and then 90: in d"),
+        ((FIVE,), {"yaw": [90.0] * 5}, r"yaw must be in rad, .*did you mean 1\.571\?"),
         ((FIVE,), {"yaw": [0.0, 1.0]}, r"yaw must have shape|yaw must"),
         ((FIVE,), {"yaw": 0.0, "look_at": (0, 0)}, "yaw must not be given with look_at"),
         ((FIVE,), {"look_at": (0.0,)}, "look_at must have shape"),

@@ -7,6 +7,7 @@ the processor. A stale file is therefore never found; a damaged one is ignored.
 
 import ast
 import atexit
+import bisect
 import contextlib
 import dis
 import functools
@@ -165,6 +166,11 @@ def _known_sources() -> dict[str, tuple[str, list[str]]]:
     return known
 
 
+_JUMPS = {*dis.hasjrel, *dis.hasjabs}
+"""Instructions whose argument is the place of another one."""
+_BYTES = 2  #: size of an instruction
+
+
 def digest_of_function(function: Callable[..., Any]) -> str:
     """Digest of a function: its module with all imports, its instructions, defaults and closure.
 
@@ -186,12 +192,22 @@ def _function(function: Any, above: tuple[Any, ...]) -> Iterator[str]:
 
 
 def _code(code: CodeType) -> Iterator[str]:
-    """Instructions, independent of their lines: functions of a module may share a name."""
-    for instruction in dis.get_instructions(code):
-        if isinstance(instruction.argval, CodeType):
-            yield from _code(instruction.argval)
-        else:
-            yield f"{instruction.opname} {instruction.argval!r}"
+    """Instructions, independent of their lines: functions of a module may share a name.
+
+    With -OO, Python writes "NOP" in place of a docstring, which moves the targets of jumps.
+    """
+    instructions = list(dis.get_instructions(code))
+    skipped = [instruction.offset for instruction in instructions if instruction.opname == "NOP"]
+    for instruction in instructions:
+        value = instruction.argval
+        if instruction.opname == "NOP":
+            continue
+        if isinstance(value, CodeType):
+            yield from _code(value)
+            continue
+        if instruction.opcode in _JUMPS:
+            value -= _BYTES * bisect.bisect_left(skipped, value)
+        yield f"{instruction.opname} {value!r}"
 
 
 def _value(value: Any, above: tuple[Any, ...]) -> Iterator[str]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.compiling.cache import digest_of_function
+from quad_gym.kernels.compiling.cache import _code, digest_of_function
 from tests.builders import run_python
 
 ROOT = Path(__file__).parents[3]
@@ -142,6 +142,19 @@ def test_digests_of_functions_differ_with_their_closures(values):
 def test_functions_differ_in_their_defaults_and_in_their_code():
     functions = [holding(1.0), holding(1.0, 2.0), lambda x: x + 1.0, lambda x: x - 1.0]
     assert len({digest_of_function(function) for function in functions}) == 4
+
+
+def test_code_is_the_same_without_docstrings():
+    """Python leaves them out with -OO."""
+    body = ('"""Text."""', "while x > 1.0:", "    x *= 0.5", "return x")
+    source = "\n    ".join(("def f(x):", *body))
+    found = []
+    for optimize in (0, 2):
+        names = {}
+        exec(compile(source, "f", "exec", optimize=optimize), names)
+        found.append(list(_code(names["f"].__code__)))
+    assert found[0] == found[1]
+    assert any("JUMP" in line for line in found[0])
 
 
 def test_a_function_that_calls_itself_has_a_digest():
