@@ -505,7 +505,7 @@ def pack(plans: Iterable[DevicePlan]) -> Iterator[Path]:
 def _packed(plan: DevicePlan) -> Path:
     """Return the file of a wheel with the PTX of a plan, which need not exist."""
     key = repr((plan.settings, sorted(plan.stages.items())))
-    sources = sources_digest(Path(__file__).parents[1])
+    sources = sources_digest(Path(__file__).parent)
     return FOLDER / f"{sources[:12]}_{hashlib.sha256(key.encode()).hexdigest()[:12]}.ptx.z"
 
 

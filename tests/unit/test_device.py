@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from quad_gym.device import plan_of, ptx_of
 from quad_gym.envs.config import TASK_DEFAULTS
 from quad_gym.kernels.compiling.building import PROCESSORS
 from quad_gym.kernels.library import machine
+from quad_gym.kernels.sources import sources_digest
 from quad_gym.params.suites import SUITES
 from tests.builders import vec_env
 from tests.golden import device, ptx, sass
@@ -151,7 +153,9 @@ def test_module_in_a_wheel_is_taken_for_its_sources_and_settings_alone(tmp_path,
     (tmp_path / "older.ptx.z").touch()
     monkeypatch.setattr(emission, "FOLDER", tmp_path)
     monkeypatch.setattr(emission, "_emitted", lambda plan: b"of the wheel")
-    assert list(emission.pack([plan])) == list(tmp_path.iterdir())
+    written = list(emission.pack([plan]))
+    assert written == list(tmp_path.iterdir())
+    assert written[0].name.startswith(sources_digest(Path(quad_gym.__file__).parent)[:12])
     monkeypatch.setattr(emission, "_emitted", lambda plan: b"emitted")
     assert (ptx_of(plan), ptx_of(other)) == (b"of the wheel", b"emitted")
     monkeypatch.setattr(emission, "sources_digest", lambda package: "0" * 64)
