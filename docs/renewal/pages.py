@@ -14,8 +14,9 @@ MARKED = re.compile(r"(<!-- =([\w.]+) -->)(.*?)(<!-- / -->)", re.DOTALL)
 
 
 def pages() -> list[Path]:
-    """README, the pages that are not generated, and the page of large tables."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), TABLES]
+    """README, the pages that are not generated, the page of large tables, and the paper."""
+    paper = ROOT / "docs/paper/paper.md"
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), TABLES, paper]
 
 
 def marked(page: Path) -> dict[str, list[str]]:

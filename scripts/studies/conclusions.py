@@ -6,7 +6,7 @@ is missing, or of other flights, it is `NOT_MEASURED`. `docs.renewal` writes the
 pages, and a test compares these with the rows.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from quad_gym.analysis.metrics import Estimated
@@ -20,7 +20,7 @@ from scripts.studies.parts import (
     TRACKING_STEPS,
 )
 from scripts.studies.report import number, share
-from scripts.studies.rows import Effect, Rows, effect, mean_effect
+from scripts.studies.rows import RATES, Effect, Rows, effect, mean_effect
 
 NOT_MEASURED = "Not yet measured with the present flights (`python -m scripts.studies run --all`)."
 """Text of a conclusion or table whose rows are missing or of other flights."""
@@ -34,15 +34,21 @@ class MissingRowsError(ValueError):
 
 def points(found: Effect) -> str:
     """Difference of rates in percentage points, with its interval and verdict."""
-    return f"{number(found.scaled(100.0).size, 0)} percentage points ({verdict(found)})"
+    return f"{number(found.scaled(100.0).size, 0)} points ({verdict(found)})"
 
 
 def verdict(found: Effect) -> str:
-    """P value and verdict of a difference."""
-    word = "significant" if found.significant else "not significant"
+    """P value of a difference, and where it is not significant, this word."""
     if found.p is None:
-        return word
-    return f"p < 0.001, {word}" if found.p < 0.001 else f"p = {found.p:.2g}, {word}"
+        return "significant" if found.significant else "not significant"
+    p = "p < 0.001" if found.p < 0.001 else f"p = {found.p:.2g}"
+    return p if found.significant else f"{p}, not significant"
+
+
+def table(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """Table in Markdown whose columns are numbers, except the first."""
+    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *body]
+    return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
 class Arms:
@@ -73,20 +79,22 @@ class Arms:
         return points(effect(self[first], self[second], column))
 
 
-def look_around_control(rows: Rows) -> str:
-    """Effect of the training observation, all else equal."""
-    arms, pair = Arms(rows, BUDGETS["LookAround"]), ("std_certainty", "truth_std_certainty")
-    crashes = arms.against(*pair, "crashed")
+def look_around_headline(rows: Rows) -> str:
+    """Training on the estimate with the task's own reward, for readers of one sentence."""
+    arms, (ours, other) = Arms(rows, BUDGETS["LookAround"]), ("std", "truth_std")
+    success, crashes = (effect(arms[ours], arms[other], column) for column in RATES)
+    shown = [share(arms[name].estimated(column)) for column in RATES for name in (ours, other)]
     return (
-        f"LookAround, trained on the estimate instead of the truth, with standard deviation and "
-        f"reward for certainty in both arms ({arms.budget(*pair)}): {arms.named(pair[0])} and "
-        f"{arms.named(pair[1])} differ in success by {arms.against(*pair)}, and in crashes by "
-        f"{crashes}."
+        f"Policies that observe the filter's standard deviation succeed in {shown[0]} of the "
+        f"episodes on the estimate if they were trained on the estimate, and in {shown[1]} if they "
+        f"were trained on the truth ({verdict(success)}). Their crash rates are {shown[2]} and "
+        f"{shown[3]} ({verdict(crashes)}; {arms.budget(ours, other)})."
     )
 
 
+_OBSERVATION = "training on the estimate"
 _FACTORS = {
-    "training on the estimate": (
+    _OBSERVATION: (
         ("estimate", "truth"),
         ("std", "truth_std"),
         ("certainty", "truth_certainty"),
@@ -106,20 +114,33 @@ _FACTORS = {
     ),
 }
 """Pairs of arms of LookAround that differ in one factor only."""
+_CONDITIONS = (
+    "neither",
+    "standard deviation",
+    "reward for certainty",
+    "standard deviation, reward for certainty",
+)
+"""What the arms of the pairs have in common, in their order."""
+
+
+def look_around_observation(rows: Rows) -> str:
+    """Effect of the training observation in each combination of the other two factors."""
+    arms, body = Arms(rows, BUDGETS["LookAround"]), []
+    for (ours, other), condition in zip(_FACTORS[_OBSERVATION], _CONDITIONS, strict=True):
+        shown = [share(arms[name].estimated("success")) for name in (other, ours)]
+        changes = [points(effect(arms[ours], arms[other], column)) for column in RATES]
+        body.append([condition, *shown, *changes])
+    heads = ["in both arms", "trained on the truth", "trained on the estimate"]
+    return table([*heads, "difference", "difference in crashes"], body)
 
 
 def look_around_factors(rows: Rows) -> str:
-    """Share of each of the three factors, averaged over the others."""
-    arms = Arms(rows, BUDGETS["LookAround"])
-    parts = []
+    """Effect of each of the three factors, averaged over the others."""
+    arms, body = Arms(rows, BUDGETS["LookAround"]), []
     for factor, pairs in _FACTORS.items():
-        found = mean_effect([(arms[first], arms[second]) for first, second in pairs])
-        parts.append(f"{factor} {points(found)}")
-    names = {name for pairs in _FACTORS.values() for pair in pairs for name in pair}
-    return (
-        f"LookAround, success, each factor averaged over all combinations of the other two "
-        f"(8 arms, {arms.budget(*sorted(names))}): {'; '.join(parts)}."
-    )
+        compared = [(arms[first], arms[second]) for first, second in pairs]
+        body.append([factor, *(points(mean_effect(compared, column)) for column in RATES)])
+    return table(["factor", "difference in success", "difference in crashes"], body)
 
 
 def look_around_noise(rows: Rows) -> str:
@@ -274,16 +295,16 @@ def _shown(found: Estimated, column: str) -> str:
     return f"{number(Estimated(*(scale * value for value in found)), 0)} {unit}"
 
 
-def arms_table(table: str, steps: int) -> Conclusion:
+def arms_table(name: str, steps: int) -> Conclusion:
     """Make the table of the arms of a study with one budget, as Markdown."""
 
     def text(rows: Rows) -> str:
-        own = [part for part in PARTS if part.table == table and part.steps == steps]
-        names = dict.fromkeys(name for part in own for name in part.arms)
+        own = [part for part in PARTS if part.table == name and part.steps == steps]
+        names = dict.fromkeys(arm for part in own for arm in part.arms)
         arms, body = Arms(rows, steps), []
-        for name in names:
+        for arm in names:
             try:
-                found = arms[name]
+                found = arms[arm]
             except MissingRowsError:
                 continue  # of a part that is not complete
             body.append(
@@ -296,18 +317,17 @@ def arms_table(table: str, steps: int) -> Conclusion:
                 ]
             )
         if not body:
-            raise MissingRowsError(table)
-        heads = ["trained on", "seeds", "success", "crashed", "return"]
-        lines = [heads, ["---", *["---:"] * 4], *body]
-        return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+            raise MissingRowsError(name)
+        return table(["trained on", "seeds", "success", "crashed", "return"], body)
 
     return text
 
 
 CONCLUSIONS: Mapping[str, tuple[str, Conclusion]] = {
     "look_around.table": ("look_around", arms_table("look_around", BUDGETS["LookAround"])),
-    "look_around.control": ("look_around", look_around_control),
-    "look_around.factors": ("look_around", look_around_factors),
+    "look_around.headline": ("look_around", look_around_headline),
+    "look_around.observation.table": ("look_around", look_around_observation),
+    "look_around.factors.table": ("look_around", look_around_factors),
     "look_around.noise": ("look_around", look_around_noise),
     "stale_race.table": ("stale_race", arms_table("stale_race", BUDGETS["StaleRace"])),
     "stale_race.training": ("stale_race", stale_race_training),

@@ -23,7 +23,7 @@ FEW = 5  #: number of seeds below which intervals over trainings are wide
 
 def number(found: Estimated, digits: int) -> str:
     """Number with its interval."""
-    return in_brackets(found.value, (found.low, found.high), f".{digits}f")
+    return in_brackets(found.value, (found.low, found.high), f"z.{digits}f")
 
 
 def share(found: Estimated) -> str:

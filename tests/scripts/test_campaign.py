@@ -175,21 +175,27 @@ def test_conclusions_follow_from_rows_and_name_arms_seeds_budget_and_interval(tm
     rows = Rows([row for part in own[:2] for row in complete_rows(part, success)])
     rows.write(tmp_path / "look_around.csv")
     found = conclusions.texts(tmp_path)
-    control = found["look_around.control"]
-    assert '"estimate + standard deviation, reward for certainty" (80 [' in control
-    assert '"truth + standard deviation, reward for certainty" (50 [' in control
-    assert "(20 seeds, 2,000,000 steps)" in control
-    assert "by 30 [" in control
-    assert "percentage points (p < 0.001, significant)" in control
-    factors = found["look_around.factors"]
-    for words in ("estimate 30 [", "standard deviation 20 [", "certainty 10 ["):
-        assert words in factors
+    pairs = found["look_around.observation.table"].splitlines()
+    both = next(line for line in pairs if line.startswith("| standard deviation, reward"))
+    assert "| 50 [" in both
+    assert "| 80 [" in both
+    assert "| 30 [" in both
+    assert "points (p < 0.001) | -30 [" in both
+    factors = found["look_around.factors.table"]
+    for factor, points in (("estimate", 30), ("standard deviation", 20), ("certainty", 10)):
+        row = next(line for line in factors.splitlines() if f"{factor} |" in line)
+        assert f"| {points} [" in row
+        assert f"| {-points} [" in row
+    headline = found["look_around.headline"]
+    assert "succeed in 70 [" in headline
+    assert "and in 40 [" in headline
+    assert "20 seeds, 2,000,000 steps" in headline
     assert found["look_around.noise"] == conclusions.NOT_MEASURED
     assert found["stale_race.table"].strip() == conclusions.NOT_MEASURED
     assert own[0] not in conclusions.incomplete(folder=tmp_path)
     assert own[2] in conclusions.incomplete(folder=tmp_path)
     Rows([row | {"flights": "others"} for row in rows.rows]).write(tmp_path / "look_around.csv")
-    assert conclusions.texts(tmp_path)["look_around.control"] == conclusions.NOT_MEASURED
+    assert conclusions.texts(tmp_path)["look_around.headline"] == conclusions.NOT_MEASURED
 
 
 def test_every_conclusion_can_be_computed_once_all_parts_are_measured(tmp_path):
