@@ -116,17 +116,8 @@ def calibrate(
     check.number("share", share, least=0.05, most=0.95)
     check.flag("delays", delays)
     check.flag("rotation", rotation)
-    several = list(log) if isinstance(log, list | tuple) else [log]
-    starts: list[Any] = list(start) if isinstance(start, list | tuple) else [start] * len(several)
-    if len(starts) != len(several) or not several:
-        raise ValueError(f"start must be one for each of {len(several)} logs, got {len(starts)}")
-    logs = [longest_part(read_log(each, **reading)) for each in several]
-    placed, body = origin_of(logs[0], suite), reading.get("body", "flu")
-    for k, each in enumerate(logs):
-        with naming(each):
-            logs[k] = _checked(each, placed, body)
+    logs, begins, placed = _logs_and_starts(log, start, suite, reading)
     prior = _prior_of(placed, logs[0], rotation)
-    begins = [dict(each or {}) for each in starts]
     report = progress or (lambda _: None)
     if len(logs) == 1:
         used, time = 1, logs[0].imu.time
@@ -159,6 +150,22 @@ def calibrate(
     if used < len(flights):
         _, found, new = searched(len(flights), search)
     return Calibration(new, prior, found, before, after, split, used)
+
+
+def _logs_and_starts(
+    log: Any, start: Any, suite: SensorSuite, reading: Reading
+) -> tuple[list[Log], list[dict[str, Any]], SensorSuite]:
+    """Return the logs, checked, the start of each, and the suite at the place of the first one."""
+    several = list(log) if isinstance(log, list | tuple) else [log]
+    starts: list[Any] = list(start) if isinstance(start, list | tuple) else [start] * len(several)
+    if len(starts) != len(several) or not several:
+        raise ValueError(f"start must be one for each of {len(several)} logs, got {len(starts)}")
+    logs = [longest_part(read_log(each, **reading)) for each in several]
+    placed = origin_of(logs[0], suite)
+    for k, each in enumerate(logs):
+        with naming(each):
+            logs[k] = _checked(each, placed, reading.get("body", "flu"))
+    return logs, [dict(each or {}) for each in starts], placed
 
 
 def _searched(
