@@ -72,12 +72,9 @@ class ReadingDefinition(NamedTuple):
         """Names in a log: the keyword, and of vectors in G also the name in I."""
         return (self.keyword, f"{self.name}_I") if self.in_G else (self.name,)
 
-    def known(self, values: NDArray[np.float64], blocks: int | None = None) -> NDArray[np.bool_]:
-        """Return True for the rows of `values` (n, ...) in which one of its blocks has no NaN.
-
-        `blocks`: number of the blocks that count; None: all.
-        """
-        known = np.isfinite(values.reshape(len(values), -1, self.length))[:, :blocks]
+    def known(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return True for the rows of `values` (n, ...) in which one of its blocks has no NaN."""
+        known = np.isfinite(values.reshape(len(values), -1, self.length))
         return np.asarray(np.any(np.all(known, axis=2), axis=1))
 
     @property

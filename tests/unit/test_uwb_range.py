@@ -8,7 +8,7 @@ from quad_gym.analysis.consistency import InnovationRecorder
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.estimation.inputs import measured_blocks
 from quad_gym.logs.formats import read_log
-from quad_gym.logs.replaying.measurements import LogMeasurements
+from quad_gym.logs.replaying.measurements import LogMeasurements, MisfitError
 from quad_gym.params.portable import euler_dcm
 from quad_gym.records import AID_BLOCK, Aid, Control, GateDecision
 from quad_gym.rotations import quaternion_to_dcm
@@ -122,6 +122,14 @@ def test_rows_of_a_log_without_some_of_the_ranges_are_kept():
     np.testing.assert_array_equal(stream.time, table["time"][10::10])
     first = LogMeasurements(read_log(table), UWB, False).at("uwb_range", 0)
     assert measured_blocks(first) == [FIRST, FIRST + 2, FIRST + 3]
+    more = table | {"uwb_range_4": np.where(np.arange(n) % 10 == 5, 9.0, np.nan)}
+    measured = LogMeasurements(read_log(more), UWB, False)
+    of_fifth = measured.streams["uwb_range"].values["uwb_range"][:, 4] > 0.0
+    rows = np.arange(len(of_fifth))  # the suite has no fifth anchor
+    np.testing.assert_array_equal(measured.present(measured.number("uwb_range"), rows), ~of_fifth)
+    fewer = {name: column for name, column in table.items() if name != "uwb_range_3"}
+    with pytest.raises(MisfitError, match="must have the 4 blocks of uwb_range .* got 3"):
+        LogMeasurements(read_log(fewer), UWB, False)
 
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +159,17 @@ def held(log: Log, suite: SensorSuite, place: Any) -> tuple[Log, SensorSuite]:
 UNMEASURED = 1e4  #: standard deviation along an axis that was not measured [m]
 
 
+class _Column(NamedTuple):
+    """A reading of a stream, which a suite uses."""
+
+    reading: ReadingDefinition
+    keyword: str  #: of a filter's `update`
+    values: Floats  #: (n, ...) of the blocks that the suite has
+    known: NDArray[np.bool_]  #: (n,) rows in which one of them was measured
+    turns: bool  #: True for vectors in I, which a filter receives in G
+    sigmas: Floats | None  #: (n, ...) accuracy that a receiver reports
+
+
 class LogMeasurements:
     """Measurements of a log that a suite uses.
 
@@ -174,17 +185,6 @@ class LogMeasurements:
         used = {name: stream for name, stream in given.items() if self._uses(name)}
         self.streams = {"imu": log.imu, **used}
         self._names = list(self.streams)
-        self._taken: dict[str, list[tuple[ReadingDefinition, str]]] = {}
-        left_out = [name for name in given if name not in used]
-        for name in (name for name in used if name in SENSOR_PARAMS):
-            self._taken[name] = []
-            for reading in SENSOR_PARAMS[name].readings(name):
-                keys = [key for key in reading.in_logs if key in used[name].values]
-                if suite.blocks_of(reading.name):
-                    self._taken[name] += [(reading, key) for key in keys]
-                elif keys:
-                    left_out.append(reading.name)
-        self.unused = tuple(left_out)
         if "camera" in used:
             assert suite.camera is not None
             have = used["camera"].values["pixels"].shape[1]
@@ -193,6 +193,17 @@ class LogMeasurements:
                     f"the log must have the {len(suite.camera.features_I)} features of the suite, "
                     f"got {have}"
                 )
+        self._columns: dict[str, list[_Column]] = {}
+        left_out = [name for name in given if name not in used]
+        for name in (name for name in used if name in SENSOR_PARAMS):
+            self._columns[name] = []
+            for reading in SENSOR_PARAMS[name].readings(name):
+                keys = [key for key in reading.in_logs if key in used[name].values]
+                if suite.blocks_of(reading.name):
+                    self._columns[name] += [self._column(used[name], reading, key) for key in keys]
+                elif keys:
+                    left_out.append(reading.name)
+        self.unused = tuple(left_out)
         self.R_GI, self._origin = np.eye(3), np.zeros(3)
         if suite.gnss is not None:
             self._origin = np.array(suite.gnss.reference_antenna_G)
@@ -205,6 +216,24 @@ class LogMeasurements:
         gnss, given = self.suite.gnss, self.log.gnss
         told = given is not None and {*READINGS["gnss_baseline"].in_logs} & set(given.values)
         return gnss is not None and gnss.has_baseline and not told
+
+    def _column(self, stream: Stream, reading: ReadingDefinition, key: str) -> _Column:
+        """Return a reading of a stream, under one of its names in a log."""
+        values, count = stream.values[key], self.suite.blocks_of(reading.name)
+        blocks = values.reshape(len(stream), -1, reading.length)[:, :count]
+        if blocks.shape[1] < count:
+            raise MisfitError(
+                f"the log must have the {count} blocks of {key} that the suite has, got "
+                f"{blocks.shape[1]}"
+            )
+        return _Column(
+            reading,
+            reading.keyword,
+            blocks.reshape(len(stream), *self.suite.shape_of(reading.name)),
+            reading.known(blocks),
+            reading.in_G and key != reading.keyword,
+            stream.values.get(reading.sigma) if reading.reported else None,
+        )
 
     def number(self, name: str) -> int:
         """Return the number of a stream."""
@@ -220,9 +249,8 @@ class LogMeasurements:
         """Return True for the rows of a stream, by its number, in which something was measured."""
         name = self._names[number]
         found = np.full(len(rows), name == "attitude")
-        for reading, key in self._taken.get(name, ()):
-            values = self.streams[name].values[key][rows]
-            found |= reading.known(values, self.suite.blocks_of(reading.name))
+        for column in self._columns.get(name, ()):
+            found |= column.known[rows]
         return found
 
     def at(self, name: str, k: int) -> Measurement | None:
@@ -238,19 +266,18 @@ class LogMeasurements:
             assert self.suite.gnss is not None
             baseline_I = turned(self._attitude(k).T, self.suite.gnss.baseline_B)
             return {"gnss_baseline_G": turned(self.R_GI, baseline_I)}
-        values, found = self.streams[name].values, dict[str, Any]()
-        for reading, key in self._taken[name]:
-            count = self.suite.blocks_of(reading.name)
-            if reading.keyword in found or not reading.known(values[key][k : k + 1], count)[0]:
+        found: dict[str, Any] = {}
+        for column in self._columns[name]:
+            if not column.known[k] or column.keyword in found:
                 continue
-            value = np.reshape(values[key][k], (-1, reading.length))[:count]
-            value = value.reshape(self.suite.shape_of(reading.name))
-            if reading.in_G and key != reading.keyword:
+            value = column.values[k]
+            if column.turns:
                 value = turned(self.R_GI, value)
-            elif reading.from_center:
+            elif column.reading.from_center:
                 value = value - self._origin
-            found[reading.keyword] = value
-            self._add_noise(found, name, reading, k)
+            found[column.keyword] = value
+            if column.sigmas is not None:
+                self._add_noise(found, name, column.reading, column.sigmas[k])
         return found
 
     def heading(self, time: float) -> float | None:
@@ -272,20 +299,16 @@ class LogMeasurements:
         return level(float(values["heading"][k]))
 
     def _add_noise(
-        self, found: dict[str, Any], sensor: str, reading: ReadingDefinition, k: int
+        self, found: dict[str, Any], sensor: str, reading: ReadingDefinition, sigma: Any
     ) -> None:
         """Add the accuracy that a receiver reports: infinity for an axis that was not measured."""
-        values = self.streams[sensor].values.get(reading.sigma) if reading.reported else None
-        if values is None:
-            return
-        sigma = values[k]
         if np.isinf(sigma).any():
             known = sigma if self._reported else np.full_like(sigma, np.nan)
             own = getattr(getattr(self.suite, sensor), reading.noise)
             known = np.where(np.isnan(known), own, known)
             found[reading.sigma] = np.where(np.isinf(sigma), UNMEASURED, known)
         elif self._reported and np.isfinite(sigma).all():
-            found[reading.sigma] = sigma if values.ndim > 1 else float(sigma)
+            found[reading.sigma] = sigma
 
 
 # --------------------------------------------------------------------------------------------------
