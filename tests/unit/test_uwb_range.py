@@ -128,7 +128,7 @@ def test_rows_of_a_log_without_some_of_the_ranges_are_kept():
     rows = np.arange(len(of_fifth))  # the suite has no fifth anchor
     np.testing.assert_array_equal(measured.present(measured.number("uwb_range"), rows), ~of_fifth)
     fewer = {name: column for name, column in table.items() if name != "uwb_range_3"}
-    with pytest.raises(MisfitError, match="must have the 4 blocks of uwb_range .* got 3"):
+    with pytest.raises(MisfitError, match=r"must have the 4 blocks of uwb_range .* got 3"):
         LogMeasurements(read_log(fewer), UWB, False)
 
 
