@@ -31,7 +31,7 @@ from quad_gym.estimation.filters import KalmanFilter, run_while_unknown
 from quad_gym.estimation.inputs import Tape
 from quad_gym.logs.formats import Floats, Log, Reading
 from quad_gym.logs.replaying.player import ESTIMATORS, Player
-from quad_gym.logs.replaying.replay import in_parts, named_start, prepared
+from quad_gym.logs.replaying.replay import in_parts, judged, named_start, prepared
 from quad_gym.logs.replaying.results import Smoothed
 from quad_gym.params import checks as check
 from quad_gym.params.suites import SensorSuite
@@ -75,11 +75,14 @@ def smooth(
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)
     whole, suite = prepared(log, sensors, reading)
+    begins = named_start(start)
+    whole, found = judged(whole, suite, begins, estimator, reported_noise)
+    whole = replace(whole, notes=(*whole.notes, *(finding.text for finding in found)))
 
     def fly(part: Log, begin: dict[str, Any]) -> Smoothed:
         return _smoothed(Player(part, suite, estimator, begin, reported_noise, None))
 
-    return in_parts(whole, named_start(start), fly)
+    return in_parts(whole, begins, fly)
 
 
 def _smoothed(player: Player) -> Smoothed:

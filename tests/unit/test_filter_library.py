@@ -165,6 +165,19 @@ def test_example_equals_replay_after_resets_outliers_outage_and_start_in_motion(
 
 
 @needs_compiler
+@pytest.mark.slow  # it compiles two filters for export
+@pytest.mark.parametrize("name", ["consumer", "field"])
+def test_example_equals_replay_with_a_compass_that_reverses_in_flight(name):
+    suite = quad_gym.sensor_suite(name)
+    table = Recorded(flown(suite, 8.0), suite, max_ticks=3).table()
+    table = {k: v for k, v in table.items() if np.isfinite(v).any()}
+    for axis in "xy":
+        table[f"magnetometer_{axis}"][table["time"] > 3.0] *= -1.0
+    result = require_equal(partial(estimates, example(name, "x86-64")), table, suite, {})
+    assert result.compass_out.any()
+
+
+@needs_compiler
 def test_exported_filter_takes_samples_in_the_axes_of_sensors(tmp_path):
     """Rows of samples are those of the log, and the library rotates them as the replay does."""
     suite = quad_gym.sensor_suite("consumer").replace(

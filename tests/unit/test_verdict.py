@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from quad_gym.estimation import replay
+from quad_gym.estimation import calibrate, replay, smooth
+from quad_gym.logs.calibrating import calibration
 from quad_gym.logs.formats import Log, Stream
 from quad_gym.logs.replaying import rules
 from quad_gym.logs.replaying.results import (
@@ -42,6 +43,15 @@ def flight():
 
 def judged(change):
     return verdicts.judged(NAME, change, *flight(), seed=0)[0]
+
+
+def disturb(table, wrong):
+    """Make positions or velocities of a table wrong from 20 to 32 s."""
+    name = "gnss_enu" if wrong == "positions" else "gnss_velocity_enu"
+    since = table["time"] - 20.0
+    inside = verdicts.rows(table, name) & (since > 0.0) & (since < 12.0)
+    gain = since[inside] if wrong == "positions" else np.ones(inside.sum())
+    table[name][inside] += np.outer(gain, [1.5, 1.0, 0.0])
 
 
 def of(result, quantity):
@@ -77,16 +87,39 @@ def test_gnss_that_drifts_or_jumps_makes_the_position_unusable(change):
 )
 def test_the_imu_shows_which_of_positions_and_velocities_is_wrong_for_some_time(wrong, right):
     def change(table, rng, suite):
-        name = "gnss_enu" if wrong == "positions" else "gnss_velocity_enu"
-        since = table["time"] - 20.0
-        inside = verdicts.rows(table, name) & (since > 0.0) & (since < 12.0)
-        gain = since[inside] if wrong == "positions" else np.ones(inside.sum())
-        table[name][inside] += np.outer(gain, [1.5, 1.0, 0.0])
+        disturb(table, wrong)
 
     result, error = verdicts.judged(NAME, change, *flight(), seed=0)
     assert not result.problems
     assert any(f"{right}, so that the {wrong} are left out" in f.text for f in result.findings)
     assert error < 3.0
+
+
+def test_smoothing_and_calibration_leave_out_the_same_positions(monkeypatch):
+    """The calibration ends where its search would begin."""
+    log, truth = flight()
+    table = {name: column.copy() for name, column in log.items()}
+    disturb(table, "positions")
+    reading = {"from_": 12.0, "until": 36.0}
+    smoothed = smooth(table, sensors=NAME, **reading)
+    assert any("so that the positions are left out" in note for note in smoothed.notes)
+    assert verdicts.position_errors(smoothed, truth).max() < 3.0
+    searched = []
+
+    def stop(*flight):
+        searched.append(flight[0])
+        raise InterruptedError
+
+    monkeypatch.setattr(calibration, "turn_on_biases", stop)
+    with pytest.raises(InterruptedError):
+        calibrate(table, sensors=NAME, share=0.95, **reading)
+    stamps, (place,) = (
+        searched[0].gnss.time,
+        (value for name, value in searched[0].gnss.values.items() if name.startswith("position_")),
+    )
+    known = np.isfinite(place).all(axis=1)
+    assert not known[(stamps > 21.0) & (stamps < 31.0)].any()
+    assert known[stamps < 19.0].mean() > 0.9
 
 
 def test_gnss_that_drifts_while_a_camera_holds_the_position_is_a_problem():
@@ -180,6 +213,15 @@ def test_a_start_that_the_flight_contradicts_is_said():
         re.search(r"given position at the start contradicts .* by about (9|1[01])\.?\d* m:", text)
         for text in result.problems
     )
+    fast = int(np.argmax(np.linalg.norm(truth["velocity"], axis=1)))
+    since, speed = truth["time"][fast], float(np.linalg.norm(truth["velocity"][fast]))
+    w, x, y, z = truth["quaternion"][fast]
+    heading = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    start = {"position": truth["position"][fast], "heading": heading}
+    result = replay(log, sensors=NAME, start=start, from_=since, until=since + 8.0)
+    (text,) = (text for text in result.problems if "velocity at the start contradicts" in text)
+    found = float(re.search(r"about ([\d.]+) m/s: the vehicle is not at rest", text)[1])
+    assert found == pytest.approx(speed, rel=0.3)
     lean = euler_to_dcm((0.35, 0.0, 0.0))
     leaning = {n: log[n] @ lean.T for n in ("gyro", "accel", "magnetometer")}
     result = replay(log | leaning, sensors=NAME)
@@ -205,6 +247,17 @@ def test_noise_that_is_assumed_too_large_is_pessimistic_and_no_problem():
     result = judged(verdicts.pessimism)
     assert not result.problems
     assert "pessimistic in GNSS position by a factor of " in result.verdict
+    assert any("a calibration finds the noise" in f.text for f in of(result, "log"))
+
+
+def test_accuracy_that_a_receiver_reports_is_not_called_pessimistic():
+    log, _ = flight()
+    fixes = np.isfinite(log["gnss_enu"])
+    result = replay(log | {"gnss_sigma": np.where(fixes, 6.0, np.nan)}, sensors=NAME)
+    assert not result.problems
+    assert "pessimistic in GNSS position" not in result.verdict
+    (text,) = (f.text for f in result.findings if "the receiver reports" in f.text)
+    assert text.startswith("GNSS position: innovations are ")
 
 
 def test_noise_of_a_barometer_makes_the_height_uncertain_only():

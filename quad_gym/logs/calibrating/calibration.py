@@ -19,7 +19,7 @@ from quad_gym.logs.formats import Log, Reading, read_log
 from quad_gym.logs.formats.clocks import longest_part, naming
 from quad_gym.logs.formats.quantities import compared
 from quad_gym.logs.replaying.measurements import implausible
-from quad_gym.logs.replaying.replay import origin_of, replay
+from quad_gym.logs.replaying.replay import judged, named_start, origin_of, replay
 from quad_gym.logs.replaying.rules import BEYOND, MAX_BIAS
 from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import SENSOR_PARAMS
@@ -49,6 +49,8 @@ class Calibration:
     of the first ones"""
     split: float  #: time at which this part begins [s]; of several logs, all of the later ones
     used: int = 1  #: number of logs with which the validated numbers were found
+    disputes: tuple[str, ...] = ()
+    """sentences on positions and velocities of GNSS that contradict each other"""
 
     @property
     def verdict(self) -> str:
@@ -68,6 +70,7 @@ class Calibration:
         found = {n.number.sensor for n in self.numbers}
         absent = [name for name in SENSOR_PARAMS if getattr(self.suite, name) and name not in found]
         return (
+            *self.disputes,
             *(
                 f"the log does not determine {n.number.name} ({n.value:.3g}, {n.prior:.3g} before)"
                 for n in silent
@@ -116,17 +119,17 @@ def calibrate(
     check.number("share", share, least=0.05, most=0.95)
     check.flag("delays", delays)
     check.flag("rotation", rotation)
-    logs, begins, placed = _logs_and_starts(log, start, suite, reading)
+    logs, begins, placed, disputes = _logs_and_starts(log, start, suite, reading)
     prior = _prior_of(placed, logs[0], rotation)
     report = progress or (lambda _: None)
     if len(logs) == 1:
         used, time = 1, logs[0].imu.time
         split = float(time[0] + share * (time[-1] - time[0]))
-        flights, judged = [logs[0].until(split)], {"": 0}
+        flights, later = [logs[0].until(split)], {"": 0}
     else:
         used, split = max(1, min(len(logs) - 1, round(share * len(logs)))), -math.inf
         flights = logs
-        judged = {_name_of(logs[k], k): k for k in range(used, len(logs))}
+        later = {_name_of(logs[k], k): k for k in range(used, len(logs))}
     report("Biases of the IMU")
     biases = [turn_on_biases(*each, prior) for each in zip(flights, begins, strict=True)]
     flights = [_without(part, found) for part, found in zip(flights, biases, strict=True)]
@@ -144,28 +147,31 @@ def calibrate(
     search, found, new = searched(used)
     report("Validation")
     before, after = (
-        pooled({n: validate(logs[k], s, begins[k], split) for n, k in judged.items()})
+        pooled({n: validate(logs[k], s, begins[k], split) for n, k in later.items()})
         for s in (prior, new)
     )
     if used < len(flights):
         _, found, new = searched(len(flights), search)
-    return Calibration(new, prior, found, before, after, split, used)
+    return Calibration(new, prior, found, before, after, split, used, tuple(disputes))
 
 
 def _logs_and_starts(
     log: Any, start: Any, suite: SensorSuite, reading: Reading
-) -> tuple[list[Log], list[dict[str, Any]], SensorSuite]:
-    """Return the logs, checked, the start of each, and the suite at the place of the first one."""
+) -> tuple[list[Log], list[dict[str, Any]], SensorSuite, list[str]]:
+    """Return the logs, checked, the start of each, the suite at the first place, and disputes."""
     several = list(log) if isinstance(log, list | tuple) else [log]
     starts: list[Any] = list(start) if isinstance(start, list | tuple) else [start] * len(several)
     if len(starts) != len(several) or not several:
         raise ValueError(f"start must be one for each of {len(several)} logs, got {len(starts)}")
     logs = [longest_part(read_log(each, **reading)) for each in several]
-    placed = origin_of(logs[0], suite)
+    placed, body = origin_of(logs[0], suite), reading.get("body", "flu")
+    begins, disputes = [dict(each or {}) for each in starts], list[str]()
     for k, each in enumerate(logs):
         with naming(each):
-            logs[k] = _checked(each, placed, reading.get("body", "flu"))
-    return logs, [dict(each or {}) for each in starts], placed
+            checked = _checked(each, placed, body)
+            logs[k], wrong = judged(checked, placed, named_start(begins[k]), reported_noise=False)
+            disputes += [finding.text for finding in wrong]
+    return logs, begins, placed, disputes
 
 
 def _searched(

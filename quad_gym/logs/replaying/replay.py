@@ -17,7 +17,7 @@ from quad_gym.logs.formats.quantities import compared, disputed, without
 from quad_gym.logs.replaying.measurements import FilterCalls
 from quad_gym.logs.replaying.player import ESTIMATORS, OwnPlayer, Player
 from quad_gym.logs.replaying.results import Estimates, Finding, Replay, joined
-from quad_gym.logs.replaying.rules import changes, uncertain
+from quad_gym.logs.replaying.rules import changes, reported_by, uncertain
 from quad_gym.logs.replaying.verdict import during, with_verdict
 from quad_gym.params import checks as check
 from quad_gym.params.suites import SensorSuite, sensor_suite
@@ -131,22 +131,23 @@ def replay(
             rows.extend(calls.rows)
         return found
 
-    def attempt(log: Log) -> Replay:
-        def of_part(part: Log, begin: dict[str, Any]) -> Replay:
-            return Player(part, suite, estimator, begin, reported_noise, reach).play()
-
-        return in_parts(log, named_start(start), of_part)
-
     rows: list[str] = []
-    whole, found = _judged(whole, suite, attempt)
+    whole, found = judged(whole, suite, named_start(start), estimator, reported_noise, reach)
     result = in_parts(whole, named_start(start), fly)
     if samples is not None:
         Path(samples).write_text("".join(rows), encoding="utf-8")
-    return with_verdict(whole, reading.get("body", "flu"), suite, result, dict(start or {}), found)
+    reports = reported_by(whole) if reported_noise else frozenset()
+    about = whole, reading.get("body", "flu"), suite, result
+    return with_verdict(*about, dict(start or {}), found, reports)
 
 
-def _judged(
-    log: Log, suite: SensorSuite, attempt: Callable[[Log], Replay]
+def judged(
+    log: Log,
+    suite: SensorSuite,
+    start: dict[str, Any],
+    estimator: str = "ukf",
+    reported_noise: bool = True,
+    reach: float | None = None,
 ) -> tuple[Log, tuple[Finding, ...]]:
     """Return a log without wrong positions or velocities of GNSS, and a finding about them.
 
@@ -156,11 +157,21 @@ def _judged(
     Args:
         log: The log.
         suite: The suite.
-        attempt: Replays a log.
+        start: The start, see `named_start`.
+        estimator: Filter that is tried without either.
+        reported_noise: True: with the accuracy that the receiver reports.
+        reach: Longest delay of measurements; None: they are processed in the order of their stamps.
     """
     span = disputed(log, suite)
     if span is None:
         return log, ()
+
+    def attempt(log: Log) -> Replay:
+        def of_part(part: Log, begin: dict[str, Any]) -> Replay:
+            return Player(part, suite, estimator, begin, reported_noise, reach).play()
+
+        return in_parts(log, start, of_part)
+
     ratios = {}
     for quantity in ("position", "velocity"):
         tried = without(log, quantity, span)

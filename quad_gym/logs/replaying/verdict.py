@@ -8,7 +8,7 @@ innovations as their autocorrelation leaves.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -62,24 +62,24 @@ RULES = (
     Rule(rules.late, "more than half of a sensor, or all from a time on, is late", "a tenth"),
     Rule(rules.clocks, "clocks of IMU and GNSS run apart by more than 0.15 s"),
     Rule(rules.gaps, "10 s of flight without a correction, over all parts, or none at all"),
+    Rule(heading_rules.axes, "axes of magnetometer and IMU differ"),
+    Rule(
+        heading_rules.contradicted,
+        "a heading 10 degrees and 4 standard deviations from the motion's, reset or for 2 s",
+        "a magnetometer that was left out",
+    ),
     Rule(
         rules.misfits,
         "innovations twice as large; a tenth rejected, or rejected in one run; GNSS for 10 s; a "
         "mean NIS of 25; correlated innovations of GNSS",
         "1.4 times as large; a run of rejections that chance does not explain",
     ),
-    Rule(heading_rules.axes, "axes of magnetometer and IMU differ"),
     Rule(heading_rules.jumps, "", "the magnetic field jumps by a fifth, as no turn explains"),
     Rule(heading_rules.strength, "", "the strength of the magnetic field changes by 10 % for 2 s"),
     Rule(rules.first_heading, "the motion contradicts the heading at the start"),
     Rule(rules.first_tilt, "", "the motion contradicts roll and pitch at the start"),
     Rule(rules.first_place, "GNSS contradicts a given position or velocity at the start"),
     Rule(rules.lost_samples, "", "the IMU pauses for 0.3 s"),
-    Rule(
-        heading_rules.contradicted,
-        "a heading 10 degrees and 4 standard deviations from the motion's, reset or for 2 s",
-        "a magnetometer that was left out",
-    ),
     Rule(rules.unexplained, "the estimate changes as no sample of the IMU explains"),
     Rule(rules.flagged, "the filter is flagged as diverged at the end"),
     Rule(
@@ -88,7 +88,7 @@ RULES = (
     ),
     Rule(rules.unknown_heading, "", "a heading that nothing shows until the end"),
 )
-"""All rules, with the limits beyond which a quantity is unusable or uncertain."""
+"""All rules, causes before consequences, with limits of unusable and uncertain quantities."""
 
 
 def with_verdict(
@@ -98,11 +98,13 @@ def with_verdict(
     result: Replay,
     start: Mapping[str, Any],
     known: tuple[Finding, ...] = (),
+    reports: Collection[str] = (),
 ) -> Replay:
     """Return a replay with its findings, the worst first, and the verdict in a line.
 
     If the log has commands of the motors, it ends for the verdict where they stop for good. Some
-    findings may be `known` before.
+    findings may be `known` before. For sensors that `reports` lists, the filter used the accuracy
+    that they report.
     """
     flown = _until_landing(log, result)
     sensors = by_sensor(flown.measured)
@@ -111,10 +113,10 @@ def with_verdict(
         own = rejected_for_their_size(sensors["magnetometer"], probability)
         sensors = {**sensors, "magnetometer": own}
     fits = {name: fit for name, m in sensors.items() if (fit := fit_of(m))}
-    case = Evidence(log, body, suite, flown, sensors, fits, start)
+    case = Evidence(log, body, suite, flown, sensors, fits, start, reports)
     found = [*known, *(finding for rule in RULES for finding in rule.find(case))]
     found.sort(key=lambda finding: -finding.severity)
-    return replace(result, findings=tuple(found), verdict=in_one_line(found, fits))
+    return replace(result, findings=tuple(found), verdict=in_one_line(found, fits, reports))
 
 
 def _until_landing(log: Log, result: Replay) -> Replay:
@@ -146,8 +148,13 @@ def during(result: Replay, since: float, until: float) -> Replay:
     return replace(result, **cut, measured=measured)
 
 
-def in_one_line(findings: Sequence[Finding], fits: Mapping[str, Fit]) -> str:
-    """Return the verdict in a line: usable or not, and NIS per degree of freedom."""
+def in_one_line(
+    findings: Sequence[Finding], fits: Mapping[str, Fit], reports: Collection[str] = ()
+) -> str:
+    """Return the verdict in a line: usable or not, and NIS per degree of freedom.
+
+    Sensors that report their accuracy, in `reports`, are not called pessimistic.
+    """
     if problems := [f for f in findings if f.severity == Severity.LOST]:
         return f"not usable, because {problems[0]}"
     if not fits:
@@ -164,8 +171,10 @@ def in_one_line(findings: Sequence[Finding], fits: Mapping[str, Fit]) -> str:
     if reservations:
         listed = ", ".join(reservations)
         text = f"usable with reservations: {listed}; NIS per degree of freedom {span}"
+    assumed = {name: value for name, value in values.items() if name not in reports} or {"": 1.0}
+    least = min(assumed, key=assumed.__getitem__)
     for word, name, value in (
-        ("pessimistic", min(values, key=values.__getitem__), 1.0 / max(low, 1e-6)),
+        ("pessimistic", least, 1.0 / max(assumed[least], 1e-6)),
         ("optimistic", max(values, key=values.__getitem__), high),
     ):
         if value > rules.RATIO:
