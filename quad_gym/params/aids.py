@@ -63,6 +63,11 @@ class ReadingDefinition(NamedTuple):
         return f"{self.block or self.name}_{k}" if self.most_blocks > 1 else self.name
 
     @property
+    def together(self) -> str:
+        """Name of all of its blocks together."""
+        return f"{self.block}s" if self.block else self.name
+
+    @property
     def keyword(self) -> str:
         """Keyword of a filter's `update`: names of vectors in G say so."""
         return f"{self.name}_G" if self.in_G else self.name

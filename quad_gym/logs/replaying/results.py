@@ -2,7 +2,6 @@
 
 import bisect
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
@@ -12,7 +11,7 @@ import numpy as np
 
 from quad_gym.estimation.filters import Results
 from quad_gym.logs.formats import Floats
-from quad_gym.params.sensor_table import AID_PARAMS, READINGS
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import (
     FREEDOMS,
@@ -262,11 +261,10 @@ class Smoothed(Estimates):
 def by_sensor(measured: Mapping[str, InnovationSeries]) -> dict[str, InnovationSeries]:
     """Return the innovations of a replay by sensor, with all blocks of a sensor together."""
     found = dict(measured)
-    several = {name: name for name, kind in AID_PARAMS.items() if kind.most_blocks > 1}
-    for word, together in {"feature": "features", **several}.items():
-        names = [name for name in measured if re.fullmatch(rf"{word}_\d+", name)]
-        if names:
-            found[together] = stacked([found.pop(name) for name in names])
+    for reading in (reading for reading in READINGS.values() if reading.most_blocks > 1):
+        names = {reading.name_of(k) for k in range(reading.most_blocks)}
+        if parts := [found.pop(name) for name in measured if name in names]:
+            found[reading.together] = stacked(parts)
     return found
 
 

@@ -22,7 +22,7 @@ from quad_gym.logs.replaying.results import (
     larger,
     runs_beyond_chance,
 )
-from quad_gym.params.sensor_table import AID_PARAMS
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.rotations import quaternion_to_dcm
 
@@ -32,32 +32,30 @@ from quad_gym.rotations import quaternion_to_dcm
 
 FALSE_ALARM = 1e-3  #: probability of a chance event that counts as a finding
 
-NAMES = {
-    "gnss_position": "GNSS position",
-    "gnss_baseline": "GNSS baseline",
-    "gnss_velocity": "GNSS velocity",
-    "features": "camera features",
-    **{name: name.replace("_", " ") for name in AID_PARAMS},
-}
-"""Sensors in sentences."""
+_READINGS = {reading.together: reading for reading in READINGS.values()}
+
+NAMES = {name: name.replace("gnss", "GNSS").replace("_", " ") for name in _READINGS}
+NAMES["features"] = "camera features"
+"""Readings in sentences, all blocks of one together."""
 
 
 def _observing(*states: str) -> tuple[str, ...]:
-    return tuple(name for name, kind in AID_PARAMS.items() if {*states} & {*kind.observes})
+    return tuple(n for n, reading in _READINGS.items() if {*states} & {*reading.observes})
 
 
+_VERTICAL = "gnss_velocity"  #: also corrects the height, by its vertical part
 MEASURED_BY = {
-    "position": ("gnss_position", "gnss_velocity", "features", *_observing("position", "velocity")),
-    "height": ("gnss_position", "gnss_velocity", "features", *_observing("height")),
-    "heading": ("gnss_baseline", "features", *_observing("heading")),
+    "position": _observing("position", "velocity"),
+    "height": tuple(n for n in _READINGS if n in (*_observing("height"), _VERTICAL)),
+    "heading": _observing("heading"),
 }
-"""Sensors that correct a quantity."""
-OF_SENSOR = {"gnss_baseline": "heading"} | {
-    name: kind.observes[0]
-    for name, kind in AID_PARAMS.items()
-    if kind.observes in (("height",), ("heading",))
+"""Readings that correct a quantity."""
+OF_SENSOR = {
+    name: reading.observes[0]
+    for name, reading in _READINGS.items()
+    if reading.observes in (("height",), ("heading",))
 }
-"""Quantities of sensors; the position for others."""
+"""Quantities of readings; the position for others."""
 
 
 @dataclass(frozen=True, eq=False)
