@@ -7,7 +7,7 @@ text is drawn at four times its size, which spaces letters evenly.
 
 import contextlib
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -77,6 +77,7 @@ class Canvas:
         self.surface = self._pygame.Surface((width, height), 0, 32, _RGBX)
         self._packed = self._pygame.Surface((width, height), 0, 24, _RGBX)
         self._background: Any = None
+        self._panel: tuple[Any, Any] = (None, None)
         self._fonts: dict[int, Any] = {}
         self._words: dict[tuple[str, int, Color], Any] = {}
 
@@ -187,6 +188,23 @@ class Canvas:
         self._layer.set_clip(None)
         self._layer.fill((*WHITE, 190), box)
         self.surface.blit(self._layer, (round(left), round(top)), box)
+
+    def panel(
+        self,
+        key: tuple[Any, ...],
+        at: tuple[float, float],
+        size: tuple[float, float],
+        write: Callable[[], None],
+    ) -> None:
+        """Show a brightened rectangle with words, which `write` has written for an equal key."""
+        left, top = map(round, at)
+        if self._panel[0] != key:
+            panel = self._pygame.Surface(tuple(map(round, size)), self._pygame.SRCALPHA, 32, _RGBA)
+            panel.fill((*WHITE, 190))
+            picture, self.surface = self.surface, panel
+            write()
+            self._panel, self.surface = (key, panel), picture
+        self.surface.blit(self._panel[1], (left, top))
 
     def text(
         self,

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from quad_gym.flights import Flight
 from quad_gym.records import Shape
-from quad_gym.rotations import quaternion_to_dcm
 
 # --------------------------------------------------------------------------------------------------
 # Geometry of pictures in NumPy: a viewing camera, and outlines of ellipsoids.
@@ -92,6 +91,19 @@ class Perspective:
         return self.focal / max(float(self.in_view(point)[2]), NEAR)
 
 
+def attitude_of(quaternion: Floats) -> Floats:
+    """R_BI (..., 3, 3) of finite quaternions (..., 4): SciPy would take longer than most lines."""
+    q = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, 0)
+    w, x, y, z = q
+    xx, yy, zz = 2.0 * q[1:] * q[1:]
+    xy, xz, yz, wx, wy, wz = 2.0 * np.stack([x * y, x * z, y * z, w * x, w * y, w * z])
+    R_BI = np.empty((*quaternion.shape[:-1], 3, 3))
+    R_BI[..., 0, 0], R_BI[..., 0, 1], R_BI[..., 0, 2] = 1.0 - yy - zz, xy + wz, xz - wy
+    R_BI[..., 1, 0], R_BI[..., 1, 1], R_BI[..., 1, 2] = xy - wz, 1.0 - xx - zz, yz + wx
+    R_BI[..., 2, 0], R_BI[..., 2, 1], R_BI[..., 2, 2] = xz + wy, yz - wx, 1.0 - xx - yy
+    return R_BI
+
+
 def look_at(eye: Floats, target: Floats, focal: float, center: Floats) -> Perspective:
     """View from `eye` toward `target`, with the vertical upright."""
     into = (target - eye) / np.linalg.norm(target - eye)
@@ -153,7 +165,7 @@ def chase_view(flight: Flight, width: float, height: float) -> Perspective:
     """
     recent = flight.rows[-max(2, round(0.5 * flight.scene.control_rate)) :]
     here = np.array(recent["position"][-1])
-    ahead = quaternion_to_dcm(recent["quaternion"])[:, 0, :2].mean(axis=0)
+    ahead = attitude_of(recent["quaternion"])[:, 0, :2].mean(axis=0)
     heading = np.arctan2(ahead[1], ahead[0]) - np.radians(28.0)
     behind = np.array([np.cos(heading), np.sin(heading), 0.0])
     eye = here - 2.4 * behind + (0.0, 0.0, 1.15)

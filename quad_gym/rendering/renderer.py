@@ -33,6 +33,7 @@ VIEWS = ("fixed", "chase")  #: names of the views of a flight
 MOVING_VIEWS = {"chase": chase_view, "follow": follow_view, "course": course_view}
 MIN_WIDTH, MIN_HEIGHT = 320, 240
 STALE_FIX = 0.5  #: time without a fix after which a warning is shown [s]
+_GRAIN = 16  #: of the legend's width, which else would change with its numbers [pixels]
 _SEEN = {
     "truth": "truth",
     "estimate": "estimate",
@@ -132,20 +133,26 @@ class Renderer:
         policy = flight.about.get("policy")
         lines: list[tuple[str, Mark | None]] = []
         lines += [(_controller(str(policy)), None)] if policy else []
-        lines += [*legend_of(flight), (errors_of(flight), None)]
+        lines += [*legend_of(flight), (errors := errors_of(flight), None)]
         lines += [(words, None) for words in _warnings(flight)]
         width = max(26 + canvas.width_of(words, small) for words, _ in lines)
-        width = max(width, canvas.width_of(f"{title}   {clock}", large) + 12)
-        step, x, y = canvas.line_height(small) + 2, 12.0, 9.0
-        canvas.veil(6, 6, width, 8 + canvas.line_height(large) + step * len(lines))
-        canvas.text(title, x, y, large)
-        canvas.text(clock, 6 + width - 6, y, large, colors.INK, 1.0)
-        y += canvas.line_height(large) + 2
-        for words, mark in lines:
-            if mark is not None:
-                canvas.mark(mark, x, y, small)
-            canvas.text(words, x if mark is None else x + 15, y, small)
-            y += step
+        head = (canvas.width_of(words, large) for words in (title, "   ", clock))
+        width = -(-max(width, sum(head) + 12) // _GRAIN) * _GRAIN
+        step, first = canvas.line_height(small) + 2, 5.0 + canvas.line_height(large)
+        places = {words: first + step * k for k, (words, _) in enumerate(lines)}
+
+        def write() -> None:  # without what changes in each picture
+            canvas.text(title, 6, 3, large)
+            for words, mark in lines:
+                if mark is not None:
+                    canvas.mark(mark, 6, places[words], small)
+                if words != errors:
+                    canvas.text(words, 6 if mark is None else 21, places[words], small)
+
+        key = (title, width, *((words, mark) for words, mark in lines if words != errors))
+        canvas.panel(key, (6, 6), (width, first + 3 + step * len(lines)), write)
+        canvas.text(clock, width, 9, large, colors.INK, 1.0)
+        canvas.text(errors, 12, 6 + places[errors], small)
 
 
 def _controller(policy: str) -> str:

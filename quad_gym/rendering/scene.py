@@ -10,8 +10,13 @@ from quad_gym.flights import Flight, FlightScene
 from quad_gym.records import GateDecision
 from quad_gym.rendering import canvas as colors
 from quad_gym.rendering.canvas import Canvas, Color, Label
-from quad_gym.rendering.geometry import Perspective, ellipsoid_axes, ellipsoid_outline, faces_of
-from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.rendering.geometry import (
+    Perspective,
+    attitude_of,
+    ellipsoid_axes,
+    ellipsoid_outline,
+    faces_of,
+)
 
 # --------------------------------------------------------------------------------------------------
 # Inset with the image plane of the vehicle's camera and the features in it.
@@ -77,7 +82,7 @@ class Inset:
         canvas.inside((box.left, box.top, box.width, box.height))
         q = image["estimated_quaternion"]
         if np.isfinite(q).all():
-            predicted = scene.project_features(image["estimated_position"], quaternion_to_dcm(q))
+            predicted = scene.project_features(image["estimated_position"], attitude_of(q))
             for at in place_in_inset(predicted, scene, box):
                 canvas.disc(at, 6.0, colors.VERMILLION, 1.5)
         places, refused = place_in_inset(image["pixels"], scene, box), self._refused
@@ -374,7 +379,7 @@ class Scene:
 
     def _attitude(self, column: str) -> Floats:
         q = self._now[column]
-        return quaternion_to_dcm(q) if np.isfinite(q).all() else np.eye(3)
+        return attitude_of(q) if np.isfinite(q).all() else np.eye(3)
 
     def _estimate(self) -> None:
         believed = self._flight["observed_position"][-1]
