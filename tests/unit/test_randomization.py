@@ -89,12 +89,12 @@ def test_all_draws_are_independent(drawn):
     assert np.abs(along).max() < alarm_score(along.size) / math.sqrt(19_999)
 
 
-@given(st.floats(-5.0, 5.0), st.floats(0.0, 3.0), st.floats(0.1, 4.0), st.integers(0, 3))
+@given(st.floats(-5.0, 3.0), st.floats(0.0, 3.0), st.floats(0.1, 4.0), st.integers(0, 3))
 def test_bounds_hold_to_the_last_bit(low, width, sigma, kind):
     high = low + width
     given = Uniform(low, high)
     if kind == 1:
-        given = LogUniform(math.exp(low), math.exp(high))
+        given = LogUniform(math.exp(low - 5.0), math.exp(high - 5.0))
     elif kind == 2:
         given = Normal(low + 0.3 * width, sigma, low, high + 1e-3)
     elif kind == 3:

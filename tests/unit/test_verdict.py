@@ -115,7 +115,11 @@ def test_smoothing_and_calibration_leave_out_the_same_positions(monkeypatch):
         calibrate(table, sensors=NAME, share=0.95, **reading)
     stamps, (place,) = (
         searched[0].gnss.time,
-        (value for name, value in searched[0].gnss.values.items() if name.startswith("position_")),
+        (
+            value
+            for name, value in searched[0].gnss.values.items()
+            if name.startswith("gnss_position_")
+        ),
     )
     known = np.isfinite(place).all(axis=1)
     assert not known[(stamps > 21.0) & (stamps < 31.0)].any()

@@ -74,10 +74,11 @@ class Evidence:
 
 def reported_by(log: Log) -> frozenset[str]:
     """Return the measurements of GNSS whose accuracy a receiver reports."""
-    names = {"position_sigma_I": "gnss_position", "velocity_sigma": "gnss_velocity"}
     values = {} if log.gnss is None else log.gnss.values
     return frozenset(
-        names[name] for name in names if name in values and np.isfinite(values[name]).any()
+        name
+        for name, reading in READINGS.items()
+        if reading.reported and np.isfinite(values.get(reading.sigma, math.nan)).any()
     )
 
 
@@ -263,7 +264,7 @@ def _factor(fit: Fit) -> float:
     return 1.0 / math.sqrt(max(fit.mean_nis, 1e-6))
 
 
-def _smooth(name: str, m: Measured) -> str:
+def _smooth(name: str, m: InnovationSeries) -> str:
     """Return a sentence on innovations that are smaller than a receiver's accuracy."""
     known = np.isfinite(m.nis) & ~m.gated
     size, sigma = (float(np.sqrt((v[known] ** 2).mean())) for v in (m.innovation, m.sigma))
