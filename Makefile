@@ -86,9 +86,10 @@ test-clients:  ## each client of docs/libraries.md in an environment of its own;
 test-arm: setup  ## golden flights on AArch64, emulated: needs gcc-aarch64-linux-gnu and qemu-user-static
 	$(BIN)/python -m tests.golden.aarch64
 
-test-single: setup  ## golden flights in single precision, with each number of lanes
+test-single: setup  ## golden flights and exported filters in single precision, with each number of lanes
 	for lanes in 16 8 4 2; do QUAD_GYM_PRECISION=single QUAD_GYM_LANES=$$lanes \
 		$(BIN)/python -m tests.golden.flights || exit 1; done
+	$(BIN)/python -m pytest tests/statistical/test_single_precision.py -k exported
 
 test-slow: setup  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow

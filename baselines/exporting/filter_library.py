@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.exporting.controller import Controller, c_source, descriptions
+from quad_gym.packing import slow_errors_of
 from quad_gym.params import checks as check
+from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
-from quad_gym.records import require_double
+from quad_gym.records import FEATURE_BLOCKS, PRECISION
 
 # --------------------------------------------------------------------------------------------------
 # A policy for an exported filter: its observation from the estimate, as text of C sources.
@@ -73,37 +75,49 @@ LIBRARY, HEADER = "libquad_gym_filter.a", "quad_gym_filter.h"
 class Target(NamedTuple):
     """A processor for which filters are exported."""
 
-    processor: tuple[str, str, str]
-    """triple of four parts, processor and relocation, in LLVM's words"""
+    processor: dict[str, Any]
+    """triple of four parts, processor and relocation, in LLVM's words; see `building.Processor`"""
     words: str  #: description
     build: str  #: commands that build the example
+    single: bool = False  #: True: always in single precision; False: in that of the process
 
 
 _CMAKE = "cmake -B build && cmake --build build"
 _BARE = """\
-arm-none-eabi-gcc -std=c99 -O2 -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-d16 \\
+arm-none-eabi-gcc -std=c99 -O2 -mcpu={0} -mfloat-abi=hard -mfpu={1} \\
     main.c libquad_gym_filter.a -lm  # with the start-up code and linker script of your board"""
 _WASM = """\
 # Debian: clang lld wasi-libc libclang-rt-dev-wasm32
 clang --target=wasm32-wasi --sysroot=/usr -std=c99 -O2 -D_WASI_EMULATED_PROCESS_CLOCKS \\
     main.c libquad_gym_filter.a -lm -lwasi-emulated-process-clocks -o example.wasm"""
+_THUMB = "thumbv7em-unknown-none-eabihf"
 TARGETS = {
     "x86-64": Target(
-        ("x86_64-unknown-linux-gnu", "x86-64-v3", "pic"),
+        {"triple": "x86_64-unknown-linux-gnu", "cpu": "x86-64-v3"},
         "Linux on x86-64 with AVX2 and FMA (since 2013)",
         _CMAKE,
     ),
     "aarch64": Target(
-        ("aarch64-unknown-linux-gnu", "generic", "pic"),
+        {"triple": "aarch64-unknown-linux-gnu", "cpu": "generic"},
         "Linux on AArch64",
         _CMAKE.replace("build &&", "build -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc &&", 1),
     ),
     "cortex-m7": Target(
-        ("thumbv7em-unknown-none-eabihf", "cortex-m7", "static"),
+        {"triple": _THUMB, "cpu": "cortex-m7", "reloc": "static"},
         "Cortex-M7 with double-precision FPU, hard-float ABI",
-        _BARE,
+        _BARE.format("cortex-m7", "fpv5-d16"),
     ),
-    "wasm32": Target(("wasm32-unknown-unknown", "generic", "static"), "WebAssembly", _WASM),
+    "cortex-m4": Target(
+        {"triple": _THUMB, "cpu": "cortex-m4", "reloc": "static", "fma": "qg_core_fma"},
+        "Cortex-M4 or Cortex-M7 with single-precision FPU, hard-float ABI",
+        _BARE.format("cortex-m4", "fpv4-sp-d16"),
+        single=True,
+    ),
+    "wasm32": Target(
+        {"triple": "wasm32-unknown-unknown", "cpu": "generic", "reloc": "static"},
+        "WebAssembly",
+        _WASM,
+    ),
 }
 """Processors by the names that users write."""
 
@@ -129,17 +143,19 @@ def export_filter(
             measurements.
 
     Raises:
-        ValueError: If the target is unknown, the filter of the suite cannot run, the policy
-            observes more than the estimate, or the process computes in single precision.
+        ValueError: If the target is unknown, the filter of the suite cannot run, or the policy
+            observes more than the estimate.
         ImportError: If Numba is not installed.
         RuntimeError: If the kernels cannot be emitted for the target.
     """
     check.choice("target", target, tuple(TARGETS))
-    require_double("the export of a filter")
     suite.require_filter()
     check.package("numba", "exporting a filter", "compile")
     values = {} if policy is None else policy_values(policy)
     env = {"QUAD_GYM_LANES": "1", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    env["QUAD_GYM_PRECISION"] = "single" if TARGETS[target].single else PRECISION
+    if env["QUAD_GYM_PRECISION"] == "single":
+        env["QUAD_GYM_ROOM"] = " ".join(map(str, room_for(suite)))
     path = os.pathsep.join(part for part in sys.path if isinstance(part, str))
     done = subprocess.run(
         [sys.executable, "-c", "from baselines.exporting.filter_process import write; write()"],
@@ -156,6 +172,18 @@ def export_filter(
         files.append(folder / name)
         files[-1].write_bytes(content)
     return files
+
+
+def room_for(suite: SensorSuite) -> tuple[int, ...]:
+    """Return the sizes of the records of a suite's filter, see `records.ROOM`."""
+    blocks = []
+    for name, reading in READINGS.items():
+        count = suite.blocks_of(name)  # those that may be several support each other in the gate
+        blocks.append(max(2 if count and reading.most_blocks > 1 else 1, count))
+    features = suite.blocks_of("pixels")
+    together = FEATURE_BLOCKS + features + sum(params.blocks for params in suite.aids.values())
+    states = max(len(slow_errors_of(suite)) - 2, together - 15, 1)  # without biases of the IMU
+    return (*blocks, together, 3 * -(-states // 3))
 
 
 def archive(objects: dict[str, bytes]) -> bytes:

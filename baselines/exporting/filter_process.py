@@ -33,13 +33,17 @@ from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.records import (
     BLOCKS_OF,
+    FIRST_OF_FLIGHTS,
     FLIGHT_BLOCK,
     KEPT,
     MEASUREMENT,
     OPERATION,
     PARAMS_BLOCK,
     PARTS,
+    PRECISION,
+    REAL_BYTES,
     SAMPLE,
+    SINGLE,
     START,
     STEP_BLOCK,
     WORK_BLOCK,
@@ -71,6 +75,7 @@ _RECORDS = {
     "memory": MEMORY,
 }
 """Records in the memory of an exported filter, by their names there."""
+_PLACES = ("gnss_position",)  #: readings that stay in double precision
 _OUTCOMES = {
     Outcome.OK: "done",
     Outcome.NOT_STARTED: "call an init function first",
@@ -85,6 +90,11 @@ _OUTCOMES = {
 
 
 _WINDOW = 0.5  #: longest delay of measurements beyond the suite's `log_delays` [s], as in a replay
+_SHORT_WINDOW = 0.1
+"""Longest delay beyond the suite's latencies in single precision, for processors with little memory
+[s]."""
+_CORE = ("tick", "filter_status", "diverged")
+"""Fields that the filter uses of the core, of which it has all in memory."""
 
 
 class Sources:
@@ -145,13 +155,12 @@ class Sources:
     # ---- numbers ------------------------------------------------------------------------------
 
     def _copied(self, used: set[str]) -> list[tuple[int, int]]:
-        """Return places and lengths of the used parts in memory, in doubles."""
+        """Return places and lengths of the used parts in memory, in words of REAL_BYTES."""
         found: list[tuple[int, int]] = []
-        for name, fields in PARTS:
-            if name not in used:
-                continue
-            place = (offset_of(FLIGHT_BLOCK, fields[0].name) - self.room.skipped) // 8
-            length = sum(math.prod(field.shape) for field in fields)
+        names = [f.name for part, fields in PARTS if part in used - {"core"} for f in fields]
+        for name in (*_CORE, *names):
+            place = (offset_of(FLIGHT_BLOCK, name) - self.room.skipped) // REAL_BYTES
+            length = FLIGHT_BLOCK[name].itemsize // REAL_BYTES
             if found and sum(found[-1]) == place:
                 found[-1] = (found[-1][0], found[-1][1] + length)
             else:
@@ -160,10 +169,9 @@ class Sources:
 
     def _record_values(self) -> dict[str, Any]:
         values: dict[str, Any] = {
-            "FLIGHT_WORDS": self.room.dtype.itemsize // 8,
-            "PARAMS_WORDS": PARAMS_BLOCK.itemsize // 8,
-            "WORK_WORDS": WORK_BLOCK.itemsize // 8,
-            "STEPS_WORDS": STEP_BLOCK.itemsize // 8,
+            **{f"{name}_WORDS": -(-size // 8) for name, size in self._sizes.items()},
+            "REAL": "float" if SINGLE else "double",
+            "PRECISION": PRECISION,
             "COPY_WORDS": sum(length for _, length in self.copied),
             "SKIPPED": self.room.skipped,
             "STAGES": len(Stage),
@@ -190,21 +198,35 @@ class Sources:
         values |= {f"A_{kind.name}": int(kind) for kind in Kept}
         return values
 
+    @property
+    def _sizes(self) -> dict[str, int]:
+        """Bytes of the filter's records in memory, by their names in the templates."""
+        return {
+            "FLIGHT": self.room.dtype.itemsize,
+            "PARAMS": PARAMS_BLOCK.itemsize,
+            "WORK": offset_of(WORK_BLOCK, FIRST_OF_FLIGHTS),
+            "STEPS": STEP_BLOCK.itemsize,
+        }
+
     def _suite_values(self) -> dict[str, Any]:
         suite = self.suite
-        window = _WINDOW + max(0.0, *vars(suite.log_delays).values())
+        window, every, waiting = _WINDOW, 8, 16
+        if SINGLE:
+            latencies = (sensor.latency for sensor in suite.sensors.values())
+            window, every, waiting = _SHORT_WINDOW + max(0.0, *latencies), 16, 4
+        window += max(0.0, *vars(suite.log_delays).values())
         rate = sum(sensor.rate for sensor in suite.sensors.values())
         events = math.ceil(1.25 * window * (max(suite.imu.rate, self.imu_rate) + rate)) + 24
-        measurements = math.ceil(1.25 * window * rate) + 16
-        copies = events // 8 + 2
+        measurements = math.ceil(1.25 * window * rate) + waiting
+        copies = events // every + 2
         words = sum(
             (
-                self.room.dtype.itemsize + PARAMS_BLOCK.itemsize + WORK_BLOCK.itemsize,
-                STEP_BLOCK.itemsize + 8 * len(Stage) + WINDOW.itemsize + 24,
-                (events + copies + 72) * OPERATION.itemsize + 16 * PENDING.itemsize,
-                events * EVENT.itemsize + (events + 36) * SAMPLE.itemsize,
-                (measurements + 16) * MEASUREMENT.itemsize,
-                copies * 8 * sum(length for _, length in self.copied),
+                sum(self._sizes.values()) + 8 * len(Stage) + WINDOW.itemsize + 24,
+                (events + copies + 4 * waiting + 8) * OPERATION.itemsize,
+                waiting * PENDING.itemsize + events * EVENT.itemsize,
+                (events + 2 * waiting + 4) * SAMPLE.itemsize,
+                (measurements + waiting) * MEASUREMENT.itemsize,
+                copies * REAL_BYTES * sum(length for _, length in self.copied),
             )
         )
         turns = bool(mounting_of(suite)["imu_turns"][0])
@@ -215,11 +237,14 @@ class Sources:
             "SUITE": self.label,
             "ESTIMATOR": suite.estimator.kind,
             "TARGET": TARGETS[self.target].words,
+            "FMA": "fma" in TARGETS[self.target].processor,
             "BUILD": TARGETS[self.target].build,
             "TICK": repr(suite.imu.dt),
             "AVERAGES": int(suite.imu.samples == "average"),
             "LONGEST": repr(max(LONGEST_STEP, suite.imu.dt)),
             "WINDOW": repr(window),
+            "COPY_EVERY": every,
+            "WAITING": waiting,
             "EVENTS": events,
             "MEASUREMENTS": measurements,
             "RAM": f"{words:,}",
@@ -252,25 +277,26 @@ class Sources:
         }
 
     def _texts_of(self, name: str) -> dict[str, str]:
-        """Return what the templates have of a reading."""
+        """Return the texts of a reading in the templates."""
         reading, count, first = READINGS[name], self.suite.blocks_of(name), BLOCKS_OF[name].start
         group, length = list(READINGS).index(name), reading.length
         numbers, several = count * length, reading.sigmas > 1
         frame = ", in G" if reading.in_G else ""
         note = f"{reading.meaning}{frame} [{reading.unit}]"
         note += "; NAN: not measured" if reading.most_blocks > 1 else ""
-        value = f"const double {name}[{numbers}]" if numbers > 1 else f"double {name}"
-        sigma = f"const double *{reading.sigma}" if several else f"double {reading.sigma}"
+        kind, put = ("double", "qgi_place") if name in _PLACES else ("qg_real", "qgi_value")
+        value = f"const {kind} {name}[{numbers}]" if numbers > 1 else f"{kind} {name}"
+        sigma = f"const qg_real *{reading.sigma}" if several else f"qg_real {reading.sigma}"
         of_sigma = f"{reading.sigmas} standard deviations" if several else "standard deviation"
         given = f", {sigma}" if reading.reported else ""
         call = f"int qg_update_{name}(qg_filter *f, {value}{given}, double time)"
         take = (
             f"    for (int i = 0; m->{name} && i < {count}; i++)\n"
-            f"        r.valid[{first} + i] = qgi_put(r.measurement[{first} + i],\n"
-            f"{36 * ' '}m->{name} + {length} * i, {length});\n"
+            f"        r.valid[{first} + i] = {put}(r.measurement[{first} + i],\n"
+            f"{38 * ' '}m->{name} + {length} * i, {length});\n"
         )
         take += (
-            f"    qgi_put(r.sigma[{group}], m->{reading.sigma}, {reading.sigmas});\n"
+            f"    qgi_value(r.sigma[{group}], m->{reading.sigma}, {reading.sigmas});\n"
             if several
             else f"    r.sigma[{group}][0] = m->{reading.sigma};\n"
         )
@@ -282,7 +308,7 @@ class Sources:
         return {
             "MACROS": macros,
             "FIELDS_OF_MEASUREMENTS": (
-                f"    const double *{name}; /* {numbers}: {note} */\n"
+                f"    const {kind} *{name}; /* {numbers}: {note} */\n"
                 f"    {sigma}; /* {of_sigma} [{reading.sigma_unit}] */\n"
             ),
             "TAKE": take,
@@ -294,13 +320,14 @@ class Sources:
         """Return the C code that takes the numbers of a row of the example's input."""
         readings = self.suite.sensors[sensor].readings(sensor)
         if len(readings) == 1:
-            return f"m.{readings[0].name} = x + 1"
+            return f"m.{readings[0].name} = real + 1"
         taken, place = [], 1
         for reading in readings:
             if self.suite.blocks_of(reading.name):
-                taken.append(f"m.{reading.name} = given({place})")
+                numbers = "given" if reading.name in _PLACES else "value"
+                taken.append(f"m.{reading.name} = {numbers}({place})")
                 if reading.reported:
-                    number = "given" if reading.sigmas > 1 else "number"
+                    number = "value" if reading.sigmas > 1 else "number"
                     taken.append(f"m.{reading.sigma} = {number}({place + reading.length})")
             place += reading.length + reading.sigmas * reading.reported
         return ", ".join(taken)
@@ -312,12 +339,12 @@ def _numbers(values: Any) -> str:
 
 
 def _struct(name: str, dtype: np.dtype) -> str:
-    """Return the C type of a record whose fields are all eight bytes long."""
+    """Return the C type of a record."""
     assert dtype.fields is not None
     lines = []
     for field, (kind, *_) in dtype.fields.items():
         base, shape = kind.subdtype or (kind, ())
-        word = "double" if base.kind == "f" else "int64_t"
+        word = {"f8": "double", "f4": "float", "i8": "int64_t"}[base.str[1:]]
         lines.append(f"    {word} {field}{''.join(f'[{n}]' for n in shape)};")
     return "\n".join(["typedef struct {", *lines, f"}} {name};", ""])
 
@@ -337,7 +364,7 @@ def _contents(
 ) -> dict[str, bytes]:
     """Return the files by name; records must have one lane."""
     sources = Sources(suite, label, target, policy, imu_rate)
-    processor = Processor(*TARGETS[target].processor)
+    processor = Processor(**TARGETS[target].processor)
     missing = [name for name in sources.functions if not is_cached(name, processor)]
     if missing:
         say(f"quad_gym: compiling {len(missing)} kernels of the filter for {target} (once)")

@@ -31,8 +31,9 @@ class ExportFilterArgs:
     """Options of the export."""
 
     sensors: SuiteName = SENSORS
-    target: Literal["x86-64", "aarch64", "cortex-m7", "wasm32"] = "x86-64"
-    """processor: x86-64 (with AVX2) or aarch64 with Linux, cortex-m7, or WebAssembly"""
+    target: Literal["x86-64", "aarch64", "cortex-m7", "cortex-m4", "wasm32"] = "x86-64"
+    """processor: x86-64 (with AVX2) or aarch64 with Linux, cortex-m7, cortex-m4 (in single
+    precision, also for a Cortex-M7 without double precision), or WebAssembly"""
     policy: str | None = None
     """also export a policy that acts on the estimate: pretrained, or a file of quad-gym train"""
     normalization: Normalized = None

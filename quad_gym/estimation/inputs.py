@@ -100,7 +100,8 @@ def measured_blocks(measurement: Measurement) -> list[int]:
 def values_of(measurement: Measurement, name: str, count: int) -> Floats:
     """Return the first blocks of a reading, (count, length); NaN: not measured."""
     blocks = slice(BLOCKS_OF[name].start, BLOCKS_OF[name].start + count)
-    values: Floats = measurement["measurement"][0, blocks, : READINGS[name].length].copy()
+    numbers = measurement["measurement"][0, blocks, : READINGS[name].length]
+    values: Floats = np.array(numbers, np.float64)
     values[measurement["valid"][0, blocks] == 0.0] = np.nan
     return values
 

@@ -35,6 +35,7 @@ from quad_gym.records import (
     OPERATION,
     PARAMS_BLOCK,
     POSITION_BLOCK,
+    REAL_BYTES,
     SAMPLE,
     SETTINGS,
     START,
@@ -81,7 +82,7 @@ _events_at, _samples_at, _waits_at, _operations_at, _measurements_at = map(
     array_at, (EVENT, SAMPLE, PENDING, OPERATION, MEASUREMENT)
 )
 _words_at, _numbers_at, _reals_at, _singles_at = map(
-    array_at, (np.uint64, np.int64, np.float64, np.float32)
+    array_at, (np.dtype(f"u{REAL_BYTES}"), np.int64, np.float64, np.float32)
 )
 _NUMBERS = (_FLIGHT, _PARAMS, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE)
 
@@ -90,7 +91,8 @@ _NUMBERS = (_FLIGHT, _PARAMS, _PARAMS, _STEPS, _SETTINGS, _WORK, _TABLE)
 def _copy(memory, parts, number, restores):
     """Copy the used parts of the filter's memory, or restore them from a copy."""
     words = _words_at(memory.flight, parts[1] + parts[2 * parts[0] - 1])
-    copy = _words_at(memory.copies + 8 * number * memory.copy_words, memory.copy_words)
+    place = memory.copies + REAL_BYTES * number * memory.copy_words
+    copy = _words_at(place, memory.copy_words)
     k = 0
     for part in range(parts[0]):
         for i in range(parts[2 * part + 1], parts[2 * part + 1] + parts[2 * part + 2]):
@@ -140,7 +142,7 @@ def take(
     """Process a sample or the measurement m, in the axes of its sensor.
 
     `parts` is the address of the number of parts of the filter's memory that copies have, and of
-    the place and length of each, in words.
+    the place and length of each, in words as long as a number of the filter.
     """
     _correct(mounting, given, m)
     known = math.isfinite(given.time) and math.isfinite(given.dt)

@@ -38,7 +38,10 @@ from quad_gym.records.states import ROWS
 _OK, _NOT_FINITE, _RANGE = int(Outcome.OK), int(Outcome.NOT_FINITE), int(Outcome.OUT_OF_RANGE)
 _CONTRADICTION = int(Outcome.CONTRADICTION)
 _POSITIONS, _BASELINES, _VELOCITIES, _IMAGES = range(AID_GROUPS)
-_LARGEST = 1e15  #: largest standard deviation
+_in_precision = np.dtype(REAL).type  #: the number in the precision of lanes
+_LEAST = tuple(float(_in_precision(least)) for least in LEAST_SIGMA)
+_LARGEST = float(_in_precision(1e15))  #: largest standard deviation
+_PI = float(_in_precision(math.pi))
 
 
 @kernel
@@ -85,10 +88,10 @@ def _check_sigmas(sigma, group, measured):
             outcome = _CONTRADICTION
         elif not math.isfinite(sigma[i]):
             outcome = _NOT_FINITE
-        elif not LEAST_SIGMA[group] <= sigma[i] <= _LARGEST:
+        elif not _LEAST[group] <= sigma[i] <= _LARGEST:
             outcome = _RANGE
-    if group == _BASELINES and sigma[0] > math.pi:
-        sigma[0] = math.pi
+    if group == _BASELINES and sigma[0] > _PI:
+        sigma[0] = _PI
     return outcome
 
 
@@ -125,7 +128,6 @@ _PREDICT_STAGE, _UPDATE_STAGE = int(Stage.PREDICT), int(Stage.UPDATE)
 _PREDICT, _UPDATE, _COPY, _RESTORE, _KEEP = map(int, Operation)
 _HEIGHT = AID_BLOCK[Aid["BAROMETER"]]
 _LANES = 8 * WIDTH  #: bytes
-_in_precision = np.dtype(REAL).type  #: the number in the precision of lanes
 
 
 @kernel
@@ -213,7 +215,7 @@ def _replace_noise(p, m, own):
     sigma = m.sigma[_BASELINES, 0]
     if sigma == sigma:
         p.baseline_sigma = sigma
-        if sigma <= math.pi:  # otherwise only the heading is used, with the suite's noise
+        if sigma <= _PI:  # otherwise only the heading is used, with the suite's noise
             p.baseline_noise = sigma
     p.velocity_sigma = _chosen(m.sigma[_VELOCITIES, 0], own.velocity_sigma)
     p.pixel_sigma = _chosen(m.sigma[_IMAGES, 0], own.pixel_sigma)

@@ -63,7 +63,7 @@ from quad_gym.params.sensor_table import (
     SensorTable,
 )
 from quad_gym.params.uwb_range import UwbRangeParams
-from quad_gym.records import FEATURE_BLOCKS, MAX_TOGETHER, MAX_UNDER_WAY, Aid
+from quad_gym.records import ALLOWED_TOGETHER, FEATURE_BLOCKS, MAX_UNDER_WAY, Aid
 
 # --------------------------------------------------------------------------------------------------
 # A sensor suite: IMU, GNSS, camera, and the filter that fuses them.
@@ -166,8 +166,8 @@ class SensorSuite(SensorTable, Saved):
             delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, self.imu.rate)
         features = 0 if self.camera is None else len(self.camera.features_I)
         count = FEATURE_BLOCKS + features + sum(params.blocks for params in self.aids.values())
-        if count > MAX_TOGETHER:
-            most = MAX_TOGETHER - FEATURE_BLOCKS
+        if count > ALLOWED_TOGETHER:
+            most = ALLOWED_TOGETHER - FEATURE_BLOCKS
             raise ValueError(
                 f"sensors must have at most {most} camera features and measurements of other "
                 f"sensors at an instant, got {count - FEATURE_BLOCKS}"

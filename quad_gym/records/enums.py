@@ -1,5 +1,6 @@
 """Enumerations of the values that records hold."""
 
+import os
 from enum import IntEnum, IntFlag
 
 from quad_gym.params.sensor_table import SENSOR_SHAPES
@@ -80,7 +81,13 @@ _SHAPES = [reading for sensor in _SENSOR_SHAPES for reading in sensor.readings]
 READINGS = tuple(shape.name for shape in _SHAPES)
 """Names of the sensors' readings, in the order of the sensors. Each is a group of the gate."""
 LENGTHS = tuple(shape.length for shape in _SHAPES)  #: numbers in a block of each reading
-MOST_BLOCKS = tuple(shape.most_blocks for shape in _SHAPES)  #: largest numbers of their blocks
+ROOM = tuple(map(int, os.environ.get("QUAD_GYM_ROOM", "").split()))
+"""Sizes of the records of a process that exports a filter for a processor with little memory:
+blocks of each reading, blocks of an instant, and slow errors; empty: the largest ones. Set by
+`baselines.exporting` alone."""
+ALLOWED_BLOCKS = tuple(shape.most_blocks for shape in _SHAPES)
+"""Largest numbers of their blocks in a suite."""
+MOST_BLOCKS = ROOM[:-2] or ALLOWED_BLOCKS  #: largest numbers for which records have room
 LEAST_SIGMA = tuple(shape.least_sigma for shape in _SHAPES)
 """Smallest standard deviations of a measurement of each reading."""
 DIRECTIONS = tuple(shape.direction for shape in _SHAPES)

@@ -287,6 +287,10 @@ WORK_FIELDS = (
     Field("alone", (SENSOR_GROUPS,), "0 or 1", "groups whose quantity no other accepted sensor measures"),
     Field("drifted", (), "0 or 1", "1 if the estimate has drifted gradually"),
     Field("hidden", (MAX_FEATURES,), "0 or 1", "features whose directions are too uncertain"),
+    # heading by motion
+    Field("held", (), "0 or 1", "1 where an update must not correct the attitude"),
+    Field("held_attitude", (3, 3), "-", "the attitude before it"),
+    Field("since_level", (3,), "m/s, s", "sums in N at the instant of the measurement"),
     # the segment of a trajectory at an instant
     Field("path_time", (), "s", "time in the episode; then since the beginning of the segment"),
     Field("path_still", (), "0 or 1", "1 before the start and beyond the end"),
@@ -329,9 +333,6 @@ WORK_FIELDS = (
     Field("slow_decay", (MAX_SLOW,), "-", "decay of the slow errors since then"),
     Field("since_time", (), "s", "T since then"),
     Field("since_turn", (3, 3), "-", "C of then"),
-    Field("held", (), "0 or 1", "1 where an update must not correct the attitude"),
-    Field("held_attitude", (3, 3), "-", "the attitude before it"),
-    Field("since_level", (3,), "m/s, s", "sums in N of then"),
     Field("since_velocity", (3,), "m/s", "V of then"),
     Field("since_position", (3,), "m", "X of then"),
     Field("since_bias_gain", (3, 3), "s", "B_s, gain of the biases since then"),
@@ -339,6 +340,8 @@ WORK_FIELDS = (
     Field("columns", (15, 21 + MAX_SLOW), "mixed", "errors of the state, taken back or on: columns of P, of P_slow^T, and six of noise"),
 )
 # fmt: on
+FIRST_OF_FLIGHTS = "path_time"
+"""First field that only flights of a batch need: a filter for one vehicle uses those before it."""
 
 
 # --------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from quad_gym.records.sizes import (
     MAX_BLOCKS,
     MAX_SLOW,
     MAX_STATES,
+    REAL,
     SENSOR_GROUPS,
     Field,
 )
@@ -130,11 +131,12 @@ MOUNTING = np.dtype(
 ESTIMATE = np.dtype(
     [
         ("time", "f8"),
-        *((name, "f8", 3) for name in ("position", "velocity")),
-        ("R_BI", "f8", (3, 3)),
-        ("quaternion", "f8", 4),
-        *((name, "f8", 3) for name in ("accel_bias", "gyro_bias")),
-        ("sigma", "f8", 15),
+        ("position", "f8", 3),
+        ("velocity", REAL, 3),
+        ("R_BI", REAL, (3, 3)),
+        ("quaternion", REAL, 4),
+        *((name, REAL, 3) for name in ("accel_bias", "gyro_bias")),
+        ("sigma", REAL, 15),
         ("diverged", "i4"),
     ],
     align=True,
@@ -194,20 +196,23 @@ class SensorReading(NamedTuple):
 # Records of a tape: inputs of a filter, and the operations that process them in order.
 # --------------------------------------------------------------------------------------------------
 
-SAMPLE = np.dtype([("gyro", "f8", 3), ("accel", "f8", 3), ("dt", "f8"), ("gyro_before", "f8", 3)])
+SAMPLE = np.dtype(
+    [("gyro", REAL, 3), ("accel", REAL, 3), ("dt", "f8"), ("gyro_before", REAL, 3)], align=True
+)
 """An IMU sample that propagates the estimate; `gyro_before` is the one before, for lever arms."""
 
 MEASUREMENT = np.dtype(
     [
-        ("valid", "f8", MAX_BLOCKS),  # 1 where a block is measured
-        ("measurement", "f8", (MAX_BLOCKS, 3)),  # as in a flight's record
+        ("valid", REAL, MAX_BLOCKS),  # 1 where a block is measured
+        ("measurement", REAL, (MAX_BLOCKS, 3)),  # as in a flight's record
         # standard deviations of readings, of positions three; 0: not given, and after the check
         # NaN: as in the parameters
-        ("sigma", "f8", (SENSOR_GROUPS, 3)),
+        ("sigma", REAL, (SENSOR_GROUPS, 3)),
         # results of the check
         ("outcome", "i8"),
         ("culprit", "i8"),  # number of the reading at fault; plus SENSOR_GROUPS: its deviations
-    ]
+    ],
+    align=True,
 )
 """Measurements of one instant, by blocks, from a log or a caller to the filter."""
 

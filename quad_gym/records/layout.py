@@ -83,8 +83,12 @@ def room_of(used: frozenset[str]) -> Room:
     the window.
     """
     chosen = [i for i, (name, _) in enumerate(PARTS) if name in used | {"core"}]
-    fields = [field for _, part in PARTS[chosen[0] : chosen[-1] + 1] for field in part]
-    return Room(block_dtype(tuple(fields)), offset_of(FLIGHT_BLOCK, fields[0].name))
+    first = FLIGHT_FIELDS.index(PARTS[chosen[0]][1][0])
+    # words begin at a multiple of 8 bytes, which a number of float32 of one flight may not
+    while offset_of(FLIGHT_BLOCK, FLIGHT_FIELDS[first].name) % 8:
+        first -= 1
+    fields = FLIGHT_FIELDS[first : 1 + FLIGHT_FIELDS.index(PARTS[chosen[-1]][1][-1])]
+    return Room(block_dtype(fields), offset_of(FLIGHT_BLOCK, fields[0].name))
 
 
 def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:

@@ -4,8 +4,8 @@ import os
 from typing import NamedTuple
 
 from quad_gym.records.enums import (
-    AID_MOST,
     AID_TRIPLES,
+    ALLOWED_BLOCKS,
     DIRECTIONS,
     GROUP_COUNT,
     GROUP_FREEDOMS,
@@ -13,6 +13,7 @@ from quad_gym.records.enums import (
     MOST_BLOCKS,
     OWN_ERRORS,
     READINGS,
+    ROOM,
     Aid,
     FaultKind,
     Sensor,
@@ -53,7 +54,7 @@ def require_double(what: str) -> None:
 
 
 WIDTHS = (1, 2, 4, 8)  #: supported numbers of lanes; 1 is for filters on other processors
-SINGLE_WIDTHS = (2, 4, 8, 16)  #: the same in single precision
+SINGLE_WIDTHS = (1, 2, 4, 8, 16)  #: the same in single precision
 WARP = 32  #: number of flights in a block on a GPU, whose threads fly one each
 RESIDENT = 8  #: blocks that a multiprocessor of a GPU flies at once, with 255 registers a thread
 _NEEDED = {
@@ -148,11 +149,14 @@ POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK, FEATURE_BLOCKS = (
 FEATURE_SLICE = BLOCKS_OF["pixels"]  #: blocks of the features
 MAX_FEATURES = FEATURE_SLICE.stop - FEATURE_SLICE.start  #: largest number of a camera's features
 AID_BLOCK = FIRST_BLOCK[FIRST_AID:]  #: first block of each aiding sensor
-AID_BLOCKS, AID_ROWS = AID_BLOCK[0], sum(AID_MOST)  #: first of their blocks, and number of these
+AID_BLOCKS = AID_BLOCK[0]  #: first of their blocks
 AID_NUMBERS = tuple(sum(AID_TRIPLES[:aid]) for aid in Aid)  #: first row of each aiding sensor in `aid_numbers`
-MAX_TOGETHER = max(AID_BLOCKS + 4, FEATURE_BLOCKS + AID_ROWS)
-"""Largest number of blocks of an instant: all of GNSS and camera and four more, or all of the other
-sensors and GNSS."""
+ALLOWED_TOGETHER = max(
+    sum(ALLOWED_BLOCKS[:AID_GROUPS]) + 4, FEATURE_BLOCKS + sum(ALLOWED_BLOCKS[AID_GROUPS:])
+)
+"""Largest number of blocks of an instant in a suite: all of GNSS and camera and four more, or all
+of the other sensors and GNSS."""
+MAX_TOGETHER = ROOM[-2] if ROOM else ALLOWED_TOGETHER  #: the same for which records have room
 MAX_MEASUREMENTS = 3 * MAX_TOGETHER  #: largest length of the stacked measurement; a direction has three numbers
 SEVERAL = tuple(group for group in range(SENSOR_GROUPS) if MOST_BLOCKS[group] > 1)
 """Groups of several blocks, which support each other: images, for example."""
@@ -166,7 +170,7 @@ DIRECTION_BLOCKS = tuple((GROUP_BLOCK[g], GROUP_BLOCK[g] + MOST_BLOCKS[g]) for g
 """First and end of each range of blocks that are directions."""
 MAX_OBSERVATION = 512  #: largest length of an observation
 WARM_DRAWS = 21  #: standard normals for the errors of a warm start: 15 for the states, 6 for the true biases
-MAX_SLOW = 9
+MAX_SLOW = ROOM[-1] if ROOM else 9
 """Largest number of slow sensor errors among a filter's states, a multiple of three: the drift of
 GNSS positions, the hard iron of a magnetometer, and one number for each other sensor."""
 MAX_STATES = 15 + MAX_SLOW  #: number of states of a filter with all slow errors

@@ -4,6 +4,7 @@ A process computes in one precision, and each compiles its own kernels.
 """
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -83,7 +84,20 @@ def test_replay_in_single_precision_agree_with_double(tmp_path):
     assert single["verdict"] == double["verdict"]
 
 
-@pytest.mark.parametrize("lanes", SINGLE_WIDTHS)
+@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler (cc)")
+@pytest.mark.parametrize("suite", ["crazyflie", "rtk", "consumer", "uwb"])
+def test_exported_filters_in_single_precision_equal_replays_in_it(suite):
+    """With resets, outliers, outages, late measurements and starts in motion, bitwise.
+
+    Also on a Cortex-M4, where the tools to emulate one are installed.
+    """
+    words = f"replay and {suite} and not (aarch64 or cortex-m7 or wasm32)"
+    words = ("-q", "-k", words, "tests/unit/test_filter_library.py")
+    told = flown(*words, module="pytest", QUAD_GYM_PRECISION="single")
+    assert " passed" in told
+
+
+@pytest.mark.parametrize("lanes", SINGLE_WIDTHS[1:])
 def test_golden_flights_in_single_precision_do_not_depend_on_number_of_lanes(lanes):
     environment = {"QUAD_GYM_PRECISION": "single", "QUAD_GYM_LANES": str(lanes)}
     flown(module="tests.golden.flights", **environment)

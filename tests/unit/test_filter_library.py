@@ -3,6 +3,7 @@
 import ctypes
 import dataclasses
 import functools
+import importlib.util
 import math
 import shutil
 import subprocess
@@ -17,12 +18,14 @@ import pytest
 import quad_gym
 from baselines.exporting import controller_of, export_filter
 from baselines.exporting.filter_library import LIBRARY, archive
+from docs.examples import cortex_m4
 from quad_gym.commands.main import main
 from quad_gym.estimation import UnscentedKalmanFilter, replay
 from quad_gym.estimation.starts import state_at_rest
 from quad_gym.logs.formats import read_log
 from quad_gym.logs.replaying.log_start import wide_start
 from quad_gym.params.suites import ALL_SUITES
+from quad_gym.records import REAL, SINGLE
 from tests.console_commands import refused
 from tests.logged_flights import Recorded, flown
 
@@ -51,6 +54,13 @@ needs_aarch64 = pytest.mark.skipif(
 needs_arm = pytest.mark.skipif(
     not (shutil.which(f"{ARM}-gcc") and shutil.which("qemu-arm-static")),
     reason="no gcc-arm-linux-gnueabihf, or no qemu-user-static",
+)
+needs_single = pytest.mark.skipif(
+    not SINGLE, reason="computes in single precision: set QUAD_GYM_PRECISION=single"
+)
+needs_m4 = pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, ("unicorn", "ziglang"))),
+    reason="no emulator of a Cortex-M4: pip install unicorn ziglang",
 )
 slow = partial(pytest.param, marks=pytest.mark.slow)  # half a minute for each target
 REST = {"position": (0.0, 0.0, 1.5), "heading": math.radians(20.0)}
@@ -101,9 +111,19 @@ def example(name, target, *flags, compiler="cc"):
 
 
 def estimates(*command):
-    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    names, *rows = told.split()
+    return parsed(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def parsed(printed):
+    names, *rows = printed.split()
     return names.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
+
+
+def as_printed(result):
+    """Columns of a replay (n, columns), rounded to the precision of the process, but not times."""
+    columns = np.array(list(result.columns().values()))
+    columns[1:] = columns[1:].astype(REAL)
+    return columns.T
 
 
 def require_equal(run, log, suite, start):
@@ -112,7 +132,7 @@ def require_equal(run, log, suite, start):
     wanted = replay(log, sensors=suite, start=start, samples=samples)
     names, rows = run(samples)
     assert names == list(wanted.columns())
-    np.testing.assert_array_equal(rows, np.array(list(wanted.columns().values())).T)
+    np.testing.assert_array_equal(rows, as_printed(wanted))
     assert len(rows) > 100
     return wanted
 
@@ -202,7 +222,7 @@ def test_exported_filter_takes_samples_in_the_axes_of_sensors(tmp_path):
         assert len(found) > 20
         assert set(found) <= given
     found = estimates(program, tmp_path / "samples.csv")[1]
-    np.testing.assert_array_equal(found, np.array(list(result.columns().values())).T)
+    np.testing.assert_array_equal(found, as_printed(result))
 
 
 @functools.cache
@@ -274,7 +294,7 @@ def test_example_refuses_measurements_older_than_its_memory(tmp_path):
     files = [folder / "main.c", folder / LIBRARY]
     subprocess.run(["cc", "-O2", *files, "-lm", "-o", folder / "example"], check=True)
     found = estimates(folder / "example", samples)[1]
-    np.testing.assert_array_equal(found, np.array(list(result.columns().values())).T)
+    np.testing.assert_array_equal(found, as_printed(result))
 
 
 @needs_compiler
@@ -334,6 +354,15 @@ def on_arm(name, log):
     return estimates("qemu-arm-static", "-cpu", "max", program, log)
 
 
+def on_m4(name, log):
+    """Run the code for Cortex-M4 in Unicorn."""
+    folder = exported(name, "cortex-m4")
+    program = folder / "example"
+    if not program.exists():
+        cortex_m4.compiled(folder)
+    return parsed(cortex_m4.Machine(program, log).run())
+
+
 def on_wasm(name, log):
     """Run the code for WebAssembly in Node.js."""
     folder = exported(name, "wasm32")
@@ -358,12 +387,16 @@ def on_wasm(name, log):
     [
         pytest.param(on_aarch64, id="aarch64", marks=[needs_aarch64, pytest.mark.slow]),
         pytest.param(on_arm, id="cortex-m7", marks=[needs_arm, pytest.mark.slow]),
+        pytest.param(on_m4, id="cortex-m4", marks=[needs_single, needs_m4, pytest.mark.slow]),
         pytest.param(on_wasm, id="wasm32", marks=[needs_wasm, pytest.mark.slow]),
     ],
 )
-@pytest.mark.parametrize("name", ["rtk", slow("consumer"), pytest.param(TURNED_FILE, id="turned")])
+@pytest.mark.parametrize(
+    "name", ["rtk", slow("crazyflie"), slow("consumer"), pytest.param(TURNED_FILE, id="turned")]
+)
 def test_example_on_foreign_processor_prints_estimates_of_replay(run, name):
-    require_equal(partial(run, name), logged(name), quad_gym.sensor_suite(name), {})
+    suite = quad_gym.sensor_suite(name)
+    require_equal(partial(run, name), logged(name), suite, REST if suite.gnss is None else {})
 
 
 @pytest.mark.slow  # two minutes to fly, three to filter

@@ -1,7 +1,12 @@
-"""Single precision of a process: its records, and refused calls that need double precision."""
+"""Single precision of a process: its records, memory of exported filters, and refused calls."""
+
+import re
 
 import pytest
 
+from baselines.exporting.filter_library import room_for
+from quad_gym import sensor_suite
+from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import FLIGHT_BLOCK, WIDTH, places_of_lanes
 from tests.builders import run_python
 
@@ -9,7 +14,6 @@ RECORDS = """
 import warnings
 
 import numpy as np
-from baselines.exporting import export_filter
 from quad_gym import UnscentedKalmanFilter, sensor_suite
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.main import main
@@ -44,7 +48,6 @@ assert [str(w.message).split(":")[0] for w in caught] == [
 ]
 main(["version"])
 for refused in (
-    lambda: export_filter(sensor_suite("standard"), "filter", "x86-64", "."),
     lambda: calibrate({}, sensors="rtk"),
     lambda: smooth({}, sensors="rtk"),
 ):
@@ -83,7 +86,43 @@ def test_flights_in_single_precision_equal_golden_flights():
     assert done.returncode == 0, done.stderr
 
 
-def test_single_precision_has_its_own_records_warns_of_distance_and_refuses_exports():
+def test_single_precision_has_its_own_records_warns_of_distance_and_refuses_calibration():
     done = run_python("-c", RECORDS, QUAD_GYM_PRECISION="single")
     assert "(single precision)" in done.stdout, done.stderr
-    assert done.stdout.count("needs double precision, got QUAD_GYM_PRECISION=single") == 3
+    assert done.stdout.count("needs double precision, got QUAD_GYM_PRECISION=single") == 2
+
+
+MEMORY = """
+import sys
+
+from baselines.exporting.filter_process import Sources
+from quad_gym import sensor_suite
+from quad_gym.records import FLIGHT_BLOCK
+
+sources = Sources(sensor_suite(sys.argv[1]), sys.argv[1], "cortex-m4", {})
+room = sources.room
+for name in room.dtype.names:
+    assert room.dtype.fields[name][1] + room.skipped == FLIGHT_BLOCK.fields[name][1]
+print(sources.texts(0)["README.md"].decode())
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [
+        ("crazyflie", 50_000),
+        ("indoor", 100_000),  # sixteen features
+        *(
+            pytest.param(name, 100_000, marks=pytest.mark.slow)
+            for name in ALL_SUITES
+            if name not in ("crazyflie", "indoor")
+        ),
+    ],
+)
+def test_exported_filter_in_single_precision_fits_the_memory_of_a_microcontroller(name, most):
+    room = " ".join(map(str, room_for(sensor_suite(name))))
+    variables = {"QUAD_GYM_LANES": "1", "QUAD_GYM_ROOM": room, "QUAD_GYM_PRECISION": "single"}
+    done = run_python("-c", MEMORY, name, **variables)
+    assert done.returncode == 0, done.stderr
+    told = re.search(r"`qg_filter`.*about ([\d,]+) \|", done.stdout)
+    assert 20_000 < int(told[1].replace(",", "")) < most

@@ -18,6 +18,49 @@ extern int qg_core_start(void *, void *, void *, void *, const void *, void *, v
 extern const char qg_core_params[], qg_core_steps[], qg_core_settings[], qg_core_first[],
     qg_core_fix[], qg_core_parts[], qg_core_mounting[];
 @STAGE_DECLARATIONS@
+@IF FMA@
+
+/* ---- a b + c, rounded once, as an exact sum of four numbers (Boldo and Melquiond 2008) ---- */
+
+double qg_core_fma(double a, double b, double c);
+
+static double qgi_sum(double a, double b, double *error)
+{
+    double sum = a + b, part = sum - a;
+    *error = (a - (sum - part)) + (b - part);
+    return sum;
+}
+
+/* a + b; an inexact sum has an odd last bit. */
+static double qgi_odd_sum(double a, double b)
+{
+    double error, sum = qgi_sum(a, b, &error);
+    int64_t bits;
+    memcpy(&bits, &sum, sizeof bits);
+    if (error != 0.0 && !(bits & 1))
+        bits += (error > 0.0) == (sum > 0.0) ? 1 : -1;
+    memcpy(&sum, &bits, sizeof bits);
+    return sum;
+}
+
+/* For results that are normal numbers. */
+double qg_core_fma(double a, double b, double c)
+{
+    static const double split = 134217729.0; /* 2^27 + 1 */
+    int i, j, k;
+    double x = frexp(a, &i), y = frexp(b, &j), z = frexp(c, &k);
+    if (!isfinite(a) || !isfinite(b) || !isfinite(c) || a == 0.0 || b == 0.0)
+        return a * b + c;
+    k -= i + j;
+    if (k > 150)
+        return c;
+    double p = x * y, x0 = split * x - (split * x - x), y0 = split * y - (split * y - y);
+    double rest = ((x0 * y0 - p) + x0 * (y - y0) + (x - x0) * y0) + (x - x0) * (y - y0);
+    double low, lower, sum = qgi_sum(ldexp(z, k < -150 ? -150 : k), rest, &lower);
+    sum = qgi_sum(p, sum, &low);
+    return ldexp(sum + qgi_odd_sum(lower, low), i + j);
+}
+@END@
 
 /* The address of the full record, of which only the used parts are in memory. */
 static char *qgi_flight(const qg_filter *f)
@@ -26,12 +69,25 @@ static char *qgi_flight(const qg_filter *f)
 }
 
 /* Copy n numbers; return 0 without any. */
-static int qgi_put(double *to, const double *from, int n)
+#define QGI_PUT(name, to_type, from_type)                            \
+    static int name(to_type *to, const from_type *from, int n)       \
+    {                                                                \
+        for (int i = 0; from && i < n; i++)                          \
+            to[i] = (to_type)from[i];                                \
+        return from != 0;                                            \
+    }
+QGI_PUT(qgi_put, double, double)
+QGI_PUT(qgi_sample, double, qg_real)
+QGI_PUT(qgi_value, qg_real, qg_real)
+@IF GNSS@
+QGI_PUT(qgi_place, qg_real, double)
+
+static int qgi_rounded(double *to, const double *from, int n)
 {
-    for (int i = 0; from && i < n; i++)
-        to[i] = from[i];
-    return from != 0;
+    qg_real numbers[3];
+    return qgi_place(numbers, from, n) && qgi_sample(to, numbers, n);
 }
+@END@
 
 static int64_t qgi_address(const void *place) { return (int64_t)(uintptr_t)place; }
 
@@ -52,11 +108,11 @@ static int qgi_take(qg_filter *f, qg_input_record *input, qg_measurement_record 
     return (int)input->outcome;
 }
 
-int qg_predict(qg_filter *f, const double gyro[3], const double accel[3], double dt)
+int qg_predict(qg_filter *f, const qg_real gyro[3], const qg_real accel[3], double dt)
 {
     qg_input_record input = {0};
-    qgi_put(input.gyro, gyro, 3);
-    qgi_put(input.accel, accel, 3);
+    qgi_sample(input.gyro, gyro, 3);
+    qgi_sample(input.accel, accel, 3);
     input.dt = dt;
     return qgi_take(f, &input, f->measurement);
 }
@@ -117,7 +173,7 @@ int qg_init_at_rest(qg_filter *f, const double position[3], double heading, doub
 @IF BAROMETER@
 void qg_barometer_from_start(qg_filter *f)
 {
-    *(double *)(void *)((char *)f->steps + @OF_LEVEL@) = NAN;
+    *(qg_real *)(void *)((char *)f->steps + @OF_LEVEL@) = NAN;
 }
 
 @END@
@@ -127,9 +183,9 @@ int qg_init(qg_filter *f, const qg_start *s)
     qg_fix_record fix;
     memcpy(&fix, qg_core_fix, sizeof fix);
     fix.time = s->time;
-    fix.has_position = qgi_put(fix.position, s->gnss_position, 3);
-    qgi_put(fix.sigma, s->gnss_sigma, 3);
-    fix.has_baseline = qgi_put(fix.baseline, s->gnss_baseline, 3);
+    fix.has_position = qgi_rounded(fix.position, s->gnss_position, 3);
+    qgi_rounded(fix.sigma, s->gnss_sigma, 3);
+    fix.has_baseline = qgi_rounded(fix.baseline, s->gnss_baseline, 3);
     fix.has_velocity = qgi_put(fix.velocity, s->gnss_velocity, 3);
     fix.has_heading = qgi_put(&fix.heading, s->heading, 1);
     fix.has_field = qgi_put(fix.field_B, s->magnetometer, 3);
@@ -180,9 +236,17 @@ int qg_action(qg_filter *f, const qg_reference *reference, float action[4])
 {
     static const double zero[3] = {0.0, 0.0, 0.0}, up[3] = {0.0, 0.0, 1.0};
     float observation[@SIZE@] = {0.0f}, *o = observation, found[4];
-    qg_estimate e;
-    if (qg_state(f, &e) != QG_OK || !f->window.has_gyro)
+    qg_estimate s;
+    struct {
+        double position[3], velocity[3], R_BI[9], gyro_bias[3], sigma[15];
+    } e;
+    if (qg_state(f, &s) != QG_OK || !f->window.has_gyro)
         return QG_NOT_STARTED;
+    qgi_put(e.position, s.position, 3);
+    qgi_sample(e.velocity, s.velocity, 3);
+    qgi_sample(e.R_BI, s.R_BI, 9);
+    qgi_sample(e.gyro_bias, s.gyro_bias, 3);
+    qgi_sample(e.sigma, s.sigma, 15);
     (void)zero, (void)up;
     @FIELDS@
     if (qg_policy(observation, found))

@@ -18,6 +18,7 @@
 
 static qg_filter filter;
 static double x[MOST];
+static qg_real real[MOST]; /* the same numbers */
 static int silent;
 
 static void stop(const char *what, const char *why)
@@ -38,31 +39,35 @@ static const double *given(int place)
     return isnan(x[place]) ? 0 : x + place;
 }
 
+static const qg_real *value(int place)
+{
+    return isnan(x[place]) ? 0 : real + place;
+}
+
 static double number(int place)
 {
     return isnan(x[place]) ? 0.0 : x[place];
 }
 
-static void print_numbers(const double *numbers, int n)
+static void print_numbers(const qg_real *numbers, int n)
 {
     while (n-- > 0)
-        printf(",%.17g", *numbers++);
+        printf(",%.17g", (double)*numbers++);
 }
 
 static void print_estimate(void)
 {
-    static double last[4]; // so that the sign of the quaternion does not change
+    static qg_real last[4]; // so that the sign of the quaternion does not change
     qg_estimate e;
     demand(qg_state(&filter, &e), "estimate");
     double product = 0.0;
     for (int i = 0; i < 4; i++)
-        product += e.quaternion[i] * last[i];
+        product += (double)e.quaternion[i] * last[i];
     for (int i = 0; i < 4; i++)
         last[i] = product < 0.0 ? -e.quaternion[i] : e.quaternion[i];
     if (silent)
         return;
-    printf("%.17g", e.time);
-    print_numbers(e.position, 3);
+    printf("%.17g,%.17g,%.17g,%.17g", e.time, e.position[0], e.position[1], e.position[2]);
     print_numbers(e.velocity, 3);
     print_numbers(last, 4);
     print_numbers(e.accel_bias, 3);
@@ -87,7 +92,7 @@ static void start(void)
 static int update(const char *name)
 {
     qg_measurements m = {0};
-    (void)given, (void)number;
+    (void)given, (void)value, (void)number;
 @ROWS@        return 0;
     demand(qg_update(&filter, &m, x[0]), name);
     return 1;
@@ -110,8 +115,10 @@ static void call(char *row)
     }
     for (; n < MOST; n++)
         x[n] = NAN;
+    for (n = 0; n < MOST; n++)
+        real[n] = (qg_real)x[n];
     if (!strcmp(name, "imu"))
-        demand(qg_predict(&filter, x, x + 3, x[6]), name);
+        demand(qg_predict(&filter, real, real + 3, x[6]), name);
     else if (!strcmp(name, "estimate"))
         print_estimate();
     else if (!strcmp(name, "rest"))

@@ -3,7 +3,8 @@
  * For: @TARGET@.
  *
  * The filter with which a controller was trained: a static library of its compiled kernels
- * (libquad_gym_filter.a), and this header. The estimates are bitwise those of `quad-gym replay`.
+ * (libquad_gym_filter.a), and this header. The estimates are bitwise those of `quad-gym replay` in
+ * @PRECISION@ precision.
  * One .c file of your program defines QUAD_GYM_FILTER_IMPLEMENTATION before it includes this
  * header; link it with libquad_gym_filter.a and the math library.
  *
@@ -22,6 +23,8 @@
 extern "C" {
 #endif
 
+typedef @REAL@ qg_real; /* of samples, measurements and estimates; times and places are double */
+
 enum qg_result {
 @OUTCOMES@};
 
@@ -32,7 +35,7 @@ enum qg_result {
 #define QG_WINDOW @WINDOW@ /* longest delay of a measurement [s] */
 #endif
 #ifndef QG_COPY_EVERY
-#define QG_COPY_EVERY 8 /* inputs between two copies of the filter; fewer copies: less memory, and
+#define QG_COPY_EVERY @COPY_EVERY@ /* inputs between two copies of the filter; fewer copies: less memory, and
                          * more time for a delayed measurement */
 #endif
 #ifndef QG_EVENTS
@@ -42,7 +45,7 @@ enum qg_result {
 #define QG_MEASUREMENTS @MEASUREMENTS@ /* measurements among them */
 #endif
 #ifndef QG_WAITING
-#define QG_WAITING 16 /* measurements that may wait for later samples */
+#define QG_WAITING @WAITING@ /* measurements that may wait for later samples */
 #endif
 #define QG_COPIES (QG_EVENTS / QG_COPY_EVERY + 2)
 @MACROS@
@@ -83,7 +86,7 @@ void qg_barometer_from_start(qg_filter *filter);
 
 /* Propagate the estimate over dt, from 1e-9 s to QG_LONGEST_STEP: angular rate [rad/s] and specific
  * force [m/s^2] in the axes of the IMU, from which @MOUNTING@. */
-int qg_predict(qg_filter *filter, const double gyro[3], const double accel[3], double dt);
+int qg_predict(qg_filter *filter, const qg_real gyro[3], const qg_real accel[3], double dt);
 
 /* Measurements of one instant, for one joint update. NULL: not measured. Standard deviations are
  * per axis; 0 or NULL: the suite's. */
@@ -100,15 +103,15 @@ int qg_update(qg_filter *filter, const qg_measurements *measured, double time);
 /* ---- outputs ---- */
 
 typedef struct {
-    double time;          /* up to which the filter has predicted [s] */
-    double position[3];   /* of the center of mass, in I [m] */
-    double velocity[3];   /* in I [m/s] */
-    double R_BI[9];       /* attitude, row by row: v_B = R_BI v_I */
-    double quaternion[4]; /* (w, x, y, z), body to inertial */
-    double accel_bias[3]; /* in B [m/s^2] */
-    double gyro_bias[3];  /* in B [rad/s] */
-    double sigma[15];     /* standard deviations: position, velocity, error angles, biases */
-    int diverged;         /* 1 while innovations show that the estimate is wrong */
+    double time;           /* up to which the filter has predicted [s] */
+    double position[3];    /* of the center of mass, in I [m] */
+    qg_real velocity[3];   /* in I [m/s] */
+    qg_real R_BI[9];       /* attitude, row by row: v_B = R_BI v_I */
+    qg_real quaternion[4]; /* (w, x, y, z), body to inertial */
+    qg_real accel_bias[3]; /* in B [m/s^2] */
+    qg_real gyro_bias[3];  /* in B [rad/s] */
+    qg_real sigma[15];     /* standard deviations: position, velocity, error angles, biases */
+    int diverged;          /* 1 while innovations show that the estimate is wrong */
 } qg_estimate;
 
 int qg_state(const qg_filter *filter, qg_estimate *estimate);
@@ -159,7 +162,7 @@ struct qg_filter {
     qg_operation_record operation[QG_EVENTS + QG_COPIES + 4 * QG_WAITING + 8];
     qg_sample_record sample[QG_EVENTS + 2 * QG_WAITING + 4];
     qg_measurement_record measurement[QG_MEASUREMENTS + QG_WAITING];
-    double copy[QG_COPIES][@COPY_WORDS@];
+    qg_real copy[QG_COPIES][@COPY_WORDS@];
 };
 
 #ifdef __cplusplus

@@ -78,6 +78,9 @@ class Processor(NamedTuple):
     reloc: str = "pic"
     level: int = 2  #: level of optimization; 3 gives larger code
     tune: str = ""  #: processor for which instructions are chosen and ordered; empty: `cpu`
+    fma: str = ""
+    """function that computes a multiply-add of float64 where the processor cannot, as few C
+    libraries do exactly; empty: an instruction, or the C library's function"""
 
 
 class _ForeignLibrary(EntryLibrary):
@@ -225,6 +228,8 @@ def optimized(text: str, processor: Processor) -> Any:
     """Return the module of IR, optimized for a processor."""
     machine = machine_of(processor)
     text = _with_pauses(text, processor.triple.partition("-")[0])
+    if processor.fma:
+        text = text.replace("@llvm.fma.f64(", f"@{processor.fma}(")
     if processor.tune:
         text = re.sub(r"(?m)^attributes #\d+ = \{", rf'\g<0> "tune-cpu"="{processor.tune}"', text)
     module = llvm.parse_assembly(text)

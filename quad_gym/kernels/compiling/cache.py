@@ -33,7 +33,7 @@ from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from quad_gym.kernels.library import say
-from quad_gym.records import PRECISION, REGISTER, WIDTH
+from quad_gym.records import PRECISION, REGISTER, ROOM, WIDTH
 
 # --------------------------------------------------------------------------------------------------
 # Digests of everything that compiled code depends on, which show whether a cache is stale.
@@ -282,7 +282,8 @@ def _compiler(context: Any) -> str:
     """The compiler, its options, and the processor that it compiles for."""
     options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
     versions = f"{numba.__version__} {llvmlite.__version__} {_FORM}"
-    return f"{context.codegen().magic_tuple()} {versions} {PRECISION} {WIDTH} {REGISTER} {options}"
+    records = f"{PRECISION} {WIDTH} {REGISTER}" + (f" {ROOM}" if ROOM else "")
+    return f"{context.codegen().magic_tuple()} {versions} {records} {options}"
 
 
 def _needed(module: Any) -> tuple[str, ...]:

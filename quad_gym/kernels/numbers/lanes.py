@@ -132,7 +132,8 @@ def _cast_to_vector(context, builder, source, target, value):  # type: ignore[no
     return vector_of(context, builder, value, source, target)
 
 
-default_type_manager.set_compatible(types.float64, lanes, Conversion.safe)
+for _plain in {types.float64, REAL}:
+    default_type_manager.set_compatible(_plain, lanes, Conversion.safe)
 default_type_manager.set_compatible(types.int64, lanes, Conversion.safe)
 default_type_manager.set_compatible(types.uint64, words, Conversion.safe)
 default_type_manager.set_compatible(types.boolean, mask, Conversion.safe)

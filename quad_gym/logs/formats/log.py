@@ -13,6 +13,7 @@ from quad_gym.frames import geodetic_to_ecef
 from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_PARAMS
 from quad_gym.params.suites import SensorSuite
+from quad_gym.records import REAL
 from quad_gym.records.inputs import MOUNTING
 from quad_gym.rotations import euler_to_dcm
 
@@ -30,6 +31,11 @@ def mounting_of(suite: SensorSuite) -> NDArray[Any]:
     found["R_compass"] = euler_to_dcm(suite.log_compass_rotation)
     found["gyro_bias"], found["accel_bias"] = suite.log_gyro_bias, suite.log_accel_bias
     return found
+
+
+def sensed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return numbers of a sensor in the precision of the process, as exported filters take them."""
+    return values.astype(REAL).astype(np.float64)
 
 
 def rotated(R: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -208,14 +214,14 @@ class Log(_AidStreams):
         if mounting["imu_turns"]:
             values, before["imu"] = self.imu.values, self.imu
             turned = {
-                name: rotated(mounting["R_imu"], values[name] - mounting[f"{name}_bias"])
+                name: rotated(mounting["R_imu"], sensed(values[name]) - mounting[f"{name}_bias"])
                 for name in ("gyro", "accel")
             }
             changes["imu"] = replace(self.imu, values=turned)
         compass = changes.get("magnetometer", self.magnetometer)
         if mounting["compass_turns"] and compass is not None:
             before["magnetometer"] = compass
-            field_B = rotated(mounting["R_compass"], compass.values["magnetometer"])
+            field_B = rotated(mounting["R_compass"], sensed(compass.values["magnetometer"]))
             changes["magnetometer"] = replace(compass, values={"magnetometer": field_B})
         return replace(self, **changes, in_sensor_axes=before) if changes else self
 
