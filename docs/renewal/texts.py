@@ -215,7 +215,11 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
         if cell["misses"]
     ]
     alarms = max(cell["values"]["alarms_per_hour"] for cell in calm.values())
+    missed = {label: cell["values"]["undetected"] for label, cell in faulty.items()}
+    most = sorted(missed, key=lambda label: -missed[label])[:4]
     return {
+        "recovery.few": f"{sum(share <= 2.5 for share in missed.values())}",
+        "recovery.most": "; ".join(f"{label} ({missed[label]:.0f} %)" for label in most),
         "recovery": table(
             ("suite, fault", "consistent [%]", "flagged [%]", "undetected [%]", "reason"), rows
         ),
