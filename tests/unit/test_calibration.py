@@ -34,7 +34,7 @@ from quad_gym.logs.formats import Log, Stream
 from quad_gym.logs.replaying.results import Finding, Severity, correlation_time
 from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.sensor_table import AID_PARAMS, SENSOR_PARAMS
-from quad_gym.params.suites import CONSUMER
+from quad_gym.params.suites import ALL_SUITES, CONSUMER
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from tests.console_commands import run
 from tests.logged_flights import Recorded, flown
@@ -367,6 +367,22 @@ def test_search_near_the_largest_delay_and_inclination_stays_below_it():
             if not number.noise:  # noise has a lower end of its own
                 assert number.value(prior, low) == pytest.approx(prior + number.spread * low)
                 assert low == -MAX_SPREAD
+
+
+@pytest.mark.parametrize("name", ALL_SUITES)
+def test_suite_accepts_both_ends_of_every_number_of_a_search(name):
+    suite, tried = quad_gym.sensor_suite(name), 0
+    for number in NUMBERS:
+        if number.part(suite) is None or getattr(number.part(suite), number.field) is None:
+            continue
+        prior = number.of(suite)
+        if number.positive and prior <= 0.0:
+            continue
+        for end in number.ends(prior):
+            changed = number.put(suite, number.value(prior, end))
+            assert number.of(changed) == number.value(prior, end)
+            tried += 1
+    assert tried >= 20
 
 
 def at_rest_for(rest, total=75.0):

@@ -158,7 +158,8 @@ NUMBERS = (
     Number(sensor="gnss", field="drift_sigma_I", axes=_UP, spread=_WIDE, unit="m"),
     Number(sensor="gnss", field="drift_tau", spread=_WIDE, unit="s"),
     Number(sensor="gnss", field="velocity_sigma", spread=_WIDE, unit="m/s"),
-    Number(sensor="gnss", field="baseline_sigma", spread=_WIDE, unit="rad"),
+    Number(sensor="gnss", field="baseline_sigma", spread=_WIDE, unit="rad",
+           limit=3.0),
     *(
         Number(sensor="gnss", field=_LEVER, axes=(k,), spread=0.15, positive=False, unit="m")
         for k in range(3)
