@@ -75,18 +75,45 @@ def form_of_records() -> str:
     return hashlib.sha256(repr(sorted(named.items())).encode()).hexdigest()[:16]
 
 
-def require_same_form(form: str | None, *, fits: bool = True) -> None:
-    """Refuse the memory of a pickled object whose records the kernels would misread.
+OTHER_FORM = (
+    "an environment, batch or filter must be unpickled with the version of quad_gym, the precision "
+    "and the number of lanes with which it was pickled: make it again, for example with "
+    "gymnasium.make"
+)
+"""Message about a pickled object whose records the kernels would misread."""
 
-    Raises:
-        ValueError: If its form differs from `form_of_records`, or it does not fit otherwise.
+
+class RecordsOfOneForm:
+    """Flights or a filter whose records the kernels read.
+
+    A pickle keeps the form of the records, but neither the stages, which another version may have
+    under other names, nor what belongs to a process.
     """
-    if form != form_of_records() or not fits:
-        raise ValueError(
-            "an environment, batch or filter must be unpickled with the version of quad_gym, the "
-            "precision and the number of lanes with which it was pickled: make it again, for "
-            "example with gymnasium.make"
-        )
+
+    def _without_process(self) -> dict[str, Any]:
+        """Return the attributes with addresses or threads, as a copy begins with them."""
+        raise NotImplementedError
+
+    def _choose_stages(self) -> None:
+        """Set the stages that the settings need, or raise ValueError if the records do not fit."""
+        raise NotImplementedError
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without stages, addresses and threads."""
+        kept = self.__dict__ | self._without_process() | {"form_of_records": form_of_records()}
+        del kept["_stages"]
+        return kept
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a pickled or copied state, with the stages that this version has.
+
+        Raises:
+            ValueError: If the records of the state have another form.
+        """
+        if state.pop("form_of_records", None) != form_of_records():
+            raise ValueError(OTHER_FORM)
+        self.__dict__.update(state)
+        self._choose_stages()
 
 
 # --------------------------------------------------------------------------------------------------

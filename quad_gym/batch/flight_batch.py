@@ -26,11 +26,11 @@ from quad_gym.configuration import FlightConfiguration
 from quad_gym.kernels.entries import linked_table
 from quad_gym.kernels.stages import needed_stages, used_parts
 from quad_gym.packing import (
-    form_of_records,
+    OTHER_FORM,
+    RecordsOfOneForm,
     pack_paths,
     params_block,
     params_record,
-    require_same_form,
     settings_record,
 )
 from quad_gym.params import checks as check
@@ -63,7 +63,7 @@ _CALLS_OF_CHECK = 256  #: calls between two checks of these limits
 _WORTH_NO_COPY = 1 << 16  #: size of observations [bytes] above which a step allocates its own
 
 
-class FlightBatch(FlightMemory):
+class FlightBatch(RecordsOfOneForm, FlightMemory):
     """N flights of one configuration, advanced together by compiled kernels.
 
     The record of a flight holds its complete state: `snapshot` and `restore` copy arrays, and a
@@ -107,7 +107,7 @@ class FlightBatch(FlightMemory):
         self._settings, self._paths = settings_record(c), pack_paths(c.task.trajectories)
         if c.filters and c.filter_start == "warm":
             pack_warm_start(self._settings[0], FlightBatch, c)
-        self._stages = needed_stages(self._settings[0])
+        self._choose_stages()
         mode = np.array((c.compiled_autoreset,), [("autoreset", np.int64)])
         digest = configuration_digest(self._settings, mode, model, true, *self._paths)
         used = used_parts(self._settings[0])
@@ -323,23 +323,18 @@ class FlightBatch(FlightMemory):
             Call.GATHERED: self._gathered,
         }
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the threads, which a copy starts again, and without stages."""
-        kept = self.__dict__ | {"_crew": None, "_calls": None, "form": form_of_records()}
-        del kept["_stages"]
-        return kept
-
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled or copied state, with the stages that this version has.
+        """Restore a pickled or copied state; see `RecordsOfOneForm`."""
+        super().__setstate__(state)
+        if self._room != room_of(used_parts(self._settings[0])):
+            raise ValueError(OTHER_FORM)
 
-        Raises:
-            ValueError: If the records of the state have another form.
-        """
-        require_same_form(state.pop("form", None))
-        settings = state["_settings"][0]
-        fits = state["_room"] == room_of(used_parts(settings))
-        require_same_form(form_of_records(), fits=fits)
-        self.__dict__.update(state, _stages=needed_stages(settings))
+    def _without_process(self) -> dict[str, Any]:
+        return {"_crew": None, "_calls": None}
+
+    def _choose_stages(self) -> None:
+        """Choose the stages that the flights need."""
+        self._stages = needed_stages(self._settings[0])
 
     def trajectory(self, flight: int) -> tuple[Trajectory, float] | None:
         """Return the trajectory of a flight's present episode, as rotated for it, and its phase.

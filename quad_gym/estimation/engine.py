@@ -20,14 +20,13 @@ from quad_gym.kernels import entries
 from quad_gym.kernels.entries import linked_table
 from quad_gym.kernels.stages import needed_stages
 from quad_gym.packing import (
+    RecordsOfOneForm,
     blocks_of,
     form_of,
-    form_of_records,
     pack_sensors,
     pack_tick,
     params_block,
     params_record,
-    require_same_form,
     slow_errors_of,
 )
 from quad_gym.params.suites import SensorSuite
@@ -65,7 +64,7 @@ _NO_RESULTS = (
 _PARTS = frozenset({"filter", "watch", "slow", "aids"})
 
 
-class Engine:
+class Engine(RecordsOfOneForm):
     """Records, parameters and stages of one filter.
 
     Args:
@@ -105,6 +104,9 @@ class Engine:
         """Choose the stages that the filter needs."""
         needed = needed_stages(self.settings[0])
         self._stages = {stage: needed[stage] for stage in entries.FILTER_STAGES if stage in needed}
+
+    def _without_process(self) -> dict[str, Any]:
+        return {"_calls": {}, "_linked": None}
 
     # ---- memory -------------------------------------------------------------------------------
 
@@ -242,22 +244,6 @@ class Engine:
                 )
                 self._calls[k, id(operation)] = call
             call()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state without addresses, which another process or copy does not share."""
-        kept = self.__dict__ | {"_calls": {}, "_linked": None, "form_of_records": form_of_records()}
-        del kept["_stages"]
-        return kept
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled or copied state, with the stages that this version has.
-
-        Raises:
-            ValueError: If the records of the state have another form.
-        """
-        require_same_form(state.pop("form_of_records", None))
-        self.__dict__.update(state)
-        self._choose_stages()
 
     def run(self, tape: Tape, slots: NDArray[Any] | None = None) -> tuple[Floats, Floats]:
         """Run the operations of a tape.

@@ -13,7 +13,6 @@ from quad_gym.batch.memory import Calls
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.batch.starts import hidden_points, nearest_obstacle
 from quad_gym.configuration import FlightConfiguration
-from quad_gym.kernels.stages import needed_stages
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.world import WorldParams
 from quad_gym.records import (
@@ -45,7 +44,7 @@ class ReadableBatch(FlightBatch):
         super().__init__(c)  # type: ignore[arg-type]
         self._split = split
         self._settings["shown"] = True
-        self._stages = needed_stages(self._settings[0])
+        self._choose_stages()
         # rows at distances of a power of two would compete for a few cache lines
         self._shown = np.zeros((SHOWN_SIZE, len(self._actions) + _GAP))
         self.period = 1.0 / self.clocks.control_rate
