@@ -4,8 +4,10 @@ Marks may be within a sentence or around a table. A name may occur in several pl
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+
+from quad_gym.analysis.reports import markdown_table
 
 ROOT = Path(__file__).parents[2]
 TABLES = ROOT / "docs" / "reference" / "measurements.md"
@@ -63,8 +65,6 @@ def console(text: str) -> str:
     return f"\n```text\n{text.strip()}\n```\n"
 
 
-def table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table in Markdown, with numbers aligned to the right."""
-    first, *others = heads
-    lines = [[first, *others], ["---", *("---:" for _ in others)], *map(list, rows)]
-    return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return f"\n{markdown_table(heads, rows)}\n"

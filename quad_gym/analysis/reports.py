@@ -116,6 +116,12 @@ def write_csv(file: Path, columns: Mapping[str, Any]) -> Path:
     return file
 
 
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
+    """Return a table in Markdown; its columns after the first `texts` ones are numbers."""
+    rule = ["---" if k < texts else "---:" for k in range(len(heads))]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (heads, rule, *rows))
+
+
 def text_table(groups: Mapping[str, Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
     """Format a table for the screen; the first column is left-aligned, others right-aligned.
 

@@ -1,9 +1,10 @@
 """Table of EstimateBench, computed from rows per seed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from quad_gym.analysis.metrics import Estimated
+from quad_gym.analysis.reports import markdown_table
 from scripts.estimate_bench.entries import FILE, Entry
 from scripts.estimate_bench.rows import MEMORY, arms_of
 from scripts.estimate_bench.tasks import TASKS, BenchTask
@@ -98,11 +99,5 @@ def table(file: Path = DATA / "estimate_bench.csv", entries: Path = ENTRIES) -> 
     blocks = []
     for task in TASKS:
         body = lines(task, measured, entered.get(task.name, Rows(())))
-        blocks.append(f"\n### {task.name}\n\n{task.asks}.\n\n{markdown(HEADS, body)}")
+        blocks.append(f"\n### {task.name}\n\n{task.asks}.\n\n{markdown_table(HEADS, body)}")
     return "\n".join(blocks).replace("?.", "?")
-
-
-def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown, with numbers aligned to the right."""
-    rule = ["---", *("---:" for _ in heads[1:])]
-    return "\n".join(f"| {' | '.join(line)} |" for line in [list(heads), rule, *map(list, rows)])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from quad_gym.analysis.metrics import Estimated
+from quad_gym.analysis.reports import markdown_table
 from scripts.studies.campaign import DATA, Part, flights_digest, is_complete
 from scripts.studies.parts import (
     BUDGETS,
@@ -45,10 +46,9 @@ def verdict(found: Effect) -> str:
     return p if found.significant else f"{p}, not significant"
 
 
-def table(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Table in Markdown whose columns are numbers, except the first."""
-    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *body]
-    return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+def table(heads: Sequence[str], body: Sequence[Sequence[str]], texts: int = 1) -> str:
+    """Table of a page, between its marks."""
+    return f"\n{markdown_table(heads, body, texts)}\n"
 
 
 class Arms:
@@ -114,19 +114,13 @@ _FACTORS = {
     ),
 }
 """Pairs of arms of LookAround that differ in one factor only."""
-_CONDITIONS = (
-    "neither",
-    "standard deviation",
-    "reward for certainty",
-    "standard deviation, reward for certainty",
-)
-"""What the arms of the pairs have in common, in their order."""
 
 
 def look_around_observation(rows: Rows) -> str:
     """Effect of the training observation in each combination of the other two factors."""
     arms, body = Arms(rows, BUDGETS["LookAround"]), []
-    for (ours, other), condition in zip(_FACTORS[_OBSERVATION], _CONDITIONS, strict=True):
+    for ours, other in _FACTORS[_OBSERVATION]:
+        condition = arms[other].label.removeprefix("truth").lstrip("+, ") or "neither"
         shown = [share(arms[name].estimated("success")) for name in (other, ours)]
         changes = [points(effect(arms[ours], arms[other], column)) for column in RATES]
         body.append([condition, *shown, *changes])
@@ -259,8 +253,7 @@ def when_to_train(rows: Rows) -> str:
         "gain of training on it",
         "seeds",
     ]
-    lines = [heads, ["---", "---", *["---:"] * 5], *body]
-    return "\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return table(heads, body, texts=2)
 
 
 def when_to_train_summary(rows: Rows) -> str:

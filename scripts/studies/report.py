@@ -10,12 +10,21 @@ import numpy as np
 from quad_gym import IDS, sensor_suite
 from quad_gym.analysis.metrics import Estimated, in_brackets
 from quad_gym.analysis.plots import learning_figure
-from quad_gym.analysis.reports import Report, stacked, text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import (
+    Report,
+    markdown_table,
+    stacked,
+    text_table,
+    versions,
+    write_csv,
+    write_json,
+)
 from quad_gym.envs.config import BENCHMARKS
 from quad_gym.rendering.video import ending_for_readers
 from scripts.studies.films import CHOICES, label_of, pair_of
 from scripts.studies.plots import glance_figure, pace_figure
-from scripts.studies.scores import SIGNIFICANT, difference, permutation_p
+from scripts.studies.rows import Effect
+from scripts.studies.scores import difference, permutation_p
 from scripts.studies.study import StudyResults
 
 FEW = 5  #: number of seeds below which intervals over trainings are wide
@@ -67,10 +76,10 @@ def _label(results: StudyResults, name: str) -> str:
 def _against_truth(results: StudyResults, best: str) -> list[str]:
     label = _label(results, best)
     ours, truth = results.rows[best], results.rows["truth"]
-    change = difference(ours["success"], truth["success"])
-    points = number(Estimated(*(100.0 * value for value in change)), 0)
     p = permutation_p([(results.mean_success(best), results.mean_success("truth"))])
-    word = "a significant" if p < SIGNIFICANT else "no significant"
+    change = Effect(difference(ours["success"], truth["success"]), p)
+    word = "a significant" if change.significant else "no significant"
+    points = number(change.scaled(100.0).size, 0)
     verdict = f"{word} difference ({points} percentage points, p = {p:.2g})"
     success = [
         f"On the estimate, {label} succeeds in {share(ours['success'])} of the episodes, and "
@@ -92,13 +101,13 @@ def _against_truth(results: StudyResults, best: str) -> list[str]:
 def _against_rules(results: StudyResults, best: str) -> str:
     rule = results.best(results.fixed())
     a, b = results.rows[best]["return"], results.rows[rule]["return"]
-    change, label = difference(a, b), _label(results, best)
-    verdict = "significantly above" if change.value > 0.0 else "significantly below"
-    if change.holds(0.0):
+    change, label = Effect(difference(a, b), None), _label(results, best)
+    verdict = "significantly above" if change.size.value > 0.0 else "significantly below"
+    if not change.significant:
         verdict = "not significantly different from"
     return (
         f"{label[0].upper()}{label[1:]} returns {number(a, 1)}, {verdict} the best fixed rule "
-        f"({_label(results, rule)}, {number(b, 1)}): a difference of {number(change, 1)}."
+        f"({_label(results, rule)}, {number(b, 1)}): a difference of {number(change.size, 1)}."
     )
 
 
@@ -137,11 +146,10 @@ def write_report(results: StudyResults, film: Path | None = None) -> list[Path]:
     study, folder, (heads, rows) = results.study, results.study.folder, _table(results)
     trainings = f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
     flown = f"{trainings if results.trained() else ''}{study.episodes:,}"
-    lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *rows]
     text = [
         f"{flown} test episodes with each policy. Success: {study.about.meaning}.",
         "",
-        *("| " + " | ".join(line) + " |" for line in lines),
+        markdown_table(heads, rows),
         "",
         *(f"- {sentence}" for sentence in conclusions(results)),
     ]

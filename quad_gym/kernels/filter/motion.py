@@ -511,9 +511,8 @@ def _reset_attitude(flight, p, work, slow, lanes, R_BI, variance, first, moves):
 def watch_compass(flight, p, first, agrees, far):
     """Follow a compass that is left out; return the lanes in which its fields are refused.
 
-    The first one of a series of refused ones may be `far` beyond the gate.
-
-    It is used again when it has agreed for long with a heading that the motion confirms.
+    The first field of a series of refused ones may be `far` beyond the gate. The compass is used
+    again when it has agreed for long with a heading that the motion confirms.
     """
     out, known = flight.compass_out > 0.0, (flight.tick - flight.level_tick) * p.dt < RECENT
     R_BI, zero = load33(flight.R_hat), zero_like(p.dt)
