@@ -90,6 +90,7 @@ PARTS: tuple[Part, ...] = (
         "std",
         "since_fix",
         "truth_on_truth",
+        seeds=FEWER,
     ),
     *(
         Part(
