@@ -63,10 +63,9 @@ class Arms:
             raise MissingRowsError(name)
         return found
 
-    def named(self, name: str) -> str:
-        """Label of an arm in quotes, with its success."""
-        found = self[name]
-        return f'"{found.label}" ({share(found.estimated("success"))})'
+    def success(self, name: str) -> str:
+        """Success of an arm, in percent."""
+        return share(self[name].estimated("success"))
 
     def budget(self, *names: str) -> str:
         """Number of seeds, and of steps."""
@@ -77,6 +76,16 @@ class Arms:
     def against(self, first: str, second: str, column: str = "success") -> str:
         """Difference of two arms."""
         return points(effect(self[first], self[second], column))
+
+
+def compared(arms: Arms, names: Sequence[str], against: Mapping[str, str]) -> str:
+    """Table of arms and their differences from others, given by the words for these."""
+    body = []
+    for name in names:
+        others = [arms.against(name, other) if name != other else "" for other in against.values()]
+        body.append([arms[name].label, str(arms[name].seeds), arms.success(name), *others])
+    heads = ["trained on", "seeds", "success", *(f"difference from {words}" for words in against)]
+    return table(heads, body)
 
 
 def look_around_headline(rows: Rows) -> str:
@@ -139,23 +148,21 @@ def look_around_factors(rows: Rows) -> str:
 
 def look_around_noise(rows: Rows) -> str:
     """Noise on the truth instead of the filter, all else equal."""
-    arms = Arms(rows, BUDGETS["LookAround"])
-    noisy = ("noisy_std_certainty", "matched_std_certainty")
-    parts = [
-        f"{arms.named(name)} differs from the truth by "
-        f"{arms.against(name, 'truth_std_certainty')} and from the estimate by "
-        f"{arms.against(name, 'std_certainty')}"
-        for name in noisy
-    ]
-    return f"LookAround, noise ({arms.budget(*noisy)}): {'; '.join(parts)}."
+    names = ("noisy_std_certainty", "matched_std_certainty")
+    against = {"the truth": "truth_std_certainty", "the estimate": "std_certainty"}
+    return compared(Arms(rows, BUDGETS["LookAround"]), names, against)
 
 
 def stale_race_training(rows: Rows) -> str:
     """Training on the estimate in the race with late measurements."""
     arms, pair = Arms(rows, BUDGETS["StaleRace"]), ("std", "truth")
     return (
-        f"StaleRace ({arms.budget(*pair)}): {arms.named(pair[0])} and {arms.named(pair[1])} differ "
-        f"by {arms.against(*pair)}; the rule {arms.named('pd')}."
+        f"Policies that were trained on the estimate and observe its 15 standard deviations pass "
+        f"all gates in {arms.success('std')} of the episodes, and policies that were trained on "
+        f"the truth in {arms.success('truth')}, a difference of {arms.against(*pair)}, with "
+        f"{arms.budget(*pair)}. On the truth, the latter would pass them in "
+        f"{arms.success('truth_on_truth')}. PD control passes them on the estimate in "
+        f"{arms.success('pd')}."
     )
 
 
@@ -164,58 +171,65 @@ def stale_race_compensation(rows: Rows) -> str:
     arms = Arms(rows, BUDGETS["StaleRace"])
     pair = ("truth_delay_compensated", "std_delay_compensated")
     return (
-        f"StaleRace with delay compensation in the test ({arms.budget(*pair)}): "
-        f"{arms.named(pair[0])} and {arms.named(pair[1])} differ by {arms.against(*pair)}; the "
-        f"former differs from the estimate without compensation by "
-        f"{arms.against(pair[0], 'std')}."
+        f"If the filter compensates the delay in the test, the same policies pass all gates in "
+        f"{arms.success(pair[0])} (trained on the truth) and {arms.success(pair[1])} (trained on "
+        f"the estimate without compensation). Compensation therefore gives policies that were "
+        f"trained on the truth {arms.against(pair[0], 'truth')}, and they differ from those that "
+        f"were trained and tested on the uncompensated estimate by {arms.against(pair[0], 'std')}."
     )
 
 
 def stale_race_substitutes(rows: Rows) -> str:
-    """Noise and a residual model instead of the filter."""
-    arms, names = Arms(rows, BUDGETS["StaleRace"]), ("noisy", "residual")
-    parts = [
-        f"{arms.named(name)} differs from the truth by {arms.against(name, 'truth')} and from the "
-        f"estimate by {arms.against(name, 'std')}"
-        for name in names
-    ]
-    return f"StaleRace, errors added to the truth ({arms.budget(*names)}): {'; '.join(parts)}."
+    """Noise, a residual model and a compensating filter in training, without deviations."""
+    names = ("estimate", "noisy", "residual", "compensated")
+    against = {"the truth": "truth", "the estimate with standard deviations": "std"}
+    return compared(Arms(rows, BUDGETS["StaleRace"]), names, against)
 
 
 def stale_race_curve(rows: Rows) -> str:
-    """Success by budget."""
-    parts = []
-    budgets = sorted((*RACE_CURVE, BUDGETS["StaleRace"]))
-    for steps in budgets:
-        arms = Arms(rows, steps)
-        parts.append(
-            f"{steps / 1e6:g} million steps: {arms.named(CURVE_ARMS[1])}, "
-            f"{arms.named(CURVE_ARMS[0])}"
-        )
+    """Success by budget, as a table."""
+    body = []
+    for steps in sorted((*RACE_CURVE, BUDGETS["StaleRace"])):
+        arms, (truth, ours) = Arms(rows, steps), CURVE_ARMS
+        changed = arms.against(ours, truth)
+        body.append([f"{steps:,}", arms.success(truth), arms.success(ours), changed])
     seeds = Arms(rows, BUDGETS["StaleRace"])[CURVE_ARMS[0]].seeds
-    return f"StaleRace, success by budget ({seeds} seeds each): {'; '.join(parts)}."
+    heads = [
+        "steps",
+        f"truth ({seeds} seeds)",
+        f"estimate + 15 standard deviations ({seeds} seeds)",
+    ]
+    return table([*heads, "difference"], body, texts=0)
 
 
 def outage_dash_rules(rows: Rows) -> str:
     """Rules: waiting once does not pay."""
     arms = Arms(rows, BUDGETS["OutageDash"])
-    names = ("pd", "pd_waits_at_start", "pd_waiting", "pd_backs_off")
-    shown = ", ".join(arms.named(name) for name in names)
-    lost = arms.against("pd_waits_at_start", "pd_waiting")
     return (
-        f"OutageDash, fixed rules ({arms['pd'].episodes:,} episodes): {shown}. Waiting once, at "
-        f"the start, differs from waiting when uncertain by {lost}."
+        f"PD control that does not wait succeeds in {arms.success('pd')} of "
+        f"{arms['pd'].episodes:,} episodes. To wait at the start for the end of an outage gives "
+        f"{arms.success('pd_waits_at_start')}, to wait wherever the filter is uncertain "
+        f"{arms.success('pd_waiting')}, and to back off from walls as well "
+        f"{arms.success('pd_backs_off')}. Waiting once differs from waiting when uncertain by "
+        f"{arms.against('pd_waits_at_start', 'pd_waiting')}."
     )
 
 
 def outage_dash_learned(rows: Rows) -> str:
-    """Learned policies against the best rule, without and with memory."""
-    arms, best = Arms(rows, BUDGETS["OutageDash"]), "pd_backs_off"
-    names = ("truth", "std", "since_fix", "recurrent")
-    parts = [f"{arms.named(name)}, {arms.against(name, best)}" for name in names]
+    """Learned policies without memory, against each other and the best rule."""
+    names, best = ("truth", "std", "since_fix"), "pd_backs_off"
+    against = {"the truth": "truth", "the rule that backs off": best}
+    return compared(Arms(rows, BUDGETS["OutageDash"]), names, against)
+
+
+def outage_dash_memory(rows: Rows) -> str:
+    """A recurrent policy against the best rule and the policy without memory."""
+    arms = Arms(rows, BUDGETS["OutageDash"])
     return (
-        f"OutageDash, learned policies against the rule {arms.named(best)} "
-        f"({arms.budget(*names)}): {'; '.join(parts)}."
+        f"A recurrent policy on the estimate and its normalized uncertainty succeeds in "
+        f"{arms.success('recurrent')} of the episodes ({arms.budget('recurrent')}). This differs "
+        f"from the policy without memory by {arms.against('recurrent', 'std')}, and from the rule "
+        f"that backs off by {arms.against('recurrent', 'pd_backs_off')}."
     )
 
 
@@ -321,15 +335,16 @@ CONCLUSIONS: Mapping[str, tuple[str, Conclusion]] = {
     "look_around.headline": ("look_around", look_around_headline),
     "look_around.observation.table": ("look_around", look_around_observation),
     "look_around.factors.table": ("look_around", look_around_factors),
-    "look_around.noise": ("look_around", look_around_noise),
+    "look_around.noise.table": ("look_around", look_around_noise),
     "stale_race.table": ("stale_race", arms_table("stale_race", BUDGETS["StaleRace"])),
     "stale_race.training": ("stale_race", stale_race_training),
     "stale_race.compensation": ("stale_race", stale_race_compensation),
-    "stale_race.substitutes": ("stale_race", stale_race_substitutes),
-    "stale_race.curve": ("stale_race", stale_race_curve),
+    "stale_race.substitutes.table": ("stale_race", stale_race_substitutes),
+    "stale_race.curve.table": ("stale_race", stale_race_curve),
     "outage_dash.table": ("outage_dash", arms_table("outage_dash", BUDGETS["OutageDash"])),
     "outage_dash.rules": ("outage_dash", outage_dash_rules),
-    "outage_dash.learned": ("outage_dash", outage_dash_learned),
+    "outage_dash.learned.table": ("outage_dash", outage_dash_learned),
+    "outage_dash.memory": ("outage_dash", outage_dash_memory),
     "when_to_train.table": ("when_to_train", when_to_train),
     "when_to_train.summary": ("when_to_train", when_to_train_summary),
 }

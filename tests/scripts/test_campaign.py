@@ -190,7 +190,7 @@ def test_conclusions_follow_from_rows_and_name_arms_seeds_budget_and_interval(tm
     assert "succeed in 70 [" in headline
     assert "and in 40 [" in headline
     assert "20 seeds, 2,000,000 steps" in headline
-    assert found["look_around.noise"] == conclusions.NOT_MEASURED
+    assert found["look_around.noise.table"].strip() == conclusions.NOT_MEASURED
     assert found["stale_race.table"].strip() == conclusions.NOT_MEASURED
     assert own[0] not in conclusions.incomplete(folder=tmp_path)
     assert own[2] in conclusions.incomplete(folder=tmp_path)
