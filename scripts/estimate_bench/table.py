@@ -14,7 +14,7 @@ from scripts.studies.rows import Rows
 
 ENTRIES = Path(__file__).with_name("entries")  #: folder of the entries of others
 HEADS = ("row", "track", "seeds", "success", "crashed", "return", "score", "processor seconds")
-NOT_MEASURED = "not yet measured"
+NOT_MEASURED = "Not yet measured with the present flights"
 
 
 def score(returned: Estimated, rule: float, ideal: float) -> Estimated:
@@ -53,51 +53,55 @@ def entry_rows(folder: Path = ENTRIES) -> dict[str, Rows]:
     return {task: Rows(rows) for task, rows in found.items()}
 
 
-def lines(task: BenchTask, measured: Rows, entered: Rows) -> list[list[str]]:
-    """Lines of a task; a row that was not measured on the present flights says so."""
+def lines(task: BenchTask, measured: Rows, entered: Rows) -> tuple[list[list[str]], list[str]]:
+    """Lines of the rows of a task that were measured on the present flights, and other labels."""
     now = flights_digest(task.flights)
-    own = measured.where(task=task.name, flights=now)
+    own, fresh = measured.where(task=task.name, flights=now), entered.where(flights=now)
     rule, ideal = own.of("rule"), own.of("truth_on_truth")
     ends = (
         (rule.estimated("return").value, ideal.estimated("return").value)
         if rule.rows and ideal.rows
         else None
     )
-    found = []
-    for arm in arms_of(task):
-        track = "memory" if arm.name in MEMORY else "memoryless"
-        found.append(_line(arm.label, track, own.of(arm.name), ends))
-    fresh = entered.where(flights=now)
-    for name in dict.fromkeys(row["arm"] for row in entered.rows):
-        rows = fresh.of(name)
-        first = entered.of(name).rows[0]
-        found.append(_line(str(first["label"]), str(first["track"]), rows, ends))
-    return found
+    every = [
+        (arm.label, "memory" if arm.name in MEMORY else "memoryless", own.of(arm.name))
+        for arm in arms_of(task)
+    ]
+    for row in {row["arm"]: row for row in entered.rows}.values():
+        every.append((str(row["label"]), str(row["track"]), fresh.of(row["arm"])))
+    found = [_line(label, track, rows, ends) for label, track, rows in every if rows.rows]
+    return found, [label for label, _, rows in every if not rows.rows]
 
 
 def _line(label: str, track: str, rows: Rows, ends: tuple[float, float] | None) -> list[str]:
-    if not rows.rows:
-        return [label, track, NOT_MEASURED, *[""] * (len(HEADS) - 3)]
-    trained = rows.rows[0]["seed"] is not None
     returned = rows.estimated("return")
     scored = "" if ends is None or ends[1] <= ends[0] else number(score(returned, *ends), 2)
     return [
         label,
         track,
-        str(rows.seeds) if trained else "",
+        str(rows.seeds) if rows.trained else "rule",
         share(rows.estimated("success")),
         share(rows.estimated("crashed")),
         number(returned, 1),
         scored,
-        f"{rows.estimated('seconds').value:.0f}" if trained else "",
+        f"{rows.estimated('seconds').value:.0f}" if rows.trained else "",
     ]
+
+
+def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
+    """Heading, question and table of a task, and the rows that it lacks."""
+    question = task.asks if task.asks.endswith("?") else f"{task.asks}."
+    body, missing = lines(task, measured, entered)
+    parts = [f"### {task.name}", question]
+    if body:
+        parts.append(markdown_table(HEADS, body, texts=2))
+    if missing:
+        parts.append(f"{NOT_MEASURED}: {'; '.join(missing) if body else 'all rows'}.")
+    return "\n\n".join(parts)
 
 
 def table(file: Path = DATA / "estimate_bench.csv", entries: Path = ENTRIES) -> str:
     """All tasks, as Markdown."""
     measured, entered = Rows.read(file), entry_rows(entries)
-    blocks = []
-    for task in TASKS:
-        body = lines(task, measured, entered.get(task.name, Rows(())))
-        blocks.append(f"\n### {task.name}\n\n{task.asks}.\n\n{markdown_table(HEADS, body)}")
-    return "\n".join(blocks).replace("?.", "?")
+    blocks = [block(task, measured, entered.get(task.name, Rows(()))) for task in TASKS]
+    return "\n" + "\n\n".join(blocks)
