@@ -189,8 +189,8 @@ _WITH_HISTORY = {**_task("RaceWithHistory"), **STD}
 STALE_RACE = (
     Arm("pd", "PD", policy="pd"),
     Arm("truth", "truth", learning=TRUTH),
-    Arm("std", "estimate + 15 standard deviations", environment=STD),
     Arm("estimate", "estimate"),
+    Arm("std", "estimate + 15 standard deviations", environment=STD),
     Arm("noisy", "truth + noise matched to observed errors", learning=_RACE_NOISE),
     Arm(
         "residual",

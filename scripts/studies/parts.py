@@ -72,6 +72,7 @@ PARTS: tuple[Part, ...] = (
         "training on the estimate, and delay compensation",
         "pd",
         "truth",
+        "estimate",
         "std",
         "truth_on_truth",
         "truth_delay_compensated",
@@ -108,8 +109,7 @@ PARTS: tuple[Part, ...] = (
     ),
     _part(
         "StaleRace",
-        "estimate without standard deviations, noise, residual model",
-        "estimate",
+        "noise, residual model, and delay compensation in training",
         "noisy",
         "residual",
         "compensated",
