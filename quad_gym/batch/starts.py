@@ -289,9 +289,10 @@ def check_standing(
             )
 
 
-def check_pad(task: TaskParams) -> None:
-    """Refuse a task whose launch pad, at height 0, is out of bounds wherever a reference begins."""
-    if not task.may_start_on_ground:
+def check_pad(c: FlightConfiguration) -> None:
+    """Refuse a launch pad, at height 0, that is out of bounds wherever a reference begins."""
+    task, elsewhere = c.task, "start_position_I" in c.randomization.names
+    if c.world.ground is not None or elsewhere or not task.may_start_on_ground:
         return
     distance = max(max(low, -high, 0.0) for low, high in _reference_heights(task))
     if distance > task.out_of_bounds:

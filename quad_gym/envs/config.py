@@ -7,17 +7,16 @@ with the others, `params/task.py` and `configuration.py` know.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, TypeAlias, TypeVar
 
-from quad_gym.configuration import FILTER_ARGUMENTS, FlightConfiguration, arguments_without_effect
+from quad_gym.configuration import FILTER_ARGUMENTS, FlightConfiguration
 from quad_gym.envs.spaces import ACTIONS, LAYOUTS, OBSERVATIONS
 from quad_gym.faults import GnssOutage, felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
-from quad_gym.params.suites import SensorSuite, given_suite, sensor_suite
+from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit, fields_without_effect
-from quad_gym.records import Autoreset, Layout
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -258,8 +257,8 @@ class EnvConfig(Checked, eq=False, bare=True):
         vehicle = _part(VehicleConfig, given)
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
-            if "duration" not in of_task:  # in place of the task's own limit
-                params = params.replace(duration=steps / vehicle.control_rate)
+            limit = steps / vehicle.control_rate  # in place of the task's, unless that was given
+            params = params.replace(duration=min(limit, of_task.get("duration") or limit))
         return cls(
             name=name,
             tasks=tasks,
@@ -288,50 +287,6 @@ class EnvConfig(Checked, eq=False, bare=True):
             "max_episode_steps": self.max_steps,
             **parts,
         }
-
-    @cached_property
-    def suite(self) -> SensorSuite:
-        """The sensor suite that `sensors`, `camera` and `estimator` select."""
-        sensors, estimator = self.sensors.sensors, self.filter.estimator
-        suite = given_suite("sensors", sensors)
-        if not self.sensors.camera:
-            suite = suite.replace(camera=None)
-        elif "camera" in self.asked and suite.camera is None:
-            raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
-        if estimator is None or own_estimator(estimator) is not None:
-            return suite
-        check.choice("estimator", estimator, ("ukf", "ekf"))
-        return suite.replace(estimator=suite.estimator.replace(kind=estimator))
-
-    def flights(self, count: int, autoreset: Autoreset, threads: int | None) -> FlightConfiguration:
-        """Return the configuration of a batch of such flights.
-
-        Raises:
-            ValueError: If a value is invalid, or a given keyword has no effect.
-        """
-        seen, raw = self.observation, self.observation.observation == "measurements"
-        vehicle = {n: value for n, value in vars(self.vehicle).items() if n != "action"}
-        found = FlightConfiguration(
-            count,
-            task=self.task,
-            sensors=self.suite,
-            true_sensors=self.sensors.true_sensors,
-            estimator=own_estimator(self.filter.estimator),
-            filter_start=self.filter.filter_start,
-            source=OBSERVATIONS[seen.observation],
-            control=ACTIONS[self.vehicle.action],
-            layout=Layout.MEASUREMENTS if raw else LAYOUTS[seen.layout],
-            run_filter=self.sensors.run_filter,
-            include_std=seen.include_std,
-            privileged=seen.privileged,
-            innovations=seen.innovations,
-            autoreset=autoreset,
-            threads=threads,
-            **vehicle,
-            **vars(self.world),
-        )
-        check.effect(self.asked, arguments_without_effect(found))
-        return found
 
 
 def require_known(given: Mapping[str, Any], others: Sequence[str] = ()) -> None:

@@ -2,39 +2,40 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import innovations_of
 from quad_gym.batch.starts import check_in_bounds, check_pad, checked_start
-from quad_gym.configuration import MAX_FLIGHTS, FlightConfiguration
-from quad_gym.envs.config import EnvConfig
+from quad_gym.configuration import MAX_FLIGHTS, FlightConfiguration, arguments_without_effect
+from quad_gym.envs.config import EnvConfig, own_estimator
 from quad_gym.envs.spaces import (
-    PRIVILEGED_NAMES,
-    ObservationField,
+    ACTIONS,
+    LAYOUTS,
+    OBSERVATIONS,
+    OWN_LAYOUT,
+    Table,
     layout_bounds,
-    observation_layout,
     observation_space,
     policy_size,
+    table_of,
+    table_with_task,
 )
 from quad_gym.faults import named_faults
 from quad_gym.params import checks as check
-from quad_gym.params.world import WorldParams
-from quad_gym.records import Autoreset
+from quad_gym.params.suites import SensorSuite, given_suite
+from quad_gym.records import Autoreset, Layout
 
 if TYPE_CHECKING:
     from quad_gym.rendering.renderer import Rendering
-    from quad_gym.tasks import Task
     from quad_gym.tasks.batch import TaskBatch
-
-
-Table = tuple[ObservationField, ...]  #: of an observation's parts
 
 
 class Flights:
@@ -45,31 +46,29 @@ class Flights:
     ) -> None:
         check.whole("num_envs", count, most=MAX_FLIGHTS)
         self.config = config
-        seen = config.observation
+        seen, vehicle = config.observation, config.vehicle
         self.name, self.task, self.observation = config.name, config.task, seen.observation
-        self.action, self.layout = config.vehicle.action, seen.layout
-        self.control_rate, self.reward_terms = config.vehicle.control_rate, seen.reward_terms
-        c = config.flights(count, autoreset, threads)
-        drawn = c.randomization.names
-        if c.world.ground is None and not config.tasks and "start_position_I" not in drawn:
-            check_pad(c.task)  # a user-defined task may set where vehicles start
-        self.table: Table = observation_layout(
-            seen.observation,
-            config.asked.get("layout"),
-            sensors=c.sensors,
-            include_std=c.include_std,
-            privileged=c.privileged,
-            drawn=(drawn if drawn or c.world != WorldParams() else None) if c.privileged else None,
-        )
-        c = replace(c, bounds=layout_bounds(self.table))
-        if not config.tasks:
-            self.batch = FlightBatch(c)  # type: ignore[arg-type]
-        else:
+        self.action, self.layout = vehicle.action, seen.layout
+        self.control_rate, self.reward_terms = vehicle.control_rate, seen.reward_terms
+        c = _configuration(config, count, autoreset, threads)
+        self.table: Table = table_of(c)
+        c = c.replace(bounds=layout_bounds(self.table))
+        self.batch: FlightBatch
+        if config.tasks:
             self.batch, self.table = batch_with_task(config.tasks, c, self.table)
-        if config.max_steps is not None:
-            self.batch.limit(min(config.max_steps, self.batch.max_steps or config.max_steps))
-        self.space = observation_space(self.table)
-        self.policy_size = policy_size(self.table) if c.privileged else None
+        else:
+            check_pad(c)  # a task in Python may set where vehicles start
+            self.batch = FlightBatch(c)  # type: ignore[arg-type]
+
+    @cached_property
+    def space(self) -> spaces.Box | spaces.Dict:
+        """Space of the observations."""
+        return observation_space(self.table)
+
+    @cached_property
+    def policy_size(self) -> int | None:
+        """Elements of an observation for the policy, before privileged ones; None: without any."""
+        return policy_size(self.table) if self.config.observation.privileged else None
 
     def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
         """The start values in the options of a reset, checked before anything changes."""
@@ -90,6 +89,54 @@ class Flights:
             "policy": observations[..., : self.policy_size].copy(),
             "privileged": observations[..., self.policy_size :].copy(),
         }
+
+
+def _configuration(
+    config: EnvConfig, count: int, autoreset: Autoreset, threads: int | None
+) -> FlightConfiguration:
+    """Return the configuration of a batch: that of the environment in enumerations and objects.
+
+    Raises:
+        ValueError: If a value is invalid, or a given keyword has no effect.
+    """
+    seen, raw = config.observation, config.observation.observation == "measurements"
+    vehicle = {name: value for name, value in vars(config.vehicle).items() if name != "action"}
+    c = FlightConfiguration(
+        count,
+        task=config.task,
+        sensors=_suite(config),
+        true_sensors=config.sensors.true_sensors,
+        estimator=own_estimator(config.filter.estimator),
+        filter_start=config.filter.filter_start,
+        source=OBSERVATIONS[seen.observation],
+        control=ACTIONS[config.vehicle.action],
+        layout=Layout.MEASUREMENTS if raw else LAYOUTS[seen.layout],
+        run_filter=config.sensors.run_filter,
+        include_std=seen.include_std,
+        privileged=seen.privileged,
+        innovations=seen.innovations,
+        autoreset=autoreset,
+        threads=threads,
+        **vehicle,
+        **vars(config.world),
+    )
+    own_layout = {"layout": OWN_LAYOUT} if raw else {}
+    check.effect(config.asked, arguments_without_effect(c) | own_layout)
+    return c
+
+
+def _suite(config: EnvConfig) -> SensorSuite:
+    """Return the sensor suite that `sensors`, `camera` and `estimator` select."""
+    sensors, estimator = config.sensors.sensors, config.filter.estimator
+    suite = given_suite("sensors", sensors)
+    if not config.sensors.camera:
+        suite = suite.replace(camera=None)
+    elif "camera" in config.asked and suite.camera is None:
+        raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
+    if estimator is None or own_estimator(estimator) is not None:
+        return suite
+    check.choice("estimator", estimator, ("ukf", "ekf"))
+    return suite.replace(estimator=suite.estimator.replace(kind=estimator))
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -141,71 +188,35 @@ def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------------------
 
 
-def laid_over(tasks: Sequence[Any]) -> "Task":
-    """Make one task of several, of which each is laid over the one before it.
-
-    A task that derives from the class of the one before it takes its place.
-    """
-    from quad_gym.tasks import Task
-    from quad_gym.tasks.batch import LaidTask
-    from quad_gym.tasks.task import resolve_task
-
-    found = resolve_task(tasks[0])
-    for given in tasks[1:]:
-        over = resolve_task(given)
-        base = type(found.over if isinstance(found, LaidTask) else found)
-        if base is not Task and isinstance(over, base):
-            found = LaidTask(over, found.base) if isinstance(found, LaidTask) else over
-        else:
-            found = LaidTask(over, found)
-    return found
-
-
 def batch_with_task(
-    given: Sequence[Any], c: FlightConfiguration, table: Table
+    tasks: Sequence[Any], c: FlightConfiguration, table: Table
 ) -> "tuple[TaskBatch, Table]":
-    """Make the flights with user-defined tasks; return them, and their observation's table.
+    """Make flights with user-defined tasks, each laid over the one before it.
 
-    `given` are tasks, each of which is laid over the one before it.
     The parts that `observe` returns are found by calling it once, with a flight made for the
-    purpose. Parts with names of built-in parts are refused.
-    """
-    from quad_gym.tasks.batch import Part, TaskBatch
-    from quad_gym.tasks.task import ObservationSpec
+    purpose.
 
-    task = laid_over(given)
+    Args:
+        tasks: The tasks, or their names.
+        c: Configuration of the flights.
+        table: Table of the built-in observation.
+
+    Returns:
+        The flights, and the table of their observations.
+    """
+    from quad_gym.tasks.batch import Part, TaskBatch, laid_over
+
+    split, task = policy_size(table), laid_over(tasks)
     task._require(c.sensors, c.world)
-    split = policy_size(table)
     if not task.has("observe"):
         return TaskBatch(c, own_task=task, split=split), table
-    first = TaskBatch(replace(c, count=1, threads=1), own_task=task, split=split)
+    first = TaskBatch(c.replace(count=1, threads=1), own_task=task, split=split)
     first.reset(keys=np.zeros((1, 2), np.uint64))
     sizes = {name: part.shape[1] for name, part in first.ask_parts().items()}
-    unknown = sorted(set(task.observes) - set(sizes))
-    if unknown:
-        raise ValueError(f"observes has {unknown[0]!r}, which observe does not return")
-    kept = tuple(
-        field
-        for field in table
-        if field.slice.stop <= split and (not task.replaces_observation or field.name in task.keeps)
-    )
-    rest = tuple(f for f in table if f.slice.start >= split)
-    taken = ({field.name for field in (*kept, *rest)} | PRIVILEGED_NAMES) & set(sizes)
-    if taken:
-        raise ValueError(f"observe must not return {min(taken)!r}, a name of a built-in part")
-    described = {name: task.observes.get(name, ObservationSpec()) for name in sizes}
-    own = [ObservationField(name, slice(0, sizes[name]), *described[name]) for name in sizes]
-    parts = {n: Part(sizes[n], described[n].low, described[n].high) for n in sizes}
-    new, place = [], 0
-    for field in (*kept, *own, *rest):
-        size = field.slice.stop - field.slice.start
-        new.append(field._replace(slice=slice(place, place + size)))
-        place += size
-    if not new:
-        raise ValueError("observe must return something where it replaces the observation")
-    columns = [k for field in kept for k in range(field.slice.start, field.slice.stop)]
-    batch = TaskBatch(c, own_task=task, split=split, parts=parts, kept=columns)
-    return batch, tuple(new)
+    table, kept = table_with_task(table, task, sizes)
+    own = {field.name: field for field in table if field.name in sizes}
+    parts = {name: Part(sizes[name], own[name].low, own[name].high) for name in sizes}
+    return TaskBatch(c, own_task=task, split=split, parts=parts, kept=kept), table
 
 
 # --------------------------------------------------------------------------------------------------

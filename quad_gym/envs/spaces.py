@@ -4,17 +4,22 @@
 order.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from quad_gym.configuration import FlightConfiguration
 from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite, given_suite
+from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, MAX_OBSERVATION, Control, Layout, Source
+
+if TYPE_CHECKING:
+    from quad_gym.tasks import Task
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
 """Values of the keyword `observation`."""
@@ -24,6 +29,9 @@ ACTIONS = {control.name.lower(): control for control in Control if control is no
 
 LAYOUTS = {"relative": Layout.RELATIVE, "absolute": Layout.ABSOLUTE}
 """Values of the keyword `layout`."""
+
+OWN_LAYOUT = 'with observation="measurements", which has its own'
+"""The case in which `layout` has no effect."""
 
 Part = tuple[str, int, str, str, float]
 """Name, size, unit, frame and bound of one part of an observation."""
@@ -42,6 +50,9 @@ class ObservationField(NamedTuple):
     low: float  #: lower bound, to which observations are clipped
     high: float  #: upper bound, to which observations are clipped
 
+
+Table = tuple[ObservationField, ...]
+"""The parts of an observation, in their order."""
 
 _RELATIVE: tuple[Part, ...] = (
     ("position_error", 3, "m", "B", 100.0),
@@ -104,8 +115,6 @@ def _sensor_fields(suite: SensorSuite) -> tuple[Part, ...]:
 
 
 def _world_fields(drawn: Sequence[str], suite: SensorSuite) -> tuple[Part, ...]:
-    for name in drawn:
-        check.choice("drawn", name, tuple(COLUMNS))
     sizes = {name: columns.stop - columns.start for name, columns in COLUMNS.items()}
     sizes["feature_offsets_I"] = 3 * suite.blocks_of("pixels")
     drawn_sizes = ((name, size) for name, size in sizes.items() if name in drawn)
@@ -121,7 +130,7 @@ def observation_layout(
     privileged: bool = False,
     sensors: SensorSuite | str = "standard",
     drawn: Sequence[str] | None = None,
-) -> tuple[ObservationField, ...]:
+) -> Table:
     """Return the table of an observation: name, slice, unit, frame and bounds of each part.
 
     Args:
@@ -145,15 +154,34 @@ def observation_layout(
     check.choice("layout", "relative" if layout is None else layout, tuple(LAYOUTS))
     suite = given_suite("sensors", sensors)
     raw = observation == "measurements"
-    parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
-    if raw:
-        parts = _sensor_fields(suite)
-    without = {"layout": 'with observation="measurements", which has its own'} if raw else {}
+    without = {"layout": OWN_LAYOUT} if raw else {}
     if not privileged:
         without["drawn"] = "with privileged=False"
     given = {"layout": layout, "drawn": drawn}
     check.effect({name: value for name, value in given.items() if value is not None}, without)
-    parts = (*parts, _LAST_ACTION)
+    for name in drawn or ():
+        check.choice("drawn", name, tuple(COLUMNS))
+    numbered = Layout.MEASUREMENTS if raw else LAYOUTS[layout or "relative"]
+    return _table(numbered, suite, include_std, privileged, drawn)
+
+
+def table_of(c: FlightConfiguration) -> Table:
+    """Return the table of the observations of flights."""
+    drawn = c.randomization.names
+    calm = not drawn and c.world == WorldParams()  # and then no draw and no wind is shown
+    return _table(c.layout, c.sensors, c.include_std, c.privileged, None if calm else drawn)
+
+
+def _table(
+    layout: Layout,
+    suite: SensorSuite,
+    include_std: bool,
+    privileged: bool,
+    drawn: Sequence[str] | None,
+) -> Table:
+    """Return the table of an observation, see `observation_layout`."""
+    states = {Layout.RELATIVE: _RELATIVE, Layout.ABSOLUTE: _ABSOLUTE}
+    parts = (*(states.get(layout) or _sensor_fields(suite)), _LAST_ACTION)
     if include_std:
         units = ("m", "m/s", "rad", "m/s^2", "rad/s")
         frames = ("I", "I", "B", "B", "B")
@@ -163,17 +191,66 @@ def observation_layout(
         )
     if privileged:
         parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn, suite))
-    table, first = [], 0
+    fields = []
     for name, size, unit, frame, bound in parts:
         low, high = (0.0, 1.0) if bound == _FLAG else (-bound, bound)
-        table.append(ObservationField(name, slice(first, first + size), unit, frame, low, high))
-        first += size
+        fields.append(ObservationField(name, slice(0, size), unit, frame, low, high))
+    return _numbered(fields)
+
+
+def _numbered(fields: Iterable[ObservationField]) -> Table:
+    """Return parts as a table, in which the slice of each begins where the one before it ends."""
+    table, first = [], 0
+    for field in fields:
+        end = first + field.slice.stop - field.slice.start
+        table.append(field._replace(slice=slice(first, end)))
+        first = end
     return tuple(table)
 
 
-def layout_bounds(
-    table: tuple[ObservationField, ...],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def table_with_task(
+    table: Table, task: "Task", sizes: Mapping[str, int]
+) -> tuple[Table, list[int]]:
+    """Return the table of observations with the parts of a user's task.
+
+    Args:
+        table: Table of the built-in observation.
+        task: The task, whose parts follow the built-in ones that it keeps.
+        sizes: Sizes of the arrays that its `observe` returns, by name.
+
+    Returns:
+        The table, and the columns of the built-in observation for the policy that it has kept.
+
+    Raises:
+        ValueError: If parts of the task have names of built-in ones, or do not exist.
+    """
+    from quad_gym.tasks.task import ObservationSpec
+
+    unknown = sorted(set(task.observes) - set(sizes))
+    if unknown:
+        raise ValueError(f"observes has {unknown[0]!r}, which observe does not return")
+    split = policy_size(table)
+    kept = [
+        field
+        for field in table
+        if field.slice.stop <= split and (not task.replaces_observation or field.name in task.keeps)
+    ]
+    truth = [field for field in table if field.slice.start >= split]
+    taken = ({field.name for field in (*kept, *truth)} | PRIVILEGED_NAMES) & set(sizes)
+    if taken:
+        raise ValueError(f"observe must not return {min(taken)!r}, a name of a built-in part")
+    plain = ObservationSpec()
+    own = [
+        ObservationField(name, slice(0, size), *task.observes.get(name, plain))
+        for name, size in sizes.items()
+    ]
+    new = _numbered([*kept, *own, *truth])
+    if not new:
+        raise ValueError("observe must return something where it replaces the observation")
+    return new, [k for field in kept for k in range(field.slice.start, field.slice.stop)]
+
+
+def layout_bounds(table: Table) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the bounds (low, high) of every number of an observation, (n,) each."""
     size = table[-1].slice.stop
     if size > MAX_OBSERVATION:
@@ -184,7 +261,7 @@ def layout_bounds(
     return low, high
 
 
-def observation_space(table: tuple[ObservationField, ...]) -> spaces.Box | spaces.Dict:
+def observation_space(table: Table) -> spaces.Box | spaces.Dict:
     """Return the space of a table: a Box, or a Dict of two with a privileged part."""
     low, high = (bound.astype(np.float32) for bound in layout_bounds(table))
     split = policy_size(table)
@@ -195,7 +272,7 @@ def observation_space(table: tuple[ObservationField, ...]) -> spaces.Box | space
     return spaces.Dict({"policy": policy, "privileged": truth})
 
 
-def policy_size(table: tuple[ObservationField, ...]) -> int:
+def policy_size(table: Table) -> int:
     """Return the number of elements of an observation for the policy; the rest is privileged."""
     for field in table:
         if field.name == _PRIVILEGED[0][0]:

@@ -17,7 +17,15 @@ from quad_gym.params.task import TaskParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import RESULTS, Autoreset, Ending, Result
 from quad_gym.records.state import State
-from quad_gym.tasks.task import BOUND, METHODS, FlightRandom, Task, TaskError, label
+from quad_gym.tasks.task import (
+    BOUND,
+    METHODS,
+    FlightRandom,
+    Task,
+    TaskError,
+    label,
+    resolve_task,
+)
 from quad_gym.tasks.view import VIEW_FIELDS, BuiltinView, Group, ReadableBatch, View, field
 
 if TYPE_CHECKING:
@@ -408,6 +416,21 @@ class _BaseView(BuiltinView):
     def ending(self) -> NDArray[np.int64]:
         over, why = self.terminated | self.truncated, self._beneath.ending
         return np.where(over, np.where(why > 0, why, int(Ending.TASK)), 0)
+
+
+def laid_over(tasks: Sequence[Any]) -> Task:
+    """Make one task of several, of which each is laid over the one before it.
+
+    A task that derives from the class of the one before it takes its place.
+    """
+    found, *others = [resolve_task(given) for given in tasks]
+    for over in others:
+        base = type(found.over if isinstance(found, LaidTask) else found)
+        if base is not Task and isinstance(over, base):
+            found = LaidTask(over, found.base) if isinstance(found, LaidTask) else over
+        else:
+            found = LaidTask(over, found)
+    return found
 
 
 # --------------------------------------------------------------------------------------------------
