@@ -153,7 +153,7 @@ def checked_estimate(method: str, given: Any, count: int, rows: Truths) -> dict[
     return found
 
 
-def own_copy(given: Estimator) -> Estimator:
+def _own_copy(given: Estimator) -> Estimator:
     """Return a copy that shares nothing with the estimator."""
     try:
         return copy.deepcopy(given)
@@ -359,6 +359,9 @@ class StartView(Measurements):
 # `OwnFilter`: the calls of a user's estimator by the flights that fly on it.
 # --------------------------------------------------------------------------------------------------
 
+STARTS = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias", "covariance")
+"""Names of the estimate with which an episode begins, attributes of a `StartView`."""
+
 _FIELDS = {
     "position": "r_hat",
     "velocity": "v_hat",
@@ -371,18 +374,28 @@ _FIELDS = {
 
 
 class OwnFilter:
-    """A batch's own copy of a user's estimator.
+    """An own copy of a user's estimator, with the state of all flights that it estimates.
 
-    The kernels fly tick by tick up to the measurements; the estimate is then written to the
-    fields in which they expect the filter's.
+    The kernels of a batch fly tick by tick up to the measurements; the estimate is then written to
+    the fields in which they expect the filter's.
     """
 
     def __init__(self, given: Estimator, count: int) -> None:
         self.name = type(given).__name__
-        self._estimator = own_copy(given)
-        self.state = self._estimator.state = State(count, given.state)
+        self.estimator = _own_copy(given)
+        self.state = self.estimator.state = State(count, given.state)
         self.state.lock(False)
         self._failed, self._has_covariance = False, True
+
+    def begin(self, view: Any, mask: Truths) -> Mapping[str, ArrayLike]:
+        """Begin the episodes of flights in `mask`; return the estimate, by default the view's."""
+        others = self.state.rows()
+        self.state.begin(mask)
+        self.state.lock(False)
+        estimate = self.estimator.reset(view, mask)
+        self.state.put(others[~mask], ~mask)
+        self.state.lock(False)
+        return {name: getattr(view, name) for name in STARTS} if estimate is None else estimate
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -417,7 +430,8 @@ class OwnFilter:
             begun = batch.record("tick") == 0.0
         if begun.any():
             self._failed = True
-            self._begin(batch, begun)
+            view = StartView(batch, _sample(batch), begun)
+            self._write(batch, "reset", self.begin(view, begun), begun, view)
             observations = batch._fly(Command.LOOK)
             if batch.configuration.autoreset is Autoreset.NEXT_STEP and command != Command.RESET:
                 row = batch._results[Result.ESTIMATION_ERROR, : batch.count]
@@ -433,22 +447,8 @@ class OwnFilter:
             sample = _sample(batch)  # which the vehicle has taken at the start of the tick
             batch._fly(Command.TICK + left)
             measurements = Measurements(batch, _sample(batch) if averages else sample)
-            estimate = self._estimator.update(measurements)
+            estimate = self.estimator.update(measurements)
             self._write(batch, "update", estimate, everyone, measurements, with_covariance=not left)
-
-    def _begin(self, batch: FlightMemory, mask: Truths) -> None:
-        """Begin the episodes of flights in `mask`."""
-        others = self.state.rows()
-        self.state.begin(mask)
-        self.state.lock(False)
-        view = StartView(batch, _sample(batch), mask)
-        estimate = self._estimator.reset(view, mask)
-        self.state.put(others[~mask], ~mask)
-        self.state.lock(False)
-        if estimate is None:
-            names = ("position", "velocity", "R_BI", "gyro_bias", "accel_bias", "covariance")
-            estimate = {name: getattr(view, name) for name in names}
-        self._write(batch, "reset", estimate, mask, view)
 
     def _write(
         self,

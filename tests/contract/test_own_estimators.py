@@ -227,7 +227,7 @@ def test_measurements_arrive_as_the_sensors_deliver_them(sensors):
     seen = Log()
     made = FlightBatch(3, sensors=sensors, estimator=seen, source=Source.TRUTH, run_filter=True)
     plain = FlightBatch(3, sensors=sensors, source=Source.TRUTH, run_filter=True)
-    seen = made._own_filter._estimator.seen
+    seen = made._own_filter.estimator.seen
     arrivals = 0
     for flights in (made, plain):
         flights.reset(seeds=range(3))

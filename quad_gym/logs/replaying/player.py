@@ -6,7 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.batch.own_estimator import Estimator, checked_estimate, factors, own_copy
+from quad_gym.batch.own_estimator import (
+    STARTS,
+    Estimator,
+    OwnFilter,
+    checked_estimate,
+    factors,
+)
 from quad_gym.estimation.filters import (
     LONGEST_STEP,
     ExtendedKalmanFilter,
@@ -37,9 +43,8 @@ from quad_gym.packing import blocks_of
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import FREEDOMS, POSITION_BLOCK, FilterStatus
+from quad_gym.records import FREEDOMS, POSITION_BLOCK
 from quad_gym.records.inputs import INPUT, SAME_TIME, Outcome, SensorReading
-from quad_gym.records.state import State
 from quad_gym.rotations import dcm_to_quaternion
 
 # --------------------------------------------------------------------------------------------------
@@ -129,15 +134,21 @@ class Player:
         )
         if self.holds:
             measured.pop(POSITION_BLOCK, None)
+        return self._replay(self.estimator, columns, measured)
+
+    def _replay(
+        self, name: str, columns: dict[str, Any], measured: dict[int, InnovationSeries]
+    ) -> Replay:
+        """Return the result of the estimator with a name, with innovations by block."""
         return Replay(
-            estimator=self.estimator,
+            estimator=name,
             sensors=self.assumed,
             time=self.times,
             **columns,
             status=self.filter.status,
             measured={name_of(block): found for block, found in measured.items()},
             notes=(SENTENCE,) if self.holds else (),
-            late={name: np.array(ages) for name, ages in self.late.items()},
+            late={sensor: np.array(ages) for sensor, ages in self.late.items()},
             unused=self.unused,
         )
 
@@ -256,72 +267,64 @@ class Player:
 EVERYONE = np.ones(1, bool)
 
 
-class OwnPlayer:
-    """Processes the contents of a log with a user's estimator, in the order of arrival.
+class OwnPlayer(Player):
+    """Player with a user's estimator in place of the filter, whose start it has.
 
     A tick, of the suite's IMU, has the mean of the log's samples over it, and the measurements that
-    have arrived since the tick before, one of each sensor at most. The start is the built-in
-    filter's.
+    have arrived since the tick before, one of each sensor at most.
 
     Args:
-        player: A player of the log with a built-in filter.
-        estimator: The estimator, of which a copy is used.
+        own: The estimator, of which a copy is used.
+        values: Arguments of `Player`.
     """
 
-    def __init__(self, player: Player, estimator: Estimator) -> None:
-        self._player, self._suite = player, player.suite
-        self._name, self._estimator = type(estimator).__name__, own_copy(estimator)
-        self._estimator.state = State(1, estimator.state)
-        self._estimator.state.lock(False)
+    def __init__(self, own: Estimator, *values: Any) -> None:
+        super().__init__(*values)
+        self._own = OwnFilter(own, 1)
         self._arrived: dict[int, list[tuple[float, float]]] = {}  # stamps and arrivals by block
-        suite = player.suite
-        self._vehicle = VehicleParams(gravity=suite.estimator.gravity)
-        features = () if suite.camera is None else suite.camera.features_I
+        self._vehicle = VehicleParams(gravity=self.suite.estimator.gravity)
+        features = () if self.suite.camera is None else self.suite.camera.features_I
         self._features = np.array(features, np.float64).reshape(1, -1, 3)
 
     def play(self) -> Replay:
         """Estimate along the whole log."""
-        player, dt = self._player, self._suite.imu.dt
-        player.start.tilted = False  # an estimator of a user's knows no unknown heading
-        player.write_tape()
-        kf = player.filter
+        self.start.tilted = False  # an estimator of a user's knows no unknown heading
+        self.write_tape()
+        kf, imu, dt = self.filter, self.log.imu, self.suite.imu.dt
         if not kf.heading_known:
             raise ValueError(
                 "start must have a heading, or the log a baseline or a magnetometer, for an "
                 "estimator of your own (--heading)"
             )
-        begin, imu = kf.time, player.log.imu
-        count = 1 + int((imu.time[-1] - begin) / dt + SAME_TIME)
-        times = np.asarray(begin + dt * np.arange(count), np.float64)
+        count = 1 + int((imu.time[-1] - kf.time) / dt + SAME_TIME)
+        self.times = times = np.asarray(kf.time + dt * np.arange(count), np.float64)
         gyro, accel = (self._means(imu.values[name], times) for name in ("gyro", "accel"))
         last = np.searchsorted(imu.time, times + SAME_TIME, "right") - 1
         now = imu.values["gyro"][np.maximum(last, 0)]
-        names = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias", "covariance")
-        start = {name: np.array(getattr(kf, name))[np.newaxis] for name in names}
+        start = {name: np.array(getattr(kf, name))[np.newaxis] for name in STARTS}
         view = self._at(0.0, gyro[0], accel[0], now[0], {}, **start)
-        given = self._estimator.reset(view, EVERYONE)
-        rows = [self._row("reset", start if given is None else given)]
-        waiting = self._arrivals(begin)
+        rows = [self._row("reset", self._own.begin(view, EVERYONE))]
+        waiting, self.late = self._arrivals(kf.time), {}
         for k in range(1, len(times)):
             readings = self._readings(waiting, times[k])
-            view = self._at(times[k] - begin, gyro[k - 1], accel[k - 1], now[k], readings)
-            rows.append(self._row("update", self._estimator.update(view)))
-        return self._result(times, rows)
+            view = self._at(times[k] - times[0], gyro[k - 1], accel[k - 1], now[k], readings)
+            rows.append(self._row("update", self._own.estimator.update(view)))
+        return self._replay(self._own.name, _columns(rows), self._measured())
 
     def _means(self, values: Floats, times: Floats) -> Floats:
         """Return the means of the IMU's samples between successive times, (n, 3)."""
-        stamps = self._player.log.imu.time
-        held = values[1:] if self._player.averages else values[:-1]
+        stamps = self.log.imu.time
+        held = values[1:] if self.averages else values[:-1]
         integral = np.zeros_like(values)
         integral[1:] = np.cumsum(held * np.diff(stamps)[:, np.newaxis], axis=0)
         at = np.stack([np.interp(times, stamps, column) for column in integral.T], axis=1)
-        means = np.diff(at, axis=0) / self._suite.imu.dt
+        means = np.diff(at, axis=0) / self.suite.imu.dt
         return means if len(means) else values[:1]
 
     def _arrivals(self, begin: float) -> deque[tuple[float, float, str, int]]:
         """Return arrivals, time stamps, sensors and places of the measurements after the start."""
         found = []
-        for name, stream in self._player.streams.items():
+        for name, stream in self.streams.items():
             if name != "imu":
                 later = np.flatnonzero(stream.time > begin + SAME_TIME).tolist()
                 found += [(stream.received[k], stream.time[k], name, k) for k in later]
@@ -337,31 +340,34 @@ class OwnPlayer:
                 later.append(arrival)
                 continue
             known.add(name)
-            player, age = self._player, max(now - stamp, 0.0)
-            measurement = player.measured.at(name, k)
-            if measurement is not None and age <= player.window + self._suite.imu.dt:
-                found |= self._by_name(measurement, age)
-                for block in measured_blocks(measurement):
-                    self._arrived.setdefault(block, []).append((stamp, received))
+            measurement, age = self.measured.at(name, k), max(now - stamp, 0.0)
+            if measurement is None:
+                continue
+            if age > self.window + self.suite.imu.dt:
+                self.late.setdefault(name, []).append(received - stamp)
+                continue
+            found |= self._by_name(measurement, age)
+            for block in measured_blocks(measurement):
+                self._arrived.setdefault(block, []).append((stamp, received))
         waiting.extendleft(reversed(later))
         return found
 
     def _by_name(self, given: Measurement, age: float) -> dict[str, SensorReading]:
         """Return a measurement as readings, by their names."""
-        found, R_IG = {}, self._player.measured.R_GI.T
+        found, R_IG = {}, self.measured.R_GI.T
         for name, reading in READINGS.items():
-            value = values_of(given, name, self._suite.blocks_of(name))
+            value = values_of(given, name, self.suite.blocks_of(name))
             new = np.asarray(np.isfinite(value).all(axis=1))
             if not new.any():
                 continue
             if name == "gnss_baseline":  # has any length
-                assert self._suite.gnss is not None
-                length = np.linalg.norm(self._suite.gnss.baseline_B)
+                assert self.suite.gnss is not None
+                length = np.linalg.norm(self.suite.gnss.baseline_B)
                 value = value * (length / np.linalg.norm(value))
             if reading.in_G:
                 value = (R_IG @ value[0])[np.newaxis]
             several = reading.most_blocks > 1
-            one = value.reshape(1, *self._suite.shape_of(name)).copy()
+            one = value.reshape(1, *self.suite.shape_of(name)).copy()
             found[name] = SensorReading(one, new[np.newaxis] if several else new, age)
         return found
 
@@ -377,16 +383,16 @@ class OwnPlayer:
         """Return the `Measurements`, or the `StartView`, of an instant."""
         for name, reading in READINGS.items():
             if name not in readings:
-                count = self._suite.blocks_of(name)
+                count = self.suite.blocks_of(name)
                 new = np.zeros((1, count) if reading.most_blocks > 1 else 1, bool)
-                nothing = np.full((1, *self._suite.shape_of(name)), np.nan)
+                nothing = np.full((1, *self.suite.shape_of(name)), np.nan)
                 start[name] = SensorReading(nothing, new, 0.0) if count else None
         return SimpleNamespace(
             count=1,
-            dt=self._suite.imu.dt,
-            sensors=self._suite,
+            dt=self.suite.imu.dt,
+            sensors=self.suite,
             vehicle=self._vehicle,
-            ground_height=self._suite.estimator.ground_height,
+            ground_height=self.suite.estimator.ground_height,
             gyro=gyro[np.newaxis].copy(),
             accel=accel[np.newaxis].copy(),
             gyro_now=now[np.newaxis].copy(),
@@ -399,7 +405,7 @@ class OwnPlayer:
 
     def _row(self, method: str, given: Any) -> Floats:
         """Return an estimate, if it is valid, as numbers: r, v, R_BI, b_a, b_g and sigmas."""
-        method = f"{self._name}.{method}"
+        method = f"{self._own.name}.{method}"
         found = checked_estimate(method, given, 1, EVERYONE)
         sigma = np.full(15, np.nan)
         if "covariance" in found:
@@ -409,40 +415,33 @@ class OwnPlayer:
         names = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias")
         return np.concatenate([*(found.get(name, zero).ravel() for name in names), sigma])
 
-    def _result(self, times: Floats, rows: list[Floats]) -> Replay:
-        r, v, R, b_a, b_g, sigma = np.split(np.array(rows), np.cumsum((3, 3, 9, 3, 3)), axis=1)
-        everywhere = np.ones(len(times), bool)
-        return Replay(
-            estimator=self._name,
-            sensors=self._suite,
-            time=times,
-            position=r,
-            velocity=v,
-            quaternion=dcm_to_quaternion(R.reshape(-1, 3, 3)),
-            accel_bias=b_a,
-            gyro_bias=b_g,
-            sigma=sigma,
-            heading_known=everywhere,
-            diverged=~everywhere,
-            heading_apart=np.zeros(len(times)),
-            motion_sigma=np.full(len(times), np.inf),
-            compass_out=~everywhere,
-            status=FilterStatus(0),
-            measured=self._measured(),
-            late={},
-            unused=self._player.unused,
-        )
-
-    def _measured(self) -> dict[str, InnovationSeries]:
-        """Return times of the measurements, by kind; their innovations are unknown."""
+    def _measured(self) -> dict[int, InnovationSeries]:
+        """Return times of the measurements, by block; their innovations are unknown."""
         found = {}
-        for block in blocks_of(self._suite):
+        for block in blocks_of(self.suite):
             if block in self._arrived:
                 stamps = np.array(self._arrived[block])
                 unknown = np.full((len(stamps), FREEDOMS[block]), np.nan)
                 none = np.zeros(len(stamps))
                 times = stamps[:, 0], stamps[:, 1]
-                found[name_of(block)] = InnovationSeries(
-                    *times, unknown, unknown, unknown[:, 0], none
-                )
+                found[block] = InnovationSeries(*times, unknown, unknown, unknown[:, 0], none)
         return found
+
+
+def _columns(rows: list[Floats]) -> dict[str, Any]:
+    """Return fields of `Replay` from rows; an own estimator has no diagnostics of its heading."""
+    r, v, R, b_a, b_g, sigma = np.split(np.array(rows), np.cumsum((3, 3, 9, 3, 3)), axis=1)
+    everywhere = np.ones(len(rows), bool)
+    return {
+        "position": r,
+        "velocity": v,
+        "quaternion": dcm_to_quaternion(R.reshape(-1, 3, 3)),
+        "accel_bias": b_a,
+        "gyro_bias": b_g,
+        "sigma": sigma,
+        "heading_known": everywhere,
+        "diverged": ~everywhere,
+        "heading_apart": np.zeros(len(rows)),
+        "motion_sigma": np.full(len(rows), np.inf),
+        "compass_out": ~everywhere,
+    }

@@ -123,12 +123,14 @@ def replay(
     reach = window + max(0.0, *vars(suite.log_delays).values())
 
     def fly(part: Log, begin: dict[str, Any]) -> Replay:
-        calls = None if samples is None else FilterCalls(suite, part)
-        hold = own is None and calls is None  # the exported filter receives measurements only
-        player = Player(part, suite, estimator, begin, reported_noise, reach, calls, hold)
-        found = player.play() if own is None else OwnPlayer(player, own).play()
-        if calls is not None:
-            rows.extend(calls.rows)
+        of_part = part, suite, estimator, begin, reported_noise, reach
+        if own is not None:
+            return OwnPlayer(own, *of_part).play()
+        if samples is None:
+            return Player(*of_part, hold=True).play()
+        calls = FilterCalls(suite, part)  # the exported filter receives measurements only
+        found = Player(*of_part, calls).play()
+        rows.extend(calls.rows)
         return found
 
     rows: list[str] = []
