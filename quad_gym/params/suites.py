@@ -164,13 +164,12 @@ class SensorSuite(SensorTable, Saved):
             label = type(sensor).__name__
             check.ticks(f"{label}.rate", sensor.rate, self.imu.rate)
             delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, self.imu.rate)
-        features = 0 if self.camera is None else len(self.camera.features_I)
-        count = FEATURE_BLOCKS + features + sum(params.blocks for params in self.aids.values())
-        if count > ALLOWED_TOGETHER:
-            most = ALLOWED_TOGETHER - FEATURE_BLOCKS
+        most = ALLOWED_TOGETHER - FEATURE_BLOCKS  # those of GNSS always have room
+        count = sum(n for name, n in self._counts.items() if SENSOR_OF[name] != "gnss")
+        if count > most:
             raise ValueError(
                 f"sensors must have at most {most} camera features and measurements of other "
-                f"sensors at an instant, got {count - FEATURE_BLOCKS}"
+                f"sensors at an instant, got {count}"
             )
 
     @property
@@ -273,12 +272,9 @@ class SensorSuite(SensorTable, Saved):
         for name, sensor in self.sensors.items():
             word = _WORDS.get(name, name)
             found |= {f"{word} rate [Hz]": sensor.rate, f"{word} phase": sensor.phase}
-        if (gnss := self.gnss) is not None:
-            found["presence of a GNSS baseline (secondary_antenna_B)"] = gnss.has_baseline
-            gives = gnss.velocity_sigma is not None
-            found["presence of GNSS velocities (velocity_sigma)"] = gives
-        if self.camera is not None:
-            found["number of camera features"] = len(self.camera.features_I)
+            for reading in sensor.readings(name):
+                count = self.blocks_of(reading.name)
+                found[f"number of {reading.block or reading.name} measurements"] = count
         return found
 
     def with_rates(self, *, imu: float | None = None, **sensors: float | None) -> "SensorSuite":

@@ -155,11 +155,15 @@ BATCHES = [
 ]
 TRUE_SENSORS = [
     ("gnss", {"rate": 5.0}, r"GNSS rate \[Hz\] of sensors, 10\.0, got 5\.0"),
-    ("gnss", {"velocity_sigma": None}, "presence of GNSS velocities"),
+    ("gnss", {"velocity_sigma": None}, "number of gnss_velocity measurements"),
     ("gnss", {"phase": 0.5}, "GNSS phase of sensors, None, got 0.5"),
     ("camera", {"rate": 50.0}, r"camera rate \[Hz\] of sensors, 25\.0, got 50\.0"),
     ("camera", {"phase": 0.0}, "camera phase of sensors, None, got 0.0"),
-    ("camera", {"features_I": ((1.0, 2.0, 0.0),)}, "camera features of sensors, 12, got 1"),
+    (
+        "camera",
+        {"features_I": ((1.0, 2.0, 0.0),)},
+        "number of feature measurements of sensors, 12, got 1",
+    ),
     ("imu", {"rate": 400.0}, "IMU rate"),
     ("imu", {"samples": "instant"}, "IMU samples"),
 ]

@@ -48,6 +48,12 @@ def test_ranges_have_the_closed_form_their_noise_and_outliers():
     assert abs(np.corrcoef(errors.T)[np.triu_indices(4, 1)]).max() < 0.1
 
 
+def test_true_sensors_have_as_many_anchors_as_the_filter_assumes():
+    fewer = suite_with(anchors_I=UWB.uwb_range.anchors_I[:3])
+    with pytest.raises(ValueError, match="number of uwb_range measurements of sensors, 4, got 3"):
+        UWB.require_like(fewer)
+
+
 def test_anchors_beyond_the_longest_range_are_not_measured():
     suite = suite_with(max_range=3.0, outlier_probability=0.0)
     batch = fly(suite, 1, task="hover", start="hover")
