@@ -340,6 +340,7 @@ def learning_figure(
     uses the observation of the training, and scores of different observations do not compare.
     """
     figure, ((axes,),) = panels(1, 1, (7.0, 4.0), title)
+    dot: dict[str, Any] = {"markeredgecolor": INK, "linestyle": "none"}
     for k, (label, seeds) in enumerate(curves.items(), start=1):
         style = _STYLES[k % len(_STYLES)]
         for steps, scores in seeds:
@@ -349,7 +350,6 @@ def learning_figure(
         axes.plot(seeds[0][0][:shortest] / 1e6, middle, linewidth=2.0, label=label, **style)
         if tests:
             end = 1.04 * max(steps[-1] for steps, _ in seeds) / 1e6
-            dot: dict[str, Any] = {"markeredgecolor": INK, "linestyle": "none"}
             axes.plot(end, tests[label], "o", color=style["color"], label="_", **dot)
     if tests:  # the dots have the colors of the lines; their explanation has none
         axes.plot([], [], "o", color="none", label="dots: test on the estimate", **dot)

@@ -95,21 +95,13 @@ class FlightBatch(RecordsOfOneForm, FlightMemory):
             check_cold_start(c.sensors, c.draws)
         check_reference(c.task, c.vehicle, c.actions, c.control)
         check_standing(c.task, c.flown_vehicle, c.world, c.draws)
-        ground = WorldParams(ground_height=c.world.ground_height)  # what a filter models of it
-        model = params_record(c.vehicle, c.sensors, c.pd_gains, c.actions, ground)
-        vehicle, sensors, world = c.flown_vehicle, c.flown_sensors, c.world
-        if (vehicle, sensors, world) == (c.vehicle, c.sensors, ground):
-            true = model.copy()
-        else:
-            true = params_record(vehicle, sensors, c.pd_gains, c.actions, world)
-        true["action_delay"] = c.action_delay
-        self._model, self._world = params_block(model), params_block(true)
+        parameters = self._pack_parameters(c)
         self._settings, self._paths = settings_record(c), pack_paths(c.task.trajectories)
         if c.filters and c.filter_start == "warm":
             pack_warm_start(self._settings[0], FlightBatch, c)
         self._choose_stages()
         mode = np.array((c.compiled_autoreset,), [("autoreset", np.int64)])
-        digest = configuration_digest(self._settings, mode, model, true, *self._paths)
+        digest = configuration_digest(self._settings, mode, *parameters, *self._paths)
         used = used_parts(self._settings[0])
         self._allocate(room_of(used), c.draws.low, digest)
         self._words, self._written = words_of_update(self._settings[0], used)
@@ -126,6 +118,23 @@ class FlightBatch(RecordsOfOneForm, FlightMemory):
         self._exchange = aligned_zeros(len(self._blocks) if own else 0, EXCHANGE_BLOCK)
         self._crew: Crew | None = None
         self._calls_until_check, self._beyond_single = 0, ""
+
+    def _pack_parameters(self, c: FlightConfiguration) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Write the parameters as filter and controller assume them, and the true ones.
+
+        Returns:
+            Both as scalar records, shape (1,).
+        """
+        ground = WorldParams(ground_height=c.world.ground_height)  # what a filter models of it
+        model = params_record(c.vehicle, c.sensors, c.pd_gains, c.actions, ground)
+        vehicle, sensors, world = c.flown_vehicle, c.flown_sensors, c.world
+        if (vehicle, sensors, world) == (c.vehicle, c.sensors, ground):
+            true = model.copy()
+        else:
+            true = params_record(vehicle, sensors, c.pd_gains, c.actions, world)
+        true["action_delay"] = c.action_delay
+        self._model, self._world = params_block(model), params_block(true)
+        return model, true
 
     def _allocate_for_threads(self) -> None:
         """Allocate the memory that each thread has for itself."""

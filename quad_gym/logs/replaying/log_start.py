@@ -56,11 +56,11 @@ def _first_speed(log: Log, suite: SensorSuite) -> float | None:
     nearest = int(np.argmin(np.abs(log.imu.time - time[0])))
     turning = float(np.linalg.norm(log.imu.values["gyro"][nearest]))
     speed, spread = 0.0, np.inf
-    if rows.sum() > 3:  # at the first fix, with a constant acceleration
+    if rows.sum() > 3:  # a parabola, whose slope at the first fix is the velocity there
         powers = np.vander(time[rows] - time[0], 3)
-        fit = np.linalg.pinv(powers)[1]
-        speed = float(np.linalg.norm(fit @ positions[rows]))
-        spread = max(suite.gnss.position_sigma_I) * float(np.linalg.norm(fit))
+        slope = np.linalg.pinv(powers)[1]
+        speed = float(np.linalg.norm(slope @ positions[rows]))
+        spread = max(suite.gnss.position_sigma_I) * float(np.linalg.norm(slope))
     moving = speed > max(FAST, CERTAIN * spread)
     return speed if moving or turning > TURNING else None
 
@@ -88,7 +88,7 @@ class LogStart:
         self._measured, self._in_order = measured, in_order
         self._field: int | None = None  # the last magnetic field before the start
         self.field_row: int | None = None  #: row of the magnetometer that the start uses
-        self._first_fix = math.inf
+        self._first_fix = math.inf  # arrival of the first fix that waits for a heading
         # roll and pitch of a wide start are too uncertain for a heading by a magnetic field
         self.tilted = bool(wide_start(measured.suite, measured.log)) and not in_order
 
@@ -105,7 +105,7 @@ class LogStart:
             kf._engine.steps["level"] = np.nan
 
     def found_in(self, name: str, k: int) -> bool:
-        """Return True if the start is known with measurement k of a stream."""
+        """Return True if the start is known with measurement k of a stream; `from_fix` has it."""
         if name == "magnetometer":
             self._field = k
         if name != "gnss":
