@@ -155,6 +155,10 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
 # blocks are therefore gathered into one: the words that an update reads (`records/layout.py`) are
 # copied to a block of scratch memory, and the words that it writes are copied back. Lanes do not
 # affect each other, so results are unchanged.
+#
+# A queue, `kind`, has the addresses of its lanes' first words (`source`) and of their blocks
+# (`source_block`). `plain` is a record whose fields have an axis of lanes, to read one lane of it:
+# other code sees the same memory as lanes.
 # --------------------------------------------------------------------------------------------------
 
 _MANY = 6 * WIDTH // 8

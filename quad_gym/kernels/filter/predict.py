@@ -167,6 +167,171 @@ def _maps(form, f_B, f_start, w_B, R_BI, half, dt):
 
 
 @kernel
+def _load_covariance(P):
+    """Blocks of the covariance: of e, r and v, of the biases, and of the biases with the former."""
+    motion = (
+        load_symmetric(P, E),
+        load_symmetric(P, R),
+        load_symmetric(P, V),
+        load_block(P, R, E),
+        load_block(P, V, E),
+        load_block(P, V, R),
+    )
+    biases = load_symmetric(P, BA), load_symmetric(P, BG), load_block(P, BG, BA)
+    accel = load_block(P, BA, E), load_block(P, BA, R), load_block(P, BA, V)
+    gyro = load_block(P, BG, E), load_block(P, BG, R), load_block(P, BG, V)
+    return motion, biases, accel, gyro
+
+
+@kernel
+def _keep_covariance(P, ok, motion, biases, accel, gyro):
+    """Store blocks of the covariance, in the order of `_load_covariance`, in the lanes `ok`."""
+    ee, rr, vv, re, ve, vr = motion
+    aa, gg, ga = biases
+    ae, ar, av = accel
+    ge, gr, gv = gyro
+    keep_lower(P, E, ok, ee)
+    keep_block(P, R, E, ok, re)
+    keep_lower(P, R, ok, rr)
+    keep_block(P, V, E, ok, ve)
+    keep_block(P, V, R, ok, vr)
+    keep_lower(P, V, ok, vv)
+    keep_block(P, BA, E, ok, ae)
+    keep_block(P, BA, R, ok, ar)
+    keep_block(P, BA, V, ok, av)
+    keep_lower(P, BA, ok, aa)
+    keep_block(P, BG, E, ok, ge)
+    keep_block(P, BG, R, ok, gr)
+    keep_block(P, BG, V, ok, gv)
+    keep_block(P, BG, BA, ok, ga)
+    keep_lower(P, BG, ok, gg)
+
+
+@kernel
+def _with_states_before(maps, motion, biases, accel, gyro):
+    """Covariances of v+ with the states before, (e, r, v, b_a, b_g), and of e+ with (e, b_a, b_g).
+
+    They lack the remainders of the sigma points, as in a linear filter.
+    """
+    full, B, K, G, H = maps
+    ee, _, vv, re, ve, vr = motion
+    (aa, gg, ga), (ae, ar, av), (ge, gr, gv) = biases, accel, gyro
+    Ve = ve + K @ ee + G @ ae + H @ ge
+    Vr = vr + K @ re.T + G @ ar + H @ gr
+    Vv = vv + K @ ve.T + G @ av + H @ gv
+    Va = av.T + K @ ae.T + G @ aa + H @ ga
+    Vg = gv.T + K @ ge.T + G @ ga.T + H @ gg
+    Ee, Ea, Eg = full @ ee + B @ ge, full @ ae.T + B @ ga, full @ ge.T + B @ gg
+    return Ve, Vr, Vv, Va, Vg, Ee, Ea, Eg
+
+
+@kernel
+def _columns(form, c, rows, f_B, f_start, w_B, R_BI, half, dt):
+    """Odd and even parts of acceleration and error angles along the columns that turn, over c.
+
+    Args:
+        form: Options of the filter.
+        c: Spread of the sigma points.
+        rows: Rows of the factor for the error angles and for both biases, (3, 3) each.
+        f_B, f_start, w_B, R_BI, half, dt: As in `_column`.
+
+    Returns:
+        Four tuples of three vectors, one for each column: odd and even parts of the acceleration,
+        odd and even parts of the error angles.
+    """
+    l_e, l_a, l_g = rows
+    e_0, e_1, e_2 = c * l_e.T
+    a_0, a_1, a_2 = c * l_a.T
+    g_0, g_1, g_2 = c * l_g.T
+    odd_0, s_0, turn_0, t_0 = _column(form, c, e_0, a_0, g_0, f_B, f_start, w_B, R_BI, half, dt)
+    odd_1, s_1, turn_1, t_1 = _column(form, c, e_1, a_1, g_1, f_B, f_start, w_B, R_BI, half, dt)
+    odd_2, s_2, turn_2, t_2 = _column(form, c, e_2, a_2, g_2, f_B, f_start, w_B, R_BI, half, dt)
+    return (odd_0, odd_1, odd_2), (s_0, s_1, s_2), (turn_0, turn_1, turn_2), (t_0, t_1, t_2)
+
+
+@kernel
+def _even_moments(p, c, dt, s, t, midpoint):
+    """Moments of the even parts s of the acceleration and t of the error angles.
+
+    Returns:
+        Means of acceleration and error angles; their shares of the covariance of v, of v with e,
+        and of e.
+    """
+    zero = zero_like(dt)
+    nothing = (zero, zero, zero)
+    mean_e, S_ve, S_e = nothing, (nothing, nothing, nothing), (nothing, nothing, nothing)
+    inverse_c, excess = 1.0 / c, p.sigma_beta - p.sigma_spread * p.sigma_spread
+    s_0, s_1, s_2 = s
+    mean_a = inverse_c * (s_0 + s_1 + s_2)
+    S_v = outer(s_0, s_0) + outer(s_1, s_1) + outer(s_2, s_2) + outer(excess * mean_a, mean_a)
+    S_v = dt * dt * S_v
+    if not midpoint:
+        t_0, t_1, t_2 = t
+        mean_e = inverse_c * (t_0 + t_1 + t_2)
+        S_ve = outer(s_0, t_0) + outer(s_1, t_1) + outer(s_2, t_2)
+        S_ve = dt * (S_ve + outer(excess * mean_a, mean_e))
+        S_e = outer(t_0, t_0) + outer(t_1, t_1) + outer(t_2, t_2)
+        S_e = S_e + outer(excess * mean_e, mean_e)
+    return mean_a, mean_e, S_v, S_ve, S_e
+
+
+@kernel
+def _spread(p, slow):
+    """Spread c of the sigma points, from the number of states with the noise."""
+    augmented = 27.0
+    if slow is not None:
+        augmented = 27.0 + 2.0 * slow.slow_errors
+    return p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
+
+
+@kernel
+def _remainders(p, form, c, maps, factor, diagonal_e, blocks, f_B, f_start, w_B, R_BI, half):
+    """Differences of the sigma points that turn from a linear filter.
+
+    Args:
+        p: Parameters of the filter.
+        form: Options of the filter.
+        c: Spread of the sigma points.
+        maps: Matrices of the prediction.
+        factor, diagonal_e: Factor of the covariance of e.
+        blocks: Blocks of the covariance: of e, r and v, and of both biases with these.
+        f_B, f_start, w_B, R_BI, half: As in `_column`.
+
+    Returns:
+        Rows of the factor, of e, b_a, b_g, v and r; means of acceleration and error angles;
+        remainders q of v+ and q_e of e+, a row for each column of the factor; products of v+ with q
+        and q_e, of r+ with q_e, and of e+ with q_e; sums of even parts, see `_even_moments`.
+    """
+    dt, midpoint = p.dt, (form & FilterForm.MIDPOINT.value) != 0
+    full, B, K, G, H = maps
+    (_, _, _, re, ve, _), (ae, _, _), (ge, _, _) = blocks
+    half_dt = 0.5 * dt
+    l_e, l_a = lower33(factor, diagonal_e), solve_right33(ae, factor)
+    l_g, l_v, l_r = (
+        solve_right33(ge, factor),
+        solve_right33(ve, factor),
+        solve_right33(re, factor),
+    )
+    rows = (l_e, l_a, l_g)
+    odd, s, turned, t = _columns(form, c, rows, f_B, f_start, w_B, R_BI, half, dt)
+    mean_a, mean_e, S_v, S_ve, S_e = _even_moments(p, c, dt, s, t, midpoint)
+    odd = (dt * odd[0], dt * odd[1], dt * odd[2])
+    q = odd - (K @ l_e + G @ l_a + H @ l_g).T
+    f_v = l_v + odd.T
+    v_q = f_v @ q
+    zero = zero_like(dt)
+    nothing = (zero, zero, zero)
+    none = (nothing, nothing, nothing)
+    q_e, v_qe, r_qe, e_qe = none, none, none, none
+    if not midpoint:
+        q_e = turned - (full @ l_e + B @ l_g).T
+        v_qe, r_qe = f_v @ q_e, (l_r + half_dt * (l_v + f_v)) @ q_e
+        e_qe = turned.T @ q_e
+    rows = (l_e, l_a, l_g, l_v, l_r)
+    return rows, (mean_a, mean_e), (q, q_e), (v_q, v_qe, r_qe, e_qe), (S_v, S_ve, S_e)
+
+
+@kernel
 def _predict_covariance(flight, p, settings, slow, f_B, w_B, R_BI, half, sound):
     """Predict the covariance, in the lanes `sound` where it stays one.
 
@@ -174,76 +339,42 @@ def _predict_covariance(flight, p, settings, slow, f_B, w_B, R_BI, half, sound):
         Mean of the acceleration minus the center's, mean of the error angles, and the lanes.
 
     With v+ = v + K e + G b_a + H b_g + q, and r+ = r + dt (v + v+) / 2, covariances of v+, r+ and
-    e+ with the states before follow first. The last sums up those with the states after.
+    e+ with the states before follow first, then those with the states after. Two letters name the
+    covariance of two states, a capital one the state after: Ve is the covariance of v+ with e.
     """
     P, dt, form = flight.P, p.dt, settings.form
     midpoint, extended = (form & FilterForm.MIDPOINT.value) != 0, (form & FilterForm.EKF.value) != 0
-    augmented = 27.0  # states with the noise
-    if slow is not None:
-        augmented = 27.0 + 2.0 * slow.slow_errors
     half_dt = 0.5 * dt
     f_start = f_B
     if midpoint:
         f_start = half.T @ f_B
-    full, B, K, G, H = _maps(form, f_B, f_start, w_B, R_BI, half, dt)
+    maps = _maps(form, f_B, f_start, w_B, R_BI, half, dt)
+    full, B, K, G, H = maps
+    motion, biases, with_accel, with_gyro = _load_covariance(P)
+    ee, rr, vv, re, ve, vr = motion
+    (aa, gg, ga), (_, ar, av), (_, gr, gv) = biases, with_accel, with_gyro
 
-    ee, rr, vv = load_symmetric(P, E), load_symmetric(P, R), load_symmetric(P, V)
-    aa, gg, ga = load_symmetric(P, BA), load_symmetric(P, BG), load_block(P, BG, BA)
-    re, ve, vr = load_block(P, R, E), load_block(P, V, E), load_block(P, V, R)
-    ae, ar, av = load_block(P, BA, E), load_block(P, BA, R), load_block(P, BA, V)
-    ge, gr, gv = load_block(P, BG, E), load_block(P, BG, R), load_block(P, BG, V)
-
-    # of v+, of e+ with the states before
-    Ve = ve + K @ ee + G @ ae + H @ ge
-    Vr = vr + K @ re.T + G @ ar + H @ gr
-    Vv = vv + K @ ve.T + G @ av + H @ gv
-    Va = av.T + K @ ae.T + G @ aa + H @ ga
-    Vg = gv.T + K @ ge.T + G @ ga.T + H @ gg
-    Ee, Ea, Eg = full @ ee + B @ ge, full @ ae.T + B @ ga, full @ ge.T + B @ gg
-
+    Ve, Vr, Vv, Va, Vg, Ee, Ea, Eg = _with_states_before(
+        maps, motion, biases, with_accel, with_gyro
+    )
+    factor, diagonal_e, pivot = cholesky33(add_to_diagonal(ee, KNOWN))
     zero = zero_like(dt)
     nothing = (zero, zero, zero)
     none = (nothing, nothing, nothing)
-    factor, diagonal_e, pivot = cholesky33(add_to_diagonal(ee, KNOWN))
-    mean_a, mean_e = nothing, nothing
-    q, q_e, S_v, S_ve, S_e = none, none, none, none, none
-    v_q, v_qe, r_qe, e_qe = none, none, none, none
+    mean_a, mean_e, q, q_e = nothing, nothing, none, none
+    (v_q, v_qe, r_qe, e_qe), (S_v, S_ve, S_e) = (none, none, none, none), (none, none, none)
     if not extended:
-        c = p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
-        l_e, l_a = lower33(factor, diagonal_e), solve_right33(ae, factor)
-        l_g, l_v, l_r = (
-            solve_right33(ge, factor),
-            solve_right33(ve, factor),
-            solve_right33(re, factor),
+        blocks = (motion, with_accel, with_gyro)
+        c = _spread(p, slow)
+        rows, means, remainders, products, even = _remainders(
+            p, form, c, maps, factor, diagonal_e, blocks, f_B, f_start, w_B, R_BI, half
         )
-        e_0, e_1, e_2 = c * l_e.T
-        a_0, a_1, a_2 = c * l_a.T
-        g_0, g_1, g_2 = c * l_g.T
-        odd_0, s_0, turn_0, t_0 = _column(form, c, e_0, a_0, g_0, f_B, f_start, w_B, R_BI, half, dt)
-        odd_1, s_1, turn_1, t_1 = _column(form, c, e_1, a_1, g_1, f_B, f_start, w_B, R_BI, half, dt)
-        odd_2, s_2, turn_2, t_2 = _column(form, c, e_2, a_2, g_2, f_B, f_start, w_B, R_BI, half, dt)
-        inverse_c, excess = 1.0 / c, p.sigma_beta - p.sigma_spread * p.sigma_spread
-        odd = (dt * odd_0, dt * odd_1, dt * odd_2)  # rows are columns of the factor
-        q = odd - (K @ l_e + G @ l_a + H @ l_g).T
-        mean_a = inverse_c * (s_0 + s_1 + s_2)
-        S_v = outer(s_0, s_0) + outer(s_1, s_1) + outer(s_2, s_2) + outer(excess * mean_a, mean_a)
-        S_v = dt * dt * S_v
-        f_v = l_v + odd.T
-        v_q = f_v @ q
+        (mean_a, mean_e), (q, q_e), (l_e, l_a, l_g, l_v, l_r) = means, remainders, rows
+        (v_q, v_qe, r_qe, e_qe), (S_v, S_ve, S_e) = products, even
         Ve, Vr, Vv = Ve + q.T @ l_e.T, Vr + q.T @ l_r.T, Vv + q.T @ l_v.T
         Va, Vg = Va + q.T @ l_a.T, Vg + q.T @ l_g.T
         if not midpoint:
-            turned = (turn_0, turn_1, turn_2)
-            q_e = turned - (full @ l_e + B @ l_g).T
-            mean_e = inverse_c * (t_0 + t_1 + t_2)
-            S_ve = outer(s_0, t_0) + outer(s_1, t_1) + outer(s_2, t_2)
-            S_ve = dt * (S_ve + outer(excess * mean_a, mean_e))
-            S_e = outer(t_0, t_0) + outer(t_1, t_1) + outer(t_2, t_2)
-            S_e = S_e + outer(excess * mean_e, mean_e)
-            v_qe, r_qe = f_v @ q_e, (l_r + half_dt * (l_v + f_v)) @ q_e
-            e_qe = turned.T @ q_e
             Ee, Ea, Eg = Ee + q_e.T @ l_e.T, Ea + q_e.T @ l_a.T, Eg + q_e.T @ l_g.T
-
     # of r+ with the states before
     Re, Rr, Rv = re + half_dt * (ve + Ve), rr + half_dt * (vr + Vr), vr.T + half_dt * (vv + Vv)
     Ra, Rg = ar.T + half_dt * (av.T + Va), gr.T + half_dt * (gv.T + Vg)
@@ -268,29 +399,16 @@ def _predict_covariance(flight, p, settings, slow, f_B, w_B, R_BI, half, sound):
         new_ee, new_re, new_ve = T @ new_ee @ T.T, new_re @ T.T, new_ve @ T.T
         Ea, Eg = T @ Ea, T @ Eg
     a, g = p.accel_bias_decay, p.gyro_bias_decay
-    drive_a, drive_g = p.accel_bias_drive, p.gyro_bias_drive
-    new_aa = add_to_diagonal(a * a * aa, drive_a * drive_a)
-    new_gg = add_to_diagonal(g * g * gg, drive_g * drive_g)
+    new_aa = add_to_diagonal(a * a * aa, p.accel_bias_drive * p.accel_bias_drive)
+    new_gg = add_to_diagonal(g * g * gg, p.gyro_bias_drive * p.gyro_bias_drive)
 
     ok = sound & (pivot > 0.0) & _are_variances(new_ee, new_rr, new_vv, new_aa, new_gg)
-    keep_lower(P, E, ok, new_ee)
-    keep_block(P, R, E, ok, new_re)
-    keep_lower(P, R, ok, new_rr)
-    keep_block(P, V, E, ok, new_ve)
-    keep_block(P, V, R, ok, new_rv.T)
-    keep_lower(P, V, ok, new_vv)
-    keep_block(P, BA, E, ok, a * Ea.T)
-    keep_block(P, BA, R, ok, a * Ra.T)
-    keep_block(P, BA, V, ok, a * Va.T)
-    keep_lower(P, BA, ok, new_aa)
-    keep_block(P, BG, E, ok, g * Eg.T)
-    keep_block(P, BG, R, ok, g * Rg.T)
-    keep_block(P, BG, V, ok, g * Vg.T)
-    keep_block(P, BG, BA, ok, (g * a) * ga)
-    keep_lower(P, BG, ok, new_gg)
+    motion = (new_ee, new_rr, new_vv, new_re, new_ve, new_rv.T)
+    biases = (new_aa, new_gg, (g * a) * ga)
+    accel_with, gyro_with = (a * Ea.T, a * Ra.T, a * Va.T), (g * Eg.T, g * Rg.T, g * Vg.T)
+    _keep_covariance(P, ok, motion, biases, accel_with, gyro_with)
     if slow is not None:
-        maps = (full, B, K, G, H, q, q_e)
-        predict_slow(flight, slow, p, maps, factor, turn, turns, midpoint, ok)
+        predict_slow(flight, slow, p, (full, B, K, G, H, q, q_e), factor, turn, turns, midpoint, ok)
     return mean_a, turn, ok
 
 

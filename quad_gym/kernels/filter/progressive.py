@@ -12,8 +12,8 @@ term l^T h'' l / 2. Their sum mu is the mean of the second order, so that its ra
 
 with |mu|^2 over the variance across it for a direction, whose mu is mostly along it. mu adds up:
 distances, lengths of unit vectors, fields and slant ranges are curved in one sense for all offsets.
-The steps begin with 10^m times the noise, which divides rho by
-10^(m/2), and then have 10^m / 9, 10^(m-1) / 9, ... 10 / 9 times the noise.
+The steps begin with 10^m times the noise, which divides rho by 10^(m/2), and then have 10^m / 9,
+10^(m-1) / 9, ... 10 / 9 times the noise.
 
 Source: R. Zanetti, "Recursive Update Filtering for Nonlinear Estimation", IEEE Trans. Automatic
 Control 57(6), 2012, on the idea.
@@ -41,7 +41,7 @@ _FIRST = (10.0, 100.0, 1e3, 1e4, 1e5, 1e6)
 """Factors of the first step with 1, 2, ... further ones; the sum of inverses is one."""
 MOST_STEPS = len(_FIRST)  #: largest number of steps after the first
 FEW = 2.0  #: smallest number of further steps
-_LARGE = (5.0, 20.0, 80.0, 300.0)  #: ratios above which there are more
+_LARGE = (5.0, 20.0, 80.0, 300.0)  #: ratios rho, above each of which there is one step more
 
 
 @kernel
@@ -76,7 +76,7 @@ def count_steps(flight, p, work, settings, mask):
 
 @kernel
 def _ratio_squared(flight, work, settings):
-    """rho^2, see above; features in work.hidden do not count."""
+    """rho^2, see the docstring of this file; features in work.hidden do not count."""
     k, total, mu, R = 0, zero_like(work.spread), work.mu, work.Rz
     for sensor in range(SENSORS):
         first = FIRST_BLOCK[sensor]
@@ -84,7 +84,7 @@ def _ratio_squared(flight, work, settings):
             if any_of(flight.block_valid[block] > 0.0):
                 x, y, z = mu[k] * mu[k], mu[k + 1] * mu[k + 1], mu[k + 2] * mu[k + 2]
                 if is_direction(block):
-                    twice = R[k, k] + R[k + 1, k + 1] + R[k + 2, k + 2]
+                    twice = R[k, k] + R[k + 1, k + 1] + R[k + 2, k + 2]  # of two axes across
                     share = 2.0 * (x + y + z) / twice
                     if block >= FEATURE_BLOCKS:
                         share = select(work.hidden[block - FEATURE_BLOCKS] > 0.0, 0.0, share)

@@ -9,10 +9,9 @@ mu mu^T + R its noise, so that P_zz = A A^T + Rz, the matrix inversion lemma giv
 over the columns L1 that measurements depend on (`columns.py`). As a sum of squares it stays
 accurate when a measurement is 10^8 times as good as the prediction.
 
-Sensors
-(`kernels/sensors/`) fill three rows of the stacked measurement for each block. A block that a lane
-lacks is masked: its columns and innovation are zero and its noise is one, which gives exactly the
-update without it. Blocks that no lane has are left out.
+Sensors (`kernels/sensors/`) fill three rows of the stacked measurement for each block. A block that
+a lane lacks is masked: its columns and innovation are zero and its noise is one, which gives
+exactly the update without it. Blocks that no lane has are left out.
 """
 
 import math

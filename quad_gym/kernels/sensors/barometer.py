@@ -22,6 +22,7 @@ _BLOCK, _DRAW = AID_BLOCK[_S], DRAW_AID[_S]
 
 @kernel
 def _measure(flight, p, i):
+    """Three numbers, of which the first is the altitude [m], and True: each lane measures."""
     n, _ = normal_pair(stream_of(flight), _DRAW)
     return (flight.r[2] + flight.aid_scalar[_S] + p.aid_sigma[_S] * n, 0.0, 0.0), True
 
@@ -36,7 +37,7 @@ def _expect(flight, p, work, settings, i, k, valid):
     put_block(work, settings, k, valid, z, (altitude, zero, zero), noise)
     for j in range(last + 1):
         value = work.L[settings.motion_columns + first, j]
-        if j <= R + 2:
+        if j <= R + 2:  # the factor is a lower triangle
             value = value + work.L[R + 2, j]
         put_three(work.A[last - j], k, valid, (value, zero, zero))
     for j in range(settings.motion_columns):

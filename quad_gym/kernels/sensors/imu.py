@@ -46,9 +46,10 @@ def specific_force(flight, p, R_BI):
 
 @kernel
 def _sample_imu(flight, p, w_B, f_B, mask):
-    """Add biases and white noise to the filter's body rates and specific force, where `mask`.
+    """Sample the IMU with biases and white noise, where `mask`.
 
-    Inner loops read the gyro at the present instant, with the same bias and noise.
+    The filter's sample is of the true body rates `w_B` and specific force `f_B`. Inner loops read
+    the gyro at the present instant, `w_meas`, with the same bias and noise.
     """
     n_a, n_g = six_normals(stream_of(flight), DRAW_IMU)
     b_a, b_g = load3(flight.b_a), load3(flight.b_g)

@@ -2,7 +2,7 @@
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.numbers.elementary import exp, is_finite
-from quad_gym.kernels.numbers.lanes import logical_not, select, zero_like
+from quad_gym.kernels.numbers.lanes import logical_not, no_lane, select, zero_like
 from quad_gym.kernels.numbers.linalg import dot, keep, load3, load4, norm
 from quad_gym.kernels.numbers.rotation import quaternion_to_dcm
 from quad_gym.kernels.task.reference import evaluate_reference
@@ -38,7 +38,7 @@ def _reward(flight, p, settings, work, active, R_BI, w_B):
         gap = flight.action[i] - flight.last_action[i]
         change = change + gap * gap
     scale = settings.reward_scale
-    finished = active & (change < 0.0)  # false in all lanes so far
+    finished = no_lane(spin)
     if settings.task == TaskKind.WAYPOINTS:
         passed, progress = _pass_gate(flight, settings, active)
         _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)

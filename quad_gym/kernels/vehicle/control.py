@@ -1,6 +1,6 @@
 """From an action to motor voltages: delay, PD control, and inner loops of the actions.
 
-All use the nominal parameters `p`, never the true ones.
+Control uses the nominal parameters, never the true ones. The delay of an action is the true one.
 """
 
 import math
@@ -40,7 +40,7 @@ def _forget_actions(flight, settings, mask):
 
 @kernel
 def _delay_action(flight, p, settings):
-    """Set the action of the coming tick: the one commanded `action_delay` steps ago.
+    """Set the action of the coming tick: the one commanded `p.action_delay` steps ago.
 
     The delay is in control steps, and is rounded to whole ticks: with T ticks per step, tick j of a
     step carries out the action of k steps ago, where k is `delay T - j` ticks in steps, rounded up.
@@ -75,10 +75,10 @@ def delay_action_stage(flight, world, model, settings, work, stages, flag):
 def allocate(thrust, torque, p):
     """Motor voltages for a total thrust [N] and a torque in B [N m].
 
-    The thrust is limited to 0.9 of the rotors' sum. The torque is multiplied by the largest alpha
-    <= 1 that keeps every rotor force at most Fmax: with the forces f + alpha t, alpha is the least
-    (Fmax - f_i) / t_i over the rotors with t_i > 0. Negative forces are set to zero, and a rotor
-    that the thrust alone overloads, as unequal arms allow, is limited to Fmax.
+    The thrust is limited to 0.9 of the rotors' sum, 3.6 Fmax. The torque is multiplied by the
+    largest alpha <= 1 that keeps every rotor force at most Fmax: with the forces f + alpha t, alpha
+    is the least (Fmax - f_i) / t_i over the rotors with t_i > 0. Negative forces are set to zero,
+    and a rotor that the thrust alone overloads, as unequal arms allow, is limited to Fmax.
     """
     limit = p.max_rotor_force
     zero = zero_like(thrust)
@@ -157,9 +157,14 @@ def tilt_rates(z_desired_I, R_BI, yaw_rate, p):
 
 @kernel
 def act(flight, a, p, mode, reference):
-    """Set the motor voltages of the coming tick.
+    """Set the motor voltages of the coming tick, from the observed state.
 
-    `mode` is the meaning of the action `a`, a `Control`; `reference` is read by `Control.PD`.
+    Args:
+        flight: Record.
+        a: Action (4,), in [-1, 1]; with `Control.PD` not used.
+        p: Nominal parameters.
+        mode: Meaning of the action, a `Control`.
+        reference: (r*, v*, a*, x*) in I, which only `Control.PD` uses.
     """
     R_BI, w_B = load33(flight.R_seen), load3(flight.w_seen)
     weight = p.mass * p.gravity
