@@ -95,6 +95,9 @@ def test_measurements_arrive_with_their_ages_and_samples_are_averaged():
     np.testing.assert_allclose([new[19].age, new[20].age], [0.045, 0.04], atol=1e-9)
     assert not ticks[0].magnetometer.new.any()
     assert np.isnan(result.sigma).all()
+    assert result.too_late == 0
+    narrow = replay(log, sensors=suite, estimator=Seen, start={"heading": 0.3}, window=0.01)
+    np.testing.assert_allclose(narrow.late["gnss"], [0.043, 0.033])
 
 
 def test_invalid_starts_and_estimates_are_refused(table):
