@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import quad_gym
+import quad_gym.frames
 from quad_gym.analysis.consistency import InnovationRecorder
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.estimation.inputs import measured_blocks
@@ -14,6 +15,7 @@ from quad_gym.records import AID_BLOCK, Aid, Control, GateDecision
 from quad_gym.rotations import quaternion_to_dcm
 from tests.builders import batch as flights_of
 from tests.field_flights import fly, nees, steps
+from tests.filter_states import set_at_rest
 
 UWB = quad_gym.sensor_suite("uwb")
 TAG = (0.1, -0.05, 0.08)
@@ -223,3 +225,67 @@ def test_a_crazyflie_hovers_on_its_ranges():
         batch.step(np.zeros((16, 4)))
     assert (np.linalg.norm(batch.record("v"), axis=1) < 0.3).all()
     assert (quaternion_to_dcm(batch.record("q"))[:, 2, 2] > 0.99).all()
+
+
+def mirrored(place, anchors):
+    """A place at the same distances from three anchors: its mirror image in their plane."""
+    normal = np.cross(anchors[1] - anchors[0], anchors[2] - anchors[0])
+    normal = normal / np.linalg.norm(normal)
+    return place - 2.0 * (normal @ (place - anchors[0])) * normal
+
+
+def seconds_until_flagged(suite, kind, ranges_at):
+    """Time until a filter at rest at PLACE is flagged [s]; infinite after two seconds.
+
+    Before, it has the right ranges for longer than its initial position counts as measured.
+    """
+    kf, rng = kind(suite), np.random.default_rng(3)
+    P = np.diag(np.repeat([0.05, 0.05, 0.01, 0.02, 0.001], 3) ** 2)
+    set_at_rest(kf, P, position=PLACE)
+    for step in range(-30, 50):  # at 25 Hz
+        ranges = (HERE if step < 0 else ranges_at(step)) + suite.uwb_range.noise_sigma * rng.normal(
+            size=5
+        )
+        given = {"uwb_range": ranges[: suite.uwb_range.blocks]}
+        if suite.gnss is not None:
+            R_IG = quad_gym.frames.ecef_to_enu(suite.gnss.reference_antenna_G)
+            given["gnss_position_G"] = R_IG.T @ (PLACE + suite.gnss.primary_antenna_B)
+            given["gnss_velocity_G"] = np.zeros(3)
+        kf.update(**given)
+        if kf.diverged:
+            return 0.04 * (step + 1)
+        for _ in range(8):
+            kf.predict(np.zeros(3), (0.0, 0.0, 9.8), 0.005)
+    return np.inf
+
+
+FIVE = suite_with(anchors_I=(*UWB.uwb_range.anchors_I, (0.0, 0.0, 6.0)))
+PLACE = np.array([1.0, 0.5, 1.5])
+HERE = distances(PLACE, np.eye(3), FIVE.uwb_range)
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_filter_is_flagged_where_three_ranges_agree_with_a_wrong_place(kind):
+    """Three of four ranges are those of the estimate, so only the fourth one shows the error."""
+    place = mirrored(PLACE, np.array(FIVE.uwb_range.anchors_I))
+    there = distances(place, np.eye(3), FIVE.uwb_range)
+    np.testing.assert_allclose(there[:3], HERE[:3], rtol=1e-12)
+    assert abs(there[3] - HERE[3]) > 1.0
+    assert seconds_until_flagged(UWB, kind, lambda _: there) < 0.5
+
+
+WITH_GNSS = quad_gym.sensor_suite("rtk").simplified().replace(uwb_range=UWB.uwb_range)
+
+
+@pytest.mark.parametrize(
+    ("suite", "detours"),
+    [
+        (FIVE, lambda _: 3.0 * np.eye(5)[4]),
+        (WITH_GNSS, lambda _: 3.0 * np.eye(5)[3]),
+        (UWB, lambda step: 2.0 * np.eye(5)[step % 4]),
+    ],
+    ids=["four others", "gnss", "each in turn"],
+)
+def test_filter_is_not_flagged_where_others_contradict_a_range(suite, detours):
+    kind = UnscentedKalmanFilter
+    assert seconds_until_flagged(suite, kind, lambda step: HERE + detours(step)) == np.inf

@@ -28,6 +28,7 @@ from quad_gym.kernels.filter.measurements import (
 from quad_gym.kernels.filter.motion import watch_compass
 from quad_gym.kernels.filter.recovery import (
     OUTLIER,
+    confirmed,
     count_rejections,
     glitches,
     limit_of,
@@ -69,6 +70,8 @@ _GAIN = 0.05  #: change of a factor on the noise by one measurement
 _ADAPTED = 1.3  #: mean NIS over the degrees of freedom above which the noise is adapted
 _SERIES = 3.0  #: rejections in a row beyond which further ones do not adapt the noise
 _MAX_FACTOR = 25.0  #: largest factor on the variance of a noise: five times its sigma
+_POSITION_NUMBERS = 3.0
+"""Numbers that determine a position: no more accepted ones agree with any position."""
 
 
 @kernel
@@ -176,8 +179,8 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
     suite's noise. A direction is left out where the sum of its predicted variances is too large.
 
     Returns:
-        Lanes in which it is counted; lanes in which it is beyond the gate; its NIS; half the NIS of
-        its difference from the last one.
+        Lanes in which it is counted; lanes in which it is beyond the gate; lanes in which it is
+        rejected as its last measurement; its NIS; half the NIS of its difference from the last one.
     """
     gating, none = (settings.form & FilterForm.GATE.value) != 0, no_lane(work.again)
     valid = (work.taking > 0.0) & (flight.block_valid[s] > 0.0)
@@ -208,6 +211,7 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
             beyond = beyond | watch_compass(flight, p, first, nis < limit, nis > OUTLIER * limit)
         rejected = _weigh(flight, p, settings, group, beyond, nis, limit)
     weakened = beyond & logical_not(rejected)
+    again = rejected & (flight.gate[s] == GateDecision.REJECTED)
     _store_decision(flight, s, first, rejected, unsure, weakened)
     if gating:
         gate = flight.gate[s]
@@ -222,7 +226,7 @@ def _gate_block(flight, p, work, settings, k, s, group, limit, numbers):
         used = valid & logical_not(out)
         work.suite_nis = work.suite_nis + select(used, suite_nis, 0.0)
         work.used_nis = work.used_nis + select(used, used_nis, 0.0)
-    return first & logical_not(unsure), beyond, nis, scatter
+    return first & logical_not(unsure), beyond, again, nis, scatter
 
 
 @kernel
@@ -230,15 +234,20 @@ def gate_blocks(flight, p, work, settings, k, first, count, group, limit, number
     """Decide on the blocks of a group from `first` on, at row k, and mask those left out.
 
     The group counts as rejected if half of its blocks are; otherwise rejected ones do not count.
-    Rejections do not count against a filter that other sensors support.
+    Rejections do not count against a filter that other sensors support. A block that is rejected
+    again counts if the accepted ones determine a position without redundancy: three ranges agree
+    with any estimate that has followed them, so a fourth one is the only evidence against it.
     """
     zero = zero_like(flight.tick)
     counted, refused, total, kept, scattered = zero, zero, zero, zero, zero
+    denied, denials = zero, zero
     for s in range(first, first + count):
         if any_of(flight.block_valid[s] > 0.0):
-            valid, beyond, nis, scatter = _gate_block(
+            valid, beyond, again, nis, scatter = _gate_block(
                 flight, p, work, settings, k, s, group, limit, numbers
             )
+            denied = denied + select(valid & again, nis, 0.0)
+            denials = denials + select(valid & again, 1.0, 0.0)
             counted, refused = counted + select(valid, 1.0, 0.0), refused + select(beyond, 1.0, 0.0)
             total = total + select(valid, nis, 0.0)
             kept = kept + select(valid & logical_not(beyond), nis, 0.0)
@@ -254,6 +263,12 @@ def gate_blocks(flight, p, work, settings, k, first, count, group, limit, number
     if (settings.form & FilterForm.GATE.value) != 0:
         _adapt_noise(flight, group, measured, scattered / several, numbers, limit)
     count_rejections(flight, group, measured, most, glitch)
+    if group in SEVERAL:
+        alone = (denials > 0.0) & logical_not(most)
+        alone = alone & ((counted - refused) * numbers <= _POSITION_NUMBERS)
+        if any_of(alone):
+            alone = alone & logical_not(confirmed(flight, p, settings, group))
+            nis = select(alone, (kept + denied) / maximum(counted - refused + denials, 1.0), nis)
     judged = measured & logical_not(excused)
     work.judged_nis = work.judged_nis + select(judged, nis, 0.0)
     work.judged_freedoms = work.judged_freedoms + select(judged, numbers, 0.0)

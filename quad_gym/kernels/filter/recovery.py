@@ -139,6 +139,12 @@ def supported(flight, p, settings, refused):
     """
     if refused in SEVERAL:
         return no_lane(flight.tick)
+    return confirmed(flight, p, settings, refused)
+
+
+@kernel
+def confirmed(flight, p, settings, refused):
+    """Lanes in which other groups have lately measured all that the group `refused` measures."""
     found = logical_not(no_lane(flight.tick))
     for bit in range(QUANTITIES):
         if (GROUP_OBSERVES[refused] >> bit) & 1:
