@@ -280,3 +280,33 @@ def test_mean_nis_of_an_update_is_its_dimension_with_each_suite(name, kind):
     deviation = excess.std(ddof=1) / np.sqrt(len(excess))
     assert abs(excess.mean()) < 0.05 + stats.t.isf(ALARM / 2, 47) * deviation
     assert deviation < 0.03
+
+
+@pytest.mark.parametrize("error", [None, 0.0], ids=["heading error", "none"])
+def test_nis_of_rtk_is_below_its_dimension_by_the_baselines_with_a_heading_error_alone(error):
+    """A constant error that is modeled as white noise takes nearly all of the two of a baseline.
+
+    Their noise is so large that they are nearly independent of other measurements.
+    """
+    suite = quad_gym.sensor_suite("rtk")
+    if error is not None:
+        suite = suite.replace(gnss=suite.gnss.replace(heading_error_sigma=error))
+    batch = fly(suite, 64, task="circle", filter_start="warm")
+    whole, of_baselines = np.zeros(2), np.zeros(2)
+    for _ in range(600):
+        batch.step()
+        measured = measured_now(batch)
+        any_measured = measured.any(axis=1)
+        dimension = batch.record("nis_dimension")
+        whole += [batch.record("nis")[any_measured].sum(), dimension[any_measured].sum()]
+        baseline = measured[:, BASELINE_BLOCK]
+        square = batch.record("block_nis")[baseline, BASELINE_BLOCK]
+        of_baselines += [square.sum(), 2.0 * baseline.sum()]
+    limit = stats.norm.isf(ALARM / 2) * np.sqrt(2.0 / whole[1])
+    others = whole - of_baselines
+    assert others[0] / others[1] == pytest.approx(1.0, abs=1.1 * limit)
+    if error is None:
+        assert of_baselines[0] / of_baselines[1] < 0.05
+        assert 0.92 < whole[0] / whole[1] < 0.95
+    else:
+        assert whole[0] / whole[1] == pytest.approx(1.0, abs=limit)
