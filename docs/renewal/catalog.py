@@ -139,6 +139,13 @@ CATALOG = {
             },
         ),
         Result(
+            name="causes",
+            commands=["scripts.consistency causes --episodes 400 --output OUT"],
+            flights=("fault *", "RandomTrajectory, *", "uwb"),
+            texts=texts.causes,
+            figures={"0/causes.csv": "docs/data/recovery_causes.csv"},
+        ),
+        Result(
             name="ablation_filters",
             commands=["scripts.consistency filters --output OUT"],
             flights=("RandomTrajectory, rtk",),

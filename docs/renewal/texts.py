@@ -228,6 +228,48 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
     }
 
 
+def causes(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    """Write the causes of undetected failures as CSV and as a table; shares of sentences."""
+    cells = _read(folder / "0/causes.json")["cells"]
+    _write_cells(folder / "0/causes.csv", "trial", cells)
+    names = ("undetected", "in_measured", "faint", "flagged_before")
+    rows = [
+        [
+            label,
+            *(f"{cell['values'][name]:.1f}" for name in names),
+            cell["expected"][""],
+            f"{cell['values']['remedied']:.1f}",
+        ]
+        for label, cell in cells.items()
+    ]
+    heads = (
+        "suite, fault",
+        "undetected [%]",
+        "in a measured quantity [% of these]",
+        "too faint [% of these]",
+        "flagged before [% of these]",
+        "remedy",
+        "undetected with it [%]",
+    )
+    values = {label: cell["values"] for label, cell in cells.items()}
+    shares = {
+        f"causes.{suite}.{name}": _limits(
+            [found[name] for label, found in values.items() if label.startswith(f"{suite}, ")]
+        )
+        for suite in ("crazyflie", "uwb", "field")
+        for name in (*names, "remedied")
+    }
+    jump = values["crazyflie, position_jump"]
+    shares |= {f"causes.jump.{name}": f"{value:.0f} %" for name, value in jump.items()}
+    return shares | {"causes": table(heads, rows)}
+
+
+def _limits(shares: Sequence[float]) -> str:
+    """The smallest and the largest of some shares [%]."""
+    low, high = min(shares), max(shares)
+    return f"{low:.0f} %" if round(low) == round(high) else f"{low:.0f} to {high:.0f} %"
+
+
 def study_rows(
     summary: Mapping[str, Any], head: str, arms: Sequence[str], columns: Sequence[str]
 ) -> str:

@@ -2,15 +2,16 @@
 
     python -m scripts.consistency matrix      every suite on every task, and other conditions
     python -m scripts.consistency recovery    every suite with every fault that it can have
+    python -m scripts.consistency causes      causes of failures that are not detected, and remedies
     python -m scripts.consistency filters     UKF and EKF, and the UKF without each correction
     python -m scripts.consistency models      true vehicle, world and sensors that differ
 
 The matrix has means of the normalized squares of errors and innovations (NEES, NIS) from a cold and
 from a warm start, and on one task with faults, latencies, mountings, randomization, random starts
 and wind; --cells suites leaves these out. The recovery shows how many filters are consistent 10 s
-after a fault, how many flag their divergence, and the rate of false alarms. An interrupted run of
-either continues when it is started again. Filters and models fly the same seeds, and show NEES and
-errors.
+after a fault, how many flag their divergence, and the rate of false alarms. The causes are of
+filters that do neither. An interrupted run of these three continues when it is started again.
+Filters and models fly the same seeds, and show NEES and errors.
 """
 
 import math
@@ -25,22 +26,25 @@ from quad_gym.analysis.consistency import ASTRAY
 from quad_gym.analysis.reports import require_writable, versions, write_json
 from quad_gym.commands.consistency import CaseFlights
 from quad_gym.commands.options import SuiteName, Threads, parse, require_at_least, usage_errors
-from scripts.consistency import ablation, matrix, recovery
+from scripts.consistency import ablation, causes, matrix, recovery
 from scripts.consistency.tables import run_cases, unexpected
+
+RESUMED: dict[str, Any] = {"matrix": matrix, "recovery": recovery, "causes": causes}
+"""Modules of the tables whose runs continue when they are started again."""
 
 
 @dataclass(frozen=True)
 class TableArgs:
     """Options of the tables."""
 
-    table: Positional[Literal["matrix", "recovery", "filters", "models"]]
+    table: Positional[Literal["matrix", "recovery", "causes", "filters", "models"]]
     """table to compute"""
     episodes: int | None = None
     """number of flights in each case; defaults to 400, or 1000 for filters and models"""
     seed: int = 0
     """seed of the first flight; the others have consecutive seeds"""
     duration: float = 10.0
-    """length of a flight [s], but for recovery"""
+    """length of a flight [s], but for recovery and causes"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """of matrix: the suites on all tasks, other conditions on one task, or both"""
     sensors: SuiteName = "rtk"
@@ -68,17 +72,17 @@ def main(args: TableArgs) -> None:
     """Compute a table."""
     with usage_errors():
         require_writable("--output", args.folder)
-    count = args.episodes or (400 if args.table in ("matrix", "recovery") else 1000)
+    count = args.episodes or (400 if args.table in RESUMED else 1000)
     flights = CaseFlights(count, args.seed, args.duration, args.threads)
-    if args.table in ("matrix", "recovery"):
+    if args.table in RESUMED:
         _fly_cells(args, flights)
     else:
         _ablate(args, flights)
 
 
 def _fly_cells(args: TableArgs, flights: CaseFlights) -> None:
-    table: Any = matrix if args.table == "matrix" else recovery
-    cases = matrix.cases_of(args.cells) if table is matrix else recovery.cases()
+    table = RESUMED[args.table]
+    cases = matrix.cases_of(args.cells) if table is matrix else table.cases()
     head = {"duration": args.duration} if table is matrix else {}
     files = args.folder / args.table
     found = run_cases(cases, files, flights, table.measure, table.table_of, **head)

@@ -7,6 +7,9 @@
 * A flight has a **large error** while any of these nine errors exceeds six standard
   deviations. A missed alarm is a flight with large errors for `MISSED_AFTER` without interruption
   that is not flagged in that time; a false alarm is a new flag without a fault.
+* A flight is **consistent in measured quantities** while the NEES of the coordinates that sensors
+  of its suite measure is below this quantile: a filter without a compass, for example, cannot know
+  of errors of its heading.
 """
 
 from collections.abc import Sequence
@@ -18,6 +21,8 @@ from numpy.typing import NDArray
 from quad_gym.analysis.consistency import flight_errors
 from quad_gym.analysis.metrics import chi_square_quantile, nees
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.params.sensor_table import READINGS
+from quad_gym.params.suites import SensorSuite
 
 CONSISTENT = 0.9973
 """Probability of the chi-square quantile below which a flight is consistent, as for 3 sigma."""
@@ -26,8 +31,18 @@ MISSED_AFTER = 2.0
 """Duration of large errors without a flag after which an alarm counts as missed [s]."""
 REQUIRED = 0.99  #: required share of flights that are consistent or flagged
 MOTION = slice(0, 9)  #: coordinates of position, velocity and attitude in the error state
+_MEASURED_BY = {0: "position", 1: "position", 2: "height", 8: "heading"}
+"""Quantity that a sensor observes, by coordinate; without any, errors of the coordinate stay.
+Velocity and tilt are observed by each of them."""
 
 Flags = NDArray[np.bool_]
+
+
+def measured_coordinates(sensors: SensorSuite) -> list[int]:
+    """Coordinates of `MOTION` that a sensor of the suite measures."""
+    readings = (READINGS[name] for name in READINGS if sensors.blocks_of(name) > 0)
+    observed = {quantity for reading in readings for quantity in reading.observes}
+    return [i for i in range(MOTION.stop) if _MEASURED_BY.get(i) in {None, *observed}]
 
 
 @dataclass(frozen=True)
@@ -42,6 +57,8 @@ class Recovery:
     """True while a flight is flagged as diverged, (t, flights)"""
     large_error: Flags
     """True while a flight has a large error, (t, flights)"""
+    consistent_in_measured: Flags
+    """True while a flight is consistent in measured quantities, (t, flights)"""
 
     def share(self, flags: Flags, time: float) -> float:
         """Share of flights with a flag, (t, flights), at the instant nearest to a time [s]."""
@@ -51,6 +68,10 @@ class Recovery:
     def undetected(self) -> Flags:
         """Undetected failures, (t, flights): True while neither consistent nor flagged."""
         return ~(self.consistent | self.flagged)
+
+    def flagged_since(self, start: float) -> Flags:
+        """True for flights that were flagged at any time after `start` [s], (flights,)."""
+        return np.asarray(self.flagged[self.time > start + 1e-9].any(axis=0))
 
     def time_to(self, flags: Flags, since: float) -> float:
         """Time after `since` until `flags` hold permanently for a `REQUIRED` share of flights [s].
@@ -113,8 +134,10 @@ def follow_recovery(
     if looks < 2:
         raise ValueError(f"duration must be at least twice every, got {duration} and {every}")
     bound = chi_square_quantile(MOTION.stop - MOTION.start, CONSISTENT)
+    measured = measured_coordinates(batch.sensors)
+    bound_of_measured = chi_square_quantile(len(measured), CONSISTENT)
     shape = (looks, batch.count)
-    consistent, flagged, large_error = np.zeros((3, *shape), bool)
+    consistent, flagged, large_error, in_measured = np.zeros((4, *shape), bool)
     batch.reset(seeds=seeds)
     for k in range(looks):
         for _ in range(stride):
@@ -122,7 +145,9 @@ def follow_recovery(
         errors, covariances = flight_errors(batch)[:, MOTION], batch.covariance()[:, MOTION, MOTION]
         sigma = np.sqrt(np.einsum("nii->ni", covariances))
         consistent[k] = nees(errors, covariances) < bound
+        of_measured = covariances[:, measured][:, :, measured]
+        in_measured[k] = nees(errors[:, measured], of_measured) < bound_of_measured
         flagged[k] = batch.record("diverged") > 0.0
         large_error[k] = (np.abs(errors) > LARGE * sigma).any(axis=1)
     time = np.array([batch.sensors.imu.dt * stride * k for k in range(1, looks + 1)])
-    return Recovery(time, consistent, flagged, large_error)
+    return Recovery(time, consistent, flagged, large_error, in_measured)

@@ -3,7 +3,7 @@
 Every suite flies each preset fault that it can have. A fault starts at `FAULT_START` and, unless it
 is instantaneous, ends after `FAULT_DURATION`; flights are evaluated `RECOVERY_TIME` later. See
 `scripts.consistency.recovered` for the definitions. For the rate of false alarms, every suite also
-flies without a fault.
+flies without a fault. `scripts.consistency.causes` explains undetected failures.
 """
 
 import math
@@ -21,12 +21,19 @@ from quad_gym.faults import (
     PositionJump,
     possible,
 )
-from quad_gym.params.suites import sensor_suite
-from scripts.consistency.recovered import REQUIRED, Recovery, follow_recovery
+from quad_gym.params.suites import SensorSuite, sensor_suite
+from scripts.consistency.recovered import (
+    REQUIRED,
+    Recovery,
+    follow_recovery,
+    measured_coordinates,
+)
 from scripts.consistency.tables import FLOWN, CaseResults, case_table, vehicle_of
 
 FAULT_START, FAULT_DURATION, RECOVERY_TIME = 3.0, 5.0, 10.0
 """Start and duration of faults, and time that filters have to recover [s]."""
+STEP_OF_GYRO, DURING_OUTAGE = "gyro step of 1 deg/s", "gnss_outage with imu_bias_step"
+"""Names of two faults that are no presets."""
 LONG = 15.0  #: duration of long losses of a sensor, after which priors are wide [s]
 CALM_TASKS = ("hover", "random_trajectory", "waypoints")
 CALM_DURATION = 60.0  #: length of flights without a fault [s]
@@ -75,8 +82,8 @@ def cases() -> Iterator[Case]:
     catalog |= {
         "magnetometer near iron": (MagnetometerDisturbance(how="iron", **field),),
         "magnetometer frozen": (MagnetometerDisturbance(how="frozen", **field),),
-        "gyro step of 1 deg/s": (GyroBiasStep(start=FAULT_START, size=math.radians(1.0)),),
-        "gnss_outage with imu_bias_step": (
+        STEP_OF_GYRO: (GyroBiasStep(start=FAULT_START, size=math.radians(1.0)),),
+        DURING_OUTAGE: (
             GnssOutage(start=FAULT_START, duration=FAULT_DURATION),
             AccelBiasStep(start=middle),
             GyroBiasStep(start=middle),
@@ -84,15 +91,25 @@ def cases() -> Iterator[Case]:
     }
     for name in FLOWN:
         suite = sensor_suite(name)
-        gated = suite.estimator.false_alarm_probability > 0.0
-        expected = {} if gated else {"": "no gate, so it cannot correct itself"}
         for fault, parts in catalog.items():
             if possible(parts, suite):
-                keywords = {"faults": parts} | vehicle_of(name)
+                keywords, expected = {"faults": parts} | vehicle_of(name), reason(suite, parts)
                 yield Case(f"{name}, {fault}", suite, CALM_TASKS[1], "warm", keywords, expected)
     for name in FLOWN:
         for task in CALM_TASKS:
             yield Case(f"{name}, {task}", sensor_suite(name), task, "warm", vehicle_of(name))
+
+
+def reason(suite: SensorSuite, faults: tuple[Fault, ...]) -> dict[str, str]:
+    """Reason for which a filter cannot recover from faults, by column; empty if it can."""
+    if suite.estimator.false_alarm_probability == 0.0:
+        return {"": "no gate, so it cannot correct itself"}
+    measured, kinds = measured_coordinates(suite), tuple(map(type, faults))
+    if PositionJump in kinds and 0 not in measured:
+        return {"undetected": "no sensor measures the horizontal position"}
+    if GyroBiasStep in kinds and 8 not in measured:
+        return {"undetected": "no sensor measures the heading"}
+    return {}
 
 
 def measure(case: Case, flights: CaseFlights) -> dict[str, Any]:

@@ -8,15 +8,20 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.commands.consistency import CaseFlights
+from quad_gym.commands.consistency import Case, CaseFlights
 from quad_gym.commands.options import parse
-from quad_gym.faults import GyroBiasStep
+from quad_gym.faults import GnssJump, GyroBiasStep, PositionJump
 from quad_gym.params.suites import SUITES
 from scripts.consistency import __main__ as script
-from scripts.consistency import matrix, recovery
+from scripts.consistency import causes, evidence, matrix, recovery
 from scripts.consistency import tables as runs
-from scripts.consistency.recovered import CONSISTENT, Recovery, follow_recovery
-from scripts.consistency.tables import FLOWN, run_cases
+from scripts.consistency.recovered import (
+    CONSISTENT,
+    Recovery,
+    follow_recovery,
+    measured_coordinates,
+)
+from scripts.consistency.tables import FLOWN, run_cases, vehicle_of
 from tests.field_flights import fly, nees
 
 SMALL = CaseFlights(64, duration=1.0)
@@ -110,7 +115,8 @@ def test_default_filter_is_consistent_without_sensors(fault, start):
 
 def flights_of(consistent, flagged, large_error, every=0.5):
     time = every * np.arange(1, len(consistent) + 1)
-    return Recovery(time, *(np.array(flags, bool) for flags in (consistent, flagged, large_error)))
+    found = (np.array(flags, bool) for flags in (consistent, flagged, large_error, consistent))
+    return Recovery(time, *found)
 
 
 def test_long_large_errors_without_a_flag_are_missed_alarms():
@@ -131,6 +137,62 @@ def test_recovery_time_ends_when_99_percent_of_flights_are_consistent():
     assert found.time_to(found.consistent, 2.5) == pytest.approx(1.0)
     assert found.time_to(found.flagged, 1.0) == math.inf
     assert found.share(found.undetected, 3.0) == pytest.approx(0.02)
+
+
+def test_flights_that_were_flagged_before_an_instant_do_not_count():
+    flagged = np.zeros((4, 3))
+    flagged[1, 0] = flagged[2, 1] = True  # after 1.0 and 1.5 s
+    found = flights_of(np.ones((4, 3)), flagged, np.zeros((4, 3)))
+    assert found.flagged_since(1.0).tolist() == [False, True, False]
+
+
+def test_a_quantity_counts_as_measured_where_a_sensor_of_the_suite_observes_it():
+    found = {name: measured_coordinates(quad_gym.sensor_suite(name)) for name in FLOWN}
+    assert found.pop("crazyflie") == [2, 3, 4, 5, 6, 7]  # neither place nor heading
+    assert found.pop("uwb") == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert all(coordinates == list(range(9)) for coordinates in found.values())
+
+
+def test_a_remedy_changes_one_sensor():
+    for (suite, fault), (sensor, source) in causes.REMEDIES.items():
+        found, before = causes.remedied(suite, fault), quad_gym.sensor_suite(suite)
+        assert getattr(found, sensor) == getattr(quad_gym.sensor_suite(source), sensor)
+        assert getattr(found, sensor) != getattr(before, sensor)
+        assert found.replace(**{sensor: getattr(before, sensor)}) == before
+
+
+JUMP = 0.02  #: size of a jump [m]
+
+
+def evidence_of_jump(name, suite, fault, duration):
+    keywords = {"faults": (fault,)} | vehicle_of(name)
+    case = Case(name, suite, "hover", "warm", keywords)
+    return evidence.evidence_of(case, seeds=range(128), duration=duration, threads=1)
+
+
+def test_evidence_of_a_jump_of_positions_is_its_square_over_the_variance_of_an_innovation():
+    """Twice the logarithm of the ratio of two normal densities, with mean d^2 and variance 4 d^2.
+
+    There is one position after the jump, and the estimate is known better than its noise.
+    """
+    suite = quad_gym.sensor_suite("mocap")
+    suite = suite.replace(gnss=suite.gnss.replace(phase=0.0, latency=0.0))
+    sigma = suite.gnss.position_sigma_I[0]
+    fault = GnssJump(start=0.21, size=JUMP, direction=(1.0, 0.0, 0.0))
+    found = evidence_of_jump("mocap", suite, fault, 0.22)
+    square = (JUMP / sigma) ** 2
+    assert abs(found.mean() - square) < 0.15 * square + 6.0 * 2.0 * JUMP / sigma / np.sqrt(128)
+    assert found.std() == pytest.approx(2.0 * JUMP / sigma, rel=0.4)
+
+
+def test_a_horizontal_jump_leaves_no_evidence_for_optical_flow_and_range_finder():
+    suite = quad_gym.sensor_suite("crazyflie")
+    fault = PositionJump(start=0.5, direction=(1.0, 1.0, 0.0))
+    found = evidence_of_jump("crazyflie", suite, fault, 2.0)
+    assert np.median(found) < 0.1 * evidence.REQUIRED
+    assert (found > evidence.REQUIRED).mean() < 0.02
+    upward = PositionJump(start=0.5, direction=(0.0, 0.0, 1.0))
+    assert evidence_of_jump("crazyflie", suite, upward, 2.0).min() > 10.0 * evidence.REQUIRED
 
 
 def test_consistent_flights_and_flags_equal_a_plain_computation():
