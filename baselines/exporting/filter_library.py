@@ -17,8 +17,8 @@ from baselines.exporting.controller import Controller, c_source, descriptions
 from quad_gym.packing import slow_errors_of
 from quad_gym.params import checks as check
 from quad_gym.params.sensor_table import READINGS
-from quad_gym.params.suites import SensorSuite
-from quad_gym.records import FEATURE_BLOCKS, PRECISION
+from quad_gym.params.suites import SensorSuite, blocks_together
+from quad_gym.records import PRECISION
 
 # --------------------------------------------------------------------------------------------------
 # A policy for an exported filter: its observation from the estimate, as text of C sources.
@@ -180,8 +180,7 @@ def room_for(suite: SensorSuite) -> tuple[int, ...]:
     for name, reading in READINGS.items():
         count = suite.blocks_of(name)  # those that may be several support each other in the gate
         blocks.append(max(2 if count and reading.most_blocks > 1 else 1, count))
-    features = suite.blocks_of("pixels")
-    together = FEATURE_BLOCKS + features + sum(params.blocks for params in suite.aids.values())
+    together = blocks_together(suite)
     states = max(len(slow_errors_of(suite)) - 2, together - 15, 1)  # without biases of the IMU
     return (*blocks, together, 3 * -(-states // 3))
 

@@ -125,6 +125,12 @@ class LogDelays(Checked, more=dict.fromkeys(SENSOR_PARAMS, (Delay, 0.0))):
         def __getattr__(self, name: str) -> float: ...
 
 
+def blocks_together(suite: "SensorSuite") -> int:
+    """Return the number of blocks at an instant of all sensors; those of GNSS always have room."""
+    others = (name for name in READINGS if SENSOR_OF[name] != "gnss")
+    return FEATURE_BLOCKS + sum(map(suite.blocks_of, others))
+
+
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
     """Return a latency [s] in ticks, with at most MAX_UNDER_WAY measurements in transit."""
     ticks, longest = round(latency * imu_rate), MAX_UNDER_WAY * check.ticks(name, rate, imu_rate)
@@ -164,12 +170,12 @@ class SensorSuite(SensorTable, Saved):
             label = type(sensor).__name__
             check.ticks(f"{label}.rate", sensor.rate, self.imu.rate)
             delay_ticks(f"{label}.latency", sensor.latency, sensor.rate, self.imu.rate)
-        most = ALLOWED_TOGETHER - FEATURE_BLOCKS  # those of GNSS always have room
-        count = sum(n for name, n in self._counts.items() if SENSOR_OF[name] != "gnss")
-        if count > most:
+        together = blocks_together(self)
+        if together > ALLOWED_TOGETHER:
             raise ValueError(
-                f"sensors must have at most {most} camera features and measurements of other "
-                f"sensors at an instant, got {count}"
+                f"sensors must have at most {ALLOWED_TOGETHER - FEATURE_BLOCKS} camera features "
+                "and measurements of other sensors at an instant, got "
+                f"{together - FEATURE_BLOCKS}"
             )
 
     @property
