@@ -153,6 +153,18 @@ def look_around_noise(rows: Rows) -> str:
     return compared(Arms(rows, BUDGETS["LookAround"]), names, against)
 
 
+def stale_race_headline(rows: Rows) -> str:
+    """Late measurements, for readers of one sentence."""
+    arms, pair = Arms(rows, BUDGETS["StaleRace"]), ("estimate", "truth")
+    return (
+        f"Policies that were trained on the estimate pass all gates in {arms.success('estimate')} "
+        f"of the episodes on the estimate, and policies that were trained on the truth in "
+        f"{arms.success('truth')} ({verdict(effect(arms[pair[0]], arms[pair[1]]))}; "
+        f"{arms.budget(*pair)}). If the filter compensates the delay, the latter pass them in "
+        f"{arms.success('truth_delay_compensated')}."
+    )
+
+
 def stale_race_training(rows: Rows) -> str:
     """Training on the estimate in the race with late measurements."""
     arms = Arms(rows, BUDGETS["StaleRace"])
@@ -339,6 +351,7 @@ CONCLUSIONS: Mapping[str, tuple[str, Conclusion]] = {
     "look_around.factors.table": ("look_around", look_around_factors),
     "look_around.noise.table": ("look_around", look_around_noise),
     "stale_race.table": ("stale_race", arms_table("stale_race", BUDGETS["StaleRace"])),
+    "stale_race.headline": ("stale_race", stale_race_headline),
     "stale_race.training": ("stale_race", stale_race_training),
     "stale_race.compensation": ("stale_race", stale_race_compensation),
     "stale_race.substitutes.table": ("stale_race", stale_race_substitutes),
