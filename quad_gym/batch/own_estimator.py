@@ -153,7 +153,7 @@ def checked_estimate(method: str, given: Any, count: int, rows: Truths) -> dict[
     return found
 
 
-def _own_copy(given: Estimator) -> Estimator:
+def own_copy(given: Estimator) -> Estimator:
     """Return a copy that shares nothing with the estimator."""
     try:
         return copy.deepcopy(given)
@@ -382,7 +382,7 @@ class OwnFilter:
 
     def __init__(self, given: Estimator, count: int) -> None:
         self.name = type(given).__name__
-        self.estimator = _own_copy(given)
+        self.estimator = own_copy(given)
         self.state = self.estimator.state = State(count, given.state)
         self.state.lock(False)
         self._failed, self._has_covariance = False, True
