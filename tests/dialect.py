@@ -81,7 +81,7 @@ VERBS = (
     r"(is|are|was|were|be|has|have|had|do|does|can|cannot|may|must|will|adds?|begin|belong|build|"
     r"builds|compiles?|consider|evaluates?|exports?|follows?|include|install|lets?|lists?|"
     r"localize|look|looks|makes?|need|needs|provides?|reach|read|report|see|selects?|shows?|"
-    r"simulates?|takes?|use|uses)"
+    r"simulates?|succeeds?|takes?|use|uses)"
 )
 """Verbs of sentences in README, one of which each sentence needs."""
 

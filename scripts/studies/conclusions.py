@@ -160,7 +160,7 @@ def stale_race_headline(rows: Rows) -> str:
         f"Policies that were trained on the estimate pass all gates in {arms.success('estimate')} "
         f"of the episodes on the estimate, and policies that were trained on the truth in "
         f"{arms.success('truth')} ({verdict(effect(arms[pair[0]], arms[pair[1]]))}; "
-        f"{arms.budget(*pair)}). If the filter compensates the delay, the latter pass them in "
+        f"{arms.budget(*pair)}). With a filter that compensates the delay, the latter succeed in "
         f"{arms.success('truth_delay_compensated')}."
     )
 
