@@ -54,7 +54,8 @@ class Normalization:
         x = np.asarray(observations, np.float32)
         if x.shape[-1:] != self.mean.shape:
             raise ValueError(
-                f"normalization has {len(self.mean)} numbers, but the observation {x.shape[-1:]}"
+                f"observations must have {len(self.mean)} numbers, as the normalization has, got "
+                f"shape {x.shape}"
             )
         scaled = (x - self.mean) / self.deviation
         return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
@@ -163,10 +164,12 @@ def require_statistics(file: Path, given: Any) -> None:
     """Refuse a policy next to which there are statistics that were not given."""
     near = statistics_near(file) if given is None else ()
     if near:
+        own = [path for path in near if path.stem == file.stem]  # saved together with the policy
+        which = str(*own) if len(own) == 1 else f"{'one of them' if len(near) > 1 else near[0]}"
         raise ValueError(
-            f"{file} lies next to {_listed(near)} with the statistics of its observations "
-            f"(VecNormalize), without which it acts differently: give normalization {near[0]}, or "
-            f"{NONE} if it was trained without"
+            f"{file} lies next to {_listed(near)} with statistics of observations (VecNormalize), "
+            f"without which it acts differently: give normalization {which}, or {NONE!r} if it "
+            "was trained without"
         )
 
 

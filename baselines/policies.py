@@ -105,7 +105,7 @@ def load_policy(name: str, env: Any, normalization: Any = None) -> Policy:
             warnings.warn(
                 f"{file} was trained on {trained_on}, but flies {task_of(env)}", stacklevel=2
             )
-        return normalized(name, policy, normalization)  # type: ignore[no-any-return]
+        return _normalized(file, policy, normalization, env)
     if file.suffix != ".zip":
         raise ValueError(
             "policy must be pd, pd:lab, pd:FILE.json, pretrained, or a .npz or .zip file, "
@@ -195,7 +195,7 @@ def _stable_baselines_policy(file: Path, env: Any, normalization: Any) -> Policy
         model = algorithm_class(_ALGORITHM_OF_MODULE[module]).load(file, device="cpu")
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
         raise ValueError(f"{file} cannot be loaded: {error}") from None
-    policy = normalized(str(file), model, normalization)
+    policy: Any = _normalized(file, model, normalization, env)
     space = getattr(env, "single_observation_space", env.observation_space)
     free = policy is not model and model.observation_space.shape == space.shape
     if model.observation_space != space and not free:
@@ -226,9 +226,27 @@ def _is_unbounded(space: Any, bounded: Any) -> bool:
     )
 
 
-def _require_size(file: Path, size: int, env: Any) -> None:
+def _normalized(file: Path, policy: Any, normalization: Any, env: Any) -> Policy:
+    """Policy with its statistics; a ValueError if they are of observations of another size."""
+    found = normalized(str(file), policy, normalization)
+    if found is not policy and (size := len(found.normalization.mean)) != _size_of(env):
+        source = f" in {normalization}" if isinstance(normalization, str | Path) else ""
+        raise ValueError(
+            f"normalization must be of the {_size_of(env)} numbers that the environment returns, "
+            f"got {size}{source}: make it with the keywords with which {file} was trained, and "
+            "give the statistics of this training"
+        )
+    return found  # type: ignore[no-any-return]
+
+
+def _size_of(env: Any) -> int:
+    """Numbers in an observation of one environment."""
     space = getattr(env, "single_observation_space", env.observation_space)
-    here = gymnasium.spaces.flatdim(space)
+    return gymnasium.spaces.flatdim(space)
+
+
+def _require_size(file: Path, size: int, env: Any) -> None:
+    here = _size_of(env)
     if size != here:
         raise ValueError(
             f"{file} expects observations of {size} numbers, but the environment returns {here}: "

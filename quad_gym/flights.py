@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
-from quad_gym.analysis.reports import write_csv
+from quad_gym.analysis.reports import as_json, write_csv
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.packing import params_record
@@ -273,7 +273,9 @@ def save_flight(rows: NDArray[Any], scene: FlightScene, about: dict[str, Any], p
     unfinished = path.with_name(path.name + ".part")
     try:
         with unfinished.open("wb") as stream:
-            np.savez_compressed(stream, header=np.array(json.dumps(header)), **arrays)
+            np.savez_compressed(
+                stream, header=np.array(json.dumps(header, default=as_json)), **arrays
+            )
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from baselines.compiled_ppo import kernels
 from baselines.compiled_ppo.kernels import INPUTS, OUTPUTS, STORED, TILE
 from baselines.mlp import MlpPolicy
+from baselines.policies import interface_of
 from baselines.recipes import ACTIVATIONS, Recipe
 from quad_gym.batch.threads import (
     MIN_BLOCKS_PER_THREAD,
@@ -335,13 +336,20 @@ class CompiledPPO:
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
         """Return deterministic actions for observations (..., n), with or without critic's part."""
-        policy, x = self.policy(), np.asarray(observation, np.float32)
+        policy, x = self.networks.policy({}), np.asarray(observation, np.float32)
         whole = x.shape[-1:] == self._observations.shape[-1:]
         return policy.predict(x[..., : policy.inputs] if whole else x, state, episode_start)
 
     def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy:
-        """Copy the present policy to one that requires only NumPy."""
-        return self.networks.policy(record or {"interface": {}})
+        """Copy the present policy to one that requires only NumPy.
+
+        Its record defaults to the observations, actions and control rate of the training, so that
+        `load_policy` refuses environments with others.
+        """
+        if record is None:
+            ours = isinstance(self.env.unwrapped, QuadVectorEnv)
+            record = {"interface": interface_of(self.env) if ours else {}}
+        return self.networks.policy(record)
 
     @property
     def training_return(self) -> float:

@@ -252,7 +252,7 @@ def main(args: ReplayArgs) -> None:
             log = read_log(args.log, **args.reading())
             suite, reason = (args.sensors, "") if args.sensors else suite_for(log)
             if reason:
-                print(f"Suite: {suite} (--sensors), as {reason}.")
+                print(f"Suite: {suite}, as {reason}. --sensors chooses another.")
             options["sensors"] = suite
             result = replay(log, window=args.window, samples=args.samples, **options)
             if args.smooth:

@@ -301,7 +301,8 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArra
         want is None or have == want for have, want in zip(result.shape, shape, strict=False)
     )
     if not fits:
-        wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
+        sizes = ["n" if n is None else str(n) for n in shape]
+        wanted = f"({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"  # as Python writes them
         what = f"have shape {wanted}" if shape else "be a number"
         raise ValueError(f"{name} must {what}, got {result.shape}")
     return result

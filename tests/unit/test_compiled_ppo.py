@@ -6,6 +6,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from baselines.compiled_ppo import CompiledPPO
+from baselines.policies import load_policy
 from tests.unit.sliders import sliders, small_recipe
 
 
@@ -138,6 +139,23 @@ def test_diverged_training_raises_floating_point_error():
 def test_unsupported_environment_or_recipe_raises_value_error(env, recipe, message):
     with pytest.raises(ValueError, match=message):
         CompiledPPO(env, recipe)
+
+
+def test_policy_is_refused_where_actions_or_observations_differ(tmp_path):
+    def hover(count=1, **keywords):
+        return gymnasium.make_vec("QuadGym/Hover-v0", num_envs=count, **keywords)
+
+    trained = hover(8, autoreset_mode="SameStep", start="hover", action="velocity")
+    model = CompiledPPO(trained, small_recipe(), seed=np.int64(0), env_seed=np.int64(10**9))
+    model.policy().save(tmp_path / "mine.npz")
+    name = str(tmp_path / "mine.npz")
+    assert load_policy(name, hover(action="velocity", observation="truth")) is not None
+    with pytest.raises(ValueError, match=r"trained with action velocity, but .* has ctbr"):
+        load_policy(name, hover())
+    with pytest.raises(ValueError, match=r"trained with control_rate 50.0, but .* has 100.0"):
+        load_policy(name, hover(action="velocity", control_rate=100))
+    with pytest.raises(ValueError, match=r"trained with observations of .* fields"):
+        load_policy(name, hover(action="velocity", include_std=True))
 
 
 def test_input_of_the_critic_alone_changes_no_action():

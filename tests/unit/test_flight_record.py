@@ -36,6 +36,17 @@ def assert_same_flights(ours, theirs):
     assert ours.about == theirs.about
 
 
+def test_seeds_and_keywords_as_numpy_scalars_are_saved(tmp_path):
+    flight = record_flight(
+        PDPolicy(gymnasium.make("QuadGym/Circle-v0")),
+        "QuadGym/Circle-v0",
+        seed=np.int64(7),
+        duration=np.float32(0.5),
+    )
+    flight.save(tmp_path / "it.npz")
+    assert Flight.load(tmp_path / "it.npz").about["seed"] == 7
+
+
 def test_rows_are_control_steps_from_the_start():
     _, flight, _ = recorded_flight(steps=12, control_rate=100.0)
     assert len(flight) == 13

@@ -593,7 +593,7 @@ def test_fictitious_position_keeps_the_tilt_without_gnss():
     ("text", "message"),
     [
         ("time,accel_x\n0,1\n", "a log must have a column gyro_x"),
-        ("time,gyro\n0,inf\n", "columns of a log must be"),
+        ("time,gyro\n0,inf\n", "columns of a log must have known names"),
         ("time,barometer\n0,inf\n1,2\n", "column barometer must be finite"),
     ],
 )

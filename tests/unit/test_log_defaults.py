@@ -36,7 +36,7 @@ def written(table, path):
 
 def test_suite_by_default_uses_the_sensors_of_the_log(table, tmp_path):
     ended = run("replay", written(table, tmp_path / "a.csv"), "--output", tmp_path / "a")
-    assert ended.stdout.startswith("Suite: field (--sensors), as the log has a receiver and")
+    assert ended.stdout.startswith("Suite: field, as the log has a receiver, a barometer and a")
     assert "Ignored" not in ended.stdout
     assert ended.returncode == 0
 

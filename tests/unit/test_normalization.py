@@ -181,6 +181,19 @@ def test_statistics_next_to_a_policy_are_not_forgotten(place, trained, tmp_path)
     assert load_policy(str(name), plain(1), normalization="none") is not None
 
 
+def test_message_names_the_statistics_that_were_saved_with_the_policy(trained, tmp_path):
+    _, model, env = trained
+    model.save(tmp_path / "mine.zip")
+    for stem in ("another", "mine"):
+        env.save(tmp_path / f"{stem}.pkl")
+    with pytest.raises(ValueError, match=r"another\.pkl, mine\.pkl .* give .*/mine\.pkl, or"):
+        load_policy(str(tmp_path / "mine.zip"), plain(1))
+    env.save(tmp_path / "third.pkl")
+    (tmp_path / "mine.pkl").unlink()
+    with pytest.raises(ValueError, match="give normalization one of them, or 'none'"):
+        load_policy(str(tmp_path / "mine.zip"), plain(1))
+
+
 def test_commands_take_the_statistics(trained, tmp_path, capsys, monkeypatch):
     folder, _, _ = trained
     monkeypatch.chdir(tmp_path)
@@ -199,13 +212,13 @@ def test_statistics_that_do_not_fit_are_refused(trained, tmp_path):
     folder, _, env = trained
     name, one = str(folder / "policy.zip"), np.ones(27)
     for given, message in (
-        (Normalization(one, one), "policy must have|27 numbers"),
+        (Normalization(one, one), "normalization must be of the 28 numbers .* got 27"),
         (str(tmp_path / "none.pkl"), "there is no normalization"),
         ("vn.txt", r"must be a \.pkl or \.npz file"),
         (plain(1), "normalization must be a file, or a VecNormalize"),
     ):
         with pytest.raises(ValueError, match=message):
-            load_policy(name, plain(1), normalization=given).predict(np.zeros(28))
+            load_policy(name, plain(1), normalization=given)
     (tmp_path / "bad.pkl").write_bytes(b"nothing")
     np.savez(tmp_path / "bad.npz", mean=one)
     for file in ("bad.pkl", "bad.npz"):

@@ -12,6 +12,7 @@ from quad_gym.estimation import LOG_COLUMNS, Stream, read_log, replay
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
 from quad_gym.logs.plots import replay_figure
 from quad_gym.params.suites import CONSUMER
+from tests.builders import recorded_flight
 from tests.console_commands import run
 from tests.estimators import Simple
 from tests.filter_states import at_rest
@@ -270,7 +271,7 @@ def small(**changes):
         ({"gyro": np.zeros((4, 2))}, "gyro must have shape"),
         ({"accel": np.full((4, 3), np.inf)}, "accel must be finite"),
         ({"accel": np.full((4, 3), np.nan)}, "at least two IMU samples"),
-        ({"gyros": np.zeros(4)}, "columns of a log must be .*, got gyros: remove it"),
+        ({"gyros": np.zeros(4)}, "columns of a log must have .*, got gyros; did you mean gyro_x?"),
         ({"gnss": np.zeros((4, 3))}, "must have one of gnss, gnss_enu"),
         ({"gnss_enu": None}, "must have a GNSS position to start from"),
         ({"gnss_enu": None, "gnss_east": np.zeros(4)}, "must have a column gnss_north with"),
@@ -281,6 +282,15 @@ def small(**changes):
 def test_invalid_logs_raise_errors_that_name_the_column(changes, message):
     with pytest.raises((ValueError, TypeError), match=message):
         replay(small(**changes), sensors=RTK)
+
+
+def test_recorded_episode_is_no_log(tmp_path):
+    """`flight.csv` is the name of both in the documentation."""
+    _, flight, _ = recorded_flight(steps=3)
+    logs = [flight, flight.save(tmp_path / "flight.npz"), flight.to_csv(tmp_path / "flight.csv")]
+    for log in logs:
+        with pytest.raises(ValueError, match=r"one row for each control step.* fly --replay"):
+            replay(log, sensors=RTK)
 
 
 @pytest.mark.parametrize("name", ["rtk", "lab"])  # averaged and instant samples

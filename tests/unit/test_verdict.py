@@ -60,10 +60,26 @@ def of(result, quantity):
 
 def test_a_flight_without_a_fault_is_usable_in_every_quantity():
     result = judged(verdicts.nothing)
-    assert [line.split(";")[0] for line in by_quantity(result.findings)] == [
+    assert [re.split(r"[;\n]", line)[0] for line in by_quantity(result.findings)] == [
         f"{quantity}: usable" for quantity in ("position", "height", "attitude", "heading")
     ]
     assert result.verdict.startswith("usable: NIS per degree of freedom ")
+
+
+def test_several_findings_are_a_list():
+    findings = [
+        Finding(quantity="height", severity=Severity.UNCERTAIN, text="first"),
+        Finding(quantity="heading", severity=Severity.NOTE, text="one"),
+        Finding(quantity="height", severity=Severity.LOST, text="second"),
+    ]
+    assert "\n".join(by_quantity(findings)).splitlines() == [
+        "position: usable",
+        "height: not usable",
+        "  - first",
+        "  - second",
+        "attitude: usable",
+        "heading: usable; one",
+    ]
 
 
 def test_a_heading_that_nothing_shows_is_uncertain():

@@ -286,9 +286,10 @@ def _recording(log: Any, body: str, columns: Path | str | None) -> RawLog:
     elif hasattr(log, "columns") and hasattr(log, "to_numpy"):
         given = {name: log[name] for name in log.columns}
     else:
+        why = f", an episode: {tables.EPISODE}" if hasattr(log, "scene") else ""
         raise ValueError(
             "log must be a DataFrame, a mapping of columns, or a path of a .csv, .ulg, .bin, bag "
-            f"or folder, got {type(log).__name__}"
+            f"or folder, got {type(log).__name__}{why}"
         )
     if columns is not None:
         return tables.mapped(given, Path(columns), "the table")

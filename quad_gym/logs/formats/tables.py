@@ -4,7 +4,7 @@ import csv
 import gzip
 import tomllib
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -44,6 +44,12 @@ _TOGETHER = ("imu", "gnss")
 
 DISORDER = 0.1  #: share of steps back in time, of the IMU, that no recorder writes
 
+EPISODE = (
+    "it has one row for each control step, without the other samples of the IMU, so that no filter "
+    "can process it: show it with quad-gym fly --replay FILE.npz"
+)
+"""Reason why a recorded flight is no log."""
+
 _CONVERTED = {
     ".bbl": "a blackbox of Betaflight or INAV: convert it with blackbox_decode, and map the "
     "columns of its .csv (columns=, --columns)",
@@ -59,6 +65,7 @@ _CONVERTED = {
     ".tlog": "telemetry of MAVLink, whose IMU is too slow for a filter: use the log of the "
     "autopilot (.bin, .ulg), or convert it with mavlogdump.py --format csv and map its columns "
     "(columns=, --columns)",
+    ".npz": f"an archive of arrays. If it is an episode that quad_gym recorded, {EPISODE}",
     ".log": "a text log of ArduPilot: use the binary log (.bin) of the same flight",
 }
 """Files of others, by their endings, and how to read them."""
@@ -133,10 +140,7 @@ def checked_columns(given: Mapping[Any, Any]) -> Columns:
             found.update({n: array_[:, i].astype(np.float64) for i, n in enumerate(names)})
         else:
             if name not in known and _pixel_of(name) is None:
-                raise ValueError(
-                    f"columns of a log must be {', '.join(sorted(known))} or pixels, got {name}: "
-                    "remove it, or map it (columns=, --columns)"
-                )
+                raise ValueError(_unknown(name, list(map(str, given)), known))
             found[name] = check.array(f"column {name}", array_, (None,), allow_nan=True)
     lengths = {len(column) for column in found.values()}
     if len(lengths) > 1:
@@ -145,6 +149,17 @@ def checked_columns(given: Mapping[Any, Any]) -> Columns:
         if name not in found:
             raise ValueError(f"a log must have a column {name}, got {', '.join(found) or 'none'}")
     return found
+
+
+def _unknown(name: str, given: Sequence[str], known: Iterable[str]) -> str:
+    """Explain that a column is unknown."""
+    if {"filter_status", "nees", "estimation_error"} <= set(given):  # of `Flight.to_csv`
+        return f"this is an episode that quad_gym recorded: {EPISODE}"
+    return (
+        f"columns of a log must have known names, got {name}{check.did_you_mean(name, known)}. "
+        "Remove it, or map it (columns=, --columns). "
+        f"Known are {', '.join(sorted(known))} and pixels"
+    )
 
 
 def _names_of(key: str, width: int) -> tuple[str, ...]:

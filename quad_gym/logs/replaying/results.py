@@ -54,13 +54,17 @@ class Finding:
 
 
 def by_quantity(findings: Sequence[Finding]) -> list[str]:
-    """Return a line on each quantity: its findings, or "usable"."""
+    """Return a paragraph on each quantity: its findings, or "usable".
+
+    A single finding is in the first line, and several are a list below it.
+    """
     lines = [f"log: {f.text}" for f in findings if f.quantity == "log"]
     for quantity in QUANTITIES:
         some = [f for f in findings if f.quantity == quantity]
         worst = max((f.severity for f in some), default=Severity.NOTE)
         words = ("usable", "uncertain", "not usable")[worst]
-        lines.append("; ".join([f"{quantity}: {words}", *(f.text for f in some)]))
+        between = "\n  - " if len(some) > 1 else "; "
+        lines.append(between.join([f"{quantity}: {words}", *(f.text for f in some)]))
     return lines
 
 
