@@ -8,6 +8,8 @@ Writes a folder with a static library, a C99 header, an example that filters a l
 file. The estimates are bitwise those of `quad-gym replay`. docs/deployment.md explains the use.
 
     quad-gym export filter --sensors mine.toml --log flight.csv --output filter
+
+Options that read a log, such as --columns and --from, have the meaning that they have in replay.
 """
 
 from dataclasses import dataclass
@@ -24,11 +26,12 @@ from quad_gym.commands.options import (
     refuse_overwriting,
     usage_errors,
 )
+from quad_gym.commands.replay import ReadingArgs
 
 
 @dataclass(frozen=True)
-class ExportFilterArgs:
-    """Options of the export."""
+class ExportFilterArgs(ReadingArgs):
+    """Options of the export; those that read a log need --log."""
 
     sensors: SuiteName = SENSORS
     target: Literal["x86-64", "aarch64", "cortex-m7", "cortex-m4", "wasm32"] = "x86-64"
@@ -62,6 +65,8 @@ def main(args: ExportFilterArgs) -> None:
         folder = args.output or Path("results/export") / f"filter_{label}_{args.target}"
         refuse_overwriting(folder / LIBRARY, args.overwrite)
         require_writable("--output", folder)
+        if args.log is None and (words := args.words()):
+            raise ValueError(f"{words[0]} must come with --log")
         if args.env_id is not None and args.policy is None:
             raise ValueError("--env-id must come with --policy")
         if args.normalization is not None and args.policy is None:
@@ -74,7 +79,7 @@ def main(args: ExportFilterArgs) -> None:
         )
         rate = 0.0
         if args.log is not None:
-            log = read_log(args.log)
+            log = read_log(args.log, **args.reading())
             suite = origin_of(log.corrected(suite), suite)
             rate = 1.0 / float(np.median(np.diff(log.imu.time)))
         files = export_filter(suite, label, args.target, folder, policy, imu_rate=rate)

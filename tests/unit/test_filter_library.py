@@ -22,6 +22,7 @@ from docs.examples import cortex_m4
 from quad_gym.commands.main import main
 from quad_gym.estimation import UnscentedKalmanFilter, replay
 from quad_gym.estimation.starts import state_at_rest
+from quad_gym.frames import geodetic_to_ecef
 from quad_gym.logs.formats import read_log
 from quad_gym.logs.replaying.log_start import wide_start
 from quad_gym.params.suites import ALL_SUITES
@@ -711,3 +712,43 @@ def test_command_writes_a_folder_and_replaces_none(tmp_path, monkeypatch, capsys
 def test_unknown_target_is_refused(tmp_path):
     with pytest.raises(ValueError, match="target must be one of"):
         export_filter(quad_gym.sensor_suite("rtk"), "rtk", "riscv", tmp_path)
+
+
+def test_origin_is_the_first_fix_of_the_part_of_the_log_that_is_replayed(tmp_path, monkeypatch):
+    """A vehicle drives north by 0.001 degrees a second; columns have the names of others."""
+    time = np.arange(0.0, 4.0, 0.01)
+    rows = [f"{t:.2f},0,0,0,0,0,9.81,{47.0 + 0.001 * t},8.5,400" for t in time]
+    names = "stamp,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z,gnss_lat,gnss_lon,gnss_alt"
+    (tmp_path / "log.csv").write_text("\n".join([names, *rows]))
+    columns = {"time": ["stamp"], "gnss_lla": ["gnss_lat", "gnss_lon", "gnss_alt"]}
+    columns |= {name: [f"{name}_{axis}" for axis in "xyz"] for name in ("gyro", "accel")}
+    (tmp_path / "map.toml").write_text(
+        "\n".join(f"[{name}]\ncolumns = {given}" for name, given in columns.items())
+    )
+    seen = []
+
+    def caught(suite, *_, **__):
+        seen.append(suite.gnss.reference_antenna_G)
+        return []
+
+    monkeypatch.setattr("baselines.exporting.filter_library.export_filter", caught)
+    options = (
+        "--sensors",
+        "field",
+        "--log",
+        tmp_path / "log.csv",
+        "--columns",
+        tmp_path / "map.toml",
+    )
+    words = ["export", "filter", *map(str, options), "--output", str(tmp_path / "out")]
+    for part, begin in (([], 0.0), (["--from", "2.5"], 2.5)):
+        main([*words, *part])
+        np.testing.assert_allclose(
+            seen[-1],
+            geodetic_to_ecef(math.radians(47.0 + 0.001 * begin), math.radians(8.5), 400.0),
+            atol=1e-3,
+        )
+
+
+def test_options_that_read_a_log_need_one(capsys):
+    assert "--from must come with --log" in refused("export filter --from 2", capsys)

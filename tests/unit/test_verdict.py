@@ -27,7 +27,7 @@ from quad_gym.logs.replaying.results import (
     runs_beyond_chance,
 )
 from quad_gym.logs.replaying.rules import HORIZONS, changes
-from quad_gym.logs.replaying.verdict import in_one_line
+from quad_gym.logs.replaying.verdict import RULES, in_one_line
 from quad_gym.records import GateDecision
 from quad_gym.rotations import euler_to_dcm
 from tests import foreign_logs
@@ -247,6 +247,18 @@ def test_a_start_that_the_flight_contradicts_is_said():
     result = replay(log | leaning, sensors=NAME)
     (text,) = (f.text for f in of(result, "attitude") if "roll and pitch at the start" in f.text)
     assert 17 <= int(re.search(r"about (\d+) degrees", text)[1]) <= 23
+
+
+def test_a_wrong_given_heading_comes_before_the_innovations_that_it_enlarges():
+    log, truth = flight()
+    log = {name: values for name, values in log.items() if name != "magnetometer"}
+    first = int(np.searchsorted(truth["time"], 12.0))
+    w, x, y, z = truth["quaternion"][first]
+    heading = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    result = replay(log, sensors=NAME, start={"heading": heading + 0.5}, from_=12.0)
+    assert re.search(r"because heading: the given heading .* by about 2\d degrees", result.verdict)
+    names = [rule.find for rule in RULES]
+    assert names.index(rules.given_heading) < names.index(rules.misfits)
 
 
 def test_an_outage_of_twelve_seconds_is_dead_reckoning_and_one_of_six_is_not():

@@ -130,7 +130,8 @@ static void call(char *row)
         static const double origin[3] = {@REFERENCE@};
         for (int i = 0; i < 3; i++)
             if (x[i] != origin[i])
-                stop("the log has another origin", "export the filter with --log LOG");
+                stop("the log has another origin",
+                     "export the filter with --log LOG, and the options of its replay (--from)");
     }
 #endif
 #ifdef QG_BAROMETER

@@ -662,7 +662,19 @@ def _turned_back(case: Evidence, part: _FirstPart, k: int) -> Floats:
     return np.asarray(back)
 
 
+def given_heading(case: Evidence) -> Iterator[Finding]:
+    """A given heading that the flight contradicts: a cause of large innovations."""
+    if "heading" in case.start:
+        yield from _heading_at_start(case)
+
+
 def first_heading(case: Evidence) -> Iterator[Finding]:
+    """A measured heading at the start that the flight contradicts."""
+    if "heading" not in case.start:
+        yield from _heading_at_start(case)
+
+
+def _heading_at_start(case: Evidence) -> Iterator[Finding]:
     """A heading at the start that the flight contradicts.
 
     The gyro, with the bias of a later estimate, turns that estimate back to the start. The heading

@@ -68,6 +68,7 @@ RULES = (
         "a heading 10 degrees and 4 standard deviations from the motion's, reset or for 2 s",
         "a magnetometer that was left out",
     ),
+    Rule(rules.given_heading, "the motion contradicts the given heading"),
     Rule(
         rules.misfits,
         "innovations twice as large; a tenth rejected, or rejected in one run; GNSS for 10 s; a "
