@@ -6,10 +6,10 @@
     quad-gym replay flight.csv --sensors rtk --estimator module:Class
 
 A log is a CSV table, a log of PX4 or ArduPilot, a bag of ROS, or a folder in the format of EuRoC;
-some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/logs.md describes them. Without
---sensors, the sensors in the log choose a suite. The last
-lines are the verdict. The exit code is 1 if units or axes are implausible, the suite's noise model
-does not fit the log, or the filter was lost.
+some require an extra, such as `pip install 'quad-gym[ulog]'`. docs/log-formats.md describes them.
+Without --sensors, the sensors in the log choose a suite. The last lines are the verdict. The exit
+code is 1 if units or axes are implausible, the suite's noise model does not fit the log, or the
+filter was lost.
 """
 
 import math
@@ -67,7 +67,7 @@ class ReadingArgs:
     topic: Keywords = field(default_factory=dict)
     """topics of a ROS bag to use, such as imu=/mavros/imu/data_raw"""
     columns: Path | None = None
-    """file (.toml) that maps the columns of a table to those of docs/logs.md"""
+    """file (.toml) that maps the columns of a table to those of docs/log-formats.md"""
     from_: Annotated[float | None, arg(name="from")] = None
     """time at which to begin, in the log's clock [s]"""
     until: float | None = None
