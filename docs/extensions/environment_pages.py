@@ -364,8 +364,9 @@ def _log_page() -> str:
         for key, c in columns.items()
     ]
     return (
-        "# Columns of a log\n\n[`quad-gym replay`](../log-formats.md#tables) reads these columns of "
-        "a table. A dictionary may have the columns of a quantity together, by the name at the left. "
+        "# Columns of a log\n\n[`quad-gym replay`](../log-formats.md#tables) reads these columns "
+        "of a table. A dictionary may have the columns of a quantity together, by the name at the "
+        "left. "
         "Reported standard deviations replace the suite's, and a value of motors holds until "
         "the next row with one. Frames: I east, north, up; B body (forward, left, up); C image, "
         "from its center.\n\n" + _table(("together", "columns", "unit", "frame", "meaning"), rows)
