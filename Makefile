@@ -128,7 +128,9 @@ $(VENV)/.builder: $(VENV)/.user
 define check-dist
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
-	for wheel in dist/*.whl; do $(BIN)/auditwheel show $$wheel | tee /dev/stderr | grep -q '"manylinux_2_' || exit 1; done
+	for wheel in dist/*.whl; do found=$$($(BIN)/auditwheel show $$wheel) && echo "$$found" \
+		&& echo "$$found" | grep -q '"manylinux_2_' || exit 1; done
+	ls -l dist
 endef
 
 wheel: kernels $(VENV)/.builder  ## build sdist and a wheel with the libraries into dist, and check what they hold; needs gcc and cmake
