@@ -27,6 +27,7 @@ from baselines.policies import keywords_of_policy, load_policy
 from quad_gym import IDS, Flight, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands import options
+from quad_gym.commands.evaluate import gates_of
 from quad_gym.envs.keywords import Observation
 from quad_gym.evaluation import Policy
 from quad_gym.faults import PRESETS, faults_of
@@ -131,7 +132,11 @@ def fly(env: Any, policy: Policy, seed: int, about: Any) -> Iterator[Flight]:
     for flight, ending in fly_steps(policy, env, seed, about | {"seed": seed}):  # noqa: B007
         yield flight
     words = f"seed {seed}: {ending.replace('_', ' ')} after {flight['time'][-1]:.2f} s, "
-    words += f"mean tracking error {1e3 * flight['position_error'].mean():.1f} mm"
+    gates = gates_of(env)
+    if gates:
+        words += f"{int(flight['gates_passed'][-1])} of {gates} gates passed"
+    else:
+        words += f"mean tracking error {1e3 * flight['position_error'].mean():.1f} mm"
     if flight.scene.observation != "truth":
         words += f", mean estimation error {1e3 * flight['estimation_error'].mean():.1f} mm"
     print(words)

@@ -1,8 +1,11 @@
 """Tests of the command `fly`."""
 
+import re
+
 import numpy as np
 import pytest
 
+from baselines.policies import load_policy
 from quad_gym import IDS, Flight
 from quad_gym.commands import fly as script
 from tests import console_commands
@@ -38,6 +41,18 @@ def test_fly_writes_video_and_flight_that_replays_to_same_video(tmp_path):
 def test_every_task_is_made_with_the_default_options(env_id):
     env = script.make_env(script.FlyArgs(env_id=env_id))
     assert env.unwrapped.flights.batch.sensors.camera is not None or "outage" in IDS[env_id]
+
+
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [("waypoints", r"\d of 5 gates passed"), ("hover", r"mean tracking error \d+\.\d mm")],
+)
+def test_a_flight_is_summed_up_by_gates_on_a_course_and_by_errors_elsewhere(task, said, capsys):
+    env = script.make_env(script.FlyArgs(env_id=task, duration=1.0))
+    list(script.fly(env, load_policy("pd", env), 0, {}))
+    printed = capsys.readouterr().out
+    assert re.search(said, printed)
+    assert ("gates" in printed) != ("tracking" in printed)
 
 
 def test_fly_uses_default_action_and_faults_of_task():
