@@ -21,7 +21,7 @@ NEEDS |= {"circle": "matplotlib", "train": "stable_baselines3"}
 REFUSED = [
     ("trian", "trian"),
     ("replay", "LOG"),
-    ("replay binary.npz", "binary.npz must be a table of text (.csv)"),
+    ("replay binary.npz", "binary.npz is an archive of arrays"),
     ("version extra", "extra"),
     ("consistency --output text.toml", "cannot write to --output text.toml: File exists"),
     # ---- training

@@ -105,8 +105,8 @@ def test_fields_missing_in_file_come_from_its_base(tmp_path):
         ('base = "rtk"\n[imu]\nrate = 2020-01-01', "ImuParams.rate must be a number"),
         ('base = "rtk"\n[imu]\nrate = nan', "ImuParams.rate must be finite"),
         ('base = "rtk"\n[imu.rate]\nx = 1', "ImuParams.rate must be a number"),
-        ('base = "rtk"\n[imu]\nlever_arm_B = [1, 2]', r"lever_arm_B must have shape \(3\)"),
-        ('base = "rtk"\n[imu]\nlever_arm_B = 1', r"lever_arm_B must have shape \(3\)"),
+        ('base = "rtk"\n[imu]\nlever_arm_B = [1, 2]', r"lever_arm_B must have shape \(3,\)"),
+        ('base = "rtk"\n[imu]\nlever_arm_B = 1', r"lever_arm_B must have shape \(3,\)"),
         ('base = "rtk"\n[gnss]\nrate = 7', "GnssParams.rate must divide the IMU rate"),
         (
             'base = "rtk"\n[camera]\nfeatures_I = []',

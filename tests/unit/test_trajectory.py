@@ -277,7 +277,7 @@ def test_hostile_points_are_refused(arguments, options, message):
     ("function", "options", "message"),
     [
         (None, {}, "function must be a function"),
-        (lambda t: (t, t), {}, r"function\(0\) must have shape \(3\)"),
+        (lambda t: (t, t), {}, r"function\(0\) must have shape \(3,\)"),
         (lambda t: (t, t, np.nan), {}, r"function\(0\) must be finite"),
         (lambda t: (abs(t - 1.0), 0, 1), {}, "function must be smooth"),
         (lambda t: (t, 0, 1), {"closed": True}, "must return to its start"),

@@ -158,7 +158,7 @@ def test_only_the_wrong_range_is_rejected(kind):
 
 def test_ranges_that_are_no_ranges_to_the_anchors_are_refused():
     kf, _ = filter_in_flight(UnscentedKalmanFilter)
-    with pytest.raises(ValueError, match=r"uwb_range must have shape \(4\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"uwb_range must have shape \(4,\), got \(3,\)"):
         kf.update(uwb_range=[1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="anchors_I must have 1 to 8 positions, got 9"):
         quad_gym.UwbRangeParams(anchors_I=np.zeros((9, 3)))
