@@ -14,7 +14,6 @@ from scripts.studies.rows import Rows
 
 ENTRIES = Path(__file__).with_name("entries")  #: folder of the entries of others
 HEADS = ("row", "track", "seeds", "success", "crashed", "return", "score", "processor seconds")
-NOT_MEASURED = "Not yet measured with the present flights"
 
 
 def score(returned: Estimated, rule: float, ideal: float) -> Estimated:
@@ -95,8 +94,12 @@ def block(task: BenchTask, measured: Rows, entered: Rows) -> str:
     parts = [f"### {task.name}", question]
     if body:
         parts.append(markdown_table(HEADS, body, texts=2))
-    if missing:
-        parts.append(f"{NOT_MEASURED}: {'; '.join(missing) if body else 'all rows'}.")
+    if not body:
+        parts.append("No row is measured with the present flights yet.")
+    elif missing:
+        parts.append(
+            f"These rows are not measured with the present flights yet: {'; '.join(missing)}."
+        )
     return "\n\n".join(parts)
 
 

@@ -155,13 +155,15 @@ def look_around_noise(rows: Rows) -> str:
 
 def stale_race_headline(rows: Rows) -> str:
     """Late measurements, for readers of one sentence."""
-    arms, pair = Arms(rows, BUDGETS["StaleRace"]), ("estimate", "truth")
+    arms = Arms(rows, BUDGETS["StaleRace"])
+    found = effect(arms["estimate"], arms["truth"])
     return (
         f"Policies that were trained on the estimate pass all gates in {arms.success('estimate')} "
         f"of the episodes on the estimate, and policies that were trained on the truth in "
-        f"{arms.success('truth')} ({verdict(effect(arms[pair[0]], arms[pair[1]]))}; "
-        f"{arms.budget(*pair)}). With a filter that compensates the delay, the latter succeed in "
-        f"{arms.success('truth_delay_compensated')}."
+        f"{arms.success('truth')} ({verdict(found)}; {arms.budget('estimate', 'truth')}). With a "
+        f"filter that compensates the delay, the latter succeed in "
+        f"{arms.success('truth_delay_compensated')}. PD control succeeds in {arms.success('pd')} "
+        f"without compensation."
     )
 
 
@@ -172,9 +174,10 @@ def stale_race_training(rows: Rows) -> str:
         f"On the estimate, policies that were trained on the truth pass all gates in "
         f"{arms.success('truth')} of the episodes, and policies that were trained on the estimate "
         f"in {arms.success('estimate')}, a difference of {arms.against('estimate', 'truth')}. "
-        f"Observing the 15 standard deviations as well changes success to {arms.success('std')} "
-        f"({arms.against('std', 'estimate')}; {arms.budget('truth', 'estimate', 'std')}). On the "
-        f"truth, the policies that were trained on it pass all gates in "
+        f"Policies that also observe the 15 standard deviations succeed in {arms.success('std')}, "
+        f"which differs from those without by {arms.against('std', 'estimate')}. Each arm has "
+        f"{arms.budget('truth', 'estimate', 'std')}. On the truth, the policies that were trained "
+        f"on it pass all gates in "
         f"{arms.success('truth_on_truth')}. PD control passes them on the estimate in "
         f"{arms.success('pd')}."
     )
@@ -187,8 +190,8 @@ def stale_race_compensation(rows: Rows) -> str:
     return (
         f"If the filter compensates the delay in the test, the same policies pass all gates in "
         f"{arms.success(pair[0])} (trained on the truth) and {arms.success(pair[1])} (trained on "
-        f"the estimate without compensation). Compensation therefore gives policies that were "
-        f"trained on the truth {arms.against(pair[0], 'truth')}, and they differ from those that "
+        f"the estimate without compensation). The success of policies that were trained on the "
+        f"truth changes by {arms.against(pair[0], 'truth')}, and then differs from policies that "
         f"were trained and tested on the uncompensated estimate by {arms.against(pair[0], 'std')}."
     )
 
