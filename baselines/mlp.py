@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.normalization import Normalization
-from quad_gym.analysis.reports import as_json
+from quad_gym.analysis.reports import without_numpy
 
 FORMAT = "quad_gym policy 1"  #: identifier of the file format
 LARGEST = 2**28  #: largest size of a file, unpacked [bytes]; the included policies have 0.1 MB
@@ -103,7 +103,9 @@ class MlpPolicy:
         if self.normalization is not None:
             about |= {"format": NORMALIZED_FORMAT, "clip": self.normalization.clip}
             layers |= {"mean": self.normalization.mean, "deviation": self.normalization.deviation}
-        np.savez_compressed(file, about=np.array(json.dumps(about, default=as_json)), **layers)
+        np.savez_compressed(
+            file, about=np.array(json.dumps(about, default=without_numpy)), **layers
+        )
 
     @classmethod
     def load(cls, file: str | Path) -> "MlpPolicy":

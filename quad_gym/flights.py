@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
-from quad_gym.analysis.reports import write_csv
+from quad_gym.analysis.reports import without_numpy, write_csv
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.packing import params_record
@@ -257,13 +257,6 @@ FORMAT, VERSION = "quad_gym flight", 1
 _STATES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 
 
-def _without_numpy(value: Any) -> Any:
-    """Convert a number or array of NumPy, such as a seed, for JSON; others are refused."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise TypeError(f"about must have numbers, texts, lists and dictionaries, got {value!r}")
-
-
 def save_flight(rows: NDArray[Any], scene: FlightScene, about: dict[str, Any], path: Path) -> Path:
     """Write the archive; the file appears only when it is complete."""
     header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "about": about}
@@ -280,7 +273,7 @@ def save_flight(rows: NDArray[Any], scene: FlightScene, about: dict[str, Any], p
     unfinished = path.with_name(path.name + ".part")
     try:
         with unfinished.open("wb") as stream:
-            text = json.dumps(header, default=_without_numpy)
+            text = json.dumps(header, default=without_numpy)
             np.savez_compressed(stream, header=np.array(text), **arrays)
         os.replace(unfinished, path)
     finally:

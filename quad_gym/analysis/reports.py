@@ -63,6 +63,13 @@ def remove_unused_folders() -> None:
             _made.pop(0).rmdir()
 
 
+def without_numpy(value: Any) -> Any:
+    """Convert a number or array of NumPy, such as a seed, for `json.dumps`; refuse others."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a record must have numbers, texts, lists and dictionaries, got {value!r}")
+
+
 def as_json(value: Any) -> Any:
     """Convert a value to JSON types: dataclasses to objects, arrays to lists, NaN to null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

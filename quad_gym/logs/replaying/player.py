@@ -38,14 +38,19 @@ from quad_gym.logs.replaying.measurements import (
     lacks_position,
     nothing_in_common,
 )
-from quad_gym.logs.replaying.results import InnovationSeries, Replay, collected, name_of
+from quad_gym.logs.replaying.results import (
+    InnovationSeries,
+    Replay,
+    collected,
+    name_of,
+    state_columns,
+)
 from quad_gym.packing import blocks_of
 from quad_gym.params.sensor_table import READINGS
 from quad_gym.params.suites import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import FREEDOMS, POSITION_BLOCK
 from quad_gym.records.inputs import INPUT, SAME_TIME, Outcome, SensorReading
-from quad_gym.rotations import dcm_to_quaternion
 
 # --------------------------------------------------------------------------------------------------
 # A filter that processes a log event by event, in the order of arrival.
@@ -412,8 +417,8 @@ class OwnPlayer(Player):
             factors(method, found["covariance"], EVERYONE)
             sigma = np.sqrt(np.diag(found["covariance"][0]))
         zero = np.zeros((1, 3))
-        names = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias")
-        return np.concatenate([*(found.get(name, zero).ravel() for name in names), sigma])
+        state = (found.get(name, zero).ravel() for name in STARTS if name != "covariance")
+        return np.concatenate([*state, sigma])
 
     def _measured(self) -> dict[int, InnovationSeries]:
         """Return times of the measurements, by block; their innovations are unknown."""
@@ -430,14 +435,10 @@ class OwnPlayer(Player):
 
 def _columns(rows: list[Floats]) -> dict[str, Any]:
     """Return fields of `Replay` from rows; an own estimator has no diagnostics of its heading."""
-    r, v, R, b_a, b_g, sigma = np.split(np.array(rows), np.cumsum((3, 3, 9, 3, 3)), axis=1)
+    columns, sigma = state_columns(np.array(rows))
     everywhere = np.ones(len(rows), bool)
     return {
-        "position": r,
-        "velocity": v,
-        "quaternion": dcm_to_quaternion(R.reshape(-1, 3, 3)),
-        "accel_bias": b_a,
-        "gyro_bias": b_g,
+        **columns,
         "sigma": sigma,
         "heading_known": everywhere,
         "diverged": ~everywhere,

@@ -40,11 +40,10 @@ def suite_for(log: Log) -> tuple[str, str]:
     if log.gnss is not None and log.attitude is not None:
         return "mocap", "the log has positions and attitudes of motion capture"
     if log.gnss is not None:
-        used = [
-            "a receiver",
-            *(f"a {n}" for n in ("barometer", "magnetometer") if n in log.streams),
-        ]
-        return "field", f"the log has {', '.join(used[:-1])}{' and ' * bool(used[1:])}{used[-1]}"
+        used = [name for name in ("barometer", "magnetometer") if name in log.streams]
+        *before, last = [f"a {word}" for word in ("receiver", *used)]
+        listed = f"{', '.join(before)} and {last}" if before else last
+        return "field", f"the log has {listed}"
     for name, needs in (("uwb", ("uwb_range",)), ("crazyflie", ("optical_flow", "range_finder"))):
         if set(needs) <= set(log.streams):
             return name, f"the log has {' and '.join(n.replace('_', ' ') for n in needs)}"

@@ -479,15 +479,25 @@ def collected(
     return columns, measured
 
 
-def _columns_of(kept: Floats) -> dict[str, Any]:
-    """Return fields of `Replay` from stored estimates."""
-    r, v, R, b_a, b_g, variances, state = np.split(kept, np.cumsum((3, 3, 9, 3, 3, 15)), 1)
-    return {
+def state_columns(rows: Floats) -> tuple[dict[str, Floats], Floats]:
+    """Return fields of `Replay` from rows of r, v, R_BI, b_a, b_g, and the rest of the rows."""
+    r, v, R, b_a, b_g, rest = np.split(rows, np.cumsum((3, 3, 9, 3, 3)), axis=1)
+    state = {
         "position": r,
         "velocity": v,
         "quaternion": dcm_to_quaternion(R.reshape(-1, 3, 3)),
         "accel_bias": b_a,
         "gyro_bias": b_g,
+    }
+    return state, rest
+
+
+def _columns_of(kept: Floats) -> dict[str, Any]:
+    """Return fields of `Replay` from stored estimates."""
+    columns, rest = state_columns(kept)
+    variances, state = np.split(rest, (15,), axis=1)
+    return {
+        **columns,
         "sigma": np.sqrt(variances),
         "heading_known": (state[:, 5] > 0.0) & (state[:, 4] <= 0.0),
         "diverged": state[:, 0] > 0.0,
