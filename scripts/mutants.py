@@ -9,14 +9,21 @@ with its line, its function and their docstrings. Of the tests in these files, t
 in this order, and the first failure ends the run. Golden flights, which notice any change of a
 flight, are left out, as are a few files of which a test takes minutes.
 
+A line of a kernel is broken in a process whose other kernels are compiled already
+(`mutants_of_kernels.py`), without tests that start processes of their own. Lines of which the rest
+of the kernels depends in another way, such as constants of a module, run last: each compiles most
+kernels again.
+
 The table has one row for each mutant:
 
-- `caught`: a test failed, which the table names. At the end, all these tests run once with
-  unbroken lines, where they must pass.
+- `caught`: a test failed, which the table names, or the process crashed. At the end, all these
+  tests run once with unbroken lines, where they must pass.
 - `survived`: these tests passed. The line is equivalent, another test notices it, or a test is
   missing.
 - `stopped`: the tests took longer than the limit, so the result is open. Remove the row, and
   continue with a larger limit.
+
+Its seconds are of processor time.
 
 A run that is interrupted continues where it stopped: mutants in the table are not run again.
 """
@@ -30,12 +37,12 @@ import math
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -71,6 +78,17 @@ _COSTLY = {
     "tests/unit/test_filter_library.py",
 }
 """Files of which a test takes minutes, or compiles for another processor: left out, too."""
+_PROCESSES = re.compile(
+    r"subprocess|AsyncVectorEnv|multiprocessing|quad_gym\.kernels\.compiling\.cache"
+)
+"""Text in files of tests of which processes, or the cache, would compile all kernels again."""
+_FAST = {
+    "QUAD_GYM_KERNELS": "numba",
+    "QUAD_GYM_LANES": "2",
+    "NUMBA_OPT": "1",
+    "OMP_NUM_THREADS": "1",
+}
+"""Settings with which kernels compile fast; the bits of flights do not depend on them."""
 _WORD = re.compile(r"[A-Za-z][a-z]{3,}|[A-Z]{4,}")
 _FIRST, _MOST = 10, 60
 """Number of tests that run first, and of all that run: the others in the order of their files."""
@@ -124,6 +142,7 @@ class Mutant(NamedTuple):
     weights: tuple[
         tuple[str, float], ...
     ]  #: words of line, function and module, how much each counts
+    function: str = ""  #: name of the function; "" outside of functions
 
     @property
     def name(self) -> str:
@@ -144,7 +163,8 @@ class MutantsArgs:
     nearest: int = 6
     """number of test files that run for each"""
     limit: float = 900.0
-    """time after which the tests of a mutant are stopped [s]; its result is then open"""
+    """time after which the tests of a mutant are stopped [s]: processor time for lines of kernels,
+    otherwise elapsed time; the result is then open"""
     output: Path = Path("results/mutants.csv")
     """table, which is continued"""
 
@@ -176,7 +196,8 @@ def mutants_of(path: Path) -> list[Mutant]:
             for weight, words in parts:
                 weights.update(dict.fromkeys(words_of(words), weight))  # type: ignore[arg-type]
             after = before[:begin] + new + before[end:]
-            found.append(Mutant(str(path), line, before, after, tuple(weights.items())))
+            name = "" if function is None else function.name
+            found.append(Mutant(str(path), line, before, after, tuple(weights.items()), name))
     return found
 
 
@@ -268,7 +289,7 @@ def nearness(weights: dict[str, float], words: Sequence[str]) -> float:
 def nearest_tests(mutant: Mutant, count: int, texts: dict[str, str]) -> list[str]:
     """Return the test files nearest to a mutant, the nearest first.
 
-    Importing its module counts as a few rare words.
+    Importing its module counts as a few rare words, and so does the name of its function.
     """
     module = mutant.file.removesuffix(".py").replace("/", ".")
     words = {name: words_of(text) for name, text in texts.items()}
@@ -281,6 +302,11 @@ def nearest_tests(mutant: Mutant, count: int, texts: dict[str, str]) -> list[str
     rank = {
         name: nearness(weights, words[name])
         + 8.0 * (re.search(rf"\b{re.escape(module)}\b", text) is not None)
+        + 8.0
+        * (
+            re.search(rf"\b{re.escape(mutant.function)}\b", text) is not None
+            and len(mutant.function) > 5
+        )
         for name, text in texts.items()
     }
     return sorted(rank, key=lambda name: (-rank[name], name))[:count]
@@ -299,6 +325,23 @@ def pytest_collection_modifyitems(items: list[Any]) -> None:
     items[:] = [items[i] for i in [*order[:_FIRST], *sorted(order[_FIRST:_MOST])]]
 
 
+def arguments_of(mutant: Mutant | None, tests: Sequence[str]) -> list[str]:
+    """Return the arguments of pytest: all tests, or the nearest ones up to the first failure."""
+    ordered = [] if mutant is None else ["-x", "-p", "scripts.mutants"]
+    return ["-q", "-m", "not slow", "-k", "not golden", *ordered, *tests]
+
+
+def outcome(code: int, printed: str) -> tuple[str, str]:
+    """Return result and failed tests of a run of pytest that was not stopped."""
+    failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", printed, re.MULTILINE)
+    # 1: a test failed; 2, 3, 4: a file cannot be imported; 5: there are no tests; negative: a crash
+    if code in (2, 3, 4):
+        failed = failed or ["import"]
+    if code < 0:
+        failed = [f"crash: {signal.Signals(-code).name}"]
+    return "survived" if code == 0 else "caught" if failed else "not run", " ".join(failed)
+
+
 def run(
     mutant: Mutant | None, tests: Sequence[str], copy: Path, limit: float | None
 ) -> tuple[str, float, str]:
@@ -306,8 +349,7 @@ def run(
 
     Without a mutant, all lines are as they were.
     """
-    began, command = time.monotonic(), [sys.executable, "-m", "pytest", "-q", "-m", "not slow"]
-    command += ["-k", "not golden"]
+    began = _used_by_children()
     environment = {**os.environ, "PYTHONPATH": str(copy)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     if mutant is not None:
@@ -316,10 +358,11 @@ def run(
         lines = kept.splitlines(keepends=True)
         lines[mutant.line - 1] = mutant.after + "\n"
         file.write_text("".join(lines), encoding="utf-8")
-        command += ["-x", "-p", "scripts.mutants"]
         environment[_WORDS_OF] = json.dumps(mutant.weights)
+        if folder_of(mutant) == "kernels":
+            environment.update(_FAST)
     running = subprocess.Popen(
-        [*command, *tests],
+        [sys.executable, "-m", "pytest", *arguments_of(mutant, tests)],
         cwd=copy,
         env=environment,
         stdout=subprocess.PIPE,
@@ -329,20 +372,68 @@ def run(
     )
     try:
         printed, _ = running.communicate(timeout=limit)
-        failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", printed, re.MULTILINE)
-        # 1: a test failed; 2, 3, 4: a file cannot be imported; 5: there are no tests
-        if running.returncode in (2, 3, 4):
-            failed = failed or ["import"]
-        result = "survived" if running.returncode == 0 else "caught" if failed else "not run"
-        return result, time.monotonic() - began, " ".join(failed)
+        result, failed = outcome(running.returncode, printed)
+        return result, _used_by_children() - began, failed
     except subprocess.TimeoutExpired:
-        return "stopped", time.monotonic() - began, ""
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
+        return "stopped", _used_by_children() - began, ""
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(running.pid, signal.SIGKILL)
         running.wait()
         if mutant is not None:
             file.write_text(kept, encoding="utf-8")
+
+
+def _used_by_children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+class CompiledKernels:
+    """A process that has compiled all kernels of a copy, and breaks lines of them."""
+
+    def __init__(self, copy: Path) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "scripts.mutants_of_kernels"],
+            cwd=copy,
+            env={**os.environ, **_FAST, "PYTHONPATH": str(copy)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        print(f"compiled all kernels in {self._answer()['cpu']:.0f} s", flush=True)
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        answer: dict[str, Any] = json.loads(self._process.stdout.readline())
+        return answer
+
+    def run(
+        self, mutant: Mutant | None, tests: Sequence[str], limit: float
+    ) -> tuple[str, float, str] | None:
+        """Run tests as the function `run` does; None: this line cannot be broken here."""
+        order: dict[str, Any] = {"file": "", "line": 0, "after": None, "variables": {}}
+        if mutant is not None:
+            order |= {"file": mutant.file, "line": mutant.line, "after": mutant.after}
+            order["variables"] = {_WORDS_OF: json.dumps(mutant.weights)}
+        order |= {"arguments": arguments_of(mutant, tests), "limit": limit}
+        assert self._process.stdin is not None
+        print(json.dumps(order), file=self._process.stdin, flush=True)
+        answer = self._answer()
+        if answer["code"] is None:
+            return None
+        if answer["code"] == -signal.SIGXCPU:
+            return "stopped", answer["cpu"], ""
+        result, failed = outcome(answer["code"], answer["printed"])
+        return result, answer["cpu"], failed
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
 
 
 def main(args: MutantsArgs) -> None:
@@ -363,26 +454,56 @@ def main(args: MutantsArgs) -> None:
         for path in sorted((ROOT / "tests").rglob("test_*.py"))
         if "clients" not in path.parts and str(path.relative_to(ROOT)) not in _LEFT_OUT | _COSTLY
     }
-    with tempfile.TemporaryDirectory() as folder, args.output.open("a", newline="") as stream:
-        copy, writer = Path(folder), csv.writer(stream, lineterminator="\n")
+    todo = [
+        mutant
+        for mutant in chosen(args.count, args.seed)
+        if mutant.name not in known and folder_of(mutant) in args.only
+    ]
+    with contextlib.ExitStack() as held:
+        copy = Path(held.enter_context(tempfile.TemporaryDirectory()))
+        stream = held.enter_context(args.output.open("a", encoding="utf-8", newline=""))
+        writer = csv.writer(stream, lineterminator="\n")
         for name in _COPIED:
             source = ROOT / name
             (shutil.copytree if source.is_dir() else shutil.copy)(source, copy / name)
         if not known and stream.tell() == 0:
             writer.writerow(COLUMNS)
-        for mutant in chosen(args.count, args.seed):
-            if mutant.name in known or folder_of(mutant) not in args.only:
-                continue
-            tests = nearest_tests(mutant, args.nearest, texts)
-            result, seconds, failed = run(mutant, tests, copy, args.limit)
+
+        def note(
+            mutant: Mutant, tests: list[str], result: str, seconds: float, failed: str
+        ) -> None:
             words = (mutant.before.strip(), mutant.after.strip(), result, f"{seconds:.0f}", failed)
             writer.writerow((mutant.name, mutant.file, mutant.line, *words, " ".join(tests)))
             stream.flush()
             noticed.add(failed)
             print(f"{result:9} {seconds:4.0f} s  {mutant.name}  {failed}", flush=True)
+
+        kernels = None
+        in_kernels = [mutant for mutant in todo if folder_of(mutant) == "kernels"]
+        alone = {name: text for name, text in texts.items() if not _PROCESSES.search(text)}
+        if in_kernels:
+            kernels = CompiledKernels(copy)
+            held.callback(kernels.close)
+            for mutant in in_kernels:
+                tests = nearest_tests(mutant, args.nearest, alone)
+                found = kernels.run(mutant, tests, args.limit)
+                if found is not None:
+                    note(mutant, tests, *found)
+                    todo.remove(mutant)
+        for mutant in todo:
+            tests = nearest_tests(mutant, args.nearest, texts)
+            note(mutant, tests, *run(mutant, tests, copy, args.limit))
         names = sorted(name for name in noticed if "::" in name)
-        result, _, failed = run(None, names, copy, None) if names else ("survived", 0.0, "")
-        if result != "survived":
+        here = [name for name in names if kernels and name.partition("::")[0] in alone]
+        failures = []
+        if kernels and here:
+            failures.append(kernels.run(None, here, 100.0 * args.limit))
+        if others := [name for name in names if name not in here]:
+            failures.append(run(None, others, copy, None))
+        failed = " ".join(
+            found[2] or found[0] for found in failures if found and found[0] != "survived"
+        )
+        if failed:
             sys.exit(f"these tests fail without a broken line, too, and notice nothing: {failed}")
 
 

@@ -3,6 +3,8 @@
 import ast
 import csv
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,67 @@ def test_nearest_tests_import_the_module_or_share_its_rare_words():
     texts["tests/test_near.py"] = """assert record["baseline_noise"]"""
     texts["tests/test_direct.py"] = "from quad_gym.params.gnss import GnssParams"
     assert mutants.nearest_tests(mutant, 2, texts) == ["tests/test_direct.py", "tests/test_near.py"]
+
+
+def test_tests_that_name_the_function_are_nearer():
+    mutant = mutants.Mutant("quad_gym/kernels/image.py", 3, "", "", (("image", 3.0),), "reset_fix")
+    texts = {f"tests/test_{k}.py": "import quad_gym" for k in range(9)}
+    texts["tests/test_near.py"] = "image"
+    texts["tests/test_direct.py"] = "reset_fix(flight)"
+    assert mutants.nearest_tests(mutant, 2, texts) == ["tests/test_direct.py", "tests/test_near.py"]
+
+
+@pytest.mark.parametrize(
+    ("code", "printed", "expected"),
+    [
+        (0, "3 passed", ("survived", "")),
+        (1, "FAILED test_a.py::test_it[x y] - assert", ("caught", "test_a.py::test_it[x y]")),
+        (2, "no module", ("caught", "import")),
+        (5, "no tests ran", ("not run", "")),
+        (-11, "Fatal Python error", ("caught", "crash: SIGSEGV")),
+    ],
+)
+def test_codes_and_reports_of_pytest_give_results(code, printed, expected):
+    assert mutants.outcome(code, printed) == expected
+
+
+BREAKING = """
+import numpy as np
+from scripts import mutants, mutants_of_kernels as broken
+from quad_gym.estimation import solve_wahba
+from quad_gym.kernels.filter.starts import wahba
+
+wahba_of_vectors, step_biases = entries = [
+    broken.dispatcher_of(f"quad_gym.kernels.single:{name}")
+    for name in ("wahba_of_vectors", "step_biases")
+]
+broken.keep_in_memory()
+kernels = broken.Kernels([f"quad_gym.kernels.single:{e.__name__}" for e in entries])
+turn = np.linalg.qr(np.arange(9.0).reshape(3, 3) ** 2 + np.eye(3))[0]
+turn *= np.linalg.det(turn)
+vectors = np.random.default_rng(1).normal(size=(5, 3))
+solve = lambda: solve_wahba(np.ones(5), vectors, vectors @ turn.T)
+np.testing.assert_allclose(solve(), turn, atol=1e-13)
+known = list(wahba.overloads.values())
+file = mutants.ROOT / "quad_gym/kernels/filter/starts.py"
+text = file.read_text()
+change = lambda before, after: kernels.change(file, text, text.replace(before, after))
+change("select(zeta < 0.0, -1.0, 1.0) /", "select(zeta < 0.0, -1.0, 1.0) *")
+assert not wahba_of_vectors.overloads and step_biases.overloads
+assert known == list(wahba.overloads.values())  # its caller is not translated again
+assert not np.allclose(solve(), turn, atol=1e-3)
+try:
+    change("_SWEEPS = 10", "_SWEEPS = 11")
+except broken.Unsuitable as reason:
+    print(reason)
+"""
+
+
+@pytest.mark.slow  # compiles two entries in a process of its own
+def test_a_broken_kernel_changes_the_entries_that_reach_it_and_compiles_no_others():
+    run = [sys.executable, "-c", BREAKING]
+    found = subprocess.run(run, cwd=mutants.ROOT, check=True, capture_output=True, text=True)
+    assert found.stdout == "not in a function\n"
 
 
 def test_weights_of_words_fall_from_module_to_line(tmp_path, monkeypatch):
@@ -95,14 +158,26 @@ def test_campaign_continues_its_table(tmp_path, monkeypatch):
         assert len(tests) == 2
         return "caught", 1.0, "tests/test_it.py::test_it"
 
+    class CompiledKernels:
+        def __init__(self, copy):
+            pass
+
+        def run(self, mutant, tests, limit):
+            return run(mutant, tests, "", limit) if mutant.line % 2 else None
+
+        def close(self):
+            pass
+
     monkeypatch.setattr(mutants, "run", run)
+    monkeypatch.setattr(mutants, "CompiledKernels", CompiledKernels)
     monkeypatch.setattr(mutants.shutil, "copytree", lambda source, to: to.mkdir())
-    for count in (2, 3):
+    for count in (5, 9):
         mutants.main(mutants.MutantsArgs(count=count, nearest=2, output=table))
     with table.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert [row["mutant"] for row in rows] == ran == [m.name for m in mutants.chosen(3, 0)]
+    assert [row["mutant"] for row in rows] == ran
+    assert sorted(ran) == sorted(mutant.name for mutant in mutants.chosen(9, 0))
     assert {row["result"] for row in rows} == {"caught"}
     passed = "caught", 1.0, "tests/test_it.py::test_it"
     with pytest.raises(SystemExit, match=r"fail without a broken line, too.*test_it"):
-        mutants.main(mutants.MutantsArgs(count=3, nearest=2, output=table))
+        mutants.main(mutants.MutantsArgs(count=9, nearest=2, output=table))
