@@ -10,9 +10,9 @@ in this order, and the first failure ends the run. Golden flights, which notice 
 flight, are left out, as are a few files of which a test takes minutes.
 
 A line of a kernel is broken in a process whose other kernels are compiled already
-(`mutants_of_kernels.py`), without tests that start processes of their own. Lines of which the rest
-of the kernels depends in another way, such as constants of a module, run last: each compiles most
-kernels again.
+(`mutants_of_kernels.py`), without tests that start processes of their own. If the nearest tests
+pass, those run that are nearest to the kernels that call it. Lines of which the rest of the kernels
+depends in another way, such as constants of a module, run last: each compiles most kernels again.
 
 The table has one row for each mutant:
 
@@ -31,6 +31,7 @@ A run that is interrupted continues where it stopped: mutants in the table are n
 import ast
 import contextlib
 import csv
+import functools
 import inspect
 import json
 import math
@@ -271,6 +272,37 @@ def chosen(count: int, seed: int) -> list[Mutant]:
     return list(by_line.values())[:count]
 
 
+def with_callers(mutant: Mutant) -> Mutant:
+    """Return a mutant of a kernel with words of the kernels that call its function, and so on.
+
+    Words of a caller count half as much as those of the function that it calls.
+    """
+    weights, names, weight = Counter[str](), {mutant.function} - {""}, 2.0
+    seen = set(names)
+    while names and weight > 0.2:
+        weight *= 0.5
+        found = [kernel for kernel in _kernels() if kernel[3] & names and kernel[1] not in seen]
+        for file, name, text, _ in found:
+            for share, words in ((1.5, Path(file).stem), (1.0, name), (0.5, text)):
+                for word in words_of(words):
+                    weights[word] = max(weights[word], share * weight)  # type: ignore[assignment]
+        names = {kernel[1] for kernel in found}
+        seen |= names
+    return mutant._replace(weights=tuple(weights.items()), function="")
+
+
+@functools.cache
+def _kernels() -> list[tuple[str, str, str, set[str]]]:
+    """Return files, names and docstrings of all kernels, and the names that each uses."""
+    return [
+        (str(path), node.name, ast.get_docstring(node) or "", names - {node.name})
+        for path in sorted((ROOT / "quad_gym" / "kernels").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef)
+        for names in [{part.id for part in ast.walk(node) if isinstance(part, ast.Name)}]
+    ]
+
+
 def nearness(weights: dict[str, float], words: Sequence[str]) -> float:
     """Return the nearness of a text to a mutant, by the words that they share.
 
@@ -485,10 +517,16 @@ def main(args: MutantsArgs) -> None:
             kernels = CompiledKernels(copy)
             held.callback(kernels.close)
             for mutant in in_kernels:
-                tests = nearest_tests(mutant, args.nearest, alone)
-                found = kernels.run(mutant, tests, args.limit)
+                tests, seconds = list[str](), 0.0
+                for near in (mutant, with_callers(mutant)):
+                    rest = {name: text for name, text in alone.items() if name not in tests}
+                    tests += (latest := nearest_tests(near, args.nearest, rest))
+                    found = kernels.run(near, latest, args.limit)
+                    seconds += found[1] if found else 0.0
+                    if found is None or found[0] != "survived":
+                        break
                 if found is not None:
-                    note(mutant, tests, *found)
+                    note(mutant, tests, found[0], seconds, found[2])
                     todo.remove(mutant)
         for mutant in todo:
             tests = nearest_tests(mutant, args.nearest, texts)

@@ -33,6 +33,7 @@ from typing import Any
 
 import pytest
 from numba.core.bytecode import FunctionIdentity
+from numba.core.errors import NumbaError
 
 from quad_gym.kernels.compiling.cache import CodeCache
 from quad_gym.kernels.compiling.decorators import EntryDispatcher
@@ -141,7 +142,7 @@ def _translate_again(kernel: Any) -> list[Any]:
         if fresh.signature != compiled.signature:
             raise Unsuitable(f"type changes to {fresh.signature}")
         assert fresh.fndesc.mangled_name == compiled.fndesc.mangled_name
-        for name in ("_final_module", "_linking_libraries"):
+        for name in ("_final_module", "_shared_module", "_linking_libraries"):
             setattr(compiled.library, name, getattr(fresh.library, name))
     FunctionIdentity._unique_ids = kept
     return [compiled.library for compiled in old.values()]
@@ -193,6 +194,10 @@ def _run(kernels: Kernels, order: dict[str, Any], changed: Any, printed: Any) ->
                 kernels.change(*changed)
             except Unsuitable as reason:
                 print(reason, flush=True)
+                return
+            except NumbaError as error:  # as in each test that calls it
+                print(f"{error}\nERROR compilation", flush=True)
+                code = 1
                 return
         code = int(pytest.main(order["arguments"]))
     finally:
