@@ -123,6 +123,22 @@ def test_weights_of_words_fall_from_module_to_line(tmp_path, monkeypatch):
     }
 
 
+def test_words_of_callers_count_less_with_each_call(tmp_path, monkeypatch):
+    folder = tmp_path / "quad_gym/kernels"
+    folder.mkdir(parents=True)
+    (folder / "sums.py").write_text(
+        "def inner(a):\n    return a + 1\n\n"
+        'def middle(b):\n    """Rate."""\n    return inner(b)\n\n'
+        "def outer(c):\n    return middle(c)\n\ndef other(d):\n    return d\n"
+    )
+    monkeypatch.setattr(mutants, "ROOT", tmp_path)
+    mutants._kernels.cache_clear()
+    mutant = mutants.Mutant("quad_gym/kernels/sums.py", 2, "", "", (), "inner")
+    weights = dict(mutants.with_callers(mutant).weights)
+    mutants._kernels.cache_clear()
+    assert weights == {"sum": 1.5, "middle": 1.0, "rate": 0.5, "outer": 0.5}
+
+
 @pytest.mark.slow  # three runs of pytest
 def test_tests_that_fail_catch_a_mutant_and_stopped_ones_leave_it_open(tmp_path):
     (tmp_path / "scripts").mkdir()
