@@ -56,7 +56,9 @@ def _pictures(study: str, task: str, options: str, *names: str) -> Result:
 
 
 _FILMED = "--arms truth included --seeds 1 --episodes 200 --video webp"
-_DEFAULTS = "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {}"
+_DEFAULTS = (
+    "docs/examples/sb3_defaults.py --algorithm ppo --env-id QuadGym/{}-v0 --seed {} --every 2000000"
+)
 
 CATALOG = {
     result.name: result

@@ -17,6 +17,7 @@ from baselines.recipes import ALGORITHMS, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
+from quad_gym.records.sizes import PRECISION, PRECISIONS
 from scripts.studies.fitting import errors_of
 
 
@@ -50,11 +51,14 @@ class Arm(Checked, kw_only=False):
     others are with Stable-Baselines3"""
     parameters: ReadOnly = field(default_factory=dict)
     """Parameters of the algorithm that override the recipe's"""
+    precision: Annotated[str, partial(check.choice, choices=PRECISIONS)] = PRECISION
+    """Precision of the flights in training; in the test, it is always the one of the process"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         given = self.policy if self.flies is None else f"taken from {self.flies}"
         learns = self.training or self.learning or self.parameters or self.algorithm != "ppo"
+        learns = learns or self.precision != PRECISION
         if given is not None and learns:
             raise ValueError(f"Arm {self.name} must not be trained, because its policy is {given}")
         if self.policy is not None and self.flies is not None:
@@ -125,6 +129,13 @@ ARMS = (
         "estimate + standard deviation, reward for certainty",
         environment=_WITH_STD,
         learning=_STD_CERTAINTY,
+    ),
+    Arm(
+        "std_certainty_single",
+        "estimate + standard deviation, reward for certainty, in single precision",
+        environment=_WITH_STD,
+        learning=_STD_CERTAINTY,
+        precision="single",
     ),
     Arm("truth", "truth", learning=TRUTH),
     Arm("estimate", "estimate"),

@@ -12,6 +12,7 @@ everything is trained again.
 import fnmatch
 import hashlib
 import json
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +24,8 @@ from baselines.recipes import Recipe, first_seed, recipe
 from baselines.training import train
 from quad_gym import IDS
 from quad_gym.analysis.reports import write_json
-from quad_gym.experiments import Flown, Training, Trial
+from quad_gym.experiments import PAUSE, Flown, Job, Training, Trial
+from quad_gym.records.sizes import PRECISION
 from scripts.studies.arms import Arm, chosen_arms
 from scripts.studies.rows import Rows
 from scripts.studies.scores import worst_tenth
@@ -195,7 +197,8 @@ class Cell:
 
         Raises `StoppedError` if the training was stopped, from where it continues next time.
         """
-        seconds = 0.0 if self.training is None else _trained(self.training)
+        precision = self.arm.precision
+        seconds = 0.0 if self.training is None else _trained(self.training, precision)
         began = time.process_time()
         policy = self.arm.policy if self.training is None else self.training.best
         assert policy is not None
@@ -231,22 +234,50 @@ class Cell:
         }
 
 
-def _trained(training: Training) -> float:
+def _trained(training: Training, precision: str) -> float:
     """Complete a training; returns its processor time over all sittings [s]."""
     file = training.folder / "processor.json"
     before = json.loads(file.read_text(encoding="utf-8"))["seconds"] if file.exists() else 0.0
     if training.finished:
         return float(before)
-    began = time.process_time()
+    began = _processor_time()
     try:
-        done = train(training.plan, training.folder, resume=True, tensorboard=False, quiet=True)
+        if precision == PRECISION:
+            done = train(training.plan, training.folder, resume=True, tensorboard=False, quiet=True)
+            finished = done.finished
+        else:
+            finished = _trained_elsewhere(training, precision)
     finally:
-        spent = before + time.process_time() - began
+        spent = before + _processor_time() - began
         if training.folder.exists():
             write_json(file, {"seconds": spent})
-    if not done.finished:
+    if not finished:
         raise StoppedError
     return float(spent)
+
+
+def _processor_time() -> float:
+    """Processor time of this process and those that it has waited for [s]."""
+    return sum(os.times()[:4])
+
+
+def _trained_elsewhere(training: Training, precision: str) -> bool:
+    """Train in a process with another precision; returns True if all steps are completed."""
+    os.environ["QUAD_GYM_PRECISION"] = (
+        precision  # the new process inherits it; this one has read its own
+    )
+    try:
+        job = Job(training.folder / "logs", training)
+    finally:
+        os.environ["QUAD_GYM_PRECISION"] = PRECISION
+    while (ended := job.ended()) is None:
+        try:
+            time.sleep(PAUSE)
+        except KeyboardInterrupt:
+            job.stop()
+    if ended.kind not in ("finished", "stopped"):
+        raise RuntimeError(f"training {training.name} in {precision} precision {ended}")
+    return ended.kind == "finished"
 
 
 def row_key(row: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -153,6 +153,21 @@ def look_around_noise(rows: Rows) -> str:
     return compared(Arms(rows, BUDGETS["LookAround"]), names, against)
 
 
+def look_around_single(rows: Rows) -> str:
+    """Flights of the training in single precision, all else equal."""
+    arms = Arms(rows, BUDGETS["LookAround"])
+    names = single, double = ("std_certainty_single", "std_certainty")
+    success, crashed = ([share(arms[name].estimated(column)) for name in names] for column in RATES)
+    return (
+        f"In LookAround, policies whose training flew in single precision succeed in {success[0]} "
+        f"of the episodes in double precision and crash in {crashed[0]} "
+        f"({arms.budget(single)}). Those whose training flew in double precision succeed in "
+        f"{success[1]} and crash in {crashed[1]} ({arms[double].seeds} seeds), a difference in "
+        f"success of {arms.against(single, double)} and in crashes of "
+        f"{arms.against(single, double, 'crashed')}."
+    )
+
+
 def stale_race_headline(rows: Rows) -> str:
     """Late measurements, for readers of one sentence."""
     arms = Arms(rows, BUDGETS["StaleRace"])
@@ -353,6 +368,7 @@ CONCLUSIONS: Mapping[str, tuple[str, Conclusion]] = {
     "look_around.observation.table": ("look_around", look_around_observation),
     "look_around.factors.table": ("look_around", look_around_factors),
     "look_around.noise.table": ("look_around", look_around_noise),
+    "look_around.single": ("look_around", look_around_single),
     "stale_race.table": ("stale_race", arms_table("stale_race", BUDGETS["StaleRace"])),
     "stale_race.headline": ("stale_race", stale_race_headline),
     "stale_race.training": ("stale_race", stale_race_training),

@@ -118,6 +118,12 @@ PARTS: tuple[Part, ...] = (
         _part("StaleRace", f"success after {steps:,} steps", *CURVE_ARMS, steps=steps)
         for steps in RACE_CURVE
     ),
+    _part(
+        "LookAround",
+        "training in single precision",
+        "std_certainty_single",
+        seeds=FEWER,
+    ),
     _part("OutageDash", "a policy with memory", "recurrent", seeds=FEWER),
     _part("LookAround", "noise alone, and a privileged critic", "noisy", "matched"),
     _part(
