@@ -23,7 +23,9 @@ from scripts.studies.parts import (
 from scripts.studies.report import number, share
 from scripts.studies.rows import RATES, Effect, Rows, effect, mean_effect
 
-NOT_MEASURED = "Not yet measured with the present flights (`python -m scripts.studies run --all`)."
+NOT_MEASURED = (
+    "This is not yet measured with the present flights (`python -m scripts.studies run --all`)."
+)
 """Text of a conclusion or table whose rows are missing or of other flights."""
 
 Conclusion = Callable[[Rows], str]
@@ -33,9 +35,12 @@ class MissingRowsError(ValueError):
     """Error raised if an arm has not been measured."""
 
 
-def points(found: Effect) -> str:
+def points(found: Effect, separator: str = " ") -> str:
     """Difference of rates in percentage points, with its interval and verdict."""
-    return f"{number(found.scaled(100.0).size, 0)} points ({verdict(found)})"
+    return f"{number(found.scaled(100.0).size, 0)} points{separator}({verdict(found)})"
+
+
+LINE = "<br>"  #: separator in cells of tables, so that these are narrow
 
 
 def verdict(found: Effect) -> str:
@@ -73,16 +78,21 @@ class Arms:
         seeds = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         return f"{seeds} seeds, {self._steps:,} steps"
 
-    def against(self, first: str, second: str, column: str = "success") -> str:
+    def against(
+        self, first: str, second: str, column: str = "success", separator: str = " "
+    ) -> str:
         """Difference of two arms."""
-        return points(effect(self[first], self[second], column))
+        return points(effect(self[first], self[second], column), separator)
 
 
 def compared(arms: Arms, names: Sequence[str], against: Mapping[str, str]) -> str:
     """Table of arms and their differences from others, given by the words for these."""
     body = []
     for name in names:
-        others = [arms.against(name, other) if name != other else "" for other in against.values()]
+        others = [
+            arms.against(name, other, separator=LINE) if name != other else ""
+            for other in against.values()
+        ]
         body.append([arms[name].label, str(arms[name].seeds), arms.success(name), *others])
     heads = ["trained on", "seeds", "success", *(f"difference from {words}" for words in against)]
     return table(heads, body)
@@ -131,7 +141,7 @@ def look_around_observation(rows: Rows) -> str:
     for ours, other in _FACTORS[_OBSERVATION]:
         condition = arms[other].label.removeprefix("truth").lstrip("+, ") or "neither"
         shown = [share(arms[name].estimated("success")) for name in (other, ours)]
-        changes = [points(effect(arms[ours], arms[other], column)) for column in RATES]
+        changes = [points(effect(arms[ours], arms[other], column), LINE) for column in RATES]
         body.append([condition, *shown, *changes])
     heads = ["in both arms", "trained on the truth", "trained on the estimate"]
     return table([*heads, "difference", "difference in crashes"], body)
@@ -223,7 +233,7 @@ def stale_race_curve(rows: Rows) -> str:
     body = []
     for steps in sorted((*RACE_CURVE, BUDGETS["StaleRace"])):
         arms, (truth, ours) = Arms(rows, steps), CURVE_ARMS
-        changed = arms.against(ours, truth)
+        changed = arms.against(ours, truth, separator=LINE)
         body.append([f"{steps:,}", arms.success(truth), arms.success(ours), changed])
     seeds = Arms(rows, BUDGETS["StaleRace"])[CURVE_ARMS[0]].seeds
     heads = [
@@ -286,7 +296,7 @@ def when_to_train(rows: Rows) -> str:
                     _shown(rule, column),
                     _shown(ideal.estimated(column), column),
                     _shown(cost.size, column),
-                    f"{_shown(gain.size, column)} ({verdict(gain)})",
+                    f"{_shown(gain.size, column)}{LINE}({verdict(gain)})",
                     f"{truth.seeds}",
                 ]
             )

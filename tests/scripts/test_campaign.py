@@ -180,7 +180,7 @@ def test_conclusions_follow_from_rows_and_name_arms_seeds_budget_and_interval(tm
     assert "| 50 [" in both
     assert "| 80 [" in both
     assert "| 30 [" in both
-    assert "points (p < 0.001) | -30 [" in both
+    assert "points<br>(p < 0.001) | -30 [" in both
     factors = found["look_around.factors.table"]
     for factor, points in (("estimate", 30), ("standard deviation", 20), ("certainty", 10)):
         row = next(line for line in factors.splitlines() if f"{factor} |" in line)
