@@ -21,12 +21,13 @@ FORMAT = "quad_gym policy 1"  #: identifier of the file format
 LARGEST = 2**28  #: largest size of a file, unpacked [bytes]; the included policies have 0.1 MB
 NORMALIZED_FORMAT = "quad_gym policy 2"  #: identifier of a file that has a normalization
 
-_ACTIVATIONS: dict[str, Any] = {
+FUNCTIONS: dict[str, Any] = {
     "relu": lambda x: np.maximum(x, 0.0),
     "tanh": np.tanh,
     "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
     "none": lambda x: x,
 }
+"""Activations by name."""
 
 
 class MlpPolicy:
@@ -60,9 +61,9 @@ class MlpPolicy:
         fitting = all(b.shape == (w.shape[0],) for w, b in zip(weights, biases, strict=True))
         if not (chained and fitting and len(activations) == len(weights)):
             raise ValueError(f"weights, biases and activations must fit each other, got {shapes}")
-        unknown = sorted(set(activations) - set(_ACTIVATIONS))
+        unknown = sorted(set(activations) - set(FUNCTIONS))
         if unknown:
-            raise ValueError(f"activations must be among {', '.join(_ACTIVATIONS)}, got {unknown}")
+            raise ValueError(f"activations must be among {', '.join(FUNCTIONS)}, got {unknown}")
         self.weights, self.biases = tuple(weights), tuple(biases)
         self.activations, self.record = tuple(activations), dict(record)
         if normalization is not None and len(normalization.mean) != self.inputs:
@@ -91,7 +92,7 @@ class MlpPolicy:
         if self.normalization is not None:
             x = self.normalization(x)
         for W, b, activation in zip(self.weights, self.biases, self.activations, strict=True):
-            x = _ACTIVATIONS[activation](x @ W.T + b)
+            x = FUNCTIONS[activation](x @ W.T + b)
         return np.clip(x, -1.0, 1.0).astype(np.float32), None
 
     def save(self, file: str | Path | IO[bytes]) -> None:

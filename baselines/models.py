@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 import quad_gym
 from baselines.keeping import STATE, RunKeeper, best_file, reading_checkpoint, replace_file
-from baselines.recipes import Linear, Plan, Recipe, first_seed
+from baselines.recipes import ALGORITHMS, Linear, Plan, Recipe, first_seed
 from quad_gym.params import checks as check
 
 # --------------------------------------------------------------------------------------------------
@@ -81,6 +81,7 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
     Raises a ValueError if a parameter is unknown to the algorithm, or its value is invalid.
     """
     chosen = plan.recipe
+    check.choice("algorithm of Stable-Baselines3", chosen.algorithm, ALGORITHMS)
     parameters: dict[str, Any] = {}
     if chosen.parameters.get("critic_only"):
         raise ValueError(

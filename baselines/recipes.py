@@ -76,6 +76,9 @@ ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
 environments."""
 
+IMITATION = "dagger"
+"""Algorithm that imitates another controller (`baselines.compiled_ppo.imitation`)."""
+
 ACTIVATIONS = ("relu", "tanh", "elu")  #: activations between the layers of a policy
 
 
@@ -99,8 +102,8 @@ ReadOnly = Annotated[Mapping[str, Any], _read_only]
 class Recipe(Checked):
     """Hyperparameters of a training."""
 
-    algorithm: Annotated[str, partial(check.choice, choices=ALGORITHMS)] = "ppo"
-    """Algorithm, one of `ALGORITHMS`"""
+    algorithm: Annotated[str, partial(check.choice, choices=(*ALGORITHMS, IMITATION))] = "ppo"
+    """Algorithm, one of `ALGORITHMS`, or `IMITATION`"""
     steps: Annotated[int, check.whole] = 1_800_000
     """Environment steps, summed over all flights"""
     n_envs: Annotated[int, check.whole] = 256
@@ -116,8 +119,8 @@ class Recipe(Checked):
     reward_scale: check.Positive = 0.2
     """Factor on the rewards that the algorithm receives; a perfect circle then returns 160"""
     action_noise: check.Positive = 0.1
-    """Standard deviation of the exploration noise on actions of TD3; the policies of the other
-    algorithms are stochastic themselves"""
+    """Standard deviation of the exploration noise on actions of TD3, and in imitation; the policies
+    of the other algorithms are stochastic themselves"""
     flights: ReadOnly = field(default_factory=lambda: {"start": "mixed"})
     """Keywords of the environment for training only, unless they are given explicitly"""
     parameters: ReadOnly = field(default_factory=dict)
@@ -180,8 +183,17 @@ _DEFAULTS = {
     "sac": _SAC,
     "td3": _SAC.replace(algorithm="td3", parameters={**_OFF_POLICY, "policy_delay": 2}),
     "tqc": _SAC.replace(algorithm="tqc"),
+    # found on OutageDash; each step is in 14 minibatches on average
+    IMITATION: Recipe(
+        algorithm=IMITATION,
+        steps=300_000,
+        n_envs=250,
+        learning_rate=(1e-3, 1e-5),
+        action_noise=0.25,
+        flights={},
+    ),
 }
-"""Default recipe of each algorithm, found on Circle."""
+"""Default recipe of each algorithm; those of the other algorithms were found on Circle."""
 
 
 def _changed(base: Recipe, parameters: Mapping[str, Any], **fields: Any) -> Recipe:
@@ -216,12 +228,12 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
 
 
 def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
-    """Included recipe for a task, by its id, and one of `ALGORITHMS`.
+    """Included recipe for a task, by its id, and one of `ALGORITHMS`, or `IMITATION`.
 
     Recurrent PPO has the recipe of PPO, and an LSTM of 64 units.
     """
     check.choice("env_id", env_id, tuple(IDS))
-    check.choice("algorithm", algorithm, ALGORITHMS)
+    check.choice("algorithm", algorithm, (*ALGORITHMS, IMITATION))
     if algorithm == "recurrent_ppo":
         base = recipe(env_id)
         memory = {**base.policy, "lstm_hidden_size": 64}

@@ -64,10 +64,14 @@ class Networks:
             W[:] = last_gain * orthogonal(W.shape, rng)
         self._room = tuple(room[0] for room in self.rooms(1)[:2])
 
-    def layers(self, table: Table) -> list[tuple[Any, Any]]:
-        """Weights (outputs, inputs) and biases (outputs,) of each layer, as views."""
+    def layers(self, table: Table, vector: Floats | None = None) -> list[tuple[Any, Any]]:
+        """Weights (outputs, inputs) and biases (outputs,) of each layer, as views.
+
+        They are views of the parameters, or of a vector like these, such as a gradient.
+        """
+        vector = self.params if vector is None else vector
         return [
-            (self.params[w : w + i * o].reshape(o, i), self.params[b : b + o])
+            (vector[w : w + i * o].reshape(o, i), vector[b : b + o])
             for i, o, w, b, _ in table.tolist()
         ]
 
@@ -269,7 +273,7 @@ class CompiledPPO:
         env_seed: int | None = None,
         threads: int | None = None,
     ) -> None:
-        inputs, outputs = _sizes(env)
+        inputs, outputs = sizes_of(env)
         self.parameters = _checked(recipe, inputs)
         self.env, self.recipe, self.num_timesteps = env, recipe, 0
         self.losses: dict[str, float] = {}
@@ -324,7 +328,7 @@ class CompiledPPO:
     def prepare(self) -> None:
         """Begin the first episodes, and compile all kernels."""
         if self._seen is None:
-            self._seen = _floats(self.env.reset(seed=self._env_seed)[0])
+            self._seen = as_floats(self.env.reset(seed=self._env_seed)[0])
         self.networks.evaluate(self._seen[:1])
         self.learner.prepare()
 
@@ -346,10 +350,7 @@ class CompiledPPO:
         Its record defaults to the observations, actions and control rate of the training, so that
         `load_policy` refuses environments with others.
         """
-        if record is None:
-            ours = isinstance(self.env.unwrapped, QuadVectorEnv)
-            record = {"interface": interface_of(self.env) if ours else {}}
-        return self.networks.policy(record)
+        return self.networks.policy(record_for(self.env) if record is None else record)
 
     @property
     def training_return(self) -> float:
@@ -403,12 +404,12 @@ class CompiledPPO:
             seen, reward, terminated, truncated, info = self.env.step(
                 self._actions[t].clip(-1.0, 1.0)
             )
-            self._seen = _floats(seen)
+            self._seen = as_floats(seen)
             self._rewards[t] = np.float32(self.recipe.reward_scale) * reward.astype(np.float32)
             self._ended[t] = terminated | truncated
             cut = np.flatnonzero(truncated & ~terminated)
             if cut.size:  # bootstrap truncated episodes with the critic's value
-                last = _floats(np.stack(info["final_obs"][cut]))
+                last = as_floats(np.stack(info["final_obs"][cut]))
                 value = evaluate(last)[1]
                 self._rewards[t, cut] += self.parameters["gamma"] * value
             self._returns += reward
@@ -452,11 +453,18 @@ def advantages(
     return found
 
 
-def _floats(observations: Any) -> NDArray[np.float32]:
+def record_for(env: VectorEnv[Any, Any, Any]) -> dict[str, Any]:
+    """Record of a policy with the observations, actions and control rate of its training."""
+    ours = isinstance(env.unwrapped, QuadVectorEnv)
+    return {"interface": interface_of(env) if ours else {}}
+
+
+def as_floats(observations: Any) -> NDArray[np.float32]:
+    """Convert observations or actions to contiguous float32."""
     return np.ascontiguousarray(observations, np.float32)
 
 
-def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
+def sizes_of(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
     """Check the spaces and the autoreset mode; return lengths of observation and action."""
     sizes = []
     for name, space in (

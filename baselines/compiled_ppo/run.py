@@ -1,4 +1,4 @@
-"""Training of a plan with the compiled PPO."""
+"""Training of a plan with the compiled engine: PPO, or imitation."""
 
 import io
 import pickle
@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 
+from baselines.compiled_ppo.imitation import Imitation, columns_of
 from baselines.compiled_ppo.ppo import CompiledPPO
 from baselines.keeping import (
     STATE,
@@ -20,7 +21,7 @@ from baselines.keeping import (
     replace_file,
 )
 from baselines.policies import interface_of
-from baselines.recipes import Plan, description, first_seed
+from baselines.recipes import IMITATION, Plan, description, first_seed
 
 
 class Events:
@@ -48,15 +49,15 @@ class Events:
 
 
 class CompiledKeeper(RunKeeper):
-    """`RunKeeper` for the compiled PPO."""
+    """`RunKeeper` for the compiled engine."""
 
     events: Events | None = None
     """Writer for TensorBoard; None: no files"""
 
-    def _training_return(self, model: CompiledPPO) -> float:
+    def _training_return(self, model: CompiledPPO | Imitation) -> float:
         return model.training_return
 
-    def _save(self, model: CompiledPPO, *, best: bool) -> None:
+    def _save(self, model: CompiledPPO | Imitation, *, best: bool) -> None:
         content = io.BytesIO()
         record = {"plan": description(self._plan), "interface": interface_of(self._judge)}
         if self.events is not None:
@@ -71,10 +72,15 @@ class CompiledKeeper(RunKeeper):
         replace_file(last_file(self._plan, self._folder), content.getvalue())
 
 
-def make_compiled(plan: Plan) -> CompiledPPO:
+def make_compiled(plan: Plan) -> CompiledPPO | Imitation:
     """Make the untrained model of a plan, with its environment."""
     seed = first_seed("training", plan.seed, plan.recipe.n_envs)
     flights = plan.make_vector_flights()
+    if plan.recipe.algorithm == IMITATION:
+        judge = plan.make_judge()
+        columns = columns_of(interface_of(judge)["observation"], flights)
+        judge.close()
+        return Imitation(flights, plan.recipe, columns=columns, seed=plan.seed, env_seed=seed)
     if plan.recipe.parameters.get("critic_only"):
         _require_leaving(plan, flights)
     return CompiledPPO(flights, plan.recipe, seed=plan.seed, env_seed=seed, threads=plan.threads)
@@ -114,7 +120,7 @@ def run(
     if tensorboard:
         keeper.events = Events(folder / "tensorboard" / "run")
 
-    def watch(model: CompiledPPO) -> bool:
+    def watch(model: CompiledPPO | Imitation) -> bool:
         keeper.watch(model, model.num_timesteps)
         return not keeper.stopping
 
