@@ -412,3 +412,26 @@ def test_quaternions_of_a_turn_do_not_change_their_sign():
     half = -0.5 * (result.time - time[0])
     np.testing.assert_allclose(np.stack([w, z]), [np.cos(half), np.sin(half)], atol=1e-2)
     np.testing.assert_allclose(np.stack([x, y]), 0.0, atol=1e-2)
+
+
+def test_measurement_from_before_the_start_is_not_late():
+    """It was taken before the first sample of the IMU, and arrives within the jitter of others."""
+    suite, rng = quad_gym.sensor_suite("uwb"), np.random.default_rng(0)
+    place, count = np.array([1.0, 0.5, 1.5]), 100
+    ranges = np.linalg.norm(place - np.array(suite.uwb_range.anchors_I), axis=1)
+    stamps = 0.005 + 0.04 * np.arange(count)
+    delays = rng.uniform(0.01, 0.05, count)
+    delays[[0, 5]] = 0.008, 0.001
+    ticks = 0.01 * np.arange(1, 401)
+    columns = {"time": np.append(ticks, stamps), "received": np.append(ticks, stamps + delays)}
+    wide = np.full((len(ticks) + count, 10), np.nan)
+    wide[: len(ticks), :6] = np.array([0, 0, 0, 0, 0, 9.8]) + 1e-3 * rng.normal(size=(400, 6))
+    wide[len(ticks) :, 6:] = ranges + 0.1 * rng.normal(size=(count, 4))
+    columns |= {"gyro": wide[:, :3], "accel": wide[:, 3:6]}
+    columns |= {f"uwb_range_{k}": wide[:, 6 + k] for k in range(4)}
+    order = np.argsort(columns["received"], kind="stable")
+    log = {name: column[order] for name, column in columns.items()}
+    result = replay(log, sensors=suite, start={"position": place, "heading": 0.0})
+    assert (result.time[0], result.too_late) == (0.01, 0)
+    assert not result.problems
+    assert len(result.measured["uwb_range_0"].time) == count - 1

@@ -100,6 +100,7 @@ class Player:
         self.late: dict[str, list[float]] = {}  # ages of what came too late, by sensor
         self.history = InputHistory(self.window, max(LONGEST_STEP, suite.imu.dt), numbered=True)
         self.writer = TapeWriter(self.measured.by_number, self.history)
+        self.began = np.nan  #: time of the start
         self.times = np.empty(0)  #: of the estimates
         self.stamps = np.empty((0, 2))  #: of all updates, each with its arrival
 
@@ -171,7 +172,7 @@ class Player:
         if fix is None:
             return None
         self.start.begin(self.filter, self.suite)
-        begin = self.filter.time
+        begin = self.began = self.filter.time
         self.history.begin(begin)
         if self.calls is not None:
             given = self.start.from_fix or {"time": begin, **self.start.given}
@@ -253,10 +254,13 @@ class Player:
         measures, old = inputs["rank"] > 0, inputs["outcome"] == Outcome.TOO_OLD
         took = measures & ~old
         self.writer.rows.extend(np.column_stack([kinds, places])[took].ravel().tolist())
-        for kind, place in zip(kinds[old].tolist(), places[old].tolist(), strict=True):
+        # what was measured before the start and arrives soon after it is not late
+        age = inputs["now"] - inputs["time"]
+        late = old & ((inputs["time"] > self.began) | (age > self.window))
+        for kind, place in zip(kinds[late].tolist(), places[late].tolist(), strict=True):
             stream = self.streams[names[kind]]
-            age = float(stream.received[place] - stream.time[place])
-            self.late.setdefault(names[kind], []).append(age)
+            waited = float(stream.received[place] - stream.time[place])
+            self.late.setdefault(names[kind], []).append(waited)
         if self.calls is not None:
             rows = places.copy()
             rows[kinds == 0] = self._samples(places[kinds == 0], before)
