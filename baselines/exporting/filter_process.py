@@ -30,7 +30,7 @@ from quad_gym.kernels.stages import Stage, needed_stages
 from quad_gym.logs.formats.log import mounting_of
 from quad_gym.logs.replaying.results import COLUMNS
 from quad_gym.params.sensor_table import READINGS
-from quad_gym.params.suites import SensorSuite
+from quad_gym.params.suites import ALL_SUITES, SensorSuite
 from quad_gym.records import (
     BLOCKS_OF,
     FIRST_OF_FLIGHTS,
@@ -234,7 +234,7 @@ class Sources:
             "MOUNTING": "the library rotates them" if turns else "B does not differ",
             "TITLE": f"State estimator: {suite.estimator.kind.upper()} of the sensor suite "
             f'"{self.label}", quad_gym {quad_gym.__version__}.',
-            "SUITE": self.label,
+            "SUITE": self.label if self.label in ALL_SUITES else f"{self.label}.toml",
             "ESTIMATOR": suite.estimator.kind,
             "TARGET": TARGETS[self.target].words,
             "FMA": "fma" in TARGETS[self.target].processor,

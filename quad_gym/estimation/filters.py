@@ -428,13 +428,13 @@ class KalmanFilter(FilterEstimate):
                 `predict`.
             time: Time stamp of the measurements [s], from `oldest_time` to the filter's `time`;
                 None: the filter's `time`.
-            others: Measurements of aiding sensors in the suite: `barometer`, the height in I from
-                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T];
-                `optical_flow`, (2,) angular rates [rad/s]; `range_finder` [m]; `uwb_range`,
-                (anchors,) ranges [m]. Also standard deviations that replace the suite's, per axis:
-                `gnss_sigma`, a number or three numbers (east, north, up) [m]; `velocity_sigma`
-                [m/s], `baseline_sigma` [rad], `pixel_sigma` [pixels], and for each aiding sensor,
-                such as `barometer_sigma` [m], in its unit.
+            others: Measurements of the suite's other sensors by their names, with the units and
+                frames of `measured.NAME` in docs/reference/fields.md and the shape (), (length,),
+                (blocks,) or (blocks, length): `barometer` [m], `magnetometer`, (3,) in B [T].
+                Also standard deviations that replace the suite's, per axis: `gnss_sigma`, a number
+                or three numbers (east, north, up) [m]; `velocity_sigma` [m/s], `baseline_sigma`
+                [rad], `pixel_sigma` [pixels], and for each other sensor, such as `barometer_sigma`
+                [m], in its unit.
 
         Raises:
             ValueError: If an argument has another shape or is not finite, the suite lacks the

@@ -351,6 +351,14 @@ def matrix(name: str, value: Any, rows: int | None, columns: int) -> tuple[tuple
     return tuple(tuple(row) for row in numbers.tolist())
 
 
+def places(name: str, value: Any, *, most: int) -> Matrix:
+    """`value` as one to `most` positions (n, 3)."""
+    found = matrix(name, value, None, 3)
+    if not 1 <= len(found) <= most:
+        raise ValueError(f"{name} must have 1 to {most} positions, got {len(found)}")
+    return found
+
+
 def ticks(name: str, rate: float, tick_rate: float) -> int:
     """Return the number of ticks between two events at `rate` [Hz], which must be whole."""
     ratio = tick_rate / positive(name, rate)

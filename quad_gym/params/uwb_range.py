@@ -1,16 +1,12 @@
 """Ranges to anchors by ultra-wideband radio, and their errors."""
 
-from typing import Annotated, Any, ClassVar
+from functools import partial
+from typing import Annotated, ClassVar
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
 
-
-def _anchors(name: str, value: Any) -> check.Matrix:
-    places = check.matrix(name, value, None, 3)
-    if not 1 <= len(places) <= UwbRangeParams.most_blocks:
-        raise ValueError(f"{name} must have 1 to 8 positions, got {len(places)}")
-    return places
+MOST_ANCHORS = 8  #: as in the Crazyflie firmware
 
 
 class UwbRangeParams(AidParams):
@@ -27,7 +23,7 @@ class UwbRangeParams(AidParams):
     noise_sigma: check.Positive = 0.1
     """standard deviation of the white noise [m]; Decawave DWM1000 data sheet: 10 cm. The Crazyflie
     firmware assumes 0.25 m for two-way ranges (lpsTwrTag.c)"""
-    anchors_I: Annotated[check.Matrix, _anchors] = (
+    anchors_I: Annotated[check.Matrix, partial(check.places, most=MOST_ANCHORS)] = (
         (-5.0, -5.0, 0.2),
         (5.0, -5.0, 3.0),
         (5.0, 5.0, 0.2),
@@ -46,7 +42,7 @@ class UwbRangeParams(AidParams):
     """longest detour, which is uniform from zero on [m]; engineering judgment"""
 
     _ideal: ClassVar = {"latency": 0.0, "outlier_probability": 0.0}
-    most_blocks, rows, observes = 8, 10, ("position", "height", "velocity")
+    most_blocks, rows, observes = MOST_ANCHORS, 2 + MOST_ANCHORS, ("position", "height", "velocity")
     reads_velocity = False
     unit, frame, meaning = "m", "-", "distances to the anchors"
     raw = ("m", "-", 100.0)

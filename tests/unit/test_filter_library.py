@@ -207,6 +207,8 @@ def test_exported_filter_takes_samples_in_the_axes_of_sensors(tmp_path):
         log_accel_bias=(0.1, 0.0, 0.2),
     )
     export_filter(suite, "askew", "x86-64", tmp_path)
+    # the suite is none of the built-in ones, so a command needs its file
+    assert "quad-gym replay LOG --sensors askew.toml " in (tmp_path / "README.md").read_text()
     program = tmp_path / "example"
     files = [tmp_path / "main.c", tmp_path / LIBRARY]
     subprocess.run(["cc", "-O2", *files, "-lm", "-o", program], check=True)

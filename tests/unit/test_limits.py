@@ -21,9 +21,9 @@ from quad_gym.faults import Fault, SensorLoss, _angle_span, _duration, span
 from quad_gym.params import checks as check
 from quad_gym.params.camera import _features
 from quad_gym.params.checks import Checked, _unless_none
+from quad_gym.params.sensor_table import SENSOR_PARAMS
 from quad_gym.params.suites import given_suite
 from quad_gym.params.task import ONE_TASK_FIELDS
-from quad_gym.params.uwb_range import _anchors
 from quad_gym.params.vehicle import Clocks
 from quad_gym.params.world import Obstacle
 from quad_gym.records import DRAWABLES, MAX_FEATURES, MAX_GATES, Autoreset, Control, Layout, Source
@@ -116,7 +116,7 @@ KINDS = {
     span: spans,
     _duration: lambda: [(math.inf, -math.inf), *spans(open_end=True)],
     _features: lambda: rows_of(MAX_FEATURES),
-    _anchors: lambda: rows_of(8),
+    check.places: rows_of,
     recipes._sizes: lambda: [((1,), ()), ((1,), (0,)), ((64, 1), (64, 0)), ((64,), (1.5,))],
     recipes._rates: lambda: vectors(2, 0.0, open_end=True),
     recipes._read_only: lambda: [({"start": "mixed"}, ["start"]), ({}, None)],
@@ -274,6 +274,8 @@ def examples():
     collect(faults.MagnetometerDisturbance(how="iron"))  # the only form with a direction
     for name in ("rtk", "consumer", "crazyflie", "uwb", "indoor"):
         collect(quad_gym.sensor_suite(name))
+    for kind in SENSOR_PARAMS.values():  # also those that no suite has yet
+        collect(kind())
     collect(LAB)
     for kind in (
         quad_gym.ActionParams,

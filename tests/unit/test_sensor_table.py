@@ -14,7 +14,7 @@ from quad_gym.estimation.inputs import (
 from quad_gym.logs.replaying.measurements import lacks_position
 from quad_gym.packing import pack_aids, slow_states
 from quad_gym.params.aids import AidParams, SlowError
-from quad_gym.params.sensor_table import AID_PARAMS, READINGS, _shape_of
+from quad_gym.params.sensor_table import AID_PARAMS, READINGS, SENSOR_OF, _shape_of
 from quad_gym.records import PARAMS
 
 UWB = quad_gym.sensor_suite("uwb")
@@ -60,23 +60,27 @@ def test_sensor_of_positions_replaces_a_fictitious_position(monkeypatch):
     assert not lacks_position(SimpleNamespace(streams={"uwb_range"}), UWB)
 
 
-EVERY = quad_gym.sensor_suite("rtk").replace(**{name: kind() for name, kind in AID_PARAMS.items()})
+def suite_with(sensor):
+    """A suite that has a sensor, with its default parameters."""
+    suite = quad_gym.sensor_suite("rtk")
+    return suite.replace(**{sensor: AID_PARAMS[sensor]()}) if sensor in AID_PARAMS else suite
 
 
 @pytest.mark.parametrize("name", READINGS)
 def test_wrong_measurement_of_any_reading_is_refused_by_its_keyword(name):
     """The compiled check finds the number, and Python names the argument."""
     keyword, sigma = READINGS[name].keyword, READINGS[name].sigma
-    right = np.ones(EVERY.shape_of(name))
+    suite = suite_with(SENSOR_OF[name])
+    right = np.ones(suite.shape_of(name))
     wrong = right.copy()
     wrong[(0,) * wrong.ndim] = np.inf
     with pytest.raises(ValueError, match=f"{keyword} must be finite"):
-        checked_measurement(EVERY, {keyword: wrong})
+        checked_measurement(suite, {keyword: wrong})
     for value, message in ((0.0, "at least"), (-0.1, "at least"), (np.nan, "finite")):
         with pytest.raises(ValueError, match=f"{sigma} must be .*{message}"):
-            checked_measurement(EVERY, {keyword: right, sigma: value})
+            checked_measurement(suite, {keyword: right, sigma: value})
     with pytest.raises(ValueError, match=f"{sigma} must come with its measurement"):
-        checked_measurement(EVERY, {sigma: 0.1})
-    found = checked_measurement(EVERY, {keyword: right, sigma: 0.1})
+        checked_measurement(suite, {sigma: 0.1})
+    found = checked_measurement(suite, {keyword: right, sigma: 0.1})
     np.testing.assert_array_equal(sigmas_of(found, name), 0.1)
-    assert len(measured_blocks(found)) == EVERY.blocks_of(name)
+    assert len(measured_blocks(found)) == suite.blocks_of(name)
