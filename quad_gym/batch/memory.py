@@ -223,6 +223,11 @@ class FlightMemory:
         self._blocks[:] = snapshot
         self._begun = False  # it may have been taken before a reset
 
+    @property
+    def begun(self) -> bool:
+        """True once the flights have been stepped; False again after `restore`."""
+        return self._begun
+
     def copied_record(self, flight: int) -> NDArray[np.uint32]:
         """Return the whole record of one flight at the present instant, for `with_records`."""
         block, lane = divmod(flight, WIDTH)

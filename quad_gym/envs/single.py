@@ -277,11 +277,13 @@ class QuadEnv(Rendered, gymnasium.Env[Any, np.ndarray]):
             gymnasium.error.ResetNeeded: If the episode is over.
         """
         numbers = checked_actions(action, (4,))
-        if self._over or not self._seeded:
+        batch = self.flights.batch
+        if not batch.begun:  # a snapshot may have been restored
+            self._over = batch.record("needs_reset")[0] > 0.0
+        if self._over:
             raise gymnasium.error.ResetNeeded(
                 "call reset() before step(): no episode is in progress"
             )
-        batch = self.flights.batch
         observations = batch.step(numbers)
         row = batch.results[0].tolist()
         terminated, truncated = row[Result.TERMINATED] > 0.0, row[Result.TRUNCATED] > 0.0

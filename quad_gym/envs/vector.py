@@ -174,15 +174,17 @@ class QuadVectorEnv(Rendered, gymnasium.vector.VectorEnv[Any, NDArray[Any], NDAr
             ended and the next ones have begun, otherwise None.
         """
         numbers = checked_actions(actions, (self.num_envs, 4))
-        if not self._seeded:
-            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        batch = self.flights.batch
+        if not batch.begun:  # a snapshot may have been restored
+            self._over = batch.record("needs_reset") > 0.0
+            if not batch.record("episode").all():
+                raise gymnasium.error.ResetNeeded("call reset() before step()")
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
         if disabled and self._over.any():
             raise gymnasium.error.ResetNeeded(
                 f"the episode of environment {int(np.flatnonzero(self._over)[0])} is over: "
                 "reset it before step()"
             )
-        batch = self.flights.batch
         same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
         flown_with = batch.drawn() if same_step else {}
         observations = self.flights.split(batch.step(numbers))

@@ -13,6 +13,7 @@ from quad_gym import packing
 from tests.builders import SHORT, actions_for, flat, run_python, vec_env
 from tests.contract.comparing import assert_same, state_of
 from tests.contract.configurations import CONFIGURATIONS
+from tests.tasks.tasks import Chase
 
 STANDARD = quad_gym.sensor_suite("standard")
 QUIETER = STANDARD.replace(camera=STANDARD.camera.replace(pixel_sigma=19.0))
@@ -171,3 +172,26 @@ def test_snapshot_fits_any_time_limit_and_number_of_threads():
     other.reset(seeds=range(9))
     mine.restore(pickle.loads(pickle.dumps(other.snapshot())))
     assert_same(mine.read("position"), other.read("position"))
+
+
+@pytest.mark.parametrize("task", [None, Chase], ids=["built-in task", "own task"])
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec], ids=["single", "vector"])
+def test_end_of_an_episode_is_restored_with_it(make, task):
+    """An environment whose episodes do not begin by themselves flies on from each other instant."""
+    words = {} if make is gymnasium.make else {"num_envs": 2, "autoreset_mode": "Disabled"}
+    env, fresh = (make("QuadGym/Hover-v0", task=task, **words).unwrapped for _ in range(2))
+    env.reset(seed=1)
+    action, instants, rewards = np.ones(env.action_space.shape), [], []
+    while not instants or not np.any(over):
+        instants.append(env.flights.batch.snapshot())
+        _, reward, terminated, truncated, _ = env.step(action)
+        over = np.asarray(terminated) | truncated
+        rewards.append(reward)
+    end = env.flights.batch.snapshot()
+    for other in (env, fresh):  # one whose episode is over, and one that was never reset
+        other.flights.batch.restore(instants[3])
+        np.testing.assert_array_equal([other.step(action)[1] for _ in rewards[3:]], rewards[3:])
+    env.reset(seed=2)
+    env.flights.batch.restore(end)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(action)
