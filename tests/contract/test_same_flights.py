@@ -181,8 +181,8 @@ def test_end_of_an_episode_is_restored_with_it(make, task):
     words = {} if make is gymnasium.make else {"num_envs": 2, "autoreset_mode": "Disabled"}
     env, fresh = (make("QuadGym/Hover-v0", task=task, **words).unwrapped for _ in range(2))
     env.reset(seed=1)
-    action, instants, rewards = np.ones(env.action_space.shape), [], []
-    while not instants or not np.any(over):
+    action, instants, rewards, over = np.ones(env.action_space.shape), [], [], False
+    while not np.any(over):
         instants.append(env.flights.batch.snapshot())
         _, reward, terminated, truncated, _ = env.step(action)
         over = np.asarray(terminated) | truncated
