@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.estimation.starts import level_start, still_start
 from quad_gym.records import joint_covariance
 from tests.field_flights import fly
 from tests.filter_states import set_at_rest
@@ -47,6 +48,17 @@ def flight_for(how, seed):
 def share(dimension, count):
     """Return the 99.9 % interval of the mean NEES of a consistent filter."""
     return chi2.ppf((0.0005, 0.9995), dimension * count) / count
+
+
+def test_first_estimate_does_not_depend_on_what_its_memory_held():
+    """An exported filter has one record for all its starts."""
+    found = []
+    for held in (0.0, np.nan):
+        first = level_start(MAGNETIC)
+        first["root"], first["e"], first["P"] = held, held, held
+        found.append(still_start(first, np.zeros(3)).covariance)
+    np.testing.assert_array_equal(*found)
+    assert np.isfinite(found[0]).all()
 
 
 @pytest.mark.parametrize("how", ["heading", "magnetometer", "course", "nothing"])

@@ -218,9 +218,13 @@ def test_thrust_on_one_side_tips_it_over():
         volts = math.sqrt(force / lab.thrust_coefficient) / lab.motor_speed_per_volt
         action = np.full((1, 4), -1.0)
         action[0, [1, 2]] = volts / lab.hover_voltage - 1.0
+        feet = []
         for _ in range(300):
             flights.step(action)
+            feet.append(flights.record("footing")[0])
         tipped.append(bool(flights.record("needs_reset")[0]))
+        turning = [number for number in feet if number != 4.0]
+        assert turning[:10] == (10 * [2.0] if tipped[-1] else [])
     assert tipped == [False, True]
 
 

@@ -211,6 +211,18 @@ def test_start_with_a_large_tilt_leaves_a_right_compass_in_use(kind):
     assert error[2] < math.radians(8.0)
 
 
+@pytest.mark.parametrize("tilt_sigma", [0.02, 0.3])
+def test_only_a_first_tilt_beyond_the_usual_one_is_expected_to_lean(tilt_sigma):
+    """The usual one is 0.06 rad; the filter's tilt has two axes of this standard deviation."""
+    flight = LevelFlight(MAGNETIC, np.random.default_rng(3))
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    position, velocity = flight.gnss(0.0)
+    kf.initialize(position, gnss_velocity_G=velocity, tilt_sigma=tilt_sigma)
+    kf.predict(*flight.sample(0.0, 0.02), dt=0.02)
+    expected = max(tilt_sigma**2 - 0.06**2, 0.0)
+    assert kf._engine.read("level_first")[0] == pytest.approx(expected, rel=0.02, abs=1e-6)
+
+
 def found_by_the_verdict(compass, apart, sigma, out, unknown=0.0, fields=None):
     """Findings on a replay of 40 s, whose heading differs from 10 s on until it is reset.
 

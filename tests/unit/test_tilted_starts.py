@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.estimation.starts import level_start, rest, still_start
 from quad_gym.rotations import euler_to_dcm
 from tests.level_flights import GRAVITY, MAGNETIC, R_IG, LevelFlight
 from tests.unit.test_filter_starts import share
@@ -98,6 +99,25 @@ def test_level_and_resting_starts_of_a_level_vehicle_agree():
     imu = MAGNETIC.imu
     one_sample = imu.accel_noise_density / math.sqrt(imu.dt)
     assert claimed == pytest.approx(math.hypot(imu.accel_bias_sigma, one_sample), rel=2e-3)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_tilt_has_the_third_order_of_the_heading(axis):
+    """An error psi of the heading turns a steep vehicle by psi^3 / 6 sin(inclination), too.
+
+    The sixth moment of a normal number is 15 sigma^6. Body axis `axis` is inclined; the second
+    order of psi is about the level axis across it.
+    """
+    sigma, turn, incline = 0.01, 0.5, 0.6
+    k = np.array([0.0, 0.0, math.sqrt(1.0 - incline**2)])
+    k[axis] = incline
+    first = level_start(MAGNETIC)
+    rest(first, GRAVITY * k, sigma * GRAVITY, GRAVITY)
+    first["heading_sigma"] = turn
+    P, T = still_start(first, np.zeros(3)).covariance[6:9, 6:9], first["T"][0]
+    bias = MAGNETIC.imu.accel_bias_sigma / GRAVITY
+    expected = sigma**2 + bias**2 * (1.0 + turn**2) + 15.0 * turn**6 / 36.0 * incline**2
+    assert (T.T @ P @ T)[axis, axis] == pytest.approx(expected, rel=1e-12)
 
 
 REST = {"accel": [0.0, 0.0, GRAVITY]}
