@@ -50,7 +50,7 @@ def share(dimension, count):
     return chi2.ppf((0.0005, 0.9995), dimension * count) / count
 
 
-def test_first_estimate_does_not_depend_on_what_its_memory_held():
+def test_first_estimate_does_not_depend_on_earlier_content_of_its_memory():
     """An exported filter has one record for all its starts."""
     found = []
     for held in (0.0, np.nan):
