@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from baselines.arm_tasks import Parts, Scaled, WithStd, WithUncertainty
 from quad_gym.params import checks as check
 from quad_gym.tasks.look_around import LookAround
-from quad_gym.tasks.outage_dash import gaps_of
+from quad_gym.tasks.outage_dash import OutageDash, gaps_of
 from quad_gym.tasks.rewards import Crash
 from quad_gym.tasks.stale_race import StaleRace
 from quad_gym.tasks.task import ObservationSpec
@@ -204,6 +204,20 @@ class ConstantCrashCost(Scaled):
 
 class ConstantCrashCostWithUncertainty(ConstantCrashCost, WithUncertainty):
     """`WithUncertainty` for training, with the changes of `ConstantCrashCost`."""
+
+
+class WithUncertaintyForRule(WithUncertainty):
+    """`WithUncertainty` whose observation also contains the parts of `OutageDash`, for rules.
+
+    It is for training by imitation: the rule reads its parts, and the policy those of
+    `WithUncertainty`.
+    """
+
+    observes: Mapping[str, ObservationSpec] = {**WithUncertainty.observes, **OutageDash.observes}
+
+    def observe(self, view: "View") -> Parts:
+        """Return both observations."""
+        return {**OutageDash.observe(self, view), **super().observe(view)}
 
 
 class WithTimeSinceFix(WithUncertainty):

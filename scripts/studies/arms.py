@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from baselines.policies import is_included
-from baselines.recipes import ALGORITHMS, ReadOnly
+from baselines.recipes import ALGORITHMS, IMITATION, ReadOnly
 from quad_gym import NoisyObservationParams, sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
@@ -46,9 +46,9 @@ class Arm(Checked, kw_only=False):
     learning: ReadOnly = field(default_factory=dict)
     """Keywords that override both in training, but not in the selection of the best policy, such as
     another reward"""
-    algorithm: Annotated[str, partial(check.choice, choices=ALGORITHMS)] = "ppo"
-    """Algorithm, one of `baselines.recipes.ALGORITHMS`; PPO is trained with the compiled engine,
-    others are with Stable-Baselines3"""
+    algorithm: Annotated[str, partial(check.choice, choices=(*ALGORITHMS, IMITATION))] = "ppo"
+    """Algorithm, one of `baselines.recipes.ALGORITHMS`, or `IMITATION`; PPO and imitation are
+    trained with the compiled engine, others are with Stable-Baselines3"""
     parameters: ReadOnly = field(default_factory=dict)
     """Parameters of the algorithm that override the recipe's"""
     precision: Annotated[str, partial(check.choice, choices=PRECISIONS)] = PRECISION
@@ -79,7 +79,7 @@ class Arm(Checked, kw_only=False):
     @property
     def engine(self) -> str:
         """Training engine of the arm, one of `baselines.recipes.ENGINES`."""
-        return "compiled" if self.algorithm == "ppo" else "sb3"
+        return "compiled" if self.algorithm in ("ppo", IMITATION) else "sb3"
 
 
 def _task(name: str, module: str = "scripts.studies.arm_tasks") -> dict[str, str]:
@@ -238,6 +238,9 @@ _SINCE_FIX = _task("WithTimeSinceFix")
 _CONSTANT_CRASH_COST = _task("ConstantCrashCost")
 _CONSTANT_WITH_UNCERTAINTY = _task("ConstantCrashCostWithUncertainty")
 
+SLOWED = (50, 25, 0)
+"""Speeds of `rules.SlowsDown` while the filter is uncertain, in percent of its full speed."""
+
 OUTAGE_DASH = (
     Arm("pd", "PD at 4.7 m/s", policy="pd"),
     Arm("pd_slow", "PD at 2.4 m/s", policy="pd:slow"),
@@ -255,6 +258,15 @@ OUTAGE_DASH = (
         environment=STD,
     ),
     Arm("pd_planning", "PD that plans by covariances", policy="planning", environment=STD),
+    *(
+        Arm(
+            f"pd_slows_to_{share}",
+            f"PD at {share} % of its speed when uncertain",
+            policy=f"slows_to_{share}",
+            environment=STD,
+        )
+        for share in SLOWED
+    ),
     Arm("truth", "truth", environment=_SCALED, learning={**_CONSTANT_CRASH_COST, **TRUTH}),
     Arm("estimate", "estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
     Arm(
@@ -268,6 +280,14 @@ OUTAGE_DASH = (
         "estimate + normalized uncertainty + time since the last fix",
         environment=_SINCE_FIX,
         learning=_task("ConstantCrashCostWithTimeSinceFix"),
+    ),
+    Arm(
+        "imitation",
+        "estimate + normalized uncertainty, imitation of the rule that backs off",
+        environment=_WITH_UNCERTAINTY,
+        learning={**_task("WithUncertaintyForRule"), **STD},
+        algorithm=IMITATION,
+        parameters={"teacher": "scripts.studies.rules:BacksOff"},
     ),
     Arm(
         "recurrent",

@@ -20,7 +20,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from baselines.recipes import Recipe, first_seed, recipe
+from baselines.recipes import IMITATION, Recipe, first_seed, recipe
 from baselines.training import train
 from quad_gym import IDS
 from quad_gym.analysis.reports import write_json
@@ -40,9 +40,18 @@ OUTPUT = Path("results/studies")  #: folder of trainings and rows
 FIRST_EPISODE = 100_000  #: seed of the first test episode
 EPISODES = 1000  #: number of test episodes of each policy
 
-SECONDS_PER_MILLION: Mapping[str, float] = {"ppo": 16.0, "recurrent_ppo": 185.0, "sac": 570.0}
+SECONDS_PER_MILLION: Mapping[str, float] = {
+    "ppo": 16.0,
+    "recurrent_ppo": 185.0,
+    "sac": 570.0,
+    IMITATION: 60.0,
+}
 """Processor time of a million steps, by algorithm, until a training has been measured."""
-OUTAGE_SECONDS_PER_MILLION: Mapping[str, float] = {"ppo": 185.0, "recurrent_ppo": 600.0}
+OUTAGE_SECONDS_PER_MILLION: Mapping[str, float] = {
+    "ppo": 185.0,
+    "recurrent_ppo": 600.0,
+    IMITATION: 200.0,
+}
 """Processor time of a million steps in OutageDash, whose steps last 0.1 to 0.25 s."""
 FLIGHT_SECONDS = 8.0  #: processor time of the test episodes of a policy, until measured
 

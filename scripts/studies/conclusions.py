@@ -11,10 +11,12 @@ from pathlib import Path
 
 from quad_gym.analysis.metrics import Estimated
 from quad_gym.analysis.reports import markdown_table
+from scripts.studies.arms import SLOWED
 from scripts.studies.campaign import DATA, Part, flights_digest, is_complete
 from scripts.studies.parts import (
     BUDGETS,
     CURVE_ARMS,
+    IMITATION_STEPS,
     PARTS,
     RACE_CURVE,
     SUITES,
@@ -57,16 +59,20 @@ def table(heads: Sequence[str], body: Sequence[Sequence[str]], texts: int = 1) -
 
 
 class Arms:
-    """Rows of arms with one number of steps, and words about them."""
+    """Rows of arms, and words about them.
 
-    def __init__(self, rows: Rows, steps: int) -> None:
+    Each arm has one number of steps: the first of the given ones with which it was trained.
+    """
+
+    def __init__(self, rows: Rows, *steps: int) -> None:
         self._rows, self._steps = rows, steps
 
     def __getitem__(self, name: str) -> Rows:
-        found = self._rows.of(name, self._steps)
-        if not found.rows:
-            raise MissingRowsError(name)
-        return found
+        for steps in self._steps:
+            found = self._rows.of(name, steps)
+            if found.rows:
+                return found
+        raise MissingRowsError(name)
 
     def success(self, name: str) -> str:
         """Success of an arm, in percent."""
@@ -76,7 +82,8 @@ class Arms:
         """Number of seeds, and of steps."""
         counts = sorted({self[name].seeds for name in names})
         seeds = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        return f"{seeds} seeds, {self._steps:,} steps"
+        steps = sorted({self[name].steps for name in names})
+        return f"{seeds} seeds, {' or '.join(f'{count:,}' for count in steps)} steps"
 
     def against(
         self, first: str, second: str, column: str = "success", separator: str = " "
@@ -259,9 +266,37 @@ def outage_dash_rules(rows: Rows) -> str:
 
 def outage_dash_learned(rows: Rows) -> str:
     """Learned policies without memory, against each other and the best rule."""
-    names, best = ("truth", "std", "since_fix"), "pd_backs_off"
+    names, best = ("truth", "std", "since_fix", "imitation"), "pd_backs_off"
     against = {"the truth": "truth", "the rule that backs off": best}
-    return compared(Arms(rows, BUDGETS["OutageDash"]), names, against)
+    return compared(Arms(rows, BUDGETS["OutageDash"], IMITATION_STEPS), names, against)
+
+
+def outage_dash_speed(rows: Rows) -> str:
+    """Success and return by the speed of PD control while the filter is uncertain, as a table."""
+    arms = Arms(rows, IMITATION_STEPS)
+    kinds = {"100 %": "pd", **{f"{share} %": f"pd_slows_to_{share}" for share in SLOWED}}
+    kinds["waits halfway between walls"] = "pd_waiting"
+    body = [
+        [words, arms.success(name), number(arms[name].estimated("return"), 1)]
+        for words, name in kinds.items()
+    ]
+    return table(["speed while uncertain", "success", "return"], body)
+
+
+def outage_dash_imitation(rows: Rows) -> str:
+    """Imitation of the best rule, against the rule and PPO with the same observation."""
+    arms = Arms(rows, BUDGETS["OutageDash"], IMITATION_STEPS)
+    speeds = {name: arms[name].estimated("speed") for name in ("std", "pd_backs_off", "pd")}
+    return (
+        f"A network that imitates the rule that backs off from the observation *estimate + "
+        f"normalized uncertainty* succeeds in {arms.success('imitation')} of the episodes "
+        f"({arms.budget('imitation')}). It differs from the rule by "
+        f"{arms.against('imitation', 'pd_backs_off')}, and from the policies that PPO finds with "
+        f"the same observation and network by {arms.against('imitation', 'std')}. These fly at "
+        f"{number(speeds['std'], 1)} m/s on average, the rule at "
+        f"{speeds['pd_backs_off'].value:.1f} m/s, and PD control that does not wait at "
+        f"{speeds['pd'].value:.1f} m/s."
+    )
 
 
 def outage_dash_memory(rows: Rows) -> str:
@@ -388,6 +423,8 @@ CONCLUSIONS: Mapping[str, tuple[str, Conclusion]] = {
     "outage_dash.table": ("outage_dash", arms_table("outage_dash", BUDGETS["OutageDash"])),
     "outage_dash.rules": ("outage_dash", outage_dash_rules),
     "outage_dash.learned.table": ("outage_dash", outage_dash_learned),
+    "outage_dash.speed.table": ("outage_dash", outage_dash_speed),
+    "outage_dash.imitation": ("outage_dash", outage_dash_imitation),
     "outage_dash.memory": ("outage_dash", outage_dash_memory),
     "when_to_train.table": ("when_to_train", when_to_train),
     "when_to_train.summary": ("when_to_train", when_to_train_summary),

@@ -1,8 +1,11 @@
 """Parts of the campaign behind the pages, in the order in which they are run."""
 
+from dataclasses import replace
 from itertools import product
 
+from scripts.studies.arms import SLOWED
 from scripts.studies.campaign import Part
+from scripts.studies.tasks import STUDIED
 
 SEEDS = 20  #: number of training seeds of each arm behind a conclusion
 FEWER = 10  #: number of training seeds of slow arms, and of the many tracking tasks
@@ -20,13 +23,20 @@ TRACKING_STEPS = {"Circle": 1_800_000, "RandomTrajectory": 1_800_000, "Waypoints
 """Budgets of the tracking tasks, as in their recipes [steps]."""
 BUDGETS = {"LookAround": 2_000_000, "StaleRace": 4_000_000, "OutageDash": 1_200_000}
 """Steps of the trainings in the tasks in which the estimate matters."""
+IMITATION_STEPS = 300_000  #: steps of imitation in OutageDash
 _TABLES = {"LookAround": "look_around", "StaleRace": "stale_race", "OutageDash": "outage_dash"}
 
 
 def _part(
-    task: str, decides: str, *arms: str, steps: int | None = None, seeds: int = SEEDS
+    task: str,
+    decides: str,
+    *arms: str,
+    steps: int | None = None,
+    seeds: int = SEEDS,
+    evaluations: int | None = None,
 ) -> Part:
     """Part of a task in which the estimate matters; steps are those of `BUDGETS` if None."""
+    about = STUDIED[_TABLES[task]]
     return Part(
         table=_TABLES[task],
         decides=f"{task}: {decides}",
@@ -35,6 +45,7 @@ def _part(
         steps=BUDGETS[task] if steps is None else steps,
         seeds=seeds,
         flights=(task, f"{task}, truth"),
+        about=None if evaluations is None else replace(about, evaluations=evaluations),
     )
 
 
@@ -92,6 +103,15 @@ PARTS: tuple[Part, ...] = (
         "since_fix",
         "truth_on_truth",
         seeds=FEWER,
+    ),
+    _part(
+        "OutageDash",
+        "imitation of the best rule, and the speed while uncertain",
+        *(f"pd_slows_to_{share}" for share in SLOWED),
+        "imitation",
+        steps=IMITATION_STEPS,
+        seeds=FEWER,
+        evaluations=2,  # its last policy is hardly different from the one before
     ),
     *(
         Part(

@@ -90,6 +90,11 @@ class Rows:
         return len(self.rows)
 
     @property
+    def steps(self) -> int:
+        """Number of steps of the trainings of an arm."""
+        return int(self.rows[0]["steps"])
+
+    @property
     def trained(self) -> bool:
         """True for an arm with trainings, False for a fixed rule."""
         return self.rows[0]["seed"] is not None

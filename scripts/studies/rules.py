@@ -4,6 +4,7 @@ All are PD control on the observation alone, with `include_std=True`.
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from baselines.pd import MARGIN, SIGMAS, PDPolicy
 from quad_gym.evaluation import Policy
+from scripts.studies.arms import SLOWED
 from scripts.studies.planning import LOST, PlanningPolicy
 
 Array = NDArray[np.float64]
@@ -44,6 +46,27 @@ class BacksOff(PDPolicy):
         near = (ahead > 0.0) & (ahead < BACK) & (off > room) & ~uncertain
         error = np.where(near, gap - BACK * seen.heading, seen.position_error)
         return seen._replace(position_error=error)
+
+
+class SlowsDown(PDPolicy):
+    """PD control that flies at a share of its speed while the filter is uncertain.
+
+    Uncertain is defined as in mode "waiting", but the vehicle stays where it is: with a share of
+    zero it hovers. The shares show along which way of flying the return increases.
+    """
+
+    def __init__(self, env: Any, share: float) -> None:
+        super().__init__(env)
+        self._share = share
+
+    def _read(self, rows: Array) -> Any:
+        part = {name: rows[:, where] for name, where in self._slices.items()}
+        seen = super()._read(rows)
+        error, room = seen.position_error, 0.5 * part["gap_width"] - MARGIN
+        uncertain = SIGMAS * part["position_sigma"].max(axis=1, keepdims=True) > room
+        distance = np.linalg.norm(error, axis=1, keepdims=True)
+        limited = error * np.minimum(1.0, self._reach / np.maximum(distance, 1e-9))
+        return seen._replace(position_error=np.where(uncertain, self._share * limited, error))
 
 
 class WaitsAtStart(PDPolicy):
@@ -90,5 +113,6 @@ RULES: Mapping[str, Callable[[Any], Policy]] = {
     "planning": PlanningPolicy,
     "backs_off": BacksOff,
     "waits_at_start": WaitsAtStart,
+    **{f"slows_to_{share}": partial(SlowsDown, share=0.01 * share) for share in SLOWED},
 }
 """Rules by name, made for an environment."""

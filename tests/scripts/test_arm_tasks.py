@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from baselines.compiled_ppo.imitation import columns_of, teacher_of
 from baselines.policies import interface_of, load_policy
 from baselines.recipes import Plan, recipe
 from scripts.studies.arms import OUTAGE_DASH
@@ -180,6 +181,29 @@ def test_rule_backs_off_from_a_wall_near_the_gap_only_if_certain():
     np.testing.assert_allclose(flown_alone("backs_off", inside), [2.0, 1.0, 0.0])
     uncertain = near | {"position_sigma": 1.0}
     np.testing.assert_allclose(flown_alone("backs_off", uncertain), [-4.0, 3.0, 0.0])
+
+
+@pytest.mark.parametrize(("share", "pursued"), [(50, 0.75), (25, 0.375), (0, 0.0)])
+def test_rule_slows_down_only_if_uncertain(share, pursued):
+    ahead = {"position_error": (6.0, 0.0, 0.0), "gap_width": 4.0}
+    np.testing.assert_allclose(flown_alone(f"slows_to_{share}", ahead), [6.0, 0.0, 0.0])
+    uncertain = ahead | {"position_sigma": 0.8}  # the room is 1.5 m
+    np.testing.assert_allclose(flown_alone(f"slows_to_{share}", uncertain), [pursued, 0.0, 0.0])
+
+
+def test_imitation_shows_the_rule_its_observation_and_the_policy_its_own():
+    arm = next(arm for arm in OUTAGE_DASH if arm.name == "imitation")
+    env, seen = make("WithUncertaintyForRule", env_id=DASH_ID, include_std=True)
+    plain = gymnasium.make_vec(DASH_ID, num_envs=6, include_std=True)
+    scaled, own = make("WithUncertainty", env_id=DASH_ID)
+    rule, same_rule = RULES["backs_off"](plain), teacher_of(arm.parameters["teacher"], env)
+    columns = columns_of(interface_of(scaled)["observation"], env)
+    shown = plain.reset(seed=3)[0]
+    for _ in range(5):
+        action = rule.predict(shown)[0]
+        np.testing.assert_array_equal(same_rule.predict(seen)[0], action)
+        np.testing.assert_array_equal(seen[:, columns], own)
+        shown, seen, own = (each.step(action)[0] for each in (plain, env, scaled))
 
 
 def test_critic_of_look_around_observes_the_truth():

@@ -162,6 +162,7 @@ def complete_rows(part, success):
         row = {"arm": cell.arm.name, "label": cell.arm.label, "seed": cell.seed, "steps": trained}
         row |= {"episodes": 1000, "success": rate, "crashed": 1.0 - rate, "return": 100.0 * rate}
         row |= {"return_sd": 1.0, "seconds": 9.0, "flights": part.digest, "error": 1.0 - rate}
+        row["speed"] = 4.0 * rate
         found.append(row | dict(part.columns))
     return found
 
@@ -196,6 +197,32 @@ def test_conclusions_follow_from_rows_and_name_arms_seeds_budget_and_interval(tm
     assert own[2] in conclusions.incomplete(folder=tmp_path)
     Rows([row | {"flights": "others"} for row in rows.rows]).write(tmp_path / "look_around.csv")
     assert conclusions.texts(tmp_path)["look_around.headline"] == conclusions.NOT_MEASURED
+
+
+def test_imitation_is_compared_with_its_rule_and_with_ppo(tmp_path):
+    rates = {"imitation": 0.85, "std": 0.6, "pd_backs_off": 0.86, "pd_slows_to_25": 0.7}
+    parts = [part for part in PARTS if part.table == "outage_dash"][:2]
+    rows = [row for part in parts for row in complete_rows(part, lambda a: rates.get(a, 0.5))]
+    Rows(rows).write(tmp_path / "outage_dash.csv")
+    found = conclusions.texts(tmp_path)
+    sentence = found["outage_dash.imitation"]
+    assert "succeeds in 85 [" in sentence
+    assert "(10 seeds, 300,000 steps)" in sentence
+    assert "from the rule by -1 [" in sentence
+    assert "network by 25 [" in sentence
+    table = found["outage_dash.speed.table"].strip().splitlines()
+    assert [line.split(" | ")[0] for line in table[2:]] == [
+        *(f"| {share} %" for share in (100, 50, 25, 0)),
+        "| waits halfway between walls",
+    ]
+    assert "| 70 [" in table[4]
+    learned = found["outage_dash.learned.table"]
+    assert "imitation of the rule that backs off | 10 | 85 [" in learned
+    plan = parts[1].study(campaign.OUTPUT).cases()["imitation"]
+    other = parts[0].study(campaign.OUTPUT).cases()["std"]
+    assert plan.environment == other.environment
+    assert plan.recipe.layers == other.recipe.layers
+    assert plan.recipe.activation == other.recipe.activation
 
 
 def test_every_conclusion_can_be_computed_once_all_parts_are_measured(tmp_path):
