@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -169,10 +170,12 @@ def controller_of(
         _require_no_module(file, "ENV_ID", env_id)
     if keywords is None:
         keywords = plan.get("environment", {}) if plan.get("env_id") == env_id else {}
+        # keywords that are given replace all of the record, so a user must name all of them
+        words = " ".join(shlex.quote(f"{name}={value}") for name, value in keywords.items())
         for name, value in keywords.items():
-            _require_no_module(file, f"--env {name}", value)
+            _require_no_module(file, f"--env {words}", value)
             if name not in ("task", "estimator"):  # which name modules
-                _require_no_file(file, f"--env {name}", value)
+                _require_no_file(file, f"--env {words}", value)
     env = gymnasium.make_vec(env_id, num_envs=1, threads=1, **keywords)
     try:
         found: Any = load_policy(str(file), env, normalization)

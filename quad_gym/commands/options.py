@@ -261,9 +261,13 @@ def flying_options(keywords: Mapping[str, Any]) -> str:
     """Format keywords of an environment as options of `quad-gym evaluate`, each after a space."""
     rest = dict(keywords)
     words = [f"--{k} {rest.pop(k)}" for k in ("observation", "sensors", "estimator") if k in rest]
-    if rest:
-        words.append("--env " + " ".join(shlex.quote(f"{k}={v}") for k, v in rest.items()))
-    return "".join(" " + word for word in words)
+    return "".join(" " + word for word in words) + env_option(rest)
+
+
+def env_option(keywords: Mapping[str, Any]) -> str:
+    """Format keywords of an environment as the option --env after a space; empty without any."""
+    words = " ".join(shlex.quote(f"{k}={v}") for k, v in keywords.items())
+    return words and f" --env {words}"
 
 
 _WORDS = {"true": "True", "false": "False", "none": "None"}

@@ -121,4 +121,5 @@ def main(args: TrainArgs) -> None:
     policy = f"--policy {done.best_policy}{options.flying_options(plan.environment)}"
     print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")
     if plan.recipe.algorithm != "recurrent_ppo":
-        print(f"Export it: quad-gym export policy {done.best_policy} --to c")
+        env = options.env_option(plan.environment)
+        print(f"Export it: quad-gym export policy {done.best_policy} --to c{env}")

@@ -250,8 +250,11 @@ def test_export_of_privileged_policy_raises_value_error(tmp_path):
 @pytest.mark.parametrize(
     ("plan", "named"),
     [
-        ({"env_id": CIRCLE, "environment": {"estimator": "evil:E"}}, "--env estimator"),
-        ({"env_id": CIRCLE, "environment": {"task": "evil:T"}}, "--env task"),
+        ({"env_id": CIRCLE, "environment": {"estimator": "evil:E"}}, "--env estimator=evil:E"),
+        (  # keywords replace all of the record, so the message has all of them
+            {"env_id": CIRCLE, "environment": {"include_std": True, "task": "evil:T"}},
+            "--env include_std=True task=evil:T",
+        ),
         ({"env_id": f"evil:{CIRCLE}"}, "ENV_ID"),
     ],
 )
@@ -329,5 +332,6 @@ def test_damaged_or_hostile_policy_is_refused(entries, message, tmp_path):
 def test_file_that_a_policy_file_names_is_not_opened(keywords, tmp_path):
     plan = {"env_id": CIRCLE, "environment": keywords}
     file = rewritten(tmp_path / "policy.npz", record={"plan": plan})
-    with pytest.raises(ValueError, match=f"names a file, .*specify --env {next(iter(keywords))}"):
+    (name,) = keywords
+    with pytest.raises(ValueError, match=f"names a file, .*specify --env '?{name}="):
         controller_of(str(file))

@@ -13,6 +13,7 @@ from quad_gym.commands.options import (
     EnvId,
     Keywords,
     SuiteNames,
+    env_option,
     environment_of,
     flying_options,
     known_id,
@@ -139,6 +140,8 @@ def test_keywords_are_formatted_as_command_line_options():
     words = shlex.split(flying_options({**keywords, "world": "a b"}))
     assert words[:3] == ["--observation", "noisy", "--env"]
     assert words[3:] == ["camera=False", "faults=gnss_jump+rotor_loss", "world=a b"]
+    assert env_option({}) == ""
+    assert env_option({"sensors": "rtk", "task": "m:T"}) == " --env sensors=rtk task=m:T"
 
 
 def test_ids_may_be_short_without_the_command_line(tmp_path):
