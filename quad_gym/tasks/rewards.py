@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
+from quad_gym.params.portable import exp_of
 from quad_gym.params.task import RewardParams
 from quad_gym.records import Ending
 
@@ -122,7 +123,7 @@ class Tracking(Term):
     """Rate of decay with distance [1/m]"""
 
     def __call__(self, view: "View") -> Floats:
-        return np.exp(-self.rate * view.position_error)
+        return exp_of(-self.rate * view.position_error)
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,17 @@ def test_limit_of_chi_square_is_exceeded_with_the_probability(freedoms, beyond):
     assert abs(found - beyond) <= 0.5001 * (least - most) / 2
 
 
+def test_exponentials_of_arrays_are_within_an_ulp_and_do_not_use_numpys(monkeypatch):
+    x = np.append(np.random.default_rng(2).uniform(-40.0, 40.0, 500), [0.0, -745.0, 709.7])
+    exact = np.array([float(mpmath.exp(mpmath.mpf(value))) for value in x.tolist()])
+    monkeypatch.setattr(np, "exp", None)
+    found = portable.exp_of(x)
+    assert np.all(np.abs(found - exact) <= 1.5 * np.spacing(exact))
+    assert found[500] == 1.0
+    ends = portable.exp_of([[-np.inf, -1e300, 1e300, np.inf, np.nan]])
+    np.testing.assert_array_equal(ends, [[0.0, 0.0, np.inf, np.inf, np.nan]])
+
+
 def test_values_at_the_ends_are_exact():
     assert [portable.exp(x) for x in (-np.inf, -1e300, -0.0)] == [0.0, 0.0, 1.0]
     assert [portable.erfc(x) for x in (-np.inf, 0.0, 1e9, np.inf)] == [2.0, 1.0, 0.0, 0.0]
