@@ -6,6 +6,7 @@ import json
 import os
 import zipfile
 import zlib
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -444,6 +445,9 @@ class Flight:
         return pandas.DataFrame(table(self.rows)).set_index("time")
 
 
+_IDENTITY = ("tick", "episode", "key")
+
+
 class FlightRecorder:
     """Recorder of one flight of a batch; it reads the batch and never changes it.
 
@@ -469,6 +473,8 @@ class FlightRecorder:
         self._count = 0
         self._copies: list[NDArray[np.uint32]] = []
         """instants not yet converted to rows: a copy takes a hundredth of the time of a row"""
+        self._ticks: list[float] = []  #: of the rows and the copies
+        self._episode = b""  #: number and key of the recorded episode
         self._scene: FlightScene | None = None
         self._model = params_record(batch.vehicle, batch.sensors)[0]
 
@@ -485,12 +491,22 @@ class FlightRecorder:
         return Flight(self._rows[: self._count], self._scene, self._about)
 
     def keep(self) -> None:
-        """Record the present instant; the first instant of an episode starts a new flight."""
-        tick = self._batch.record("tick", self._which)[0]
-        if tick == 0.0 or self._scene is None:
+        """Record the present instant; the first instant of an episode starts a new flight.
+
+        After a snapshot has been restored, the instant replaces those that are not earlier. One of
+        another episode starts a new flight.
+        """
+        tick, number, key = (self._batch.record(n, self._which)[0] for n in _IDENTITY)
+        episode = number.tobytes() + key.tobytes()
+        if tick == 0.0 or self._scene is None or episode != self._episode:
             self._rows, self._count = np.zeros_like(self._rows), 0  # flights keep their rows
-            self._scene = self._scene_of_episode()
-            self._copies = []
+            self._scene, self._episode = self._scene_of_episode(), episode
+            self._copies, self._ticks = [], []
+        elif tick <= self._ticks[-1]:
+            self._fill_rows(self._scene)
+            self._rows, self._count = self._rows.copy(), bisect_left(self._ticks, tick)
+            del self._ticks[self._count :]
+        self._ticks.append(float(tick))
         self._copies.append(self._batch.copied_record(int(self._which[0])))
 
     def _fill_rows(self, scene: FlightScene) -> None:

@@ -140,6 +140,38 @@ def test_new_episode_starts_new_flight_and_keeps_the_old_one():
     np.testing.assert_array_equal(recorder.flight["position"], first["position"][:1])
 
 
+def test_instants_after_a_restored_snapshot_are_replaced():
+    """The rows are those of a flight with the same actions, and an earlier record is unchanged."""
+    calm, wild = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 8, 4))
+    env, straight = (QuadEnv("hover", sensors="rtk", faults="gnss_outliers") for _ in range(2))
+    recorder, expected = (FlightRecorder(e.flights.batch) for e in (env, straight))
+
+    def fly(env, recorder, actions):
+        for action in actions:
+            env.step(action)
+            recorder.keep()
+
+    for each, kept in ((env, recorder), (straight, expected)):
+        each.reset(seed=1)
+        kept.keep()
+        fly(each, kept, calm[:3])
+    instant = env.flights.batch.snapshot()
+    fly(env, recorder, calm[3:])
+    before = recorder.flight
+    rows = before.rows.tobytes()
+    env.flights.batch.restore(instant)
+    fly(env, recorder, wild)
+    fly(straight, expected, wild)
+    assert_same_flights(recorder.flight, expected.flight)
+    assert before.rows.tobytes() == rows
+    env.reset(seed=2)
+    recorder.keep()
+    env.flights.batch.restore(instant)  # of the episode before
+    fly(env, recorder, wild[:1])
+    assert recorder.flight.rows.tobytes() == expected.flight.rows[4:5].tobytes()
+    assert (recorder.flight.scene.features_I == expected.flight.scene.features_I).all()
+
+
 def test_rows_do_not_depend_on_when_they_are_read():
     """Episodes end during the run, so that copies of earlier episodes are dropped."""
     env = QuadVectorEnv(11, "circle", autoreset_mode="SameStep", max_episode_steps=9)
