@@ -1,11 +1,14 @@
 """Innovations of each block against a plain filter; the gate, and its reopening."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy import stats
 
 import quad_gym
 from quad_gym.estimation import UnscentedKalmanFilter
+from quad_gym.frames import ecef_to_enu
 from quad_gym.packing import params_record
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import (
@@ -17,7 +20,7 @@ from quad_gym.records import (
 )
 from tests.circle_flight import record_circle
 from tests.field_flights import fly, measured_now, state_errors, steps
-from tests.filter_states import set_like
+from tests.filter_states import set_at_rest, set_like
 from tests.lane_filter import EIGHT, STATE, LaneFilter
 from tests.reference_ukf import PlainUKF
 from tests.unit.alarms import ALARM
@@ -95,6 +98,20 @@ def test_nis_of_each_block_and_of_all_agrees_with_a_plain_filter(across):
         assert (ours.gate_decisions[blocks] == GateDecision.ACCEPTED).all()
         for ukf in (ours, plain):
             ukf.predict(RECORDING.gyro[k], RECORDING.accel[k])
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5])
+def test_innovation_of_a_vertical_direction_has_the_size_of_its_angle(azimuth):
+    """A vertical direction has no horizontal one across it: any two axes do, of length one."""
+    gnss = LAB.gnss.replace(primary_antenna_B=(0.0, 0.0, 0.0), secondary_antenna_B=(0.0, 0.0, 0.2))
+    ukf = UnscentedKalmanFilter(LAB.replace(gnss=gnss))
+    set_at_rest(ukf, 1e-6 * np.eye(15))
+    angle, R_IG = 2e-3, ecef_to_enu(gnss.reference_antenna_G)
+    across = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    u = math.sin(angle) * across + [0.0, 0.0, math.cos(angle)]
+    ukf.update(gnss_position_G=np.zeros(3), gnss_baseline_G=R_IG.T @ (0.2 * u))
+    size = np.linalg.norm(ukf._engine.read("innovation")[0, BASELINE_BLOCK, :2])
+    assert size == pytest.approx(math.sin(angle), rel=1e-6)
 
 
 @pytest.mark.parametrize("wrong", ["gnss_position_G", "gnss_baseline_G", "pixels"])
