@@ -175,9 +175,10 @@ def folder_of(mutant: Mutant) -> str:
     return Path(mutant.file).parts[1].removesuffix(".py")
 
 
-def words_of(text: str) -> list[str]:
+@functools.lru_cache(maxsize=4096)  # the texts of all tests are compared with each mutant
+def words_of(text: str) -> tuple[str, ...]:
     """Split a text, and names in it, into words without their plural."""
-    return [word.lower().rstrip("s") for word in _WORD.findall(text)]
+    return tuple(word.lower().rstrip("s") for word in _WORD.findall(text))
 
 
 def mutants_of(path: Path) -> list[Mutant]:
