@@ -1,4 +1,4 @@
-"""Bundle the page: `python -m docs.browser.build FILE.html`, with clang, wasm-ld and wasi-libc."""
+"""Bundle the page: `python -m docs.browser.build FILE.html`, with the package `ziglang`."""
 
 import base64
 import gzip

@@ -218,6 +218,6 @@ def test_site_has_page_or_explanation_if_tools_are_missing(tmp_path, monkeypatch
     browser_page.write_page(app, None)
     written = tmp_path / "_static" / "fly.html"
     assert written.read_text() == build.page()
-    monkeypatch.setattr(browser_page, "missing_tools", lambda: ["clang"])
+    monkeypatch.setattr(browser_page, "missing_tools", lambda: ["ziglang"])
     browser_page.write_page(app, None)
-    assert "a machine without clang" in written.read_text()
+    assert "a machine without ziglang" in written.read_text()
