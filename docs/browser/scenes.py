@@ -13,6 +13,7 @@ from quad_gym.params.suites import SensorSuite, sensor_suite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import pd_gains
 from quad_gym.records import Control, Source
+from quad_gym.records.sizes import DELAY_SLOTS, STAMP
 
 CONTROLLERS = 3
 """Flights of a scene: PD control, policies trained on the true state and on the estimate."""
@@ -96,6 +97,7 @@ def described(name: str, batch: FlightBatch) -> dict[str, Any]:
         "included": SCENES[name].included,
         "tick": suite.imu.dt,
         "ticksPerStep": round(suite.imu.rate / CONTROL_RATE),
+        "stamps": (DELAY_SLOTS, STAMP),
         "harmonics": int(batch._settings["harmonics"][0]),
         "features": 0 if suite.camera is None else len(suite.camera.features_I),
         "magnified": SCENES[name].magnified,

@@ -238,6 +238,7 @@ class Simulation {
   setLatency(factor) {
     this.latency = factor;
     const { flights } = this, delays = flights.settings("sensor_delay"), ticks = flights.settings("sensor_ticks");
+    const [slots, length] = flights.info.stamps;
     for (const sensor of [GNSS, CAMERA]) {
       const before = Number(delays[sensor]), delay = Math.round(factor * flights.nominal.delay[sensor]);
       if (flights.nominal.delay[sensor] === 0) continue;
@@ -245,8 +246,8 @@ class Simulation {
       flights.settings("under_way")[sensor] = BigInt(Math.ceil(delay / Number(ticks[sensor])));
       for (let k = 0; k < CONTROLLERS; k++) {
         const stamps = flights.field(k, "stamps"), tick = flights.field(k, "tick")[0];
-        for (let slot = 0; slot < 3; slot++) {
-          const place = 28 * (3 * sensor + slot);
+        for (let slot = 0; slot < slots; slot++) {
+          const place = length * (slots * sensor + slot);
           if (tick - stamps[place] >= before) stamps[place] = NaN;
         }
       }
