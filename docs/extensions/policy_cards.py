@@ -1,5 +1,6 @@
 """Model cards of the included policies, from the records of their trainings."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,16 @@ def page() -> str:
     return _HEAD + "".join(_card(file) for file in sorted(PRETRAINED.glob("*.npz")))
 
 
+def _keywords(given: Mapping[str, Any]) -> str:
+    return ", ".join(f"`{name}={value}`" for name, value in given.items())
+
+
+def _method(recipe: Mapping[str, Any]) -> str:
+    """Algorithm of a training; an imitation has a teacher."""
+    teacher = recipe["parameters"].get("teacher")
+    return recipe["algorithm"].upper() if teacher is None else f"imitation of `{teacher}`"
+
+
 def _card(file: Path) -> str:
     policy = MlpPolicy.load(file)
     record = policy.record
@@ -40,17 +51,17 @@ def _card(file: Path) -> str:
         "task": f"`{plan['env_id']}`",
         "observation": f"{given.get('observation', 'estimate')}, {policy.inputs} numbers",
         "action": f"`{record['interface']['action']}`, {record['interface']['control_rate']:g} Hz",
-        "keywords": ", ".join(f"`{k}={v}`" for k, v in given.items()) or "none",
+        "keywords": _keywords(plan["environment"]) or "none",
+        "in training": _keywords(plan.get("learning", {})),
         "network": f"multilayer perceptron {'-'.join(map(str, sizes))}, {policy.activations[0]}",
-        "training": f"{recipe['algorithm'].upper()}, {record.get('steps', recipe['steps']):,} "
-        "steps, "
+        "training": f"{_method(recipe)}, {record.get('steps', recipe['steps']):,} steps, "
         f"{recipe['n_envs']} flights, seed {plan['seed']}, engine {plan.get('engine', 'sb3')}",
         "validation": _validation(best),
         "trained": f"{record['ended'][:10]}, quad_gym {record['versions']['quad_gym']}"
         if "ended" in record
         else "2026-11, date not recorded",
     }
-    lines = "".join(f"| {name} | {text} |\n" for name, text in rows.items())
+    lines = "".join(f"| {name} | {text} |\n" for name, text in rows.items() if text)
     return f"\n## `{file.name}`\n\n| | |\n|---|---|\n{lines}"
 
 

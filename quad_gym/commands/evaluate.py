@@ -48,8 +48,8 @@ _LABELS = {
 
 _INCLUDED = {
     "look_around": "estimate + standard deviation, reward for certainty",
-    "stale_race": "estimate + 15 standard deviations + history",
-    "outage_dash": "estimate + normalized uncertainty",
+    "stale_race": "estimate + 15 standard deviations",
+    "outage_dash": "estimate + normalized uncertainty, imitation of a rule",
 }
 """Names of included policies whose training differs in more than the observation, by task"""
 
