@@ -311,7 +311,7 @@ OUTAGE_DASH = (
     ),
     Arm(
         "included",
-        "estimate + normalized uncertainty, imitation of the rule that backs off",
+        "estimate + normalized uncertainty, imitation",
         policy="pretrained",
         environment=_WITH_UNCERTAINTY,
     ),

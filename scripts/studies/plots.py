@@ -45,16 +45,23 @@ def pace_figure(episodes: Mapping[str, Episode]) -> Any:
         time = episode["time"]
         above.plot(time, episode["speed"], color=plots.BLUE, label="speed")
         _draw_uncertainty(below, episode)
-        failed = time[np.nan_to_num(episode.get("outage", np.zeros_like(time))) > 0]
-        if failed.size:
-            for axes, label in ((above, "no GNSS"), (below, "_")):
-                style: dict[str, Any] = {"color": plots.GREY, "alpha": 0.2, "linewidth": 0}
-                axes.axvspan(failed[0], failed[-1], label=label, **style)
+        failed = np.nan_to_num(episode.get("outage", np.zeros_like(time))) > 0
+        for axes, label in ((above, "no GNSS"), (below, "_")):
+            style: dict[str, Any] = {"color": plots.GREY, "alpha": 0.2, "linewidth": 0}
+            for first, last in outages(failed):
+                axes.axvspan(time[first], time[last], label=label, **style)
+                label = "_"  # one entry of the legend for all outages
         _mark_end(below, time, episode["speed"], episode["ending"])
     grid[0, 0].set_ylabel("speed [m/s]")
     grid[0, 0].set_ylim(bottom=0.0)
     _finish(grid, episodes, "speed")
     return figure
+
+
+def outages(failed: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of each run of true values (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], failed, [False]]).astype(np.int8)))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
 
 
 def _grid(episodes: Mapping[str, Episode], height: float, **options: Any) -> tuple[Any, Any]:

@@ -9,6 +9,7 @@ from quad_gym.evaluation import Episodes
 from quad_gym.experiments import Flown
 from scripts.studies import __main__ as command
 from scripts.studies.arms import Arm
+from scripts.studies.plots import outages
 from scripts.studies.tasks import stays
 from tests.console_commands import plain, without_figures
 from tests.scripts.running import run
@@ -148,3 +149,11 @@ def test_wrong_options_end_with_exit_code_2(words, message, tmp_path, monkeypatc
         run(words.split())
     assert end.value.code == 2
     assert message in plain(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("failed", "runs"),
+    [("0110010", [(1, 2), (5, 5)]), ("111", [(0, 2)]), ("000", []), ("", [])],
+)
+def test_outages_are_runs_of_instants_without_gnss(failed, runs):
+    assert outages(np.array([letter == "1" for letter in failed], bool)) == runs
